@@ -1,0 +1,17 @@
+"""Errors that a user's input can cause: one line that names the place, what was found and what is allowed."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class ConfigError(ValueError):
+    """A value from outside is wrong: a misspelt name, a wrong type, a number out of range, a broken file."""
+
+
+def nearest(found: object, allowed: Iterable[object]) -> str:
+    """The allowed names as a list in words, with the nearest match to what was found: `a, b, c. Did you mean 'b'?`."""
+    names = [str(name) for name in allowed]
+    close = difflib.get_close_matches(str(found), names, n=1, cutoff=0.5)
+    return ", ".join(names) + (f". Did you mean {close[0]!r}?" if close else "")

@@ -1,0 +1,211 @@
+"""Components: what is structure, what is a leaf, and that a change of numbers never compiles anew."""
+
+from typing import Annotated, Any, Literal
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsafe.component import Component, Range, Unit, choices, fields, normalise
+from jaxsafe.types import Metres, Positive, StatusName
+
+Length = Annotated[Any, Unit("m"), Positive]
+
+
+class Part(Component):
+    """A nested component."""
+
+    name: str
+    size: Metres = 1.0
+
+
+class SmallPart(Part, type="small"):
+    """One kind of part."""
+
+
+class LargePart(Part, type="large"):
+    """Another kind of part."""
+
+    extra: Metres = 2.0
+
+
+class Twin(Part):
+    """Another class with the same fields."""
+
+
+class Whole(Component):
+    """One field of every kind."""
+
+    name: str
+    count: Annotated[int, Range(1)] = 1
+    flag: bool = False
+    kind: Literal["a", "b"] = "a"
+    words: tuple[str, ...] = ()
+    refers: StatusName = "speed"
+    maybe: str | None = None
+    length: Length = 1.0
+    optional: Length | None = None
+    interval: Annotated[Any, Unit("m", length=2)] = (0.0, 1.0)
+    table: dict[str, Metres]
+    part: Part = SmallPart(name="part")
+    parts: tuple[Part, ...] = ()
+
+
+@pytest.fixture
+def whole() -> Whole:
+    parts = (SmallPart(name="x", size=3), LargePart(name="y", size=np.float64(4.0)))
+    return normalise(Whole(name="whole", table={"b": 2, "a": 1.0}, parts=parts))
+
+
+def test_the_annotation_decides_what_is_structure() -> None:
+    static = {name for name, field in fields(Whole).items() if field.static}
+    assert static == {"name", "count", "flag", "kind", "words", "refers", "maybe"}
+
+
+def test_the_annotation_carries_unit_range_and_reference() -> None:
+    table = fields(Whole)
+    assert table["length"].unit == Unit("m")
+    assert table["length"].range == Positive
+    assert table["optional"].unit == Unit("m")
+    assert table["interval"].unit == Unit("m", length=2)
+    assert table["refers"].refers is not None
+    assert table["refers"].refers.section == "status"
+    assert [name for name, field in table.items() if field.required] == ["name", "table"]
+
+
+def test_ranges_know_their_open_and_closed_ends() -> None:
+    assert 0.0 not in Positive
+    assert 1e-9 in Positive
+    closed = Range(2.0, 3.0)
+    assert 2 in closed
+    assert 3 in closed
+    assert 3.1 not in closed
+    assert 3 not in Range(2.0, 3.0, open_high=True)
+    assert float("nan") not in closed
+    assert str(Positive) == "> 0"
+    assert str(Range(0.0)) == "≥ 0"
+    assert str(Range(0.0, 1.0, open_low=True)) == "in (0, 1]"
+
+
+def test_numbers_are_the_leaves(whole: Whole) -> None:
+    leaves = {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(whole)}
+    expected = {".length": 1.0, ".table['a']": 1.0, ".table['b']": 2.0, ".part.size": 1.0, ".parts[0].size": 3.0}
+    expected |= {".parts[1].size": 4.0, ".parts[1].extra": 2.0}
+    assert set(leaves) == {*expected, ".interval"}
+    assert all(leaves[path] == value for path, value in expected.items())
+
+
+def test_flattening_and_unflattening_gives_the_same_component(whole: Whole) -> None:
+    leaves, structure = jax.tree.flatten(whole)
+    again = jax.tree.unflatten(structure, leaves)
+    assert type(again) is Whole
+    assert again == whole
+    assert (again.name, again.kind, again.parts[1].name) == ("whole", "a", "y")
+
+
+def test_unflattening_checks_nothing_so_that_any_leaf_passes(whole: Whole) -> None:
+    assert jax.tree.map(lambda _: None, whole).length is None
+    assert jax.tree.map(lambda leaf: -leaf, whole).length == -1.0
+
+
+def test_components_are_frozen_and_keyword_only(whole: Whole) -> None:
+    with pytest.raises(AttributeError):
+        whole.length = 2.0  # type: ignore[misc]
+    with pytest.raises(TypeError):
+        Part("name")  # type: ignore[misc]
+
+
+def test_after_normalising_no_leaf_is_weakly_typed_or_of_another_dtype(whole: Whole) -> None:
+    for leaf in jax.tree.leaves(whole):
+        assert isinstance(leaf, jax.Array)
+        assert leaf.dtype == jnp.float32
+        assert not leaf.aval.weak_type
+
+
+def test_in_x64_normalising_gives_float64() -> None:
+    with jax.enable_x64(True):
+        built = normalise(Whole(name="whole", table={}, length=0.1))
+        assert {leaf.dtype for leaf in jax.tree.leaves(built)} == {np.dtype("float64")}
+        assert float(built.length) == 0.1
+
+
+def test_equality_compares_every_number_and_every_name(whole: Whole) -> None:
+    assert whole == normalise(whole.replace(length=1))
+    assert whole != whole.replace(length=jnp.float32(1.5))
+    assert whole != whole.replace(name="other")
+    assert whole != whole.replace(kind="b")
+    assert whole != whole.replace(table={"a": 1.0, "c": 2.0})
+    assert whole != whole.replace(parts=whole.parts[::-1])
+    assert whole != whole.replace(interval=jnp.asarray([0.0, 2.0]))
+    assert normalise(SmallPart(name="x")) != normalise(LargePart(name="x"))
+    assert normalise(Twin(name="x")) != normalise(SmallPart(name="x"))
+    assert whole != "whole"
+    assert whole != None  # noqa: E711
+
+
+def test_equal_components_have_equal_hashes_and_can_be_keys(whole: Whole) -> None:
+    same = normalise(whole.replace(length=1))
+    assert hash(same) == hash(whole)
+    assert {whole: 1}[same] == 1
+    assert {whole: 1, whole.replace(name="other"): 2}[whole] == 1
+
+
+def test_any_numbers_compile_once() -> None:
+    chex.clear_trace_counter()
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def area(whole: Whole) -> jax.Array:
+        return whole.length * whole.count + sum(whole.table.values()) + jnp.sum(whole.interval)
+
+    values = (1, 2.0, np.float64(3.0), np.float32(4.0), jnp.float32(5.0), jnp.asarray(6))
+    built = [normalise(Whole(name="whole", length=value, table={"a": value})) for value in values]
+    assert [float(area(whole)) for whole in built] == [2.0 * float(value) + 1.0 for value in values]
+    assert float(area(jax.tree.map(lambda leaf: 2 * leaf, built[0]))) == 6.0
+
+
+def test_a_change_of_structure_compiles_anew() -> None:
+    traces = []
+
+    @jax.jit
+    def times(whole: Whole) -> jax.Array:
+        traces.append(whole.count)
+        return whole.length * whole.count
+
+    built = normalise(Whole(name="whole", length=2.0, table={}))
+    assert times(built) == 2.0
+    assert times(built.replace(count=3)) == 6.0
+    assert times(built) == 2.0
+    assert traces == [1, 3]
+
+
+def test_two_classes_with_the_same_fields_are_different_structures() -> None:
+    one, other = normalise(SmallPart(name="x")), normalise(Twin(name="x"))
+    assert jax.tree.structure(one) != jax.tree.structure(other)
+    assert jax.tree.structure((one, one)) != jax.tree.structure((one, other))
+
+
+def test_a_class_never_runs_the_program_compiled_for_another() -> None:
+    def make_class(index: int) -> type[Component]:
+        def value(self: Any) -> jax.Array:
+            return self.size + index
+
+        return type(f"Numbered{index}", (Part,), {"value": value})
+
+    value = jax.jit(lambda part: part.value())
+    assert [float(value(normalise(make_class(index)(name="x", size=0.0)))) for index in range(30)] == list(range(30))
+
+
+def test_vmap_over_a_leaf_gives_a_batch_of_components() -> None:
+    lengths = jnp.asarray([1.0, 2.0, 3.0])
+    batch = jax.vmap(lambda length: normalise(Part(name="x")).replace(size=length))(lengths)
+    assert batch.name == "x"
+    chex.assert_trees_all_equal(jax.vmap(lambda part: 2 * part.size)(batch), 2 * lengths)
+
+
+def test_types_are_chosen_by_name_among_all_subclasses() -> None:
+    assert choices(Part) == {"small": SmallPart, "large": LargePart}
+    assert choices(SmallPart) == {"small": SmallPart}
+    assert choices(Whole) == {}
