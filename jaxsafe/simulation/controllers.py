@@ -1,0 +1,94 @@
+"""From the agent's action to named controls in physical units (Section 4 "Platforms", Appendix "Environment Platforms").
+
+Controls are named, never positional, between here and the dynamics. Actions are positional, in the order in which the
+actuators are listed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.component import Component, Range, Unit
+from jaxsafe.types import Number
+
+Bound = Annotated[Number, Unit("physical")]
+Controls = Mapping[str, Float[Array, ""]]
+
+
+class Actuator(Component):
+    """One named input of a platform and its limits, in physical units.
+
+    Continuous actions in [−1, 1] are clipped and mapped affinely to [low, high], or, `zero_centred`, piecewise linearly so
+    that 0 stays 0; with `rescale` off they are physical already and only clipped. Discrete actions choose one of `points`
+    values spaced equally from low to high, both included.
+    """
+
+    name: str
+    low: Bound
+    high: Bound
+    points: Annotated[int, Range(2)] = 11
+    rescale: bool = True
+    zero_centred: bool = False
+
+    def from_continuous(self, action: Float[Array, ""]) -> Float[Array, ""]:
+        """Map an action to the physical control."""
+        if not self.rescale:
+            return jnp.clip(action, self.low, self.high)
+        share = jnp.clip(action, -1.0, 1.0)
+        if self.zero_centred:
+            return jnp.where(share < 0.0, -self.low * share, self.high * share)
+        return self.low + (share + 1.0) * (self.high - self.low) / 2.0
+
+    def from_discrete(self, index: Array) -> Float[Array, ""]:
+        """Map an index in 0 … points − 1 (clipped) to the physical control."""
+        share = jnp.clip(index, 0, self.points - 1).astype(self.low.dtype) / (self.points - 1)
+        return self.low + share * (self.high - self.low)
+
+
+class Controller(Component):
+    """The source of a platform's desired controls: an agent's actions, or nothing at all."""
+
+    actuators: tuple[Actuator, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The actuators in the order of the action."""
+        return tuple(actuator.name for actuator in self.actuators)
+
+    @property
+    def points(self) -> tuple[int, ...]:
+        """Number of choices of each actuator; empty if actions are continuous."""
+        return ()
+
+    def control(self, action: Array) -> Controls:
+        """Return the desired control of every actuator, by name."""
+        raise NotImplementedError
+
+
+class Continuous(Controller, type="continuous"):
+    """An agent whose action is one number in [−1, 1] per actuator, shape (actuators,)."""
+
+    def control(self, action: Float[Array, " actuators"]) -> Controls:
+        return {actuator.name: actuator.from_continuous(action[i]) for i, actuator in enumerate(self.actuators)}
+
+
+class Discrete(Controller, type="discrete"):
+    """An agent whose action is one index per actuator, int, shape (actuators,)."""
+
+    @property
+    def points(self) -> tuple[int, ...]:
+        return tuple(actuator.points for actuator in self.actuators)
+
+    def control(self, action: Array) -> Controls:
+        return {actuator.name: actuator.from_discrete(action[i]) for i, actuator in enumerate(self.actuators)}
+
+
+class Uncontrolled(Controller, type="uncontrolled"):
+    """A platform without actuators, such as the chief."""
+
+    def control(self, action: Array) -> Controls:
+        return {}

@@ -1,0 +1,120 @@
+"""Spacecraft in Hill's frame: Clohessy-Wiltshire motion, Eqs. (12), (16); x points away from the Earth, y along the orbit.
+
+The thrust is constant over a step, so the step is exact: the linear equations are solved in closed form (zero-order hold).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.simulation.controllers import Controls
+from jaxsafe.simulation.platform import Platform
+from jaxsafe.types import Kilograms, Number, RadiansPerSecond, Record, Seconds
+
+MEAN_MOTION = 0.001027
+"""Mean motion n of the chief's orbit [rad/s], Table 4."""
+
+MASS = 12.0
+"""Mass m of the deputy [kg], Table 4."""
+
+
+class SpacecraftState(Record):
+    """State of a spacecraft relative to the origin of Hill's frame."""
+
+    position: Float[Array, " d"]  # r [m]
+    velocity: Float[Array, " d"]  # v [m/s]
+    delta_v: Float[Array, " d"]  # velocity change F Δt / m bought with thrust in the last step [m/s]
+
+
+class Anchor(Platform, type="anchor"):
+    """A spacecraft at rest at the origin of Hill's frame, which is an equilibrium of Eqs. (12), (16): the chief."""
+
+    def rest(self) -> SpacecraftState:
+        return SpacecraftState(*3 * (jnp.zeros(self.dimension, jnp.result_type(float)),))
+
+    def step(self, state: SpacecraftState, controls: Controls, dt: Seconds) -> SpacecraftState:
+        return state
+
+
+class Spacecraft(Anchor, type="spacecraft"):
+    """A point mass with one thruster pair per axis: `thrust_x`, `thrust_y` and, in space, `thrust_z` [N]."""
+
+    mass: Kilograms = MASS
+    mean_motion: RadiansPerSecond = MEAN_MOTION
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return tuple(f"thrust_{axis}" for axis in "xyz"[: self.dimension])
+
+    def step(self, state: SpacecraftState, controls: Controls, dt: Seconds) -> SpacecraftState:
+        """Advance by the exact solution for constant thrust."""
+        acceleration = jnp.stack([controls[name] for name in self.inputs]) / self.mass
+        position, velocity = cwh_flow(state.position, state.velocity, acceleration, self.mean_motion, dt)
+        return SpacecraftState(position, velocity, acceleration * dt)
+
+
+def cwh_acceleration(r: Float[Array, " d"], v: Float[Array, " d"], a: Float[Array, " d"], n: Number) -> Float[Array, " d"]:
+    """Relative acceleration in Hill's frame, Eqs. (12), (16).
+
+    ẍ = 2nẏ + 3n²x + aₓ,  ÿ = −2nẋ + a_y,  z̈ = −n²z + a_z
+
+    Args:
+        r: position [m], shape (d,), d = 2 or 3.
+        v: velocity [m/s], shape (d,).
+        a: thrust acceleration F/m [m/s²], shape (d,).
+        n: mean motion [rad/s].
+
+    Returns:
+        Acceleration [m/s²], shape (d,).
+    """
+    planar = [2.0 * n * v[1] + 3.0 * n**2 * r[0] + a[0], -2.0 * n * v[0] + a[1]]
+    return jnp.stack(planar + [-(n**2) * r[2] + a[2]] * (r.shape[0] == 3))
+
+
+def cwh_flow(
+    r: Float[Array, " d"], v: Float[Array, " d"], a: Float[Array, " d"], n: Number, t: Number
+) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
+    """Position and velocity after a time t under constant thrust acceleration: the solution of Eqs. (12), (16).
+
+    With τ = nt and the entire functions s₁ = sin τ/τ, c₂ = (1 − cos τ)/τ², s₃ = (τ − sin τ)/τ³, every coefficient is a
+    product without cancellation, so that float32 keeps its precision at τ = 0.001 and n = 0 is the double integrator.
+    Arguments as in `cwh_acceleration`, t in seconds.
+    """
+    tau = n * t
+    s1, c2, s3 = _sine_ratios(tau)
+    half = 2.0 * tau * c2  # 2(1 − cos τ)/τ
+    third = 2.0 * tau * s3 * t * t  # 2(τ − sin τ)/n²
+    sine, versine = tau * s1, tau * tau * c2  # sin τ, 1 − cos τ
+    x, y, vx, vy, ax, ay = r[0], r[1], v[0], v[1], a[0], a[1]
+    position = [
+        x + 3.0 * versine * x + t * s1 * vx + t * half * vy + t * t * c2 * ax + third * ay,
+        y - 6.0 * tau**3 * s3 * x - t * half * vx + t * (4.0 * s1 - 3.0) * vy - third * ax + t * t * (4.0 * c2 - 1.5) * ay,
+    ]
+    velocity = [
+        vx + 3.0 * n * sine * x - versine * vx + 2.0 * sine * vy + t * s1 * ax + t * half * ay,
+        vy - 6.0 * n * versine * x - 2.0 * sine * vx - 4.0 * versine * vy - t * half * ax + t * (4.0 * s1 - 3.0) * ay,
+    ]
+    if r.shape[0] == 3:
+        z, vz, az = r[2], v[2], a[2]
+        position.append(z - versine * z + t * s1 * vz + t * t * c2 * az)
+        velocity.append(vz - n * sine * z - versine * vz + t * s1 * az)
+    return jnp.stack(position), jnp.stack(velocity)
+
+
+def _sine_ratios(tau: Number) -> tuple[Any, Any, Any]:
+    """The ratios sin τ/τ, (1 − cos τ)/τ² and (τ − sin τ)/τ³, smooth through τ = 0."""
+    s3, half = _sine_remainder(tau), tau / 2.0
+    return 1.0 - tau**2 * s3, 0.5 * (1.0 - half**2 * _sine_remainder(half)) ** 2, s3
+
+
+def _sine_remainder(tau: Number) -> Any:
+    """(τ − sin τ)/τ³; a series where |τ| < 1, where quotients, `jnp.sinc` too, lose the digits of their derivative."""
+    small = jnp.abs(tau) < 1.0
+    coefficients = jnp.asarray([(-1) ** k / math.factorial(2 * k + 3) for k in reversed(range(9))], jnp.result_type(float))
+    series = jnp.polyval(coefficients, jnp.where(small, tau, 0.0) ** 2)
+    large = jnp.where(small, 1.0, tau)
+    return jnp.where(small, series, (large - jnp.sin(large)) / large**3)

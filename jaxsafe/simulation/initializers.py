@@ -1,0 +1,81 @@
+"""Random starts: each initializer draws one field of a platform's state (Section 4 "Initialization", Tables 3 and 4).
+
+Initializers run in the order in which they are listed, platform after platform, so a later one may refer to a field drawn
+earlier or to an earlier platform.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.component import Component, Range, Unit
+from jaxsafe.simulation.geometry import direction, safe_norm
+from jaxsafe.types import Key, MetresPerSecond, Number, PerSecond, PlatformName, Sim
+
+TWO_PI = 2.0 * jnp.pi
+
+Distances = Annotated[Number, Unit("m", length=2), Range(0.0)]
+Angles = Annotated[Number, Unit("rad", length=2)]
+Shares = Annotated[Number, Unit("1", length=2), Range(0.0)]
+
+
+class Initializer(Component):
+    """Draws the state field that it is named after."""
+
+    name: str
+
+    def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Array:
+        """Return the field's value, given this platform's fields drawn so far and the platforms placed so far."""
+        raise NotImplementedError
+
+
+class Direction(Component):
+    """A random direction: azimuth and, in space, polar angle, each uniform (not uniform on the sphere)."""
+
+    azimuth: Angles = (0.0, TWO_PI)
+    polar: Angles | None = None
+
+    def draw(self, key: Key) -> Float[Array, " d"]:
+        """Return a unit vector, (2,) without and (3,) with a polar range."""
+        key_azimuth, key_polar = jax.random.split(key)
+        return direction(uniform(key_azimuth, self.azimuth), None if self.polar is None else uniform(key_polar, self.polar))
+
+
+class AtDistance(Initializer, type="at_distance"):
+    """A position at a random distance and in a random direction from another platform."""
+
+    about: PlatformName
+    distance: Distances
+    direction: Direction = Direction()
+
+    def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Float[Array, " d"]:
+        key_distance, key_direction = jax.random.split(key)
+        return sim.platforms[self.about].position + uniform(key_distance, self.distance) * self.direction.draw(
+            key_direction
+        )
+
+
+class BelowSpeedLimit(Initializer, type="below_speed_limit"):
+    """A velocity in a random direction with a speed uniform in shares × (ν₀ + ν₁‖r‖), Eq. (14), r drawn before."""
+
+    about: PlatformName
+    floor: Annotated[MetresPerSecond, Range(0.0)]
+    slope: Annotated[PerSecond, Range(0.0)]
+    share: Shares = (0.0, 1.0)
+    direction: Direction = Direction()
+
+    def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Float[Array, " d"]:
+        key_speed, key_direction = jax.random.split(key)
+        limit = self.floor + self.slope * safe_norm(drawn["position"] - sim.platforms[self.about].position)
+        return limit * uniform(key_speed, self.share) * self.direction.draw(key_direction)
+
+
+def uniform(key: Key, interval: Float[Array, " 2"]) -> Float[Array, ""]:
+    """A number uniform in [low, high]."""
+    low, high = interval[0], interval[1]
+    return low + (high - low) * jax.random.uniform(key, dtype=interval.dtype)

@@ -1,0 +1,131 @@
+"""Random starts: ranges, distributions (Kolmogorov-Smirnov) and independence, Table 4.
+
+The keys are fixed, so a test either always passes or always fails; at the level used here a right sampler with other
+keys would fail one comparison in a thousand.
+"""
+
+from itertools import combinations
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import kstest, spearmanr
+
+import jaxsafe
+from jaxsafe.component import normalise
+from jaxsafe.environment import Environment
+from jaxsafe.simulation.initializers import Direction, uniform
+
+NUM_STARTS = 4000
+LEVEL = 1e-3
+N = 0.001027
+
+draw_starts = jax.jit(jax.vmap(jaxsafe.reset, in_axes=(None, 0)))
+
+
+def measure(env: Environment, seed: int = 0) -> dict[str, np.ndarray]:
+    """What is drawn at each of many starts, from the positions and velocities alone."""
+    state, _ = draw_starts(env, jax.random.split(jax.random.key(seed), NUM_STARTS))
+    deputy = state.sim.platforms["deputy"]
+    position, velocity = np.asarray(deputy.position, float), np.asarray(deputy.velocity, float)
+    distance, speed = np.linalg.norm(position, axis=1), np.linalg.norm(velocity, axis=1)
+    drawn = {"distance": distance, "share": speed / (0.2 + 2 * N * distance)}
+    for name, vector, norm in (("position", position, distance), ("velocity", velocity, speed)):
+        drawn[f"{name} azimuth"] = np.arctan2(vector[:, 1], vector[:, 0]) % (2 * np.pi)
+        if vector.shape[1] == 3:
+            drawn[f"{name} polar"] = np.arccos(np.clip(vector[:, 2] / norm, -1, 1))
+    return drawn
+
+
+@pytest.fixture(scope="module", params=["docking2d", "docking3d"])
+def starts(request: pytest.FixtureRequest) -> dict[str, np.ndarray]:
+    return measure(jaxsafe.make(request.param))
+
+
+def is_uniform(sample: np.ndarray, low: float, high: float) -> bool:
+    return kstest(sample, "uniform", args=(low, high - low)).pvalue > LEVEL
+
+
+def test_the_check_of_uniformity_can_fail() -> None:
+    sample = np.linspace(0.0, 1.0, NUM_STARTS)
+    assert is_uniform(sample, 0.0, 1.0)
+    assert not is_uniform(sample, 0.0, 1.05)
+    assert not is_uniform(sample**1.1, 0.0, 1.0)
+
+
+def test_distances_are_uniform_between_100_and_150_metres(starts: dict[str, np.ndarray]) -> None:
+    assert starts["distance"].min() >= 100.0 - 1e-4
+    assert starts["distance"].max() <= 150.0 + 1e-4
+    assert is_uniform(starts["distance"], 100.0, 150.0)
+
+
+def test_speeds_are_uniform_up_to_the_limit_at_their_distance(starts: dict[str, np.ndarray]) -> None:
+    assert starts["share"].max() <= 1.0 + 1e-6
+    assert is_uniform(starts["share"], 0.0, 1.0)
+
+
+def test_all_angles_are_uniform(starts: dict[str, np.ndarray]) -> None:
+    for name, sample in starts.items():
+        if name.endswith("azimuth"):
+            assert is_uniform(sample, 0.0, 2.0 * np.pi), name
+        if name.endswith("polar"):
+            assert is_uniform(sample, 0.0, np.pi), name
+
+
+def test_a_spatial_start_has_six_random_numbers_and_a_planar_one_four() -> None:
+    assert len(measure(jaxsafe.make("docking2d"))) == 4
+    assert len(measure(jaxsafe.make("docking3d"))) == 6
+
+
+def test_what_is_drawn_is_drawn_independently(starts: dict[str, np.ndarray]) -> None:
+    for one, other in combinations(starts, 2):
+        assert spearmanr(starts[one], starts[other]).pvalue > LEVEL, (one, other)
+
+
+def test_all_starts_differ_and_other_keys_give_other_starts(starts: dict[str, np.ndarray]) -> None:
+    for sample in starts.values():
+        assert len(np.unique(sample)) > 0.99 * NUM_STARTS
+    env = jaxsafe.make("docking2d")
+    one, again, other = (measure(env, seed)["distance"] for seed in (5, 5, 6))
+    np.testing.assert_array_equal(one, again)
+    assert not np.isin(one, other).any()
+
+
+def test_the_chief_starts_at_rest_at_the_origin_and_no_thrust_has_acted() -> None:
+    state, timestep = jaxsafe.reset(jaxsafe.make("docking3d"), jax.random.key(1))
+    assert all(not leaf.any() for leaf in jax.tree.leaves(state.sim.platforms["chief"]))
+    assert not state.sim.platforms["deputy"].delta_v.any()
+    assert timestep.info.status["delta_v"] == 0.0
+
+
+def test_ranges_can_be_overridden_without_compiling_anew() -> None:
+    chex.clear_trace_counter()
+    reset = jax.jit(chex.assert_max_traces(jaxsafe.reset, n=1))
+    env, key = jaxsafe.make("docking2d"), jax.random.key(3)
+    reset(env, key)
+    changes = {
+        "deputy.start.position.distance": [7, 7],
+        "deputy.start.position.direction.azimuth": [np.pi / 2, np.pi / 2],
+        "deputy.start.velocity.share": [2, 2],
+        "deputy.start.velocity.direction.azimuth": [0, 0],
+    }
+    deputy = reset(jaxsafe.override(env, changes), key)[0].sim.platforms["deputy"]
+    np.testing.assert_allclose(deputy.position, [0.0, 7.0], atol=1e-5)
+    np.testing.assert_allclose(deputy.velocity, [2 * (0.2 + 2 * N * 7), 0.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("polar", "size"), [(None, 2), ((0.0, np.pi), 3)])
+def test_a_direction_without_a_polar_range_is_planar(polar: tuple[float, float] | None, size: int) -> None:
+    drawn = normalise(Direction(polar=polar)).draw(jax.random.key(0))
+    assert drawn.shape == (size,)
+    assert float(jnp.linalg.norm(drawn)) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("low", "high"), [(2.0, 3.0), (4.0, 4.0), (-1e6, 1e6)])
+def test_uniform_stays_within_its_interval(low: float, high: float) -> None:
+    keys = jax.random.split(jax.random.key(0), 1000)
+    sample = jax.vmap(uniform, in_axes=(0, None))(keys, jnp.asarray([low, high]))
+    assert low <= sample.min()
+    assert sample.max() <= high
