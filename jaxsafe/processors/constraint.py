@@ -1,0 +1,35 @@
+"""Safety constraints h ≥ 0, evaluated at every step for `cost`, `margins` and the safety metrics of Section 5."""
+
+from __future__ import annotations
+
+from jaxtyping import Array, Float
+
+from jaxsafe.component import Component
+from jaxsafe.types import Sim, StatusName
+
+
+class Constraint(Component):
+    """A signed margin h, safe where h ≥ 0, and the limit of which a violation is a share."""
+
+    name: str
+
+    def margin(self, sim: Sim) -> Float[Array, ""]:
+        """Return h, in the units of the limit."""
+        raise NotImplementedError
+
+    def limit(self, sim: Sim) -> Float[Array, ""]:
+        """Return the limit at this step, positive."""
+        raise NotImplementedError
+
+
+class SpeedLimit(Constraint, type="speed_limit"):
+    """h = v_limit − ‖v‖ [m/s], Eqs. (14), (17)."""
+
+    speed: StatusName
+    velocity_limit: StatusName
+
+    def margin(self, sim: Sim) -> Float[Array, ""]:
+        return sim.status[self.velocity_limit] - sim.status[self.speed]
+
+    def limit(self, sim: Sim) -> Float[Array, ""]:
+        return sim.status[self.velocity_limit]

@@ -1,0 +1,112 @@
+"""Reward terms (Tables 7 and 8); the reward of a step is their sum. All terms are 0 at reset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.component import Component, Unit
+from jaxsafe.processors.processor import Processor
+from jaxsafe.processors.terminal import Ends
+from jaxsafe.types import (
+    Dimensionless,
+    Metres,
+    Number,
+    OutcomeName,
+    Positive,
+    Record,
+    Seconds,
+    Sim,
+    StatusName,
+)
+
+PerMetrePerSecond = Annotated[Number, Unit("s/m")]
+
+
+class Bound(Component):
+    """Ends the episode with `outcome` once the term's sum over the episode is below `below`."""
+
+    below: Dimensionless
+    outcome: str
+    ends: Ends = "terminated"
+
+
+class Reward(Processor):
+    """Base of all reward terms; any term may carry a bound."""
+
+    bound: Bound | None = None
+
+
+class Potential(Record):
+    """Memory of `DistanceChange`."""
+
+    current: Float[Array, ""]
+    change: Float[Array, ""]
+
+
+class DistanceChange(Reward, type="distance_change"):
+    """Change of an exponential potential of a distance: scale·(e^(−a d_t) − e^(−a d_(t−1))), a = ln 2 / half_distance."""
+
+    distance: StatusName
+    half_distance: Annotated[Metres, Positive]
+    scale: Dimensionless = 2.0
+
+    def init(self, sim: Sim) -> Potential:
+        current = self._potential(sim)
+        return Potential(current, jnp.zeros_like(current))
+
+    def increment(self, memory: Potential, sim: Sim, dt: Number) -> Potential:
+        current = self._potential(sim)
+        return Potential(current, current - memory.current)
+
+    def process(self, memory: Potential, sim: Sim) -> Float[Array, ""]:
+        return memory.change
+
+    def _potential(self, sim: Sim) -> Float[Array, ""]:
+        return self.scale * jnp.exp(-jnp.log(2.0) / self.half_distance * sim.status[self.distance])
+
+
+class VelocityConstraint(Reward, type="velocity_constraint"):
+    """offset + scale·(‖v‖ − v_limit) on a step with ‖v‖ > v_limit, else 0, Table 8."""
+
+    speed: StatusName
+    velocity_limit: StatusName
+    offset: Dimensionless = -0.01
+    scale: PerMetrePerSecond = -0.01
+
+    def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
+        excess = sim.status[self.speed] - sim.status[self.velocity_limit]
+        return jnp.where(excess > 0.0, self.offset + self.scale * excess, 0.0)
+
+
+class DeltaVCost(Reward, type="delta_v"):
+    """scale·‖u/m‖Δt, Table 8; the control is the one that acted, after run time assurance."""
+
+    delta_v: StatusName
+    scale: PerMetrePerSecond = -0.01
+
+    def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
+        return self.scale * sim.status[self.delta_v]
+
+
+class Success(Reward, type="success"):
+    """value − t/t_max when the episode ends with `outcome`: sooner is better."""
+
+    outcome: OutcomeName
+    time_scale: Seconds
+    value: Dimensionless = 2.0
+
+    def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
+        return jnp.where(sim.ended[self.outcome], self.value - sim.time / self.time_scale, 0.0)
+
+
+class Failure(Reward, type="failure"):
+    """A constant for each way to fail, by outcome name."""
+
+    values: Mapping[OutcomeName, Dimensionless]
+
+    def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
+        return jnp.sum(jnp.stack([jnp.where(sim.ended[outcome], value, 0.0) for outcome, value in self.values.items()]))

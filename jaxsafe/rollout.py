@@ -1,0 +1,81 @@
+"""Running episodes back to back: automatic reset, batches of environments, and scans over time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxsafe.environment import Environment, reset, step
+from jaxsafe.types import Key, State, TimeStep
+
+Policy = Callable[[Key, Array], Array]
+"""`policy(key, observation) -> action`, batched where the observations are."""
+
+
+def rollout(env: Environment, policy: Policy, key: Key, num_steps: int, num_envs: int | None = None) -> TimeStep:
+    """Run a policy for a number of steps; every finished episode is followed by a fresh random start.
+
+    The time step that ends an episode holds the episode's true last observation; the policy acts next on the observation
+    of the new start, which is not part of the result.
+
+    Args:
+        env: the environment.
+        policy: `policy(key, observation) -> action`; with `num_envs` it sees and returns a leading axis of that size.
+        key: a typed PRNG key.
+        num_steps: steps to take in each environment.
+        num_envs: number of environments run side by side; None is one, without a batch axis.
+
+    Returns:
+        The time steps, stacked [num_steps] or [num_steps, num_envs].
+    """
+    key_start, key_run = jax.random.split(key)
+    carry = reset(env, key_start) if num_envs is None else reset_batch(env, key_start, num_envs)
+
+    def one_step(carry: tuple[State, Array], key: Key) -> tuple[tuple[State, Array], TimeStep]:
+        state, observation = carry
+        key_policy, key_reset = jax.random.split(key)
+        action = policy(key_policy, observation)
+        if num_envs is None:
+            return step_or_reset(env, state, action, key_reset)
+        return step_or_reset_batch(env, state, action, key_reset)
+
+    _, timesteps = jax.lax.scan(one_step, (carry[0], carry[1].observation), jax.random.split(key_run, num_steps))
+    return timesteps
+
+
+def step_or_reset(env: Environment, state: State, action: Array, key: Key) -> tuple[tuple[State, Array], TimeStep]:
+    """One step; where it ends the episode, the next state is a fresh start.
+
+    Returns:
+        The next state with the observation to act on, and the time step taken, with the observation it led to.
+    """
+    state, timestep = step(env, state, action)
+    fresh_state, fresh = reset(env, key)
+    return _where(timestep.done, (fresh_state, fresh.observation), (state, timestep.observation)), timestep
+
+
+def reset_batch(env: Environment, key: Key, num_envs: int) -> tuple[State, TimeStep]:
+    """Independent random starts, [num_envs]."""
+    return jax.vmap(reset, in_axes=(None, 0))(env, jax.random.split(key, num_envs))
+
+
+def step_or_reset_batch(env: Environment, state: State, action: Array, key: Key) -> tuple[tuple[State, Array], TimeStep]:
+    """`step_or_reset` for a batch, [num_envs]; starts are drawn only on steps on which some episode ends.
+
+    Drawing a start costs many times a step, and with few environments most steps end no episode.
+    """
+    state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, state, action)
+    done = timestep.done
+
+    def draw(old: tuple[State, Array]) -> tuple[State, Array]:
+        fresh_state, fresh = reset_batch(env, key, done.shape[0])
+        return _where(done, (fresh_state, fresh.observation), old)
+
+    return jax.lax.cond(jnp.any(done), draw, lambda old: old, (state, timestep.observation)), timestep
+
+
+def _where(done: Array, fresh: tuple[State, Array], old: tuple[State, Array]) -> tuple[State, Array]:
+    return jax.tree.map(lambda a, b: jnp.where(done.reshape(done.shape + (1,) * (a.ndim - done.ndim)), a, b), fresh, old)

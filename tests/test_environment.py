@@ -1,0 +1,207 @@
+"""`reset`, `reset_to` and `step`: structure, chosen starts, and what an environment says about itself."""
+
+import re
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsafe
+from jaxsafe import ConfigError, Environment
+from jaxsafe.types import State, TimeStep
+
+START = {"deputy": {"position": [100.0, 50.0], "velocity": [0.1, -0.2]}}
+OUTCOMES = ("running", "success", "crash", "distance", "timeout", "velocity")
+
+reset = jax.jit(jaxsafe.reset)
+step = jax.jit(jaxsafe.step)
+
+
+@pytest.fixture(scope="module")
+def env() -> Environment:
+    return jaxsafe.make("docking2d")
+
+
+def shapes(tree: Any) -> Any:
+    return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)), tree)
+
+
+@pytest.mark.parametrize("actions", ["continuous", "discrete"])
+@pytest.mark.parametrize("task", ["docking2d", "docking3d"])
+@pytest.mark.parametrize("x64", [False, True])
+def test_reset_and_step_agree_in_structure_shape_and_dtype(task: str, actions: str, x64: bool) -> None:
+    with jax.enable_x64(x64):
+        env = jaxsafe.make(task, actions=actions)
+        action = jnp.zeros(env.action_size, jnp.int32 if actions == "discrete" else jnp.result_type(float))
+        started = jax.eval_shape(jaxsafe.reset, env, jax.random.key(0))
+        stepped = jax.eval_shape(jaxsafe.step, env, started[0], action)
+        chex.assert_trees_all_equal_structs(started, stepped)
+        assert shapes(started) == shapes(stepped)
+        kinds = {leaf.dtype for leaf in jax.tree.leaves(stepped)}
+        assert kinds == {np.dtype(jnp.result_type(float)), np.dtype("int32"), np.dtype("bool")}
+
+
+def test_reset_to_agrees_with_reset(env: Environment) -> None:
+    drawn, given = jax.eval_shape(jaxsafe.reset, env, jax.random.key(0)), jaxsafe.reset_to(env, START)
+    assert shapes(drawn) == shapes(jax.eval_shape(lambda: given))
+
+
+def test_the_methods_are_the_functions(env: Environment) -> None:
+    key, action = jax.random.key(1), jnp.ones(2)
+    chex.assert_trees_all_equal(env.reset(key), jaxsafe.reset(env, key))
+    state, _ = env.reset(key)
+    chex.assert_trees_all_equal(env.step(state, action), jaxsafe.step(env, state, action))
+
+
+def test_a_start_has_no_reward_no_cost_and_no_end(env: Environment) -> None:
+    fast = {"deputy": {"position": [100.0, 0.0], "velocity": [5.0, 0.0]}}
+    for state, timestep in (reset(env, jax.random.key(0)), jaxsafe.reset_to(env, fast)):
+        assert timestep.reward == 0.0
+        assert timestep.cost == 0.0
+        assert not timestep.done
+        assert state.num_steps == 0
+        assert state.sim.time == 0.0
+        assert all(value == 0.0 for value in timestep.info.reward_terms.values())
+        assert all(value == 0.0 for value in timestep.info.reward_totals.values())
+        assert not timestep.info.control_actual.any()
+    assert timestep.info.margins["velocity_limit"] < 0.0
+
+
+def test_reset_to_starts_where_it_is_told(env: Environment) -> None:
+    state, timestep = jaxsafe.reset_to(env, START)
+    np.testing.assert_array_equal(state.sim.platforms["deputy"].position, np.float32([100.0, 50.0]))
+    np.testing.assert_array_equal(state.sim.platforms["deputy"].velocity, np.float32([0.1, -0.2]))
+    np.testing.assert_array_equal(state.sim.platforms["chief"].position, [0.0, 0.0])
+    distance, speed = np.hypot(100, 50), np.hypot(0.1, 0.2)
+    expected = [1.0, 0.5, 0.2, -0.4, speed, 0.2 + 2 * 0.001027 * distance]
+    np.testing.assert_allclose(timestep.observation, expected, rtol=1e-6)
+
+
+def test_reset_to_takes_arrays_and_traced_values(env: Environment) -> None:
+    position = jnp.asarray([[100.0, 0.0], [0.0, 0.4]])
+    velocity = np.zeros(2)
+
+    def start(position: jax.Array) -> tuple[State, TimeStep]:
+        return jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})
+
+    state, timestep = jax.jit(jax.vmap(start))(position)
+    np.testing.assert_array_equal(state.sim.platforms["deputy"].position, position)
+    assert [env.outcomes[i] for i in timestep.info.outcome.tolist()] == ["running", "success"]
+
+
+def test_reset_to_may_move_the_chief(env: Environment) -> None:
+    _, timestep = jaxsafe.reset_to(env, START | {"chief": {"position": [100.0, 47.0]}})
+    assert timestep.info.status["docking_distance"] == 3.0
+
+
+@pytest.mark.parametrize(
+    ("start", "message"),
+    [
+        ({}, r"^reset_to: deputy\.position is missing: it is random at reset, so give it$"),
+        ({"deputy": {"position": [1, 2]}}, r"^reset_to: deputy\.velocity is missing"),
+        ({"deputi": {}}, r"^reset_to: unknown platform 'deputi'; choose from chief, deputy\. Did you mean 'deputy'\?$"),
+        ({"deputy": {"positon": [1, 2]}}, r"^reset_to: deputy has no field 'positon'; .* Did you mean 'position'\?$"),
+        ({"deputy": {"position": [1, 2, 3], "velocity": [0, 0]}}, r"position: expected shape \(2,\), found \(3,\)"),
+        ({"deputy": {"position": 1.0, "velocity": [0, 0]}}, r"position: expected shape \(2,\), found \(\)"),
+        ({"deputy": {"position": ["a", "b"], "velocity": [0, 0]}}, r"position: expected numbers, found \['a', 'b'\]"),
+        ({"deputy": {"position": None, "velocity": [0, 0]}}, r"deputy\.position: expected numbers, found None"),
+        ({"deputy": {"position": [float("nan"), 0], "velocity": [0, 0]}}, r"position: expected finite numbers"),
+        ({"deputy": {"position": [0, 0], "velocity": [0, float("inf")]}}, r"velocity: expected finite numbers"),
+    ],
+)
+def test_a_bad_start_is_refused(env: Environment, start: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        jaxsafe.reset_to(env, start)
+    assert re.search(message, str(caught.value))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_start_at_the_chief_has_an_outcome_but_is_not_done(env: Environment) -> None:
+    state, timestep = jaxsafe.reset_to(env, {"deputy": {"position": [0.0, 0.3], "velocity": [0.0, 0.0]}})
+    assert env.outcomes[int(timestep.info.outcome)] == "success"
+    assert not timestep.done
+    assert timestep.reward == 0.0
+    assert state.sim.ended["success"]
+
+
+def test_a_step_ignores_the_earlier_outcome(env: Environment) -> None:
+    state, _ = jaxsafe.reset_to(env, {"deputy": {"position": [0.0, 0.3], "velocity": [0.0, 3.0]}})
+    state, away = step(env, state, jnp.zeros(2))
+    assert env.outcomes[int(away.info.outcome)] == "running"
+    assert not away.done
+    state, _ = jaxsafe.reset_to(env, {"deputy": {"position": [0.0, 0.3], "velocity": [0.0, 0.0]}})
+    for _ in range(3):
+        state, docked = step(env, state, jnp.zeros(2))
+        assert env.outcomes[int(docked.info.outcome)] == "success"
+        assert docked.terminated
+    assert float(docked.info.reward_terms["success"]) == pytest.approx(2.0 - 3.0 / 2000.0)
+
+
+def test_a_step_does_not_depend_on_the_flags_of_the_state(env: Environment) -> None:
+    state, _ = reset(env, jax.random.key(2))
+    ended = {name: ~flag for name, flag in state.sim.ended.items()}
+    forgetful = state.replace(sim=state.sim.replace(ended=ended, status={}, regions={}))
+    chex.assert_trees_all_equal(jaxsafe.step(env, state, jnp.ones(2)), jaxsafe.step(env, forgetful, jnp.ones(2)))
+
+
+def test_rewards_of_the_steps_add_up_to_the_totals_and_terms_to_the_reward(env: Environment) -> None:
+    state, _ = jaxsafe.reset_to(env, {"deputy": {"position": [100.0, 0.0], "velocity": [0.0, 0.6]}})
+    sums = dict.fromkeys((term.name for term in env.reward), 0.0)
+    for action in jax.random.uniform(jax.random.key(0), (30, 2), minval=-1.0):
+        state, timestep = step(env, state, action)
+        assert float(timestep.reward) == pytest.approx(float(sum(timestep.info.reward_terms.values())), abs=1e-7)
+        sums = {name: total + float(timestep.info.reward_terms[name]) for name, total in sums.items()}
+        totals = {name: float(total) for name, total in timestep.info.reward_totals.items()}
+        assert totals == pytest.approx(sums, abs=1e-5)
+    assert sums["velocity_constraint"] < 0.0
+
+
+def test_control_is_reported_in_physical_units_and_no_assurance_intervenes(env: Environment) -> None:
+    state, _ = reset(env, jax.random.key(0))
+    _, timestep = step(env, state, jnp.asarray([0.25, -7.0]))
+    np.testing.assert_array_equal(timestep.info.control_desired, [0.25, -1.0])
+    np.testing.assert_array_equal(timestep.info.control_actual, timestep.info.control_desired)
+    assert not timestep.info.intervening
+
+
+def test_time_counts_steps(env: Environment) -> None:
+    state, _ = reset(env, jax.random.key(0))
+    for count in (1, 2, 3):
+        state, _ = step(env, state, jnp.zeros(2))
+        assert (state.num_steps, state.sim.time) == (count, count)
+
+
+@pytest.mark.parametrize(("task", "axes"), [("docking2d", "xy"), ("docking3d", "xyz")])
+def test_an_environment_names_its_parts(task: str, axes: str) -> None:
+    env = jaxsafe.make(task)
+    assert env.outcomes == OUTCOMES
+    assert env.action_names == tuple(f"thrust_{axis}" for axis in axes)
+    assert env.action_size == len(axes)
+    assert env.num_action_points == ()
+    assert env.observation_names == (
+        *(f"deputy.position.{axis}" for axis in axes),
+        *(f"deputy.velocity.{axis}" for axis in axes),
+        "status.speed",
+        "status.velocity_limit",
+    )
+    assert env.observation_size == 2 * len(axes) + 2
+    _, timestep = jaxsafe.reset(env, jax.random.key(0))
+    assert timestep.observation.shape == (env.observation_size,)
+    assert set(timestep.info.margins) == {"velocity_limit"}
+    terms = ("distance_change", "velocity_constraint", "delta_v", "success", "failure")
+    assert tuple(term.name for term in env.reward) == terms
+    assert {"in_docking", "docking_distance", "velocity_limit"} <= set(timestep.info.status)
+
+
+def test_discrete_actions_change_the_controller_and_nothing_else() -> None:
+    continuous, discrete = jaxsafe.make("docking3d"), jaxsafe.make("docking3d", actions="discrete")
+    assert discrete.num_action_points == (11, 11, 11)
+    assert discrete.action_names == continuous.action_names
+    state, _ = jaxsafe.reset_to(continuous, {"deputy": {"position": [100.0, 50.0, 0.0], "velocity": [0.1, 0.0, 0.0]}})
+    pushed, chosen = step(continuous, state, jnp.asarray([-1.0, 0, 1])), step(discrete, state, jnp.asarray([0, 5, 10]))
+    chex.assert_trees_all_close(pushed, chosen, atol=1e-7)
+    assert jaxsafe.make("docking3d", actions="continuous") == continuous
+    assert discrete != continuous

@@ -1,0 +1,174 @@
+"""Episodes back to back: fresh starts, true last observations, and batches that are many single environments."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsafe
+from jaxsafe import Environment
+from jaxsafe.rollout import reset_batch, step_or_reset, step_or_reset_batch
+from jaxsafe.simulation.cwh import cwh_flow
+from jaxsafe.types import State, TimeStep
+
+NUM_STEPS, NUM_ENVS, LENGTH = 30, 6, 4
+TRACED: list[tuple[int, ...]] = []
+
+step = jax.jit(jaxsafe.step)
+rollout = jax.jit(jaxsafe.rollout, static_argnames=("policy", "num_steps", "num_envs"))
+
+
+def policy(key: jax.Array | None, observation: jax.Array) -> jax.Array:
+    """A deterministic function of the observation, for one environment and for many."""
+    TRACED.append(observation.shape)
+    return jnp.sin(7.0 * observation[..., :2])
+
+
+@pytest.fixture(scope="module")
+def env() -> Environment:
+    """Every episode times out after four steps."""
+    return jaxsafe.make("docking2d", {"terminal.timeout.limit": LENGTH - 1})
+
+
+@pytest.fixture(scope="module")
+def single(env: Environment) -> TimeStep:
+    return rollout(env, policy, jax.random.key(0), NUM_STEPS)
+
+
+@pytest.fixture(scope="module")
+def batch(env: Environment) -> TimeStep:
+    return rollout(env, policy, jax.random.key(0), NUM_STEPS, num_envs=NUM_ENVS)
+
+
+def state_at(env: Environment, observation: jax.Array) -> State:
+    """The state of which this is the docking observation."""
+    position, velocity = 100.0 * observation[:2], 0.5 * observation[2:4]
+    return jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})[0]
+
+
+def is_start(observation: jax.Array) -> bool:
+    """Whether this may be the observation of a start: 100-150 m away within the speed limit."""
+    return 99.99 <= 100 * np.hypot(*observation[:2]) <= 150.01 and observation[4] <= observation[5] + 1e-6
+
+
+def before(env: Environment, observation: jax.Array, action: jax.Array) -> np.ndarray:
+    """The observation from which a step with this action led here: the flow, which is linear, run backwards."""
+    with jax.enable_x64(True):
+        there = np.asarray(observation[:4], float) * [100, 100, 0.5, 0.5]
+        back = cwh_flow(there[:2], there[2:], np.asarray(action, float) / 12.0, 0.001027, -1.0)
+        position, velocity = (np.asarray(part) for part in back)
+    speed, limit = np.linalg.norm(velocity), 0.2 + 2 * 0.001027 * np.linalg.norm(position)
+    return np.concatenate([position / 100, velocity / 0.5, [speed, limit]])
+
+
+def assert_is_a_run(env: Environment, timesteps: TimeStep) -> None:
+    """Inside an episode each observation follows from the last; after an end the next comes from a random start."""
+    starts = []
+    for t in range(1, NUM_STEPS):
+        last, following = timesteps.observation[t - 1], timesteps.observation[t]
+        if timesteps.terminated[t - 1]:
+            start = before(env, following, timesteps.info.control_actual[t])
+            assert is_start(start)
+            np.testing.assert_allclose(policy(None, jnp.float32(start)), timesteps.info.control_actual[t], atol=1e-4)
+            starts.append(start)
+        else:
+            action = policy(None, last)
+            np.testing.assert_allclose(timesteps.info.control_actual[t], action, atol=1e-6)
+            np.testing.assert_allclose(following, step(env, state_at(env, last), action)[1].observation, atol=1e-5)
+    assert len(starts) == NUM_STEPS // LENGTH
+    assert len(np.unique(np.round(np.asarray(starts)[:, 0], 4))) == len(starts)
+
+
+def test_a_rollout_stacks_time_steps(single: TimeStep, env: Environment) -> None:
+    assert all(leaf.shape[0] == NUM_STEPS for leaf in jax.tree.leaves(single))
+    assert single.observation.shape == (NUM_STEPS, env.observation_size)
+    assert single.reward.shape == (NUM_STEPS,)
+
+
+def test_episodes_follow_each_other_from_fresh_random_starts(env: Environment, single: TimeStep) -> None:
+    assert_is_a_run(env, single)
+
+
+def test_the_step_that_ends_an_episode_keeps_its_facts(single: TimeStep, env: Environment) -> None:
+    ends = np.arange(NUM_STEPS) % LENGTH == LENGTH - 1
+    np.testing.assert_array_equal(single.terminated, ends)
+    np.testing.assert_array_equal(single.info.outcome, np.where(ends, env.outcomes.index("timeout"), 0))
+    np.testing.assert_array_equal(single.info.reward_terms["failure"], np.where(ends, -1.0, 0.0))
+    for t in np.flatnonzero(ends):
+        last = step(env, state_at(env, single.observation[t - 1]), policy(None, single.observation[t - 1]))[1]
+        np.testing.assert_allclose(single.observation[t], last.observation, atol=1e-5)
+
+
+def test_totals_begin_anew_with_every_episode(single: TimeStep) -> None:
+    for name, terms in single.info.reward_terms.items():
+        whole = np.asarray(terms)[: NUM_STEPS // LENGTH * LENGTH].reshape(-1, LENGTH)
+        totals = np.asarray(single.info.reward_totals[name])[: whole.size].reshape(-1, LENGTH)
+        np.testing.assert_allclose(totals, np.cumsum(whole, axis=1), atol=1e-6)
+
+
+def test_each_environment_of_a_batch_is_a_run_of_its_own(env: Environment, batch: TimeStep) -> None:
+    assert batch.observation.shape == (NUM_STEPS, NUM_ENVS, env.observation_size)
+    for i in range(NUM_ENVS):
+        assert_is_a_run(env, jax.tree.map(lambda leaf, i=i: leaf[:, i], batch))
+
+
+def test_the_environments_of_a_batch_differ(batch: TimeStep) -> None:
+    assert len(np.unique(batch.observation[..., 0])) == NUM_STEPS * NUM_ENVS
+
+
+def test_in_a_batch_only_the_finished_environments_start_anew(env: Environment) -> None:
+    state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(1), 4)
+    state = state.replace(num_steps=jnp.asarray([0, LENGTH - 1, 1, LENGTH - 1]))
+    action = jax.random.uniform(jax.random.key(3), (4, 2), minval=-1.0)
+    (after, observation), timestep = jax.jit(step_or_reset_batch)(env, state, action, jax.random.key(2))
+    assert timestep.done.tolist() == [False, True, False, True]
+    assert after.num_steps.tolist() == [1, 0, 2, 0]
+    for i in range(4):
+        _, alone = step(env, jax.tree.map(lambda leaf, i=i: leaf[i], state), action[i])
+        np.testing.assert_allclose(timestep.observation[i], alone.observation, atol=1e-6)
+        assert np.array_equal(observation[i], timestep.observation[i]) == (not timestep.done[i])
+        if timestep.done[i]:
+            assert is_start(np.asarray(observation[i]))
+    assert not np.allclose(observation[1], observation[3])
+
+
+@pytest.mark.parametrize("ends", ["terminated", "truncated"])
+def test_every_kind_of_end_is_followed_by_a_start(ends: str) -> None:
+    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": LENGTH - 1, "terminal.timeout.ends": ends})
+    state, _ = jaxsafe.reset(env, jax.random.key(0))
+    for num_steps, expected in ((LENGTH - 2, LENGTH - 1), (LENGTH - 1, 0)):
+        before = state.replace(num_steps=jnp.asarray(num_steps))
+        (after, observation), timestep = step_or_reset(env, before, jnp.zeros(2), jax.random.key(1))
+        assert int(after.num_steps) == expected
+        assert bool(getattr(timestep, ends)) == (expected == 0)
+        assert np.array_equal(observation, timestep.observation) == (expected != 0)
+
+
+def test_a_rollout_under_jit_is_the_same_and_compiles_once(env: Environment, single: TimeStep) -> None:
+    plain = jaxsafe.rollout(env, policy, jax.random.key(0), NUM_STEPS)
+    chex.assert_trees_all_close(single, plain, atol=1e-5)
+    num_traces = len(TRACED)
+    other = rollout(jaxsafe.override(env, {"deputy.mass": 20}), policy, jax.random.key(0), NUM_STEPS)
+    assert len(TRACED) == num_traces > 0
+    assert not np.allclose(other.observation, plain.observation)
+
+
+def test_the_key_decides_everything(env: Environment, single: TimeStep) -> None:
+    chex.assert_trees_all_equal(single, rollout(env, policy, jax.random.key(0), NUM_STEPS))
+    other = rollout(env, policy, jax.random.key(1), NUM_STEPS)
+    assert not np.isin(other.observation[:, 0], single.observation[:, 0]).any()
+
+
+def test_discrete_actions_roll_out_with_a_new_key_at_every_step() -> None:
+    env = jaxsafe.make("docking3d", {"terminal.timeout.limit": LENGTH - 1}, actions="discrete")
+
+    def choose(key: jax.Array, observation: jax.Array) -> jax.Array:
+        return jax.random.randint(key, (*observation.shape[:-1], env.action_size), 0, 11)
+
+    timesteps = rollout(env, choose, jax.random.key(0), NUM_STEPS, num_envs=3)
+    fifths = np.asarray(timesteps.info.control_actual) * 5.0
+    np.testing.assert_allclose(fifths, np.round(fifths), atol=1e-5)
+    assert set(np.round(fifths).ravel()) == set(range(-5, 6))
+    assert len(np.unique(np.round(fifths).reshape(NUM_STEPS, -1), axis=0)) == NUM_STEPS
+    assert timesteps.terminated.sum() == 3 * (NUM_STEPS // LENGTH)
