@@ -1,0 +1,9 @@
+"""Aerospace SafeRL benchmarks as pure JAX functions."""
+
+from jaxsafe.config import override
+from jaxsafe.environment import Environment, reset, reset_to, step
+from jaxsafe.envs import make
+from jaxsafe.errors import ConfigError
+from jaxsafe.rollout import rollout
+
+__all__ = ["ConfigError", "Environment", "make", "override", "reset", "reset_to", "rollout", "step"]

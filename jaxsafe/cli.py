@@ -1,0 +1,115 @@
+"""What the commands share: `key=value` arguments, one-line errors with exit code 2, and the compilation cache."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxsafe.config import yaml
+from jaxsafe.errors import ConfigError, nearest
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells expect."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Arguments:
+    """A command line `key=value …` as typed, values read as YAML scalars."""
+
+    options: dict[str, Any]
+
+    @classmethod
+    def parse(cls, argv: Sequence[str]) -> Arguments:
+        """Read the words of a command line.
+
+        Raises:
+            ConfigError: a word is not `key=value`, or a key stands twice.
+        """
+        options: dict[str, Any] = {}
+        for word in argv:
+            key, equals, text = word.partition("=")
+            if not equals or not key:
+                raise ConfigError(f"argument {word!r}: expected key=value, for instance seeds=10")
+            if key in options:
+                raise ConfigError(f"{key}: given twice")
+            options[key] = yaml.parse(text, key)
+        return cls(options)
+
+    def pop(self, key: str, default: Any = None) -> Any:
+        """Take one option out."""
+        return self.options.pop(key, default)
+
+    def pop_text(self, key: str) -> str | None:
+        """Take out an option that is a name or a path; `runs/7` and `7` are both text.
+
+        Raises:
+            ConfigError: it was given without a value.
+        """
+        if key not in self.options:
+            return None
+        value = self.options.pop(key)
+        if value is None or isinstance(value, (list, dict, bool)):
+            raise ConfigError(f"{key}: expected a name or a path, found {value!r}")
+        return str(value)
+
+    def pop_count(self, key: str, default: int, least: int = 1) -> int:
+        """Take out a whole number.
+
+        Raises:
+            ConfigError: it is something else, or too small.
+        """
+        value = self.options.pop(key, default)
+        if isinstance(value, float) and value.is_integer():
+            value = int(value)
+        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+            raise ConfigError(f"{key}: expected a whole number ≥ {least}, found {value!r}")
+        return value
+
+    def pop_overrides(self) -> dict[str, Any]:
+        """Take out the `env.<path>=value` options, without their prefix."""
+        paths = [key for key in self.options if key.startswith("env.")]
+        return {key.removeprefix("env."): self.options.pop(key) for key in paths}
+
+    def refuse_rest(self, known: Sequence[str]) -> None:
+        """Raise a ConfigError for an option that nobody took."""
+        for key in self.options:
+            raise ConfigError(f"{key}: unknown option; choose from {nearest(key, known)}")
+
+
+def run(main: Callable[[Sequence[str]], int | None], usage: Callable[[], str]) -> None:
+    """Run a command and leave with its exit code."""
+    argv = sys.argv[1:]
+    if not argv or argv[0] in ("-h", "--help", "help"):
+        print(usage(), file=sys.stdout if argv else sys.stderr)
+        sys.exit(0 if argv else 2)
+    try:
+        sys.exit(main(argv) or 0)
+    except ConfigError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except OSError as error:
+        place = error.filename or "file"
+        print(f"error: {place}: {error.strerror or error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+
+
+def enable_compilation_cache() -> None:
+    """Keep compiled programs between runs, unless the user chose a place or none; the second start is then quick."""
+    import jax
+
+    if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
+        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+        try:
+            (base / "jaxsafe").mkdir(parents=True, exist_ok=True)
+        except OSError:
+            return  # a home that cannot be written costs time, nothing else
+        jax.config.update("jax_compilation_cache_dir", str(base / "jaxsafe"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

@@ -1,0 +1,32 @@
+"""`python -m jaxsafe.config docking3d`: the complete environment as one YAML file, on standard output."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from jaxsafe import cli
+from jaxsafe.errors import ConfigError
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    from jaxsafe.config import dump
+    from jaxsafe.envs import make
+
+    task, *words = argv
+    if "=" in task:
+        raise ConfigError(f"argument {task!r}: expected a task first, for instance docking3d")
+    arguments = cli.Arguments.parse(words)
+    changes, actions = arguments.pop_overrides(), arguments.pop_text("actions")
+    arguments.refuse_rest(["actions", "env.…"])
+    print(dump(make(task, changes, actions=actions)), end="")  # type: ignore[arg-type]
+    return 0
+
+
+def usage() -> str:
+    """The help text."""
+    return "usage: python -m jaxsafe.config TASK [actions=continuous|discrete] [env.PATH=VALUE …]"
+
+
+if __name__ == "__main__":
+    cli.run(main, usage)

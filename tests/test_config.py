@@ -1,0 +1,533 @@
+"""Environments as YAML and overrides: what is written reads back, and every fault is one line with its place."""
+
+import copy
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsafe
+from jaxsafe import ConfigError, Environment
+from jaxsafe.config import build, dump, load
+from jaxsafe.config.convert import to_component
+from jaxsafe.config.yaml import parse, write
+from jaxsafe.processors.status import Status
+from jaxsafe.types import PlatformName
+
+VARIANTS = [(task, actions) for task in ("docking2d", "docking3d") for actions in ("continuous", "discrete")]
+
+
+class SpeedSquared(Status, type="speed_squared_of_test"):
+    """A status as a user would write it."""
+
+    of: PlatformName
+
+    def process(self, memory: Any, sim: Any) -> jax.Array:
+        return jnp.sum(sim.platforms[self.of].velocity ** 2)
+
+
+@pytest.fixture(scope="module")
+def env() -> Environment:
+    return jaxsafe.make("docking2d")
+
+
+@pytest.fixture
+def tree(env: Environment) -> dict[str, Any]:
+    """The plain data of docking2d, a fresh copy to break."""
+    return parse(dump(env), "docking2d")
+
+
+def fault(act: Callable[[], Any]) -> str:
+    """The message of the ConfigError that `act` raises, after checking that it is one line."""
+    with pytest.raises(ConfigError) as caught:
+        act()
+    message = str(caught.value)
+    assert "\n" not in message
+    assert len(message) < 400
+    return message
+
+
+def fault_in(tree: Any) -> str:
+    return fault(lambda: load(write(tree)))
+
+
+def compose(tree: Any) -> Environment:
+    """What `load` does with a file's content, without the text."""
+    return build(to_component(tree, Environment, ""))
+
+
+def put(tree: Any, path: str, value: Any) -> Any:
+    """Set the value at a path such as `status.3.floor`."""
+    *parents, last = [int(part) if part.isdigit() else part for part in path.split(".")]
+    inner = tree
+    for part in parents:
+        inner = inner[part]
+    inner[last] = value
+    return tree
+
+
+def mappings(tree: Any) -> Iterator[dict[str, Any]]:
+    """Every mapping in plain data."""
+    if isinstance(tree, dict):
+        yield tree
+    for inner in tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ():
+        yield from mappings(inner)
+
+
+# What is written reads back
+
+
+@pytest.mark.parametrize(("task", "actions"), VARIANTS)
+def test_loading_a_dump_gives_the_same_environment(task: str, actions: str) -> None:
+    env = jaxsafe.make(task, actions=actions)
+    again = load(dump(env))
+    assert again == env
+    assert dump(again) == dump(env)
+    assert jax.tree.map(lambda leaf: leaf.dtype, again) == jax.tree.map(lambda leaf: leaf.dtype, env)
+
+
+def test_loading_a_dump_keeps_overrides_and_awkward_numbers(env: Environment) -> None:
+    changes = {"deputy.mass": 1 / 3, "reward.delta_v.scale": -1e-30, "terminal.distance.limit": 1e30, "dt": 7.0e-5}
+    changes |= {"observation.position.clip": [-1, 1], "terminal.timeout.ends": "truncated"}
+    changed = jaxsafe.override(env, changes)
+    assert load(dump(changed)) == changed
+    assert changed != env
+
+
+def test_in_x64_a_dump_keeps_all_digits() -> None:
+    with jax.enable_x64(True):
+        env = jaxsafe.make("docking3d", {"deputy.mass": 1 / 3})
+        assert float(load(dump(env)).agent_platform.mass) == 1 / 3
+        assert load(dump(env)) == env
+
+
+def test_a_dump_holds_shortest_decimals(env: Environment) -> None:
+    assert "mean_motion: 0.001027\n" in dump(env)
+    assert "scale: -0.01" in dump(env)
+
+
+def test_an_environment_is_read_from_a_file_and_then_overridden(env: Environment, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(dump(env))
+    assert load(path) == env
+    assert load(str(path)) == env
+    assert jaxsafe.make(path, actions="discrete") == jaxsafe.make("docking2d", actions="discrete")
+    assert float(jaxsafe.make(str(path), {"deputy.mass": 10}).agent_platform.mass) == 10.0
+
+
+def test_fields_with_a_default_may_be_left_out(tree: dict[str, Any], env: Environment) -> None:
+    del tree["dt"], tree["terminal"][0]["ends"], tree["platforms"][1]["mass"]
+    del tree["platforms"][1]["start"][0]["direction"]
+    assert load(write(tree)) == env
+
+
+def test_a_component_of_the_user_is_usable_from_yaml(tree: dict[str, Any]) -> None:
+    tree["status"].append({"type": "speed_squared_of_test", "name": "energy", "of": "deputy"})
+    tree["observation"].append({"type": "observe_status", "name": "energy", "status": "energy"})
+    env = load(write(tree))
+    assert load(dump(env)) == env
+    _, timestep = jaxsafe.reset_to(env, {"deputy": {"position": [100.0, 0.0], "velocity": [0.3, 0.4]}})
+    assert timestep.info.status["energy"] == pytest.approx(0.25)
+    assert timestep.observation[-1] == pytest.approx(0.25)
+
+
+# Overrides
+
+
+def test_overrides_reach_fields_of_fields_of_lists_and_of_mappings(env: Environment) -> None:
+    changes = {
+        "dt": 2,
+        "deputy.mass": 10,
+        "platforms.deputy.mean_motion": 0.002,
+        "deputy.start.position.distance": (50, 60),
+        "deputy.start.position.direction.azimuth": [0, 1],
+        "deputy.controller.actuators.thrust_x.points": 5,
+        "reward.velocity_constraint.bound.below": -7,
+        "reward.failure.values.crash": -3,
+        "terminal.timeout.ends": "truncated",
+        "status.delta_v.norm": "l1",
+        "observation.position.clip": [-1, 1],
+    }
+    changed = jaxsafe.override(env, changes)
+    deputy = changed.agent_platform
+    assert (changed.dt, deputy.mass) == (2.0, 10.0)
+    assert deputy.mean_motion == np.float32(0.002)
+    assert deputy.start[0].distance.tolist() == [50.0, 60.0]
+    assert deputy.start[0].direction.azimuth.tolist() == [0.0, 1.0]
+    assert deputy.controller.actuators[0].points == 5
+    assert deputy.controller.actuators[1].points == 11
+    assert changed.reward[1].bound is not None
+    assert changed.reward[1].bound.below == -7.0
+    assert {name: float(value) for name, value in changed.reward[4].values.items()} == {
+        "crash": -3.0,
+        "distance": -1.0,
+        "timeout": -1.0,
+        "velocity": 0.0,
+    }
+    assert changed.terminal[3].ends == "truncated"
+    assert changed.status[4].norm == "l1"
+    assert changed.observation[0].clip is not None
+    assert env == jaxsafe.make("docking2d")
+
+
+def test_an_override_with_the_value_it_has_changes_nothing(env: Environment) -> None:
+    assert jaxsafe.override(env, {"deputy.mass": 12, "reward.delta_v.scale": np.float64(-0.01)}) == env
+    assert jaxsafe.override(env, {}) == env
+
+
+def test_make_with_overrides_is_override_of_make(env: Environment) -> None:
+    assert jaxsafe.make("docking2d", {"deputy.mass": 9}) == jaxsafe.override(env, {"deputy.mass": 9})
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("reward.delta_v.scal", 1, r"reward\.delta_v\.scal: unknown field 'scal'.* Did you mean 'scale'\?"),
+        ("reward.delta.scale", 1, r"reward\.delta: unknown name 'delta'.*success.* Did you mean 'delta_v'\?"),
+        ("rewards.delta_v.scale", 1, r"rewards: unknown field 'rewards'.* Did you mean 'reward'\?"),
+        ("deputi.mass", 1, r"deputi: unknown field 'deputi'.* Did you mean 'deputy'\?"),
+        ("deputy.start.positon.distance", 1, r"deputy\.start\.positon: unknown name.* Did you mean 'position'\?"),
+        ("reward.failure.values.crsh", 1, r"reward\.failure\.values: unknown name 'crsh'.* Did you mean 'crash'\?"),
+        ("", 1, r"unknown field ''; choose from agent"),
+        ("reward..scale", 1, r"reward: unknown name ''"),
+        ("agent.x", 1, r"agent\.x: agent has no fields"),
+        ("dt.x", 1, r"dt\.x: dt has no fields"),
+        ("reward.delta_v.bound.below", -1, r"bound has no fields because it is not set"),
+        ("deputy", 1, r"deputy: name one of its fields: .*mass"),
+        ("reward.delta_v", 1, r"reward\.delta_v: name one of its fields: .*scale"),
+        ("reward", 1, r"reward: expected a list, found 1"),
+        ("deputy.mass", 0, r"deputy\.mass: expected a number in kg > 0, found 0"),
+        ("deputy.mass", "heavy", r"deputy\.mass: expected a number in kg > 0, found 'heavy'"),
+        ("deputy.mass", "12", r"deputy\.mass: expected a number .*, found '12'"),
+        ("deputy.mass", True, r"deputy\.mass: expected a number .*, found True"),
+        ("deputy.mass", None, r"deputy\.mass: expected a number .*, found None"),
+        ("deputy.mass", float("nan"), r"deputy\.mass: expected a number .*, found nan"),
+        ("deputy.mass", 1e-50, r"deputy\.mass: expected a number .* > 0, found 1e-50"),
+        ("deputy.mass", 10**400, r"deputy\.mass: expected a number .*, found 1000"),
+        ("deputy.mass", [1.0], r"deputy\.mass: expected a number .*, found \[1\.0\]"),
+        ("deputy.mass", {"kg": 12}, r"deputy\.mass: expected a number .*, found \{'kg': 12\}"),
+        ("deputy.mass", 1j, r"deputy\.mass: expected a number .*, found 1j"),
+        ("deputy.start.position.distance", [3, 1], r"distance: expected low ≤ high, found \[3, 1\]"),
+        ("deputy.start.position.distance", [1, 2, 3], r"expected a list \[low, high\] in m ≥ 0, found \[1, 2, 3\]"),
+        ("deputy.start.position.distance", [-1, 1], r"expected a list \[low, high\] in m ≥ 0, found \[-1, 1\]"),
+        ("deputy.start.position.distance", [False, True], r"expected a list \[low, high\].*found \[False, True\]"),
+        ("deputy.start.position.distance", ["1", "2"], r"expected a list \[low, high\].*found \['1', '2'\]"),
+        ("deputy.start.position.distance", 3, r"expected a list \[low, high\] in m ≥ 0, found 3"),
+        ("deputy.controller.actuators.thrust_x.points", 1, r"expected a whole number ≥ 2, found 1"),
+        ("deputy.controller.actuators.thrust_x.points", 3.5, r"expected a whole number ≥ 2, found 3\.5"),
+        ("deputy.controller.actuators.thrust_x.points", True, r"expected a whole number ≥ 2, found True"),
+        ("deputy.controller.actuators.thrust_x.rescale", 1, r"expected true or false, found 1"),
+        ("deputy.controller.actuators.thrust_x.low", 2, r"thrust_x: expected low ≤ high, found 2 and 1"),
+        ("deputy.dimension", 4, r"deputy\.dimension: expected a whole number in \[2, 3\], found 4"),
+        ("terminal.timeout.ends", "truncate", r"ends: found 'truncate'; choose from .* Did you mean 'truncated'\?"),
+        ("status.delta_v.norm", "l3", r"norm: found 'l3'; choose from l1, l2"),
+        ("status.speed.of", "chef", r"status\.speed\.of: nothing is called 'chef'.* Did you mean 'chief'\?"),
+        ("reward.failure.values", {"crsh": -1}, r"nothing is called 'crsh'.* Did you mean 'crash'\?"),
+        ("reward.velocity_constraint.bound", None, r"nothing is called 'velocity'; choose from success, crash"),
+        ("reward.success.outcome", "sucess", r"nothing is called 'sucess'.* Did you mean 'success'\?"),
+        ("reward.delta_v.name", "success", r"reward: the name 'success' stands twice"),
+        ("agent", "chief", r"agent: 'chief' cannot be the agent: it takes no control"),
+    ],
+)
+def test_a_bad_override_is_refused(env: Environment, path: str, value: Any, message: str) -> None:
+    assert re.search(message, fault(lambda: jaxsafe.override(env, {path: value})))
+
+
+@pytest.mark.parametrize(
+    ("path", "make_value", "message"),
+    [
+        ("deputy.mass", lambda w: jnp.stack([w, w]), r"deputy\.mass: expected a number .*an array of shape \(2,\)"),
+        ("deputy.start.position.distance", lambda w: w, r"expected a list \[low, high\].*an array of shape \(\)"),
+        ("deputy.controller.actuators.thrust_x.points", lambda w: w, r"points: expected a whole number"),
+        ("status.delta_v.norm", lambda w: w, r"norm: found an array of shape \(\); choose from l1, l2"),
+        ("agent", lambda w: w, r"agent: expected a name"),
+        ("deputy.mas", lambda w: w, r"unknown field 'mas'"),
+    ],
+)
+def test_a_misplaced_traced_value_is_refused(env: Environment, path: str, make_value: Any, message: str) -> None:
+    def act() -> Any:
+        return jax.eval_shape(lambda w: jaxsafe.override(env, {path: make_value(w)}), jnp.float32(1.0))
+
+    assert re.search(message, fault(act))
+
+
+def test_overrides_take_traced_values(env: Environment) -> None:
+    masses = jnp.asarray([10.0, 12.0, 14.0])
+    batch = jax.vmap(lambda mass: jaxsafe.override(env, {"deputy.mass": mass}))(masses)
+    assert batch.agent_platform.mass.tolist() == masses.tolist()
+    low = {"deputy.controller.actuators.thrust_x.low": jnp.float32(-2.0)}
+    assert jax.jit(lambda: jaxsafe.override(env, low))().agent_platform.controller.actuators[0].low == -2.0
+    slope = jax.grad(lambda mass: 3.0 * jaxsafe.override(env, {"deputy.mass": mass}).agent_platform.mass)(12.0)
+    assert slope == 3.0
+
+
+# Faults of `make`
+
+
+@pytest.mark.parametrize(
+    ("act", "message"),
+    [
+        (lambda: jaxsafe.make("docking2"), r"env: unknown task 'docking2'.* Did you mean 'docking2d'\?"),
+        (lambda: jaxsafe.make(""), r"env: unknown task ''.*; choose from docking2d, docking3d"),
+        (lambda: jaxsafe.make("docking2d", actions="discret"), r"actions: unknown kind.* Did you mean 'discrete'\?"),
+        (lambda: jaxsafe.make("no_such_file.yaml"), r"no_such_file\.yaml: cannot be read: No such file"),
+        (lambda: jaxsafe.make("docking2d", {"deputy.mas": 1}), r"deputy\.mas: .* Did you mean 'mass'\?"),
+    ],
+)
+def test_make_refuses_what_it_does_not_know(act: Callable[[], Any], message: str) -> None:
+    assert re.search(message, fault(act))
+
+
+# Faults in a YAML file
+
+
+@pytest.mark.parametrize("task", ["docking2d", "docking3d"])
+def test_every_misspelt_field_is_refused_with_the_right_one(task: str) -> None:
+    tree = parse(dump(jaxsafe.make(task)), task)
+    num_keys = sum(len(mapping) for mapping in mappings(tree))
+    assert num_keys > 150
+    for count in range(num_keys):
+        broken = copy.deepcopy(tree)
+        mapping, key = [(mapping, key) for mapping in mappings(broken) for key in mapping][count]
+        items = [(f"{name}x" if name == key else name, value) for name, value in mapping.items()]
+        mapping.clear()
+        mapping.update(items)
+        message = fault(lambda broken=broken: compose(broken))
+        if key == "type":
+            assert re.search(r": field 'type' is missing; choose from \w+", message)
+        else:
+            assert f"'{key}x'" in message
+            assert f"Did you mean '{key}'?" in message
+
+
+def test_every_misspelt_type_choice_or_reference_is_refused(tree: dict[str, Any]) -> None:
+    words = [(mapping, key) for mapping in mappings(tree) for key, value in mapping.items() if isinstance(value, str)]
+    words = [(mapping, key) for mapping, key in words if key != "name"]
+    assert len(words) > 50
+    for mapping, key in words:
+        right = mapping[key]
+        mapping[key] = f"{right}x"
+        message = fault(lambda: compose(tree))
+        mapping[key] = right
+        if key == "outcome" and mapping.get("below"):  # a bound brings its outcome; what refers to it is then wrong
+            assert "nothing is called 'velocity'" in message
+        else:
+            assert f"'{right}x'" in message
+            assert f"Did you mean '{right}'?" in message
+
+
+def test_every_missing_field_without_a_default_is_named(tree: dict[str, Any]) -> None:
+    places = [(mapping, key) for mapping in mappings(tree) for key in mapping]
+    required = {(mapping.get("type"), key) for mapping, key in places if refusal_without(tree, mapping, key)}
+    assert required >= {
+        *((None, key) for key in ("agent", "platforms", "terminal", "reward", "observation", "low", "high", "below")),
+        *(("spacecraft", key) for key in ("type", "name", "dimension", "controller")),
+        *(("at_distance", key) for key in ("type", "name", "about", "distance")),
+        *(("circle", key) for key in ("type", "name", "on", "radius")),
+        *(("velocity_limit", key) for key in ("type", "name", "distance", "floor", "slope")),
+        *(("distance_change", key) for key in ("type", "name", "distance", "half_distance")),
+        *(("observe", key) for key in ("type", "name", "of", "what")),
+    }
+    optional = {"dt", "ends", "points", "scale", "clip", "share", "offset", "mass", "mean_motion", "azimuth"}
+    assert optional.isdisjoint(key for _, key in required)
+
+
+def refusal_without(tree: dict[str, Any], mapping: dict[str, Any], key: str) -> bool:
+    """Whether the tree is refused without one key, which is then put back where it was."""
+    before = dict(mapping)
+    del mapping[key]
+    try:
+        compose(tree)
+    except ConfigError as error:
+        return "\n" not in str(error)
+    finally:
+        mapping.clear()
+        mapping.update(before)
+    return False
+
+
+def test_a_missing_field_is_named_with_what_it_takes(tree: dict[str, Any]) -> None:
+    del tree["status"][3]["floor"]
+    message = fault_in(tree)
+    assert message == "status.velocity_limit (velocity_limit): field 'floor' is missing; it takes a number in m/s ≥ 0"
+
+
+def test_every_number_replaced_by_a_word_a_truth_value_or_nan_is_refused(tree: dict[str, Any]) -> None:
+    def is_number(value: Any) -> bool:
+        return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+    numbers = [(mapping, key) for mapping in mappings(tree) for key, value in mapping.items() if is_number(value)]
+    assert len(numbers) > 30
+    for mapping, key in numbers:
+        right = mapping[key]
+        for wrong in ("wrong", True, float("nan"), None, [1.0], {"a": 1.0}):
+            mapping[key] = wrong
+            assert re.search(rf"{key}: expected .*, found ", fault(lambda: compose(tree)))
+        mapping[key] = right
+    compose(tree)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        ("platforms.0", 3, r"platforms\.\[0\]: expected a mapping of fields, found 3"),
+        ("platforms", {"a": 1}, r"platforms: expected a list, found \{'a': 1\}"),
+        ("platforms", [], r"agent: nothing is called 'deputy'; choose from none"),
+        ("reward", [], r"reward: an environment needs at least one"),
+        ("observation", [], r"observation: an environment needs at least one"),
+        ("platforms.0.type", "ancor", r"platforms\.chief: unknown type 'ancor'.* Did you mean 'anchor'\?"),
+        ("platforms.0.type", 3, r"platforms\.chief: unknown type 3; choose from anchor, spacecraft"),
+        ("platforms.0.type", ["anchor"], r"platforms\.chief: unknown type \['anchor'\]"),
+        ("platforms.0.name", 3, r"platforms\.\[0\]\.name: expected a name, found 3"),
+        ("platforms.0.dimension", 3, r"platforms: expected the same dimension for all, found chief 3, deputy 2"),
+        ("platforms.1.start.0.about", "deputy", r"nothing listed before it is called 'deputy'; choose from chief"),
+        ("platforms.1.start.0.name", "positon", r"positon: no such state field;.* Did you mean 'position'\?"),
+        ("platforms.1.start.1.name", "position", r"platforms\.deputy\.start: the name 'position' stands twice"),
+        ("platforms.1.start.0.direction.polar", [0, 3], r"direction: draws 3 numbers, the platform has 2 dimensions"),
+        ("platforms.1.controller", {"type": "uncontrolled"}, r"actuators: expected thrust_x, thrust_y, found none"),
+        ("platforms.1.controller.type", "uncontrolled", r"controller \(uncontrolled\): takes no actuators"),
+        ("platforms.1.controller.actuators.0.name", "thrust", r"expected thrust_x, thrust_y, found thrust, thrust_y"),
+        ("platforms.1.controller.actuators.0.name", "thrust_y", r"found thrust_y, thrust_y"),
+        ("regions.0.on", "chef", r"regions\.docking_region\.on: nothing is called 'chef'.* Did you mean 'chief'\?"),
+        ("regions.0.radius", -1, r"regions\.docking_region\.radius: expected a number in m ≥ 0, found -1"),
+        ("regions.0.name", "dock", r"status\.in_docking\.region: nothing is called 'docking_region'; choose from dock"),
+        ("status.1.name", "speed", r"status: the name 'speed' stands twice"),
+        ("status.3.distance", "delta_v", r"velocity_limit\.distance: nothing listed before it is called 'delta_v'"),
+        ("status.3.distance", "velocity_limit", r"nothing listed before it is called 'velocity_limit'"),
+        ("status.3.distance", "docking_distanc", r"Did you mean 'docking_distance'\?"),
+        ("constraints.0.speed", "spee", r"constraints\.velocity_limit\.speed: nothing is called 'spee'.* 'speed'\?"),
+        ("terminal.0.name", "running", r"outcomes: the name 'running' stands twice"),
+        ("terminal.0.in_docking", "indocking", r"terminal\.success\.in_docking: .* Did you mean 'in_docking'\?"),
+        ("reward.1.bound", -5, r"reward\.velocity_constraint\.bound: expected a mapping of fields, found -5"),
+        ("reward.1.bound.outcome", "crash", r"outcomes: the name 'crash' stands twice"),
+        ("reward.1.bound.outcom", "crash", r"bound: unknown field 'outcom'.* Did you mean 'outcome'\?"),
+        ("reward.4.values", 3, r"reward\.failure\.values: expected a mapping of names to values, found 3"),
+        ("observation.0.what", "positon", r"observation\.position\.what: .* Did you mean 'position'\?"),
+        ("observation.0.scale", 0, r"observation\.position\.scale: expected a number > 0, found 0"),
+        ("observation.0.clip", [1, -1], r"observation\.position\.clip: expected low ≤ high, found \[1, -1\]"),
+        ("observation.2.status", "sped", r"observation\.speed\.status: .* Did you mean 'speed'\?"),
+        ("agent", "deputi", r"agent: nothing is called 'deputi'.* Did you mean 'deputy'\?"),
+    ],
+)
+def test_a_broken_environment_is_refused(tree: dict[str, Any], path: str, value: Any, message: str) -> None:
+    assert re.search(message, fault_in(put(tree, path, value)))
+
+
+def test_a_status_may_refer_only_to_earlier_ones(tree: dict[str, Any]) -> None:
+    tree["status"].reverse()
+    assert "nothing listed before it is called 'docking_distance'" in fault_in(tree)
+    tree["status"].reverse()
+    tree["platforms"].reverse()
+    assert "platforms.deputy.start.position.about: nothing listed before it is called 'chief'" in fault_in(tree)
+
+
+def test_the_direction_of_a_spatial_start_needs_a_polar_range() -> None:
+    message = fault(lambda: jaxsafe.make("docking3d", {"deputy.start.velocity.direction.polar": None}))
+    assert "start.velocity.direction: draws 2 numbers, the platform has 3 dimensions" in message
+
+
+@pytest.mark.parametrize("text", ["- 1\n- 2\n", "hello\n", "\n", "3\n"])
+def test_a_file_that_is_no_mapping_is_refused(text: str) -> None:
+    assert fault(lambda: load(text)).startswith("environment: expected a mapping of fields, found ")
+
+
+# YAML itself
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1e6", 1e6),
+        ("3e-4", 3e-4),
+        ("-1E+3", -1000.0),
+        ("1.", 1.0),
+        (".5", 0.5),
+        ("12", 12),
+        ("-7", -7),
+        ("010", 10),
+        ("0x10", "0x10"),
+        ("1_000", "1_000"),
+        ("1:30", "1:30"),
+        ("2020-01-01", "2020-01-01"),
+        ("on", "on"),
+        ("off", "off"),
+        ("yes", "yes"),
+        ("no", "no"),
+        ("true", True),
+        ("false", False),
+        ("True", "True"),
+        ("null", None),
+        ("~", None),
+        ("", None),
+        ("'12'", "12"),
+        ("[1e-3, no]", [1e-3, "no"]),
+        (".inf", float("inf")),
+        ("-.inf", -float("inf")),
+    ],
+)
+def test_scalars_are_read_as_users_expect(text: str, value: Any) -> None:
+    read = parse(f"key: {text}\n", "file")["key"]
+    assert read == value
+    assert type(read) is type(value)
+
+
+@pytest.mark.parametrize("value", ["on", "no", "true", "1e6", "010", "", "null", 1e6, 3e-4, 10, True, None, [1, "1"]])
+def test_plain_data_written_reads_back(value: Any) -> None:
+    assert parse(write({"key": value}), "file") == {"key": value}
+
+
+def test_numbers_without_a_point_reach_the_environment(env: Environment) -> None:
+    text = dump(env).replace("mass: 12.0", "mass: 1e6").replace("mean_motion: 0.001027", "mean_motion: 3e-4")
+    deputy = load(text.replace("points: 11", "points: 010")).agent_platform
+    assert (deputy.mass, deputy.mean_motion) == (1e6, np.float32(3e-4))
+    assert deputy.controller.actuators[0].points == 10
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("agent: a\nagent: b\n", r"^environment, line \d: not valid YAML: key 'agent' stands twice$"),
+        ("x:\n  - {a: 1, a: 2}\n", r"^environment, line 2: not valid YAML: key 'a' stands twice$"),
+        ("agent: [1, 2\n", r"^environment, line \d: not valid YAML: expected"),
+        ("agent: 'x\n", r"^environment, line \d: not valid YAML: "),
+        ("a: b: c\n", r"^environment, line 1: not valid YAML: mapping values are not allowed"),
+        ("agent: *x\n", r"^environment, line 1: not valid YAML: found undefined alias"),
+        ("\tagent: x\n", r"^environment, line 1: not valid YAML: "),
+        ("{[1, 2]: 3}\n", r"^environment.*: not valid YAML: "),
+        ("a: 1\n---\nb: 2\n", r"^environment.*: not valid YAML: "),
+        ("agent: \x00\n", r"^environment.*: not valid YAML: "),
+        ("dt: " + "9" * 5000 + "\n", r"^environment: not valid YAML: "),
+        ("[" * 5000 + "\n", r"^environment.*: not valid YAML: "),
+    ],
+)
+def test_broken_yaml_is_refused(text: str, message: str) -> None:
+    assert re.search(message, fault(lambda: load(text)))
+
+
+def test_a_repeated_key_is_refused_deep_in_an_environment(env: Environment) -> None:
+    text = dump(env).replace("  mass: 12.0\n", "  mass: 12.0\n  mass: 13.0\n")
+    assert "key 'mass' stands twice" in fault(lambda: load(text))
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    missing, binary = tmp_path / "missing.yaml", tmp_path / "binary.yaml"
+    binary.write_bytes(b"\xff\xfe\x00\x81")
+    assert fault(lambda: load(missing)) == f"{missing}: cannot be read: No such file or directory"
+    assert fault(lambda: load(tmp_path)).startswith(f"{tmp_path}: cannot be read: ")
+    assert fault(lambda: load(binary)) == f"{binary}: cannot be read: not a text file"
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("dt: [1\n")
+    assert fault(lambda: load(broken)).startswith(f"{broken}, line 2: not valid YAML: ")
+
+
+@pytest.mark.parametrize("kind", ["apply:os.system", "object/apply:os.system", "object/new:os.system"])
+def test_tags_of_python_are_refused_and_nothing_runs(kind: str, tmp_path: Path) -> None:
+    sign = tmp_path / "sign"
+    for text in (f'!!python/{kind} ["touch {sign}"]\n', f'dt: !!python/{kind} ["touch {sign}"]\n'):
+        assert "not valid YAML: could not determine a constructor for the tag" in fault(lambda text=text: load(text))
+    assert not sign.exists()
