@@ -1,0 +1,147 @@
+"""The metrics of Section 5 of the paper, from running sums over any stream of time steps.
+
+`accumulate` follows one episode step by step; `summarise` turns finished episodes into the paper's metrics.
+The paper defines the safety violation rate as the share of tests *without* a violation and calls lower better; here it is
+the share with one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from jaxsafe.types import Record, TimeStep
+
+METRICS = (
+    "average_return",
+    "episode_length",
+    "success_rate",
+    "control_usage",
+    "control_usage_l1",
+    "safety_violation_rate",
+    "episode_safety_violation_rate",
+    "episode_violation_severity_mean",
+    "episode_violation_severity_max",
+    "mean_reward",
+)
+"""The names that `summarise` returns."""
+
+
+class Episode(Record):
+    """Sums over one episode so far."""
+
+    episode_return: Float[Array, ""]
+    length: Int[Array, ""]  # steps
+    outcome: Int[Array, ""]  # index into `env.outcomes`, 0 while running
+    delta_v: Float[Array, ""]  # Σ ‖u/m‖₂ Δt [m/s], 0 where the task has no Δv
+    delta_v_l1: Float[Array, ""]  # Σ ‖u/m‖₁ Δt [m/s]
+    violating_steps: Int[Array, ""]  # steps with h < 0
+    severity_sum: Float[Array, ""]  # Σ max(0, −h)/limit
+    severity_max: Float[Array, ""]
+    reward_totals: Mapping[str, Float[Array, ""]]  # Σ of each reward term
+
+
+def begin(timestep: TimeStep) -> Episode:
+    """Sums at the start of an episode: all zero, in the shapes of `timestep`."""
+    zero, count = jnp.zeros_like(timestep.reward), jnp.zeros(timestep.reward.shape, jnp.int32)
+    totals = jax.tree.map(jnp.zeros_like, timestep.info.reward_totals)
+    return Episode(zero, count, count, zero, zero, count, zero, zero, totals)
+
+
+def accumulate(episode: Episode, timestep: TimeStep) -> Episode:
+    """Add one step."""
+    info = timestep.info
+    severity = jnp.max(jnp.stack([*info.severity.values(), jnp.zeros_like(timestep.reward)]), axis=0)
+    return Episode(
+        episode.episode_return + timestep.reward,
+        episode.length + 1,
+        info.outcome,
+        episode.delta_v + info.status.get("delta_v", 0.0),
+        episode.delta_v_l1 + info.status.get("delta_v_l1", 0.0),
+        episode.violating_steps + (timestep.cost > 0.0),
+        episode.severity_sum + severity,
+        jnp.maximum(episode.severity_max, severity),
+        info.reward_totals,
+    )
+
+
+def summarise(episodes: Episode, success: int, has_delta_v: bool = True) -> dict[str, float | None]:
+    """The metrics over a set of finished episodes.
+
+    Args:
+        episodes: sums of the episodes, each field of shape (episodes,).
+        success: index of the outcome that counts as success.
+        has_delta_v: whether control usage means anything in this task; if not it is None.
+
+    Returns:
+        Every name of `METRICS`: rates as fractions in [0, 1], Δv in m/s, length in steps, severity as a share of the limit
+        (mean over violating steps, 0 if there is none).
+    """
+    mean = {name: float(np.mean(value)) for name, value in vars(episodes).items() if name != "reward_totals"}
+    violating, steps = mean["violating_steps"], mean["length"]
+    return {
+        "average_return": mean["episode_return"],
+        "episode_length": steps,
+        "success_rate": float(np.mean(np.asarray(episodes.outcome) == success)),
+        "control_usage": mean["delta_v"] if has_delta_v else None,
+        "control_usage_l1": mean["delta_v_l1"] if has_delta_v else None,
+        "safety_violation_rate": float(np.mean(np.asarray(episodes.violating_steps) > 0)),
+        "episode_safety_violation_rate": violating / max(steps, 1e-9),
+        "episode_violation_severity_mean": mean["severity_sum"] / violating if violating else 0.0,
+        "episode_violation_severity_max": float(np.max(episodes.severity_max)),
+        "mean_reward": mean["episode_return"] / max(steps, 1e-9),
+    }
+
+
+def interaction_efficiency(
+    steps: np.ndarray, success: np.ndarray, episodes: np.ndarray, threshold: float = 0.8, at_least: int = 20
+) -> dict[str, Any]:
+    """First environment step (per seed) at which success in training reaches a threshold, Table 2.
+
+    Args:
+        steps: environment steps taken by each seed, shape (updates,).
+        success: success rate of each seed over its last 100 finished episodes, shape (updates, seeds).
+        episodes: number of episodes that each seed has finished, shape (updates, seeds).
+        threshold: the success rate to reach, on the average over seeds.
+        at_least: episodes that a seed must have finished before its rate counts.
+
+    Returns:
+        `timesteps` for the seed-averaged curve and `per_seed` for each curve; None where never reached.
+    """
+
+    def first(reached: np.ndarray) -> int | None:
+        return int(steps[np.argmax(reached)]) if reached.any() else None
+
+    enough = episodes >= at_least
+    rate = np.where(enough, np.nan_to_num(success), 0.0)
+    together = enough.all(axis=1) & (rate.mean(axis=1) >= threshold)
+    return {
+        "timesteps": first(together),
+        "per_seed": [first(enough[:, i] & (rate[:, i] >= threshold)) for i in range(rate.shape[1])],
+    }
+
+
+def over_seeds(per_seed: list[float | None]) -> dict[str, Any]:
+    """Mean, 95 % percentile-bootstrap interval over seeds, interquartile mean, and the values themselves."""
+    if any(value is None for value in per_seed):
+        return {"mean": None, "ci95": None, "iqm": None, "per_seed": per_seed}
+    from scipy.stats import trim_mean
+
+    values = np.asarray(per_seed, float)
+    return {
+        "mean": float(values.mean()),
+        "ci95": [float(bound) for bound in bootstrap_interval(values[None])[:, 0]],
+        "iqm": float(trim_mean(values, 0.25)),
+        "per_seed": [float(value) for value in values],
+    }
+
+
+def bootstrap_interval(values: np.ndarray, resamples: int = 2000) -> np.ndarray:
+    """95 % percentile-bootstrap interval of the mean over the last axis: (rows, seeds) to (2, rows)."""
+    draws = np.random.default_rng(0).integers(values.shape[-1], size=(resamples, values.shape[-1]))
+    return np.percentile(values[:, draws].mean(axis=-1), [2.5, 97.5], axis=-1)

@@ -1,0 +1,244 @@
+"""The metrics of Section 5, over streams of time steps written by hand."""
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import bootstrap, trim_mean
+
+import jaxsafe
+from jaxsafe.metrics import (
+    METRICS,
+    Episode,
+    accumulate,
+    begin,
+    bootstrap_interval,
+    interaction_efficiency,
+    over_seeds,
+    summarise,
+)
+from jaxsafe.types import Info, TimeStep
+
+SUCCESS, CRASH = 1, 2
+
+
+def time_step(
+    reward: float, delta_v: tuple[float, ...] = (0.0, 0.0), severity: tuple[float, ...] = (0.0, 0.0), outcome: int = 0
+) -> TimeStep:
+    """A step with two safety constraints; its totals are not used but carried along."""
+    margins = {name: jnp.asarray(-share) for name, share in zip("ab", severity, strict=True)}
+    info = Info(
+        outcome=jnp.asarray(outcome),
+        status={"delta_v": jnp.asarray(delta_v[0]), "delta_v_l1": jnp.asarray(delta_v[1])},
+        reward_terms={"term": jnp.asarray(reward)},
+        reward_totals={"term": jnp.asarray(10.0 * reward)},
+        control_desired=jnp.zeros(1),
+        control_actual=jnp.zeros(1),
+        intervening=jnp.asarray(False),
+        margins=margins,
+        severity={name: jnp.asarray(share) for name, share in zip("ab", severity, strict=True)},
+    )
+    ended = jnp.asarray(outcome != 0)
+    cost = jnp.asarray(float(max(severity) > 0.0))
+    return TimeStep(jnp.zeros(1), jnp.asarray(reward), cost, ended, jnp.asarray(False), info)
+
+
+def follow(*timesteps: TimeStep) -> Episode:
+    episode = begin(timesteps[0])
+    for timestep in timesteps:
+        episode = accumulate(episode, timestep)
+    return episode
+
+
+@pytest.fixture
+def episodes() -> Episode:
+    """Three episodes: a safe success, a success with two violating steps, a crash on its only step."""
+    safe = follow(time_step(1.0, (0.1, 0.2)), time_step(3.0, (0.2, 0.3), outcome=SUCCESS))
+    unsafe = follow(
+        time_step(-1.0, severity=(0.5, 0.25)),
+        time_step(0.0, (0.3, 0.4)),
+        time_step(0.0),
+        time_step(2.0, severity=(0.0, 2.0), outcome=SUCCESS),
+    )
+    crash = follow(time_step(-2.0, severity=(0.1, 0.1), outcome=CRASH))
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), safe, unsafe, crash)
+
+
+def test_sums_begin_at_zero() -> None:
+    assert all(leaf == 0 for leaf in jax.tree.leaves(begin(time_step(5.0, (1.0, 1.0), (1.0, 1.0), 1))))
+
+
+def test_steps_add_up(episodes: Episode) -> None:
+    expected = {
+        "episode_return": [4.0, 1.0, -2.0],
+        "length": [2, 4, 1],
+        "outcome": [SUCCESS, SUCCESS, CRASH],
+        "delta_v": [0.3, 0.3, 0.0],
+        "delta_v_l1": [0.5, 0.4, 0.0],
+        "violating_steps": [0, 2, 1],
+        "severity_sum": [0.0, 2.5, 0.1],
+        "severity_max": [0.0, 2.0, 0.1],
+    }
+    assert set(vars(episodes)) == {*expected, "reward_totals"}
+    for name, values in expected.items():
+        np.testing.assert_allclose(getattr(episodes, name), values, rtol=1e-6, err_msg=name)
+    np.testing.assert_allclose(episodes.reward_totals["term"], [30.0, 20.0, -20.0])
+
+
+def test_counts_are_integers_and_shapes_do_not_change_from_step_to_step() -> None:
+    before = begin(time_step(1.0))
+    after = accumulate(before, time_step(1.0, (0.1, 0.1), (0.5, 0.5), SUCCESS))
+    chex.assert_trees_all_equal_shapes_and_dtypes(before, after)
+    assert {before.length.dtype, before.outcome.dtype, before.violating_steps.dtype} == {jnp.dtype("int32")}
+
+
+def test_sums_work_on_batches_and_without_delta_v() -> None:
+    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, 2 * leaf]), time_step(1.0, (0.5, 0.5), (0.5, 0.25)))
+    episode = accumulate(accumulate(begin(batch), batch), batch)
+    np.testing.assert_allclose(episode.episode_return, [2.0, 4.0])
+    np.testing.assert_allclose(episode.severity_max, [0.5, 1.0])
+    bare = batch.replace(info=batch.info.replace(status={}, severity={}))
+    episode = accumulate(begin(bare), bare)
+    assert episode.delta_v.tolist() == episode.severity_sum.tolist() == [0.0, 0.0]
+    assert episode.delta_v.shape == episode.reward_totals["term"].shape == (2,)
+
+
+def test_the_metrics_of_three_episodes_are_those_worked_out_by_hand(episodes: Episode) -> None:
+    found = summarise(episodes, SUCCESS)
+    assert tuple(found) == METRICS
+    assert found == pytest.approx(
+        {
+            "average_return": 3.0 / 3,
+            "episode_length": 7.0 / 3,
+            "success_rate": 2.0 / 3,
+            "control_usage": 0.6 / 3,
+            "control_usage_l1": 0.9 / 3,
+            "safety_violation_rate": 2.0 / 3,  # episodes
+            "episode_safety_violation_rate": 3.0 / 7,  # steps
+            "episode_violation_severity_mean": 2.6 / 3,  # over the three violating steps
+            "episode_violation_severity_max": 2.0,
+            "mean_reward": 3.0 / 7,
+        },
+        rel=1e-6,
+    )
+
+
+def test_without_violations_severity_is_zero() -> None:
+    episode = follow(time_step(1.0, outcome=SUCCESS))
+    found = summarise(jax.tree.map(lambda leaf: leaf[None], episode), SUCCESS)
+    for name in ("safety_violation_rate", "episode_safety_violation_rate"):
+        assert found[name] == 0.0
+    assert found["episode_violation_severity_mean"] == found["episode_violation_severity_max"] == 0.0
+    assert found["success_rate"] == 1.0
+
+
+def test_control_usage_is_none_where_there_is_no_delta_v(episodes: Episode) -> None:
+    found = summarise(episodes, SUCCESS, has_delta_v=False)
+    assert found["control_usage"] is None
+    assert found["control_usage_l1"] is None
+
+
+def test_the_metrics_of_a_real_episode_agree_with_its_steps() -> None:
+    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 19})
+    actions = jax.random.uniform(jax.random.key(1), (20, 2), minval=-1.0)
+    state, timestep = jaxsafe.reset_to(env, {"deputy": {"position": [120.0, 0.0], "velocity": [0.0, 0.4]}})
+    episode, taken, step = begin(timestep), [], jax.jit(jaxsafe.step)
+    for action in actions:
+        state, timestep = step(env, state, action)
+        episode, taken = accumulate(episode, timestep), [*taken, timestep]
+    found = summarise(jax.tree.map(lambda leaf: leaf[None], episode), env.outcomes.index("success"))
+    limits = np.asarray([timestep.info.status["velocity_limit"] for timestep in taken], float)
+    over = np.maximum([timestep.info.status["speed"] for timestep in taken] - limits, 0.0) / limits
+    assert 0 < (over > 0).sum() < 20
+    assert found["control_usage"] == pytest.approx(np.linalg.norm(actions, axis=1).sum() / 12, rel=1e-5)
+    assert found["control_usage_l1"] == pytest.approx(np.abs(actions).sum() / 12, rel=1e-5)
+    assert found["episode_safety_violation_rate"] == pytest.approx((over > 0).mean())
+    assert found["episode_violation_severity_mean"] == pytest.approx(over[over > 0].mean(), rel=1e-3)
+    assert found["episode_violation_severity_max"] == pytest.approx(over.max(), rel=1e-3)
+    assert found["mean_reward"] == pytest.approx(np.mean([float(timestep.reward) for timestep in taken]), rel=1e-4)
+    assert found["average_return"] == pytest.approx(sum(map(float, state.reward_totals.values())), rel=1e-4)
+    assert found["episode_length"] == 20.0
+
+
+# Interaction efficiency
+
+
+def efficiency(success: Any, episodes: Any, **options: Any) -> dict[str, Any]:
+    steps = 100 * (1 + np.arange(len(success)))
+    return interaction_efficiency(steps, np.asarray(success, float), np.asarray(episodes), **options)
+
+
+def test_interaction_efficiency_is_the_first_step_at_which_the_average_over_seeds_reaches_four_fifths() -> None:
+    success = [[0.9, 0.0], [0.7, 0.7], [1.0, 0.6], [0.5, 0.8], [1.0, 1.0]]
+    assert efficiency(success, np.full((5, 2), 50)) == {"timesteps": 300, "per_seed": [100, 400]}
+
+
+def test_a_rate_of_exactly_four_fifths_counts() -> None:
+    assert efficiency([[0.79], [0.8]], [[100], [100]]) == {"timesteps": 200, "per_seed": [200]}
+
+
+def test_a_rate_counts_only_from_twenty_finished_episodes_on() -> None:
+    success = [[1.0, 1.0]] * 4
+    episodes = [[19, 3], [20, 10], [25, 19], [30, 20]]
+    assert efficiency(success, episodes) == {"timesteps": 400, "per_seed": [200, 400]}
+
+
+def test_the_average_waits_for_every_seed_to_have_finished_enough() -> None:
+    success = [[1.0, 1.0, 1.0, 1.0, 1.0]] * 2
+    episodes = [[50, 50, 50, 50, 19], [60, 60, 60, 60, 20]]
+    assert efficiency(success, episodes) == {"timesteps": 200, "per_seed": [100, 100, 100, 100, 200]}
+
+
+def test_interaction_efficiency_is_none_if_never_reached() -> None:
+    assert efficiency([[0.7, 1.0]] * 3, np.full((3, 2), 99)) == {"timesteps": 100, "per_seed": [None, 100]}
+    assert efficiency([[0.5, 1.0]] * 3, np.full((3, 2), 99)) == {"timesteps": None, "per_seed": [None, 100]}
+    assert efficiency([[1.0]], [[19]]) == {"timesteps": None, "per_seed": [None]}
+
+
+def test_a_seed_without_a_rate_yet_does_not_count_as_a_success() -> None:
+    assert efficiency([[np.nan, 1.0], [0.9, 1.0]], [[0, 50], [20, 60]]) == {"timesteps": 200, "per_seed": [200, 100]}
+
+
+# Over seeds
+
+
+def test_the_mean_of_ten_seeds_has_the_interval_of_scipys_percentile_bootstrap() -> None:
+    values = np.random.default_rng(3).normal(5.0, 2.0, 10)
+    found = over_seeds([float(value) for value in values])
+    expected = bootstrap((values,), np.mean, method="percentile", n_resamples=20_000, rng=np.random.default_rng(1))
+    assert found["mean"] == pytest.approx(values.mean())
+    assert found["iqm"] == pytest.approx(trim_mean(values, 0.25))
+    assert found["per_seed"] == pytest.approx(list(values))
+    assert found["ci95"] == pytest.approx(list(expected.confidence_interval), abs=0.1)
+    assert found["ci95"][0] < values.mean() < found["ci95"][1]
+
+
+def test_the_bootstrap_interval_is_row_by_row() -> None:
+    rows = np.random.default_rng(4).normal(size=(3, 10))
+    found = bootstrap_interval(rows)
+    assert found.shape == (2, 3)
+    for i in range(3):
+        np.testing.assert_array_equal(found[:, i], bootstrap_interval(rows[i : i + 1])[:, 0])
+    np.testing.assert_array_equal(bootstrap_interval(np.full((1, 5), 0.3)), np.full((2, 1), 0.3))
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=10))
+def test_the_interval_lies_within_the_values(values: list[float]) -> None:
+    found = over_seeds(values)
+    low, high = found["ci95"]
+    slack = 1e-9 * (1.0 + max(map(abs, values)))
+    assert min(values) - slack <= low <= high <= max(values) + slack
+
+
+def test_one_seed_has_an_interval_of_no_width() -> None:
+    assert over_seeds([0.7]) == {"mean": 0.7, "ci95": [0.7, 0.7], "iqm": 0.7, "per_seed": [0.7]}
+
+
+def test_a_metric_without_a_meaning_stays_none() -> None:
+    assert over_seeds([None, None]) == {"mean": None, "ci95": None, "iqm": None, "per_seed": [None, None]}
