@@ -1,0 +1,150 @@
+"""The agent: features of the observation, two multilayer perceptrons, and the distribution over actions.
+
+Parameters are a plain dict of arrays, so a policy file is an .npz of them. The feature layer belongs to the agent: the
+environment's observation is the paper's in every preset.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.component import Component, Range
+from jaxsafe.environment import Environment
+from jaxsafe.errors import ConfigError
+from jaxsafe.types import Dimensionless, Key, Positive
+
+Params = dict[str, Any]
+
+
+class Agent(Component):
+    """Actor and critic of the same shape, with nothing shared, for a given environment's spaces.
+
+    The `docking` features append to the observation the direction p/(‖p‖ + 0.01) and log(‖p‖ + 0.005) of the observed
+    position p: the target is 0.005 wide in units of p, which a plain perceptron resolves late or never.
+    """
+
+    hidden: Annotated[tuple[int, ...], Range(1)] = (64, 64)
+    features: Literal["none", "docking"] = "none"
+    log_std: Dimensionless = -0.7  # initial, of continuous actions in [−1, 1]; learnt, the same for all states
+    prior_std: Annotated[Dimensionless, Positive] = 0.3  # of discrete actions at the start, in units of half the range
+
+    def init(self, key: Key, env: Environment) -> Params:
+        """Return fresh parameters."""
+        key_actor, key_critic = jax.random.split(key)
+        inputs = self.inputs(env, jnp.zeros(env.observation_size)).shape[-1]
+        outputs = sum(env.num_action_points) or env.action_size
+        params = {
+            "actor": _init_mlp(key_actor, (inputs, *self.hidden, outputs), last_gain=0.01),
+            "critic": _init_mlp(key_critic, (inputs, *self.hidden, 1), last_gain=1.0),
+        }
+        return params if env.num_action_points else {**params, "log_std": jnp.full(env.action_size, self.log_std)}
+
+    def inputs(self, env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
+        """Return what the networks see of an observation."""
+        if self.features == "none":
+            return observation
+        position = observation[..., jnp.array(_position_elements(env))]
+        distance = jnp.linalg.norm(position, axis=-1, keepdims=True)
+        return jnp.concatenate([observation, position / (distance + 0.01), jnp.log(distance + 0.005)], axis=-1)
+
+    def distribution(self, env: Environment, params: Params, inputs: Float[Array, "*batch i"]) -> Gaussian | Categorical:
+        """Return the policy π(·|s)."""
+        out = mlp(params["actor"], inputs)
+        if not env.num_action_points:
+            return Gaussian(mean=out, log_std=params["log_std"])
+        return Categorical(logits=out + _prior(env.num_action_points, self.prior_std), points=env.num_action_points)
+
+    def value(self, params: Params, inputs: Float[Array, "*batch i"]) -> Float[Array, "*batch"]:
+        """Return the critic's V(s)."""
+        return mlp(params["critic"], inputs)[..., 0]
+
+    def act(self, env: Environment, params: Params, key: Key, observation: Array, deterministic: Array | bool) -> Array:
+        """Return an action for each observation: a sample, or the mode."""
+        distribution = self.distribution(env, params, self.inputs(env, observation))
+        return jax.tree.map(
+            lambda mode, sample: jnp.where(deterministic, mode, sample), distribution.mode(), distribution.sample(key)
+        )
+
+
+class Gaussian(Component):
+    """Independent normal distributions; actions outside [−1, 1] are clipped by the actuators, not here."""
+
+    mean: Float[Array, "*batch a"]
+    log_std: Float[Array, " a"]
+
+    def mode(self) -> Float[Array, "*batch a"]:
+        return self.mean
+
+    def sample(self, key: Key) -> Float[Array, "*batch a"]:
+        return self.mean + jnp.exp(self.log_std) * jax.random.normal(key, self.mean.shape, self.mean.dtype)
+
+    def log_prob(self, action: Float[Array, "*batch a"]) -> Float[Array, "*batch"]:
+        z = (action - self.mean) * jnp.exp(-self.log_std)
+        return jnp.sum(-0.5 * z * z - self.log_std - 0.5 * jnp.log(2.0 * jnp.pi), axis=-1)
+
+    def entropy(self) -> Float[Array, "*batch"]:
+        total = jnp.sum(self.log_std + 0.5 * jnp.log(2.0 * jnp.pi * jnp.e), axis=-1)
+        return jnp.broadcast_to(total, self.mean.shape[:-1])
+
+
+class Categorical(Component):
+    """One independent choice per actuator; their logits stand one after the other."""
+
+    logits: Float[Array, "*batch points"]
+    points: tuple[int, ...]
+
+    def mode(self) -> Array:
+        return jnp.stack([jnp.argmax(block, axis=-1) for block in self._blocks()], axis=-1).astype(jnp.int32)
+
+    def sample(self, key: Key) -> Array:
+        gumbel = jax.random.gumbel(key, self.logits.shape, self.logits.dtype)
+        return Categorical(logits=self.logits + gumbel, points=self.points).mode()
+
+    def log_prob(self, action: Array) -> Float[Array, "*batch"]:
+        chosen = [
+            jnp.take_along_axis(jax.nn.log_softmax(block), action[..., i : i + 1], axis=-1)[..., 0]
+            for i, block in enumerate(self._blocks())
+        ]
+        return jnp.sum(jnp.stack(chosen), axis=0)
+
+    def entropy(self) -> Float[Array, "*batch"]:
+        logs = [jax.nn.log_softmax(block) for block in self._blocks()]
+        return -jnp.sum(jnp.stack([jnp.sum(jnp.exp(log) * log, axis=-1) for log in logs]), axis=0)
+
+    def _blocks(self) -> list[Array]:
+        ends = [sum(self.points[: i + 1]) for i in range(len(self.points))]
+        return jnp.split(self.logits, ends[:-1], axis=-1)
+
+
+def mlp(layers: Sequence[Params], x: Float[Array, "*batch i"]) -> Float[Array, "*batch o"]:
+    """Perceptron with tanh between layers and none after the last."""
+    for layer in layers[:-1]:
+        x = jnp.tanh(x @ layer["kernel"] + layer["bias"])
+    return x @ layers[-1]["kernel"] + layers[-1]["bias"]
+
+
+def _init_mlp(key: Key, sizes: Sequence[int], last_gain: float) -> list[Params]:
+    """Orthogonal kernels, gain √2 and `last_gain` at the end, zero biases."""
+    gains = [2.0**0.5] * (len(sizes) - 2) + [last_gain]
+    keys = jax.random.split(key, len(gains))
+    return [
+        {"kernel": jax.nn.initializers.orthogonal(gain)(key_i, (fan_in, fan_out)), "bias": jnp.zeros(fan_out)}
+        for key_i, fan_in, fan_out, gain in zip(keys, sizes[:-1], sizes[1:], gains, strict=True)
+    ]
+
+
+def _prior(points: Sequence[int], std: Array | float) -> Float[Array, " points"]:
+    """Constant logits −(u/u_max/std)²/2, u from −1 to 1: an untrained policy is nearly a normal of that width about 0."""
+    return jnp.concatenate([-0.5 * (jnp.linspace(-1.0, 1.0, n) / std) ** 2 for n in points])
+
+
+def _position_elements(env: Environment) -> list[int]:
+    found = [i for i, name in enumerate(env.observation_names) if name.startswith(f"{env.agent}.position.")]
+    if not found:
+        raise ConfigError("agent.features: 'docking' needs the agent's position in the observation; choose none")
+    return found

@@ -1,0 +1,197 @@
+"""Proximal policy optimisation, one seed, as a pure function from training state to training state.
+
+`update` reads like the algorithm: collect a batch, estimate advantages, improve the networks over some epochs. Seeds,
+devices and files are the caller's business. Hyperparameters that are numbers are leaves; sizes are structure.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsafe.component import Component, Range
+from jaxsafe.environment import Environment
+from jaxsafe.metrics import Episode, accumulate, begin
+from jaxsafe.rollout import reset_batch, step_or_reset_batch
+from jaxsafe.train.agent import Agent, Params
+from jaxsafe.train.shuffle import shuffle
+from jaxsafe.train.window import Window, empty_window, push
+from jaxsafe.types import Dimensionless, Key, Positive, Record, State
+
+Share = Range(0.0, 1.0)
+
+
+class PPO(Component):
+    """Hyperparameters; names as in the literature."""
+
+    num_envs: Annotated[int, Range(1)] = 16  # episodes run side by side
+    num_steps: Annotated[int, Range(1)] = 128  # steps of each between updates
+    num_epochs: Annotated[int, Range(1)] = 10
+    num_minibatches: Annotated[int, Range(1)] = 2
+    learning_rate: Annotated[Dimensionless, Positive] = 3e-3
+    final_learning_rate: Annotated[Dimensionless, Range(0.0)] = 3e-4  # reached linearly at the end
+    gamma: Annotated[Dimensionless, Share] = 0.97
+    gae_lambda: Annotated[Dimensionless, Share] = 1.0
+    clip: Annotated[Dimensionless, Positive] = 0.2
+    value_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.5
+    entropy_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.0
+    max_grad_norm: Annotated[Dimensionless, Positive] = 0.5
+
+    @property
+    def batch_size(self) -> int:
+        """Environment steps in one update."""
+        return self.num_envs * self.num_steps
+
+
+class TrainState(Record):
+    """Everything that training needs to go on: what a checkpoint holds."""
+
+    params: Params
+    optimizer: optax.OptState
+    env_state: State  # [num_envs]
+    observation: Float[Array, "num_envs o"]
+    episode: Episode  # sums of the running episodes, [num_envs]
+    window: Window  # the latest finished episodes
+    key: Key  # of the whole run; update i uses fold_in(key, i)
+    num_updates: Int[Array, ""]
+
+
+class Transition(NamedTuple):
+    """One step of every environment, stacked [num_steps, num_envs]."""
+
+    inputs: Float[Array, "t n i"]  # what the networks saw
+    action: Array
+    log_prob: Float[Array, "t n"]
+    reward: Float[Array, "t n"]
+    terminated: Bool[Array, "t n"]
+    done: Bool[Array, "t n"]
+    next_inputs: Float[Array, "t n i"]  # of the true next observation, before any reset
+    episode: Episode  # sums including this step
+
+
+class Batch(NamedTuple):
+    """What the loss needs of each sample."""
+
+    inputs: Array
+    action: Array
+    log_prob: Array
+    advantage: Array
+    value_target: Array
+
+
+def init(env: Environment, agent: Agent, ppo: PPO, key: Key) -> TrainState:
+    """Fresh networks and episodes for one seed."""
+    key_params, key_reset, key_run = jax.random.split(key, 3)
+    params = agent.init(key_params, env)
+    env_state, timestep = reset_batch(env, key_reset, ppo.num_envs)
+    episode = begin(timestep)
+    return TrainState(
+        params, _optimizer(ppo).init(params), env_state, timestep.observation, episode,
+        empty_window(episode), key_run, jnp.zeros((), jnp.int32),
+    )  # fmt: skip
+
+
+def update(env: Environment, agent: Agent, ppo: PPO, total_updates: Array | int, state: TrainState) -> TrainState:
+    """Collect one batch with the current policy and improve policy and value on it."""
+    key_collect, key_learn = jax.random.split(jax.random.fold_in(state.key, state.num_updates))
+    state, transitions = collect(env, agent, ppo, state, key_collect)
+    batch = _to_batch(agent, ppo, state.params, transitions)
+    progress = state.num_updates / total_updates
+    learning_rate = ppo.learning_rate + (ppo.final_learning_rate - ppo.learning_rate) * progress
+    params, optimizer = learn(env, agent, ppo, learning_rate, state, batch, key_learn)
+    window = push(state.window, transitions.episode, transitions.done)
+    return state.replace(params=params, optimizer=optimizer, window=window, num_updates=state.num_updates + 1)
+
+
+def collect(env: Environment, agent: Agent, ppo: PPO, state: TrainState, key: Key) -> tuple[TrainState, Transition]:
+    """Run every environment for `num_steps`; episodes go on from one update to the next."""
+
+    def one_step(carry: tuple[State, Array, Episode], key: Key) -> tuple[tuple[State, Array, Episode], Transition]:
+        env_state, observation, episode = carry
+        key_act, key_reset = jax.random.split(key)
+        inputs = agent.inputs(env, observation)
+        policy = agent.distribution(env, state.params, inputs)
+        action = policy.sample(key_act)
+        (env_state, observation), timestep = step_or_reset_batch(env, env_state, action, key_reset)
+        done, episode = timestep.done, accumulate(episode, timestep)
+        transition = Transition(
+            inputs, action, policy.log_prob(action), timestep.reward, timestep.terminated, done,
+            agent.inputs(env, timestep.observation), episode,
+        )  # fmt: skip
+        return (
+            env_state,
+            observation,
+            jax.tree.map(lambda x: jnp.where(done, jnp.zeros_like(x), x), episode),
+        ), transition
+
+    start = (state.env_state, state.observation, state.episode)
+    end, transitions = jax.lax.scan(one_step, start, jax.random.split(key, ppo.num_steps))
+    return state.replace(env_state=end[0], observation=end[1], episode=end[2]), transitions
+
+
+def gae(reward: Array, value: Array, next_value: Array, terminated: Array, done: Array, gamma: Array, lam: Array) -> Array:
+    """Generalised advantage estimates along the leading axis.
+
+    δ_t = r_t + γ V(s_{t+1})(1 − terminated_t) − V(s_t),  A_t = δ_t + γλ(1 − done_t) A_{t+1}
+
+    V(s_{t+1}) is the value of the state that the step led to, before any reset, so an episode that is truncated, or still
+    running at the end of the batch, counts what would follow, and one that terminated does not.
+    """
+    delta = reward + gamma * next_value * (1.0 - terminated) - value
+
+    def backward(following: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        delta_t, done_t = now
+        advantage = delta_t + gamma * lam * (1.0 - done_t) * following
+        return advantage, advantage
+
+    return jax.lax.scan(backward, jnp.zeros_like(delta[0]), (delta, done), reverse=True)[1]
+
+
+def learn(
+    env: Environment, agent: Agent, ppo: PPO, learning_rate: Array, state: TrainState, batch: Batch, key: Key
+) -> tuple[Params, optax.OptState]:
+    """Some epochs of minibatch steps, each epoch over a new shuffle of the batch."""
+
+    def minibatch_step(carry: tuple[Params, optax.OptState], rows: Array) -> tuple[tuple[Params, optax.OptState], None]:
+        params, optimizer = carry
+        minibatch = jax.tree.map(lambda x: x[rows], batch)
+        gradient = jax.grad(loss)(params, env, agent, ppo, minibatch)
+        step, optimizer = _optimizer(ppo).update(gradient, optimizer)
+        return (jax.tree.map(lambda p, s: p - learning_rate * s, params, step), optimizer), None
+
+    def epoch(carry: tuple[Params, optax.OptState], key: Key) -> tuple[tuple[Params, optax.OptState], None]:
+        rows = shuffle(key, ppo.batch_size).reshape(ppo.num_minibatches, -1)
+        return jax.lax.scan(minibatch_step, carry, rows)
+
+    return jax.lax.scan(epoch, (state.params, state.optimizer), jax.random.split(key, ppo.num_epochs))[0]
+
+
+def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch) -> Array:
+    """Clipped surrogate + value error − entropy bonus, averaged over the batch."""
+    policy = agent.distribution(env, params, batch.inputs)
+    ratio = jnp.exp(policy.log_prob(batch.action) - batch.log_prob)
+    clipped = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
+    surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
+    value_error = 0.5 * (agent.value(params, batch.inputs) - batch.value_target) ** 2
+    entropy = policy.entropy()
+    return jnp.mean(-surrogate + ppo.value_coefficient * value_error - ppo.entropy_coefficient * entropy)
+
+
+def _to_batch(agent: Agent, ppo: PPO, params: Params, transitions: Transition) -> Batch:
+    """Advantages, normalised over the whole batch, and value targets; all samples in one row."""
+    t = transitions
+    value, next_value = agent.value(params, t.inputs), agent.value(params, t.next_inputs)
+    advantage = gae(t.reward, value, next_value, t.terminated, t.done, ppo.gamma, ppo.gae_lambda)
+    target = advantage + value
+    advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    batch = Batch(t.inputs, t.action, t.log_prob, advantage, target)
+    return jax.tree.map(lambda x: x.reshape(ppo.batch_size, *x.shape[2:]), batch)
+
+
+def _optimizer(ppo: PPO) -> optax.GradientTransformation:
+    """Gradient clipping and Adam's direction; the step size is the schedule's."""
+    return optax.chain(optax.clip_by_global_norm(ppo.max_grad_norm), optax.scale_by_adam(eps=1e-5))

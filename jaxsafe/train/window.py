@@ -1,0 +1,53 @@
+"""The latest finished episodes of a seed, kept inside the compiled training step: the training curve of Table 2."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Int
+
+from jaxsafe.metrics import Episode
+from jaxsafe.types import Record
+
+SIZE = 100
+"""Episodes in the window, as in the paper's training curves."""
+
+
+class Window(Record):
+    """A ring of the last `SIZE` finished episodes and the number of all finished ones."""
+
+    episodes: Episode  # each field [SIZE]; slots never filled are zero
+    count: Int[Array, ""]
+
+
+def empty_window(like: Episode) -> Window:
+    """A window in which no episode has finished yet; `like` gives dtypes."""
+    episodes = jax.tree.map(lambda x: jnp.zeros(SIZE, x.dtype), like)
+    return Window(episodes, jnp.zeros((), jnp.int32))
+
+
+def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
+    """Add those of [num_steps, num_envs] episodes that are done, in order of time."""
+    finished = done.ravel()
+    order = jnp.cumsum(finished) - 1
+    latest = finished & (order >= order[-1] + 1 - SIZE)
+    slot = jnp.where(latest, (window.count + order) % SIZE, SIZE)  # out of range: dropped
+    ring = jax.tree.map(lambda old, new: old.at[slot].set(new.ravel(), mode="drop"), window.episodes, episodes)
+    return Window(ring, window.count + order[-1] + 1)
+
+
+def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:
+    """Averages over the episodes in the window, by column name of the progress log; 0 while it is empty."""
+    filled = jnp.arange(SIZE) < window.count
+    weight = filled / jnp.maximum(jnp.minimum(window.count, SIZE), 1)
+    episodes = window.episodes
+    share = {name: jnp.sum(weight * (episodes.outcome == index)) for index, name in enumerate(outcomes) if index}
+    return {
+        "success_rate": share.get("success", jnp.zeros(())),
+        "return": jnp.sum(weight * episodes.episode_return),
+        "length": jnp.sum(weight * episodes.length),
+        "delta_v": jnp.sum(weight * episodes.delta_v),
+        "violating_steps": jnp.sum(weight * episodes.violating_steps / jnp.maximum(episodes.length, 1)),
+        **{f"outcome/{name}": value for name, value in share.items()},
+        **{f"reward/{name}": jnp.sum(weight * total) for name, total in episodes.reward_totals.items()},
+    }

@@ -1,0 +1,37 @@
+"""Settings for all tests: two devices, one thread each, and compiled programs kept between runs."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from jaxsafe.train.seeds import claim_cores
+
+os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2")
+claim_cores()
+
+import jax  # noqa: E402
+
+_cache = Path(os.environ.get("JAXSAFE_TEST_CACHE", Path(__file__).parent.parent / ".pytest_cache" / "jax"))
+jax.config.update("jax_compilation_cache_dir", str(_cache))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished training run that nobody interrupted."""
+    from tiny import TINY
+
+    from jaxsafe.train.__main__ import main
+
+    run = tmp_path_factory.mktemp("runs") / "whole"
+    assert main([*TINY, f"out={run}"]) == 0
+    return run
+
+
+@pytest.fixture
+def x64() -> Iterator[None]:
+    """Double precision for one test; environments are built inside it."""
+    with jax.enable_x64(True):
+        yield

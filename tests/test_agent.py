@@ -1,0 +1,76 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+import jaxsafe
+from jaxsafe.component import normalise
+from jaxsafe.train.agent import Agent, Categorical, Gaussian
+
+KEY = jax.random.key(3)
+
+
+def test_the_gaussian_agrees_with_scipy() -> None:
+    mean, log_std = jax.random.normal(KEY, (5, 3)), jnp.array([-0.7, 0.0, 0.4])
+    policy = Gaussian(mean=mean, log_std=log_std)
+    action = policy.sample(jax.random.key(1))
+    reference = scipy.stats.norm(np.asarray(mean), np.exp(np.asarray(log_std)))
+    np.testing.assert_allclose(policy.log_prob(action), reference.logpdf(np.asarray(action)).sum(-1), rtol=1e-5)
+    np.testing.assert_allclose(policy.entropy(), np.broadcast_to(reference.entropy(), (5, 3)).sum(-1), rtol=1e-5)
+    np.testing.assert_array_equal(policy.mode(), mean)
+
+
+def test_gaussian_samples_have_the_stated_distribution() -> None:
+    policy = Gaussian(mean=jnp.full((4000, 1), 0.3), log_std=jnp.array([-0.5]))
+    sample = np.asarray(policy.sample(KEY))[:, 0]
+    assert scipy.stats.kstest(sample, scipy.stats.norm(0.3, np.exp(-0.5)).cdf).pvalue > 0.001
+
+
+def test_the_factored_categorical_agrees_with_the_product_of_its_factors() -> None:
+    logits = jax.random.normal(KEY, (6, 5))
+    policy = Categorical(logits=logits, points=(2, 3))
+    first, second = jax.nn.softmax(logits[:, :2]), jax.nn.softmax(logits[:, 2:])
+    action = policy.sample(jax.random.key(1))
+    rows = np.arange(6)
+    expected = np.log(np.asarray(first)[rows, action[:, 0]] * np.asarray(second)[rows, action[:, 1]])
+    np.testing.assert_allclose(policy.log_prob(action), expected, rtol=1e-5)
+    entropy = scipy.stats.entropy(np.asarray(first), axis=1) + scipy.stats.entropy(np.asarray(second), axis=1)
+    np.testing.assert_allclose(policy.entropy(), entropy, rtol=1e-5)
+    np.testing.assert_array_equal(policy.mode()[:, 1], jnp.argmax(logits[:, 2:], axis=1))
+
+
+def test_categorical_samples_have_the_stated_frequencies() -> None:
+    logits = jnp.tile(jnp.log(jnp.array([0.2, 0.3, 0.5])), (6000, 1))
+    counts = np.bincount(np.asarray(Categorical(logits=logits, points=(3,)).sample(KEY))[:, 0], minlength=3)
+    assert scipy.stats.chisquare(counts, 6000 * np.array([0.2, 0.3, 0.5])).pvalue > 0.001
+
+
+@pytest.mark.parametrize("actions", ["continuous", "discrete"])
+def test_an_untrained_policy_is_centred_and_as_wide_as_configured(actions: str) -> None:
+    env = jaxsafe.make("docking2d", actions=actions)  # type: ignore[arg-type]
+    agent = normalise(Agent(features="docking", log_std=-1.2, prior_std=0.3))
+    params = agent.init(KEY, env)
+    _, timestep = env.reset(KEY)
+    actions_drawn = jax.vmap(lambda key: agent.act(env, params, key, timestep.observation, False))(
+        jax.random.split(KEY, 2000)
+    )
+    pushes = np.asarray(actions_drawn) / 5.0 - 1.0 if actions == "discrete" else np.asarray(actions_drawn)
+    assert abs(pushes.mean()) < 0.05
+    assert pushes.std() == pytest.approx(0.3, abs=0.02)
+
+
+def test_docking_features_are_direction_and_log_distance() -> None:
+    env = jaxsafe.make("docking3d")
+    agent = Agent(features="docking")
+    _, timestep = jaxsafe.reset_to(env, {"deputy": {"position": [30.0, 0.0, 40.0], "velocity": [0.0, 0.0, 0.0]}})
+    inputs = agent.inputs(env, timestep.observation)
+    np.testing.assert_array_equal(inputs[:8], timestep.observation)
+    np.testing.assert_allclose(inputs[8:], [0.3 / 0.51, 0.0, 0.4 / 0.51, np.log(0.505)], rtol=1e-6)
+    assert agent.init(KEY, env)["actor"][0]["kernel"].shape == (12, 64)
+
+
+def test_plain_agents_see_the_observation_and_nothing_else() -> None:
+    env = jaxsafe.make("docking2d")
+    _, timestep = env.reset(KEY)
+    np.testing.assert_array_equal(Agent(features="none").inputs(env, timestep.observation), timestep.observation)

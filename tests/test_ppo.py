@@ -1,0 +1,118 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import Constant, Match, Position, probe
+
+from jaxsafe.component import normalise
+from jaxsafe.environment import Environment
+from jaxsafe.train.agent import Agent
+from jaxsafe.train.ppo import PPO, TrainState, gae, init, update
+
+AGENT = normalise(Agent(hidden=(16,)))
+SMALL = normalise(
+    PPO(num_envs=8, num_steps=16, num_epochs=8, num_minibatches=2, gamma=0.9, gae_lambda=0.95, final_learning_rate=3e-3)
+)
+
+
+def train(env: Environment, updates: int = 40, ppo: PPO = SMALL) -> TrainState:
+    def run(key: jax.Array) -> TrainState:
+        return jax.lax.fori_loop(0, updates, lambda _, s: update(env, AGENT, ppo, updates, s), init(env, AGENT, ppo, key))
+
+    return jax.jit(run)(jax.random.key(0))
+
+
+def value(state: TrainState, observation: float) -> float:
+    return float(AGENT.value(state.params, jnp.array([observation])))
+
+
+def test_gae_equals_a_table_worked_out_by_hand() -> None:
+    # One environment, γ = 0.5, λ = 0.5. Step 0 runs on, step 1 is truncated, step 2 runs on, step 3 terminates, step 4 is
+    # cut off by the end of the batch.
+    reward = jnp.array([1.0, 2.0, 3.0, 4.0, 5.0])[:, None]
+    values = jnp.array([10.0, 20.0, 30.0, 40.0, 50.0])[:, None]
+    next_values = jnp.array([20.0, 8.0, 40.0, 99.0, 60.0])[:, None]
+    terminated = jnp.array([False, False, False, True, False])[:, None]
+    done = jnp.array([False, True, False, True, False])[:, None]
+    # δ = 1+10−10 = 1, 2+4−20 = −14, 3+20−30 = −7, 4+0−40 = −36, 5+30−50 = −15
+    expected = [1.0 - 14.0 / 4, -14.0, -7.0 - 36.0 / 4, -36.0, -15.0]
+    found = gae(reward, values, next_values, terminated, done, jnp.array(0.5), jnp.array(0.5))
+    np.testing.assert_allclose(found[:, 0], expected, rtol=1e-6)
+
+
+def test_gae_equals_a_loop_over_random_episodes() -> None:
+    rng = np.random.default_rng(0)
+    reward, values, next_values = (rng.normal(size=(50, 3)) for _ in range(3))
+    terminated, truncated = rng.random((2, 50, 3)) < 0.1
+    done = terminated | truncated
+    expected, following = np.zeros((50, 3)), np.zeros(3)
+    for t in reversed(range(50)):
+        delta = reward[t] + 0.97 * next_values[t] * ~terminated[t] - values[t]
+        following = delta + 0.97 * 0.8 * ~done[t] * following
+        expected[t] = following
+    arrays = (jnp.asarray(x, jnp.float32) for x in (reward, values, next_values))
+    found = gae(*arrays, jnp.asarray(terminated), jnp.asarray(done), jnp.array(0.97), jnp.array(0.8))
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_the_critic_learns_a_constant() -> None:
+    state = train(probe(Constant(name="reward")))
+    assert value(state, 1.0) == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_critic_learns_from_the_observation() -> None:
+    state = train(probe(Position(name="reward")))
+    assert value(state, 1.0) == pytest.approx(1.0, abs=0.1)
+    assert value(state, -1.0) == pytest.approx(-1.0, abs=0.1)
+
+
+def test_a_terminated_episode_counts_nothing_beyond_its_end() -> None:
+    state = train(probe(Constant(name="reward"), steps=2), updates=80)
+    # The two steps look alike, so the critic learns the mean of 1 and 1 + γ.
+    assert value(state, 1.0) == pytest.approx((1.0 + 1.9) / 2, abs=0.1)
+
+
+def test_a_truncated_episode_counts_what_would_follow() -> None:
+    state = train(probe(Constant(name="reward"), steps=2, ends="truncated"), updates=150)
+    assert value(state, 1.0) == pytest.approx(1.0 / (1.0 - 0.9), rel=0.1)
+
+
+@pytest.mark.parametrize("discrete", [False, True], ids=["gaussian", "categorical"])
+def test_the_policy_learns_the_action_that_the_observation_calls_for(discrete: bool) -> None:
+    env = probe(Match(name="reward"), discrete=discrete)
+    state = train(env, updates=100)
+    for observation in (-1.0, 1.0):
+        mode = AGENT.distribution(env, state.params, jnp.array([observation])).mode()
+        if discrete:
+            assert int(mode[0]) == (3 if observation > 0 else 1)  # the points are −1, −0.5, 0, 0.5, 1
+        else:
+            assert float(mode[0]) == pytest.approx(0.5 * observation, abs=0.1)
+
+
+def test_the_learning_rate_falls_linearly_to_its_end() -> None:
+    env = probe(Match(name="reward"))
+    frozen = SMALL.replace(learning_rate=jnp.array(1e-3), final_learning_rate=jnp.array(0.0))
+    state = init(env, AGENT, frozen, jax.random.key(0)).replace(num_updates=jnp.array(10))
+    after = update(env, AGENT, frozen, 10, state)  # progress 1: the rate is 0, so nothing moves
+    jax.tree.map(np.testing.assert_array_equal, after.params, state.params)
+    earlier = update(env, AGENT, frozen, 20, state)
+    moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), earlier.params, state.params)
+    assert max(jax.tree.leaves(moved)) > 1e-4
+
+
+def test_hyperparameters_are_leaves_that_vmap() -> None:
+    env = probe(Constant(name="reward"))
+    rates = jnp.array([1e-3, 3e-3])
+    state = init(env, AGENT, SMALL, jax.random.key(0))
+    one = lambda rate: update(env, AGENT, SMALL.replace(learning_rate=rate), 10, state).params["critic"][0]["bias"]  # noqa: E731
+    together = jax.vmap(one)(rates)
+    np.testing.assert_allclose(together, jnp.stack([one(rate) for rate in rates]), atol=1e-6)
+
+
+def test_no_gradient_is_larger_than_allowed() -> None:
+    env = probe(Position(name="reward"))
+    tiny = SMALL.replace(max_grad_norm=jnp.array(1e-30))
+    state = init(env, AGENT, tiny, jax.random.key(0))
+    after = update(env, AGENT, tiny, 10, state)  # clipped below Adam's ε: the networks hardly move
+    moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), after.params, state.params)
+    assert max(jax.tree.leaves(moved)) < 1e-6

@@ -1,0 +1,47 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxsafe
+from jaxsafe.metrics import Episode, begin
+from jaxsafe.rollout import reset_batch
+from jaxsafe.train.window import SIZE, empty_window, means, push
+
+ENV = jaxsafe.make("docking2d")
+
+
+def episodes_like(values: np.ndarray) -> Episode:
+    zero = begin(reset_batch(ENV, jax.random.key(0), 1)[1])
+    shaped = jax.tree.map(lambda x: jnp.zeros(values.shape, x.dtype), zero)
+    return shaped.replace(
+        episode_return=jnp.asarray(values), length=jnp.full(values.shape, 7), outcome=jnp.ones(values.shape, int)
+    )
+
+
+def test_the_window_keeps_the_last_hundred_finished_episodes_in_order() -> None:
+    rng = np.random.default_rng(0)
+    window = empty_window(episodes_like(np.zeros(1, np.float32)))
+    finished: list[float] = []
+    for _ in range(8):
+        values, done = rng.normal(size=(30, 4)).astype(np.float32), rng.random((30, 4)) < 0.2
+        window = jax.jit(push)(window, episodes_like(values), jnp.asarray(done))
+        finished += values[done].tolist()
+        kept = np.sort(np.asarray(window.episodes.episode_return)[: min(len(finished), SIZE)])
+        np.testing.assert_array_equal(kept, np.sort(np.float32(finished[-SIZE:])))
+    assert int(window.count) == len(finished) > SIZE
+
+
+def test_a_batch_with_more_episodes_than_the_window_leaves_its_last_ones() -> None:
+    values = np.arange(300, dtype=np.float32).reshape(100, 3)
+    window = push(empty_window(episodes_like(values)), episodes_like(values), jnp.ones((100, 3), bool))
+    np.testing.assert_array_equal(np.sort(window.episodes.episode_return), np.arange(200, 300))
+
+
+def test_averages_are_over_the_filled_part_only() -> None:
+    values = np.array([[1.0, 3.0, 9.0]], np.float32)
+    window = push(empty_window(episodes_like(values)), episodes_like(values), jnp.array([[True, True, False]]))
+    row = means(window, ENV.outcomes)
+    assert float(row["return"]) == 2.0
+    assert float(row["length"]) == 7.0
+    assert float(row["success_rate"]) == float(row["outcome/success"]) == 1.0
+    assert float(row["outcome/crash"]) == 0.0
