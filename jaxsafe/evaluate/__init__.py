@@ -1,0 +1,1 @@
+"""Evaluation: whole episodes of trained policies, their metrics, and a command line over run directories."""

@@ -1,0 +1,63 @@
+"""`python -m jaxsafe.evaluate run=runs/x`: metrics of a run's policies, in its own environment or a changed one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxsafe import cli
+from jaxsafe.train.seeds import claim_cores
+
+OPTIONS = ("run", "episodes", "seed", "checkpoint", "deterministic", "out")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    claim_cores()
+    cli.enable_compilation_cache()
+    from jaxsafe.config import override
+    from jaxsafe.errors import ConfigError
+    from jaxsafe.evaluate.report import evaluate_run
+    from jaxsafe.train import directory
+    from jaxsafe.train.results import table
+
+    arguments = cli.Arguments.parse(argv)
+    run, out, checkpoint = (arguments.pop_text(name) for name in ("run", "out", "checkpoint"))
+    changes = arguments.pop_overrides()
+    episodes, seed = arguments.pop_count("episodes", 1000), arguments.pop_count("seed", 0, least=0)
+    deterministic = arguments.pop("deterministic")
+    arguments.refuse_rest([*OPTIONS, "env.…"])
+    if run is None:
+        raise ConfigError("run: missing; for instance run=runs/docking3d")
+    if deterministic not in (None, True, False):
+        raise ConfigError(f"deterministic: expected true or false, found {deterministic!r}")
+    kinds = {None: ("stochastic", "deterministic"), True: ("deterministic",), False: ("stochastic",)}[deterministic]
+    config, env, name = directory.read(Path(run), "run")
+    env = override(env, changes)
+    request: dict[str, Any] = {
+        "episodes": episodes,
+        "evaluation_seed": seed,
+        "checkpoint": checkpoint or "last",
+        "changes": changes,
+    }
+    path, results = evaluate_run(Path(run), config, env, name, kinds, request, Path(out) if out else None)
+    print(table(results, path))
+    return 0
+
+
+def usage() -> str:
+    """The help text."""
+    return (
+        "usage: python -m jaxsafe.evaluate run=RUN [key=value …]\n\n"
+        "  episodes=N             episodes of each seed (default 1000)\n"
+        "  seed=N                 evaluation key: other starts and other noise (default 0, as in the run's own results)\n"
+        "  checkpoint=last|best|N best is per seed by success in the evaluations during training (default last)\n"
+        "  deterministic=true|false   one kind only (default both)\n"
+        "  env.PATH=VALUE         change the environment, for instance env.deputy.start.position.distance=[1000,1000]\n"
+        "  out=DIR                where to write (default: a new directory in RUN/evaluations)"
+    )
+
+
+if __name__ == "__main__":
+    cli.run(main, usage)

@@ -1,0 +1,74 @@
+"""Evaluating a run after training, into a directory of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxsafe.environment import Environment
+from jaxsafe.errors import ConfigError
+from jaxsafe.evaluate.seeds import Evaluator, episode_rows
+from jaxsafe.train.config import TrainConfig
+from jaxsafe.train.directory import versions
+from jaxsafe.train.files import append_rows, write_json
+from jaxsafe.train.restore import load_params
+from jaxsafe.train.results import evaluation, facts
+from jaxsafe.train.seeds import SeedMapper
+
+
+def evaluate_run(
+    run: Path,
+    config: TrainConfig,
+    env: Environment,
+    name: str,
+    kinds: Sequence[str],
+    request: dict[str, Any],
+    out: Path | None,
+) -> tuple[Path, dict[str, Any]]:
+    """Evaluate every seed's policy; write `results.json` and `eval.jsonl` and return their place and the results.
+
+    Args:
+        run: the run directory.
+        config: its configuration.
+        env: the environment to evaluate in.
+        name: the environment's name.
+        kinds: of `stochastic` and `deterministic`.
+        request: `episodes`, `evaluation_seed`, `checkpoint`, and anything else to put into the results.
+        out: a new directory; None makes one in `<run>/evaluations`.
+
+    Raises:
+        ConfigError: there is no such checkpoint, or `out` holds something.
+    """
+    mapper = SeedMapper(config.seeds)
+    params, step = load_params(mapper, run, config, env, request["checkpoint"])
+    out = _make_directory(run, out, request)
+    evaluator = Evaluator(mapper, env, config.agent)
+    episodes = {
+        kind: evaluator.run(params, request["episodes"], request["evaluation_seed"], kind == "deterministic")
+        for kind in kinds
+    }
+    for kind, one in episodes.items():
+        append_rows(out / "eval.jsonl", episode_rows(env, one, config.seed, step=step, kind=kind, final=True))
+    results = {
+        **facts(config, name), **request, "run": str(run), "steps": step,
+        "versions": versions(), "evaluation": evaluation(env, episodes),
+    }  # fmt: skip
+    write_json(out / "results.json", results)
+    return out / "results.json", results
+
+
+def _make_directory(run: Path, out: Path | None, request: dict[str, Any]) -> Path:
+    if out is None:
+        base = f"{request['checkpoint']}-{request['episodes']}-seed{request['evaluation_seed']}" + "-changed" * bool(
+            request["changes"]
+        )
+        candidates = [base, *(f"{base}-{number}" for number in range(2, 10_000))]
+        out = next(run / "evaluations" / name for name in candidates if not (run / "evaluations" / name).exists())
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"out: {out} already holds something and is never overwritten; choose an empty directory")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"out: cannot write {error.filename}: {error.strerror}") from None
+    return out

@@ -1,0 +1,130 @@
+"""Evaluating the policies of all seeds of a run at once, from the same starts, into rows and metrics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from jaxsafe.environment import Environment
+from jaxsafe.evaluate.episodes import longest, record_episodes, run_episodes
+from jaxsafe.metrics import METRICS, Episode, over_seeds, summarise
+from jaxsafe.train.agent import Agent, Params
+from jaxsafe.train.seeds import SeedMapper
+from jaxsafe.types import Key
+
+BATCH = 100
+"""Episodes that run side by side; the noise of a batch is drawn together, so this number is part of the results."""
+
+RECORDED = 10
+"""Episodes recorded at a time, at least: one compiled program serves the evaluations during and after training."""
+
+KINDS = ("stochastic", "deterministic")
+
+
+class Evaluator:
+    """Compiled once; runs whole batches of episodes for every seed."""
+
+    def __init__(self, mapper: SeedMapper, env: Environment, agent: Agent) -> None:
+        """Evaluate in `env`."""
+        self.mapper, self.env, self.agent = mapper, env, agent
+        self._shared = mapper.replicate((env, agent))
+        self._run = mapper.map(self._one_seed)
+        self._record = jax.jit(self._one_record, static_argnums=(2, 3))
+
+    def run(self, params: Params, num_episodes: int, seed: int, deterministic: bool) -> Episode:
+        """Episodes of every seed's policy: each field [seeds, num_episodes], on the host."""
+        batches = []
+        for key in batch_keys(seed, -(-num_episodes // BATCH)):
+            shared = (*self._shared, *self.mapper.replicate((key, np.asarray(deterministic))))
+            batches.append(self.mapper.gather(self._run(shared, params)))
+        return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :num_episodes], *batches)
+
+    def record(
+        self, params: Params, num_episodes: int, seed: int, deterministic: bool = True
+    ) -> Iterator[list[dict[str, Any]]]:
+        """Every step of the first episodes that `run` runs with one seed's parameters, as rows for a log."""
+        steps = int(longest(self.env))
+        for batch, key in enumerate(batch_keys(seed, -(-num_episodes // BATCH))):
+            count = min(BATCH, num_episodes - batch * BATCH)
+            recorded = self._record(params, key, max(count, RECORDED), steps, np.asarray(deterministic))
+            for episode in range(count):
+                state, timestep = jax.tree.map(lambda x, i=episode: np.asarray(x)[:, i], recorded)
+                ended = np.flatnonzero(timestep.done)
+                yield [_step_row(self.env, state, timestep, t) for t in range((ended[0] if ended.size else steps) + 1)]
+
+    def _one_seed(self, shared: tuple, params: Params) -> Episode:
+        env, agent, key, deterministic = shared
+        policy = lambda key, observation: agent.act(env, params, key, observation, deterministic)  # noqa: E731
+        return run_episodes(env, policy, key, BATCH)
+
+    def _one_record(self, params: Params, key: Key, num_episodes: int, steps: int, deterministic: Any) -> Any:
+        policy = lambda key, observation: self.agent.act(self.env, params, key, observation, deterministic)  # noqa: E731
+        return record_episodes(self.env, policy, key, num_episodes, steps)
+
+
+def batch_keys(seed: int, batches: int) -> Iterator[Key]:
+    """The evaluation keys: they depend on the evaluation seed only, never on the training seed."""
+    base = jax.random.key(seed)
+    return (jax.random.fold_in(base, index) for index in range(batches))
+
+
+def episode_rows(env: Environment, episodes: Episode, first_seed: int, **common: Any) -> list[dict[str, Any]]:
+    """A row for each episode of each seed, for `eval.jsonl`."""
+    success = success_index(env)
+    names = ("episode_return", "length", "delta_v", "delta_v_l1", "violating_steps", "severity_max")
+    columns = {name: np.asarray(getattr(episodes, name)).tolist() for name in names}
+    outcomes = np.asarray(episodes.outcome)
+    return [
+        {
+            **common,
+            "seed": first_seed + seed,
+            "episode": index,
+            "outcome": env.outcomes[outcomes[seed, index]],
+            "success": bool(outcomes[seed, index] == success),
+            **{name.removeprefix("episode_"): _short(column[seed][index]) for name, column in columns.items()},
+        }
+        for seed in range(outcomes.shape[0])
+        for index in range(outcomes.shape[1])
+    ]
+
+
+def metrics_over_seeds(env: Environment, episodes: Episode) -> dict[str, Any]:
+    """Every metric of Section 5: mean, interval, interquartile mean and per seed."""
+    has_delta_v = any(status.name == "delta_v" for status in env.status)
+    seeds = range(np.asarray(episodes.outcome).shape[0])
+    each = [summarise(jax.tree.map(lambda x, i=i: x[i], episodes), success_index(env), has_delta_v) for i in seeds]
+    return {name: over_seeds([one[name] for one in each]) for name in METRICS}
+
+
+def success_index(env: Environment) -> int:
+    """Which outcome is success; none, −1, where the task has no outcome of that name."""
+    return env.outcomes.index("success") if "success" in env.outcomes else -1
+
+
+def _step_row(env: Environment, state: Any, timestep: Any, t: int) -> dict[str, Any]:
+    info = timestep.info
+    platforms = {name: {field: value[t] for field, value in vars(one).items()} for name, one in state.sim.platforms.items()}
+    pick = lambda tree: {name: _plain(value[t]) for name, value in tree.items()}  # noqa: E731
+    return {
+        "t": _plain(state.sim.time[t]),
+        "platforms": {name: {field: _plain(value) for field, value in one.items()} for name, one in platforms.items()},
+        "control_desired": dict(zip(env.action_names, _plain(info.control_desired[t]), strict=True)),
+        "control_actual": dict(zip(env.action_names, _plain(info.control_actual[t]), strict=True)),
+        "status": pick(info.status),
+        "margins": pick(info.margins),
+        "reward_terms": pick(info.reward_terms),
+        "reward": _plain(timestep.reward[t]),
+        "outcome": env.outcomes[int(info.outcome[t])],
+    }
+
+
+def _plain(value: Any) -> Any:
+    array = np.asarray(value)
+    return [_plain(item) for item in array] if array.ndim else _short(array.item())
+
+
+def _short(value: Any) -> Any:
+    return float(f"{value:.6g}") if isinstance(value, float) else value

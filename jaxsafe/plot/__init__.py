@@ -1,0 +1,1 @@
+"""The paper's figures from the log files of a run."""

@@ -1,0 +1,182 @@
+"""Figures of a run from its own log files: training curves (Figs. 12-16), trajectories (18), speed and distance (19)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.figure import Figure
+
+from jaxsafe.config import yaml
+from jaxsafe.errors import ConfigError
+from jaxsafe.metrics import bootstrap_interval
+from jaxsafe.train.files import read_rows
+
+BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#8A8A8A"  # of the Okabe-Ito palette, safe for colour-blind readers
+LAST_COLOUR = 0.85  # the end of the colour map is too light on white
+CURVES = (
+    ("success_rate", "success rate [%]", 100.0),
+    ("return", "return", 1.0),
+    ("length", "episode length [steps]", 1.0),
+    ("delta_v", "Δv per episode [m/s]", 1.0),
+    ("violating_steps", "violating steps [%]", 100.0),
+)
+ALWAYS = ("success_rate", "return", "length")
+AXES = {"steps": ("step", "environment steps per seed"), "wall": ("wall_s", "wall time [s]")}
+
+Episodes = list[tuple[int, list[dict[str, Any]]]]
+
+
+def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
+    """Draw every figure for which the run has data, into `<run>/figures/`, and return their paths.
+
+    Raises:
+        ConfigError: the run has no progress log.
+    """
+    rows = read_rows(run / "progress.jsonl")
+    if not rows:
+        raise ConfigError(f"run: {run} has no rows in progress.jsonl yet; nothing to draw")
+    title = _title(run, rows)
+    figures = {f"training_{x}": training_curves(rows, x, title)}
+    episodes = _episodes(run / "episodes.jsonl")
+    if episodes:
+        figures["trajectories"] = trajectories(episodes, title)
+        if "velocity_limit" in episodes[0][1][0]["status"]:
+            figures["speed_distance"] = speed_distance(episodes, title)
+    return [_save(figure, run / "figures" / f"{name}.png") for name, figure in figures.items()]
+
+
+def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figure:
+    """A panel for each quantity: every seed thin, their mean, and the 95 % interval of the mean."""
+    column, label = AXES[x]
+    curves = [curve for curve in CURVES if curve[0] in ALWAYS or any(row[curve[0]] for row in rows)]
+    figure = Figure(figsize=(4.2 * min(len(curves), 3), 3.1 * -(-len(curves) // 3)), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(-(-len(curves) // 3), min(len(curves), 3))).ravel()
+    for panel in panels[len(curves) :]:
+        panel.remove()
+    for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
+        at, values = _table(rows, column, name)
+        _curve(panel, at, factor * values)
+        panel.set(xlabel=label, ylabel=quantity)
+        panel.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
+        if name == "success_rate":
+            panel.set_ylim(-3, 103)
+            panel.axhline(80.0, color="black", linestyle=":", linewidth=1.0)
+    if panels[0].get_legend_handles_labels()[0]:
+        panels[0].legend(loc="best", fontsize="small", frameon=False)
+    figure.suptitle(f"{title}: the last 100 training episodes", fontsize="medium")
+    return figure
+
+
+def trajectories(episodes: Episodes, title: str) -> Figure:
+    """Paths of the agent relative to the other platform, from purple early in training to green at its end."""
+    paths = [(step, _relative_path(rows)) for step, rows in episodes]
+    planes = [(0, 1)] if paths[0][1].shape[1] == 2 else [(0, 1), (0, 2)]
+    figure = Figure(figsize=(5.4 * len(planes) + 0.8, 4.9), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(1, len(planes)))
+    colours, colour = _colours(paths)
+    for panel, (i, j) in zip(panels, planes, strict=True):
+        for step, path in paths:
+            panel.plot(path[:, i], path[:, j], color=colour(step), linewidth=1.2)
+            panel.plot(path[0, i], path[0, j], "o", color=colour(step), markersize=3)
+        panel.plot(0, 0, "*", color=ORANGE, markersize=12, label="target", zorder=3)
+        panel.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]", aspect="equal")
+        panel.set_adjustable("datalim")
+    panels[0].legend(loc="best", fontsize="small", frameon=False)
+    figure.colorbar(colours, ax=list(panels), label="environment steps of training")
+    figure.suptitle(f"{title}: deterministic episodes of the first seed", fontsize="medium")
+    return figure
+
+
+def speed_distance(episodes: Episodes, title: str) -> Figure:
+    """Speed against distance with the distance-dependent limit: safe is below the dotted line."""
+    figure = Figure(figsize=(6.4, 4.4), layout="constrained")
+    panel = figure.subplots()
+    colours, colour = _colours(episodes)
+    limits = []
+    for step, rows in episodes:
+        status = [row["status"] for row in rows]
+        distance, speed, limit = (
+            np.array([one[k] for one in status]) for k in ("docking_distance", "speed", "velocity_limit")
+        )
+        panel.plot(distance, speed, color=colour(step), linewidth=1.0)
+        limits.append(np.stack([distance, limit]))
+    line = np.concatenate(limits, axis=1)
+    line = line[:, np.argsort(line[0])]
+    panel.plot(line[0], line[1], color="black", linestyle=":", linewidth=1.6, label="speed limit")
+    panel.set(xlabel="distance to the chief [m]", ylabel="speed [m/s]", xlim=(0, None), ylim=(0, 1.5 * line[1].max()))
+    panel.legend(loc="upper left", frameon=False)
+    figure.colorbar(colours, ax=panel, label="environment steps of training")
+    figure.suptitle(f"{title}: deterministic episodes of the first seed", fontsize="medium")
+    return figure
+
+
+def _curve(panel: Axes, at: np.ndarray, values: np.ndarray) -> None:
+    known = ~np.isnan(values).any(axis=1)  # a mean over fewer seeds would be another curve
+    at, values = at[known], values[known]
+    if not len(at):
+        panel.text(0.5, 0.5, "no episode has ended yet", ha="center", va="center", transform=panel.transAxes)
+        return
+    panel.plot(at, values, color=GREY, linewidth=0.6, alpha=0.6)
+    panel.plot([], [], color=GREY, linewidth=0.6, label="each seed")
+    panel.plot(at, values.mean(axis=1), color=BLUE, linewidth=1.8, label="mean")
+    if values.shape[1] > 1:
+        panel.fill_between(at, *bootstrap_interval(values), color=BLUE, alpha=0.25, linewidth=0, label="95 % interval")
+    panel.margins(x=0.0)
+
+
+def _table(rows: Sequence[dict[str, Any]], column: str, name: str, most: int = 300) -> tuple[np.ndarray, np.ndarray]:
+    """One column as (updates, seeds) at the values of the x column, thinned to at most `most` points."""
+    steps = sorted({row["step"] for row in rows})
+    steps = sorted({steps[i] for i in np.linspace(0, len(steps) - 1, min(most, len(steps))).astype(int)})
+    seeds = sorted({row["seed"] for row in rows})
+    index = {step: i for i, step in enumerate(steps)}
+    at, values = np.zeros(len(steps)), np.full((len(steps), len(seeds)), np.nan)
+    for row in rows:
+        if row["step"] in index:
+            at[index[row["step"]]] = row[column]
+            values[index[row["step"]], seeds.index(row["seed"])] = np.nan if row[name] is None else row[name]
+    return at, values
+
+
+def _episodes(path: Path) -> Episodes:
+    """Logged episodes in order, each with the training step of its policy; those of the end only once."""
+    grouped: dict[tuple[int, bool, int], list[dict[str, Any]]] = {}
+    for row in read_rows(path):
+        grouped.setdefault((row["step"], row["final"], row["episode"]), []).append(row)
+    return [(step, rows) for (step, _, _), rows in grouped.items()]
+
+
+def _relative_path(rows: list[dict[str, Any]]) -> np.ndarray:
+    """Positions of the agent, the platform that was listed last, relative to the first, (steps, d)."""
+    first, *_, agent = rows[0]["platforms"]
+    return np.array([np.subtract(row["platforms"][agent]["position"], row["platforms"][first]["position"]) for row in rows])
+
+
+def _colours(episodes: Sequence[tuple[int, Any]]) -> tuple[ScalarMappable, Any]:
+    steps = [step for step, _ in episodes]
+    shades = ListedColormap(colormaps["viridis"](np.linspace(0.0, LAST_COLOUR, 256)))
+    scale = Normalize(0, max(steps) or 1)
+    return ScalarMappable(scale, shades), lambda step: shades(scale(step))
+
+
+def _title(run: Path, rows: Sequence[dict[str, Any]]) -> str:
+    content = yaml.read(run / "config.yaml")
+    count = len({row["seed"] for row in rows})
+    return f"{content['env']}, preset {content['training']['preset']}, {count} seed{'s' * (count != 1)}"
+
+
+def _save(figure: Figure, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}")
+    for panel in figure.axes:
+        panel.spines[["top", "right"]].set_visible(False)
+    figure.savefig(part, dpi=150, format="png")
+    part.replace(path)
+    return path

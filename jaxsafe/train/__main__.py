@@ -1,0 +1,60 @@
+"""`python -m jaxsafe.train env=docking3d seeds=10`: train all seeds, evaluate, draw figures, print a table."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxsafe import cli
+from jaxsafe.train.seeds import claim_cores
+
+BEGAN = time.monotonic()
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    claim_cores()
+    cli.enable_compilation_cache()
+    from jaxsafe.plot.figures import draw_all
+    from jaxsafe.train import directory
+    from jaxsafe.train.config import resolve
+    from jaxsafe.train.loop import Training
+    from jaxsafe.train.results import finish, table
+
+    arguments = cli.Arguments.parse(argv)
+    resume = arguments.pop_text("resume")
+    if resume is None:
+        config, env, name = resolve(arguments)
+        run = directory.create(config, env, name)
+    else:
+        arguments.refuse_rest(["resume"])
+        run = Path(resume)
+        config, env, name = directory.read(run, "resume")
+        if (run / "results.json").exists():
+            print(f"{run} is complete; nothing is left to do")
+            if not (run / "figures").exists():  # killed between the results and the figures
+                draw_all(run)
+            return 0
+    print(
+        f"{name}: {config.seeds} seeds × {config.num_updates * config.ppo.batch_size:,} steps,"
+        f" preset {config.preset}, in {run}"
+    )
+    training = Training(config, env, run, BEGAN)
+    if not training.train():
+        print(f"stopped at step {training.step:,}; go on with: python -m jaxsafe.train resume={run}")
+        return cli.INTERRUPTED
+    print(table(finish(training, config, env, name), run / "results.json"))
+    print("figures: " + ", ".join(str(figure) for figure in draw_all(run)))
+    return 0
+
+
+def usage() -> str:
+    """The help text."""
+    from jaxsafe.train.config import usage
+
+    return usage()
+
+
+if __name__ == "__main__":
+    cli.run(main, usage)

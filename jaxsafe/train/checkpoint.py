@@ -1,0 +1,58 @@
+"""Checkpoints with orbax: a step directory appears whole or not at all, so a kill leaves the one before."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxsafe.errors import ConfigError, nearest
+
+logging.getLogger("absl").setLevel(logging.ERROR)
+
+
+class Checkpoints:
+    """The numbered checkpoints in `<run>/checkpoints/`, by environment steps of each seed. All are kept."""
+
+    def __init__(self, run: Path, create: bool = False) -> None:
+        """Open the directory; `create` makes it where it is missing."""
+        import orbax.checkpoint as ocp
+
+        self._ocp = ocp
+        self.directory = (run / "checkpoints").absolute()
+        options = ocp.CheckpointManagerOptions(create=create, enable_async_checkpointing=False, read_only=not create)
+        if create or self.directory.is_dir():
+            self._manager = ocp.CheckpointManager(self.directory, options=options)
+
+    @property
+    def steps(self) -> list[int]:
+        """The steps at which there are checkpoints, in order."""
+        return sorted(self._manager.all_steps()) if hasattr(self, "_manager") else []
+
+    def save(self, step: int, state: Any, facts: dict[str, Any]) -> None:
+        """Write one checkpoint: a pytree of arrays and some JSON."""
+        ocp = self._ocp
+        args = ocp.args.Composite(state=ocp.args.StandardSave(state), facts=ocp.args.JsonSave(facts))
+        self._manager.save(step, args=args, force=True)
+
+    def restore(self, step: int, like: Any) -> tuple[Any, dict[str, Any]]:
+        """Read one checkpoint into the structure, shapes and placement of `like`.
+
+        Raises:
+            ConfigError: there is none at this step, or it is broken or of another run.
+        """
+        if step not in self.steps:
+            raise ConfigError(
+                f"checkpoint: no step {step} in {self.directory}; choose from {nearest(step, self.steps) or 'none'}"
+            )
+        ocp = self._ocp
+        abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
+        args = ocp.args.Composite(state=ocp.args.StandardRestore(abstract), facts=ocp.args.JsonRestore())
+        try:
+            restored = self._manager.restore(step, args=args)
+        except Exception as error:  # orbax and tensorstore raise whatever their layers raise
+            reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
+            raise ConfigError(f"{self.directory / str(step)}: checkpoint cannot be read: {reason}") from None
+        return restored["state"], restored["facts"]

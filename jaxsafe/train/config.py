@@ -1,0 +1,118 @@
+"""What a training run is: the options of the command line, resolved over a recipe from `configs/` and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import jax
+import jax.numpy as jnp
+
+from jaxsafe.cli import Arguments
+from jaxsafe.component import Component, Range, fields, normalise
+from jaxsafe.config import yaml
+from jaxsafe.config.convert import expects
+from jaxsafe.config.override import set_path
+from jaxsafe.environment import Environment
+from jaxsafe.envs import make
+from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.train.agent import Agent
+from jaxsafe.train.ppo import PPO
+
+Count = Annotated[int, Range(1)]
+
+
+class TrainConfig(Component):
+    """Options of `python -m jaxsafe.train`; steps and episodes are per seed."""
+
+    preset: str = "features"
+    seeds: Count = 1
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0  # the first; seeds=10 is seed … seed + 9
+    steps: Count = 500_000
+    actions: Literal["continuous", "discrete"] | None = None  # None: as the environment says
+    out: str | None = None  # None: a new directory in runs/
+    eval_every: Count | None = None  # steps; None: a tenth of the run
+    eval_episodes: Count = 100  # of each evaluation during training
+    episodes: Count = 1000  # of the evaluation at the end
+    checkpoint_every: Count | None = None  # steps; None: a tenth of the run
+    log_every: Count = 100  # every how many evaluation episodes one is logged step by step
+    tensorboard: bool = False
+    agent: Agent = Agent()
+    ppo: PPO = PPO()
+
+    @property
+    def num_updates(self) -> int:
+        """Updates of each seed: `steps`, rounded up to whole batches."""
+        return -(-self.steps // self.ppo.batch_size)
+
+    def every(self, steps: int | None) -> int:
+        """An interval in updates; a tenth of the run without one."""
+        return -(-self.num_updates // 10) if steps is None else max(1, round(steps / self.ppo.batch_size))
+
+
+def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
+    """The complete configuration, the environment and its name, from a command line.
+
+    Later wins: defaults, the recipe `configs/<env>.yaml` for the preset, the command line.
+
+    Raises:
+        ConfigError: naming the option, what was found and what is allowed.
+    """
+    task, overrides = arguments.pop_text("env"), arguments.pop_overrides()
+    if task is None:
+        raise ConfigError("env: missing; for instance env=docking3d")
+    config = TrainConfig()
+    for path, value in arguments.options.items():  # first, so that a misspelt option is told before a slow start
+        config = set_path(config, path, value)
+    env = make(task, overrides, actions=config.actions)
+    config = normalise(TrainConfig())
+    for path, value in {**recipe(task, arguments.options.get("preset")), **arguments.options}.items():
+        config = set_path(config, path, value)
+    if config.ppo.batch_size % config.ppo.num_minibatches:
+        raise ConfigError(
+            f"ppo.num_minibatches: expected a divisor of ppo.num_envs × ppo.num_steps = {config.ppo.batch_size},"
+            f" found {config.ppo.num_minibatches}"
+        )
+    observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
+    jax.eval_shape(lambda o: config.agent.inputs(env, o), observation)  # refuses features that this task cannot have
+    return config, env, Path(task).stem
+
+
+def recipe(task: str, preset: str | None) -> dict[str, Any]:
+    """Settings by dotted path from `configs/<task>.yaml`; for an environment without a file there is only `plain`.
+
+    Raises:
+        ConfigError: the preset is not in the file.
+    """
+    file = configs() / f"{task}.yaml"
+    known = yaml.read(file) if file.is_file() else {"plain": {}}
+    name = preset if preset is not None else ("features" if "features" in known else "plain")
+    if name not in known:
+        raise ConfigError(f"preset: unknown preset {name!r}; choose from {nearest(name, known)}")
+    return {"preset": name, **_flatten(known[name] or {})}
+
+
+def configs() -> Path:
+    """The directory of recipes: inside the installed package, or beside it in a checkout."""
+    package = Path(__file__).resolve().parent.parent
+    return next(path for path in (package / "configs", package.parent / "configs") if path.is_dir())
+
+
+def usage() -> str:
+    """Every option with its default and what it takes."""
+    lines = ["usage: python -m jaxsafe.train env=TASK [key=value …]      or      resume=RUN", ""]
+    lines += ["  env=TASK or env=FILE.yaml; env.PATH=VALUE changes it, for instance env.reward.delta_v.scale=-0.02", ""]
+    for section, cls in (("", TrainConfig), ("agent.", Agent), ("ppo.", PPO)):
+        for name, field in fields(cls).items():
+            if not isinstance(field.default, Component):
+                default = "" if field.default is None else f" (default {field.default})"
+                lines.append(f"  {section}{name}={expects(field)}{default}")
+    return "\n".join(lines)
+
+
+def _flatten(tree: Mapping[str, Any], place: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in tree.items():
+        flat |= _flatten(value, f"{place}{key}.") if isinstance(value, Mapping) else {f"{place}{key}": value}
+    return flat

@@ -1,0 +1,73 @@
+"""The run directory: made once, never overwritten, and complete enough to go on from."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import jaxsafe.config
+from jaxsafe.component import normalise
+from jaxsafe.config import yaml
+from jaxsafe.config.convert import to_component, to_data
+from jaxsafe.environment import Environment
+from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.train.config import TrainConfig
+from jaxsafe.train.files import write_text
+
+
+def create(config: TrainConfig, env: Environment, name: str) -> Path:
+    """Make a directory for a new run and write `config.yaml`; without `out`, the next free name in `runs/`.
+
+    Raises:
+        ConfigError: `out` already holds something, or cannot be written.
+    """
+    try:
+        path = Path(config.out) if config.out else _next_free(Path("runs"), name)
+        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+            advice = f"continue it with resume={path}" if (path / "config.yaml").exists() else "choose an empty one"
+            raise ConfigError(f"out: {path} already holds something and is never overwritten; {advice}")
+        path.mkdir(parents=True, exist_ok=True)
+        content = {"env": name, "training": to_data(config), "environment": to_data(env), "versions": versions()}
+        write_text(path / "config.yaml", yaml.write(content))
+    except OSError as error:
+        raise ConfigError(f"out: cannot write {error.filename}: {error.strerror}") from None
+    return path
+
+
+def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
+    """The configuration, environment and name of an existing run.
+
+    Raises:
+        ConfigError: there is no run; `option` is what the user called it.
+    """
+    if not (path / "config.yaml").is_file():
+        beside = [str(found.parent) for found in path.parent.glob("*/config.yaml")] if path.parent.is_dir() else []
+        choice = f"; choose from {nearest(path, sorted(beside))}" if beside else ""
+        raise ConfigError(f"{option}: no run in {str(path)!r} (a directory with config.yaml){choice}")
+    content = yaml.read(path / "config.yaml")
+    place = f"{path / 'config.yaml'}: "
+    if not isinstance(content, dict) or not {"env", "training", "environment"} <= set(content):
+        raise ConfigError(f"{place}expected the keys env, training and environment")
+    config = normalise(to_component(content["training"], TrainConfig, f"{place}training"))
+    env = jaxsafe.config.build(to_component(content["environment"], Environment, f"{place}environment"))
+    return config, env, str(content["env"])
+
+
+def versions() -> dict[str, Any]:
+    """What ran: package and library versions, Python, and the kind and number of devices."""
+    packages = ("jaxsafe", "jax", "jaxlib", "numpy", "optax", "orbax-checkpoint")
+    found = {name: importlib.metadata.version(name) for name in packages}
+    return {
+        **found,
+        "python": platform.python_version(),
+        "device": f"{len(jax.devices())} × {jax.devices()[0].device_kind}",
+    }
+
+
+def _next_free(parent: Path, name: str) -> Path:
+    names = [parent / name, *(parent / f"{name}-{number}" for number in range(2, 10_000))]
+    return next(path for path in names if not path.exists())

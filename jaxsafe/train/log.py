@@ -1,0 +1,126 @@
+"""What a run tells while it goes on: progress rows in files, a bar or plain lines on the terminal, TensorBoard if asked."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsafe.environment import Environment
+from jaxsafe.errors import ConfigError
+from jaxsafe.train.files import append_csv, append_rows, keep_rows, write_csv
+
+
+class ProgressLog:
+    """`progress.jsonl` and `progress.csv`: a row for every update of every seed."""
+
+    def __init__(self, run: Path, resume_step: int, tensorboard: bool) -> None:
+        """Open the logs, cut back to the rows up to the step from which the run goes on."""
+        self._jsonl, self._csv = run / "progress.jsonl", run / "progress.csv"
+        self.rows = keep_rows(self._jsonl, lambda row: row["step"] <= resume_step)
+        if self._csv.exists():
+            write_csv(self._csv, self.rows)
+            if not self.rows:
+                self._csv.unlink()
+        self._board = _tensorboard(run, resume_step) if tensorboard else None
+
+    def write(self, rows: list[dict[str, Any]]) -> None:
+        """Add rows to all logs."""
+        self.rows += rows
+        append_rows(self._jsonl, rows)
+        append_csv(self._csv, rows)
+        for row in rows if self._board else ():
+            for name in [key for key, value in row.items() if key not in ("seed", "step") and value is not None]:
+                self._board.add_scalar(f"{name}/seed_{row['seed']}", row[name], row["step"])  # type: ignore[union-attr]
+
+    def close(self) -> None:
+        """Flush what is buffered."""
+        if self._board:
+            self._board.close()
+
+    def curve(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Steps (updates,) and one column as (updates, seeds)."""
+        steps = np.unique([row["step"] for row in self.rows])
+        values = np.array([np.nan if row[name] is None else row[name] for row in self.rows], float)
+        return steps, values.reshape(len(steps), -1)
+
+
+def progress_rows(env: Environment, curves: dict[str, np.ndarray], seed: int, batch_size: int, wall_s: float) -> list[dict]:
+    """Rows from the arrays [seeds, updates] that a chunk returns, update after update."""
+    num_seeds, num_updates = curves["count"].shape
+    measured = columns(env)
+    return [
+        {
+            "seed": seed + i,
+            "step": int(curves["update"][i, j]) * batch_size,
+            "wall_s": round(wall_s, 3),
+            "episodes": int(curves["count"][i, j]),
+            **{name: float(f"{curves[name][i, j]:.6g}") if curves["count"][i, j] else None for name in measured},
+        }
+        for j in range(num_updates)
+        for i in range(num_seeds)
+    ]
+
+
+def columns(env: Environment) -> list[str]:
+    """The measured columns of the progress log, averages over the window, in order."""
+    first = ["success_rate", "return", "length", "delta_v", "violating_steps"]
+    return [*first, *(f"outcome/{name}" for name in env.outcomes[1:]), *(f"reward/{term.name}" for term in env.reward)]
+
+
+class Display:
+    """A live bar on a terminal, otherwise a plain line every tenth of the run."""
+
+    def __init__(self, steps: int, done: int) -> None:
+        """Show progress towards `steps` environment steps per seed, of which some are done."""
+        self._steps, self._done = steps, done
+        self._bar = None
+        if sys.stderr.isatty():
+            from tqdm import tqdm
+
+            self._bar = tqdm(total=steps, initial=done, unit=" steps", unit_scale=True, dynamic_ncols=True)
+            self._bar.set_postfix_str("compiling")
+
+    def start(self) -> None:
+        """Begin to count time: what came before is not a rate of training."""
+        self._begin = self._done, time.monotonic()
+        if self._bar is not None:
+            self._bar.unpause()
+
+    def show(self, step: int, rows: list[dict[str, Any]]) -> None:
+        """Show the state after `step` steps, from the latest row of each seed."""
+        means = {name: _mean([row[name] for row in rows]) for name in ("success_rate", "return")}
+        facts = f"success {_text(means['success_rate'], '.1%')}, return {_text(means['return'], '.2f')}"
+        if self._bar is not None:
+            self._bar.set_postfix_str(facts, refresh=False)
+            self._bar.update(step - self._done)
+        elif step * 10 // self._steps > self._done * 10 // self._steps:
+            first, begin = self._begin
+            left = (time.monotonic() - begin) * (self._steps - step) / max(step - first, 1)
+            print(f"{step:>10,} of {self._steps:,} steps, {facts}, {left:.0f} s left", flush=True)
+        self._done = step
+
+    def close(self) -> None:
+        """Leave the bar as it stands."""
+        if self._bar is not None:
+            self._bar.close()
+
+
+def _mean(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def _text(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
+
+
+def _tensorboard(run: Path, purge_step: int) -> Any:
+    try:
+        from tensorboardX import SummaryWriter
+    except ImportError:
+        raise ConfigError("tensorboard: needs the extra, pip install 'jaxsafe[tensorboard]'") from None
+    return SummaryWriter(str(run / "tensorboard"), purge_step=purge_step)

@@ -1,0 +1,193 @@
+"""The host's side of training: compiled chunks of updates, and between them logs, evaluations and checkpoints.
+
+All that decides the numbers is a function of the configuration and of the state in the checkpoint, and chunks begin at the
+same updates however often a run is interrupted: a resumed run ends bit for bit where the uninterrupted one ends.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsafe.environment import Environment
+from jaxsafe.evaluate.seeds import KINDS, Evaluator, episode_rows, success_index
+from jaxsafe.metrics import Episode
+from jaxsafe.train import ppo, window
+from jaxsafe.train.checkpoint import Checkpoints
+from jaxsafe.train.config import TrainConfig
+from jaxsafe.train.files import append_rows, keep_rows
+from jaxsafe.train.log import Display, ProgressLog, progress_rows
+from jaxsafe.train.ppo import TrainState
+from jaxsafe.train.restore import structure
+from jaxsafe.train.seeds import SeedMapper
+
+EVALUATION_SEED = 0
+"""Of the evaluations during and after training; `python -m jaxsafe.evaluate seed=…` chooses others."""
+
+
+class Training:
+    """One run: all seeds of one configuration."""
+
+    def __init__(self, config: TrainConfig, env: Environment, run: Path, began: float) -> None:
+        """Prepare the compiled functions and the state, fresh or from the latest checkpoint of `run`."""
+        self.config, self.env, self.run, self.began = config, env, run, began
+        self.mapper = SeedMapper(config.seeds)
+        self.shared = self.mapper.replicate((env, config.agent, config.ppo))
+        self.chunk = max(1, min(config.num_updates // 50, 100_000 // config.ppo.batch_size))
+        self.evaluator = Evaluator(self.mapper, env, config.agent)
+        self.checkpoints = Checkpoints(run, create=True)
+        self.elapsed = self.compile_s = 0.0
+        self.updates = 0
+        self._restore_or_init()
+        self.log = ProgressLog(run, self.step, config.tensorboard)
+        keep_rows(run / "eval.jsonl", lambda row: row["step"] <= self.step and not row["final"])
+        keep_rows(run / "episodes.jsonl", lambda row: row["step"] <= self.step and not row["final"])
+
+    @property
+    def step(self) -> int:
+        """Environment steps that each seed has taken."""
+        return self.updates * self.config.ppo.batch_size
+
+    @property
+    def wall_s(self) -> float:
+        """Seconds spent on this run so far, over all its sessions."""
+        return self.elapsed + time.monotonic() - self.began
+
+    def train(self) -> bool:
+        """Train to the end; False if the user asked to stop before. Either way the state is in a checkpoint."""
+        display = Display(self.config.num_updates * self.config.ppo.batch_size, self.step)
+        advance = self._compile()
+        display.start()
+        with _StopRequest() as stop:
+            while self.updates < self.config.num_updates and not stop.requested:
+                before, (self.state, curves) = self.updates, advance(self.shared, self.state)
+                self.updates = min(before + self.chunk, self.config.num_updates)
+                self._write_progress(curves, self.updates - before, display)
+                if self._due(before, self.config.eval_every):
+                    self._evaluate()
+                if self._due(before, self.config.checkpoint_every) or stop.requested:
+                    self._save()
+        display.close()
+        self.log.close()
+        return self.updates == self.config.num_updates
+
+    def params(self) -> list[Any]:
+        """The networks of each seed, on the host."""
+        stacked = self.mapper.gather(self.state.params)
+        return [jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(self.config.seeds)]
+
+    def evaluate_finally(self) -> dict[str, Episode]:
+        """The evaluation that stands in the results, by kind; its rows go to the logs."""
+        found = {}
+        for kind in KINDS:
+            found[kind] = self._run_episodes(kind, self.config.episodes, final=True)
+        self._record(self.config.episodes, final=True)
+        return found
+
+    def _restore_or_init(self) -> None:
+        steps = self.checkpoints.steps
+        if not steps:
+            self.state = self.mapper.map(_init)(self.shared, self.mapper.keys(self.config.seed))
+            self.best = {"params": self.state.params, "success": self.mapper.place(jnp.full(self.mapper.padded, -1.0))}
+            return
+        content, facts = self.checkpoints.restore(steps[-1], structure(self.mapper, self.env, self.config))
+        self.state, self.best = content["state"], content["best"]
+        self.updates, self.elapsed, self.compile_s = facts["updates"], facts["wall_s"], facts["compile_s"]
+
+    def _compile(self) -> Any:
+        """Compile the chunk ahead of time, so that its cost is known."""
+
+        def advance(shared: tuple, state: TrainState) -> tuple[TrainState, dict]:
+            return _chunk(shared, state, self.chunk, self.config.num_updates)
+
+        begin = time.monotonic()
+        compiled = self.mapper.map(advance).lower(self.shared, self.state).compile()
+        self.compile_s += time.monotonic() - begin
+        return compiled
+
+    def _due(self, before: int, every: int | None) -> bool:
+        """Whether a chunk that began at update `before` passed a multiple of the interval or the end."""
+        interval = self.config.every(every)
+        return self.updates // interval > before // interval or self.updates == self.config.num_updates
+
+    def _write_progress(self, curves: dict[str, jax.Array], count: int, display: Display) -> None:
+        host = {name: value[:, :count] for name, value in self.mapper.gather(curves).items()}
+        rows = progress_rows(self.env, host, self.config.seed, self.config.ppo.batch_size, self.wall_s)
+        self.log.write(rows)
+        display.show(self.step, rows[-self.config.seeds :])
+
+    def _evaluate(self) -> None:
+        """Periodic evaluation: rows, one logged episode, and the best parameters of each seed so far."""
+        episodes = self._run_episodes("deterministic", self.config.eval_episodes, final=False)
+        self._record(self.config.eval_episodes, final=False)
+        rate = np.mean(np.asarray(episodes.outcome) == success_index(self.env), axis=1)
+        success = self.mapper.place(jnp.asarray(self.mapper.pad(rate), jnp.float32))
+        self.best = _keep_best(self.best, {"params": self.state.params, "success": success})
+
+    def _run_episodes(self, kind: str, num_episodes: int, final: bool) -> Episode:
+        deterministic = kind == "deterministic"
+        episodes = self.evaluator.run(self.state.params, num_episodes, EVALUATION_SEED, deterministic)
+        rows = episode_rows(self.env, episodes, self.config.seed, step=self.step, kind=kind, final=final)
+        append_rows(self.run / "eval.jsonl", rows)
+        return episodes
+
+    def _record(self, num_episodes: int, final: bool) -> None:
+        """Log some episodes of the first seed step by step."""
+        count = -(-num_episodes // self.config.log_every)
+        recorded = self.evaluator.record(self.params()[0], count, EVALUATION_SEED)
+        facts = {"step": self.step, "seed": self.config.seed, "kind": "deterministic", "final": final}
+        for number, rows in enumerate(recorded):
+            append_rows(self.run / "episodes.jsonl", ({**facts, "episode": number, **row} for row in rows))
+
+    def _save(self) -> None:
+        facts = {"updates": self.updates, "wall_s": self.wall_s, "compile_s": self.compile_s}
+        self.checkpoints.save(self.step, {"state": self.state, "best": self.best}, facts)
+
+
+def _init(shared: tuple, key: jax.Array) -> TrainState:
+    env, agent, hyper = shared
+    return ppo.init(env, agent, hyper, key)
+
+
+def _chunk(shared: tuple, state: TrainState, length: int, limit: int) -> tuple[TrainState, dict[str, jax.Array]]:
+    """`length` updates, fewer at the end of the run, with the averages of the window after each."""
+    env, agent, hyper = shared
+
+    def one(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
+        going = state.num_updates < limit
+        state = jax.lax.cond(going, lambda s: ppo.update(env, agent, hyper, limit, s), lambda s: s, state)
+        row = {"update": state.num_updates, "count": state.window.count, **window.means(state.window, env.outcomes)}
+        return state, row
+
+    return jax.lax.scan(one, state, None, length=length)
+
+
+@jax.jit
+def _keep_best(best: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+    """Per seed, whichever succeeded more often; the later one if equal."""
+    better = now["success"] >= best["success"]
+    return jax.tree.map(lambda a, b: jnp.where(better.reshape(-1, *(1,) * (a.ndim - 1)), a, b), now, best)
+
+
+class _StopRequest:
+    """Turns the first Ctrl-C or termination into a flag, so that the run stops between chunks; the second acts as usual."""
+
+    def __enter__(self) -> _StopRequest:
+        self.requested = False
+        self._previous = {number: signal.signal(number, self._set) for number in (signal.SIGINT, signal.SIGTERM)}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _set(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
+        signal.signal(number, self._previous[signal.Signals(number)])

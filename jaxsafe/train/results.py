@@ -1,0 +1,88 @@
+"""The end of a run: `results.json`, the policy files, and the table that is printed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from jaxsafe.environment import Environment
+from jaxsafe.evaluate.seeds import metrics_over_seeds
+from jaxsafe.metrics import Episode, interaction_efficiency
+from jaxsafe.train.config import TrainConfig
+from jaxsafe.train.directory import versions
+from jaxsafe.train.files import write_json
+from jaxsafe.train.loop import Training
+from jaxsafe.train.policy import save_policy
+
+_ROWS = (
+    ("success_rate", "success rate", "%"),
+    ("average_return", "average return", ""),
+    ("episode_length", "episode length [s]", ""),
+    ("control_usage", "control usage Δv [m/s]", ""),
+    ("control_usage_l1", "control usage Δv, L1 [m/s]", ""),
+    ("safety_violation_rate", "episodes with a violation", "%"),
+    ("episode_safety_violation_rate", "violating steps", "%"),
+    ("episode_violation_severity_mean", "violation severity, mean", "%"),
+    ("episode_violation_severity_max", "violation severity, max", "%"),
+)
+
+
+def finish(training: Training, config: TrainConfig, env: Environment, name: str) -> dict[str, Any]:
+    """Evaluate, write policies and results, and return the results."""
+    episodes = training.evaluate_finally()
+    for index, params in enumerate(training.params()):
+        about = {"env": name, "preset": config.preset, "seed": config.seed + index, "step": training.step}
+        save_policy(training.run / "policy" / f"seed_{config.seed + index}.npz", env, config.agent, params, about)
+    results = {
+        **facts(config, name),
+        "steps": training.step,
+        "wall_s": round(training.wall_s, 2),
+        "compile_s": round(training.compile_s, 2),
+        "versions": versions(),
+        "interaction_efficiency": _efficiency(training),
+        "evaluation": evaluation(env, episodes),
+    }
+    write_json(training.run / "results.json", results)
+    return results
+
+
+def facts(config: TrainConfig, name: str) -> dict[str, Any]:
+    """What every result says about the run that it belongs to."""
+    return {"env": name, "preset": config.preset, "seeds": config.seeds, "seed": config.seed}
+
+
+def evaluation(env: Environment, episodes: dict[str, Episode]) -> dict[str, Any]:
+    """The metrics of each kind of evaluation."""
+    return {kind: metrics_over_seeds(env, one) for kind, one in episodes.items()}
+
+
+def table(results: dict[str, Any], path: Path) -> str:
+    """The results as text: a column for each kind, mean and 95 % interval over seeds."""
+    found = results["evaluation"]
+    count = results["seeds"]
+    lines = [
+        f"{results['env']}, preset {results['preset']}, {count} seed{'s' * (count != 1)}, {results['steps']:,} steps each"
+    ]
+    lines += ["", f"{'':28}" + "".join(f"{kind:>26}" for kind in found)]
+    for name, label, unit in _ROWS:
+        if all(one[name]["mean"] is not None for one in found.values()):
+            lines.append(f"{label:28}" + "".join(f"{_cell(one[name], unit):>26}" for one in found.values()))
+    worst = {kind: min(one["success_rate"]["per_seed"]) for kind, one in found.items()}
+    lines.append(f"{'worst seed, success rate':28}" + "".join(f"{value:>26.1%}" for value in worst.values()))
+    if "interaction_efficiency" in results:
+        steps = results["interaction_efficiency"]["timesteps"]
+        lines += ["", f"80 % training success after {f'{steps:,} steps' if steps else 'never'}"]
+        lines += [f"{results['wall_s']:.1f} s in total, {results['compile_s']:.1f} s of it compiling the training"]
+    return "\n".join([*lines, f"results in {path}"])
+
+
+def _efficiency(training: Training) -> dict[str, Any]:
+    steps, success = training.log.curve("success_rate")
+    return interaction_efficiency(steps, success, training.log.curve("episodes")[1])
+
+
+def _cell(metric: dict[str, Any], unit: str) -> str:
+    low, high = metric["ci95"]
+    if unit == "%":
+        return f"{100 * metric['mean']:.2f} [{100 * low:.2f}, {100 * high:.2f}] %"
+    return f"{metric['mean']:.2f} [{low:.2f}, {high:.2f}]"

@@ -1,0 +1,161 @@
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jaxsafe import cli
+from jaxsafe.config import __main__ as config
+from jaxsafe.errors import ConfigError
+from jaxsafe.evaluate import __main__ as evaluate
+from jaxsafe.plot import __main__ as plot
+from jaxsafe.train import __main__ as train
+from jaxsafe.train.policy import read_policy
+
+
+@pytest.fixture
+def fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
+    """Run a command in an empty directory; it must leave with code 2 and one line on standard error, which is returned."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(module: object, *words: str) -> str:
+        monkeypatch.setattr(sys, "argv", ["jaxsafe", *words])
+        with pytest.raises(SystemExit) as exit_info:
+            cli.run(module.main, module.usage)  # type: ignore[attr-defined]
+        captured = capsys.readouterr()
+        assert exit_info.value.code == 2
+        assert captured.err.count("\n") == 1
+        assert captured.err.startswith("error: ")
+        return captured.err
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["env=doking3d"], "env: unknown task 'doking3d' and not a .yaml file; choose from docking2d, docking3d. "
+         "Did you mean 'docking3d'?"),
+        (["seeds=2"], "env: missing; for instance env=docking3d"),
+        (["env="], "env: expected a name or a path, found None"),
+        (["env=docking3d", "sedes=2"], "sedes: unknown field 'sedes'; choose from"),
+        (["env=docking3d", "sedes=2"], "Did you mean 'seeds'?"),
+        (["env=docking3d", "seeds=0"], "seeds: expected a whole number ≥ 1, found 0"),
+        (["env=docking3d", "seeds=ten"], "seeds: expected a whole number ≥ 1, found 'ten'"),
+        (["env=docking3d", "seeds=2.5"], "seeds: expected a whole number ≥ 1, found 2.5"),
+        (["env=docking3d", "seed=-1"], "seed: expected a whole number in [0, 2"),
+        (["env=docking3d", "seeds=2", "seeds=3"], "seeds: given twice"),
+        (["env=docking3d", "seeds"], "argument 'seeds': expected key=value"),
+        (["env=docking3d", "preset=featurs"], "preset: unknown preset 'featurs'; choose from features, plain. "
+         "Did you mean 'features'?"),
+        (["env=docking3d", "ppo.gama=0.9"], "ppo.gama: unknown field 'gama'"),
+        (["env=docking3d", "ppo.gamma=1.5"], "ppo.gamma: expected a number in [0, 1], found 1.5"),
+        (["env=docking3d", "ppo.gamma=high"], "ppo.gamma: expected a number in [0, 1], found 'high'"),
+        (["env=docking3d", "ppo.gamma=true"], "ppo.gamma: expected a number in [0, 1], found True"),
+        (["env=docking3d", "ppo.learning_rate=.nan"], "ppo.learning_rate: expected a number > 0, found nan"),
+        (["env=docking3d", "ppo.num_minibatches=3"], "ppo.num_minibatches: expected a divisor of"),
+        (["env=docking3d", "agent.features=dock"], "agent.features: found 'dock'; choose from none, docking. "
+         "Did you mean 'docking'?"),
+        (["env=docking3d", "actions=discret"], "Did you mean 'discrete'?"),
+        (["env=docking3d", "tensorboard=maybe"], "tensorboard: expected true or false, found 'maybe'"),
+        (["env=docking3d", "env.reward.delta_v.scal=1"], "reward.delta_v.scal: unknown field 'scal'"),
+        (["env=docking3d", "env.deputy.mass=-1"], "deputy.mass: expected a number in kg > 0, found -1"),
+        (["env=nowhere.yaml"], "nowhere.yaml: cannot be read: No such file or directory"),
+        (["resume=runs/x"], "resume: no run in 'runs/x' (a directory with config.yaml)"),
+        (["resume=runs/x", "steps=5"], "steps: unknown option; choose from resume"),
+        (["env=docking3d", "out=/proc/nowhere"], "out: cannot write /proc/nowhere"),
+    ],
+)  # fmt: skip
+def test_bad_options_of_train_are_told_in_one_line(fails: Callable[..., str], words: list[str], message: str) -> None:
+    assert message in fails(train, *words)
+    assert not list(Path.cwd().iterdir())  # and nothing was begun
+
+
+def test_numbers_in_exponent_form_are_numbers(fails: Callable[..., str]) -> None:
+    assert "found -1000000" in fails(train, "env=docking3d", "steps=-1e6")
+    assert "steps: expected a whole number ≥ 1, found 0.0003" in fails(train, "env=docking3d", "steps=3e-4")
+
+
+def test_a_directory_that_holds_something_is_never_overwritten(fails: Callable[..., str], tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.yaml").write_text("precious")
+    message = fails(train, "env=docking3d", "out=run")
+    assert "out: run already holds something and is never overwritten; continue it with resume=run" in message
+    assert (tmp_path / "run" / "config.yaml").read_text() == "precious"
+
+
+def test_an_unwritable_output_is_told_in_one_line(fails: Callable[..., str], tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    assert "out: cannot write" in fails(train, "env=docking3d", "out=file/run")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "run: missing"),
+        (["run=runs/x"], "run: no run in 'runs/x'"),
+        (["run=runs/x", "episodes=0"], "episodes: expected a whole number ≥ 1, found 0"),
+        (["run=runs/x", "deterministic=maybe"], "deterministic: expected true or false, found 'maybe'"),
+        (["run=runs/x", "episods=5"], "episods: unknown option; choose from"),
+    ],
+)
+def test_bad_options_of_evaluate_are_told_in_one_line(fails: Callable[..., str], words: list[str], message: str) -> None:
+    assert message in fails(evaluate, *(words or ["seed=1"]))
+
+
+def test_bad_options_of_plot_are_told_in_one_line(fails: Callable[..., str]) -> None:
+    assert "run: no run in 'x'" in fails(plot, "run=x")
+    assert "x: unknown axis 'stps'; choose from steps, wall. Did you mean 'steps'?" in fails(plot, "run=x", "x=stps")
+
+
+def test_bad_options_of_config_are_told_in_one_line(fails: Callable[..., str]) -> None:
+    assert "Did you mean 'docking2d'?" in fails(config, "docking2")
+
+
+def test_a_broken_run_configuration_is_told_in_one_line(fails: Callable[..., str], tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.yaml").write_text("env: docking2d\ntraining: {sedes: 3}\nenvironment: {}\n")
+    assert "config.yaml: training: unknown field 'sedes'" in fails(evaluate, "run=run")
+    (tmp_path / "run" / "config.yaml").write_text("env: [\n")
+    assert "not valid YAML" in fails(train, "resume=run")
+    (tmp_path / "run" / "config.yaml").write_text("env: !!python/object/apply:os.system ['touch hacked']\n")
+    assert "not valid YAML" in fails(train, "resume=run")
+    assert not (tmp_path / "hacked").exists()
+
+
+def test_policy_files_cannot_run_code_and_broken_ones_are_told_in_one_line(tmp_path: Path) -> None:
+    class Evil:
+        def __reduce__(self) -> tuple:
+            return (Path.touch, (tmp_path / "hacked",))
+
+    np.savez(tmp_path / "evil.npz", header=np.array(Evil(), dtype=object))
+    with pytest.raises(ConfigError, match=r"evil\.npz: not a policy file"):
+        read_policy(tmp_path / "evil.npz")
+    assert not (tmp_path / "hacked").exists()
+    (tmp_path / "text.npz").write_text("hello")
+    with pytest.raises(ConfigError, match="not a policy file"):
+        read_policy(tmp_path / "text.npz")
+    np.savez(tmp_path / "other.npz", weights=np.ones(3))
+    with pytest.raises(ConfigError, match="not a policy file"):
+        read_policy(tmp_path / "other.npz")
+    with pytest.raises(ConfigError, match="cannot be read: No such file"):
+        read_policy(tmp_path / "none.npz")
+
+
+@pytest.mark.parametrize("module", ["train", "evaluate", "plot", "config"])
+def test_help_names_the_options(module: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    command = {"train": train, "evaluate": evaluate, "plot": plot, "config": config}[module]
+    monkeypatch.setattr(sys, "argv", ["jaxsafe", "--help"])
+    with pytest.raises(SystemExit) as exit_info:
+        cli.run(command.main, command.usage)
+    assert exit_info.value.code == 0
+    assert f"usage: python -m jaxsafe.{module}" in capsys.readouterr().out
+
+
+def test_import_draws_in_only_what_the_core_needs() -> None:
+    heavy = ("yaml", "orbax", "optax", "matplotlib", "gymnasium", "flax", "tqdm")
+    code = f"import sys, jaxsafe; print([name for name in {heavy} if name in sys.modules])"
+    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert found.stdout.strip() == "[]"

@@ -1,0 +1,91 @@
+import json
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import jaxsafe
+from jaxsafe.errors import ConfigError
+from jaxsafe.evaluate.__main__ import main
+from jaxsafe.evaluate.episodes import longest, record_episodes, run_episodes
+
+
+def zero(key: jax.Array, observation: jax.Array) -> jax.Array:
+    return jax.numpy.zeros((*observation.shape[:-1], 2))
+
+
+def test_the_runs_own_results_come_out_again(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([f"run={whole}", "episodes=6", f"out={tmp_path / 'again'}"]) == 0
+    again = json.loads((tmp_path / "again" / "results.json").read_text())
+    own = json.loads((whole / "results.json").read_text())
+    for kind in ("stochastic", "deterministic"):
+        assert again["evaluation"][kind] == own["evaluation"][kind]
+    assert "success rate" in capsys.readouterr().out
+    rows = [json.loads(line) for line in (tmp_path / "again" / "eval.jsonl").read_text().splitlines()]
+    assert len(rows) == 2 * 3 * 6
+
+
+def test_evaluations_get_directories_of_their_own(whole: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    before = (run / "results.json").read_bytes()
+    for _ in range(2):
+        assert main([f"run={run}", "episodes=2", "deterministic=true", "checkpoint=best"]) == 0
+    assert main([f"run={run}", "episodes=2", "checkpoint=640", "env.deputy.mass=24", "seed=3"]) == 0
+    names = sorted(path.name for path in (run / "evaluations").iterdir())
+    assert names == ["640-2-seed3-changed", "best-2-seed0", "best-2-seed0-2"]
+    assert (run / "results.json").read_bytes() == before
+    results = json.loads((run / "evaluations" / "640-2-seed3-changed" / "results.json").read_text())
+    assert results["changes"] == {"deputy.mass": 24}
+    assert results["steps"] == 640
+    with pytest.raises(ConfigError, match="never overwritten"):
+        main([f"run={run}", "episodes=2", f"out={run / 'evaluations' / 'best-2-seed0'}"])
+
+
+def test_a_checkpoint_that_is_not_there_is_told_with_those_that_are(whole: Path) -> None:
+    with pytest.raises(ConfigError, match=r"checkpoint: no step 641 in .*; choose from 320, 640, 960, 1280"):
+        main([f"run={whole}", "checkpoint=641"])
+    with pytest.raises(ConfigError, match=r"checkpoint: found 'lst'; choose from last, best, 320.*Did you mean 'last'\?"):
+        main([f"run={whole}", "checkpoint=lst"])
+
+
+@pytest.mark.parametrize("damage", ["cut", "garbage", "gone"])
+def test_a_corrupt_checkpoint_is_told_in_one_line(whole: Path, tmp_path: Path, damage: str) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    for path in (run / "checkpoints" / "1280" / "state").rglob("*"):
+        if path.is_file() and damage == "gone":
+            path.unlink()
+        elif path.is_file():
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2] if damage == "cut" else b"garbage")
+    with pytest.raises(ConfigError, match=r"1280: checkpoint cannot be read: ") as error:
+        main([f"run={run}"])
+    assert "\n" not in str(error.value)
+
+
+def test_recorded_episodes_are_those_that_were_evaluated() -> None:
+    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 30.0})
+    key = jax.random.key(5)
+    episodes = run_episodes(env, zero, key, 6)
+    states, timesteps = record_episodes(env, zero, key, 2, int(longest(env)))
+    for i in range(2):
+        last = int(np.flatnonzero(timesteps.done[:, i])[0])
+        assert last == int(episodes.length[i])
+        assert float(timesteps.reward[1 : last + 1, i].sum()) == pytest.approx(float(episodes.episode_return[i]), rel=1e-5)
+    np.testing.assert_allclose(states.sim.time[:, 0], np.arange(32))
+
+
+def test_every_episode_is_counted_once_however_short() -> None:
+    # A biased evaluation would run the same number of steps in each lane and so see more of the short episodes.
+    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 200.0, "terminal.distance.limit": 130.0})
+    episodes = run_episodes(env, zero, jax.random.key(0), 500)
+    outcomes = np.asarray(episodes.outcome)
+    start = jax.vmap(lambda key: env.reset(key)[0].sim.status["docking_distance"])(
+        jax.random.split(jax.random.split(jax.random.key(0))[0], 500)
+    )
+    assert (outcomes > 0).all()
+    beyond = np.asarray(start) > 131.0
+    assert (outcomes[beyond] == env.outcomes.index("distance")).mean() > 0.9
+    assert (np.asarray(episodes.length) <= 201).all()

@@ -1,0 +1,104 @@
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from jaxsafe.errors import ConfigError
+from jaxsafe.metrics import bootstrap_interval
+from jaxsafe.plot.__main__ import main
+from jaxsafe.plot.figures import draw_all, speed_distance, training_curves, trajectories
+
+
+def rows(num_updates: int = 50, num_seeds: int = 4) -> list[dict]:
+    rng = np.random.default_rng(0)
+    curves = np.cumsum(rng.random((num_updates, num_seeds)), axis=0) / num_updates
+    names = ("success_rate", "return", "length", "delta_v", "violating_steps")
+    return [
+        {
+            "seed": 7 + i,
+            "step": 100 * (j + 1),
+            "wall_s": 0.5 * j,
+            **dict.fromkeys(names, None if j < 3 else float(curves[j, i])),
+        }
+        for j in range(num_updates)
+        for i in range(num_seeds)
+    ]
+
+
+def test_curves_show_each_seed_their_mean_and_its_interval() -> None:
+    figure = training_curves(rows(), "steps", "title")
+    panel = figure.axes[0]
+    assert panel.get_xlabel() == "environment steps per seed"
+    assert panel.get_ylabel() == "success rate [%]"
+    mean = next(line for line in panel.lines if line.get_label() == "mean")
+    values = np.array([row["success_rate"] or np.nan for row in rows()]).reshape(50, 4)[3:]  # nothing finished before
+    np.testing.assert_allclose(mean.get_ydata(), 100 * values.mean(axis=1))
+    np.testing.assert_allclose(mean.get_xdata(), 100 * np.arange(4, 51))
+    shaded = panel.collections[0].get_paths()[0].vertices
+    assert shaded[:, 1].max() == pytest.approx(100 * bootstrap_interval(values)[1].max())
+    assert len(panel.lines) == 4 + 1 + 1 + 1  # seeds, the label, the mean, the 80 % line
+
+
+def test_a_run_in_which_no_episode_ended_has_curves_that_say_so() -> None:
+    panels = training_curves(rows(num_updates=3), "steps", "title").axes
+    assert [panel.texts[0].get_text() for panel in panels] == ["no episode has ended yet"] * 3
+
+
+def test_curves_over_wall_time_use_the_clock() -> None:
+    panel = training_curves(rows(), "wall", "title").axes[1]
+    assert panel.get_xlabel() == "wall time [s]"
+    assert panel.get_xlim()[1] == pytest.approx(24.5)
+
+
+def episode(step: int, dimension: int) -> tuple[int, list[dict]]:
+    path = np.linspace(np.full(dimension, 80.0), np.zeros(dimension), 20)
+    status = [
+        {
+            "docking_distance": float(np.linalg.norm(p)),
+            "speed": 0.2,
+            "velocity_limit": 0.2 + 0.002 * float(np.linalg.norm(p)),
+        }
+        for p in path
+    ]
+    platforms = [{"chief": {"position": [0.0] * dimension}, "deputy": {"position": list(p)}} for p in path]
+    return step, [{"status": s, "platforms": p} for s, p in zip(status, platforms, strict=True)]
+
+
+@pytest.mark.parametrize(("dimension", "panels"), [(2, 1), (3, 2)])
+def test_trajectories_have_a_panel_for_each_plane(dimension: int, panels: int) -> None:
+    figure = trajectories([episode(100, dimension), episode(200, dimension)], "title")
+    axes = [panel for panel in figure.axes if panel.get_xlabel() == "x [m]"]
+    assert len(axes) == panels
+    np.testing.assert_allclose(axes[0].lines[0].get_xdata(), np.linspace(80.0, 0.0, 20))
+
+
+def test_the_speed_limit_is_drawn_from_the_log() -> None:
+    panel = speed_distance([episode(100, 2)], "title").axes[0]
+    limit = next(line for line in panel.lines if line.get_label() == "speed limit")
+    np.testing.assert_allclose(limit.get_ydata(), 0.2 + 0.002 * np.asarray(limit.get_xdata()))
+    assert (panel.get_xlabel(), panel.get_ylabel()) == ("distance to the chief [m]", "speed [m/s]")
+
+
+def test_figures_come_from_the_log_files_alone(whole: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    for name in ("config.yaml", "progress.jsonl", "episodes.jsonl"):
+        shutil.copy(whole / name, run / name)
+    assert main([f"run={run}", "x=wall"]) == 0
+    drawn = {path.name for path in (run / "figures").iterdir()}
+    assert drawn == {"training_wall.png", "trajectories.png", "speed_distance.png"}
+    image = imread(run / "figures" / "training_wall.png")
+    assert image.shape[0] > 300
+    assert image[..., :3].std() > 0.05  # not blank
+
+
+def test_a_run_without_rows_is_told_in_one_line(whole: Path, tmp_path: Path) -> None:
+    shutil.copy(whole / "config.yaml", tmp_path / "config.yaml")
+    with pytest.raises(ConfigError, match=r"has no rows in progress\.jsonl yet"):
+        draw_all(tmp_path)
+    (tmp_path / "progress.jsonl").write_text(json.dumps({"seed": 0}) + "\nbroken\n{}\n")
+    with pytest.raises(ConfigError, match=r"progress\.jsonl, line 2"):
+        draw_all(tmp_path)

@@ -1,0 +1,220 @@
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from tiny import TINY
+
+from jaxsafe import cli
+from jaxsafe.train import __main__ as command
+from jaxsafe.train import directory
+from jaxsafe.train.checkpoint import Checkpoints
+from jaxsafe.train.loop import Training
+from jaxsafe.train.policy import load_policy, read_policy
+from jaxsafe.train.restore import structure
+from jaxsafe.train.seeds import SeedMapper
+
+
+def logs(run: Path) -> dict[str, list[dict[str, Any]]]:
+    """All rows of the logs but for the clock."""
+    found = {}
+    for name in ("progress.jsonl", "eval.jsonl", "episodes.jsonl"):
+        found[name] = [json.loads(line) for line in (run / name).read_text().splitlines()]
+        for row in found[name]:
+            row.pop("wall_s", None)
+    return found
+
+
+def final_state(run: Path) -> Any:
+    config, env, _ = directory.read(run, "run")
+    mapper, checkpoints = SeedMapper(config.seeds), Checkpoints(run)
+    content, facts = checkpoints.restore(checkpoints.steps[-1], structure(mapper, env, config))
+    state = content["state"].replace(key=jax.random.key_data(content["state"].key))
+    return {"state": state, "best": content["best"], "updates": facts["updates"]}
+
+
+def assert_same_end(run: Path, whole: Path) -> None:
+    assert logs(run) == logs(whole)
+    jax.tree.map(np.testing.assert_array_equal, final_state(run), final_state(whole))
+    for policy in sorted((whole / "policy").iterdir()):
+        one, other = np.load(policy), np.load(run / "policy" / policy.name)
+        assert {name: one[name].tobytes() for name in one.files} == {name: other[name].tobytes() for name in other.files}
+
+
+def test_a_run_directory_holds_everything(whole: Path) -> None:
+    names = {path.name for path in whole.iterdir()}
+    assert names == {
+        "config.yaml", "progress.jsonl", "progress.csv", "eval.jsonl", "episodes.jsonl", "checkpoints", "policy", "figures",
+        "results.json",
+    }  # fmt: skip
+    assert {path.name for path in (whole / "policy").iterdir()} == {"seed_0.npz", "seed_1.npz", "seed_2.npz"}
+    assert {path.name for path in (whole / "figures").iterdir()} == {
+        "training_steps.png", "trajectories.png", "speed_distance.png",
+    }  # fmt: skip
+
+
+def test_progress_has_a_row_for_every_update_of_every_seed(whole: Path) -> None:
+    rows = logs(whole)["progress.jsonl"]
+    assert [(row["step"], row["seed"]) for row in rows] == [(64 * (u + 1), seed) for u in range(20) for seed in range(3)]
+    last = rows[-1]
+    outcomes = ("success", "crash", "distance", "timeout", "velocity")
+    assert sum(last[f"outcome/{name}"] for name in outcomes) == pytest.approx(1.0, abs=1e-5)
+    terms = ("distance_change", "velocity_constraint", "delta_v", "success", "failure")
+    assert sum(last[f"reward/{name}"] for name in terms) == pytest.approx(last["return"], abs=1e-4)
+    csv = (whole / "progress.csv").read_text().splitlines()
+    assert len(csv) == len(rows) + 1
+    assert csv[0].startswith("seed,step,wall_s")
+
+
+def test_results_follow_the_schema(whole: Path) -> None:
+    results = json.loads((whole / "results.json").read_text())
+    assert {"env", "preset", "seeds", "steps", "wall_s", "compile_s", "versions", "interaction_efficiency"} < set(results)
+    assert set(results["interaction_efficiency"]) == {"timesteps", "per_seed"}
+    for kind in ("stochastic", "deterministic"):
+        for metric in results["evaluation"][kind].values():
+            assert set(metric) == {"mean", "ci95", "iqm", "per_seed"}
+            assert len(metric["per_seed"]) == 3
+    rows = [row for row in logs(whole)["eval.jsonl"] if row["final"] and row["kind"] == "stochastic"]
+    assert len(rows) == 3 * 6
+    mean = results["evaluation"]["stochastic"]["average_return"]["mean"]
+    assert mean == pytest.approx(np.mean([row["return"] for row in rows]), rel=1e-4)
+
+
+def test_logged_episodes_hold_states_controls_statuses_and_rewards(whole: Path) -> None:
+    rows = logs(whole)["episodes.jsonl"]
+    assert {row["step"] for row in rows} == {320, 640, 960, 1280}
+    episode = [row for row in rows if row["step"] == 640]
+    assert [row["t"] for row in episode] == list(range(len(episode)))
+    assert [row["outcome"] for row in episode[:-1]] == ["running"] * (len(episode) - 1)
+    assert episode[-1]["outcome"] != "running"
+    assert set(episode[0]["control_actual"]) == {"thrust_x", "thrust_y"}
+    assert sum(episode[3]["reward_terms"].values()) == pytest.approx(episode[3]["reward"], abs=1e-5)
+
+
+class _CrashError(Exception):
+    pass
+
+
+def _crash_at(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, call: int, after: bool) -> None:
+    original: Callable[..., Any] = getattr(owner, name)
+    calls = iter(range(1, 1000))
+
+    def crashing(*args: Any, **kwargs: Any) -> Any:
+        last = next(calls) == call
+        if last and not after:
+            raise _CrashError
+        result = original(*args, **kwargs)
+        if last:
+            raise _CrashError
+        return result
+
+    monkeypatch.setattr(owner, name, crashing)
+
+
+@pytest.mark.parametrize(
+    ("name", "call", "after"),
+    [
+        ("_write_progress", 3, True),  # before any checkpoint
+        ("_write_progress", 7, True),  # rows that the checkpoint does not know
+        ("_evaluate", 2, True),
+        ("_save", 2, False),  # everything written but the checkpoint
+        ("_save", 4, True),  # trained, not yet evaluated
+        ("_run_episodes", 5, True),  # in the middle of the last evaluation
+    ],
+)
+def test_a_crashed_run_resumes_to_the_same_end(
+    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, name: str, call: int, after: bool
+) -> None:
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        _crash_at(patch, Training, name, call, after)
+        with pytest.raises(_CrashError):
+            command.main([*TINY, f"out={run}"])
+    assert command.main([f"resume={run}"]) == 0
+    assert_same_end(run, whole)
+
+
+def test_ctrl_c_stops_after_a_chunk_with_a_checkpoint_and_resumes(
+    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    original = Training._write_progress
+
+    def interrupt(self: Training, *args: Any) -> None:
+        original(self, *args)
+        if self.step == 448:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Training, "_write_progress", interrupt)
+        assert command.main([*TINY, f"out={run}"]) == cli.INTERRUPTED
+    assert f"stopped at step 448; go on with: python -m jaxsafe.train resume={run}" in capsys.readouterr().out
+    assert command.main([f"resume={run}"]) == 0
+    assert_same_end(run, whole)
+
+
+def test_resuming_a_complete_run_changes_nothing(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in whole.rglob("*")}
+    assert command.main([f"resume={whole}"]) == 0
+    assert "is complete" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in whole.rglob("*")} == before
+
+
+def test_runs_without_a_name_take_the_next_free_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "docking2d").mkdir(parents=True)
+    assert command.main(TINY) == 0
+    assert (tmp_path / "runs" / "docking2d-2" / "results.json").exists()
+
+
+def test_a_policy_file_acts_like_the_trained_network(whole: Path) -> None:
+    env, agent, params = read_policy(whole / "policy" / "seed_1.npz")
+    trained = jax.tree.map(lambda x: x[1], final_state(whole)["state"].params)
+    jax.tree.map(np.testing.assert_array_equal, params, trained)
+    _, timestep = env.reset(jax.random.key(0))
+    action = load_policy(whole / "policy" / "seed_1.npz")(jax.random.key(1), timestep.observation)
+    np.testing.assert_array_equal(action, agent.act(env, trained, jax.random.key(1), timestep.observation, True))
+
+
+@pytest.mark.slow
+def test_twenty_kills_at_random_moments_change_nothing(tmp_path: Path) -> None:
+    """Kill runs twenty times at random moments, resume each until it ends, and compare with a run left alone."""
+    longer = [*(word.replace("=320", "=4000") for word in TINY if not word.startswith("steps")), "steps=40000"]
+    call, whole, rng = [sys.executable, "-m", "jaxsafe.train"], tmp_path / "whole", random.Random(0)
+    for out in (tmp_path / "first", whole):  # the second finds its programs compiled, as the runs to be killed will
+        begin = time.monotonic()
+        subprocess.run([*call, *longer, f"out={out}"], check=True, capture_output=True)
+        usual = time.monotonic() - begin
+    assert_same_end(tmp_path / "first", whole)
+    kills = ended = 0
+    while kills < 20 or not ended:
+        run = tmp_path / f"run-{ended}"
+        arguments = [f"resume={run}"] if (run / "config.yaml").exists() else [*longer, f"out={run}"]
+        process = subprocess.Popen([*call, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            process.wait(timeout=rng.uniform(0.1, 0.9) * usual if kills < 20 else None)
+        except subprocess.TimeoutExpired:
+            process.send_signal(rng.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGINT]))
+            process.wait()
+            kills += 1
+        if (run / "figures" / "speed_distance.png").exists():
+            assert_same_end(run, whole)
+            ended += 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["docking2d", "docking3d"])
+def test_the_default_recipe_learns_to_dock(tmp_path: Path, task: str) -> None:
+    assert command.main([f"env={task}", "seeds=2", "seed=2000", "episodes=200", f"out={tmp_path / 'run'}"]) == 0
+    results = json.loads((tmp_path / "run" / "results.json").read_text())
+    for kind in ("stochastic", "deterministic"):
+        assert min(results["evaluation"][kind]["success_rate"]["per_seed"]) > 0.9
