@@ -15,6 +15,7 @@ import pytest
 from tiny import TINY
 
 from jaxsafe import cli
+from jaxsafe.errors import ConfigError
 from jaxsafe.train import __main__ as command
 from jaxsafe.train import directory
 from jaxsafe.train.checkpoint import Checkpoints
@@ -218,3 +219,17 @@ def test_the_default_recipe_learns_to_dock(tmp_path: Path, task: str) -> None:
     results = json.loads((tmp_path / "run" / "results.json").read_text())
     for kind in ("stochastic", "deterministic"):
         assert min(results["evaluation"][kind]["success_rate"]["per_seed"]) > 0.9
+
+
+def test_tensorboard_gets_the_progress_of_every_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = tmp_path / "run"
+    assert command.main([*TINY, "tensorboard=true", f"out={run}"]) == 0
+    (events,) = (run / "tensorboard").iterdir()
+    content = events.read_bytes()
+    for seed in range(3):
+        known = [row for row in logs(run)["progress.jsonl"] if row["seed"] == seed and row["return"] is not None]
+        assert content.count(f"return/seed_{seed}".encode()) == len(known) > 10
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    with pytest.raises(ConfigError, match=r"tensorboard: needs the extra, pip install 'jaxsafe\[tensorboard\]'"):
+        command.main([*TINY, "tensorboard=true", f"out={tmp_path / 'other'}"])
+    assert not (tmp_path / "other").exists()

@@ -18,6 +18,7 @@ from jaxsafe.environment import Environment
 from jaxsafe.envs import make
 from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.train.agent import Agent
+from jaxsafe.train.log import tensorboard_writer
 from jaxsafe.train.ppo import PPO
 
 Count = Annotated[int, Range(1)]
@@ -74,6 +75,8 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
             f"ppo.num_minibatches: expected a divisor of ppo.num_envs × ppo.num_steps = {config.ppo.batch_size},"
             f" found {config.ppo.num_minibatches}"
         )
+    if config.tensorboard:
+        tensorboard_writer()
     observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
     jax.eval_shape(lambda o: config.agent.inputs(env, o), observation)  # refuses features that this task cannot have
     return config, env, Path(task).stem

@@ -25,7 +25,7 @@ class ProgressLog:
             write_csv(self._csv, self.rows)
             if not self.rows:
                 self._csv.unlink()
-        self._board = _tensorboard(run, resume_step) if tensorboard else None
+        self._board = tensorboard_writer()(str(run / "tensorboard"), purge_step=resume_step) if tensorboard else None
 
     def write(self, rows: list[dict[str, Any]]) -> None:
         """Add rows to all logs."""
@@ -118,9 +118,14 @@ def _text(value: float | None, form: str) -> str:
     return "–" if value is None else format(value, form)
 
 
-def _tensorboard(run: Path, purge_step: int) -> Any:
+def tensorboard_writer() -> Any:
+    """The class that writes TensorBoard's files.
+
+    Raises:
+        ConfigError: the extra is not installed.
+    """
     try:
         from tensorboardX import SummaryWriter
     except ImportError:
         raise ConfigError("tensorboard: needs the extra, pip install 'jaxsafe[tensorboard]'") from None
-    return SummaryWriter(str(run / "tensorboard"), purge_step=purge_step)
+    return SummaryWriter
