@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError, nearest
@@ -80,8 +80,12 @@ class Arguments:
             raise ConfigError(f"{key}: unknown option; choose from {nearest(key, known)}")
 
 
-def run(main: Callable[[Sequence[str]], int | None], usage: Callable[[], str]) -> None:
-    """Run a command and leave with its exit code."""
+def run(
+    main: Callable[[Sequence[str]], int | None],
+    usage: Callable[[], str],
+    leave: Callable[[int], NoReturn] = sys.exit,
+) -> None:
+    """Run a command and leave with its exit code, by `leave` after an error."""
     argv = sys.argv[1:]
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(usage(), file=sys.stdout if argv else sys.stderr)
@@ -90,14 +94,21 @@ def run(main: Callable[[Sequence[str]], int | None], usage: Callable[[], str]) -
         sys.exit(main(argv) or 0)
     except ConfigError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
+        leave(2)
     except OSError as error:
         place = error.filename or "file"
         print(f"error: {place}: {error.strerror or error}", file=sys.stderr)
-        sys.exit(2)
+        leave(2)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(INTERRUPTED)
+
+
+def at_once(code: int) -> NoReturn:
+    """Leave without Python's shutdown: after a failed restore, orbax's threads would print tracebacks into it."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def enable_compilation_cache() -> None:

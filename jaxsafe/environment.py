@@ -141,7 +141,8 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
     Args:
         env: the environment.
         state: as returned by `reset` or `step`.
-        action: float in [−1, 1], shape (action_size,), clipped; or, with discrete actions, int indices of that shape.
+        action: float in [−1, 1], shape (action_size,), clipped; or, with discrete actions, int indices of that shape,
+            clipped to 0 … points − 1.
 
     Returns:
         The next state and the time step that led there.

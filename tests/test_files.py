@@ -20,6 +20,14 @@ def test_a_broken_line_in_the_middle_is_an_error_that_names_it(tmp_path: Path) -
         read_rows(log)
 
 
+def test_a_line_that_is_no_row_of_the_log_is_an_error_that_names_it(tmp_path: Path) -> None:
+    log = tmp_path / "log.jsonl"
+    for line in ('{"a": 1}', "[1]", "null0"):
+        log.write_text(line + "\n")
+        with pytest.raises(ConfigError, match=r"log\.jsonl, line 1: not a "):
+            read_rows(log, ("step",))
+
+
 def test_logs_are_cut_back_to_the_rows_to_keep(tmp_path: Path) -> None:
     log = tmp_path / "log.jsonl"
     append_rows(log, ({"step": step} for step in range(5)))

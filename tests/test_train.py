@@ -1,6 +1,7 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -233,3 +234,40 @@ def test_tensorboard_gets_the_progress_of_every_seed(tmp_path: Path, monkeypatch
     with pytest.raises(ConfigError, match=r"tensorboard: needs the extra, pip install 'jaxsafe\[tensorboard\]'"):
         command.main([*TINY, "tensorboard=true", f"out={tmp_path / 'other'}"])
     assert not (tmp_path / "other").exists()
+
+
+def test_nothing_is_lost_when_checkpoints_are_missing(
+    tmp_path: Path, whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    shutil.rmtree(run / "checkpoints")
+    for name in ("results.json", "progress.csv"):
+        (run / name).unlink()
+    assert command.main([f"resume={run}"]) == 0
+    assert "checkpoints after step 0 are missing" in capsys.readouterr().out
+    assert (run / "progress.jsonl.bak").read_bytes() == (whole / "progress.jsonl").read_bytes()
+    assert len((run / "progress.csv").read_text().splitlines()) == len((whole / "progress.csv").read_text().splitlines())
+    assert_same_end(run, whole)
+
+
+def test_a_damaged_progress_log_is_told_before_anything_is_done(tmp_path: Path, whole: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    (run / "results.json").unlink()
+    (run / "progress.jsonl").unlink()
+    with pytest.raises(ConfigError, match=r"progress\.jsonl: expected 60 rows up to step 1280, found 0"):
+        command.main([f"resume={run}"])
+
+
+def test_a_corrupt_checkpoint_leaves_one_line_on_standard_error(tmp_path: Path, whole: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    (run / "results.json").unlink()
+    for manifest in (run / "checkpoints" / "1280").rglob("manifest.ocdbt"):
+        manifest.write_bytes(b"")
+    call = [sys.executable, "-m", "jaxsafe.train", f"resume={run}"]
+    found = subprocess.run(call, capture_output=True, text=True, check=False)
+    assert found.returncode == 2
+    assert found.stderr.count("\n") == 1, found.stderr
+    assert "checkpoint cannot be read" in found.stderr

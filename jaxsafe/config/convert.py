@@ -147,7 +147,8 @@ def _number(value: Any, field: Field, place: str) -> jax.Array:
     if not isinstance(array, Tracer):
         with np.errstate(over="ignore"):  # beyond the largest float32 is infinite
             numbers = np.asarray(array, jnp.result_type(float))
-        if np.isnan(numbers).any() or (field.range and not all(number in field.range for number in np.atleast_1d(numbers))):
+        allowed = field.range is None or all(number in field.range for number in np.atleast_1d(numbers))
+        if np.isnan(numbers).any() or not allowed or (field.range and np.isinf(numbers).any()):
             raise wrong
         if length == 2 and numbers[0] > numbers[1]:
             raise ConfigError(f"{place}: expected low ≤ high, found {_show(value)}")

@@ -30,18 +30,18 @@ def main(argv: Sequence[str]) -> int:
     arguments.refuse_rest([*OPTIONS, "env.…"])
     if run is None:
         raise ConfigError("run: missing; for instance run=runs/docking3d")
-    if deterministic not in (None, True, False):
+    if not (deterministic is None or isinstance(deterministic, bool)):
         raise ConfigError(f"deterministic: expected true or false, found {deterministic!r}")
     kinds = {None: ("stochastic", "deterministic"), True: ("deterministic",), False: ("stochastic",)}[deterministic]
     config, env, name = directory.read(Path(run), "run")
-    env = override(env, changes)
+    changed = override(env, changes)
     request: dict[str, Any] = {
         "episodes": episodes,
         "evaluation_seed": seed,
         "checkpoint": checkpoint or "last",
         "changes": changes,
     }
-    path, results = evaluate_run(Path(run), config, env, name, kinds, request, Path(out) if out else None)
+    path, results = evaluate_run(Path(run), config, (env, changed), name, kinds, request, Path(out) if out else None)
     print(table(results, path))
     return 0
 
@@ -60,4 +60,4 @@ def usage() -> str:
 
 
 if __name__ == "__main__":
-    cli.run(main, usage)
+    cli.run(main, usage, cli.at_once)

@@ -20,7 +20,7 @@ from jaxsafe.train.seeds import SeedMapper
 def evaluate_run(
     run: Path,
     config: TrainConfig,
-    env: Environment,
+    envs: tuple[Environment, Environment],
     name: str,
     kinds: Sequence[str],
     request: dict[str, Any],
@@ -31,17 +31,22 @@ def evaluate_run(
     Args:
         run: the run directory.
         config: its configuration.
-        env: the environment to evaluate in.
+        envs: the environment it was trained in, and the one to evaluate in.
         name: the environment's name.
         kinds: of `stochastic` and `deterministic`.
         request: `episodes`, `evaluation_seed`, `checkpoint`, and anything else to put into the results.
         out: a new directory; None makes one in `<run>/evaluations`.
 
     Raises:
-        ConfigError: there is no such checkpoint, or `out` holds something.
+        ConfigError: there is no such checkpoint, `out` holds something, or the policies do not fit the environment.
     """
+    own, env = envs
+    for what in ("observation_size", "action_names", "num_action_points"):
+        found, needed = getattr(env, what), getattr(own, what)
+        if found != needed:
+            raise ConfigError(f"env: the change gives {what} {found}, the policies of {run} have {needed}")
     mapper = SeedMapper(config.seeds)
-    params, step = load_params(mapper, run, config, env, request["checkpoint"])
+    params, step = load_params(mapper, run, config, own, request["checkpoint"])
     out = _make_directory(run, out, request)
     evaluator = Evaluator(mapper, env, config.agent)
     episodes = {

@@ -17,6 +17,7 @@ from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.train.files import read_rows
+from jaxsafe.train.log import NEEDS
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#8A8A8A"  # of the Okabe-Ito palette, safe for colour-blind readers
 LAST_COLOUR = 0.85  # the end of the colour map is too light on white
@@ -39,7 +40,7 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
     Raises:
         ConfigError: the run has no progress log.
     """
-    rows = read_rows(run / "progress.jsonl")
+    rows = read_rows(run / "progress.jsonl", NEEDS)
     if not rows:
         raise ConfigError(f"run: {run} has no rows in progress.jsonl yet; nothing to draw")
     title = _title(run, rows)
@@ -103,14 +104,15 @@ def speed_distance(episodes: Episodes, title: str) -> Figure:
     for step, rows in episodes:
         status = [row["status"] for row in rows]
         distance, speed, limit = (
-            np.array([one[k] for one in status]) for k in ("docking_distance", "speed", "velocity_limit")
+            np.array([one[k] for one in status], float) for k in ("docking_distance", "speed", "velocity_limit")
         )
         panel.plot(distance, speed, color=colour(step), linewidth=1.0)
         limits.append(np.stack([distance, limit]))
     line = np.concatenate(limits, axis=1)
     line = line[:, np.argsort(line[0])]
     panel.plot(line[0], line[1], color="black", linestyle=":", linewidth=1.6, label="speed limit")
-    panel.set(xlabel="distance to the chief [m]", ylabel="speed [m/s]", xlim=(0, None), ylim=(0, 1.5 * line[1].max()))
+    panel.set(xlabel="distance to the chief [m]", ylabel="speed [m/s]")
+    panel.set(xlim=(0, None), ylim=(0, 1.5 * np.nanmax(line[1], initial=0.2)))
     panel.legend(loc="upper left", frameon=False)
     figure.colorbar(colours, ax=panel, label="environment steps of training")
     figure.suptitle(f"{title}: deterministic episodes of the first seed", fontsize="medium")
@@ -148,7 +150,7 @@ def _table(rows: Sequence[dict[str, Any]], column: str, name: str, most: int = 3
 def _episodes(path: Path) -> Episodes:
     """Logged episodes in order, each with the training step of its policy; those of the end only once."""
     grouped: dict[tuple[int, bool, int], list[dict[str, Any]]] = {}
-    for row in read_rows(path):
+    for row in read_rows(path, ("step", "final", "episode", "platforms", "status")):
         grouped.setdefault((row["step"], row["final"], row["episode"]), []).append(row)
     return [(step, rows) for (step, _, _), rows in grouped.items()]
 
@@ -156,7 +158,8 @@ def _episodes(path: Path) -> Episodes:
 def _relative_path(rows: list[dict[str, Any]]) -> np.ndarray:
     """Positions of the agent, the platform that was listed last, relative to the first, (steps, d)."""
     first, *_, agent = rows[0]["platforms"]
-    return np.array([np.subtract(row["platforms"][agent]["position"], row["platforms"][first]["position"]) for row in rows])
+    positions = [np.array([row["platforms"][name]["position"] for row in rows], float) for name in (agent, first)]
+    return positions[0] - positions[1]  # a null, from a training that diverged, is nan here and leaves a gap
 
 
 def _colours(episodes: Sequence[tuple[int, Any]]) -> tuple[ScalarMappable, Any]:

@@ -14,7 +14,7 @@ from jaxsafe.component import Component, Range
 from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.simulation.controllers import Controller, Controls, Uncontrolled
 from jaxsafe.simulation.initializers import Initializer
-from jaxsafe.types import Key, Seconds, Sim
+from jaxsafe.types import Key, Record, Seconds, Sim
 
 
 class Platform(Component):
@@ -50,12 +50,15 @@ class Platform(Component):
             drawn[initializer.name] = initializer.draw(key_i, drawn, sim)
         return self.rest().replace(**drawn)
 
-    def place(self, values: Mapping[str, Any]) -> Any:
+    def place(self, values: Mapping[str, Any] | Record) -> Any:
         """Return the state with chosen fields, for a start that the user gives.
 
         Raises:
             ConfigError: a field is unknown, a random one is missing, or a value has another shape or is not a number.
         """
+        values = vars(values) if isinstance(values, Record) else values
+        if not isinstance(values, Mapping):
+            raise ConfigError(f"reset_to: {self.name}: expected fields by name, found {values!r}")
         rest = self.rest()
         for name in values:
             if name not in vars(rest):

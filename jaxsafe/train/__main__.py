@@ -57,4 +57,4 @@ def usage() -> str:
 
 
 if __name__ == "__main__":
-    cli.run(main, usage)
+    cli.run(main, usage, cli.at_once)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import logging
+import time
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +14,10 @@ import jax
 from jaxsafe.errors import ConfigError, nearest
 
 logging.getLogger("absl").setLevel(logging.ERROR)
+
+
+SETTLE_S = 0.5
+"""How long the threads of a failed read get to end, in silence."""
 
 
 class Checkpoints:
@@ -50,9 +57,11 @@ class Checkpoints:
         ocp = self._ocp
         abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
         args = ocp.args.Composite(state=ocp.args.StandardRestore(abstract), facts=ocp.args.JsonRestore())
-        try:
-            restored = self._manager.restore(step, args=args)
-        except Exception as error:  # orbax and tensorstore raise whatever their layers raise
-            reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
-            raise ConfigError(f"{self.directory / str(step)}: checkpoint cannot be read: {reason}") from None
+        with contextlib.redirect_stderr(io.StringIO()):  # threads of a failed read complain one by one
+            try:
+                restored = self._manager.restore(step, args=args)
+            except Exception as error:  # orbax and tensorstore raise whatever their layers raise
+                time.sleep(SETTLE_S)
+                reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
+                raise ConfigError(f"{self.directory / str(step)}: checkpoint cannot be read: {reason}") from None
         return restored["state"], restored["facts"]

@@ -75,6 +75,8 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
             f"ppo.num_minibatches: expected a divisor of ppo.num_envs × ppo.num_steps = {config.ppo.batch_size},"
             f" found {config.ppo.num_minibatches}"
         )
+    if config.seed + config.seeds > 2**31:
+        raise ConfigError(f"seeds: seed + seeds must not exceed 2³¹, found {config.seed} + {config.seeds}")
     if config.tensorboard:
         tensorboard_writer()
     observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)

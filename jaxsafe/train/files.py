@@ -41,29 +41,33 @@ def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
         file.writelines(json.dumps(finite(row), allow_nan=False) + "\n" for row in rows)
 
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
+def read_rows(path: Path, needs: Sequence[str] = ()) -> list[dict[str, Any]]:
     """The rows of a log; a last line that a kill cut short is not one, and neither is a missing file.
 
     Raises:
-        ConfigError: another line is broken.
+        ConfigError: another line is broken, or lacks one of the columns in `needs`.
     """
     if not path.exists():
         return []
-    lines = path.read_text(encoding="utf-8").split("\n")
+    lines = path.read_bytes().split(b"\n")
     rows = []
     for number, line in enumerate(lines, start=1):
         try:
-            if line:
-                rows.append(json.loads(line))
-        except json.JSONDecodeError:
+            row = json.loads(line) if line else None
+        except ValueError:  # of JSON or of UTF-8
             if number < len(lines):
                 raise ConfigError(f"{path}, line {number}: not a line of JSON") from None
+            row = None
+        if line and row is not None:
+            if not isinstance(row, dict) or not set(needs) <= set(row):
+                raise ConfigError(f"{path}, line {number}: not a row of this log")
+            rows.append(row)
     return rows
 
 
-def keep_rows(path: Path, keep: Callable[[dict[str, Any]], bool]) -> list[dict[str, Any]]:
-    """Cut a log back to the rows to keep, and return them."""
-    rows = [row for row in read_rows(path) if keep(row)]
+def keep_rows(path: Path, keep: Callable[[dict[str, Any]], bool], needs: Sequence[str] = ()) -> list[dict[str, Any]]:
+    """Cut a log back to the rows to keep, and return them; errors as in `read_rows`."""
+    rows = [row for row in read_rows(path, needs) if keep(row)]
     if path.exists():
         write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
     return rows

@@ -13,18 +13,27 @@ from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError
 from jaxsafe.train.files import append_csv, append_rows, keep_rows, write_csv
 
+NEEDS = ("seed", "step", "wall_s", "episodes", "success_rate", "return", "length")
+"""Columns that every row of the progress log has."""
+
 
 class ProgressLog:
     """`progress.jsonl` and `progress.csv`: a row for every update of every seed."""
 
-    def __init__(self, run: Path, resume_step: int, tensorboard: bool) -> None:
-        """Open the logs, cut back to the rows up to the step from which the run goes on."""
+    def __init__(self, run: Path, resume_step: int, expected: int, tensorboard: bool) -> None:
+        """Open the logs, cut back to the `expected` rows up to the step from which the run goes on.
+
+        Raises:
+            ConfigError: rows are missing or broken.
+        """
         self._jsonl, self._csv = run / "progress.jsonl", run / "progress.csv"
-        self.rows = keep_rows(self._jsonl, lambda row: row["step"] <= resume_step)
-        if self._csv.exists():
+        self.rows = keep_rows(self._jsonl, lambda row: row["step"] <= resume_step, NEEDS)
+        if len(self.rows) != expected:
+            raise ConfigError(f"{self._jsonl}: expected {expected} rows up to step {resume_step}, found {len(self.rows)}")
+        if self.rows:
             write_csv(self._csv, self.rows)
-            if not self.rows:
-                self._csv.unlink()
+        else:
+            self._csv.unlink(missing_ok=True)
         self._board = tensorboard_writer()(str(run / "tensorboard"), purge_step=resume_step) if tensorboard else None
 
     def write(self, rows: list[dict[str, Any]]) -> None:

@@ -6,6 +6,7 @@ same updates however often a run is interrupted: a resumed run ends bit for bit 
 
 from __future__ import annotations
 
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -22,7 +23,7 @@ from jaxsafe.metrics import Episode
 from jaxsafe.train import ppo, window
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import TrainConfig
-from jaxsafe.train.files import append_rows, keep_rows
+from jaxsafe.train.files import append_rows, keep_rows, read_rows
 from jaxsafe.train.log import Display, ProgressLog, progress_rows
 from jaxsafe.train.ppo import TrainState
 from jaxsafe.train.restore import structure
@@ -40,15 +41,17 @@ class Training:
         self.config, self.env, self.run, self.began = config, env, run, began
         self.mapper = SeedMapper(config.seeds)
         self.shared = self.mapper.replicate((env, config.agent, config.ppo))
-        self.chunk = max(1, min(config.num_updates // 50, 100_000 // config.ppo.batch_size))
+        intervals = (config.every(config.eval_every), config.every(config.checkpoint_every))
+        self.chunk = max(1, min(config.num_updates // 50, 100_000 // config.ppo.batch_size, *intervals))
         self.evaluator = Evaluator(self.mapper, env, config.agent)
         self.checkpoints = Checkpoints(run, create=True)
         self.elapsed = self.compile_s = 0.0
         self.updates = 0
         self._restore_or_init()
-        self.log = ProgressLog(run, self.step, config.tensorboard)
-        keep_rows(run / "eval.jsonl", lambda row: row["step"] <= self.step and not row["final"])
-        keep_rows(run / "episodes.jsonl", lambda row: row["step"] <= self.step and not row["final"])
+        self._keep_copies()
+        self.log = ProgressLog(run, self.step, self.updates * config.seeds, config.tensorboard)
+        for name in ("eval.jsonl", "episodes.jsonl"):
+            keep_rows(run / name, lambda row: row["step"] <= self.step and not row["final"], ("step", "final"))
 
     @property
     def step(self) -> int:
@@ -100,6 +103,16 @@ class Training:
         content, facts = self.checkpoints.restore(steps[-1], structure(self.mapper, self.env, self.config))
         self.state, self.best = content["state"], content["best"]
         self.updates, self.elapsed, self.compile_s = facts["updates"], facts["wall_s"], facts["compile_s"]
+
+    def _keep_copies(self) -> None:
+        """If the logs are further on than a kill can explain, checkpoints are missing: copy the logs, then cut."""
+        interval = self.config.every(self.config.checkpoint_every)
+        due = (self.updates // interval + 1) * interval
+        reached = -(-due // self.chunk) * self.chunk * self.config.ppo.batch_size
+        if any(row["step"] > reached for row in read_rows(self.run / "progress.jsonl", ("step",))):
+            print(f"checkpoints after step {self.step:,} are missing: going on from there, the longer logs kept as *.bak")
+            for log in self.run.glob("*.jsonl"):
+                shutil.copy(log, log.with_suffix(".jsonl.bak"))
 
     def _compile(self) -> Any:
         """Compile the chunk ahead of time, so that its cost is known."""

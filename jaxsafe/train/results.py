@@ -71,7 +71,7 @@ def table(results: dict[str, Any], path: Path) -> str:
     lines.append(f"{'worst seed, success rate':28}" + "".join(f"{value:>26.1%}" for value in worst.values()))
     if "interaction_efficiency" in results:
         steps = results["interaction_efficiency"]["timesteps"]
-        lines += ["", f"80 % training success after {f'{steps:,} steps' if steps else 'never'}"]
+        lines += ["", f"80 % training success after {steps:,} steps" if steps else "80 % training success not reached"]
         lines += [f"{results['wall_s']:.1f} s in total, {results['compile_s']:.1f} s of it compiling the training"]
     return "\n".join([*lines, f"results in {path}"])
 
