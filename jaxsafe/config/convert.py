@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxsafe.component import Component, Field, Kind, choices, fields
+from jaxsafe.component import Component, Field, Kind, choices, fields, unwrap_optional
 from jaxsafe.component import field as field_of
 from jaxsafe.errors import ConfigError, nearest
 
@@ -159,10 +159,8 @@ def _number(value: Any, field: Field, place: str) -> jax.Array:
 def _bare(hint: Any) -> Any:
     if typing.get_origin(hint) is Annotated:
         return _bare(typing.get_args(hint)[0])
-    if typing.get_origin(hint) in (typing.Union, types.UnionType):
-        options = [option for option in typing.get_args(hint) if option is not type(None)]
-        return _bare(options[0]) if len(options) == 1 else hint
-    return hint
+    inner, optional = unwrap_optional(hint)
+    return _bare(inner) if optional else hint
 
 
 def _optional(hint: Any) -> bool:

@@ -41,7 +41,7 @@ def main(argv: Sequence[str]) -> int:
         "checkpoint": checkpoint or "last",
         "changes": changes,
     }
-    path, results = evaluate_run(Path(run), config, (env, changed), name, kinds, request, Path(out) if out else None)
+    path, results = evaluate_run(Path(run), config, (env, changed), name, kinds, request, out)
     print(table(results, path))
     return 0
 

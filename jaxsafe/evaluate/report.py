@@ -9,8 +9,8 @@ from typing import Any
 from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate.seeds import Evaluator, episode_rows
+from jaxsafe.train import directory
 from jaxsafe.train.config import TrainConfig
-from jaxsafe.train.directory import versions
 from jaxsafe.train.files import append_rows, write_json
 from jaxsafe.train.restore import load_params
 from jaxsafe.train.results import evaluation, facts
@@ -24,7 +24,7 @@ def evaluate_run(
     name: str,
     kinds: Sequence[str],
     request: dict[str, Any],
-    out: Path | None,
+    out: str | None,
 ) -> tuple[Path, dict[str, Any]]:
     """Evaluate every seed's policy; write `results.json` and `eval.jsonl` and return their place and the results.
 
@@ -47,33 +47,18 @@ def evaluate_run(
             raise ConfigError(f"env: the change gives {what} {found}, the policies of {run} have {needed}")
     mapper = SeedMapper(config.seeds)
     params, step = load_params(mapper, run, config, own, request["checkpoint"])
-    out = _make_directory(run, out, request)
+    label = f"{request['checkpoint']}-{request['episodes']}-seed{request['evaluation_seed']}"
+    path = directory.make(out, run / "evaluations", label + "-changed" * bool(request["changes"]))
     evaluator = Evaluator(mapper, env, config.agent)
     episodes = {
         kind: evaluator.run(params, request["episodes"], request["evaluation_seed"], kind == "deterministic")
         for kind in kinds
     }
     for kind, one in episodes.items():
-        append_rows(out / "eval.jsonl", episode_rows(env, one, config.seed, step=step, kind=kind, final=True))
+        append_rows(path / "eval.jsonl", episode_rows(env, one, config.seed, step=step, kind=kind, final=True))
     results = {
         **facts(config, name), **request, "run": str(run), "steps": step,
-        "versions": versions(), "evaluation": evaluation(env, episodes),
+        "versions": directory.versions(), "evaluation": evaluation(env, episodes),
     }  # fmt: skip
-    write_json(out / "results.json", results)
-    return out / "results.json", results
-
-
-def _make_directory(run: Path, out: Path | None, request: dict[str, Any]) -> Path:
-    if out is None:
-        base = f"{request['checkpoint']}-{request['episodes']}-seed{request['evaluation_seed']}" + "-changed" * bool(
-            request["changes"]
-        )
-        candidates = [base, *(f"{base}-{number}" for number in range(2, 10_000))]
-        out = next(run / "evaluations" / name for name in candidates if not (run / "evaluations" / name).exists())
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ConfigError(f"out: {out} already holds something and is never overwritten; choose an empty directory")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"out: cannot write {error.filename}: {error.strerror}") from None
-    return out
+    write_json(path / "results.json", results)
+    return path / "results.json", results

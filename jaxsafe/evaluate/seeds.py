@@ -57,12 +57,10 @@ class Evaluator:
 
     def _one_seed(self, shared: tuple, params: Params) -> Episode:
         env, agent, key, deterministic = shared
-        policy = lambda key, observation: agent.act(env, params, key, observation, deterministic)  # noqa: E731
-        return run_episodes(env, policy, key, BATCH)
+        return run_episodes(env, agent.policy(env, params, deterministic), key, BATCH)
 
     def _one_record(self, params: Params, key: Key, num_episodes: int, steps: int, deterministic: Any) -> Any:
-        policy = lambda key, observation: self.agent.act(self.env, params, key, observation, deterministic)  # noqa: E731
-        return record_episodes(self.env, policy, key, num_episodes, steps)
+        return record_episodes(self.env, self.agent.policy(self.env, params, deterministic), key, num_episodes, steps)
 
 
 def batch_keys(seed: int, batches: int) -> Iterator[Key]:

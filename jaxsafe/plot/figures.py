@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -16,7 +17,7 @@ from matplotlib.figure import Figure
 from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
-from jaxsafe.train.files import read_rows
+from jaxsafe.train.files import read_rows, write_bytes
 from jaxsafe.train.log import NEEDS
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#8A8A8A"  # of the Okabe-Ito palette, safe for colour-blind readers
@@ -176,10 +177,9 @@ def _title(run: Path, rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _save(figure: Figure, path: Path) -> Path:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.name}")
     for panel in figure.axes:
         panel.spines[["top", "right"]].set_visible(False)
-    figure.savefig(part, dpi=150, format="png")
-    part.replace(path)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=150, format="png")
+    write_bytes(path, buffer.getvalue())
     return path

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from jaxsafe.component import Component, Range
 from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError
+from jaxsafe.rollout import Policy
 from jaxsafe.types import Dimensionless, Key, Positive
 
 Params = dict[str, Any]
@@ -69,6 +70,10 @@ class Agent(Component):
         return jax.tree.map(
             lambda mode, sample: jnp.where(deterministic, mode, sample), distribution.mode(), distribution.sample(key)
         )
+
+    def policy(self, env: Environment, params: Params, deterministic: Array | bool) -> Policy:
+        """Return `act` as a function of key and observation alone."""
+        return lambda key, observation: self.act(env, params, key, observation, deterministic)
 
 
 class Gaussian(Component):

@@ -20,19 +20,32 @@ from jaxsafe.train.files import write_text
 
 
 def create(config: TrainConfig, env: Environment, name: str) -> Path:
-    """Make a directory for a new run and write `config.yaml`; without `out`, the next free name in `runs/`.
+    """Make a directory for a new run, by default the next free name in `runs/`, and write `config.yaml`.
 
     Raises:
         ConfigError: `out` already holds something, or cannot be written.
     """
+    path = make(config.out, Path("runs"), name)
+    content = {"env": name, "training": to_data(config), "environment": to_data(env), "versions": versions()}
     try:
-        path = Path(config.out) if config.out else _next_free(Path("runs"), name)
+        write_text(path / "config.yaml", yaml.write(content))
+    except OSError as error:
+        raise ConfigError(f"out: cannot write {error.filename}: {error.strerror}") from None
+    return path
+
+
+def make(out: str | None, parent: Path, name: str) -> Path:
+    """Make the directory that `out` asks for, or else the next free one of a name in `parent`.
+
+    Raises:
+        ConfigError: `out` already holds something, or cannot be written.
+    """
+    path = Path(out) if out else _next_free(parent, name)
+    try:
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             advice = f"continue it with resume={path}" if (path / "config.yaml").exists() else "choose an empty one"
             raise ConfigError(f"out: {path} already holds something and is never overwritten; {advice}")
         path.mkdir(parents=True, exist_ok=True)
-        content = {"env": name, "training": to_data(config), "environment": to_data(env), "versions": versions()}
-        write_text(path / "config.yaml", yaml.write(content))
     except OSError as error:
         raise ConfigError(f"out: cannot write {error.filename}: {error.strerror}") from None
     return path

@@ -81,8 +81,8 @@ def append_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Write a whole CSV file."""
-    write_text(path, _csv(rows, header=True) if rows else "")
+    """Write a whole CSV file of at least one row."""
+    write_text(path, _csv(rows, header=True))
 
 
 def finite(value: Any) -> Any:

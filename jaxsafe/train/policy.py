@@ -65,7 +65,7 @@ def load_policy(path: str | os.PathLike, deterministic: bool = True) -> Policy:
         ConfigError: the file cannot be read, or holds something else.
     """
     env, agent, params = read_policy(path)
-    return lambda key, observation: agent.act(env, params, key, observation, deterministic)
+    return jax.jit(agent.policy(env, params, deterministic))  # or each call would work out the observation anew
 
 
 def _fill(like: Any, arrays: dict[str, np.ndarray], path: str) -> Any:
