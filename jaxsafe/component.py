@@ -18,10 +18,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsafe.errors import ConfigError
+
+ANY = -1
+"""Length of a unit that takes one number or a list of them."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Unit:
-    """Marks a leaf field: its unit and shape. `length` None is a scalar, 2 an interval, 0 a vector of any length."""
+    """Marks a leaf field: its unit and shape.
+
+    `length` None is a scalar, 2 an interval, 0 a vector of any length, `ANY` a scalar or such a vector.
+    """
 
     symbol: str
     length: int | None = None
@@ -29,18 +37,22 @@ class Unit:
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """The closed or half-open interval in which a number must lie."""
+    """The closed or half-open interval in which a number must lie, with or without 0."""
 
     low: float = -float("inf")
     high: float = float("inf")
     open_low: bool = False
     open_high: bool = False
+    nonzero: bool = False
 
     def __contains__(self, value: float) -> bool:
         above = value > self.low if self.open_low else value >= self.low
-        return above and (value < self.high if self.open_high else value <= self.high)
+        below = value < self.high if self.open_high else value <= self.high
+        return above and below and not (self.nonzero and value == 0)
 
     def __str__(self) -> str:
+        if self.nonzero:
+            return "other than 0"
         if self.high == float("inf"):
             return f"{'>' if self.open_low else '≥'} {self.low:g}"
         return f"in {'(' if self.open_low else '['}{self.low:g}, {self.high:g}{')' if self.open_high else ']'}"
@@ -48,9 +60,13 @@ class Range:
 
 @dataclasses.dataclass(frozen=True)
 class Refers:
-    """Marks a string field that names another part of the environment, for instance an earlier status."""
+    """Marks a string field that names another part of the environment, for instance an earlier status.
+
+    `boolean` says which kind of status it must be; None takes either.
+    """
 
     section: str
+    boolean: bool | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +86,7 @@ class Field:
         return self.default is dataclasses.MISSING
 
 
-@dataclass_transform(kw_only_default=True, frozen_default=True)
+@dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(dataclasses.field,))
 class Component:
     """Base of everything that an environment is composed of.
 
@@ -79,11 +95,22 @@ class Component:
     """
 
     type_name: ClassVar[str | None] = None
+    many_kinds: ClassVar[bool] = True
+    """Set in the body of a class that is a base of several kinds: only within a kind are type names unique."""
+    shorthand: ClassVar[str | None] = None
+    """A field that holds a tuple of named parts which dotted paths may begin with."""
 
     def __init_subclass__(cls, *, type: str | None = None) -> None:
         dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
+        cls.type_name = None
+        if type:
+            _refuse_taken(type, cls)
         cls.type_name = type
         _register(cls)
+
+    def problem(self) -> str | None:
+        """Return what is wrong with the fields taken together, None if nothing is; called when a user's values enter."""
+        return None
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed; nothing is checked (see `jaxsafe.override` for that)."""
@@ -136,6 +163,18 @@ def normalise(value: Any) -> Any:
 
 def _leaf(value: Any) -> Any:
     return None if value is None else jnp.asarray(value, jnp.result_type(float))
+
+
+def _refuse_taken(type_name: str, cls: type[Component]) -> None:
+    """Two classes of one kind cannot share a name; the same class defined again (a notebook's cell) replaces the first."""
+    kinds = [base for base in cls.__mro__[1:] if issubclass(base, Component) and not vars(base).get("many_kinds")]
+    others = [choices(kind).get(type_name) for kind in kinds if kind.type_name is None]
+    other = next((one for one in others if one), None)
+    if other and (other.__module__, other.__qualname__) != (cls.__module__, cls.__qualname__):
+        raise ConfigError(
+            f"type {type_name!r} of {cls.__module__}.{cls.__qualname__}: taken by {other.__module__}.{other.__qualname__};"
+            " choose another name"
+        )
 
 
 def _register(cls: type[Component]) -> None:

@@ -6,6 +6,7 @@ Shapes are those of one environment; `jax.vmap` adds leading axes. `d` is 2 or 3
 from __future__ import annotations
 
 import dataclasses
+import typing
 from collections.abc import Mapping
 from typing import Annotated, Any, Self, dataclass_transform
 
@@ -21,9 +22,11 @@ Number = Any
 """An array; until the environment is built a float, or a tuple of floats."""
 Positive = Range(0.0, open_low=True)
 Dimensionless = Annotated[Number, Unit("1")]
-Metres = Annotated[Number, Unit("m")]
+Length = Annotated[Number, Unit("m or ft")]
+"""In the unit of the platforms: metres for spacecraft, feet for aircraft."""
 MetresPerSecond = Annotated[Number, Unit("m/s")]
 PerSecond = Annotated[Number, Unit("1/s")]
+Radians = Annotated[Number, Unit("rad")]
 RadiansPerSecond = Annotated[Number, Unit("rad/s")]
 Newtons = Annotated[Number, Unit("N")]
 Kilograms = Annotated[Number, Unit("kg"), Positive]
@@ -31,8 +34,14 @@ Seconds = Annotated[Number, Unit("s"), Positive]
 
 PlatformName = Annotated[str, Refers("platforms")]
 RegionName = Annotated[str, Refers("regions")]
-StatusName = Annotated[str, Refers("status")]
+StatusName = Annotated[str, Refers("status", boolean=False)]
+"""Of a status that is a number."""
+FlagName = Annotated[str, Refers("status", boolean=True)]
+"""Of a status that is true or false."""
+AnyStatusName = Annotated[str, Refers("status")]
+ConstraintName = Annotated[str, Refers("constraints")]
 OutcomeName = Annotated[str, Refers("outcomes")]
+ParameterPath = Annotated[str, Refers("parameters")]
 
 
 @dataclass_transform(frozen_default=True)
@@ -46,6 +55,16 @@ class Record:
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed."""
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]
+
+
+def units(record: type[Record]) -> dict[str, str]:
+    """The unit of each field of a platform's state, from its annotations."""
+    hints = typing.get_type_hints(record, include_extras=True)
+    marks = {
+        name: next((mark for mark in typing.get_args(hint)[1:] if isinstance(mark, Unit)), None)
+        for name, hint in hints.items()
+    }
+    return {name: mark.symbol for name, mark in marks.items() if mark}
 
 
 class RegionState(Record):
@@ -62,7 +81,7 @@ class Sim(Record):
     platforms: Mapping[str, Any]  # by name, each the state record of its kind of platform
     regions: Mapping[str, RegionState]  # by name
     status: Mapping[str, Array]  # by name; while statuses are computed it holds only the earlier ones
-    ended: Mapping[str, Bool[Array, ""]]  # by outcome name but `running`; at most one is True
+    ended: Mapping[str, Bool[Array, ""]]  # by outcome name but `running`; at most one is True, see `Terminal.apart`
 
 
 class Memory(Record):
@@ -80,6 +99,17 @@ class State(Record):
     memory: Memory
     reward_totals: Mapping[str, Float[Array, ""]]  # sum of each reward term since the start of the episode
     num_steps: Int[Array, ""]  # steps taken in this episode
+    parameters: Mapping[str, Float[Array, ""]]  # numbers of the environment drawn for this episode, by dotted path
+
+
+class RTAInfo(Record):
+    """What run time assurance did on a step."""
+
+    correction: Float[Array, ""]  # ‖u_act − u_des‖, physical units
+    feasible: Bool[Array, ""]  # whether some control met the filter's constraints
+    certified: Bool[Array, ""]  # whether the control that acts is known to be safe
+    predicted_margin: Float[Array, ""]  # smallest h after the step, as predicted
+    backup_index: Int[Array, ""]  # the backup controller in reserve
 
 
 class Info(Record):

@@ -36,8 +36,8 @@ def fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], t
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["env=doking3d"], "env: unknown task 'doking3d' and not a .yaml file; choose from docking2d, docking3d. "
-         "Did you mean 'docking3d'?"),
+        (["env=doking3d"], "env: unknown task 'doking3d' and not a .yaml file; choose from rejoin2d, rejoin3d, docking2d, "
+         "docking3d, docking2d_oriented. Did you mean 'docking3d'?"),
         (["seeds=2"], "env: missing; for instance env=docking3d"),
         (["env="], "env: expected a name or a path, found None"),
         (["env=docking3d", "sedes=2"], "sedes: unknown field 'sedes'; choose from"),

@@ -1,5 +1,7 @@
 """Components: what is structure, what is a leaf, and that a change of numbers never compiles anew."""
 
+import dataclasses
+import types
 from typing import Annotated, Any, Literal
 
 import chex
@@ -8,17 +10,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsafe.component import Component, Range, Unit, choices, fields, normalise
-from jaxsafe.types import Metres, Positive, StatusName
+from jaxsafe.component import ANY, Component, Range, Unit, choices, fields, normalise
+from jaxsafe.config.convert import expects, to_value
+from jaxsafe.errors import ConfigError
+from jaxsafe.types import Length, Positive, StatusName
 
-Length = Annotated[Any, Unit("m"), Positive]
+Size = Annotated[Any, Unit("m"), Positive]
 
 
 class Part(Component):
     """A nested component."""
 
     name: str
-    size: Metres = 1.0
+    size: Length = 1.0
 
 
 class SmallPart(Part, type="small"):
@@ -28,7 +32,7 @@ class SmallPart(Part, type="small"):
 class LargePart(Part, type="large"):
     """Another kind of part."""
 
-    extra: Metres = 2.0
+    extra: Length = 2.0
 
 
 class Twin(Part):
@@ -45,10 +49,11 @@ class Whole(Component):
     words: tuple[str, ...] = ()
     refers: StatusName = "speed"
     maybe: str | None = None
-    length: Length = 1.0
-    optional: Length | None = None
+    length: Size = 1.0
+    optional: Size | None = None
     interval: Annotated[Any, Unit("m", length=2)] = (0.0, 1.0)
-    table: dict[str, Metres]
+    scale: Annotated[Any, Unit("m", length=ANY), Range(nonzero=True)] = 1.0
+    table: dict[str, Length]
     part: Part = SmallPart(name="part")
     parts: tuple[Part, ...] = ()
 
@@ -89,10 +94,43 @@ def test_ranges_know_their_open_and_closed_ends() -> None:
     assert str(Range(0.0, 1.0, open_low=True)) == "in (0, 1]"
 
 
+def test_a_range_may_leave_out_zero_alone() -> None:
+    nonzero = Range(nonzero=True)
+    assert 0 not in nonzero
+    assert -0.0 not in nonzero
+    assert -1e-30 in nonzero
+    assert 3 in nonzero
+    assert float("nan") not in nonzero
+    assert str(nonzero) == "other than 0"
+    assert -2.0 not in Range(-1.0, 1.0, nonzero=True)
+
+
+@pytest.mark.parametrize("value", [3, -2.0, [1.0], [1, -2, 3], (4.0, 5.0), np.arange(1.0, 4.0), jnp.ones(2)])
+def test_a_unit_of_any_length_takes_a_number_or_a_list(value: Any) -> None:
+    read = to_value(value, fields(Whole)["scale"], "scale")
+    assert read.dtype == jnp.float32
+    np.testing.assert_array_equal(read, np.asarray(value, np.float32))
+
+
+@pytest.mark.parametrize("value", [0, [1.0, 0.0], [[1.0]], [True], ["a"], None, float("nan"), [1.0, None]])
+def test_a_unit_of_any_length_refuses_zeros_tables_and_words(value: Any) -> None:
+    with pytest.raises(ConfigError, match=r"^scale: expected a number or a list of numbers in m other than 0, found "):
+        to_value(value, fields(Whole)["scale"], "scale")
+
+
+@pytest.mark.parametrize(
+    ("length", "words"),
+    [(None, "a number"), (2, "a list [low, high]"), (0, "a list of numbers"), (ANY, "a number or a list of numbers")],
+)
+def test_a_field_says_in_words_what_it_takes(length: int | None, words: str) -> None:
+    field = dataclasses.replace(fields(Whole)["scale"], unit=Unit("ft", length), range=None)
+    assert expects(field) == f"{words} in ft"
+
+
 def test_numbers_are_the_leaves(whole: Whole) -> None:
     leaves = {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(whole)}
     expected = {".length": 1.0, ".table['a']": 1.0, ".table['b']": 2.0, ".part.size": 1.0, ".parts[0].size": 3.0}
-    expected |= {".parts[1].size": 4.0, ".parts[1].extra": 2.0}
+    expected |= {".parts[1].size": 4.0, ".parts[1].extra": 2.0, ".scale": 1.0}
     assert set(leaves) == {*expected, ".interval"}
     assert all(leaves[path] == value for path, value in expected.items())
 
@@ -209,3 +247,73 @@ def test_types_are_chosen_by_name_among_all_subclasses() -> None:
     assert choices(Part) == {"small": SmallPart, "large": LargePart}
     assert choices(SmallPart) == {"small": SmallPart}
     assert choices(Whole) == {}
+
+
+def test_a_component_has_no_problem_unless_it_says_so(whole: Whole) -> None:
+    class Ordered(Part):
+        def problem(self) -> str | None:
+            return "too small" if self.size < 1.0 else None
+
+    assert whole.problem() is None
+    assert Ordered(name="x", size=0.5).problem() == "too small"
+    assert Ordered(name="x", size=2.0).problem() is None
+
+
+def define(base: type[Component], name: str, type_name: str, module: str = __name__) -> type[Component]:
+    """Define a subclass as a module of that name would."""
+    return types.new_class(name, (base,), {"type": type_name}, lambda body: body.update(__module__=module))
+
+
+@pytest.fixture
+def kind() -> type[Component]:
+    """A base of its own with one named class, so that what a test defines is seen by no other."""
+    base = types.new_class("Kind", (Component,))
+    define(base, "Taken", "taken")
+    return base
+
+
+def test_a_taken_type_name_is_refused_and_both_classes_are_named(kind: type[Component]) -> None:
+    with pytest.raises(ConfigError, match=r"^type 'taken' of elsewhere\.Mine: taken by .*\.Taken; choose another name$"):
+        define(kind, "Mine", "taken", module="elsewhere")
+    with pytest.raises(ConfigError, match="taken by"):
+        define(kind, "Other", "taken")
+    with pytest.raises(ConfigError, match="taken by"):
+        define(kind, "Taken", "taken", module="elsewhere")
+
+
+def test_a_taken_type_name_is_refused_below_another_class_of_the_kind(kind: type[Component]) -> None:
+    named = define(kind, "Named", "named")
+    before = choices(kind)
+    with pytest.raises(ConfigError, match="taken by") as caught:
+        define(named, "Mine", "taken")
+    assert choices(kind) == before  # though the traceback keeps the refused class alive
+    del caught
+
+
+def test_a_taken_type_name_is_refused_below_an_unnamed_class_of_the_kind(kind: type[Component]) -> None:
+    middle = types.new_class("Middle", (kind,))
+    with pytest.raises(ConfigError, match="taken by"):
+        define(middle, "Mine", "taken")
+
+
+def test_the_same_class_may_be_defined_again_and_replaces_the_first(kind: type[Component]) -> None:
+    first = choices(kind)["taken"]
+    again = define(kind, "Taken", "taken")
+    assert again is not first
+    assert choices(kind)["taken"] is again
+
+
+def test_different_kinds_may_share_a_type_name(kind: type[Component]) -> None:
+    other = types.new_class("OtherKind", (Component,))
+    assert choices(other) == {}
+    taken = define(other, "Mine", "taken")
+    assert choices(other) == {"taken": taken}
+    assert choices(kind)["taken"] is not taken
+
+
+def test_a_type_name_is_not_inherited(kind: type[Component]) -> None:
+    class Below(choices(kind)["taken"]):  # type: ignore[misc]
+        """A subclass that asks for no name."""
+
+    assert Below.type_name is None
+    assert choices(kind) == {"taken": Below.__mro__[1]}

@@ -1,10 +1,11 @@
 """Environments as YAML and overrides: what is written reads back, and every fault is one line with its place."""
 
-import copy
 import re
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +14,18 @@ import pytest
 
 import jaxsafe
 from jaxsafe import ConfigError, Environment
+from jaxsafe.component import normalise
 from jaxsafe.config import build, dump, load
 from jaxsafe.config.convert import to_component
+from jaxsafe.config.imports import import_modules, modules
 from jaxsafe.config.yaml import parse, write
+from jaxsafe.processors.reward import Failure
 from jaxsafe.processors.status import Status
+from jaxsafe.simulation.cwh import Spacecraft
+from jaxsafe.simulation.scripted import Schedule, Scripted
 from jaxsafe.types import PlatformName
 
-VARIANTS = [(task, actions) for task in ("docking2d", "docking3d") for actions in ("continuous", "discrete")]
+TASKS = ("rejoin2d", "rejoin3d", "docking2d", "docking3d", "docking2d_oriented")
 
 
 class SpeedSquared(Status, type="speed_squared_of_test"):
@@ -82,9 +88,10 @@ def mappings(tree: Any) -> Iterator[dict[str, Any]]:
 # What is written reads back
 
 
-@pytest.mark.parametrize(("task", "actions"), VARIANTS)
-def test_loading_a_dump_gives_the_same_environment(task: str, actions: str) -> None:
-    env = jaxsafe.make(task, actions=actions)
+@pytest.mark.parametrize(("actions", "variant"), [("continuous", "paper"), ("discrete", "released")])
+@pytest.mark.parametrize("task", TASKS)
+def test_loading_a_dump_gives_the_same_environment(task: str, actions: Any, variant: Any) -> None:
+    env = jaxsafe.make(task, actions=actions, variant=variant)
     again = load(dump(env))
     assert again == env
     assert dump(again) == dump(env)
@@ -180,6 +187,31 @@ def test_an_override_with_the_value_it_has_changes_nothing(env: Environment) -> 
     assert jaxsafe.override(env, {}) == env
 
 
+def test_a_list_of_names_keeps_those_parts_in_that_order(env: Environment) -> None:
+    changed = jaxsafe.override(env, {"observation": ["velocity", "position"], "constraints": []})
+    assert changed.observation == (env.observation[1], env.observation[0])
+    assert changed.constraints == ()
+    assert changed.observation_names == ("velocity.x", "velocity.y", "position.x", "position.y")
+    swapped = jaxsafe.override(env, {"deputy.controller.actuators": ["thrust_y", "thrust_x"]})
+    assert swapped.action_names == ("thrust_y", "thrust_x")
+    assert load(dump(changed)) == changed
+
+
+def test_a_component_is_taken_as_it_is_written(env: Environment) -> None:
+    written = Failure(name="failure", values={"crash": -1, "distance": -2.0})
+    read = {"type": "failure", "name": "failure", "values": {"crash": -1, "distance": -2.0}}
+    as_component, as_data = (jaxsafe.override(env, {"reward": [*env.reward[:4], one]}) for one in (written, read))
+    assert as_component == as_data
+    assert {type(leaf) for leaf in jax.tree.leaves(as_component)} == {type(env.dt)}
+
+
+def test_a_component_with_a_problem_is_refused_in_one_line(env: Environment) -> None:
+    schedule = Schedule(name="thrust_x", times=(0.0, 1.0), values=(1.0,))
+    chief = Spacecraft(name="chief", dimension=2, controller=Scripted(commands=(schedule,)))
+    message = fault(lambda: jaxsafe.override(env, {"platforms": [chief, env.agent_platform]}))
+    assert message.endswith("thrust_x: expected as many values as times, found 1 and 2")
+
+
 def test_make_with_overrides_is_override_of_make(env: Environment) -> None:
     assert jaxsafe.make("docking2d", {"deputy.mass": 9}) == jaxsafe.override(env, {"deputy.mass": 9})
 
@@ -213,11 +245,11 @@ def test_make_with_overrides_is_override_of_make(env: Environment) -> None:
         ("deputy.mass", {"kg": 12}, r"deputy\.mass: expected a number .*, found \{'kg': 12\}"),
         ("deputy.mass", 1j, r"deputy\.mass: expected a number .*, found 1j"),
         ("deputy.start.position.distance", [3, 1], r"distance: expected low ≤ high, found \[3, 1\]"),
-        ("deputy.start.position.distance", [1, 2, 3], r"expected a list \[low, high\] in m ≥ 0, found \[1, 2, 3\]"),
-        ("deputy.start.position.distance", [-1, 1], r"expected a list \[low, high\] in m ≥ 0, found \[-1, 1\]"),
+        ("deputy.start.position.distance", [1, 2, 3], r"expected a list \[low, high\] in m or ft ≥ 0, found \[1, 2, 3\]"),
+        ("deputy.start.position.distance", [-1, 1], r"expected a list \[low, high\] in m or ft ≥ 0, found \[-1, 1\]"),
         ("deputy.start.position.distance", [False, True], r"expected a list \[low, high\].*found \[False, True\]"),
         ("deputy.start.position.distance", ["1", "2"], r"expected a list \[low, high\].*found \['1', '2'\]"),
-        ("deputy.start.position.distance", 3, r"expected a list \[low, high\] in m ≥ 0, found 3"),
+        ("deputy.start.position.distance", 3, r"expected a list \[low, high\] in m or ft ≥ 0, found 3"),
         ("deputy.controller.actuators.thrust_x.points", 1, r"expected a whole number ≥ 2, found 1"),
         ("deputy.controller.actuators.thrust_x.points", 3.5, r"expected a whole number ≥ 2, found 3\.5"),
         ("deputy.controller.actuators.thrust_x.points", True, r"expected a whole number ≥ 2, found True"),
@@ -231,7 +263,13 @@ def test_make_with_overrides_is_override_of_make(env: Environment) -> None:
         ("reward.velocity_constraint.bound", None, r"nothing is called 'velocity'; choose from success, crash"),
         ("reward.success.outcome", "sucess", r"nothing is called 'sucess'.* Did you mean 'success'\?"),
         ("reward.delta_v.name", "success", r"reward: the name 'success' stands twice"),
-        ("agent", "chief", r"agent: 'chief' cannot be the agent: it takes no control"),
+        ("observation", ["position", "velocty"], r"observation\.velocty: unknown name.* Did you mean 'velocity'\?"),
+        ("observation", ["position", "position"], r"observation: the name 'position' stands twice"),
+        ("observation", ["position", 3], r"observation\.\[0\]: expected a mapping of fields, found 'position'"),
+        ("status", ["speed"], r"velocity_limit: nothing is called 'velocity_limit'; choose from speed"),
+        ("deputy.start", ["positon"], r"deputy\.start\.positon: unknown name.* Did you mean 'position'\?"),
+        ("deputy.controller", {"type": "uncontrolled"}, r"agent: 'deputy' cannot be the agent: its controller takes no"),
+        ("agent", "chief", r"agent: 'chief' cannot be the agent: its controller takes no actions"),
     ],
 )
 def test_a_bad_override_is_refused(env: Environment, path: str, value: Any, message: str) -> None:
@@ -273,31 +311,55 @@ def test_overrides_take_traced_values(env: Environment) -> None:
     ("act", "message"),
     [
         (lambda: jaxsafe.make("docking2"), r"env: unknown task 'docking2'.* Did you mean 'docking2d'\?"),
-        (lambda: jaxsafe.make(""), r"env: unknown task ''.*; choose from docking2d, docking3d"),
+        (lambda: jaxsafe.make(""), r"env: unknown task ''.*; choose from rejoin2d, rejoin3d, docking2d"),
         (lambda: jaxsafe.make("docking2d", actions="discret"), r"actions: unknown kind.* Did you mean 'discrete'\?"),
         (lambda: jaxsafe.make("no_such_file.yaml"), r"no_such_file\.yaml: cannot be read: No such file"),
         (lambda: jaxsafe.make("docking2d", {"deputy.mas": 1}), r"deputy\.mas: .* Did you mean 'mass'\?"),
+        (lambda: jaxsafe.make(3), r"env: expected the name of a task or a \.yaml file, found 3"),  # type: ignore[arg-type]
+        (lambda: jaxsafe.make("docking2d", ["deputy.mass=1"]), r"override"),  # type: ignore[arg-type]
+        (lambda: jaxsafe.make("docking2d", variant="releasd"), r"variant: unknown variant.* Did you mean 'released'\?"),
+        (lambda: jaxsafe.make("docking2d", randomize={"deputy.mas": [1, 2]}), r"randomize: deputy\.mas: .* 'mass'\?"),
+        (lambda: jaxsafe.make("docking2d", randomize={"deputi.mass": [1, 2]}), r"randomize: deputi: .* 'deputy'\?"),
+        (lambda: jaxsafe.make("docking2d", randomize={"deputy.mass": [2, 1]}), r"deputy\.mass: expected low ≤ high"),
+        (lambda: jaxsafe.make("docking2d", randomize={"deputy.mass": [-1, 1]}), r"randomize: deputy\.mass: .* > 0, found"),
+        (lambda: jaxsafe.make("docking2d", randomize={"deputy.mass": 3}), r"deputy\.mass: expected a list \[low, high\]"),
+        (
+            lambda: jaxsafe.make("docking2d", randomize={"deputy.name": [1, 2]}),
+            r"randomize: deputy\.name: expected the path",
+        ),
+        (lambda: jaxsafe.make("docking2d", randomize={"randomize.dt": [1, 2]}), r"randomize\.randomize\.dt: expected the"),
+        (lambda: jaxsafe.make("docking2d", randomize={"deputy.start.position.distance": [1, 2]}), r"list \[low, high\]"),
+        (lambda: jaxsafe.make("docking2d", randomize=3), r"randomize: expected paths with values, found 3"),
     ],
 )
 def test_make_refuses_what_it_does_not_know(act: Callable[[], Any], message: str) -> None:
     assert re.search(message, fault(act))
 
 
+def test_a_variant_is_for_a_task_by_name(env: Environment, tmp_path: Path) -> None:
+    path = tmp_path / "mine.yaml"
+    path.write_text(dump(env))
+    for variant in ("paper", "released"):
+        message = fault(lambda variant=variant: jaxsafe.make(path, variant=variant))
+        assert message.startswith(f"variant: {path} says itself what it is; a variant is for rejoin2d")
+    assert "Did you mean 'released'?" in fault(lambda: jaxsafe.make(path, variant="releasd"))  # type: ignore[arg-type]
+
+
 # Faults in a YAML file
 
 
-@pytest.mark.parametrize("task", ["docking2d", "docking3d"])
+@pytest.mark.parametrize("task", TASKS)
 def test_every_misspelt_field_is_refused_with_the_right_one(task: str) -> None:
     tree = parse(dump(jaxsafe.make(task)), task)
-    num_keys = sum(len(mapping) for mapping in mappings(tree))
-    assert num_keys > 150
-    for count in range(num_keys):
-        broken = copy.deepcopy(tree)
-        mapping, key = [(mapping, key) for mapping in mappings(broken) for key in mapping][count]
-        items = [(f"{name}x" if name == key else name, value) for name, value in mapping.items()]
+    places = [(mapping, key) for mapping in mappings(tree) for key in mapping]
+    assert len(places) > 150
+    for mapping, key in places:
+        before = dict(mapping)
         mapping.clear()
-        mapping.update(items)
-        message = fault(lambda broken=broken: compose(broken))
+        mapping.update({f"{name}x" if name == key else name: value for name, value in before.items()})
+        message = fault(lambda: compose(tree))
+        mapping.clear()
+        mapping.update(before)
         if key == "type":
             assert re.search(r": field 'type' is missing; choose from \w+", message)
         else:
@@ -305,7 +367,9 @@ def test_every_misspelt_field_is_refused_with_the_right_one(task: str) -> None:
             assert f"Did you mean '{key}'?" in message
 
 
-def test_every_misspelt_type_choice_or_reference_is_refused(tree: dict[str, Any]) -> None:
+@pytest.mark.parametrize("task", TASKS)
+def test_every_misspelt_type_choice_or_reference_is_refused(task: str) -> None:
+    tree = parse(dump(jaxsafe.make(task)), task)
     words = [(mapping, key) for mapping in mappings(tree) for key, value in mapping.items() if isinstance(value, str)]
     words = [(mapping, key) for mapping, key in words if key != "name"]
     assert len(words) > 50
@@ -361,11 +425,14 @@ def test_every_number_replaced_by_a_word_a_truth_value_or_nan_is_refused(tree: d
     def is_number(value: Any) -> bool:
         return isinstance(value, (int, float)) and not isinstance(value, bool)
 
+    def may_be_a_list(mapping: dict[str, Any], key: str) -> bool:
+        return key == "scale" and mapping["type"].startswith("observe")
+
     numbers = [(mapping, key) for mapping in mappings(tree) for key, value in mapping.items() if is_number(value)]
     assert len(numbers) > 30
     for mapping, key in numbers:
         right = mapping[key]
-        for wrong in ("wrong", True, float("nan"), None, [1.0], {"a": 1.0}):
+        for wrong in ("wrong", True, float("nan"), None, [None] if may_be_a_list(mapping, key) else [1.0], {"a": 1.0}):
             mapping[key] = wrong
             assert re.search(rf"{key}: expected .*, found ", fault(lambda: compose(tree)))
         mapping[key] = right
@@ -381,7 +448,7 @@ def test_every_number_replaced_by_a_word_a_truth_value_or_nan_is_refused(tree: d
         ("reward", [], r"reward: an environment needs at least one"),
         ("observation", [], r"observation: an environment needs at least one"),
         ("platforms.0.type", "ancor", r"platforms\.chief: unknown type 'ancor'.* Did you mean 'anchor'\?"),
-        ("platforms.0.type", 3, r"platforms\.chief: unknown type 3; choose from anchor, spacecraft"),
+        ("platforms.0.type", 3, r"platforms\.chief: unknown type 3; choose from anchor, .*, spacecraft$"),
         ("platforms.0.type", ["anchor"], r"platforms\.chief: unknown type \['anchor'\]"),
         ("platforms.0.name", 3, r"platforms\.\[0\]\.name: expected a name, found 3"),
         ("platforms.0.dimension", 3, r"platforms: expected the same dimension for all, found chief 3, deputy 2"),
@@ -389,18 +456,41 @@ def test_every_number_replaced_by_a_word_a_truth_value_or_nan_is_refused(tree: d
         ("platforms.1.start.0.name", "positon", r"positon: no such state field;.* Did you mean 'position'\?"),
         ("platforms.1.start.1.name", "position", r"platforms\.deputy\.start: the name 'position' stands twice"),
         ("platforms.1.start.0.direction.polar", [0, 3], r"direction: draws 3 numbers, the platform has 2 dimensions"),
-        ("platforms.1.controller", {"type": "uncontrolled"}, r"actuators: expected thrust_x, thrust_y, found none"),
-        ("platforms.1.controller.type", "uncontrolled", r"controller \(uncontrolled\): takes no actuators"),
-        ("platforms.1.controller.actuators.0.name", "thrust", r"expected thrust_x, thrust_y, found thrust, thrust_y"),
-        ("platforms.1.controller.actuators.0.name", "thrust_y", r"found thrust_y, thrust_y"),
+        ("platforms.1.controller", {"type": "uncontrolled"}, r"agent: 'deputy' cannot be .*: its controller takes no act"),
+        ("platforms.1.controller.actuators", [], r"agent: 'deputy' cannot be the agent: its controller takes no actions"),
+        ("platforms.1.controller.type", "uncontrolled", r"controller \(uncontrolled\): unknown field 'actuators'"),
+        ("platforms.1.controller", {"type": "scripted"}, r"agent: 'deputy' cannot be .*: its controller takes no actions"),
+        ("platforms.1.controller.actuators.0.name", "thrust", r"spacecraft has no control 'thrust'; choose from thrust_x"),
+        ("platforms.1.controller.actuators.0.name", "thrust_y", r"actuators: the name 'thrust_y' stands twice"),
+        ("platforms.1.controller.actuators.0.name", "a.b", r"actuators: expected a name without dots, found 'a\.b'"),
+        ("platforms.0.controller", {"type": "continuous", "actuators": []},
+         r"platforms\.chief\.controller \(continuous\): only the agent takes actions; choose from scripted, uncontrolled"),
+        ("platforms.0.controller", {"type": "scripted", "commands": [{"type": "constant", "name": "thrust_x", "at": 1}]},
+         r"platforms\.chief\.controller\.commands: anchor has no control 'thrust_x'; choose from none"),
         ("regions.0.on", "chef", r"regions\.docking_region\.on: nothing is called 'chef'.* Did you mean 'chief'\?"),
-        ("regions.0.radius", -1, r"regions\.docking_region\.radius: expected a number in m ≥ 0, found -1"),
+        ("regions.0.radius", -1, r"regions\.docking_region\.radius: expected a number in m or ft ≥ 0, found -1"),
         ("regions.0.name", "dock", r"status\.in_docking\.region: nothing is called 'docking_region'; choose from dock"),
         ("status.1.name", "speed", r"status: the name 'speed' stands twice"),
         ("status.3.distance", "delta_v", r"velocity_limit\.distance: nothing listed before it is called 'delta_v'"),
         ("status.3.distance", "velocity_limit", r"nothing listed before it is called 'velocity_limit'"),
         ("status.3.distance", "docking_distanc", r"Did you mean 'docking_distance'\?"),
         ("constraints.0.speed", "spee", r"constraints\.velocity_limit\.speed: nothing is called 'spee'.* 'speed'\?"),
+        ("status.0.name", "a.b", r"status: expected a name without dots, found 'a\.b'"),
+        ("observation.0.name", "", r"observation: expected a name without dots, found ''"),
+        ("platforms.0.name", "a.b", r"platforms: expected a name without dots, found 'a\.b'"),
+        ("reward.1.bound.outcome", "a.b", r"outcomes: expected a name without dots, found 'a\.b'"),
+        ("status.1.of", "chief", r"in_docking\.of: region 'docking_region' is on 'chief' itself; choose another"),
+        ("observation.0.relative_to", "chef", r"observation\.position\.relative_to: .* Did you mean 'chief'\?"),
+        ("observation.0.frame", "deputi", r"observation\.position\.frame: .* Did you mean 'deputy'\?"),
+        ("observation.0.form", "magnom", r"observation\.position\.form: found 'magnom'.* Did you mean 'magnorm'\?"),
+        ("observation.0.what", "orientation", r"deputy has no quantity 'orientation'; choose from position, velocity"),
+        ("observation.0.what", "roll", r"observation\.position\.what: deputy has no quantity 'roll'; choose from position"),
+        ("randomize", {"deputy.mas": [1, 2]}, r"randomize: deputy\.mas: unknown field 'mas'.* Did you mean 'mass'\?"),
+        ("imports", "mine", r"imports: expected a list of modules, found 'mine'"),
+        ("imports", [3], r"imports: expected a list of modules, found \[3\]"),
+        ("imports", None, r"imports: expected a list of modules, found None"),
+        ("imports", ["no.such.module"], r"imports: cannot import 'no\.such\.module': ModuleNotFoundError: No module named"),
+        ("imports", [""], r"imports: cannot import '': ValueError"),
         ("terminal.0.name", "running", r"outcomes: the name 'running' stands twice"),
         ("terminal.0.in_docking", "indocking", r"terminal\.success\.in_docking: .* Did you mean 'in_docking'\?"),
         ("reward.1.bound", -5, r"reward\.velocity_constraint\.bound: expected a mapping of fields, found -5"),
@@ -408,12 +498,12 @@ def test_every_number_replaced_by_a_word_a_truth_value_or_nan_is_refused(tree: d
         ("reward.1.bound.outcom", "crash", r"bound: unknown field 'outcom'.* Did you mean 'outcome'\?"),
         ("reward.4.values", 3, r"reward\.failure\.values: expected a mapping of names to values, found 3"),
         ("observation.0.what", "positon", r"observation\.position\.what: .* Did you mean 'position'\?"),
-        ("observation.0.scale", 0, r"observation\.position\.scale: expected a number > 0, found 0"),
+        ("observation.0.scale", 0, r"position\.scale: expected a number or a list of numbers other than 0, found 0"),
         ("observation.0.clip", [1, -1], r"observation\.position\.clip: expected low ≤ high, found \[1, -1\]"),
         ("observation.2.status", "sped", r"observation\.speed\.status: .* Did you mean 'speed'\?"),
         ("agent", "deputi", r"agent: nothing is called 'deputi'.* Did you mean 'deputy'\?"),
     ],
-)
+)  # fmt: skip
 def test_a_broken_environment_is_refused(tree: dict[str, Any], path: str, value: Any, message: str) -> None:
     assert re.search(message, fault_in(put(tree, path, value)))
 
@@ -429,6 +519,197 @@ def test_a_status_may_refer_only_to_earlier_ones(tree: dict[str, Any]) -> None:
 def test_the_direction_of_a_spatial_start_needs_a_polar_range() -> None:
     message = fault(lambda: jaxsafe.make("docking3d", {"deputy.start.velocity.direction.polar": None}))
     assert "start.velocity.direction: draws 2 numbers, the platform has 3 dimensions" in message
+
+
+# Parts that fit by name but cannot be computed
+
+
+class ChangesShape(Status, type="changes_shape_of_test"):
+    """A status whose memory after a step is not what it was at reset."""
+
+    how: Literal["shape", "dtype", "structure"]
+
+    def init(self, sim: Any) -> Any:
+        return jnp.zeros(2)
+
+    def increment(self, memory: Any, sim: Any, dt: Any) -> Any:
+        return {"shape": jnp.zeros(3), "dtype": jnp.zeros(2, int), "structure": (memory,)}[self.how]
+
+    def process(self, memory: Any, sim: Any) -> jax.Array:
+        return jnp.zeros(())
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        (
+            "shape",
+            r"^memory\.status\.odd: is float32\[2\] after reset and float32\[3\] after a step$|status\.odd: is float32",
+        ),
+        ("dtype", r"status\.odd: is float32\[2\] after reset and int32\[2\] after a step"),
+        ("structure", r"^status\.odd: its memory has another structure after a step than after reset$"),
+    ],
+)
+def test_a_memory_that_changes_its_form_is_told_with_its_part(tree: dict[str, Any], how: str, message: str) -> None:
+    tree["status"].append({"type": "changes_shape_of_test", "name": "odd", "how": how})
+    assert re.search(message, fault(lambda: compose(tree)))
+
+
+CYLINDER = {"type": "cylinder", "name": "docking_region", "on": "chief", "radius": 1, "height": 1}
+
+
+@pytest.mark.parametrize(
+    ("task", "changes", "place"),
+    [
+        ("docking2d", {"terminal.success.in_docking": "speed"}, "terminal.success"),
+        ("docking2d", {"terminal.crash.in_docking": "delta_v"}, "terminal.crash"),
+        ("docking2d", {"reward.failure.values": {}}, "reward.failure"),
+        ("docking2d", {"regions": [CYLINDER]}, "regions.docking_region"),
+        ("docking2d", {"regions.docking_region.offset": {"type": "displacement", "by": [1, 2, 3]}}, "regions"),
+        ("docking2d", {"regions.docking_region.offset": {"type": "displacement", "by": [1]}}, "regions.docking_region"),
+        ("docking2d", {"deputy.start": ["velocity", "position"]}, "platforms.deputy"),
+        ("docking3d", {"observation.velocity.scale": [1, 2]}, "observation.velocity"),
+        ("docking2d", {"observation.position.relative_to": "chief", "observation.position.scale": [1, 2, 3, 4]},
+         "observation.position"),
+        ("rejoin2d", {"status.rejoin_time.status": "in_rejoin", "reward.in_rejoin_first_time.status": "lead_distance"},
+         "reward.in_rejoin_first_time"),
+        ("rejoin2d", {"lead.start.position.low": [1, 1, 1], "lead.start.position.high": [2, 2, 2]}, "platforms.lead"),
+        ("rejoin3d", {"wingman.start.heading.low": [1], "wingman.start.heading.high": [2]}, "platforms.wingman"),
+    ],
+)  # fmt: skip
+def test_parts_that_cannot_be_computed_are_told_with_their_place(task: str, changes: dict[str, Any], place: str) -> None:
+    assert fault(lambda: jaxsafe.make(task, changes)).startswith(place)
+
+
+def test_a_number_has_no_components_in_a_frame() -> None:
+    changes = {"observation.attitude_rate.frame": "deputy"}
+    assert fault(lambda: jaxsafe.make("docking2d_oriented", changes)).startswith("observation.attitude_rate")
+
+
+@pytest.mark.parametrize("task", ["rejoin2d"])
+def test_only_the_agent_may_take_actions(task: str) -> None:
+    actuators = [{"name": "heading_rate", "low": -0.1, "high": 0.1}]
+    message = fault(lambda: jaxsafe.make(task, {"lead.controller": {"type": "discrete", "actuators": actuators}}))
+    assert message.startswith("platforms.lead.controller (discrete): only the agent takes actions; choose from scripted")
+    assert "cannot be the agent" in fault(lambda: jaxsafe.make(task, {"wingman.controller": {"type": "scripted"}}))
+    assert "cannot be the agent" in fault(lambda: jaxsafe.make(task, {"agent": "lead"}))
+
+
+# Components of a user's own module
+
+MODULE = """
+import jax.numpy as jnp
+from jaxsafe.processors.observation import Observation
+from jaxsafe.processors.reward import Reward
+from jaxsafe.processors.status import Status
+from jaxsafe.processors.terminal import Terminal
+from jaxsafe.simulation.initializers import Initializer
+from jaxsafe.types import Dimensionless, StatusName
+
+class Half(Status, type="half_of_test"):
+    status: StatusName
+    def process(self, memory, sim):
+        return sim.status[self.status] / 2.0
+
+class Bonus(Reward, type="bonus_of_test"):
+    value: Dimensionless = 1.0
+    def process(self, memory, sim):
+        return self.value
+
+class Clock(Observation, type="clock_of_test"):
+    def measure(self, memory, sim):
+        return sim.time[None]
+
+class Slow(Terminal, type="slow_of_test"):
+    status: StatusName
+    below: Dimensionless
+    def reached(self, sim):
+        return sim.status[self.status] < self.below
+
+class Aside(Initializer, type="aside_of_test"):
+    distance: Dimensionless
+    def draw(self, key, drawn, sim):
+        return jnp.stack([self.distance, 0.0])
+"""
+
+
+@pytest.fixture
+def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The current directory, from which modules are found; what a test imports is forgotten after it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "modules", dict(sys.modules))
+    return tmp_path
+
+
+def test_components_of_a_user_s_module_are_usable_from_yaml_at_once(tree: dict[str, Any], directory: Path) -> None:
+    (directory / "parts_of_test.py").write_text(MODULE)
+    tree["imports"] = ["parts_of_test"]
+    tree["status"].append({"type": "half_of_test", "name": "half", "status": "speed"})
+    tree["reward"].append({"type": "bonus_of_test", "name": "bonus"})
+    tree["observation"].append({"type": "clock_of_test", "name": "clock", "scale": 2.0})
+    tree["terminal"].append({"type": "slow_of_test", "name": "slow", "status": "half", "below": 1e-3})
+    tree["platforms"][1]["start"][0] = {"type": "aside_of_test", "name": "position", "distance": 70.0}
+    path = directory / "mine.yaml"
+    path.write_text(write(tree))
+    env = load(path)
+
+    state, timestep = jaxsafe.reset(env, jax.random.key(0))
+    assert state.sim.platforms["deputy"].position.tolist() == [70.0, 0.0]
+    speed = float(timestep.info.status["speed"])
+    assert float(timestep.info.status["half"]) == pytest.approx(speed / 2.0)
+    _, timestep = jaxsafe.step(env, state, jnp.zeros(2))
+    assert timestep.observation[-1] == 0.5
+    assert timestep.info.reward_terms["bonus"] == 1.0
+    assert "slow" in env.outcomes
+
+    text = dump(env)
+    assert text.startswith("imports: [parts_of_test]\n")
+    assert load(text) == env
+    assert dump(load(text)) == text
+    path.write_text(text)
+    code = "from jaxsafe.config import dump, load; print(dump(load('mine.yaml')), end='')"
+    fresh = subprocess.run([sys.executable, "-c", code], cwd=directory, check=True, capture_output=True, text=True)
+    assert fresh.stdout == text
+
+
+def test_an_environment_of_the_house_s_own_parts_needs_no_imports(env: Environment) -> None:
+    assert "imports" not in dump(env)
+
+
+def test_parts_within_parts_are_imported_too(env: Environment, directory: Path) -> None:
+    text = "from jaxsafe.simulation.scripted import Command\nclass Nod(Command, type='nod_of_test'):\n    pass\n"
+    (directory / "nested_of_test.py").write_text(text)
+    import_modules(["nested_of_test"], "")
+    nod = sys.modules["nested_of_test"].Nod(name="thrust_x")
+    chief = normalise(Spacecraft(name="chief", dimension=2, controller=Scripted(commands=(nod,))))
+    assert modules(env.replace(platforms=(chief, env.agent_platform))) == ["nested_of_test"]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("raise RuntimeError('first line\\nsecond line')", r"cannot import 'bad_of_test': RuntimeError: first line$"),
+        ("x = 1 / 0", r"cannot import 'bad_of_test': ZeroDivisionError: division by zero$"),
+        ("def", r"cannot import 'bad_of_test': SyntaxError: "),
+        ("import no_such_module_of_test", r"cannot import 'bad_of_test': ModuleNotFoundError: No module named 'no_such"),
+        ("raise ValueError", r"cannot import 'bad_of_test': ValueError: $"),
+        ("from jaxsafe.processors.status import Status\nclass Mine(Status, type='speed'):\n    pass",
+         r"type 'speed' of bad_of_test\.Mine: taken by jaxsafe\.processors\.status\.Speed; choose another name$"),
+    ],
+)  # fmt: skip
+def test_a_module_that_cannot_be_imported_is_told_in_one_line(
+    tree: dict[str, Any], directory: Path, text: str, message: str
+) -> None:
+    (directory / "bad_of_test.py").write_text(text)
+    assert re.search(message, fault_in(tree | {"imports": ["bad_of_test"]}))
+
+
+def test_a_misspelt_type_of_a_user_s_module_is_refused(tree: dict[str, Any], directory: Path) -> None:
+    text = "from jaxsafe.processors.status import Status\nclass Odd(Status, type='odd_one_of_test'):\n    pass\n"
+    (directory / "odd_of_test.py").write_text(text)
+    tree["status"].append({"type": "odd_on_of_test", "name": "odd"})
+    assert "Did you mean 'odd_one_of_test'?" in fault_in(tree | {"imports": ["odd_of_test"]})
 
 
 @pytest.mark.parametrize("text", ["- 1\n- 2\n", "hello\n", "\n", "3\n"])
@@ -531,3 +812,24 @@ def test_tags_of_python_are_refused_and_nothing_runs(kind: str, tmp_path: Path) 
     for text in (f'!!python/{kind} ["touch {sign}"]\n', f'dt: !!python/{kind} ["touch {sign}"]\n'):
         assert "not valid YAML: could not determine a constructor for the tag" in fault(lambda text=text: load(text))
     assert not sign.exists()
+
+
+@pytest.mark.parametrize(
+    ("task", "path", "status", "wanted"),
+    [
+        ("docking2d", "reward.distance_change.distance", "in_docking", "a number"),
+        ("docking2d", "terminal.distance.distance", "in_docking", "a number"),
+        ("docking2d", "terminal.success.in_docking", "speed", "true or false"),
+        ("rejoin2d", "terminal.success.time", "in_rejoin", "a number"),
+        ("rejoin2d", "reward.in_rejoin.status", "lead_distance", "true or false"),
+        ("rejoin2d", "status.rejoin_time.status", "in_rejoin", None),
+        ("docking2d", "observation.speed.status", "in_docking", None),
+    ],
+)
+def test_a_status_of_the_wrong_kind_is_refused(task: str, path: str, status: str, wanted: str | None) -> None:
+    env = jaxsafe.make(task)
+    if wanted is None:
+        jaxsafe.override(env, {path: status})
+    else:
+        message = fault(lambda: jaxsafe.override(env, {path: status}))
+        assert message == f"{path}: expected a status that is {wanted}, found {status!r}, which is not"

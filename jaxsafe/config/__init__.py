@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import os
+from typing import Any
 
 from jaxsafe.component import normalise
 from jaxsafe.config.check import check
 from jaxsafe.config.convert import to_component, to_data
+from jaxsafe.config.imports import import_modules, modules
 from jaxsafe.config.override import override
 from jaxsafe.environment import Environment
 
-__all__ = ["build", "dump", "load", "override"]
+__all__ = ["build", "describe", "dump", "from_data", "load", "override"]
 
 
 def build(env: Environment) -> Environment:
-    """Make a declared environment ready for use: numbers become arrays, names are checked."""
+    """Make a declared environment ready for use: numbers become arrays, and its parts are checked."""
     return check(normalise(env))
 
 
 def load(source: str | os.PathLike) -> Environment:
     """Read an environment from a YAML file, or from the YAML text that `dump` returns.
+
+    Modules under `imports` are imported first, so that the components which they define can be named.
 
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.
@@ -28,11 +32,29 @@ def load(source: str | os.PathLike) -> Environment:
 
     text = isinstance(source, str) and "\n" in source
     data = yaml.parse(str(source), "environment") if text else yaml.read(source)
-    return build(to_component(data, Environment, ""))
+    return from_data(data, "")
 
 
 def dump(env: Environment) -> str:
     """The complete environment as YAML text, so that `load(dump(env)) == env`."""
     from jaxsafe.config import yaml
 
-    return yaml.write(to_data(env))
+    return yaml.write(describe(env))
+
+
+def describe(env: Environment) -> dict[str, Any]:
+    """The complete environment as plain data, beginning with the modules outside jaxsafe that define parts of it."""
+    needed = modules(env)
+    return ({"imports": needed} if needed else {}) | to_data(env)
+
+
+def from_data(data: Any, place: str) -> Environment:
+    """Read what `describe` returns; `place` begins the messages of errors.
+
+    Raises:
+        ConfigError: one line that names the place, what was found and what is allowed.
+    """
+    if isinstance(data, dict) and "imports" in data:
+        data = dict(data)
+        import_modules(data.pop("imports"), place)
+    return build(to_component(data, Environment, place))

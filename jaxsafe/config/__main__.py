@@ -17,15 +17,16 @@ def main(argv: Sequence[str]) -> int:
     if "=" in task:
         raise ConfigError(f"argument {task!r}: expected a task first, for instance docking3d")
     arguments = cli.Arguments.parse(words)
-    changes, actions = arguments.pop_overrides(), arguments.pop_text("actions")
-    arguments.refuse_rest(["actions", "env.…"])
-    print(dump(make(task, changes, actions=actions)), end="")  # type: ignore[arg-type]
+    changes = arguments.pop_overrides()
+    options = {name: arguments.pop_text(name) for name in ("actions", "variant")}
+    arguments.refuse_rest([*options, "env.…"])
+    print(dump(make(task, changes, **options)), end="")  # type: ignore[arg-type]
     return 0
 
 
 def usage() -> str:
     """The help text."""
-    return "usage: python -m jaxsafe.config TASK [actions=continuous|discrete] [env.PATH=VALUE …]"
+    return "usage: python -m jaxsafe.config TASK [actions=continuous|discrete] [variant=paper|released] [env.PATH=VALUE …]"
 
 
 if __name__ == "__main__":

@@ -1,26 +1,35 @@
-"""Checks of a composed environment: every name refers to something that exists, and, where order matters, earlier."""
+"""Checks of a composed environment: names refer to parts that exist, earlier ones where order matters; it can be traced."""
 
 from __future__ import annotations
 
+import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Annotated, Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxsafe.component import Component, Refers, fields
-from jaxsafe.config.convert import join
-from jaxsafe.environment import Environment
+from jaxsafe.component import ANY, Component, Refers, fields
+from jaxsafe.config.convert import expects, to_value
+from jaxsafe.environment import Environment, reset, step
 from jaxsafe.errors import ConfigError, nearest
-from jaxsafe.processors.observation import Observe
-from jaxsafe.simulation.controllers import Actuator, Uncontrolled
+from jaxsafe.paths import join, set_path
+from jaxsafe.processors.observation import Observe, ObserveAngle
+from jaxsafe.rta.prediction import judge
 from jaxsafe.simulation.platform import Platform
+from jaxsafe.types import Sim
 
 _SECTIONS = ("platforms", "regions", "status", "constraints", "terminal", "reward", "observation")
 
 
-def check(env: Environment) -> Environment:
+def check(env: Environment, before: Environment | None = None) -> Environment:
     """Return the environment unchanged if its parts fit together.
+
+    Args:
+        env: the environment.
+        before: one that has passed and whose numbers alone differ, if there is one; then nothing is traced again.
 
     Raises:
         ConfigError: naming the part that does not fit and what it may refer to.
@@ -37,12 +46,17 @@ def check(env: Environment) -> Environment:
                 ordered = refers.section == section and section in ("platforms", "status")  # later ones are not there yet
                 known = names[refers.section][: index if ordered else None]
                 _reference(place, name, known, " listed before it" if ordered else "")
+    _check_problems(env)
     for platform in env.platforms:
         _check_platform(platform, is_agent=platform.name == env.agent)
     _check_space(env)
+    _check_randomized(env)
     for required in ("terminal", "reward", "observation"):
         if not names[required]:
             raise ConfigError(f"{required}: an environment needs at least one")
+    if before is None or _shapes(env) != _shapes(before):
+        _check_kinds(env)
+        _check_tracing(env)
     return env
 
 
@@ -52,10 +66,39 @@ def _references(component: Component, place: str) -> Iterator[tuple[str, Refers,
         if field.refers and isinstance(value, str):
             yield here, field.refers, value
         if isinstance(value, Mapping):
-            yield from ((here, Refers("outcomes"), key) for key in value)
+            yield from ((here, refers, key) for refers in _key_refers(field.hint) for key in value)
         for inner in value if isinstance(value, tuple) else (value,):
             if isinstance(inner, Component):
                 yield from _references(inner, join(here, getattr(inner, "name", "")))
+
+
+def _key_refers(hint: Any) -> list[Refers]:
+    """What the keys of `Mapping[Annotated[str, Refers(…)], …]` refer to."""
+    key = typing.get_args(hint)[0]
+    marks = typing.get_args(key)[1:] if typing.get_origin(key) is Annotated else ()
+    return [mark for mark in marks if isinstance(mark, Refers)]
+
+
+def _check_problems(env: Environment) -> None:
+    for section in _SECTIONS:
+        for part in getattr(env, section):
+            for place, problem in _problems(part, f"{section}.{part.name}"):
+                raise ConfigError(f"{place}: {problem}")
+
+
+def _problems(component: Component, place: str) -> Iterator[tuple[str, str]]:
+    """What components say is wrong with themselves; traced numbers cannot be judged."""
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(component)):
+        return
+    for name in fields(type(component)):
+        value = getattr(component, name)
+        for inner in value if isinstance(value, tuple) else (value,):
+            if isinstance(inner, Component):
+                yield from _problems(inner, join(join(place, name), getattr(inner, "name", "")))
+    with jax.ensure_compile_time_eval():  # inside a trace comparisons of constants would be traced too
+        problem = component.problem()
+    if problem:
+        yield place, problem
 
 
 def _reference(place: str, name: str, known: Iterable[str], which: str = "") -> None:
@@ -68,6 +111,8 @@ def _once(place: str, names: Sequence[str]) -> None:
     for name in names:
         if names.count(name) > 1:
             raise ConfigError(f"{place}: the name {name!r} stands twice")
+        if not name or "." in name:
+            raise ConfigError(f"{place}: expected a name without dots, found {name!r}")
 
 
 def _check_space(env: Environment) -> None:
@@ -75,45 +120,130 @@ def _check_space(env: Environment) -> None:
     if len(set(dimensions.values())) > 1:
         found = ", ".join(f"{name} {dimension}" for name, dimension in dimensions.items())
         raise ConfigError(f"platforms: expected the same dimension for all, found {found}")
-    states = {platform.name: vars(platform.rest()) for platform in env.platforms}
+    known = {platform.name: platform.quantities() for platform in env.platforms}
     for item in env.observation:
-        if isinstance(item, Observe) and item.what not in states[item.of]:
-            raise ConfigError(
-                f"observation.{item.name}.what: {item.of} has no state field {item.what!r};"
-                f" choose from {nearest(item.what, states[item.of])}"
-            )
-
-
-def _check_actuator(actuator: Actuator, place: str) -> None:
-    if any(isinstance(bound, Tracer) for bound in (actuator.low, actuator.high)):
-        return
-    if np.any(np.asarray(actuator.low) > np.asarray(actuator.high)):
-        raise ConfigError(f"{place}: expected low ≤ high, found {actuator.low:g} and {actuator.high:g}")
+        if not isinstance(item, (Observe, ObserveAngle)):
+            continue
+        for platform in (item.of, getattr(item, "relative_to", None) or item.of):
+            if item.what not in known[platform]:
+                raise ConfigError(
+                    f"observation.{item.name}.what: {platform} has no quantity {item.what!r};"
+                    f" choose from {nearest(item.what, known[platform])}"
+                )
+    for region in env.regions:
+        for status in env.status:
+            if getattr(status, "region", None) == region.name and getattr(status, "of", None) == region.on:
+                raise ConfigError(
+                    f"status.{status.name}.of: region {region.name!r} is on {region.on!r} itself; choose another"
+                )
 
 
 def _check_platform(platform: Platform, is_agent: bool) -> None:
-    place = f"platforms.{platform.name}"
-    if sorted(platform.inputs) != sorted(platform.controller.names):
+    place, controller = f"platforms.{platform.name}", platform.controller
+    parts = "actuators" if controller.takes_actions else "commands"
+    _once(f"{place}.controller.{parts}", controller.names)
+    for name in controller.names:
+        if name not in platform.inputs:
+            raise ConfigError(
+                f"{place}.controller.{parts}: {platform.type_name} has no control {name!r};"
+                f" choose from {nearest(name, platform.inputs) or 'none'}"
+            )
+    if is_agent and not (controller.takes_actions and controller.names):
+        raise ConfigError(f"agent: {platform.name!r} cannot be the agent: its controller takes no actions")
+    if controller.takes_actions and not is_agent:
         raise ConfigError(
-            f"{place}.controller.actuators: expected {', '.join(platform.inputs) or 'none'},"
-            f" found {', '.join(platform.controller.names) or 'none'}"
+            f"{place}.controller ({controller.type_name}): only the agent takes actions; choose from scripted, uncontrolled"
         )
-    if isinstance(platform.controller, Uncontrolled) and platform.controller.actuators:
-        raise ConfigError(f"{place}.controller (uncontrolled): takes no actuators")
-    if is_agent and not platform.inputs:
-        raise ConfigError(f"agent: {platform.name!r} cannot be the agent: it takes no control")
-    for actuator in platform.controller.actuators:
-        _check_actuator(actuator, f"{place}.controller.actuators.{actuator.name}")
     _once(f"{place}.start", platform.random_fields)
-    rest = platform.rest()
+    rest = vars(platform.rest())
     for initializer in platform.start:
-        if initializer.name not in vars(rest):
-            known = nearest(initializer.name, vars(rest))
-            raise ConfigError(f"{place}.start.{initializer.name}: no such state field; choose from {known}")
+        here = f"{place}.start.{initializer.name}"
+        if initializer.name not in rest:
+            raise ConfigError(f"{here}: no such state field; choose from {nearest(initializer.name, rest)}")
         if getattr(initializer, "direction", None) is not None:
             drawn = jax.eval_shape(initializer.direction.draw, jax.random.key(0)).shape  # type: ignore[attr-defined]
-            if drawn != getattr(rest, initializer.name).shape:
+            if drawn != rest[initializer.name].shape:
                 raise ConfigError(
-                    f"{place}.start.{initializer.name}.direction: draws {drawn[0]} numbers, the platform has"
-                    f" {platform.dimension} dimensions; give a polar range in space, none in the plane"
+                    f"{here}.direction: draws {drawn[0]} numbers, the platform has {platform.dimension} dimensions;"
+                    " give a polar range in space, none in the plane"
                 )
+
+
+def _check_randomized(env: Environment) -> None:
+    """Every path leads to one number, and every number of its interval is allowed there."""
+
+    def convert(value: Any, field: Any, place: str) -> Any:
+        one = field.unit.length in (None, ANY) if field.unit else isinstance(value, Mapping)
+        if not one:
+            raise ConfigError(f"{place}: expected the path of one number, found that of {expects(field)}")
+        return to_value(value, field, place)
+
+    for path, interval in env.randomize.items():
+        if path.split(".")[0] == "randomize":
+            raise ConfigError(f"randomize.{path}: expected the path of a number outside `randomize`")
+        if isinstance(interval, Tracer):
+            continue
+        low, high = np.asarray(interval).tolist()  # an element of a constant array would be traced inside a trace
+        if not np.isfinite(low) or not np.isfinite(high):
+            raise ConfigError(f"randomize.{path}: expected finite bounds, found [{low}, {high}]")
+        for value in (low, high, *([0.0] if low < 0.0 < high else [])):
+            try:
+                changed = set_path(env, path, value, convert)
+                if _shapes(changed) != _shapes(env):
+                    raise ConfigError(f"{path}: expected the path of one number, found that of a list")
+                _check_problems(changed)
+            except ConfigError as error:
+                raise ConfigError(f"randomize: {error}") from None
+
+
+def _shapes(env: Environment) -> tuple:
+    leaves, structure = jax.tree.flatten(env)
+    return structure, [jnp.shape(leaf) for leaf in leaves]
+
+
+def _check_kinds(env: Environment) -> None:
+    """Truth values where they are asked for, numbers elsewhere."""
+
+    def statuses(env: Environment) -> Mapping[str, Any]:
+        platforms = {platform.name: platform.rest() for platform in env.platforms}
+        return judge(env, Sim(jnp.zeros_like(env.dt), platforms, {}, {}, {})).status
+
+    try:
+        found = jax.eval_shape(statuses, env)
+    except Exception:  # told with its place when all is traced
+        return
+    for section in _SECTIONS:
+        for part in getattr(env, section):
+            for place, refers, name in _references(part, f"{section}.{part.name}"):
+                if refers.section == "status" and refers.boolean not in (None, found[name].dtype == bool):
+                    wanted = "true or false" if refers.boolean else "a number"
+                    raise ConfigError(f"{place}: expected a status that is {wanted}, found {name!r}, which is not")
+
+
+def _check_tracing(env: Environment) -> None:
+    """Trace one reset and one step, so that what does not fit together is told here, with its place."""
+
+    def episode(env: Environment) -> Any:
+        start, first = reset(env, jax.random.key(0))
+        action = jnp.zeros(env.action_size, int if env.num_action_points else None)
+        return (start, first), step(env, start, action)
+
+    try:
+        begin, after = jax.eval_shape(episode, env)
+    except ConfigError:
+        raise
+    except Exception as error:
+        place = next((note.removeprefix("in ") for note in getattr(error, "__notes__", ())), "environment")
+        reason = next(iter(str(error).splitlines()), "")
+        raise ConfigError(f"{place}: cannot be computed: {type(error).__name__}: {reason[:200]}") from error
+    memory, later = vars(begin[0].memory), vars(after[0].memory)
+    for section, parts in memory.items():
+        for name in parts:
+            if jax.tree.structure(parts[name]) != jax.tree.structure(later[section][name]):
+                raise ConfigError(f"{section}.{name}: its memory has another structure after a step than after reset")
+    for (path, old), new in zip(jax.tree_util.tree_leaves_with_path(begin), jax.tree.leaves(after), strict=True):
+        if (old.shape, old.dtype) != (new.shape, new.dtype):
+            place = jax.tree_util.keystr(path, simple=True, separator=".")
+            raise ConfigError(
+                f"{place}: is {old.dtype}{list(old.shape)} after reset and {new.dtype}{list(new.shape)} after a step"
+            )

@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxsafe.component import Component, Field, Kind, choices, fields, unwrap_optional
+from jaxsafe.component import ANY, Component, Field, Kind, choices, fields, normalise, unwrap_optional
 from jaxsafe.component import field as field_of
 from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.paths import join
 
 
 def to_component(data: Any, base: type[Kind], place: str) -> Kind:
@@ -24,7 +25,7 @@ def to_component(data: Any, base: type[Kind], place: str) -> Kind:
         ConfigError: naming the place, what was found and what is allowed.
     """
     if isinstance(data, base):
-        return data
+        return normalise(data)
     if not isinstance(data, Mapping):
         raise ConfigError(f"{place or 'environment'}: expected a mapping of fields, found {_show(data)}")
     cls, entries = _choose(dict(data), base, place)
@@ -60,15 +61,12 @@ def to_data(value: Any) -> Any:
     return value
 
 
-def join(place: str, name: str) -> str:
-    """`place.name`; either alone where the other is empty."""
-    return f"{place}.{name}" if place and name else place or name
-
-
 def expects(field: Field) -> str:
     """What a field takes, in words."""
     if field.unit:
-        shape = {None: "a number", 2: "a list [low, high]", 0: "a list of numbers"}[field.unit.length]
+        shape = {None: "a number", 2: "a list [low, high]", 0: "a list of numbers", ANY: "a number or a list of numbers"}[
+            field.unit.length
+        ]
         unit = "" if field.unit.symbol in ("1", "physical", "as observed") else f" in {field.unit.symbol}"
         return f"{shape}{unit}" + (f" {field.range}" if field.range else "")
     core = _bare(field.hint)
@@ -142,7 +140,8 @@ def _number(value: Any, field: Field, place: str) -> jax.Array:
         array = value if isinstance(value, jax.Array) else np.asarray(value, float)
     except (TypeError, ValueError, OverflowError):
         raise wrong from None
-    if array.ndim != (length is not None) or (length and array.shape != (length,)):
+    dimensions = {None: (0,), ANY: (0, 1)}.get(length, (1,))
+    if array.ndim not in dimensions or (length == 2 and array.shape != (2,)):
         raise wrong
     if not isinstance(array, Tracer):
         with np.errstate(over="ignore"):  # beyond the largest float32 is infinite
@@ -179,7 +178,7 @@ def _shortest(array: np.ndarray) -> Any:
 
 
 def _show(value: Any) -> str:
-    if isinstance(value, jax.Array):
+    if isinstance(value, Tracer):
         return f"an array of shape {value.shape}"
-    text = repr(value.tolist() if isinstance(value, np.ndarray) else value)
+    text = repr(to_data(value) if isinstance(value, (np.ndarray, jax.Array)) else value)
     return text if len(text) <= 60 else text[:57] + "..."

@@ -1,0 +1,44 @@
+"""Components of a user's own package in YAML: the modules that define them, to import before the rest is read."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from typing import Any
+
+from jaxsafe.component import Component, fields
+from jaxsafe.errors import ConfigError
+from jaxsafe.paths import join
+
+
+def modules(component: Component) -> list[str]:
+    """The modules outside jaxsafe that define parts of a component, in order of first use."""
+    module = type(component).__module__
+    found = [] if module.split(".")[0] == "jaxsafe" else [module]
+    for name in fields(type(component)):
+        value = getattr(component, name)
+        for inner in value if isinstance(value, tuple) else (value,):
+            found += modules(inner) if isinstance(inner, Component) else []
+    return list(dict.fromkeys(found))
+
+
+def import_modules(names: Any, place: str) -> None:
+    """Import modules, from the current directory too.
+
+    Raises:
+        ConfigError: `names` is not a list of names, or a module cannot be imported.
+    """
+    here = join(place, "imports")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise ConfigError(f"{here}: expected a list of modules, found {names!r}")
+    if os.getcwd() not in sys.path and "" not in sys.path:
+        sys.path.append(os.getcwd())
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ConfigError:
+            raise
+        except (Exception, SystemExit) as error:
+            reason = next(iter(str(error).splitlines()), "")[:200]
+            raise ConfigError(f"{here}: cannot import {name!r}: {type(error).__name__}: {reason}") from error

@@ -1,0 +1,85 @@
+"""Dotted paths into components: `reward.delta_v.scale`, `deputy.mass`, `deputy.controller.actuators.thrust_x.low`.
+
+A path walks through field names and the names of the parts in a list; at the start it may also name a part of the
+component's `shorthand` field, a platform of an environment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from jaxsafe.component import Component, Field, fields
+from jaxsafe.errors import ConfigError, nearest
+
+Convert = Callable[[Any, Field, str], Any]
+"""`convert(value, field, place)`: the value that the field takes, or a ConfigError that names the place."""
+
+
+def join(place: str, name: str) -> str:
+    """`place.name`; either alone where the other is empty."""
+    return f"{place}.{name}" if place and name else place or name
+
+
+def as_given(value: Any, field: Field, place: str) -> Any:
+    """A `Convert` that checks nothing."""
+    return value
+
+
+def set_path(component: Any, path: str, value: Any, convert: Convert = as_given) -> Any:
+    """Return the component with the value at one dotted path replaced.
+
+    Where the path leads to a list of named parts, a list of names picks them, in the new order.
+
+    Raises:
+        ConfigError: the path leads nowhere, or `convert` refuses the value.
+    """
+    return _set(component, path.split("."), value, convert, "")
+
+
+def _set(component: Any, path: list[str], value: Any, convert: Convert, place: str) -> Any:
+    head, rest = path[0], path[1:]
+    table = fields(type(component))
+    parts = getattr(component, component.shorthand) if component.shorthand and not place else ()
+    names = [part.name for part in parts]
+    if head not in table and head in names:
+        return component.replace(**{component.shorthand: _set_item(parts, path, value, convert, place)})
+    if head not in table:
+        raise ConfigError(f"{join(place, head)}: unknown field {head!r}; choose from {nearest(head, [*table, *names])}")
+    here, inner = join(place, head), getattr(component, head)
+    if not rest:
+        picked = _pick(inner, value, here) if _are_names(inner, value) else convert(value, table[head], here)
+        return component.replace(**{head: picked})
+    if isinstance(inner, Component):
+        return component.replace(**{head: _set(inner, rest, value, convert, here)})
+    if isinstance(inner, tuple):
+        return component.replace(**{head: _set_item(inner, rest, value, convert, here)})
+    if isinstance(inner, Mapping) and len(rest) == 1:
+        if rest[0] not in inner:
+            raise ConfigError(f"{here}: unknown name {rest[0]!r}; choose from {nearest(rest[0], inner)}")
+        return component.replace(**{head: convert({**inner, rest[0]: value}, table[head], here)})
+    raise ConfigError(f"{join(here, rest[0])}: {here} has no fields" + (" because it is not set" if inner is None else ""))
+
+
+def _set_item(items: tuple, path: list[str], value: Any, convert: Convert, place: str) -> tuple:
+    index = _index(items, path[0], place)
+    if len(path) == 1:
+        raise ConfigError(f"{join(place, path[0])}: name one of its fields: {', '.join(fields(type(items[index])))}")
+    changed = _set(items[index], path[1:], value, convert, join(place, path[0]))
+    return (*items[:index], changed, *items[index + 1 :])
+
+
+def _are_names(inner: Any, value: Any) -> bool:
+    named = isinstance(inner, tuple) and inner and all(hasattr(part, "name") for part in inner)
+    return bool(named and value and isinstance(value, (list, tuple)) and all(isinstance(one, str) for one in value))
+
+
+def _pick(items: tuple, names: Sequence[str], place: str) -> tuple:
+    return tuple(items[_index(items, name, place)] for name in names)
+
+
+def _index(items: tuple, name: str, place: str) -> int:
+    names = [getattr(item, "name", str(index)) for index, item in enumerate(items)]
+    if name not in names:
+        raise ConfigError(f"{join(place, name)}: unknown name {name!r}; choose from {nearest(name, names)}")
+    return names.index(name)

@@ -1,0 +1,54 @@
+"""What a filter may ask of the environment: where a control leads, how safe a state is, and the bounds of the controls.
+
+Prediction uses the plant's own map over one step, so a certificate speaks about the very state that the step will reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.types import Sim
+
+
+def advance(env: Any, sim: Sim, control: Float[Array, " m"]) -> Sim:
+    """The simulation one step later under a control of the agent in physical units, without regions and statuses."""
+    controls = dict(zip(env.action_names, control, strict=True))
+    return sim.replace(time=sim.time + env.dt, platforms=advance_platforms(env, sim, controls), regions={}, status={})
+
+
+def advance_platforms(env: Any, sim: Sim, controls: Mapping[str, Array]) -> dict[str, Any]:
+    """The platforms' next states, all from the old simulation: they move at once."""
+    platforms = {}
+    for platform in env.platforms:
+        own = controls if platform.name == env.agent else platform.controller.control(jnp.zeros(0), sim)
+        platforms[platform.name] = platform.step(sim.platforms[platform.name], own, env.dt)
+    return platforms
+
+
+def judge(env: Any, sim: Sim, before: Sim | None = None) -> Sim:
+    """Regions and statuses from the platforms alone; statuses with memory are taken as at a reset.
+
+    With `before`, one step earlier, distances are the smallest on the straight way from there, so that nothing slips
+    through between two instants.
+    """
+    sim = sim.replace(regions={region.name: region.place(sim.platforms) for region in env.regions}, status={})
+    earlier = None if before is None else judge(env, before)
+    for status in env.status:
+        value = status.process(status.init(sim), sim) if earlier is None else status.on_the_way(earlier, sim)
+        sim = sim.replace(status={**sim.status, status.name: value})
+    return sim
+
+
+def constraint(env: Any, name: str) -> Any:
+    """A safety constraint by name."""
+    return next(one for one in env.constraints if one.name == name)
+
+
+def bounds(env: Any) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Lowest and highest control, physical units, in action order."""
+    actuators = env.agent_platform.controller.actuators
+    return jnp.stack([one.low for one in actuators]), jnp.stack([one.high for one in actuators])
