@@ -10,6 +10,9 @@ from hypothesis import strategies as st
 import jaxsafe
 from jaxsafe.component import normalise
 from jaxsafe.simulation.controllers import Actuator, Continuous, Discrete, Uncontrolled
+from jaxsafe.types import Sim
+
+SIM = Sim(jnp.zeros(()), {}, {}, {}, {})
 
 
 def actuator(low: float = -1.0, high: float = 2.0, **options: object) -> Actuator:
@@ -80,23 +83,60 @@ def test_actions_are_positional_and_controls_are_named() -> None:
     actuators = (Actuator(name="b", low=0.0, high=1.0, points=3), Actuator(name="a", low=-10.0, high=10.0, points=5))
     continuous, discrete = normalise(Continuous(actuators=actuators)), normalise(Discrete(actuators=actuators))
     assert continuous.names == discrete.names == ("b", "a")
-    assert continuous.control(jnp.asarray([1.0, 0.5])) == {"b": 1.0, "a": 5.0}
-    assert discrete.control(jnp.asarray([1, 4])) == {"b": 0.5, "a": 10.0}
+    assert continuous.control(jnp.asarray([1.0, 0.5]), SIM) == {"b": 1.0, "a": 5.0}
+    assert discrete.control(jnp.asarray([1, 4]), SIM) == {"b": 0.5, "a": 10.0}
     assert continuous.points == ()
     assert discrete.points == (3, 5)
+    assert continuous.takes_actions
+    assert discrete.takes_actions
 
 
-def test_an_uncontrolled_platform_has_no_controls() -> None:
-    assert Uncontrolled().control(jnp.zeros(0)) == {}
+def test_an_uncontrolled_platform_has_no_controls_and_takes_no_actions() -> None:
+    assert Uncontrolled().control(jnp.zeros(0), SIM) == {}
     assert Uncontrolled().names == ()
+    assert Uncontrolled().points == ()
+    assert not Uncontrolled().takes_actions
 
 
-@pytest.mark.parametrize(("task", "size"), [("docking2d", 2), ("docking3d", 3)])
-def test_docking_thrusts_one_newton_per_axis_in_eleven_points(task: str, size: int) -> None:
-    env = jaxsafe.make(task, actions="discrete")
-    assert env.num_action_points == (11,) * size
-    controller = env.agent_platform.controller
-    lowest, highest = controller.control(jnp.zeros(size, int)), controller.control(jnp.full(size, 10))
-    assert list(lowest) == [f"thrust_{axis}" for axis in "xyz"[:size]]
-    assert set(map(float, lowest.values())) == {-1.0}
-    assert set(map(float, highest.values())) == {1.0}
+def test_an_actuator_whose_limits_are_the_wrong_way_round_has_a_problem() -> None:
+    assert actuator(2.0, 1.0).problem() == "expected low ≤ high, found 2 and 1"
+    assert actuator(1.0, 1.0).problem() is None
+    assert actuator().problem() is None
+
+
+TURN = np.pi / 180.0
+LIMITS = {
+    "rejoin2d": {"heading_rate": (-0.17, 0.17), "acceleration": (-96.5, 96.5)},
+    "rejoin3d": {
+        "roll_rate": (-0.17, 0.17),
+        "flight_path_angle_rate": (-0.09, 0.09),
+        "acceleration": (-96.5, 96.5),
+    },
+    "docking2d": {f"thrust_{axis}": (-1.0, 1.0) for axis in "xy"},
+    "docking3d": {f"thrust_{axis}": (-1.0, 1.0) for axis in "xyz"},
+    "docking2d_oriented": {"thrust": (-1.0, 2.0), "attitude_acceleration": (-TURN, TURN)},
+}
+
+
+@pytest.mark.parametrize("task", LIMITS)
+def test_each_task_has_its_actuators_in_order_and_their_points_reach_from_end_to_end(task: str) -> None:
+    continuous, discrete = (jaxsafe.make(task, actions=kind) for kind in ("continuous", "discrete"))
+    size = len(LIMITS[task])
+    num_points = 5 if task.startswith("rejoin") else 11
+    assert continuous.action_names == discrete.action_names == tuple(LIMITS[task])
+    assert discrete.num_action_points == (num_points,) * size
+    assert continuous.num_action_points == ()
+    ends = {continuous: (-jnp.ones(size), jnp.ones(size)), discrete: (jnp.zeros(size, int), jnp.full(size, num_points - 1))}
+    for env, actions in ends.items():
+        for index, action in enumerate(actions):
+            found = env.agent_platform.controller.control(action, SIM)
+            expected = {name: limits[index] for name, limits in LIMITS[task].items()}
+            assert {name: float(value) for name, value in found.items()} == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("task", LIMITS)
+def test_no_action_in_the_middle_is_no_control_and_the_oriented_thrust_is_zero_centred(task: str) -> None:
+    env = jaxsafe.make(task)
+    found = env.agent_platform.controller.control(jnp.zeros(env.action_size), SIM)
+    assert list(found) == list(LIMITS[task])
+    np.testing.assert_allclose([float(value) for value in found.values()], 0.0, atol=1e-8)

@@ -1,10 +1,11 @@
-"""Random starts: ranges, distributions (Kolmogorov-Smirnov) and independence, Table 4.
+"""Random starts: ranges, distributions (Kolmogorov-Smirnov) and independence, Tables 3 and 4.
 
 The keys are fixed, so a test either always passes or always fails; at the level used here a right sampler with other
 keys would fail one comparison in a thousand.
 """
 
 from itertools import combinations
+from types import SimpleNamespace
 
 import chex
 import jax
@@ -16,7 +17,8 @@ from scipy.stats import kstest, spearmanr
 import jaxsafe
 from jaxsafe.component import normalise
 from jaxsafe.environment import Environment
-from jaxsafe.simulation.initializers import Direction, uniform
+from jaxsafe.simulation.initializers import AroundAtAltitude, Direction, Fixed, Uniform, uniform
+from jaxsafe.types import Sim
 
 NUM_STARTS = 4000
 LEVEL = 1e-3
@@ -129,3 +131,104 @@ def test_uniform_stays_within_its_interval(low: float, high: float) -> None:
     sample = jax.vmap(uniform, in_axes=(0, None))(keys, jnp.asarray([low, high]))
     assert low <= sample.min()
     assert sample.max() <= high
+
+
+# The generic initializers
+
+NOWHERE = Sim(jnp.zeros(()), {}, {}, {}, {})
+
+
+@pytest.mark.parametrize("value", [3.0, (1.0, -2.0), (0.0, 5.0, 7.0)])
+def test_a_fixed_start_is_its_value_whatever_the_key(value: float | tuple[float, ...]) -> None:
+    fixed = normalise(Fixed(name="heading", value=value))
+    for seed in (0, 1):
+        np.testing.assert_array_equal(fixed.draw(jax.random.key(seed), {}, NOWHERE), np.asarray(value, np.float32))
+
+
+def draw(initializer: Uniform | AroundAtAltitude, sim: Sim = NOWHERE, seed: int = 0) -> np.ndarray:
+    keys = jax.random.split(jax.random.key(seed), NUM_STARTS)
+    return np.asarray(jax.jit(jax.vmap(lambda key: normalise(initializer).draw(key, {}, sim)))(keys), float)
+
+
+def test_a_uniform_scalar_is_uniform_between_its_bounds() -> None:
+    sample = draw(Uniform(name="speed", low=250.0, high=300.0))
+    assert sample.shape == (NUM_STARTS,)
+    assert is_uniform(sample, 250.0, 300.0)
+
+
+def test_a_uniform_vector_is_uniform_and_independent_in_each_component() -> None:
+    low, high = (-1.0, 5.0, 12_000.0), (1.0, 5.0, 14_000.0)
+    sample = draw(Uniform(name="position", low=low, high=high))
+    assert is_uniform(sample[:, 0], -1.0, 1.0)
+    assert is_uniform(sample[:, 2], 12_000.0, 14_000.0)
+    assert (sample[:, 1] == 5.0).all()
+    assert spearmanr(sample[:, 0], sample[:, 2]).pvalue > LEVEL
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "problem"),
+    [
+        (1.0, 2.0, None),
+        (2.0, 2.0, None),
+        ((0.0, 1.0), (0.0, 3.0), None),
+        (2.0, 1.0, "expected low ≤ high, found 2.0 and 1.0"),
+        ((0.0, 4.0), (1.0, 3.0), "expected low ≤ high, found [0.0, 4.0] and [1.0, 3.0]"),
+        ((0.0, 1.0), (1.0, 2.0, 3.0), "expected low ≤ high, found [0.0, 1.0] and [1.0, 2.0, 3.0]"),
+        (0.0, (1.0, 2.0), "expected low ≤ high, found 0.0 and [1.0, 2.0]"),
+    ],
+)
+def test_uniform_bounds_must_be_in_order_and_of_one_shape(low: object, high: object, problem: str | None) -> None:
+    assert normalise(Uniform(name="position", low=low, high=high)).problem() == problem
+
+
+def test_around_at_altitude_is_uniform_in_horizontal_distance_azimuth_and_altitude() -> None:
+    lead = SimpleNamespace(position=jnp.asarray([300.0, -200.0, 9_999.0]))
+    around = AroundAtAltitude(name="position", about="lead", distance=(5.0, 10.0), altitude=(-3.0, 16.0))
+    sample = draw(around, NOWHERE.replace(platforms={"lead": lead}))
+    x, y = sample[:, 0] - 300.0, sample[:, 1] + 200.0
+    drawn = {"distance": np.hypot(x, y), "azimuth": np.arctan2(y, x) % (2 * np.pi), "altitude": sample[:, 2]}
+    for name, (low, high) in {"distance": (5, 10), "azimuth": (0, 2 * np.pi), "altitude": (-3, 16)}.items():
+        assert is_uniform(drawn[name], low, high), name
+    for one, other in combinations(drawn, 2):
+        assert spearmanr(drawn[one], drawn[other]).pvalue > LEVEL, (one, other)
+
+
+# The rejoin and oriented tasks
+
+
+@pytest.mark.parametrize("task", ["rejoin2d", "rejoin3d"])
+def test_a_rejoin_starts_as_in_table_3(task: str) -> None:
+    state, _ = draw_starts(jaxsafe.make(task), jax.random.split(jax.random.key(7), NUM_STARTS))
+    lead, wingman = state.sim.platforms["lead"], state.sim.platforms["wingman"]
+    x, y = np.asarray(wingman.position - lead.position, float).T[:2]
+    drawn = {
+        "lead x": (lead.position[:, 0], 5000.0, 10_000.0),
+        "lead y": (lead.position[:, 1], 5000.0, 10_000.0),
+        "lead heading": (lead.heading, 0.0, 2 * np.pi),
+        "lead speed": (lead.speed, 250.0, 300.0),
+        "distance": (np.hypot(x, y), 5000.0, 10_000.0),
+        "azimuth": (np.arctan2(y, x) % (2 * np.pi), 0.0, 2 * np.pi),
+        "heading": (wingman.heading, 0.0, 2 * np.pi),
+        "speed": (wingman.speed, 200.0, 400.0),
+    }
+    if task == "rejoin3d":
+        drawn["lead z"] = (lead.position[:, 2], 12_000.0, 14_000.0)
+        drawn["z"] = (wingman.position[:, 2], 10_000.0, 16_000.0)
+        for craft in (lead, wingman):
+            assert not craft.roll.any()
+            assert not craft.flight_path_angle.any()
+    for name, (sample, low, high) in drawn.items():
+        assert is_uniform(np.asarray(sample, float), low, high), name
+    for one, other in combinations(drawn, 2):
+        assert spearmanr(drawn[one][0], drawn[other][0]).pvalue > LEVEL, (one, other)
+
+
+def test_an_oriented_start_has_any_attitude_and_no_turn_rate() -> None:
+    state, _ = draw_starts(jaxsafe.make("docking2d_oriented"), jax.random.split(jax.random.key(8), NUM_STARTS))
+    deputy = state.sim.platforms["deputy"]
+    assert is_uniform(np.asarray(deputy.attitude, float), -np.pi, np.pi)
+    assert not deputy.attitude_rate.any()
+    distance = np.linalg.norm(np.asarray(deputy.position, float), axis=1)
+    assert is_uniform(distance, 100.0, 150.0)
+    for sample in (distance, deputy.position[:, 0], deputy.velocity[:, 1]):
+        assert spearmanr(deputy.attitude, sample).pvalue > LEVEL

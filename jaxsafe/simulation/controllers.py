@@ -7,13 +7,13 @@ actuators are listed.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.component import Component, Range, Unit
-from jaxsafe.types import Number
+from jaxsafe.types import Number, Sim
 
 Bound = Annotated[Number, Unit("physical")]
 Controls = Mapping[str, Float[Array, ""]]
@@ -34,6 +34,9 @@ class Actuator(Component):
     rescale: bool = True
     zero_centred: bool = False
 
+    def problem(self) -> str | None:
+        return None if self.low <= self.high else f"expected low ≤ high, found {self.low:g} and {self.high:g}"
+
     def from_continuous(self, action: Float[Array, ""]) -> Float[Array, ""]:
         """Map an action to the physical control."""
         if not self.rescale:
@@ -50,45 +53,56 @@ class Actuator(Component):
 
 
 class Controller(Component):
-    """The source of a platform's desired controls: an agent's actions, or nothing at all."""
+    """The source of a platform's desired controls: an agent's actions, a script, or nothing at all."""
 
-    actuators: tuple[Actuator, ...] = ()
+    takes_actions: ClassVar[bool] = False
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The actuators in the order of the action."""
-        return tuple(actuator.name for actuator in self.actuators)
+        """The controls that it gives; for an agent's in the order of the action."""
+        return ()
 
     @property
     def points(self) -> tuple[int, ...]:
         """Number of choices of each actuator; empty if actions are continuous."""
         return ()
 
-    def control(self, action: Array) -> Controls:
-        """Return the desired control of every actuator, by name."""
+    def control(self, action: Array, sim: Sim) -> Controls:
+        """Return the desired controls by name, from the agent's action or from the simulation before the step."""
         raise NotImplementedError
 
 
-class Continuous(Controller, type="continuous"):
+class Uncontrolled(Controller, type="uncontrolled"):
+    """All controls are 0: the chief, or an aircraft that flies on as it started."""
+
+    def control(self, action: Array, sim: Sim) -> Controls:
+        return {}
+
+
+class AgentController(Controller):
+    """An agent's actions, one element per actuator."""
+
+    takes_actions: ClassVar[bool] = True
+    actuators: tuple[Actuator, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(actuator.name for actuator in self.actuators)
+
+
+class Continuous(AgentController, type="continuous"):
     """An agent whose action is one number in [−1, 1] per actuator, shape (actuators,)."""
 
-    def control(self, action: Float[Array, " actuators"]) -> Controls:
+    def control(self, action: Float[Array, " actuators"], sim: Sim) -> Controls:
         return {actuator.name: actuator.from_continuous(action[i]) for i, actuator in enumerate(self.actuators)}
 
 
-class Discrete(Controller, type="discrete"):
+class Discrete(AgentController, type="discrete"):
     """An agent whose action is one index per actuator, int, shape (actuators,)."""
 
     @property
     def points(self) -> tuple[int, ...]:
         return tuple(actuator.points for actuator in self.actuators)
 
-    def control(self, action: Array) -> Controls:
+    def control(self, action: Array, sim: Sim) -> Controls:
         return {actuator.name: actuator.from_discrete(action[i]) for i, actuator in enumerate(self.actuators)}
-
-
-class Uncontrolled(Controller, type="uncontrolled"):
-    """A platform without actuators, such as the chief."""
-
-    def control(self, action: Array) -> Controls:
-        return {}

@@ -5,13 +5,14 @@ The thrust is constant over a step, so the step is exact: the linear equations a
 
 from __future__ import annotations
 
-import math
-from typing import Any
+from typing import Annotated
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsafe.component import Unit
 from jaxsafe.simulation.controllers import Controls
+from jaxsafe.simulation.integrate import sine_ratios
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.types import Kilograms, Number, RadiansPerSecond, Record, Seconds
 
@@ -25,9 +26,20 @@ MASS = 12.0
 class SpacecraftState(Record):
     """State of a spacecraft relative to the origin of Hill's frame."""
 
-    position: Float[Array, " d"]  # r [m]
-    velocity: Float[Array, " d"]  # v [m/s]
-    delta_v: Float[Array, " d"]  # velocity change F Δt / m bought with thrust in the last step [m/s]
+    position: Annotated[Float[Array, " d"], Unit("m")]  # r
+    velocity: Annotated[Float[Array, " d"], Unit("m/s")]  # v
+    delta_v: Annotated[Float[Array, " d"], Unit("m/s")]  # velocity change F Δt / m bought with thrust in the last step
+
+    @property
+    def heading(self) -> Float[Array, ""]:
+        """A point mass keeps the axes of Hill's frame: 0."""
+        return jnp.zeros_like(self.position[..., 0])
+
+    @property
+    def orientation(self) -> Float[Array, "d d"]:
+        """Rotation from the body frame to Hill's frame: the identity."""
+        identity = jnp.eye(self.position.shape[-1], dtype=self.position.dtype)
+        return jnp.broadcast_to(identity, (*self.position.shape, self.position.shape[-1]))
 
 
 class Anchor(Platform, type="anchor"):
@@ -38,6 +50,9 @@ class Anchor(Platform, type="anchor"):
 
     def step(self, state: SpacecraftState, controls: Controls, dt: Seconds) -> SpacecraftState:
         return state
+
+    def derivative(self, state: SpacecraftState, controls: Controls) -> SpacecraftState:
+        return SpacecraftState(*3 * (jnp.zeros_like(state.position),))
 
 
 class Spacecraft(Anchor, type="spacecraft"):
@@ -52,9 +67,14 @@ class Spacecraft(Anchor, type="spacecraft"):
 
     def step(self, state: SpacecraftState, controls: Controls, dt: Seconds) -> SpacecraftState:
         """Advance by the exact solution for constant thrust."""
-        acceleration = jnp.stack([controls[name] for name in self.inputs]) / self.mass
+        acceleration = jnp.stack([controls.get(name, 0.0) for name in self.inputs]) / self.mass
         position, velocity = cwh_flow(state.position, state.velocity, acceleration, self.mean_motion, dt)
         return SpacecraftState(position, velocity, acceleration * dt)
+
+    def derivative(self, state: SpacecraftState, controls: Controls) -> SpacecraftState:
+        push = jnp.stack([controls.get(name, 0.0) for name in self.inputs]) / self.mass
+        rate = cwh_acceleration(state.position, state.velocity, push, self.mean_motion)
+        return SpacecraftState(state.velocity, rate, jnp.zeros_like(rate))
 
 
 def cwh_acceleration(r: Float[Array, " d"], v: Float[Array, " d"], a: Float[Array, " d"], n: Number) -> Float[Array, " d"]:
@@ -85,7 +105,7 @@ def cwh_flow(
     Arguments as in `cwh_acceleration`, t in seconds.
     """
     tau = n * t
-    s1, c2, s3 = _sine_ratios(tau)
+    s1, c2, s3 = sine_ratios(tau)
     half = 2.0 * tau * c2  # 2(1 − cos τ)/τ
     third = 2.0 * tau * s3 * t * t  # 2(τ − sin τ)/n²
     sine, versine = tau * s1, tau * tau * c2  # sin τ, 1 − cos τ
@@ -103,18 +123,3 @@ def cwh_flow(
         position.append(z - versine * z + t * s1 * vz + t * t * c2 * az)
         velocity.append(vz - n * sine * z - versine * vz + t * s1 * az)
     return jnp.stack(position), jnp.stack(velocity)
-
-
-def _sine_ratios(tau: Number) -> tuple[Any, Any, Any]:
-    """The ratios sin τ/τ, (1 − cos τ)/τ² and (τ − sin τ)/τ³, smooth through τ = 0."""
-    s3, half = _sine_remainder(tau), tau / 2.0
-    return 1.0 - tau**2 * s3, 0.5 * (1.0 - half**2 * _sine_remainder(half)) ** 2, s3
-
-
-def _sine_remainder(tau: Number) -> Any:
-    """(τ − sin τ)/τ³; a series where |τ| < 1, where quotients, `jnp.sinc` too, lose the digits of their derivative."""
-    small = jnp.abs(tau) < 1.0
-    coefficients = jnp.asarray([(-1) ** k / math.factorial(2 * k + 3) for k in reversed(range(9))], jnp.result_type(float))
-    series = jnp.polyval(coefficients, jnp.where(small, tau, 0.0) ** 2)
-    large = jnp.where(small, 1.0, tau)
-    return jnp.where(small, series, (large - jnp.sin(large)) / large**3)

@@ -1,4 +1,4 @@
-"""Norms with safe gradients, directions, and the regions of space that tasks refer to (Section 4, Tables 3 and 4)."""
+"""Norms with safe gradients, directions, rotations, and the regions that tasks refer to (Section 4, Tables 3 and 4)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Annotated, Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.component import Component, Range
-from jaxsafe.types import Metres, PlatformName, RegionState
+from jaxsafe.component import Component, Range, Unit
+from jaxsafe.types import Length, Number, PlatformName, Radians, RegionState
 
 
 def safe_norm(vector: Float[Array, " d"]) -> Float[Array, ""]:
@@ -23,10 +23,81 @@ def safe_norm(vector: Float[Array, " d"]) -> Float[Array, ""]:
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
 
 
-def direction(azimuth: Float[Array, ""], polar: Float[Array, ""] | None = None) -> Float[Array, " d"]:
+def closest_approach(before: Float[Array, " d"], after: Float[Array, " d"]) -> Float[Array, ""]:
+    """Smallest norm on the straight way between two vectors."""
+    change = after - before
+    squared = jnp.sum(change * change)
+    share = jnp.clip(-jnp.sum(before * change) / jnp.where(squared > 0.0, squared, 1.0), 0.0, 1.0)
+    return safe_norm(before + share * change)
+
+
+def mag_norm(vector: Float[Array, " d"]) -> Float[Array, " d+1"]:
+    """Magnitude and direction [‖v‖, v/‖v‖], Eq. (21); all 0 at v = 0, where it has no direction."""
+    magnitude = safe_norm(vector)
+    return jnp.concatenate([magnitude[None], vector / jnp.where(magnitude > 0.0, magnitude, 1.0)])
+
+
+def direction(azimuth: Float[Array, "*n"], polar: Float[Array, "*n"] | None = None) -> Float[Array, "*n d"]:
     """Unit vector at an azimuth from x [rad], in the plane; with a polar angle from z [rad], in space."""
-    planar = jnp.stack([jnp.cos(azimuth), jnp.sin(azimuth)])
-    return planar if polar is None else jnp.append(jnp.sin(polar) * planar, jnp.cos(polar))
+    x, y = jnp.cos(azimuth), jnp.sin(azimuth)
+    if polar is None:
+        return jnp.stack([x, y], axis=-1)
+    return jnp.stack([jnp.sin(polar) * x, jnp.sin(polar) * y, jnp.cos(polar)], axis=-1)
+
+
+def rotation(yaw: Float[Array, "*n"], pitch: Number | None = None, roll: Number | None = None) -> Float[Array, "*n d d"]:
+    """Rotation from a body frame to the global one by ZYX Euler angles [rad], R_z(ψ)·R_y(γ)·R_x(φ); in the plane R_z alone.
+
+    Its first column, the body's x axis, is (cos ψ cos γ, sin ψ cos γ, −sin γ).
+    """
+    c, s = jnp.cos(yaw), jnp.sin(yaw)
+    if pitch is None or roll is None:
+        return jnp.stack([jnp.stack([c, -s], axis=-1), jnp.stack([s, c], axis=-1)], axis=-2)
+    cp, sp, cr, sr = jnp.cos(pitch), jnp.sin(pitch), jnp.cos(roll), jnp.sin(roll)
+    rows = [
+        [c * cp, c * sp * sr - s * cr, c * sp * cr + s * sr],
+        [s * cp, s * sp * sr + c * cr, s * sp * cr - c * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def to_body(orientation: Float[Array, "d d"], vector: Float[Array, " d"]) -> Float[Array, " d"]:
+    """Components of a vector in the body frame, Rᵀv.
+
+    Written as a sum: a matrix product may be computed in reduced precision on accelerators.
+    """
+    if vector.shape != orientation.shape[:1]:
+        raise ValueError(f"expected a vector of {orientation.shape[0]} components to turn, found shape {vector.shape}")
+    return jnp.sum(orientation * vector[:, None], axis=0)
+
+
+class Offset(Component):
+    """Where a region's centre is, seen from the platform it is on."""
+
+    def vector(self, platform: Any) -> Float[Array, " d"]:
+        """Return the offset in the global frame, given the platform's state."""
+        raise NotImplementedError
+
+
+class Aspect(Offset, type="aspect"):
+    """ρ (cos(ψ + π + θ), sin(ψ + π + θ)), Eq. (6): behind the platform, θ from its tail, turning with it."""
+
+    distance: Annotated[Length, Range(0.0)]
+    angle: Radians
+
+    def vector(self, platform: Any) -> Float[Array, " d"]:
+        planar = self.distance * direction(platform.heading + jnp.pi + self.angle)
+        return planar if platform.position.shape == (2,) else jnp.append(planar, 0.0)
+
+
+class Displacement(Offset, type="displacement"):
+    """A constant vector along the axes of the global frame."""
+
+    by: Annotated[Number, Unit("m or ft", length=0)]
+
+    def vector(self, platform: Any) -> Float[Array, " d"]:
+        return self.by
 
 
 class Region(Component):
@@ -34,6 +105,7 @@ class Region(Component):
 
     name: str
     on: PlatformName
+    offset: Offset | None = None  # None: centred on the platform
 
     def contains(self, offset: Float[Array, " d"]) -> Bool[Array, ""]:
         """Whether a point, given by its offset from the region's centre, is inside."""
@@ -42,18 +114,34 @@ class Region(Component):
     def place(self, platforms: Mapping[str, Any]) -> RegionState:
         """Centre of the region, and which of the other platforms are inside."""
         centre = platforms[self.on].position
+        if self.offset is not None:
+            offset = self.offset.vector(platforms[self.on])
+            if offset.shape != centre.shape:
+                raise ValueError(f"expected an offset of {centre.size} numbers, found {offset.size}")
+            centre = centre + offset
         others = {name: other for name, other in platforms.items() if name != self.on}
         return RegionState(centre, {name: self.contains(other.position - centre) for name, other in others.items()})
 
 
 class Sphere(Region, type="sphere"):
-    """All points within `radius` of the centre: ‖r − c‖ ≤ ρ, Eq. (13)."""
+    """All points within `radius` of the centre: ‖r − c‖ ≤ ρ, Eqs. (7), (13)."""
 
-    radius: Annotated[Metres, Range(0.0)]
+    radius: Annotated[Length, Range(0.0)]
 
     def contains(self, offset: Float[Array, " d"]) -> Bool[Array, ""]:
         return safe_norm(offset) <= self.radius
 
 
 class Circle(Sphere, type="circle"):
-    """The sphere of a planar task, named as in Tables 3 and 4."""
+    """All points of the plane within `radius` of the centre: ‖r − c‖ ≤ ρ, Eqs. (7), (13)."""
+
+
+class Cylinder(Region, type="cylinder"):
+    """All points within `radius` of the centre in x and y, and within half the `height` in z, Eq. (10)."""
+
+    radius: Annotated[Length, Range(0.0)]
+    height: Annotated[Length, Range(0.0)]
+
+    def contains(self, offset: Float[Array, " 3"]) -> Bool[Array, ""]:
+        x, y, z = offset
+        return (safe_norm(jnp.stack([x, y])) <= self.radius) & (jnp.abs(z) <= self.height / 2.0)

@@ -11,15 +11,17 @@ from typing import Annotated
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.component import Component, Range, Unit
+from jaxsafe.component import ANY, Component, Range, Unit
 from jaxsafe.simulation.geometry import direction, safe_norm
 from jaxsafe.types import Key, MetresPerSecond, Number, PerSecond, PlatformName, Sim
 
 TWO_PI = 2.0 * jnp.pi
 
-Distances = Annotated[Number, Unit("m", length=2), Range(0.0)]
+Interval = Annotated[Number, Unit("m or ft", length=2)]
+Distances = Annotated[Number, Unit("m or ft", length=2), Range(0.0)]
 Angles = Annotated[Number, Unit("rad", length=2)]
 Shares = Annotated[Number, Unit("1", length=2), Range(0.0)]
 
@@ -46,6 +48,30 @@ class Direction(Component):
         return direction(uniform(key_azimuth, self.azimuth), None if self.polar is None else uniform(key_polar, self.polar))
 
 
+class Fixed(Initializer, type="fixed"):
+    """The same start in every episode."""
+
+    value: Annotated[Number, Unit("physical", length=ANY)]
+
+    def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Array:
+        return self.value
+
+
+class Uniform(Initializer, type="uniform"):
+    """Uniform between bounds, independently in each component: the paper's generic initializer."""
+
+    low: Annotated[Number, Unit("physical", length=ANY)]
+    high: Annotated[Number, Unit("physical", length=ANY)]
+
+    def problem(self) -> str | None:
+        if self.low.shape != self.high.shape or not np.all(np.asarray(self.low) <= np.asarray(self.high)):
+            return f"expected low ≤ high, found {self.low.tolist()} and {self.high.tolist()}"
+        return None
+
+    def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Array:
+        return self.low + (self.high - self.low) * jax.random.uniform(key, self.low.shape, self.low.dtype)
+
+
 class AtDistance(Initializer, type="at_distance"):
     """A position at a random distance and in a random direction from another platform."""
 
@@ -58,6 +84,20 @@ class AtDistance(Initializer, type="at_distance"):
         return sim.platforms[self.about].position + uniform(key_distance, self.distance) * self.direction.draw(
             key_direction
         )
+
+
+class AroundAtAltitude(Initializer, type="around_at_altitude"):
+    """A position at a random horizontal distance and azimuth from another platform, at a random altitude z of its own."""
+
+    about: PlatformName
+    distance: Distances
+    azimuth: Angles = (0.0, TWO_PI)
+    altitude: Interval
+
+    def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Float[Array, " 3"]:
+        key_distance, key_azimuth, key_altitude = jax.random.split(key, 3)
+        planar = uniform(key_distance, self.distance) * direction(uniform(key_azimuth, self.azimuth))
+        return jnp.append(sim.platforms[self.about].position[:2] + planar, uniform(key_altitude, self.altitude))
 
 
 class BelowSpeedLimit(Initializer, type="below_speed_limit"):

@@ -27,7 +27,7 @@ class Platform(Component):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The controls that `step` takes, by name."""
+        """The controls that `step` takes, by name; one that is not given is 0."""
         return ()
 
     @property
@@ -39,16 +39,36 @@ class Platform(Component):
         """Return the state record before any initializer ran: at the origin, at rest."""
         raise NotImplementedError
 
+    def quantities(self) -> tuple[str, ...]:
+        """What of its state can be observed: the fields, and what follows from them."""
+        state = self.rest()
+        derived = [name for name, value in vars(type(state)).items() if isinstance(value, property)]
+        return tuple(name for name in (*vars(state), *derived) if name not in ("orientation",))
+
+    def settle(self, state: Any) -> Any:
+        """Return the start as `step` would leave it, for instance with its angles wrapped."""
+        return state
+
     def step(self, state: Any, controls: Controls, dt: Seconds) -> Any:
         """Return the state after `dt` seconds with the controls held constant."""
+        raise NotImplementedError
+
+    def derivative(self, state: Any, controls: Controls) -> Any:
+        """Return the time derivative of the state, a record like it: f(x) + g(x)u, Eq. (3)."""
         raise NotImplementedError
 
     def reset(self, key: Key, sim: Sim) -> Any:
         """Draw a random start, given the platforms placed so far."""
         drawn: dict[str, Array] = {}
+        rest = self.rest()
         for initializer, key_i in zip(self.start, jax.random.split(key, max(len(self.start), 1)), strict=False):
-            drawn[initializer.name] = initializer.draw(key_i, drawn, sim)
-        return self.rest().replace(**drawn)
+            drawn[initializer.name] = value = initializer.draw(key_i, drawn, sim)
+            expected = getattr(rest, initializer.name).shape
+            if value.shape != expected:
+                raise ConfigError(
+                    f"platforms.{self.name}.start.{initializer.name}: expected shape {expected}, found {value.shape}"
+                )
+        return self.settle(rest.replace(**drawn))
 
     def place(self, values: Mapping[str, Any] | Record) -> Any:
         """Return the state with chosen fields, for a start that the user gives.
@@ -66,15 +86,22 @@ class Platform(Component):
         for name in self.random_fields:
             if name not in values:
                 raise ConfigError(f"reset_to: {self.name}.{name} is missing: it is random at reset, so give it")
-        return rest.replace(**{name: self._field(name, value, getattr(rest, name)) for name, value in values.items()})
+        given = {name: placed(f"{self.name}.{name}", value, getattr(rest, name)) for name, value in values.items()}
+        return self.settle(rest.replace(**given))
 
-    def _field(self, name: str, value: Any, like: Array) -> Array:
-        try:
-            array = jnp.asarray(value, like.dtype)
-        except (TypeError, ValueError):
-            raise ConfigError(f"reset_to: {self.name}.{name}: expected numbers, found {value!r}") from None
-        if array.shape != like.shape:
-            raise ConfigError(f"reset_to: {self.name}.{name}: expected shape {like.shape}, found {array.shape}")
-        if not isinstance(array, Tracer) and not bool(jnp.all(jnp.isfinite(array))):
-            raise ConfigError(f"reset_to: {self.name}.{name}: expected finite numbers, found {value!r}")
-        return array
+
+def placed(name: str, value: Any, like: Array) -> Array:
+    """A value that the user gives to `reset_to`, in the shape and type of `like`.
+
+    Raises:
+        ConfigError: it has another shape or is not finite numbers.
+    """
+    try:
+        array = jnp.asarray(value, like.dtype)
+    except (TypeError, ValueError):
+        raise ConfigError(f"reset_to: {name}: expected numbers, found {value!r}") from None
+    if value is None or array.shape != like.shape:
+        raise ConfigError(f"reset_to: {name}: expected shape {like.shape}, found {array.shape}")
+    if not isinstance(array, Tracer) and not bool(jnp.all(jnp.isfinite(array))):
+        raise ConfigError(f"reset_to: {name}: expected finite numbers, found {value!r}")
+    return array

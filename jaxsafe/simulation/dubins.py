@@ -1,0 +1,183 @@
+"""Aircraft: Dubins models in the plane, Eq. (5), and in space, Eq. (9). Lengths in ft, speeds in ft/s.
+
+Controls are held over a step. A state that reaches its limit rests there for the remainder of the step, and positions
+follow from that: exactly in the plane, by Gauss-Legendre quadrature of order 6 in space.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.component import Range, Unit
+from jaxsafe.simulation.controllers import Controls
+from jaxsafe.simulation.geometry import direction, rotation
+from jaxsafe.simulation.integrate import (
+    NODES,
+    PARTIAL_WEIGHTS,
+    WEIGHTS,
+    ramp,
+    segments,
+    sine_ratios,
+    time_to_limit,
+)
+from jaxsafe.simulation.platform import Platform
+from jaxsafe.types import Number, Positive, Record, Seconds
+
+GRAVITY = 32.17
+"""Acceleration of gravity g [ft/s²]."""
+
+SPEEDS = (200.0, 400.0)
+"""Slowest and fastest flight [ft/s], Table 3."""
+
+SpeedLimits = Annotated[Number, Unit("ft/s", length=2), Positive]
+AngleLimits = Annotated[Number, Unit("rad", length=2), Range(-jnp.pi / 2, jnp.pi / 2, open_low=True, open_high=True)]
+
+
+class Dubins2DState(Record):
+    """State of an aircraft at one altitude."""
+
+    position: Annotated[Float[Array, " 2"], Unit("ft")]  # x, y
+    heading: Annotated[Float[Array, ""], Unit("rad")]  # ψ from x towards y, not wrapped
+    speed: Annotated[Float[Array, ""], Unit("ft/s")]  # v
+
+    @property
+    def velocity(self) -> Float[Array, " 2"]:
+        """Velocity v (cos ψ, sin ψ)."""
+        return self.speed[..., None] * direction(self.heading)
+
+    @property
+    def orientation(self) -> Float[Array, "2 2"]:
+        """Rotation from the body frame, x forwards, to the global one."""
+        return rotation(self.heading)
+
+
+class Dubins2D(Platform, type="dubins2d"):
+    """An aircraft steered by `heading_rate` [rad/s] and `acceleration` [ft/s²], Eq. (5)."""
+
+    dimension: Annotated[int, Range(2, 2)] = 2
+    speed_limits: SpeedLimits = SPEEDS
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return ("heading_rate", "acceleration")
+
+    def rest(self) -> Dubins2DState:
+        zero = jnp.zeros((), jnp.result_type(float))
+        return Dubins2DState(jnp.zeros(2, zero.dtype), zero, zero + self.speed_limits[0])
+
+    def step(self, state: Dubins2DState, controls: Controls, dt: Seconds) -> Dubins2DState:
+        """Advance by the exact solution."""
+        turn, acceleration = controls.get("heading_rate", 0.0), controls.get("acceleration", 0.0)
+        speed = ramp(state.speed, 0.0, self.speed_limits, 0.0)
+        final = ramp(speed, acceleration, self.speed_limits, dt)
+        stop = time_to_limit(speed, acceleration, self.speed_limits, dt)
+        moved = _arc(state.heading, speed, turn, acceleration, stop)
+        moved = moved + _arc(state.heading + turn * stop, final, turn, 0.0, dt - stop)
+        return Dubins2DState(state.position + moved, state.heading + turn * dt, final)
+
+    def derivative(self, state: Dubins2DState, controls: Controls) -> Dubins2DState:
+        """Eq. (5) within the limits."""
+        turn, acceleration = (_number(controls, name, state.speed) for name in ("heading_rate", "acceleration"))
+        return Dubins2DState(state.velocity, turn, acceleration)
+
+
+class Dubins3DState(Record):
+    """State of an aircraft in space, Eq. (9); ż = −v sin γ."""
+
+    position: Annotated[Float[Array, " 3"], Unit("ft")]  # x, y, z
+    heading: Annotated[Float[Array, ""], Unit("rad")]  # ψ, not wrapped
+    speed: Annotated[Float[Array, ""], Unit("ft/s")]  # v
+    flight_path_angle: Annotated[Float[Array, ""], Unit("rad")]  # γ
+    roll: Annotated[Float[Array, ""], Unit("rad")]  # φ
+
+    @property
+    def velocity(self) -> Float[Array, " 3"]:
+        """Velocity v (cos ψ cos γ, sin ψ cos γ, −sin γ)."""
+        return self.speed[..., None] * _forward(self.heading, self.flight_path_angle)
+
+    @property
+    def orientation(self) -> Float[Array, "3 3"]:
+        """Rotation from the body frame, x forwards, to the global one: ZYX Euler angles ψ, γ, φ."""
+        return rotation(self.heading, self.flight_path_angle, self.roll)
+
+
+class Dubins3D(Platform, type="dubins3d"):
+    """An aircraft steered by `roll_rate`, `flight_path_angle_rate` [rad/s] and `acceleration` [ft/s²], Eq. (9).
+
+    Instead of a roll rate it takes a `heading_rate` [rad/s]: then it banks within the step to the angle φ of that
+    coordinated turn, tan φ = ψ̇ v/g.
+    """
+
+    dimension: Annotated[int, Range(3, 3)] = 3
+    speed_limits: SpeedLimits = SPEEDS
+    flight_path_angle_limits: AngleLimits = (-jnp.pi / 9, jnp.pi / 9)
+    roll_limits: AngleLimits = (-jnp.pi / 3, jnp.pi / 3)
+    gravity: Annotated[Number, Unit("ft/s²"), Range(0.0)] = GRAVITY
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return ("roll_rate", "flight_path_angle_rate", "acceleration", "heading_rate")
+
+    def rest(self) -> Dubins3DState:
+        zero = jnp.zeros((), jnp.result_type(float))
+        return Dubins3DState(jnp.zeros(3, zero.dtype), zero, zero + self.speed_limits[0], zero, zero)
+
+    def step(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Dubins3DState:
+        """Advance by quadrature over the pieces between which no limit is reached, within 1e-3 ft in 1 s, mostly 1e-5."""
+        ramps = {
+            "roll": (state.roll, self._roll_rate(state, controls, dt), self.roll_limits),
+            "gamma": (state.flight_path_angle, controls.get("flight_path_angle_rate", 0.0), self.flight_path_angle_limits),
+            "speed": (state.speed, controls.get("acceleration", 0.0), self.speed_limits),
+        }
+        ramps = {name: (ramp(x, 0.0, limits, 0.0), rate, limits) for name, (x, rate, limits) in ramps.items()}
+        begin, length = segments([time_to_limit(*each, dt) for each in ramps.values()], dt)
+        times = begin[:, None] + length[:, None] * NODES.astype(begin.dtype)
+        roll, gamma, speed = (ramp(*each, times) for each in ramps.values())
+
+        rate = self.gravity / speed * jnp.tan(roll)  # ψ̇ at the nodes, [segment, node]
+        turned = length * jnp.sum(WEIGHTS.astype(rate.dtype) * rate, axis=-1)
+        within = length[:, None] * jnp.sum(PARTIAL_WEIGHTS.astype(rate.dtype) * rate[:, None, :], axis=-1)
+        heading = state.heading + (jnp.cumsum(turned) - turned)[:, None] + within
+        shares = length[:, None] * WEIGHTS.astype(rate.dtype)
+        moved = jnp.sum((shares * speed)[..., None] * _forward(heading, gamma), axis=(0, 1))
+
+        roll, gamma, speed = (ramp(*each, dt) for each in ramps.values())
+        return Dubins3DState(state.position + moved, state.heading + jnp.sum(turned), speed, gamma, roll)
+
+    def derivative(self, state: Dubins3DState, controls: Controls) -> Dubins3DState:
+        """Eq. (9) within the limits; a commanded heading rate is that of the turn, the bank staying as it is."""
+        names = ("acceleration", "flight_path_angle_rate", "roll_rate")
+        acceleration, gamma, roll = (_number(controls, name, state.speed) for name in names)
+        turn = controls.get("heading_rate", self.gravity / state.speed * jnp.tan(state.roll))
+        return Dubins3DState(state.velocity, turn, acceleration, gamma, roll)
+
+    def _roll_rate(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Any:
+        if "heading_rate" not in controls:
+            return controls.get("roll_rate", 0.0)
+        return (jnp.arctan(controls["heading_rate"] * state.speed / self.gravity) - state.roll) / dt
+
+
+def _number(controls: Controls, name: str, like: Array) -> Array:
+    return jnp.asarray(controls.get(name, 0.0), like.dtype)
+
+
+def _forward(heading: Array, gamma: Array) -> Array:
+    """Direction of flight, […, 3]."""
+    level = jnp.cos(gamma)
+    return jnp.stack([jnp.cos(heading) * level, jnp.sin(heading) * level, -jnp.sin(gamma)], axis=-1)
+
+
+def _arc(heading: Any, speed: Any, turn: Any, acceleration: Any, t: Any) -> Float[Array, " 2"]:
+    """∫₀ᵗ (v + aτ) (cos(ψ + ωτ), sin(ψ + ωτ)) dτ, about the heading at half time.
+
+    With h = ωt/2: along that heading t (v + at/2) sin h/h, across it a t² (sin h/h − cos h)/(2h).
+    """
+    half = turn * t / 2.0
+    s1, c2, s3 = sine_ratios(half)
+    along = t * (speed + acceleration * t / 2.0) * s1
+    across = acceleration * t * t * half * (c2 - s3) / 2.0
+    forward = direction(heading + half)
+    return along * forward + across * jnp.stack([-forward[1], forward[0]])

@@ -1,0 +1,74 @@
+"""Platforms that follow a script, such as the lead: one command for each control that is not 0 (Section 3, Fig. 9)."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsafe.component import Component, Unit
+from jaxsafe.simulation.controllers import Bound, Controller, Controls
+from jaxsafe.types import Number, Radians, Seconds, Sim
+
+
+class Command(Component):
+    """The control that it is named after, as a function of the simulation at the beginning of the step."""
+
+    name: str
+
+    def value(self, sim: Sim) -> Float[Array, ""]:
+        """Return the control in physical units, held over the step."""
+        raise NotImplementedError
+
+
+class Scripted(Controller, type="scripted"):
+    """Follows its commands; controls without one are 0."""
+
+    commands: tuple[Command, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(command.name for command in self.commands)
+
+    def control(self, action: Array, sim: Sim) -> Controls:
+        return {command.name: command.value(sim) for command in self.commands}
+
+
+class Constant(Command, type="constant"):
+    """The same value at all times; `randomize` it to draw it for each episode."""
+
+    at: Bound
+
+    def value(self, sim: Sim) -> Float[Array, ""]:
+        return self.at
+
+
+class Schedule(Command, type="schedule"):
+    """Piecewise constant: `values[k]` from `times[k]` until the next time, 0 before the first."""
+
+    times: Annotated[Number, Unit("s", length=0)]
+    values: Annotated[Number, Unit("physical", length=0)]
+
+    def problem(self) -> str | None:
+        if self.times.shape != self.values.shape or not self.times.size:
+            return f"expected as many values as times, found {self.values.size} and {self.times.size}"
+        return (
+            None if np.all(np.diff(self.times) > 0.0) else f"expected times in ascending order, found {self.times.tolist()}"
+        )
+
+    def value(self, sim: Sim) -> Float[Array, ""]:
+        steps = jnp.diff(self.values, prepend=0.0)
+        return jnp.sum(jnp.where(sim.time >= self.times, steps, 0.0))
+
+
+class Sinusoid(Command, type="sinusoid"):
+    """Weaving: amplitude · sin(2π t/period + phase)."""
+
+    amplitude: Bound
+    period: Seconds
+    phase: Radians = 0.0
+
+    def value(self, sim: Sim) -> Float[Array, ""]:
+        return self.amplitude * jnp.sin(2.0 * jnp.pi * sim.time / self.period + self.phase)
