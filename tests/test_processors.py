@@ -13,13 +13,23 @@ from hypothesis import strategies as st
 import jaxsafe
 from jaxsafe.component import normalise
 from jaxsafe.environment import Environment
-from jaxsafe.processors.constraint import SpeedLimit
-from jaxsafe.processors.observation import Observe, ObserveStatus
-from jaxsafe.processors.reward import DeltaVCost, DistanceChange, Failure, Success, VelocityConstraint
-from jaxsafe.processors.status import DeltaV, Distance, InRegion, Speed, VelocityLimit
-from jaxsafe.processors.terminal import Crashed, Docked, Timeout, TooFar
+from jaxsafe.processors.constraint import Separation, SpeedLimit
+from jaxsafe.processors.observation import Observation, Observe, ObserveAngle, ObserveRegion, ObserveStatus
+from jaxsafe.processors.reward import (
+    DeltaVCost,
+    DistanceChange,
+    Failure,
+    FirstTime,
+    Success,
+    VelocityConstraint,
+    WhileIn,
+)
+from jaxsafe.processors.status import DeltaV, Distance, InRegion, RegionDistance, Speed, TimeHeld, VelocityLimit
+from jaxsafe.processors.terminal import Crashed, Docked, Held, Holds, Timeout, TooClose, TooFar
 from jaxsafe.simulation.cwh import SpacecraftState
-from jaxsafe.simulation.geometry import Circle
+from jaxsafe.simulation.dubins import Dubins2DState, Dubins3DState
+from jaxsafe.simulation.geometry import Circle, Displacement
+from jaxsafe.simulation.oriented import OrientedState
 from jaxsafe.types import Sim, State, TimeStep
 
 N = 0.001027
@@ -96,6 +106,51 @@ def test_delta_v_is_the_norm_of_the_velocity_change_bought_with_thrust() -> None
     assert float(DeltaV(name="d", of="deputy", norm="l1").process((), world())) == pytest.approx(0.07)
 
 
+def test_the_speed_limit_may_begin_to_grow_at_a_distance() -> None:
+    limit = normalise(VelocityLimit(name="v", distance="d", floor=0.2, slope=0.1, constant_to=0.5))
+    found = [float(limit.process((), world(d=distance))) for distance in (0.0, 0.5, 1.5)]
+    np.testing.assert_allclose(found, [0.2, 0.2, 0.3], rtol=1e-6)
+
+
+def test_region_distance_is_from_the_centre() -> None:
+    sim = pair()
+    assert float(RegionDistance(name="d", of="wingman", region="region").process((), sim)) == 8.0
+    assert float(RegionDistance(name="d", of="lead", region="region").process((), sim)) == 3.0
+
+
+def held_for(inside: str, dt: float = 1.0, **options: bool) -> list[float]:
+    """The time held at reset and after each step, given whether the status holds: `1` or `0` for each sample."""
+    status = normalise(TimeHeld(name="t", status="in", **options))
+    samples = [world(**{"in": flag == "1"}) for flag in inside]
+    memory = status.init(samples[0])
+    times = [float(status.process(memory, samples[0]))]
+    for sim in samples[1:]:
+        memory = status.increment(memory, sim, jnp.asarray(dt))
+        times.append(float(status.process(memory, sim)))
+    return times
+
+
+@pytest.mark.parametrize(
+    ("inside", "first_sample", "times"),
+    [
+        ("1111", False, [0, 1, 2, 3]),
+        ("1111", True, [0, 1, 2, 3]),
+        ("0111", False, [0, 0, 1, 2]),
+        ("0111", True, [0, 1, 2, 3]),
+        ("110110", False, [0, 1, 0, 0, 1, 0]),
+        ("110110", True, [0, 1, 0, 1, 2, 0]),
+        ("0000", False, [0, 0, 0, 0]),
+        ("1000", True, [0, 0, 0, 0]),
+    ],
+)
+def test_time_held_counts_from_the_sample_on_which_it_became_true(inside: str, first_sample: bool, times: list) -> None:
+    assert held_for(inside, first_sample=first_sample) == times
+
+
+def test_time_held_is_steps_times_their_length_without_drift() -> None:
+    assert held_for("1" * 201, dt=0.1)[-1] == np.float32(200) * np.float32(0.1)
+
+
 # Constraints
 
 
@@ -105,6 +160,12 @@ def test_the_margin_is_the_limit_minus_the_speed(speed: float, margin: float) ->
     sim = world(speed=speed, velocity_limit=0.25)
     assert float(constraint.margin(sim)) == pytest.approx(margin, abs=1e-7)
     assert constraint.limit(sim) == 0.25
+
+
+def test_separation_is_the_distance_beyond_its_minimum() -> None:
+    constraint = normalise(Separation(name="c", distance="d", minimum=100.0))
+    assert [float(constraint.margin(world(d=distance))) for distance in (150.0, 100.0, 40.0)] == [50.0, 0.0, -60.0]
+    assert constraint.limit(world(d=40.0)) == 100.0
 
 
 # Ends
@@ -133,6 +194,27 @@ def test_too_far_is_strictly_above_the_limit() -> None:
     too_far = normalise(TooFar(name="x", distance="d", limit=40_000.0))
     assert not too_far.reached(world(d=40_000.0))
     assert too_far.reached(world(d=40_000.01))
+
+
+@pytest.mark.parametrize(
+    ("end", "below", "at", "above"),
+    [
+        (TooFar(name="x", distance="d", limit=100.0), False, False, True),
+        (TooFar(name="x", distance="d", limit=100.0, inclusive=True), False, True, True),
+        (TooClose(name="x", distance="d", limit=100.0), True, True, False),
+        (TooClose(name="x", distance="d", limit=100.0, inclusive=False), True, False, False),
+        (Held(name="x", time="d", duration=100.0), False, True, True),
+        (Held(name="x", time="d", duration=100.0, inclusive=False), False, False, True),
+    ],
+)
+def test_a_limit_itself_counts_where_it_is_inclusive(end: Any, below: bool, at: bool, above: bool) -> None:
+    built = normalise(end)
+    assert [bool(built.reached(world(d=distance))) for distance in (99.9, 100.0, 100.1)] == [below, at, above]
+
+
+def test_a_boolean_status_may_end_an_episode() -> None:
+    assert Holds(name="x", status="s").reached(world(s=True))
+    assert not Holds(name="x", status="s").reached(world(s=False))
 
 
 def test_timeout_is_strictly_after_the_limit() -> None:
@@ -195,6 +277,62 @@ def test_failure_pays_by_outcome(ended: str | None, value: float) -> None:
     assert reward.process((), world(ended=ended)) == value
 
 
+def paid(reward: Any, inside: str) -> list[float]:
+    """What a reward pays at reset and after each step, given whether its status holds: `1` or `0` for each sample."""
+    reward, samples = normalise(reward), [world(s=flag == "1") for flag in inside]
+    memory = reward.init(samples[0])
+    values = [float(reward.process(memory, samples[0]))]
+    for sim in samples[1:]:
+        memory = reward.increment(memory, sim, 1.0)
+        values.append(float(reward.process(memory, sim)))
+    return values
+
+
+@pytest.mark.parametrize(
+    ("inside", "both_samples", "values"),
+    [
+        ("00110", False, [0, 0, 2, 2, -4]),
+        ("00110", True, [0, 0, 0, 2, -2]),
+        ("1110", False, [0, 2, 2, -4]),
+        ("1110", True, [0, 2, 2, -4]),
+        ("011011100", False, [0, 2, 2, -4, 2, 2, 2, -6, 0]),
+        ("011011100", True, [0, 0, 2, -2, 0, 2, 2, -4, 0]),
+        ("10", False, [0, 0]),
+        ("10", True, [0, 0]),
+        ("01010", True, [0, 0, 0, 0, 0]),
+    ],
+)
+def test_while_in_pays_each_step_inside_and_leaving_refunds_exactly(
+    inside: str, both_samples: bool, values: list[float]
+) -> None:
+    assert paid(WhileIn(name="x", status="s", value=2.0, both_samples=both_samples), inside) == values
+
+
+@settings(deadline=None, max_examples=30)
+@given(inside=st.text("01", min_size=1, max_size=15), both_samples=st.booleans())
+def test_the_sum_of_while_in_is_never_negative_and_zero_whenever_outside(inside: str, both_samples: bool) -> None:
+    values = paid(WhileIn(name="x", status="s", value=0.5, both_samples=both_samples), inside)
+    for total, flag in zip(np.cumsum(values), inside, strict=True):
+        assert total >= 0.0
+        assert flag == "1" or total == 0.0
+
+
+@pytest.mark.parametrize(
+    ("inside", "count_start", "values"),
+    [
+        ("00101", True, [0, 0, 3, 0, 0]),
+        ("00101", False, [0, 0, 3, 0, 0]),
+        ("11011", True, [0, 0, 0, 0, 0]),
+        ("11011", False, [0, 3, 0, 0, 0]),
+        ("10011", True, [0, 0, 0, 0, 0]),
+        ("10011", False, [0, 0, 0, 3, 0]),
+        ("0000", True, [0, 0, 0, 0]),
+    ],
+)
+def test_first_time_pays_once_an_episode(inside: str, count_start: bool, values: list[float]) -> None:
+    assert paid(FirstTime(name="x", status="s", value=3.0, count_start=count_start), inside) == values
+
+
 # Observations
 
 
@@ -214,8 +352,128 @@ def test_a_status_is_observed_as_a_number() -> None:
 
 
 def test_every_element_of_an_observation_has_a_name() -> None:
-    assert Observe(name="x", of="deputy", what="position").labels(world()) == ("deputy.position.x", "deputy.position.y")
-    assert ObserveStatus(name="x", status="s").labels(world(s=1.0)) == ("status.s",)
+    assert Observe(name="x", of="deputy", what="position").labels(world()) == ("x.x", "x.y")
+    magnorm = Observe(name="v", of="deputy", what="velocity", form="magnorm")
+    assert magnorm.labels(world()) == ("v.magnitude", "v.x", "v.y")
+    assert Observe(name="h", of="deputy", what="heading").labels(world()) == ("h",)
+    assert ObserveAngle(name="a", of="deputy", what="heading").labels(world()) == ("a.cos", "a.sin")
+    assert ObserveStatus(name="s", status="s").labels(world(s=1.0)) == ("s",)
+    assert ObserveStatus(name="s", status="s").labels(world(s=[1.0, 2.0, 3.0, 4.0])) == ("s.0", "s.1", "s.2", "s.3")
+
+
+def pair() -> Sim:
+    """A wingman at (1, 2) m heading along y, a lead at (1, 7) heading along −x, and a region 3 m above the lead."""
+    wingman = Dubins2DState(jnp.asarray([1.0, 2.0]), jnp.asarray(jnp.pi / 2), jnp.asarray(4.0))
+    lead = Dubins2DState(jnp.asarray([1.0, 7.0]), jnp.asarray(-jnp.pi), jnp.asarray(2.0))
+    platforms = {"lead": lead, "wingman": wingman}
+    region = normalise(Circle(name="region", on="lead", offset=Displacement(by=(0.0, 3.0)), radius=1.0))
+    return world().replace(platforms=platforms, regions={"region": region.place(platforms)})
+
+
+def measured(observation: Observation, sim: Sim) -> np.ndarray:
+    return np.asarray(normalise(observation).process((), sim))
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, [1.0, 7.0]),
+        ({"relative_to": "wingman"}, [0.0, 5.0]),
+        ({"relative_to": "wingman", "frame": "wingman"}, [5.0, 0.0]),
+        ({"relative_to": "wingman", "frame": "lead"}, [0.0, -5.0]),
+        ({"relative_to": "wingman", "frame": "wingman", "form": "magnorm"}, [5.0, 1.0, 0.0]),
+        ({"relative_to": "wingman", "form": "magnorm", "scale": (10.0, 1.0, 4.0)}, [0.5, 0.0, 0.25]),
+        ({"relative_to": "lead", "form": "magnorm"}, [0.0, 0.0, 0.0]),
+        ({"relative_to": "wingman", "scale": (1.0, -2.0)}, [0.0, -2.5]),
+        ({"relative_to": "wingman", "scale": (1.0, -2.0), "clip": (-1.0, 1.0)}, [0.0, -1.0]),
+    ],
+)
+def test_a_position_is_observed_in_any_frame_and_form(options: dict[str, Any], expected: list[float]) -> None:
+    found = measured(Observe(name="x", of="lead", what="position", **options), pair())
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_a_velocity_is_observed_in_any_frame() -> None:
+    for options, expected in (({}, [-2.0, 0.0]), ({"frame": "lead"}, [2.0, 0.0]), ({"frame": "wingman"}, [0.0, 2.0])):
+        found = measured(Observe(name="x", of="lead", what="velocity", **options), pair())
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+    found = measured(Observe(name="x", of="lead", what="velocity", relative_to="wingman"), pair())
+    np.testing.assert_allclose(found, [-2.0, -4.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({}, [1.0, 10.0]),
+        ({"relative_to": "wingman"}, [0.0, 8.0]),
+        ({"relative_to": "wingman", "frame": "wingman"}, [8.0, 0.0]),
+        ({"relative_to": "wingman", "frame": "wingman", "form": "magnorm", "scale": 2.0}, [4.0, 0.5, 0.0]),
+    ],
+)
+def test_a_region_is_observed_by_its_centre(options: dict[str, Any], expected: list[float]) -> None:
+    found = measured(ObserveRegion(name="x", region="region", **options), pair())
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_an_angle_is_observed_as_cosine_and_sine_and_does_not_jump() -> None:
+    angle = ObserveAngle(name="x", of="craft", what="attitude", scale=-1.0)
+    for attitude in (0.3, -2.0, math.pi, -math.pi):
+        craft = OrientedState(REST, REST, jnp.zeros(1), jnp.asarray(attitude), jnp.zeros(()))
+        found = measured(angle, world().replace(platforms={"craft": craft}))
+        np.testing.assert_allclose(found, [-math.cos(attitude), -math.sin(attitude)], atol=1e-6)
+
+
+def test_a_body_frame_in_space_takes_heading_flight_path_and_roll_into_account() -> None:
+    craft = Dubins3DState(jnp.zeros(3), *map(jnp.asarray, (0.7, 300.0, 0.2, -0.5)))
+    below = Dubins3DState(jnp.asarray([0.0, 0.0, -10.0]), *map(jnp.asarray, (0.0, 200.0, 0.0, 0.0)))
+    sim = world().replace(platforms={"craft": craft, "below": below})
+    ahead = measured(Observe(name="x", of="craft", what="velocity", frame="craft"), sim)
+    np.testing.assert_allclose(ahead, [300.0, 0.0, 0.0], atol=1e-3)
+    seen = measured(Observe(name="x", of="below", what="position", relative_to="craft", frame="craft"), sim)
+    down = -10.0 * np.array([-math.sin(0.2), math.cos(0.2) * math.sin(-0.5), math.cos(0.2) * math.cos(-0.5)])
+    np.testing.assert_allclose(seen, down, atol=1e-5)
+    roll = Observe(name="x", of="craft", what="roll", scale=0.25, clip=(-1.0, 1.0))
+    assert measured(roll, sim).tolist() == [-1.0]
+
+
+@pytest.mark.parametrize(
+    ("task", "name", "scale"),
+    [
+        ("docking2d", "position", [1.0, 2.0, 3.0]),
+        ("docking2d", "speed", [1.0, 2.0]),
+        ("rejoin2d", "lead_position", [1000.0, 1.0]),
+        ("docking2d_oriented", "attitude", [1.0, 1.0, 1.0]),
+    ],
+)
+def test_a_scale_of_the_wrong_length_is_told_with_its_observation(task: str, name: str, scale: list[float]) -> None:
+    with pytest.raises(jaxsafe.ConfigError, match=rf"^observation\.{name}: cannot be computed: ") as caught:
+        jaxsafe.make(task, {f"observation.{name}.scale": scale})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("task", "names"),
+    [
+        (
+            "rejoin2d",
+            [f"{item}.{part}" for item in ("lead_position", "rejoin_position", "wingman_velocity", "lead_velocity")
+             for part in ("magnitude", "x", "y")],
+        ),
+        (
+            "rejoin3d",
+            [f"{item}.{part}" for item in ("lead_position", "rejoin_position", "wingman_velocity", "lead_velocity")
+             for part in ("magnitude", "x", "y", "z")] + ["roll", "flight_path_angle"],
+        ),
+        ("docking2d", ["position.x", "position.y", "velocity.x", "velocity.y", "speed", "velocity_limit"]),
+        (
+            "docking2d_oriented",
+            ["position.x", "position.y", "velocity.x", "velocity.y", "attitude.cos", "attitude.sin", "attitude_rate",
+             "speed", "velocity_limit"],
+        ),
+    ],
+)  # fmt: skip
+def test_the_elements_of_each_task_s_observation_have_these_names(task: str, names: list[str]) -> None:
+    assert jaxsafe.make(task).observation_names == tuple(names)
 
 
 # The docking tasks

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 from jaxtyping import Array, Float
 
 from jaxsafe.component import Component
-from jaxsafe.types import Sim, StatusName
+from jaxsafe.types import Length, Positive, Sim, StatusName
 
 
 class Constraint(Component):
@@ -33,3 +35,16 @@ class SpeedLimit(Constraint, type="speed_limit"):
 
     def limit(self, sim: Sim) -> Float[Array, ""]:
         return sim.status[self.velocity_limit]
+
+
+class Separation(Constraint, type="separation"):
+    """h = distance − minimum, Eqs. (8), (11)."""
+
+    distance: StatusName
+    minimum: Annotated[Length, Positive]
+
+    def margin(self, sim: Sim) -> Float[Array, ""]:
+        return sim.status[self.distance] - self.minimum
+
+    def limit(self, sim: Sim) -> Float[Array, ""]:
+        return self.minimum

@@ -1,22 +1,26 @@
-"""Observations (Tables 5 and 6): each is divided by its constant and clipped; together they are one vector."""
+"""Observations (Tables 5 and 6): each is divided by its constants and clipped; together they are one vector."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.component import Unit
+from jaxsafe.component import ANY, Range, Unit
 from jaxsafe.processors.processor import Processor
-from jaxsafe.types import Number, PlatformName, Positive, Sim, StatusName
+from jaxsafe.simulation.geometry import direction, mag_norm, to_body
+from jaxsafe.types import AnyStatusName, Number, PlatformName, RegionName, Sim
 
-Scale = Annotated[Number, Unit("as observed"), Positive]
+Scale = Annotated[Number, Unit("as observed", length=ANY), Range(nonzero=True)]
 Limit = Annotated[Number, Unit("1", length=2)]
 
 
 class Observation(Processor):
-    """Base of all observations: `measure` in physical units; scale and clip are the same for all."""
+    """Base of all observations: `measure` in physical units; scale and clip are the same for all.
+
+    The scale is one divisor for all elements or one for each.
+    """
 
     scale: Scale = 1.0
     clip: Limit | None = None
@@ -27,34 +31,87 @@ class Observation(Processor):
 
     def labels(self, sim: Sim) -> tuple[str, ...]:
         """Name each of the k elements."""
-        raise NotImplementedError
+        size = self.measure(self.init(sim), sim).size
+        return tuple(f"{self.name}.{axis}" for axis in _axes(size)) if size > 1 else (self.name,)
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, " k"]:
-        scaled = self.measure(memory, sim) / self.scale
+        measured = self.measure(memory, sim)
+        if jnp.shape(self.scale) not in ((), measured.shape):
+            raise ValueError(f"scale: expected 1 or {measured.size} numbers, found {jnp.size(self.scale)}")
+        scaled = measured / self.scale
         return scaled if self.clip is None else jnp.clip(scaled, self.clip[0], self.clip[1])
 
 
-class Observe(Observation, type="observe"):
-    """A vector field of a platform's state, in the global frame."""
+class VectorObservation(Observation):
+    """Base of observed vectors: in which platform's body frame, None for the global one, and in which form.
+
+    `rectangular` is the components; `magnorm` is the magnitude and the direction, Eq. (21).
+    """
+
+    frame: PlatformName | None = None
+    form: Literal["rectangular", "magnorm"] = "rectangular"
+
+    def vector(self, sim: Sim) -> Float[Array, " d"]:
+        """Return the vector in the global frame, in physical units."""
+        raise NotImplementedError
+
+    def measure(self, memory: Any, sim: Sim) -> Float[Array, " k"]:
+        vector = jnp.atleast_1d(self.vector(sim))
+        if self.frame is not None:
+            vector = to_body(sim.platforms[self.frame].orientation, vector)
+        return mag_norm(vector) if self.form == "magnorm" else vector
+
+    def labels(self, sim: Sim) -> tuple[str, ...]:
+        if self.form == "rectangular":
+            return super().labels(sim)
+        size = self.measure((), sim).size - 1
+        return (f"{self.name}.magnitude", *(f"{self.name}.{axis}" for axis in _axes(size)))
+
+
+class Observe(VectorObservation, type="observe"):
+    """A quantity of a platform: a field of its state, or its velocity; relative to another platform if one is named."""
+
+    of: PlatformName
+    what: str
+    relative_to: PlatformName | None = None
+
+    def vector(self, sim: Sim) -> Float[Array, " d"]:
+        own = getattr(sim.platforms[self.of], self.what)
+        return own if self.relative_to is None else own - getattr(sim.platforms[self.relative_to], self.what)
+
+
+class ObserveRegion(VectorObservation, type="observe_region"):
+    """The position of a region's centre, relative to a platform if one is named."""
+
+    region: RegionName
+    relative_to: PlatformName | None = None
+
+    def vector(self, sim: Sim) -> Float[Array, " d"]:
+        centre = sim.regions[self.region].position
+        return centre if self.relative_to is None else centre - sim.platforms[self.relative_to].position
+
+
+class ObserveAngle(Observation, type="observe_angle"):
+    """An angle θ of a platform's state as [cos θ, sin θ], which does not jump at ±π."""
 
     of: PlatformName
     what: str
 
-    def measure(self, memory: Any, sim: Sim) -> Float[Array, " k"]:
-        return jnp.atleast_1d(getattr(sim.platforms[self.of], self.what))
+    def measure(self, memory: Any, sim: Sim) -> Float[Array, " 2"]:
+        return direction(getattr(sim.platforms[self.of], self.what))
 
     def labels(self, sim: Sim) -> tuple[str, ...]:
-        size = self.measure((), sim).size
-        return tuple(f"{self.of}.{self.what}.{axis}" for axis in "xyz"[:size]) if size > 1 else (f"{self.of}.{self.what}",)
+        return (f"{self.name}.cos", f"{self.name}.sin")
 
 
 class ObserveStatus(Observation, type="observe_status"):
     """A status, as a number."""
 
-    status: StatusName
+    status: AnyStatusName
 
     def measure(self, memory: Any, sim: Sim) -> Float[Array, " k"]:
         return jnp.atleast_1d(jnp.asarray(sim.status[self.status], jnp.result_type(float)))
 
-    def labels(self, sim: Sim) -> tuple[str, ...]:
-        return (f"status.{self.status}",)
+
+def _axes(size: int) -> list[str]:
+    return list("xyz"[:size]) if size <= 3 else [str(index) for index in range(size)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 from jaxsafe.component import Component
 from jaxsafe.types import Number, Sim
@@ -11,6 +11,7 @@ from jaxsafe.types import Number, Sim
 class Processor(Component):
     """Base of statuses, rewards and observations. Stateless ones write `process` only."""
 
+    many_kinds: ClassVar[bool] = True
     name: str
 
     def init(self, sim: Sim) -> Any:

@@ -6,14 +6,15 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxsafe.component import Component, Unit
 from jaxsafe.processors.processor import Processor
 from jaxsafe.processors.terminal import Ends
 from jaxsafe.types import (
     Dimensionless,
-    Metres,
+    FlagName,
+    Length,
     Number,
     OutcomeName,
     Positive,
@@ -51,7 +52,7 @@ class DistanceChange(Reward, type="distance_change"):
     """Change of an exponential potential of a distance: scale·(e^(−a d_t) − e^(−a d_(t−1))), a = ln 2 / half_distance."""
 
     distance: StatusName
-    half_distance: Annotated[Metres, Positive]
+    half_distance: Annotated[Length, Positive]
     scale: Dimensionless = 2.0
 
     def init(self, sim: Sim) -> Potential:
@@ -67,6 +68,67 @@ class DistanceChange(Reward, type="distance_change"):
 
     def _potential(self, sim: Sim) -> Float[Array, ""]:
         return self.scale * jnp.exp(-jnp.log(2.0) / self.half_distance * sim.status[self.distance])
+
+
+class Stay(Record):
+    """Memory of `WhileIn`."""
+
+    inside: Bool[Array, ""]
+    paid: Float[Array, ""]  # since the last refund
+    value: Float[Array, ""]
+
+
+class WhileIn(Reward, type="while_in"):
+    """A reward for each step on which a boolean status is true; when it turns false, minus all of them, Table 7.
+
+    So the sum over an episode is never negative and coming and going pays nothing. With `both_samples` the status must also
+    have been true one step before.
+    """
+
+    status: FlagName
+    value: Dimensionless = 0.1
+    both_samples: bool = False
+
+    def init(self, sim: Sim) -> Stay:
+        return Stay(sim.status[self.status], jnp.zeros_like(self.value), jnp.zeros_like(self.value))
+
+    def increment(self, memory: Stay, sim: Sim, dt: Number) -> Stay:
+        inside = sim.status[self.status]
+        earned = jnp.where(memory.inside, self.value, 0.0) if self.both_samples else self.value
+        value = jnp.where(inside, earned, 0.0 - memory.paid)
+        return Stay(inside, memory.paid + value, value)
+
+    def process(self, memory: Stay, sim: Sim) -> Float[Array, ""]:
+        return memory.value
+
+
+class Arrival(Record):
+    """Memory of `FirstTime`."""
+
+    before: Bool[Array, ""]
+    now: Bool[Array, ""]
+
+
+class FirstTime(Reward, type="first_time"):
+    """A reward on the step on which a boolean status is true for the first time in the episode, Table 7.
+
+    Without `count_start` a start in which it is true already is paid on the first step.
+    """
+
+    status: FlagName
+    value: Dimensionless = 0.25
+    count_start: bool = True
+
+    def init(self, sim: Sim) -> Arrival:
+        held = sim.status[self.status] & self.count_start
+        return Arrival(held, jnp.zeros_like(held))
+
+    def increment(self, memory: Arrival, sim: Sim, dt: Number) -> Arrival:
+        held = sim.status[self.status]
+        return Arrival(memory.before | held, held & ~memory.before)
+
+    def process(self, memory: Arrival, sim: Sim) -> Float[Array, ""]:
+        return jnp.where(memory.now, self.value, 0.0)
 
 
 class VelocityConstraint(Reward, type="velocity_constraint"):

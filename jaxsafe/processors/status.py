@@ -5,16 +5,31 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.component import Range
 from jaxsafe.processors.processor import Processor
-from jaxsafe.simulation.geometry import safe_norm
-from jaxsafe.types import MetresPerSecond, PerSecond, PlatformName, RegionName, Sim, StatusName
+from jaxsafe.simulation.geometry import closest_approach, safe_norm
+from jaxsafe.types import (
+    FlagName,
+    Length,
+    MetresPerSecond,
+    Number,
+    PerSecond,
+    PlatformName,
+    Record,
+    RegionName,
+    Sim,
+    StatusName,
+)
 
 
 class Status(Processor):
     """Base of all statuses."""
+
+    def on_the_way(self, before: Sim, sim: Sim) -> Any:
+        """Return the output over the step from `before` to `sim`: for distances the smallest, else that of `sim`."""
+        return self.process(self.init(sim), sim)
 
 
 class Distance(Status, type="distance"):
@@ -24,7 +39,29 @@ class Distance(Status, type="distance"):
     to: PlatformName
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
-        return safe_norm(sim.platforms[self.of].position - sim.platforms[self.to].position)
+        return safe_norm(self._apart(sim))
+
+    def on_the_way(self, before: Sim, sim: Sim) -> Float[Array, ""]:
+        return closest_approach(self._apart(before), self._apart(sim))
+
+    def _apart(self, sim: Sim) -> Float[Array, " d"]:
+        return sim.platforms[self.of].position - sim.platforms[self.to].position
+
+
+class RegionDistance(Status, type="region_distance"):
+    """Distance of a platform from the centre of a region."""
+
+    of: PlatformName
+    region: RegionName
+
+    def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
+        return safe_norm(self._apart(sim))
+
+    def on_the_way(self, before: Sim, sim: Sim) -> Float[Array, ""]:
+        return closest_approach(self._apart(before), self._apart(sim))
+
+    def _apart(self, sim: Sim) -> Float[Array, " d"]:
+        return sim.platforms[self.of].position - sim.regions[self.region].position
 
 
 class InRegion(Status, type="in_region"):
@@ -37,6 +74,35 @@ class InRegion(Status, type="in_region"):
         return sim.regions[self.region].inside[self.of]
 
 
+class Hold(Record):
+    """Memory of `TimeHeld`."""
+
+    held: Bool[Array, ""]
+    steps: Int[Array, ""]  # since it became true
+    time: Float[Array, ""]
+
+
+class TimeHeld(Status, type="time_held"):
+    """Seconds since a boolean status became true, 0 while it is false.
+
+    With `first_sample` the step on which it becomes true counts already, but never the sample at reset.
+    """
+
+    status: FlagName
+    first_sample: bool = False
+
+    def init(self, sim: Sim) -> Hold:
+        return Hold(jnp.asarray(sim.status[self.status]), jnp.zeros((), jnp.int32), jnp.zeros_like(sim.time))
+
+    def increment(self, memory: Hold, sim: Sim, dt: Number) -> Hold:
+        held = sim.status[self.status]
+        steps = jnp.where(held & (memory.held | self.first_sample), memory.steps + 1, 0)
+        return Hold(held, steps, steps.astype(memory.time.dtype) * dt)
+
+    def process(self, memory: Hold, sim: Sim) -> Float[Array, ""]:
+        return memory.time
+
+
 class Speed(Status, type="speed"):
     """Speed ‖v‖ of a platform."""
 
@@ -47,14 +113,15 @@ class Speed(Status, type="speed"):
 
 
 class VelocityLimit(Status, type="velocity_limit"):
-    """Distance-dependent speed limit ν₀ + ν₁‖r‖, Eqs. (14), (17)."""
+    """Distance-dependent speed limit ν₀ + ν₁‖r‖, Eqs. (14), (17); it grows from a distance `constant_to` on."""
 
     distance: StatusName
     floor: Annotated[MetresPerSecond, Range(0.0)]
     slope: Annotated[PerSecond, Range(0.0)]
+    constant_to: Annotated[Length, Range(0.0)] = 0.0
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
-        return self.floor + self.slope * sim.status[self.distance]
+        return self.floor + self.slope * jnp.maximum(sim.status[self.distance] - self.constant_to, 0.0)
 
 
 class DeltaV(Status, type="delta_v"):

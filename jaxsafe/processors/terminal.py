@@ -7,7 +7,7 @@ from typing import Literal
 from jaxtyping import Array, Bool
 
 from jaxsafe.component import Component
-from jaxsafe.types import Metres, Seconds, Sim, StatusName
+from jaxsafe.types import FlagName, Length, Seconds, Sim, StatusName
 
 Ends = Literal["terminated", "truncated"]
 
@@ -16,11 +16,13 @@ class Terminal(Component):
     """A condition that ends the episode with the outcome it is named after.
 
     `ends` says what the end means for learning: `terminated`, nothing follows (in the paper a timeout too is a failure), or
-    `truncated`, the episode is merely cut and the value of its last state still counts.
+    `truncated`, the episode is merely cut and the value of its last state still counts. A condition that stands `apart`
+    neither hides those after it nor is hidden by those before it, so that its reward and another's may fall on one step.
     """
 
     name: str
     ends: Ends = "terminated"
+    apart: bool = False
 
     def reached(self, sim: Sim) -> Bool[Array, ""]:
         """Whether the condition holds."""
@@ -30,7 +32,7 @@ class Terminal(Component):
 class Docked(Terminal, type="docked"):
     """Inside the docking region at no more than the speed limit, Table 10."""
 
-    in_docking: StatusName
+    in_docking: FlagName
     speed: StatusName
     velocity_limit: StatusName
 
@@ -41,7 +43,7 @@ class Docked(Terminal, type="docked"):
 class Crashed(Terminal, type="crashed"):
     """Inside the docking region above the speed limit, Table 10."""
 
-    in_docking: StatusName
+    in_docking: FlagName
     speed: StatusName
     velocity_limit: StatusName
 
@@ -50,13 +52,48 @@ class Crashed(Terminal, type="crashed"):
 
 
 class TooFar(Terminal, type="too_far"):
-    """A distance above a limit."""
+    """A distance above a limit; `inclusive`: at it already."""
 
     distance: StatusName
-    limit: Metres
+    limit: Length
+    inclusive: bool = False
 
     def reached(self, sim: Sim) -> Bool[Array, ""]:
-        return sim.status[self.distance] > self.limit
+        distance = sim.status[self.distance]
+        return distance >= self.limit if self.inclusive else distance > self.limit
+
+
+class TooClose(Terminal, type="too_close"):
+    """A distance below a limit; `inclusive`: at it already."""
+
+    distance: StatusName
+    limit: Length
+    inclusive: bool = True
+
+    def reached(self, sim: Sim) -> Bool[Array, ""]:
+        distance = sim.status[self.distance]
+        return distance <= self.limit if self.inclusive else distance < self.limit
+
+
+class Held(Terminal, type="held"):
+    """A time, such as that in the rejoin region, of at least `duration`, Eqs. (7), (10); not `inclusive`: of more."""
+
+    time: StatusName
+    duration: Seconds
+    inclusive: bool = True
+
+    def reached(self, sim: Sim) -> Bool[Array, ""]:
+        time = sim.status[self.time]
+        return time >= self.duration if self.inclusive else time > self.duration
+
+
+class Holds(Terminal, type="holds"):
+    """A boolean status that is true, for instance being in a keep-out zone."""
+
+    status: FlagName
+
+    def reached(self, sim: Sim) -> Bool[Array, ""]:
+        return sim.status[self.status]
 
 
 class Timeout(Terminal, type="timeout"):
