@@ -6,15 +6,19 @@ number of it: changing them compiles nothing anew, and `vmap` over environments 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import dataclasses
+import functools
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.component import Component
+from jaxsafe.component import Component, Unit
 from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.paths import set_path
 from jaxsafe.processors.constraint import Constraint
 from jaxsafe.processors.observation import Observation
 from jaxsafe.processors.reward import Reward
@@ -22,12 +26,20 @@ from jaxsafe.processors.status import Status
 from jaxsafe.processors.terminal import Terminal
 from jaxsafe.simulation.controllers import Controls
 from jaxsafe.simulation.geometry import Region
-from jaxsafe.simulation.platform import Platform
-from jaxsafe.types import Info, Key, Memory, PlatformName, Seconds, Sim, State, TimeStep
+from jaxsafe.simulation.initializers import uniform
+from jaxsafe.simulation.platform import Platform, placed
+from jaxsafe.types import Info, Key, Memory, Number, ParameterPath, PlatformName, Seconds, Sim, State, TimeStep
+
+Parameters = Mapping[str, Float[Array, ""]]
 
 
 class Environment(Component):
-    """A task: platforms and regions, and the processors that give their state a meaning."""
+    """A task: platforms and regions, and the processors that give their state a meaning.
+
+    `randomize` names numbers of the environment by dotted path with the interval from which each episode draws them.
+    """
+
+    shorthand: ClassVar[str | None] = "platforms"
 
     agent: PlatformName
     dt: Seconds = 1.0
@@ -38,6 +50,9 @@ class Environment(Component):
     terminal: tuple[Terminal, ...]
     reward: tuple[Reward, ...]
     observation: tuple[Observation, ...]
+    randomize: Mapping[ParameterPath, Annotated[Number, Unit("physical", length=2)]] = dataclasses.field(
+        default_factory=dict
+    )
 
     def reset(self, key: Key) -> tuple[State, TimeStep]:
         """Same as `jaxsafe.reset(env, key)`."""
@@ -111,28 +126,36 @@ def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:
     Returns:
         The state and the first time step: reward and cost as of no step taken, `terminated` and `truncated` False.
     """
+    parameters = _draw_parameters(env, key)
+    env = _with_parameters(env, parameters)
     sim = _blank(env)
     for platform, key_i in zip(env.platforms, jax.random.split(key, len(env.platforms)), strict=True):
-        sim = sim.replace(platforms={**sim.platforms, platform.name: platform.reset(key_i, sim)})
-    return _begin(env, sim)
+        with _part("platforms", platform.name):
+            sim = sim.replace(platforms={**sim.platforms, platform.name: platform.reset(key_i, sim)})
+    return _begin(env, sim, parameters)
 
 
-def reset_to(env: Environment, start: Mapping[str, Mapping[str, Any]]) -> tuple[State, TimeStep]:
+def reset_to(
+    env: Environment, start: Mapping[str, Mapping[str, Any]], parameters: Mapping[str, Any] | None = None
+) -> tuple[State, TimeStep]:
     """Start an episode from chosen platform states: `{"deputy": {"position": [100, 0, 0], "velocity": [0, 0.1, 0]}}`.
 
     Args:
         env: the environment.
         start: by platform name, by state field; every field that is random at reset must be given.
+        parameters: by dotted path, the numbers that `env.randomize` draws; all of them must be given.
 
     Raises:
-        ConfigError: a platform or field is unknown, or a random field is missing or has another shape.
+        ConfigError: a platform, field or parameter is unknown, or a random one is missing or has another shape.
     """
+    parameters = _chosen_parameters(env, parameters or {})
+    env = _with_parameters(env, parameters)
     known = {platform.name: platform for platform in env.platforms}
     for name in start:
         if name not in known:
             raise ConfigError(f"reset_to: unknown platform {name!r}; choose from {nearest(name, known)}")
     platforms = {name: platform.place(start.get(name, {})) for name, platform in known.items()}
-    return _begin(env, _blank(env).replace(platforms=platforms))
+    return _begin(env, _blank(env).replace(platforms=platforms), parameters)
 
 
 def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep]:
@@ -150,22 +173,45 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
     Raises:
         ConfigError: the action has another shape, or is not whole numbers where actions are discrete.
     """
+    env = _with_parameters(env, state.parameters)
     action = _checked(env, action)
-    controls = env.agent_platform.controller.control(action)
+    controls = env.agent_platform.controller.control(action, state.sim)
     platforms = {platform.name: _advance(env, platform, state.sim, controls) for platform in env.platforms}
     num_steps = state.num_steps + 1
     sim = _blank(env).replace(time=num_steps.astype(env.dt.dtype) * env.dt, platforms=platforms)
 
-    sim, status_memory = _statuses(env, sim, state.memory.status, env.dt)
-    sim, outcome = _terminal(env, sim)
-    sim, outcome, reward_memory, terms, totals = _rewards(env, sim, outcome, state)
-    observation, observation_memory = _observations(env, sim, state.memory.observation, env.dt)
+    sim, status_memory = _statuses(env, sim, state.memory.status)
+    sim = _terminal(env, sim)
+    sim, reward_memory, terms, totals = _rewards(env, sim, state)
+    observation, observation_memory = _observations(env, sim, state.memory.observation)
 
     memory = Memory(status_memory, reward_memory, observation_memory)
-    desired = jnp.stack([controls[name] for name in env.action_names])
-    info = _info(env, sim, outcome, terms, totals, desired)
-    reward = jnp.asarray(sum(terms.values()))
-    return State(sim, memory, totals, num_steps), _time_step(env, sim, observation, reward, info)
+    info = _info(env, sim, terms, totals, jnp.stack([controls[name] for name in env.action_names]))
+    timestep = _time_step(env, sim, observation, jnp.asarray(sum(terms.values())), info)
+    return State(sim, memory, totals, num_steps, state.parameters), timestep
+
+
+def _draw_parameters(env: Environment, key: Key) -> Parameters:
+    """Numbers for one episode, from a key of their own so that platforms start alike with and without them."""
+    keys = jax.random.split(jax.random.fold_in(key, len(env.platforms)), max(len(env.randomize), 1))
+    return {path: uniform(key_i, env.randomize[path]) for path, key_i in zip(env.randomize, keys, strict=False)}
+
+
+def _chosen_parameters(env: Environment, parameters: Mapping[str, Any]) -> Parameters:
+    for path in parameters:
+        if path not in env.randomize:
+            known = nearest(path, env.randomize) or "none"
+            raise ConfigError(f"reset_to: parameter {path!r} is not random; choose from {known}")
+    for path in env.randomize:
+        if path not in parameters:
+            raise ConfigError(f"reset_to: parameter {path!r} is missing: it is random at reset, so give it")
+    return {path: placed(f"parameter {path}", parameters[path], env.dt) for path in env.randomize}
+
+
+def _with_parameters(env: Environment, parameters: Parameters) -> Environment:
+    for path, value in parameters.items():
+        env = set_path(env, path, value)
+    return env
 
 
 def _blank(env: Environment) -> Sim:
@@ -173,16 +219,20 @@ def _blank(env: Environment) -> Sim:
     return Sim(jnp.zeros_like(env.dt), {}, {}, {}, never)
 
 
-def _begin(env: Environment, sim: Sim) -> tuple[State, TimeStep]:
+def _begin(env: Environment, sim: Sim, parameters: Parameters) -> tuple[State, TimeStep]:
     """Initialise all processors from placed platforms: `init` and `process`, no `increment`."""
-    sim, status_memory = _statuses(env, sim, None, env.dt)
-    ended, outcome = _terminal(env, sim)
-    observation, observation_memory = _observations(env, sim, None, env.dt)
-    memory = Memory(status_memory, {term.name: term.init(sim) for term in env.reward}, observation_memory)
+    sim, status_memory = _statuses(env, sim, None)
+    ended = _terminal(env, sim)
+    observation, observation_memory = _observations(env, sim, None)
+    reward_memory = {}
+    for term in env.reward:
+        with _part("reward", term.name):
+            reward_memory[term.name] = term.init(sim)
     zero = jnp.zeros((), observation.dtype)
     terms = {term.name: zero for term in env.reward}
-    info = _info(env, ended, outcome, terms, terms, jnp.zeros(env.action_size, observation.dtype))
-    state = State(ended, memory, terms, jnp.zeros((), jnp.int32))
+    info = _info(env, ended, terms, terms, jnp.zeros(env.action_size, observation.dtype))
+    memory = Memory(status_memory, reward_memory, observation_memory)
+    state = State(ended, memory, terms, jnp.zeros((), jnp.int32), parameters)
     timestep = _time_step(env, sim, observation, zero, info)  # `sim` ended nothing: the first step is always taken
     return state, timestep.replace(cost=zero)
 
@@ -203,70 +253,91 @@ def _checked(env: Environment, action: Array) -> Array:
 
 def _advance(env: Environment, platform: Platform, sim: Sim, controls: Controls) -> Any:
     """The platform's next state, from the old simulation: all platforms move at once."""
-    own = controls if platform.name == env.agent else platform.controller.control(jnp.zeros(0))
-    return platform.step(sim.platforms[platform.name], own, env.dt)
+    with _part("platforms", platform.name):
+        own = controls if platform.name == env.agent else platform.controller.control(jnp.zeros(0), sim)
+        return platform.step(sim.platforms[platform.name], own, env.dt)
 
 
-def _statuses(env: Environment, sim: Sim, memory: Mapping[str, Any] | None, dt: Any) -> tuple[Sim, dict[str, Any]]:
+def _statuses(env: Environment, sim: Sim, memory: Mapping[str, Any] | None) -> tuple[Sim, dict[str, Any]]:
     """Regions, then statuses in order; each sees only those before it. Without memory: the start of an episode."""
-    sim = sim.replace(regions={region.name: region.place(sim.platforms) for region in env.regions})
+    for region in env.regions:
+        with _part("regions", region.name):
+            sim = sim.replace(regions={**sim.regions, region.name: region.place(sim.platforms)})
     memories = {}
     for status in env.status:
-        own = status.init(sim) if memory is None else status.increment(memory[status.name], sim, dt)
-        sim = sim.replace(status={**sim.status, status.name: status.process(own, sim)})
+        with _part("status", status.name):
+            own = status.init(sim) if memory is None else status.increment(memory[status.name], sim, env.dt)
+            sim = sim.replace(status={**sim.status, status.name: status.process(own, sim)})
         memories[status.name] = own
     return sim, memories
 
 
-def _terminal(env: Environment, sim: Sim) -> tuple[Sim, Array]:
-    """The first condition that holds is the outcome."""
-    outcome = jnp.zeros((), jnp.int32)
-    for index, condition in enumerate(env.terminal, start=1):
-        outcome = jnp.where((outcome == 0) & condition.reached(sim), index, outcome)
-    return _mark(env, sim, outcome), outcome
+def _terminal(env: Environment, sim: Sim) -> Sim:
+    """The first condition that holds ends the episode; those that stand apart end it beside the others."""
+    ended, over = {}, jnp.zeros((), bool)
+    for condition in env.terminal:
+        with _part("terminal", condition.name):
+            reached = condition.reached(sim)
+            ended[condition.name] = reached if condition.apart else reached & ~over
+            over = over if condition.apart else over | reached
+    return sim.replace(ended={**sim.ended, **ended})
 
 
-def _rewards(env: Environment, sim: Sim, outcome: Array, state: State) -> tuple[Sim, Array, dict, dict, dict]:
+def _rewards(env: Environment, sim: Sim, state: State) -> tuple[Sim, dict, dict, dict]:
     """Reward terms in order; a bounded term may end the episode, and the terms after it see that."""
     memories, terms, totals = {}, {}, {}
     for term in env.reward:
-        memories[term.name] = own = term.increment(state.memory.reward[term.name], sim, env.dt)
-        terms[term.name] = value = term.process(own, sim)
-        totals[term.name] = total = state.reward_totals[term.name] + value
+        with _part("reward", term.name):
+            memories[term.name] = own = term.increment(state.memory.reward[term.name], sim, env.dt)
+            terms[term.name] = value = term.process(own, sim)
+            totals[term.name] = total = state.reward_totals[term.name] + value
         if term.bound:
-            index = env.outcomes.index(term.bound.outcome)
-            outcome = jnp.where((outcome == 0) & (total < term.bound.below), index, outcome)
-            sim = _mark(env, sim, outcome)
-    return sim, outcome, memories, terms, totals
+            apart = {condition.name for condition in env.terminal if condition.apart}
+            over = _any(ended for name, ended in sim.ended.items() if name not in apart)
+            sim = sim.replace(ended={**sim.ended, term.bound.outcome: (total < term.bound.below) & ~over})
+    return sim, memories, terms, totals
 
 
 def _observations(
-    env: Environment, sim: Sim, memory: Mapping[str, Any] | None, dt: Any
+    env: Environment, sim: Sim, memory: Mapping[str, Any] | None
 ) -> tuple[Float[Array, " observation"], dict[str, Any]]:
     memories, parts = {}, []
     for item in env.observation:
-        memories[item.name] = own = item.init(sim) if memory is None else item.increment(memory[item.name], sim, dt)
-        parts.append(item.process(own, sim))
+        with _part("observation", item.name):
+            own = item.init(sim) if memory is None else item.increment(memory[item.name], sim, env.dt)
+            parts.append(item.process(own, sim))
+        memories[item.name] = own
     return jnp.concatenate(parts), memories
 
 
-def _mark(env: Environment, sim: Sim, outcome: Array) -> Sim:
-    return sim.replace(ended={name: outcome == index for index, name in enumerate(env.outcomes) if index})
-
-
-def _info(env: Environment, sim: Sim, outcome: Array, terms: dict, totals: dict, control: Array) -> Info:
-    margins = {constraint.name: constraint.margin(sim) for constraint in env.constraints}
-    severity = {
-        constraint.name: jnp.maximum(-margins[constraint.name], 0.0) / constraint.limit(sim)
-        for constraint in env.constraints
-    }
+def _info(env: Environment, sim: Sim, terms: dict, totals: dict, control: Array) -> Info:
+    outcome = jnp.zeros((), jnp.int32)
+    for index, name in reversed(list(enumerate(env.outcomes))[1:]):
+        outcome = jnp.where(sim.ended[name], index, outcome)
+    margins, severity = {}, {}
+    for constraint in env.constraints:
+        with _part("constraints", constraint.name):
+            margins[constraint.name] = margin = constraint.margin(sim)
+            severity[constraint.name] = jnp.maximum(-margin, 0.0) / constraint.limit(sim)
     return Info(outcome, sim.status, terms, totals, control, control, jnp.zeros((), bool), margins, severity)
 
 
 def _time_step(env: Environment, sim: Sim, observation: Array, reward: Array, info: Info) -> TimeStep:
-    violated = jnp.any(jnp.array([margin < 0.0 for margin in info.margins.values()], bool))
-    ends = {
-        kind: [sim.ended[name] for name, how in env._ends.items() if how == kind] for kind in ("terminated", "truncated")
-    }
-    terminated, truncated = (jnp.any(jnp.array(ends[kind], bool)) for kind in ("terminated", "truncated"))
+    violated = _any(margin < 0.0 for margin in info.margins.values())
+    kinds = ("terminated", "truncated")
+    terminated, truncated = (_any(sim.ended[name] for name, how in env._ends.items() if how == kind) for kind in kinds)
     return TimeStep(observation, reward, violated.astype(observation.dtype), terminated, truncated, info)
+
+
+def _any(flags: Iterable[Array]) -> Array:
+    return functools.reduce(jnp.logical_or, flags, jnp.zeros((), bool))
+
+
+@contextmanager
+def _part(section: str, name: str) -> Iterator[None]:
+    """Says which part an error comes from; runs while tracing only."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"in {section}.{name}")
+        raise

@@ -29,21 +29,6 @@ def shapes(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)), tree)
 
 
-@pytest.mark.parametrize("actions", ["continuous", "discrete"])
-@pytest.mark.parametrize("task", ["docking2d", "docking3d"])
-@pytest.mark.parametrize("x64", [False, True])
-def test_reset_and_step_agree_in_structure_shape_and_dtype(task: str, actions: str, x64: bool) -> None:
-    with jax.enable_x64(x64):
-        env = jaxsafe.make(task, actions=actions)
-        action = jnp.zeros(env.action_size, jnp.int32 if actions == "discrete" else jnp.result_type(float))
-        started = jax.eval_shape(jaxsafe.reset, env, jax.random.key(0))
-        stepped = jax.eval_shape(jaxsafe.step, env, started[0], action)
-        chex.assert_trees_all_equal_structs(started, stepped)
-        assert shapes(started) == shapes(stepped)
-        kinds = {leaf.dtype for leaf in jax.tree.leaves(stepped)}
-        assert kinds == {np.dtype(jnp.result_type(float)), np.dtype("int32"), np.dtype("bool")}
-
-
 def test_reset_to_agrees_with_reset(env: Environment) -> None:
     drawn, given = jax.eval_shape(jaxsafe.reset, env, jax.random.key(0)), jaxsafe.reset_to(env, START)
     assert shapes(drawn) == shapes(jax.eval_shape(lambda: given))
@@ -181,12 +166,8 @@ def test_an_environment_names_its_parts(task: str, axes: str) -> None:
     assert env.action_names == tuple(f"thrust_{axis}" for axis in axes)
     assert env.action_size == len(axes)
     assert env.num_action_points == ()
-    assert env.observation_names == (
-        *(f"deputy.position.{axis}" for axis in axes),
-        *(f"deputy.velocity.{axis}" for axis in axes),
-        "status.speed",
-        "status.velocity_limit",
-    )
+    vectors = [f"{name}.{axis}" for name in ("position", "velocity") for axis in axes]
+    assert env.observation_names == (*vectors, "speed", "velocity_limit")
     assert env.observation_size == 2 * len(axes) + 2
     _, timestep = jaxsafe.reset(env, jax.random.key(0))
     assert timestep.observation.shape == (env.observation_size,)
@@ -194,6 +175,28 @@ def test_an_environment_names_its_parts(task: str, axes: str) -> None:
     terms = ("distance_change", "velocity_constraint", "delta_v", "success", "failure")
     assert tuple(term.name for term in env.reward) == terms
     assert {"in_docking", "docking_distance", "velocity_limit"} <= set(timestep.info.status)
+
+
+@pytest.mark.parametrize(
+    ("task", "variant", "actions", "size", "outcomes"),
+    [
+        ("rejoin2d", "paper", "heading_rate acceleration", 12, "success crash distance timeout"),
+        ("rejoin3d", "paper", "roll_rate flight_path_angle_rate acceleration", 18, "success crash distance timeout"),
+        ("docking2d_oriented", "paper", "thrust attitude_acceleration", 9, "success crash distance timeout velocity"),
+        ("rejoin2d", "released", "heading_rate acceleration", 12, "success crash timeout distance"),
+        ("rejoin3d", "released", "flight_path_angle_rate roll_rate acceleration", 18, "success crash timeout distance"),
+        ("docking2d", "released", "thrust_x thrust_y", 6, "success timeout distance crash velocity"),
+        ("docking3d", "released", "thrust_x thrust_y thrust_z", 8, "success timeout distance crash velocity"),
+        ("docking2d_oriented", "released", "thrust attitude_acceleration", 9, "success timeout distance crash velocity"),
+    ],
+)
+def test_a_variant_orders_its_actions_and_outcomes(task: str, variant: Any, actions: str, size: int, outcomes: str) -> None:
+    env = jaxsafe.make(task, variant=variant)
+    assert env.action_names == tuple(actions.split())
+    assert env.observation_size == size
+    assert env.outcomes == ("running", *outcomes.split())
+    points = 11 if "docking" in task else 5
+    assert jaxsafe.make(task, variant=variant, actions="discrete").num_action_points == (points,) * env.action_size
 
 
 def test_discrete_actions_change_the_controller_and_nothing_else() -> None:
@@ -205,3 +208,82 @@ def test_discrete_actions_change_the_controller_and_nothing_else() -> None:
     chex.assert_trees_all_close(pushed, chosen, atol=1e-7)
     assert jaxsafe.make("docking3d", actions="continuous") == continuous
     assert discrete != continuous
+
+
+# Ends
+
+
+def ends(env: Environment, position: Any, velocity: Any = (0.0, 0.0)) -> tuple[list[str], str, TimeStep]:
+    """What ended on the first step from a start, and the outcome."""
+    state, _ = jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})
+    state, timestep = step(env, state, jnp.zeros(2))
+    return [name for name, ended in state.sim.ended.items() if ended], env.outcomes[int(timestep.info.outcome)], timestep
+
+
+def test_the_first_condition_that_holds_hides_those_after_it() -> None:
+    numbers = {"terminal.timeout.limit": 0.5, "terminal.distance.limit": 0.1}
+    env = jaxsafe.make("docking2d", numbers)
+    assert ends(env, [0.3, 0.0])[:2] == (["success"], "success")
+    assert ends(env, [5.0, 0.0])[:2] == (["distance"], "distance")
+    names = ["timeout", "distance", "success", "crash"]
+    swapped = jaxsafe.make("docking2d", numbers | {"terminal": names})
+    assert swapped.outcomes == ("running", *names, "velocity")
+    assert ends(swapped, [0.3, 0.0])[:2] == (["timeout"], "timeout")
+
+
+def test_a_condition_that_stands_apart_neither_hides_nor_is_hidden() -> None:
+    numbers = {"terminal.timeout.limit": 0.5, "terminal.distance.limit": 0.1}
+    for names, outcome in (
+        (["success", "distance", "timeout", "crash"], "success"),
+        (["distance", "success", "timeout", "crash"], "distance"),
+    ):
+        env = jaxsafe.make("docking2d", numbers | {"terminal": names, "terminal.success.apart": True})
+        found, first, timestep = ends(env, [0.3, 0.0])
+        assert (set(found), first) == ({"success", "distance"}, outcome)
+        assert timestep.terminated
+        assert float(timestep.info.reward_terms["success"]) == pytest.approx(2.0 - 1.0 / 2000.0)
+        assert float(timestep.info.reward_terms["failure"]) == -1.0
+    assert ends(jaxsafe.make("docking2d", {"terminal.success.apart": True}), [0.3, 0.0])[0] == ["success"]
+    every = {f"terminal.{name}.apart": True for name in ("success", "distance", "timeout")}
+    assert set(ends(jaxsafe.make("docking2d", numbers | every), [0.3, 0.0])[0]) == {"success", "distance", "timeout"}
+
+
+def test_a_bound_is_hidden_by_ends_but_not_by_those_that_stand_apart() -> None:
+    tight = {"reward.velocity_constraint.bound.below": 1.0}
+    assert ends(jaxsafe.make("docking2d", tight), [50.0, 0.0])[:2] == (["velocity"], "velocity")
+    assert ends(jaxsafe.make("docking2d", tight), [0.3, 0.0])[:2] == (["success"], "success")
+    beside = jaxsafe.make("docking2d", tight | {"terminal.success.apart": True})
+    assert ends(beside, [0.3, 0.0])[:2] == (["success", "velocity"], "success")
+
+
+def test_a_released_docking_that_crashes_too_late_is_a_timeout() -> None:
+    numbers, found = {"terminal.timeout.limit": 0.5}, {}
+    for variant in ("paper", "released"):
+        found[variant] = ends(jaxsafe.make("docking2d", numbers, variant=variant), [0.3, -1.0], [0.0, 1.0])[1]
+    assert found == {"paper": "crash", "released": "timeout"}
+
+
+@pytest.mark.parametrize("how", ["terminated", "truncated"])
+def test_any_reward_term_may_carry_a_bound(how: str) -> None:
+    bound = {"below": -0.05, "outcome": "thirst", "ends": how}
+    env = jaxsafe.make("docking2d", {"reward.delta_v.bound": bound, "reward.delta_v.scale": -0.3})
+    assert env.outcomes == (*OUTCOMES, "thirst")
+    state, _ = jaxsafe.reset_to(env, START)
+    over, kind = [], []
+    for _ in range(4):  # each pays 0.3 √2/12 = 0.0354
+        state, timestep = step(env, state, jnp.ones(2))
+        over.append(env.outcomes[int(timestep.info.outcome)])
+        kind.append((bool(timestep.terminated), bool(timestep.truncated)))
+    assert over == ["running", *["thirst"] * 3]
+    assert kind == [(False, False), *[(how == "terminated", how == "truncated")] * 3]
+    assert env.can_truncate == (how == "truncated")
+
+
+def test_a_state_holds_the_numbers_drawn_for_its_episode(env: Environment) -> None:
+    assert reset(env, jax.random.key(0))[0].parameters == {}
+    assert jaxsafe.reset_to(env, START)[0].parameters == {}
+    random = jaxsafe.make("docking2d", randomize={"deputy.mass": [10, 14], "dt": [1, 1]})
+    state, _ = reset(random, jax.random.key(0))
+    assert set(state.parameters) == {"deputy.mass", "dt"}
+    after, _ = step(random, state, jnp.zeros(2))
+    chex.assert_trees_all_equal(after.parameters, state.parameters)

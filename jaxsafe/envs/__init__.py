@@ -3,19 +3,36 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from jaxsafe.config import build, load, override
-from jaxsafe.config.override import set_path
 from jaxsafe.environment import Environment
-from jaxsafe.envs.docking2d import docking2d
-from jaxsafe.envs.docking3d import docking3d
+from jaxsafe.envs import _docking, docking2d, docking2d_oriented, docking3d, rejoin2d, rejoin3d
 from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.paths import set_path
 from jaxsafe.simulation.controllers import Continuous, Discrete
 
-TASKS = {"docking2d": docking2d, "docking3d": docking3d}
+TASKS = {
+    "rejoin2d": rejoin2d.rejoin2d,
+    "rejoin3d": rejoin3d.rejoin3d,
+    "docking2d": docking2d.docking2d,
+    "docking3d": docking3d.docking3d,
+    "docking2d_oriented": docking2d_oriented.docking2d_oriented,
+}
 """Every task that `make` knows by name."""
+
+VARIANTS: dict[str, dict[str, Mapping[str, Any]]] = {
+    "paper": {},
+    "released": {
+        "rejoin2d": rejoin2d.RELEASED,
+        "rejoin3d": rejoin3d.RELEASED,
+        "docking2d": _docking.RELEASED,
+        "docking3d": _docking.RELEASED,
+        "docking2d_oriented": docking2d_oriented.RELEASED,
+    },
+}
+"""Overrides by variant and task: `paper` is the declaration itself, `released` the published SafeRL code's semantics."""
 
 _ACTIONS = {"continuous": Continuous, "discrete": Discrete}
 
@@ -25,6 +42,8 @@ def make(
     overrides: Mapping[str, Any] | None = None,
     *,
     actions: Literal["continuous", "discrete"] | None = None,
+    variant: Literal["paper", "released"] | None = None,
+    randomize: Mapping[str, Sequence[float]] | None = None,
 ) -> Environment:
     """Return an environment, ready for `reset` and `step`.
 
@@ -33,12 +52,24 @@ def make(
         overrides: new values by dotted path, for instance `{"reward.delta_v.scale": -0.02}`.
         actions: `continuous`, in [−1, 1], or `discrete`, indices of points per actuator; None leaves what the task has
             (the tasks by name are continuous).
+        variant: `paper`, or `released` for the semantics of the published SafeRL code; None is `paper`.
+        randomize: numbers drawn anew for each episode, by dotted path with their interval, for instance
+            `{"deputy.mass": [10, 14]}`.
 
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.
     """
     if not isinstance(task, (str, os.PathLike)):
         raise ConfigError(f"env: expected the name of a task or a .yaml file, found {task!r}")
+    for option, kinds, value in (
+        ("overrides", Mapping, overrides),
+        ("randomize", Mapping, randomize),
+        ("actions", str, actions),
+    ):
+        if value is not None and not isinstance(value, kinds):
+            raise ConfigError(
+                f"{option}: expected {'paths with values' if kinds is Mapping else 'a name'}, found {value!r}"
+            )
     name = os.fspath(task)
     if name in TASKS:
         env = build(TASKS[name]())
@@ -46,13 +77,24 @@ def make(
         env = load(name)
     else:
         raise ConfigError(f"env: unknown task {name!r} and not a .yaml file; choose from {nearest(name, TASKS)}")
+    if variant is not None:
+        env = _with_variant(env, name, variant)
     if actions is not None:
         env = _with_actions(env, actions)
-    return override(env, overrides or {})
+    random = {} if randomize is None else {"randomize": randomize}
+    return override(env, {**(overrides or {}), **random})
+
+
+def _with_variant(env: Environment, task: str, variant: str) -> Environment:
+    if variant not in VARIANTS:
+        raise ConfigError(f"variant: unknown variant {variant!r}; choose from {nearest(variant, VARIANTS)}")
+    if task not in TASKS:
+        raise ConfigError(f"variant: {task} says itself what it is; a variant is for {', '.join(TASKS)}")
+    return override(env, VARIANTS[variant].get(task, {}))
 
 
 def _with_actions(env: Environment, actions: str) -> Environment:
     if actions not in _ACTIONS:
         raise ConfigError(f"actions: unknown kind {actions!r}; choose from {nearest(actions, _ACTIONS)}")
-    controller = _ACTIONS[actions](actuators=env.agent_platform.controller.actuators)
-    return set_path(env, f"{env.agent}.controller", controller)
+    actuators = getattr(env.agent_platform.controller, "actuators", ())
+    return set_path(env, f"{env.agent}.controller", _ACTIONS[actions](actuators=actuators))

@@ -13,7 +13,7 @@ from jaxsafe.processors.status import DeltaV, Distance, InRegion, Speed, Status,
 from jaxsafe.processors.terminal import Crashed, Docked, Terminal, Timeout, TooFar
 from jaxsafe.simulation.controllers import Actuator, Continuous
 from jaxsafe.simulation.cwh import MEAN_MOTION, Anchor, Spacecraft
-from jaxsafe.simulation.initializers import AtDistance, BelowSpeedLimit, Direction
+from jaxsafe.simulation.initializers import AtDistance, BelowSpeedLimit, Direction, Initializer
 
 DOCKING_SPEED = 0.2
 """ν₀ of Eq. (14): the speed limit at the chief [m/s]."""
@@ -30,16 +30,20 @@ def chief(dimension: int) -> Anchor:
     return Anchor(name="chief", dimension=dimension)
 
 
+def deputy_start(direction: Direction) -> tuple[Initializer, ...]:
+    """100-150 m away, at a random velocity within the speed limit, Table 4."""
+    return (
+        AtDistance(name="position", about="chief", distance=(100.0, 150.0), direction=direction),
+        BelowSpeedLimit(name="velocity", about="chief", floor=DOCKING_SPEED, slope=LIMIT_SLOPE, direction=direction),
+    )
+
+
 def deputy(dimension: Literal[2, 3]) -> Spacecraft:
-    """The active spacecraft, Table 4: starts 100-150 m away at a random velocity within the speed limit."""
-    anywhere = PLANAR if dimension == 2 else SPATIAL
+    """The active spacecraft, Table 4."""
     return Spacecraft(
         name="deputy",
         dimension=dimension,
-        start=(
-            AtDistance(name="position", about="chief", distance=(100.0, 150.0), direction=anywhere),
-            BelowSpeedLimit(name="velocity", about="chief", floor=DOCKING_SPEED, slope=LIMIT_SLOPE, direction=anywhere),
-        ),
+        start=deputy_start(PLANAR if dimension == 2 else SPATIAL),
         controller=Continuous(
             actuators=tuple(Actuator(name=f"thrust_{axis}", low=-1.0, high=1.0, points=11) for axis in "xyz"[:dimension])
         ),
@@ -96,6 +100,23 @@ def docking_observation() -> tuple[Observation, ...]:
     return (
         Observe(name="position", of="deputy", what="position", scale=100.0),
         Observe(name="velocity", of="deputy", what="velocity", scale=0.5),
+        *speed_observation(),
+    )
+
+
+def speed_observation() -> tuple[Observation, ...]:
+    """The last two rows of each part of Table 6."""
+    return (
         ObserveStatus(name="speed", status="speed"),
         ObserveStatus(name="velocity_limit", status="velocity_limit"),
     )
+
+
+RELEASED = {
+    "status.velocity_limit.constant_to": 0.5,
+    "status.delta_v.norm": "l1",
+    "terminal.success.apart": True,
+    "terminal.distance.inclusive": True,
+    "terminal": ["success", "timeout", "distance", "crash"],
+}
+"""What the released code does otherwise."""
