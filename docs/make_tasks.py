@@ -1,0 +1,240 @@
+"""The pages `docs/tasks/<task>.md` and their figures, from the environments themselves, so that they cannot drift.
+
+Run `python docs/make_tasks.py` after a change to a task; `tests/test_docs.py` compares the committed pages with it. The
+paragraphs above and below the figure are written by hand; every table comes from the components of `jaxsafe.make`.
+"""
+
+from __future__ import annotations
+
+import inspect
+import sys
+import textwrap
+from collections.abc import Iterable, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import jaxsafe
+from jaxsafe.component import Component, fields
+from jaxsafe.envs import TASKS
+from jaxsafe.processors.observation import Observation, Observe, ObserveAngle, ObserveRegion
+from jaxsafe.simulation.platform import Platform
+from jaxsafe.types import units
+
+TARGET = Path(__file__).parent / "tasks"
+
+DOCKING = (
+    "A deputy spacecraft flies to within 0.5 m of a chief that rests at the origin of Hill's frame, on a circular orbit."
+    " Its speed must stay below a limit that falls with the distance; a deputy that arrives faster has crashed."
+)
+REJOIN = (
+    "A wingman flies to a point behind and beside a lead aircraft and stays in a small region about it for 20 s. It must"
+    " keep 100 ft away from the lead, which flies straight on unless its script says otherwise."
+)
+TEXT = {
+    "rejoin2d": f"{REJOIN} Both fly at one altitude. The wingman commands its heading rate and its acceleration.",
+    "rejoin3d": f"{REJOIN} The wingman commands its roll rate, the rate of its flight path angle and its acceleration;"
+    " it turns because it banks. A positive flight path angle lowers z.",
+    "docking2d": f"{DOCKING} The motion is in the plane of the orbit; one thruster pair acts along each axis.",
+    "docking3d": f"{DOCKING} The motion is in space; one thruster pair acts along each axis.",
+    "docking2d_oriented": f"{DOCKING} The motion is in the plane of the orbit. One thruster acts along the body's x axis,"
+    " stronger forwards than backwards, and a reaction wheel turns the body, so the deputy must first point and then push.",
+}
+"""What a task is, in a paragraph."""
+
+CAPTION = {
+    "deputy": "Starts are drawn from the blue ranges (dots: three of them). A scripted policy flies to the chief at 90, 60"
+    " and 115 % of the speed limit; the last crashes. x points away from the Earth, y along the orbit.",
+    "wingman": "A scripted policy flies to the rejoin point and ignores the lead: one wingman succeeds, the other crashes"
+    " into the lead on its way. Dots and squares are starts.",
+}
+"""What the figure shows, by agent."""
+
+CONTROL_UNITS = {"thrust": "N", "rate": "rad/s", "attitude_acceleration": "rad/s²", "acceleration": "ft/s²"}
+"""Unit of an actuator by the words in its name, the first that fits."""
+
+SECTIONS = (
+    ("Regions", "", "regions"),
+    ("Statuses", "Facts about the state, computed in this order; those below may use those above.", "status"),
+    ("Rewards", "The reward of a step is the sum of these terms.", "reward"),
+    (
+        "Ends of an episode",
+        "The first condition that holds is the outcome; a bound of a reward term comes last.",
+        "terminal",
+    ),
+    ("Safety constraints", "Safe where h ≥ 0; `cost` is 1 on a step on which one is violated.", "constraints"),
+)
+"""Heading, explanation and field of the sections that list parts."""
+
+
+def page(task: str) -> str:
+    """The Markdown page of a task."""
+    env = jaxsafe.make(task)
+    length = next(unit for _, unit, _ in state_fields(env.platforms[0]))
+    paths = f"A path is what `jaxsafe.make({task!r}, {{path: value}})` takes, followed by a dot and the number's name."
+    blocks = [
+        f"<!-- Written by docs/make_tasks.py. -->\n# {task}",
+        TEXT[task],
+        f"![Where {task} starts and how it ends]({task}.png)",
+        CAPTION[env.agent],
+        "The tables and equations named here are those of the paper (see [the README](../../README.md#development))."
+        f" Lengths are in {length}, the time step is {number(env.dt)} s. {paths} Where the published code differs:"
+        " [deviations](../deviations.md). The same as one file:"
+        f" [configs/envs/{task}.yaml](../../configs/envs/{task}.yaml).",
+        "## Platforms",
+        *(block for platform in env.platforms for block in platform_blocks(platform, length)),
+        "## Actions",
+        f"Continuous actions lie in [−1, 1]; with `jaxsafe.make({task!r}, actions='discrete')` they are indices of points.",
+        table(("index", "actuator", "unit", "low", "high", "[−1, 1] maps to", "points"), actions(env)),
+        "## Observation",
+        "Each element is divided by its divisor and then clipped.",
+        table(("index", "element", "what it is", "divisor", "clip"), observation(env)),
+    ]
+    for title, about, section in SECTIONS:
+        blocks += [f"## {title}", about, table(("path", "type", "what it is", "numbers"), parts(env, section, length))]
+    return "\n\n".join(wrapped(block) for block in blocks if block) + "\n"
+
+
+def wrapped(block: str) -> str:
+    """A paragraph in lines of the house's width; headings, tables and figures as they are."""
+    if block.startswith(("#", "|", "<", "!")):
+        return block
+    return textwrap.fill(block, 124, break_on_hyphens=False, break_long_words=False)
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A Markdown table."""
+    lines = [list(head), *map(list, rows)]
+    lines.insert(1, ["---"] * len(lines[0]))
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def platform_blocks(platform: Platform, length: str) -> Iterator[str]:
+    """What a platform is, its parameters, and its state with the way in which each field starts."""
+    yield f"### `{platform.name}`: {platform.type_name}"
+    yield summary(platform)
+    own = [name for name in fields(type(platform)) if name not in fields(Platform)]
+    if own:
+        yield "Parameters: " + settings(platform, length, own) + "."
+    start = {item.name: item for item in platform.start}
+    rest = platform.rest()
+
+    def begin(name: str, unit: str) -> tuple[str, ...]:
+        if name not in start:
+            return "", "the same in every episode", number(np.unique(getattr(rest, name)).squeeze())
+        return f"`{start[name].type_name}`", summary(start[name]), settings(start[name], length, physical=unit)
+
+    rows = ((f"`{name}`", unit, str(size), *begin(name, unit)) for name, unit, size in state_fields(platform))
+    yield table(("state", "unit", "size", "start", "how it is drawn", "numbers"), rows)
+    commands = getattr(platform.controller, "commands", ())
+    if commands:
+        script = "; ".join(f"`{one.name}` {one.type_name} {settings(one, length)}" for one in commands)
+        yield f"It follows a script: {script}."
+
+
+def state_fields(platform: Platform) -> list[tuple[str, str, int]]:
+    """Name, unit and number of components of each field of a platform's state."""
+    rest = platform.rest()
+    return [(name, unit, np.size(getattr(rest, name))) for name, unit in units(type(rest)).items()]
+
+
+def actions(env: jaxsafe.Environment) -> Iterator[tuple[str, ...]]:
+    """A row for each actuator."""
+    for index, one in enumerate(env.agent_platform.controller.actuators):  # type: ignore[attr-defined]
+        unit = next(unit for word, unit in CONTROL_UNITS.items() if word in one.name)
+        mapped = "[low, 0] and [0, high], so that 0 stays 0" if one.zero_centred else "[low, high]"
+        yield str(index), f"`{one.name}`", unit, number(one.low), number(one.high), mapped, str(one.points)
+
+
+def observation(env: jaxsafe.Environment) -> list[tuple[str, ...]]:
+    """A row for each element of the observation."""
+    labels: dict[str, tuple[str, ...]] = {}
+
+    def probe(key: jax.Array) -> None:
+        sim = jaxsafe.reset(env, key)[0].sim
+        labels.update({item.name: item.labels(sim) for item in env.observation})
+
+    jax.eval_shape(probe, jax.random.key(0))
+    rows = []
+    for item in env.observation:
+        divisors = np.broadcast_to(np.asarray(item.scale), len(labels[item.name]))
+        clip = "none" if item.clip is None else number(item.clip)
+        for label, divisor in zip(labels[item.name], divisors, strict=True):
+            rows.append((str(len(rows)), f"`{label}`", seen(item, label), number(divisor), clip))
+    return rows
+
+
+def seen(item: Observation, label: str) -> str:
+    """What one element of an observation is, in words."""
+    element = label.removeprefix(item.name).removeprefix(".")
+    if isinstance(item, ObserveAngle):
+        return f"{'cosine' if element == 'cos' else 'sine'} of the `{item.what}` of `{item.of}`"
+    if not isinstance(item, (Observe, ObserveRegion)):
+        return f"status `{item.status}`"  # type: ignore[attr-defined]
+    of, what = (item.of, item.what) if isinstance(item, Observe) else (item.region, "position")
+    relative = f" relative to `{item.relative_to}`" if item.relative_to else ""
+    turned = f", in the body frame of `{item.frame}`" if item.frame and element != "magnitude" else ""
+    piece = "magnitude of " if element == "magnitude" else f"{element} of " if element else ""
+    unit = "the direction of " if item.form == "magnorm" and element != "magnitude" else ""
+    return f"{piece}{unit}the `{what}` of `{of}`{relative}{turned}"
+
+
+def parts(env: jaxsafe.Environment, section: str, length: str) -> Iterator[tuple[str, ...]]:
+    """A row for each part of a section: the first line of its class's docstring, and its numbers."""
+    for part in getattr(env, section):
+        yield f"`{section}.{part.name}`", f"`{part.type_name}`", summary(part), settings(part, length)
+    if section == "terminal":
+        for term in env.reward:
+            if term.bound:
+                yield f"`reward.{term.name}.bound`", "", summary(term.bound), settings(term.bound, length)
+
+
+def summary(component: Component) -> str:
+    """The first paragraph of a component's docstring."""
+    return " ".join(inspect.cleandoc(type(component).__doc__ or "").split("\n\n")[0].split())
+
+
+def settings(component: Component, length: str, only: Iterable[str] = (), physical: str = "") -> str:
+    """The fields of a component in words, with units; what is not set is left out, and what a base class sets."""
+    units = {"m or ft": length, "physical": physical, "1": "", "as observed": ""}
+    found = []
+    for name, field in fields(type(component)).items():
+        value = getattr(component, name)
+        inherited = name not in type(component).__annotations__ and field.static and value == field.default
+        if name == "name" or value is None or inherited or (only and name not in only):
+            continue
+        if field.unit:
+            found.append(f"{name} {number(value)} {units.get(field.unit.symbol, field.unit.symbol)}".strip())
+        elif isinstance(value, Component):
+            found.append(f"{name} ({', '.join(filter(None, (value.type_name, settings(value, length))))})")
+        elif isinstance(value, dict):
+            found += [f"{key} {number(item)}" for key, item in value.items()]
+        else:
+            found.append(f"{name} {str(value).lower() if isinstance(value, bool) else f'`{value}`'}")
+    return ", ".join(found)
+
+
+def number(value: Any) -> str:
+    """A number, or a list of them, as one reads it: fractions of π where they are exact in float32."""
+    if np.ndim(value):
+        return "[" + ", ".join(map(number, value)) + "]"
+    scalar = np.float32(value)
+    share = Fraction(float(scalar) / np.pi).limit_denominator(180)
+    if share and abs(float(share) * np.pi / float(scalar) - 1.0) < 1e-6 and share.denominator * abs(share.numerator) < 400:
+        top = {1: "π", -1: "-π"}.get(share.numerator, f"{share.numerator}π")
+        text = top if share.denominator == 1 else f"{top}/{share.denominator}"
+    else:
+        text = np.format_float_positional(scalar, trim="-")
+    return text.replace("-", "−")
+
+
+if __name__ == "__main__":
+    import draw_tasks
+
+    TARGET.mkdir(exist_ok=True)
+    for task in sys.argv[1:] or TASKS:
+        (TARGET / f"{task}.md").write_text(page(task), encoding="utf-8")
+        draw_tasks.draw(task).savefig(TARGET / f"{task}.png", dpi=100)

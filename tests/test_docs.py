@@ -1,0 +1,136 @@
+"""The pages that are written from the code are current, and the code in the tutorials runs and prints what they say."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsafe
+from jaxsafe.config import dump, load
+from jaxsafe.envs import TASKS, VARIANTS
+
+ROOT = Path(__file__).parent.parent
+CUSTOM = ROOT / "configs" / "custom_env.yaml"
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+MARK = "--- end of block ---"
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md"))]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_page_of_a_task_is_current(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    from make_tasks import page  # pyright: ignore[reportMissingImports]
+
+    assert (ROOT / "docs" / "tasks" / f"{task}.md").read_text(encoding="utf-8") == page(task), "run docs/make_tasks.py"
+    assert (ROOT / "docs" / "tasks" / f"{task}.png").is_file()
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_file_of_a_task_is_current_and_is_the_task(task: str) -> None:
+    file = ROOT / "configs" / "envs" / f"{task}.yaml"
+    assert file.read_text(encoding="utf-8") == dump(jaxsafe.make(task)), f"python -m jaxsafe.config {task} > {file}"
+    assert load(file) == jaxsafe.make(task)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_override_of_the_released_variant_is_explained(task: str) -> None:
+    page = (ROOT / "docs" / "deviations.md").read_text(encoding="utf-8")
+    assert [path for path in VARIANTS["released"][task] if f"`{path}`" not in page] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_links_lead_to_files(page: Path) -> None:
+    links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
+    assert [link for link in links if not (page.parent / link).exists()] == []
+
+
+def test_the_composed_environment_survives_a_round_trip() -> None:
+    env = load(CUSTOM)
+    assert load(dump(env)) == env
+
+
+def test_the_composed_environment_can_be_solved_under_jit_and_vmap() -> None:
+    env = jaxsafe.make(CUSTOM)
+    outcomes, cost, margin = jax.jit(jax.vmap(fly_around, in_axes=(None, 0)))(env, jax.random.split(jax.random.key(0), 5))
+    assert [env.outcomes[outcome] for outcome in np.asarray(outcomes)] == ["success"] * 5
+    assert float(cost.sum()) == 0.0
+    assert float(margin.min()) > 0.0
+
+
+def test_flying_straight_through_the_zone_fails() -> None:
+    env = jaxsafe.make(CUSTOM)
+    state, _ = jaxsafe.reset_to(
+        env, {"deputy": {"position": [0.0, 71.0], "velocity": [0.0, -2.0]}}, dict.fromkeys(env.randomize, 12.0)
+    )
+    _, timestep = jax.jit(jaxsafe.step)(env, state, jnp.zeros(2))
+    assert env.outcomes[int(timestep.info.outcome)] == "keep_out"
+    assert float(timestep.info.reward_terms["failure"]) == -1.0
+    assert float(timestep.info.margins["keep_out"]) < 0.0
+    assert float(timestep.cost) == 1.0
+
+
+def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """First outcome, and up to it the cost and the smallest margin to the zone, under a policy with a way-point."""
+
+    def one_step(carry: tuple, _: None) -> tuple[tuple, tuple]:
+        state, outcome = carry
+        deputy, status = state.sim.platforms["deputy"], state.sim.status
+        beside = jnp.array([jnp.where(deputy.position[0] < 0.0, -40.0, 40.0), 45.0])
+        away = jnp.where(deputy.position[1] > 50.0, beside, 0.0) - deputy.position
+        limit = jnp.minimum(status["velocity_limit"], status["keep_out_speed_limit"])
+        thrust = 12.0 * (0.8 * limit * away / jnp.linalg.norm(away) - deputy.velocity)
+        state, timestep = jaxsafe.step(env, state, thrust)
+        cost = jnp.where(outcome == 0, timestep.cost, 0.0)
+        margin = jnp.where(outcome == 0, timestep.info.margins["keep_out"], jnp.inf)
+        return (state, jnp.where(outcome == 0, timestep.info.outcome, outcome)), (cost, margin)
+
+    start = jaxsafe.reset(env, key)[0], jnp.zeros((), jnp.int32)
+    (_, outcome), (cost, margin) = jax.lax.scan(one_step, start, None, 900)
+    return outcome, cost.sum(), margin.min()
+
+
+@pytest.mark.parametrize("page", ["compose", "extend", "deviations"])
+def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_path: Path) -> None:
+    """Blocks that begin with the name of a file are written to it; the others run in one program, in their order.
+
+    Output follows its block as `text`. YAML without a name is quoted from the composed environment. A `console` block is a
+    command and what it prints.
+    """
+    shutil.copy(CUSTOM, tmp_path)
+    program, expected = "", []
+    for kind, text in BLOCK.findall((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")):
+        named = re.match(r"# (\w+\.(?:py|yaml))\n", text)
+        if named:
+            (tmp_path / named[1]).write_text(text, encoding="utf-8")
+        elif kind == "python":
+            program += f"{text}\nprint({MARK!r})\n"
+            expected.append("")
+        elif kind == "text":
+            expected[-1] = text
+        elif kind == "yaml":
+            assert text in CUSTOM.read_text(encoding="utf-8")
+        else:
+            command, output = text.removeprefix("$ python ").split("\n", 1)
+            process = run(shlex.split(command), tmp_path)
+            assert process.stdout + process.stderr == output
+    (tmp_path / "program.py").write_text(program, encoding="utf-8")
+    process = run(["program.py"], tmp_path)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.split(f"{MARK}\n")[:-1] == expected
+
+
+def run(arguments: list[str], directory: Path) -> subprocess.CompletedProcess[str]:
+    """Run Python on one device, with the tests' compilation cache."""
+    cache = {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir)}  # type: ignore[attr-defined]
+    cache["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"  # many small programs
+    environment = {**os.environ, **cache, "PYTHONUTF8": "1", "XLA_FLAGS": ""}
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, cwd=directory, env=environment, capture_output=True, encoding="utf-8", check=False)
