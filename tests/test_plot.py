@@ -69,7 +69,7 @@ def episode(step: int, dimension: int) -> tuple[int, list[dict]]:
 
 @pytest.mark.parametrize(("dimension", "panels"), [(2, 1), (3, 2)])
 def test_trajectories_have_a_panel_for_each_plane(dimension: int, panels: int) -> None:
-    figure = trajectories([episode(100, dimension), episode(200, dimension)], "title")
+    figure = trajectories([episode(100, dimension), episode(200, dimension)], "title", "m")
     axes = [panel for panel in figure.axes if panel.get_xlabel() == "x [m]"]
     assert len(axes) == panels
     np.testing.assert_allclose(axes[0].lines[0].get_xdata(), np.linspace(80.0, 0.0, 20))

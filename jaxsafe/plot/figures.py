@@ -14,11 +14,12 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 
-from jaxsafe.config import yaml
+from jaxsafe.config import from_data, yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.train.files import read_rows, write_bytes
 from jaxsafe.train.log import NEEDS
+from jaxsafe.types import units
 
 BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#8A8A8A"  # of the Okabe-Ito palette, safe for colour-blind readers
 LAST_COLOUR = 0.85  # the end of the colour map is too light on white
@@ -44,11 +45,12 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
     rows = read_rows(run / "progress.jsonl", NEEDS)
     if not rows:
         raise ConfigError(f"run: {run} has no rows in progress.jsonl yet; nothing to draw")
-    title = _title(run, rows)
+    content = yaml.read(run / "config.yaml")
+    title = _title(content, rows)
     figures = {f"training_{x}": training_curves(rows, x, title)}
     episodes = _episodes(run / "episodes.jsonl")
     if episodes:
-        figures["trajectories"] = trajectories(episodes, title)
+        figures["trajectories"] = trajectories(episodes, title, _unit(content))
         if "velocity_limit" in episodes[0][1][0]["status"]:
             figures["speed_distance"] = speed_distance(episodes, title)
     return [_save(figure, run / "figures" / f"{name}.png") for name, figure in figures.items()]
@@ -76,7 +78,7 @@ def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figur
     return figure
 
 
-def trajectories(episodes: Episodes, title: str) -> Figure:
+def trajectories(episodes: Episodes, title: str, unit: str) -> Figure:
     """Paths of the agent relative to the other platform, from purple early in training to green at its end."""
     paths = [(step, _relative_path(rows)) for step, rows in episodes]
     planes = [(0, 1)] if paths[0][1].shape[1] == 2 else [(0, 1), (0, 2)]
@@ -87,8 +89,8 @@ def trajectories(episodes: Episodes, title: str) -> Figure:
         for step, path in paths:
             panel.plot(path[:, i], path[:, j], color=colour(step), linewidth=1.2)
             panel.plot(path[0, i], path[0, j], "o", color=colour(step), markersize=3)
-        panel.plot(0, 0, "*", color=ORANGE, markersize=12, label="target", zorder=3)
-        panel.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]", aspect="equal")
+        panel.plot(0, 0, "*", color=ORANGE, markersize=12, label=next(iter(episodes[0][1][0]["platforms"])), zorder=3)
+        panel.set(xlabel=f"{'xyz'[i]} [{unit}]", ylabel=f"{'xyz'[j]} [{unit}]", aspect="equal")
         panel.set_adjustable("datalim")
     panels[0].legend(loc="best", fontsize="small", frameon=False)
     figure.colorbar(colours, ax=list(panels), label="environment steps of training")
@@ -170,10 +172,15 @@ def _colours(episodes: Sequence[tuple[int, Any]]) -> tuple[ScalarMappable, Any]:
     return ScalarMappable(scale, shades), lambda step: shades(scale(step))
 
 
-def _title(run: Path, rows: Sequence[dict[str, Any]]) -> str:
-    content = yaml.read(run / "config.yaml")
+def _title(content: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
     count = len({row["seed"] for row in rows})
     return f"{content['env']}, preset {content['training']['preset']}, {count} seed{'s' * (count != 1)}"
+
+
+def _unit(content: dict[str, Any]) -> str:
+    """The unit of positions."""
+    platform = from_data(content["environment"], "environment").agent_platform
+    return units(type(platform.rest()))["position"]
 
 
 def _save(figure: Figure, path: Path) -> Path:

@@ -149,7 +149,7 @@ def _prior(points: Sequence[int], std: Array | float) -> Float[Array, " points"]
 
 
 def _position_elements(env: Environment) -> list[int]:
-    found = [i for i, name in enumerate(env.observation_names) if name.startswith(f"{env.agent}.position.")]
+    found = [i for i, name in enumerate(env.observation_names) if name.startswith("position.")]
     if not found:
-        raise ConfigError("agent.features: 'docking' needs the agent's position in the observation; choose none")
+        raise ConfigError("agent.features: 'docking' needs an observation called 'position'; choose none")
     return found

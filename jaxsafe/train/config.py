@@ -12,11 +12,11 @@ import jax.numpy as jnp
 from jaxsafe.cli import Arguments
 from jaxsafe.component import Component, Range, fields, normalise
 from jaxsafe.config import yaml
-from jaxsafe.config.convert import expects
-from jaxsafe.config.override import set_path
+from jaxsafe.config.convert import expects, to_value
 from jaxsafe.environment import Environment
 from jaxsafe.envs import make
 from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.paths import set_path
 from jaxsafe.train.agent import Agent
 from jaxsafe.train.log import tensorboard_writer
 from jaxsafe.train.ppo import PPO
@@ -32,6 +32,7 @@ class TrainConfig(Component):
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0  # the first; seeds=10 is seed … seed + 9
     steps: Count = 500_000
     actions: Literal["continuous", "discrete"] | None = None  # None: as the environment says
+    variant: Literal["paper", "released"] | None = None  # None: paper
     out: str | None = None  # None: a new directory in runs/
     eval_every: Count | None = None  # steps; None: a tenth of the run
     eval_episodes: Count = 100  # of each evaluation during training
@@ -65,11 +66,11 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
         raise ConfigError("env: missing; for instance env=docking3d")
     config = TrainConfig()
     for path, value in arguments.options.items():  # first, so that a misspelt option is told before a slow start
-        config = set_path(config, path, value)
-    env = make(task, overrides, actions=config.actions)
+        config = set_path(config, path, value, to_value)
+    env = make(task, overrides, actions=config.actions, variant=config.variant)
     config = normalise(TrainConfig())
     for path, value in {**recipe(task, arguments.options.get("preset")), **arguments.options}.items():
-        config = set_path(config, path, value)
+        config = set_path(config, path, value, to_value)
     if config.ppo.batch_size % config.ppo.num_minibatches:
         raise ConfigError(
             f"ppo.num_minibatches: expected a divisor of ppo.num_envs × ppo.num_steps = {config.ppo.batch_size},"

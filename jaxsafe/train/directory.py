@@ -26,7 +26,12 @@ def create(config: TrainConfig, env: Environment, name: str) -> Path:
         ConfigError: `out` already holds something, or cannot be written.
     """
     path = make(config.out, Path("runs"), name)
-    content = {"env": name, "training": to_data(config), "environment": to_data(env), "versions": versions()}
+    content = {
+        "env": name,
+        "training": to_data(config),
+        "environment": jaxsafe.config.describe(env),
+        "versions": versions(),
+    }
     try:
         write_text(path / "config.yaml", yaml.write(content))
     except OSError as error:
@@ -66,7 +71,7 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
     if not isinstance(content, dict) or not {"env", "training", "environment"} <= set(content):
         raise ConfigError(f"{place}expected the keys env, training and environment")
     config = normalise(to_component(content["training"], TrainConfig, f"{place}training"))
-    env = jaxsafe.config.build(to_component(content["environment"], Environment, f"{place}environment"))
+    env = jaxsafe.config.from_data(content["environment"], f"{place}environment")
     return config, env, str(content["env"])
 
 
