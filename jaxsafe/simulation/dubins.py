@@ -6,8 +6,10 @@ follow from that: exactly in the plane, by Gauss-Legendre quadrature of order 6 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -18,12 +20,13 @@ from jaxsafe.simulation.integrate import (
     NODES,
     PARTIAL_WEIGHTS,
     WEIGHTS,
+    pieces,
     ramp,
-    segments,
     sine_ratios,
     time_to_limit,
 )
 from jaxsafe.simulation.platform import Platform
+from jaxsafe.simulation.trig import sin_cos, tan
 from jaxsafe.types import Number, Positive, Record, Seconds
 
 GRAVITY = 32.17
@@ -96,7 +99,7 @@ class Dubins3DState(Record):
     @property
     def velocity(self) -> Float[Array, " 3"]:
         """Velocity v (cos ψ cos γ, sin ψ cos γ, −sin γ)."""
-        return self.speed[..., None] * _forward(self.heading, self.flight_path_angle)
+        return self.speed[..., None] * jnp.stack(_forward(self.heading, self.flight_path_angle), axis=-1)
 
     @property
     def orientation(self) -> Float[Array, "3 3"]:
@@ -133,25 +136,28 @@ class Dubins3D(Platform, type="dubins3d"):
             "speed": (state.speed, controls.get("acceleration", 0.0), self.speed_limits),
         }
         ramps = {name: (ramp(x, 0.0, limits, 0.0), rate, limits) for name, (x, rate, limits) in ramps.items()}
-        begin, length = segments([time_to_limit(*each, dt) for each in ramps.values()], dt)
-        times = begin[:, None] + length[:, None] * NODES.astype(begin.dtype)
-        roll, gamma, speed = (ramp(*each, times) for each in ramps.values())
+        spans = pieces([time_to_limit(*each, dt) for each in ramps.values()], dt)
 
-        rate = self.gravity / speed * jnp.tan(roll)  # ψ̇ at the nodes, [segment, node]
-        turned = length * jnp.sum(WEIGHTS.astype(rate.dtype) * rate, axis=-1)
-        within = length[:, None] * jnp.sum(PARTIAL_WEIGHTS.astype(rate.dtype) * rate[:, None, :], axis=-1)
-        heading = state.heading + (jnp.cumsum(turned) - turned)[:, None] + within
-        shares = length[:, None] * WEIGHTS.astype(rate.dtype)
-        moved = jnp.sum((shares * speed)[..., None] * _forward(heading, gamma), axis=(0, 1))
+        def follow(carry: tuple[Array, ...], span: tuple[Array, Array]) -> tuple[tuple[Array, ...], None]:
+            (heading, *moved), (begin, length) = carry, span
+            nodes = [tuple(ramp(*each, begin + node * length) for each in ramps.values()) for node in NODES]
+            turns = [length * self.gravity / speed * tan(roll) for roll, _, speed in nodes]  # ψ̇ × length
+            for (_, gamma, speed), weight, partial in zip(nodes, WEIGHTS, PARTIAL_WEIGHTS, strict=True):
+                forward = _forward(heading + _dot(partial, turns), gamma)
+                moved = [total + weight * length * speed * part for total, part in zip(moved, forward, strict=True)]
+            return (heading + _dot(WEIGHTS, turns), *moved), None
 
+        # A loop, not four copies: it keeps what it computed for one piece, where XLA would compute it again for each use.
+        still = jnp.zeros_like(state.heading)
+        (heading, *moved), _ = jax.lax.scan(follow, (state.heading, still, still, still), spans)
         roll, gamma, speed = (ramp(*each, dt) for each in ramps.values())
-        return Dubins3DState(state.position + moved, state.heading + jnp.sum(turned), speed, gamma, roll)
+        return Dubins3DState(state.position + jnp.stack(moved), heading, speed, gamma, roll)
 
     def derivative(self, state: Dubins3DState, controls: Controls) -> Dubins3DState:
         """Eq. (9) within the limits; a commanded heading rate is that of the turn, the bank staying as it is."""
         names = ("acceleration", "flight_path_angle_rate", "roll_rate")
         acceleration, gamma, roll = (_number(controls, name, state.speed) for name in names)
-        turn = controls.get("heading_rate", self.gravity / state.speed * jnp.tan(state.roll))
+        turn = controls.get("heading_rate", self.gravity / state.speed * tan(state.roll))
         return Dubins3DState(state.velocity, turn, acceleration, gamma, roll)
 
     def _roll_rate(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Any:
@@ -164,10 +170,14 @@ def _number(controls: Controls, name: str, like: Array) -> Array:
     return jnp.asarray(controls.get(name, 0.0), like.dtype)
 
 
-def _forward(heading: Array, gamma: Array) -> Array:
-    """Direction of flight, […, 3]."""
-    level = jnp.cos(gamma)
-    return jnp.stack([jnp.cos(heading) * level, jnp.sin(heading) * level, -jnp.sin(gamma)], axis=-1)
+def _forward(heading: Array, gamma: Array) -> tuple[Array, Array, Array]:
+    """Direction of flight (cos ψ cos γ, sin ψ cos γ, −sin γ)."""
+    (y, x), (z, level) = sin_cos(heading), sin_cos(gamma)
+    return x * level, y * level, -z
+
+
+def _dot(weights: Sequence[float], values: Sequence[Array]) -> Any:
+    return sum(weight * value for weight, value in zip(weights, values, strict=True))
 
 
 def _arc(heading: Any, speed: Any, turn: Any, acceleration: Any, t: Any) -> Float[Array, " 2"]:

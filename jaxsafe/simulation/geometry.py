@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsafe.component import Component, Range, Unit
+from jaxsafe.simulation.trig import sin_cos
 from jaxsafe.types import Length, Number, PlatformName, Radians, RegionState
 
 
@@ -39,10 +40,11 @@ def mag_norm(vector: Float[Array, " d"]) -> Float[Array, " d+1"]:
 
 def direction(azimuth: Float[Array, "*n"], polar: Float[Array, "*n"] | None = None) -> Float[Array, "*n d"]:
     """Unit vector at an azimuth from x [rad], in the plane; with a polar angle from z [rad], in space."""
-    x, y = jnp.cos(azimuth), jnp.sin(azimuth)
+    y, x = sin_cos(azimuth)
     if polar is None:
         return jnp.stack([x, y], axis=-1)
-    return jnp.stack([jnp.sin(polar) * x, jnp.sin(polar) * y, jnp.cos(polar)], axis=-1)
+    level, z = sin_cos(polar)
+    return jnp.stack([level * x, level * y, z], axis=-1)
 
 
 def rotation(yaw: Float[Array, "*n"], pitch: Number | None = None, roll: Number | None = None) -> Float[Array, "*n d d"]:
@@ -50,10 +52,10 @@ def rotation(yaw: Float[Array, "*n"], pitch: Number | None = None, roll: Number 
 
     Its first column, the body's x axis, is (cos ψ cos γ, sin ψ cos γ, −sin γ).
     """
-    c, s = jnp.cos(yaw), jnp.sin(yaw)
+    s, c = sin_cos(yaw)
     if pitch is None or roll is None:
         return jnp.stack([jnp.stack([c, -s], axis=-1), jnp.stack([s, c], axis=-1)], axis=-2)
-    cp, sp, cr, sr = jnp.cos(pitch), jnp.sin(pitch), jnp.cos(roll), jnp.sin(roll)
+    (sp, cp), (sr, cr) = sin_cos(pitch), sin_cos(roll)
     rows = [
         [c * cp, c * sp * sr - s * cr, c * sp * cr + s * sr],
         [s * cp, s * sp * sr + c * cr, s * sp * cr - c * sr],

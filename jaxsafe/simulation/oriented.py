@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Annotated
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -12,7 +11,7 @@ from jaxsafe.component import Range, Unit
 from jaxsafe.simulation.controllers import Controls
 from jaxsafe.simulation.cwh import MASS, MEAN_MOTION, cwh_acceleration, cwh_flow
 from jaxsafe.simulation.geometry import direction, rotation
-from jaxsafe.simulation.integrate import NODES, WEIGHTS, ramp, segments, time_to_limit
+from jaxsafe.simulation.integrate import NODES, WEIGHTS, ramp, time_to_limit
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.types import Kilograms, Number, RadiansPerSecond, Record, Seconds
 
@@ -67,32 +66,23 @@ class OrientedSpacecraft(Platform, type="oriented_spacecraft"):
 
     def step(self, state: OrientedState, controls: Controls, dt: Seconds) -> OrientedState:
         """Advance by the exact flow of Eq. (12) and, for the turning thrust, quadrature of its impulse responses."""
-        spin = (state.attitude_rate, controls.get("attitude_acceleration", 0.0), self.attitude_rate_limits)
-        spin = (ramp(spin[0], 0.0, spin[2], 0.0), *spin[1:])
-        begin, length = segments([time_to_limit(*spin, dt)], dt)
-        rates = jnp.stack([spin[0], ramp(*spin, dt)])  # after the limit that of the end, which rests on it
-        accelerations = spin[1] * jnp.array([1.0, 0.0], begin.dtype)  # θ̈ before and after the limit is reached
-        turned = length * (rates + accelerations * length / 2.0)
-        attitudes = state.attitude + jnp.cumsum(turned) - turned
-
-        after = length[:, None] * NODES.astype(begin.dtype)  # times since the segment's begin, [segment, node]
-        angle = attitudes[:, None] + rates[:, None] * after + accelerations[:, None] * after**2 / 2.0
+        limits, turn = self.attitude_rate_limits, controls.get("attitude_acceleration", 0.0)
+        start = ramp(state.attitude_rate, 0.0, limits, 0.0)
+        final = ramp(start, turn, limits, dt)
         thrust = controls.get("thrust", 0.0) / self.mass
-        kicks = thrust * (length[:, None] * WEIGHTS.astype(begin.dtype))[..., None] * direction(angle)  # [segment, node, 2]
-        left = dt - (begin[:, None] + after)
 
-        still = jnp.zeros_like(state.position)
+        still, attitude = jnp.zeros_like(state.position), state.attitude
         position, velocity = cwh_flow(state.position, state.velocity, still, self.mean_motion, dt)
-        pushed = jax.vmap(lambda kick, t: cwh_flow(still, kick, still, self.mean_motion, t))(
-            kicks.reshape(-1, 2), left.reshape(-1)
-        )
-        return OrientedState(
-            position + jnp.sum(pushed[0], axis=0),
-            velocity + jnp.sum(pushed[1], axis=0),
-            (thrust * dt)[None],
-            wrapped(state.attitude + jnp.sum(turned)),
-            ramp(*spin, dt),
-        )
+        stop = time_to_limit(start, turn, limits, dt)
+        for begin, length, rate, acceleration in ((0.0, stop, start, turn), (stop, dt - stop, final, 0.0)):
+            for node, weight in zip(NODES, WEIGHTS, strict=True):
+                after = node * length
+                angle = attitude + rate * after + acceleration * after**2 / 2.0
+                kick = thrust * weight * length * direction(angle)
+                pushed = cwh_flow(still, kick, still, self.mean_motion, dt - begin - after)
+                position, velocity = position + pushed[0], velocity + pushed[1]
+            attitude = attitude + length * (rate + acceleration * length / 2.0)
+        return OrientedState(position, velocity, (thrust * dt)[None], wrapped(attitude), final)
 
     def derivative(self, state: OrientedState, controls: Controls) -> OrientedState:
         """Eq. (20) within the limits of the attitude rate."""

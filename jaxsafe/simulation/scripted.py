@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from jaxsafe.component import Component, Unit
 from jaxsafe.simulation.controllers import Bound, Controller, Controls
+from jaxsafe.simulation.trig import sin_cos
 from jaxsafe.types import Number, Radians, Seconds, Sim
 
 
@@ -71,4 +72,4 @@ class Sinusoid(Command, type="sinusoid"):
     phase: Radians = 0.0
 
     def value(self, sim: Sim) -> Float[Array, ""]:
-        return self.amplitude * jnp.sin(2.0 * jnp.pi * sim.time / self.period + self.phase)
+        return self.amplitude * sin_cos(2.0 * jnp.pi * sim.time / self.period + self.phase)[0]

@@ -1,0 +1,52 @@
+"""Sine and cosine together, several times cheaper in float32 than XLA's own on a CPU."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.types import Number
+
+_QUARTER = (1.5703125, 4.837512969970703e-4, 7.549789948768648e-8)
+"""π/2 in three parts; the first two have so few bits that a multiple of them up to 2¹³ is exact."""
+_SINE = (-1.9515295891e-4, 8.3321608736e-3, -1.6666654611e-1)
+_COSINE = (2.443315711809948e-5, -1.388731625493765e-3, 4.166664568298827e-2)
+
+
+@jax.custom_jvp
+def sin_cos(x: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
+    """(sin x, cos x), within 1e-7 for |x| ≤ 1e4 in float32; other types take JAX's functions.
+
+    The angle is reduced to [−π/4, π/4] about the nearest multiple of π/2 (Cody and Waite), where a minimax polynomial of
+    degree 7 or 8 stands for each function (Moshier's Cephes). Beyond 1e4 the reduction loses digits; the values stay in
+    [−1, 1].
+    """
+    x = jnp.asarray(x)
+    if x.dtype != jnp.float32:
+        return jnp.sin(x), jnp.cos(x)
+    n = jnp.round(x * (2.0 / math.pi))
+    r = ((x - n * _QUARTER[0]) - n * _QUARTER[1]) - n * _QUARTER[2]
+    r = jnp.clip(r, -math.pi / 4 - 0.01, math.pi / 4 + 0.01)
+    z = r * r
+    sine = ((_SINE[0] * z + _SINE[1]) * z + _SINE[2]) * z * r + r
+    cosine = ((_COSINE[0] * z + _COSINE[1]) * z + _COSINE[2]) * z * z - 0.5 * z + 1.0
+    quadrant = n.astype(jnp.int32)
+    swap = (quadrant & 1) == 1
+    s, c = jnp.where(swap, cosine, sine), jnp.where(swap, sine, cosine)
+    return jnp.where((quadrant & 2) == 2, -s, s), jnp.where(((quadrant + 1) & 2) == 2, -c, c)
+
+
+@sin_cos.defjvp
+def _derivative(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
+    sine, cosine = sin_cos(*primals)
+    return (sine, cosine), (cosine * tangents[0], -sine * tangents[0])
+
+
+def tan(x: Number) -> Any:
+    """Tangent of x as sin x/cos x."""
+    sine, cosine = sin_cos(x)
+    return sine / cosine
