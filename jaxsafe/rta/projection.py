@@ -1,0 +1,97 @@
+"""Nearest controls in closed form: a box with one half-space, and a box with one ball. Fixed cost, exact derivatives.
+
+Both minimisers lie on a path that bends only where an element of the control reaches a bound: the Lagrangian separates over
+the elements, so for a multiplier λ each element is the clip of its own minimiser. Along the path the constraint grows
+monotonically; the piece on which it is met is found from its value at the bends, and there it is one scalar equation.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxsafe.types import Number
+
+
+def project_box_halfspace(
+    u: Float[Array, " m"], low: Float[Array, " m"], high: Float[Array, " m"], a: Float[Array, " m"], b: Number
+) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
+    """Nearest point, argmin ‖w − u‖² subject to a·w ≥ b and low ≤ w ≤ high.
+
+    With multiplier λ ≥ 0 of the half-space the minimiser is w(λ) = clip(u + λa, low, high), and a·w(λ) does not decrease.
+
+    Args:
+        u: the point to project, shape (m,).
+        low: lower bounds, shape (m,).
+        high: upper bounds, shape (m,).
+        a: normal of the half-space, shape (m,).
+        b: its offset.
+
+    Returns:
+        The projection, and whether it exists; where not, the point of the box that comes closest to the half-space.
+    """
+    slope = jnp.where(a != 0.0, a, 1.0)
+    bends = [jnp.where(a != 0.0, (bound - u) / slope, 0.0) for bound in (low, high)]
+    bends = jnp.sort(jnp.maximum(jnp.concatenate([jnp.zeros(1, u.dtype), *bends]), 0.0))
+    values = jnp.sum(a * jnp.clip(u + bends[:, None] * a, low, high), axis=-1)  # at each bend, in ascending order
+
+    after = jnp.argmax(values >= b)  # the first bend at which the constraint is met
+    middle = (bends[after] + bends[jnp.maximum(after - 1, 0)]) / 2.0
+    moving = u + middle * a
+    free = (moving > low) & (moving < high)
+    fixed = jnp.sum(jnp.where(free, 0.0, a * jnp.clip(moving, low, high)))
+    curvature = jnp.sum(jnp.where(free, a * a, 0.0))
+    step = (b - fixed - jnp.sum(jnp.where(free, a * u, 0.0))) / jnp.where(curvature > 0.0, curvature, 1.0)
+
+    met, feasible = values[0] >= b, values[-1] >= b
+    multiplier = jnp.where(met, 0.0, jnp.where(feasible, step, bends[-1]))
+    return jnp.clip(u + multiplier * a, low, high), feasible
+
+
+def project_box_ball(
+    u: Float[Array, " m"], low: Float[Array, " m"], high: Float[Array, " m"], beta: Number, p: Float[Array, " m"], k: Number
+) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
+    """Nearest point, argmin ‖w − u‖² subject to q(w) = β‖w‖² + 2p·w + k ≤ 0 and low ≤ w ≤ high; u within the box.
+
+    With centre c = −p/β and multiplier λ ≥ 0 the minimiser is w(t) = clip(u + t(c − u), low, high), t = λβ/(1 + λβ) in
+    [0, 1], and q(w(t)) does not increase.
+
+    Args:
+        u: the point to project, within the box, shape (m,).
+        low: lower bounds, shape (m,).
+        high: upper bounds, shape (m,).
+        beta: coefficient of ‖w‖², positive.
+        p: half the linear coefficients, shape (m,).
+        k: the constant.
+
+    Returns:
+        The projection, and whether it exists; where not, the point of the box nearest to the ball's centre.
+    """
+    towards = -p / beta - u
+    bound = jnp.where(towards > 0.0, high, low)
+    moves = towards != 0.0
+    times = jnp.clip(jnp.where(moves, (bound - u) / jnp.where(moves, towards, 1.0), 1.0), 0.0, 1.0)
+    bends = jnp.sort(jnp.concatenate([jnp.zeros(1, u.dtype), times, jnp.ones(1, u.dtype)]))
+    points = jnp.clip(u + bends[:, None] * towards, low, high)
+    values = _quadratic(points, beta, p, k)
+
+    after = jnp.argmax(values <= 0.0)
+    before = jnp.maximum(after - 1, 0)
+    free = times > (bends[after] + bends[before]) / 2.0
+    resting = jnp.where(free, u, jnp.clip(bound, low, high))
+    rate = jnp.where(free, towards, 0.0)
+    c2 = beta * jnp.sum(rate * rate)  # q = c2 t² + 2 c1 t + c0 on this piece
+    c1 = jnp.sum(rate * (beta * resting + p))
+    c0 = _quadratic(resting, beta, p, k)
+    root = c1 * c1 - c2 * c0
+    root = jnp.where(root > 0.0, jnp.sqrt(jnp.where(root > 0.0, root, 1.0)), 0.0)
+    divisor = root - c1
+    t = c0 / jnp.where(divisor > 0.0, divisor, 1.0)
+
+    met, feasible = values[0] <= 0.0, values[-1] <= 0.0
+    t = jnp.where(met, 0.0, jnp.where(feasible, jnp.clip(t, bends[before], bends[after]), 1.0))
+    return jnp.clip(u + t * towards, low, high), feasible
+
+
+def _quadratic(w: Float[Array, "*n m"], beta: Number, p: Float[Array, " m"], k: Number) -> Float[Array, "*n"]:
+    return beta * jnp.sum(w * w, axis=-1) + 2.0 * jnp.sum(p * w, axis=-1) + k

@@ -1,0 +1,233 @@
+"""Projections and the small quadratic program against independent solvers: random, degenerate, infeasible problems."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from qpsolvers import solve_qp
+from scipy.optimize import minimize, nnls
+
+from jaxsafe.rta.projection import project_box_ball, project_box_halfspace
+from jaxsafe.rta.qp import nearest_control
+
+NUM = 1000
+TOLERANCES = [(np.float64, 1e-12), (np.float32, 5e-6)]
+
+
+def boxes(m: int, dtype: Any) -> tuple[np.ndarray, ...]:
+    """Points inside boxes about 0."""
+    rng = np.random.default_rng(m)
+    low, high = -rng.uniform(0.5, 1.0, (NUM, m)), rng.uniform(0.5, 2.0, (NUM, m))
+    return tuple(each.astype(dtype) for each in (np.clip(rng.uniform(-1.5, 1.5, (NUM, m)), low, high), low, high))
+
+
+def oracle(
+    u: np.ndarray, low: np.ndarray, high: np.ndarray, rows: np.ndarray, offsets: np.ndarray, solver: str = "quadprog"
+) -> np.ndarray | None:
+    u, low, high, rows, offsets = (each.astype(float) for each in (u, low, high, rows, offsets))
+    return solve_qp(np.eye(len(u)), -u, G=-rows, h=-offsets, lb=low, ub=high, solver=solver)
+
+
+@pytest.mark.parametrize("m", [1, 2, 3])
+@pytest.mark.parametrize(("dtype", "tolerance"), TOLERANCES)
+@pytest.mark.usefixtures("x64")
+def test_box_and_half_space_are_projected_on_as_by_quadprog(m: int, dtype: Any, tolerance: float) -> None:
+    rng = np.random.default_rng(10 + m)
+    u, low, high = boxes(m, dtype)
+    a, b = rng.normal(size=(NUM, m)).astype(dtype), rng.normal(size=NUM).astype(dtype)
+    a[:50, 0] = 0.0  # an element without authority
+    found, feasible = jax.jit(jax.vmap(project_box_halfspace))(u, low, high, a, b)
+    assert found.dtype == dtype
+    for i in range(NUM):
+        expected = oracle(u[i], low[i], high[i], a[i, None], b[i, None])
+        if abs(np.sum(np.maximum(a[i] * low[i], a[i] * high[i])) - b[i]) < 1e-5:
+            continue  # neither clearly feasible nor clearly not
+        assert bool(feasible[i]) == (expected is not None)
+        if expected is None:
+            expected = np.where(a[i] > 0, high[i], np.where(a[i] < 0, low[i], u[i]))  # closest to the half-space
+        np.testing.assert_allclose(found[i], expected, rtol=0, atol=tolerance)
+    assert 0.5 < np.mean(feasible) < 1.0
+
+
+@pytest.mark.parametrize("m", [1, 2, 3])
+@pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-12), (np.float32, 2e-6)])
+@pytest.mark.usefixtures("x64")
+def test_box_and_ball_are_projected_on_at_least_as_well_as_by_slsqp(m: int, dtype: Any, tolerance: float) -> None:
+    rng = np.random.default_rng(20 + m)
+    u, low, high = boxes(m, dtype)
+    beta, p, k = (
+        each.astype(dtype) for each in (rng.uniform(0.5, 2.0, NUM), rng.normal(size=(NUM, m)), rng.uniform(-1, 1, NUM))
+    )
+    found, feasible = (np.asarray(each) for each in jax.jit(jax.vmap(project_box_ball))(u, low, high, beta, p, k))
+    for i in range(150):
+        centre = np.clip(-p[i] / beta[i], low[i], high[i]).astype(float)
+
+        def q(w: np.ndarray, i: int = i) -> float:
+            return float(beta[i] * w @ w + 2 * p[i] @ w + k[i])
+
+        assert feasible[i] == (q(centre) <= 0)
+        if not feasible[i]:
+            np.testing.assert_allclose(found[i], centre, rtol=0, atol=tolerance)
+            continue
+        assert q(found[i].astype(float)) < 2 * tolerance
+        assert ((found[i] >= low[i]) & (found[i] <= high[i])).all()
+        best = minimize(
+            lambda w, i=i: np.sum((w - u[i]) ** 2),
+            centre,
+            constraints=[{"type": "ineq", "fun": lambda w, q=q: -q(w)}],
+            bounds=list(zip(low[i].astype(float), high[i].astype(float), strict=True)),
+            method="SLSQP",
+            options={"ftol": 1e-14, "maxiter": 500},
+        )
+        assert np.linalg.norm(found[i] - u[i]) <= np.linalg.norm(best.x - u[i]) + 2e-6
+    assert 0.5 < feasible.mean() < 1.0
+
+
+def rows_for(m: int, count: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Random rows, some of them twice, and one that says nothing about the control."""
+    rng = np.random.default_rng(30 + m)
+    rows, offsets = rng.normal(size=(NUM, count, m)), 0.7 * rng.normal(size=(NUM, count))
+    rows[:100, 1] = rows[:100, 0]
+    offsets[:50, 1] = offsets[:50, 0]
+    rows[100:150, 1] = 0.0
+    return rows, offsets
+
+
+@pytest.mark.parametrize("m", [1, 2, 3, 4])
+@pytest.mark.parametrize("solver", ["quadprog", "daqp"])
+@pytest.mark.usefixtures("x64")
+def test_the_nearest_control_is_that_of_other_solvers(m: int, solver: str) -> None:
+    u, low, high = boxes(m, np.float64)
+    rows, offsets = rows_for(m)
+    found, feasible = (np.asarray(each) for each in jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets))
+    for i in range(NUM):
+        expected = oracle(u[i], low[i], high[i], rows[i], offsets[i], solver)
+        assert bool(feasible[i]) == (expected is not None)
+        if expected is not None:
+            np.testing.assert_allclose(found[i], expected, rtol=0, atol=1e-9 if solver == "quadprog" else 1e-5)
+    assert 0.4 < feasible.mean() < 1.0
+    assert (found[~feasible] == u[~feasible]).all()
+
+
+@pytest.mark.parametrize("m", [2, 3])
+@pytest.mark.usefixtures("x64")
+def test_float32_finds_the_same_nearest_control(m: int) -> None:
+    """In all but a few in ten thousand problems, in which the active rows are nearly parallel, within 5e-6."""
+    rng = np.random.default_rng(60 + m)
+    problem = [each.astype(np.float32) for each in (*boxes(m, np.float64), *rows_for(m))]
+    problem = [np.concatenate([each] * 10) for each in problem]
+    problem[-1] = (problem[-1] + 0.3 * rng.normal(size=problem[-1].shape)).astype(np.float32)
+    solve = jax.jit(jax.vmap(nearest_control))
+    found, feasible = solve(*problem)
+    assert found.dtype == np.float32
+    expected, possible = solve(*(each.astype(float) for each in problem))
+    error = np.abs(found - expected).max(axis=1)[np.asarray(feasible & possible)]
+    assert np.mean(np.asarray(feasible != possible)) < 1e-3
+    assert np.quantile(error, 0.998) < 5e-6
+
+
+@pytest.mark.usefixtures("x64")
+def test_the_nearest_control_meets_the_conditions_of_karush_kuhn_and_tucker() -> None:
+    u, low, high = boxes(3, np.float64)
+    rows, offsets = rows_for(3)
+    found, feasible = (np.asarray(each) for each in jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets))
+    identity = np.eye(3)
+    for i in np.flatnonzero(feasible):
+        sides, ends = np.concatenate([rows[i], identity, -identity]), np.concatenate([offsets[i], low[i], -high[i]])
+        slack = sides @ found[i] - ends
+        assert slack.min() > -1e-9
+        active = slack < 1e-8
+        if not active.any():
+            np.testing.assert_array_equal(found[i], u[i])
+            continue
+        multipliers, *_ = nnls(sides[active].T, found[i] - u[i])  # λ ≥ 0
+        np.testing.assert_allclose(sides[active].T @ multipliers, found[i] - u[i], atol=1e-7)
+
+
+@pytest.mark.parametrize(("m", "count"), [(1, 2), (2, 1), (3, 1), (3, 2), (2, 3)])
+@pytest.mark.usefixtures("x64")
+def test_slack_costs_what_it_should(m: int, count: int) -> None:
+    """Against quadprog with the slack as variables of its own."""
+    u, low, high = boxes(m, np.float64)
+    rng = np.random.default_rng(70 + m)
+    rows, offsets, cost = rng.normal(size=(NUM, count, m)), rng.normal(size=(NUM, count)), rng.uniform(0.1, 100.0, NUM)
+    rows[:50, -1] = 0.0
+    found, _ = jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets, cost)
+    for i in range(300):
+        hessian = np.diag([1.0] * m + [cost[i]] * count)
+        expected = solve_qp(
+            hessian,
+            np.concatenate([-u[i], np.zeros(count)]),
+            G=-np.concatenate([rows[i], np.eye(count)], axis=1),
+            h=-offsets[i],
+            lb=np.concatenate([low[i], np.zeros(count)]),
+            ub=np.concatenate([high[i], np.full(count, 1e6)]),
+            solver="quadprog",
+        )
+        assert expected is not None
+        np.testing.assert_allclose(found[i], expected[:m], rtol=0, atol=1e-7)
+
+
+@pytest.mark.usefixtures("x64")
+def test_derivatives_are_finite_differences_where_something_is_active() -> None:
+    rng = np.random.default_rng(50)
+    u, low, high = boxes(2, np.float64)
+    u = 0.99 * u  # on a bound there are two derivatives
+    a, b = rng.normal(size=(NUM, 2)), rng.normal(size=NUM) + 0.5
+    beta, p, k = rng.uniform(0.5, 2.0, NUM), rng.normal(size=(NUM, 2)), rng.uniform(-1, 1, NUM)
+    rows, offsets = rng.normal(size=(NUM, 2, 2)), 0.5 * rng.normal(size=(NUM, 2))
+    cases = [
+        (project_box_halfspace, (u, low, high, a, b)),
+        (project_box_ball, (u, low, high, beta, p, k)),
+        (nearest_control, (u, low, high, rows, offsets)),
+        (nearest_control, (u, low, high, rows, offsets, rng.uniform(0.1, 10.0, NUM))),
+    ]
+    for project, problem in cases:
+
+        def value(*one: jax.Array, project: Any = project) -> jax.Array:
+            return jnp.sum(project(*one)[0] * jnp.array([1.0, -2.0]))
+
+        _, feasible = jax.vmap(project)(*problem)
+        slopes = jax.jit(jax.vmap(jax.grad(value, argnums=tuple(range(len(problem))))))(*problem)
+        assert all(np.isfinite(slope).all() for slope in slopes)
+        good = 0
+        for j, leaf in enumerate(problem):
+            nudge = 1e-6 * rng.normal(size=leaf.shape)
+            ahead, behind = ([*problem[:j], leaf + sign * nudge, *problem[j + 1 :]] for sign in (1, -1))
+            expected = (jax.vmap(value)(*ahead) - jax.vmap(value)(*behind)) / 2.0
+            found = np.sum(np.reshape(slopes[j] * nudge, (NUM, -1)), axis=1)
+            close = np.abs(found - np.asarray(expected)) < 1e-5 * 1e-6 + 1e-4 * np.abs(expected)
+            assert close[np.asarray(feasible)].mean() > 0.99  # the rest changes its active set within the nudge
+            good += int(np.sum(np.abs(found) > 1e-9))
+        assert good > NUM
+
+
+def test_a_point_that_meets_everything_passes_unaltered() -> None:
+    u, low, high = jnp.array([0.3, -0.2]), -jnp.ones(2), jnp.ones(2)
+    assert (project_box_halfspace(u, low, high, jnp.array([1.0, 0.0]), 0.3)[0] == u).all()
+    assert (project_box_ball(u, low, high, 1.0, jnp.zeros(2), -0.5)[0] == u).all()
+    assert (nearest_control(u, low, high, jnp.eye(2), jnp.array([0.3, -1.0]))[0] == u).all()
+
+
+def test_degenerate_problems_give_numbers() -> None:
+    low, high, zero = -jnp.ones(2), jnp.ones(2), jnp.zeros(2)
+    problems = [
+        (project_box_halfspace, (zero, low, high, zero, 1.0), False),
+        (project_box_halfspace, (zero, low, high, zero, -1.0), True),
+        (project_box_halfspace, (high, low, high, jnp.array([1.0, 1.0]), 2.0), True),
+        (project_box_ball, (zero, low, high, 1.0, zero, 0.5), False),
+        (project_box_ball, (zero, low, high, 1.0, zero, 0.0), True),
+        (project_box_ball, (high, low, high, 1.0, -high, 1.0), True),
+        (nearest_control, (zero, low, high, jnp.zeros((1, 2)), jnp.ones(1)), False),
+        (nearest_control, (zero, low, high, jnp.zeros((1, 2)), -jnp.ones(1)), True),
+        (nearest_control, (high, low, high, jnp.eye(2), jnp.ones(2)), True),
+        (nearest_control, (zero, low, high, jnp.zeros((1, 2)), jnp.ones(1), 1.0), False),
+    ]
+    for project, problem, expected in problems:
+        found, feasible = project(*problem)
+        assert bool(feasible) == expected
+        slopes = jax.jacrev(lambda u, project=project, rest=problem[1:]: project(u, *rest)[0])(problem[0])
+        assert np.isfinite(found).all()
+        assert np.isfinite(slopes).all()
