@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, ClassVar
 
 import jax
@@ -17,18 +16,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.component import Component, Unit
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.errors import ConfigError, nearest, part
 from jaxsafe.paths import set_path
 from jaxsafe.processors.constraint import Constraint
 from jaxsafe.processors.observation import Observation
 from jaxsafe.processors.reward import Reward
 from jaxsafe.processors.status import Status
 from jaxsafe.processors.terminal import Terminal
-from jaxsafe.simulation.controllers import Controls
+from jaxsafe.rta.filter import RTA
+from jaxsafe.rta.prediction import advance
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.initializers import uniform
 from jaxsafe.simulation.platform import Platform, placed
-from jaxsafe.types import Info, Key, Memory, Number, ParameterPath, PlatformName, Seconds, Sim, State, TimeStep
+from jaxsafe.types import Info, Key, Memory, Number, ParameterPath, PlatformName, RTAInfo, Seconds, Sim, State, TimeStep
 
 Parameters = Mapping[str, Float[Array, ""]]
 
@@ -53,6 +53,7 @@ class Environment(Component):
     randomize: Mapping[ParameterPath, Annotated[Number, Unit("physical", length=2)]] = dataclasses.field(
         default_factory=dict
     )
+    rta: RTA | None = None
 
     def reset(self, key: Key) -> tuple[State, TimeStep]:
         """Same as `jaxsafe.reset(env, key)`."""
@@ -130,7 +131,7 @@ def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:
     env = _with_parameters(env, parameters)
     sim = _blank(env)
     for platform, key_i in zip(env.platforms, jax.random.split(key, len(env.platforms)), strict=True):
-        with _part("platforms", platform.name):
+        with part("platforms", platform.name):
             sim = sim.replace(platforms={**sim.platforms, platform.name: platform.reset(key_i, sim)})
     return _begin(env, sim, parameters)
 
@@ -176,17 +177,20 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
     env = _with_parameters(env, state.parameters)
     action = _checked(env, action)
     controls = env.agent_platform.controller.control(action, state.sim)
-    platforms = {platform.name: _advance(env, platform, state.sim, controls) for platform in env.platforms}
+    desired = jnp.stack([controls[name] for name in env.action_names])
+    actual, rta_memory, assurance = _assure(env, state, desired)
+    platforms = advance(env, state.sim, actual).platforms
     num_steps = state.num_steps + 1
     sim = _blank(env).replace(time=num_steps.astype(env.dt.dtype) * env.dt, platforms=platforms)
+    sim = sim.replace(intervening=jnp.zeros((), bool) if assurance is None else rta_memory.intervening)
 
     sim, status_memory = _statuses(env, sim, state.memory.status)
     sim = _terminal(env, sim)
     sim, reward_memory, terms, totals = _rewards(env, sim, state)
     observation, observation_memory = _observations(env, sim, state.memory.observation)
 
-    memory = Memory(status_memory, reward_memory, observation_memory)
-    info = _info(env, sim, terms, totals, jnp.stack([controls[name] for name in env.action_names]))
+    memory = Memory(status_memory, reward_memory, observation_memory, rta_memory)
+    info = _info(env, sim, terms, totals, desired, actual, assurance)
     timestep = _time_step(env, sim, observation, jnp.asarray(sum(terms.values())), info)
     return State(sim, memory, totals, num_steps, state.parameters), timestep
 
@@ -216,7 +220,7 @@ def _with_parameters(env: Environment, parameters: Parameters) -> Environment:
 
 def _blank(env: Environment) -> Sim:
     never = {name: jnp.zeros((), bool) for name in env.outcomes[1:]}
-    return Sim(jnp.zeros_like(env.dt), {}, {}, {}, never)
+    return Sim(jnp.zeros_like(env.dt), {}, {}, {}, never, jnp.zeros((), bool))
 
 
 def _begin(env: Environment, sim: Sim, parameters: Parameters) -> tuple[State, TimeStep]:
@@ -226,12 +230,17 @@ def _begin(env: Environment, sim: Sim, parameters: Parameters) -> tuple[State, T
     observation, observation_memory = _observations(env, sim, None)
     reward_memory = {}
     for term in env.reward:
-        with _part("reward", term.name):
+        with part("reward", term.name):
             reward_memory[term.name] = term.init(sim)
     zero = jnp.zeros((), observation.dtype)
     terms = {term.name: zero for term in env.reward}
-    info = _info(env, ended, terms, terms, jnp.zeros(env.action_size, observation.dtype))
-    memory = Memory(status_memory, reward_memory, observation_memory)
+    rta_memory, assurance = (), None
+    if env.rta is not None:
+        with part("rta"):
+            rta_memory, assurance = env.rta.begin(env, sim)
+    still = jnp.zeros(env.action_size, observation.dtype)
+    info = _info(env, ended, terms, terms, still, still, assurance)
+    memory = Memory(status_memory, reward_memory, observation_memory, rta_memory)
     state = State(ended, memory, terms, jnp.zeros((), jnp.int32), parameters)
     timestep = _time_step(env, sim, observation, zero, info)  # `sim` ended nothing: the first step is always taken
     return state, timestep.replace(cost=zero)
@@ -251,21 +260,14 @@ def _checked(env: Environment, action: Array) -> Array:
     return action
 
 
-def _advance(env: Environment, platform: Platform, sim: Sim, controls: Controls) -> Any:
-    """The platform's next state, from the old simulation: all platforms move at once."""
-    with _part("platforms", platform.name):
-        own = controls if platform.name == env.agent else platform.controller.control(jnp.zeros(0), sim)
-        return platform.step(sim.platforms[platform.name], own, env.dt)
-
-
 def _statuses(env: Environment, sim: Sim, memory: Mapping[str, Any] | None) -> tuple[Sim, dict[str, Any]]:
     """Regions, then statuses in order; each sees only those before it. Without memory: the start of an episode."""
     for region in env.regions:
-        with _part("regions", region.name):
+        with part("regions", region.name):
             sim = sim.replace(regions={**sim.regions, region.name: region.place(sim.platforms)})
     memories = {}
     for status in env.status:
-        with _part("status", status.name):
+        with part("status", status.name):
             own = status.init(sim) if memory is None else status.increment(memory[status.name], sim, env.dt)
             sim = sim.replace(status={**sim.status, status.name: status.process(own, sim)})
         memories[status.name] = own
@@ -276,7 +278,7 @@ def _terminal(env: Environment, sim: Sim) -> Sim:
     """The first condition that holds ends the episode; those that stand apart end it beside the others."""
     ended, over = {}, jnp.zeros((), bool)
     for condition in env.terminal:
-        with _part("terminal", condition.name):
+        with part("terminal", condition.name):
             reached = condition.reached(sim)
             ended[condition.name] = reached if condition.apart else reached & ~over
             over = over if condition.apart else over | reached
@@ -287,7 +289,7 @@ def _rewards(env: Environment, sim: Sim, state: State) -> tuple[Sim, dict, dict,
     """Reward terms in order; a bounded term may end the episode, and the terms after it see that."""
     memories, terms, totals = {}, {}, {}
     for term in env.reward:
-        with _part("reward", term.name):
+        with part("reward", term.name):
             memories[term.name] = own = term.increment(state.memory.reward[term.name], sim, env.dt)
             terms[term.name] = value = term.process(own, sim)
             totals[term.name] = total = state.reward_totals[term.name] + value
@@ -303,23 +305,33 @@ def _observations(
 ) -> tuple[Float[Array, " observation"], dict[str, Any]]:
     memories, parts = {}, []
     for item in env.observation:
-        with _part("observation", item.name):
+        with part("observation", item.name):
             own = item.init(sim) if memory is None else item.increment(memory[item.name], sim, env.dt)
             parts.append(item.process(own, sim))
         memories[item.name] = own
     return jnp.concatenate(parts), memories
 
 
-def _info(env: Environment, sim: Sim, terms: dict, totals: dict, control: Array) -> Info:
+def _assure(env: Environment, state: State, desired: Array) -> tuple[Array, Any, RTAInfo | None]:
+    """The control that acts: the desired one, or what run time assurance makes of it."""
+    if env.rta is None:
+        return desired, (), None
+    with part("rta"):
+        return env.rta.filter(env, state.sim, state.memory.rta, desired)
+
+
+def _info(
+    env: Environment, sim: Sim, terms: dict, totals: dict, desired: Array, actual: Array, assurance: RTAInfo | None
+) -> Info:
     outcome = jnp.zeros((), jnp.int32)
     for index, name in reversed(list(enumerate(env.outcomes))[1:]):
         outcome = jnp.where(sim.ended[name], index, outcome)
     margins, severity = {}, {}
     for constraint in env.constraints:
-        with _part("constraints", constraint.name):
+        with part("constraints", constraint.name):
             margins[constraint.name] = margin = constraint.margin(sim)
             severity[constraint.name] = jnp.maximum(-margin, 0.0) / constraint.limit(sim)
-    return Info(outcome, sim.status, terms, totals, control, control, jnp.zeros((), bool), margins, severity)
+    return Info(outcome, sim.status, terms, totals, desired, actual, sim.intervening, margins, severity, assurance)
 
 
 def _time_step(env: Environment, sim: Sim, observation: Array, reward: Array, info: Info) -> TimeStep:
@@ -331,13 +343,3 @@ def _time_step(env: Environment, sim: Sim, observation: Array, reward: Array, in
 
 def _any(flags: Iterable[Array]) -> Array:
     return functools.reduce(jnp.logical_or, flags, jnp.zeros((), bool))
-
-
-@contextmanager
-def _part(section: str, name: str) -> Iterator[None]:
-    """Says which part an error comes from; runs while tracing only."""
-    try:
-        yield
-    except Exception as error:
-        error.add_note(f"in {section}.{name}")
-        raise

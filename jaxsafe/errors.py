@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 class ConfigError(ValueError):
@@ -15,3 +16,13 @@ def nearest(found: object, allowed: Iterable[object]) -> str:
     names = [str(name) for name in allowed]
     close = difflib.get_close_matches(str(found), names, n=1, cutoff=0.5)
     return ", ".join(names) + (f". Did you mean {close[0]!r}?" if close else "")
+
+
+@contextmanager
+def part(*path: str) -> Iterator[None]:
+    """Notes on an error which part of an environment it comes from; runs while tracing only."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note("in " + ".".join(path))
+        raise

@@ -82,6 +82,7 @@ class Sim(Record):
     regions: Mapping[str, RegionState]  # by name
     status: Mapping[str, Array]  # by name; while statuses are computed it holds only the earlier ones
     ended: Mapping[str, Bool[Array, ""]]  # by outcome name but `running`; at most one is True, see `Terminal.apart`
+    intervening: Bool[Array, ""]  # whether run time assurance changed the control of the step that led here
 
 
 class Memory(Record):
@@ -90,6 +91,7 @@ class Memory(Record):
     status: Mapping[str, Any]
     reward: Mapping[str, Any]
     observation: Mapping[str, Any]
+    rta: Any  # of run time assurance
 
 
 class State(Record):
@@ -124,6 +126,7 @@ class Info(Record):
     intervening: Bool[Array, ""]  # whether run time assurance changed the control
     margins: Mapping[str, Float[Array, ""]]  # signed h(x) of every safety constraint, safe where ≥ 0
     severity: Mapping[str, Float[Array, ""]]  # max(0, −h) as a share of the constraint's limit at this step
+    rta: RTAInfo | None  # None without run time assurance
 
 
 class TimeStep(Record):

@@ -12,7 +12,7 @@ from jaxsafe.component import normalise
 from jaxsafe.simulation.controllers import Actuator, Continuous, Discrete, Uncontrolled
 from jaxsafe.types import Sim
 
-SIM = Sim(jnp.zeros(()), {}, {}, {}, {})
+SIM = Sim(jnp.zeros(()), {}, {}, {}, {}, jnp.zeros((), bool))
 
 
 def actuator(low: float = -1.0, high: float = 2.0, **options: object) -> Actuator:

@@ -135,7 +135,7 @@ def test_uniform_stays_within_its_interval(low: float, high: float) -> None:
 
 # The generic initializers
 
-NOWHERE = Sim(jnp.zeros(()), {}, {}, {}, {})
+NOWHERE = Sim(jnp.zeros(()), {}, {}, {}, {}, jnp.zeros((), bool))
 
 
 @pytest.mark.parametrize("value", [3.0, (1.0, -2.0), (0.0, 5.0, 7.0)])

@@ -42,6 +42,7 @@ def time_step(
         intervening=jnp.asarray(False),
         margins=margins,
         severity={name: jnp.asarray(share) for name, share in zip("ab", severity, strict=True)},
+        rta=None,
     )
     ended = jnp.asarray(outcome != 0)
     cost = jnp.asarray(float(max(severity) > 0.0))

@@ -56,6 +56,7 @@ def world(*, time: float = 0.0, ended: str | None = None, **status: Any) -> Sim:
         regions={"region": region.place(platforms)},
         status={name: jnp.asarray(value) for name, value in status.items()},
         ended={name: jnp.asarray(name == ended) for name in OUTCOMES},
+        intervening=jnp.asarray(False),
     )
 
 

@@ -17,7 +17,7 @@ from jaxsafe.types import Sim
 
 def at(time: float) -> Sim:
     """A world of which commands see the time alone."""
-    return Sim(jnp.asarray(time), {}, {}, {}, {})
+    return Sim(jnp.asarray(time), {}, {}, {}, {}, jnp.zeros((), bool))
 
 
 def values(command: Command, times: list[float]) -> list[float]:

@@ -18,7 +18,7 @@ def main(argv: Sequence[str]) -> int:
         raise ConfigError(f"argument {task!r}: expected a task first, for instance docking3d")
     arguments = cli.Arguments.parse(words)
     changes = arguments.pop_overrides()
-    options = {name: arguments.pop_text(name) for name in ("actions", "variant")}
+    options = {name: arguments.pop_text(name) for name in ("actions", "variant", "rta")}
     arguments.refuse_rest([*options, "env.…"])
     print(dump(make(task, changes, **options)), end="")  # type: ignore[arg-type]
     return 0
@@ -26,7 +26,8 @@ def main(argv: Sequence[str]) -> int:
 
 def usage() -> str:
     """The help text."""
-    return "usage: python -m jaxsafe.config TASK [actions=continuous|discrete] [variant=paper|released] [env.PATH=VALUE …]"
+    options = "[actions=continuous|discrete] [variant=paper|released] [rta=PRESET] [env.PATH=VALUE …]"
+    return f"usage: python -m jaxsafe.config TASK {options}"
 
 
 if __name__ == "__main__":

@@ -46,6 +46,8 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
                 ordered = refers.section == section and section in ("platforms", "status")  # later ones are not there yet
                 known = names[refers.section][: index if ordered else None]
                 _reference(place, name, known, " listed before it" if ordered else "")
+    for place, refers, name in _references(env.rta, "rta") if env.rta else ():
+        _reference(place, name, names[refers.section])
     _check_problems(env)
     for platform in env.platforms:
         _check_platform(platform, is_agent=platform.name == env.agent)
@@ -57,14 +59,16 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
     if before is None or _shapes(env) != _shapes(before):
         _check_kinds(env)
         _check_tracing(env)
+        _check_suited(env)
     return env
 
 
 def _references(component: Component, place: str) -> Iterator[tuple[str, Refers, str]]:
     for name, field in fields(type(component)).items():
         value, here = getattr(component, name), join(place, name)
-        if field.refers and isinstance(value, str):
-            yield here, field.refers, value
+        for refers, one in [(field.refers, value)] if field.refers else _listed(field.hint, value):
+            if isinstance(one, str):
+                yield here, refers, one
         if isinstance(value, Mapping):
             yield from ((here, refers, key) for refers in _key_refers(field.hint) for key in value)
         for inner in value if isinstance(value, tuple) else (value,):
@@ -72,9 +76,14 @@ def _references(component: Component, place: str) -> Iterator[tuple[str, Refers,
                 yield from _references(inner, join(here, getattr(inner, "name", "")))
 
 
+def _listed(hint: Any, value: Any) -> list[tuple[Refers, Any]]:
+    """The names in a `tuple[Annotated[str, Refers(…)], …]`, each with what it refers to."""
+    return [(refers, one) for refers in _key_refers(hint) for one in value] if isinstance(value, tuple) else []
+
+
 def _key_refers(hint: Any) -> list[Refers]:
-    """What the keys of `Mapping[Annotated[str, Refers(…)], …]` refer to."""
-    key = typing.get_args(hint)[0]
+    """What the keys of `Mapping[Annotated[str, Refers(…)], …]`, or the elements of such a tuple, refer to."""
+    key = next(iter(typing.get_args(hint)), None)
     marks = typing.get_args(key)[1:] if typing.get_origin(key) is Annotated else ()
     return [mark for mark in marks if isinstance(mark, Refers)]
 
@@ -84,6 +93,8 @@ def _check_problems(env: Environment) -> None:
         for part in getattr(env, section):
             for place, problem in _problems(part, f"{section}.{part.name}"):
                 raise ConfigError(f"{place}: {problem}")
+    for place, problem in _problems(env.rta, "rta") if env.rta else ():
+        raise ConfigError(f"{place}: {problem}")
 
 
 def _problems(component: Component, place: str) -> Iterator[tuple[str, str]]:
@@ -206,7 +217,7 @@ def _check_kinds(env: Environment) -> None:
 
     def statuses(env: Environment) -> Mapping[str, Any]:
         platforms = {platform.name: platform.rest() for platform in env.platforms}
-        return judge(env, Sim(jnp.zeros_like(env.dt), platforms, {}, {}, {})).status
+        return judge(env, Sim(jnp.zeros_like(env.dt), platforms, {}, {}, {}, jnp.zeros((), bool))).status
 
     try:
         found = jax.eval_shape(statuses, env)
@@ -233,17 +244,36 @@ def _check_tracing(env: Environment) -> None:
     except ConfigError:
         raise
     except Exception as error:
-        place = next((note.removeprefix("in ") for note in getattr(error, "__notes__", ())), "environment")
+        notes = getattr(error, "__notes__", ())
+        place = next((note.removeprefix("in ") for note in notes if note.startswith("in ")), "environment")
         reason = next(iter(str(error).splitlines()), "")
         raise ConfigError(f"{place}: cannot be computed: {type(error).__name__}: {reason[:200]}") from error
     memory, later = vars(begin[0].memory), vars(after[0].memory)
-    for section, parts in memory.items():
-        for name in parts:
-            if jax.tree.structure(parts[name]) != jax.tree.structure(later[section][name]):
+    for section in ("status", "reward", "observation"):
+        for name, first in memory[section].items():
+            if jax.tree.structure(first) != jax.tree.structure(later[section][name]):
                 raise ConfigError(f"{section}.{name}: its memory has another structure after a step than after reset")
+    if jax.tree.structure(memory["rta"]) != jax.tree.structure(later["rta"]):
+        raise ConfigError("rta: its memory has another structure after a step than after reset")
     for (path, old), new in zip(jax.tree_util.tree_leaves_with_path(begin), jax.tree.leaves(after), strict=True):
         if (old.shape, old.dtype) != (new.shape, new.dtype):
             place = jax.tree_util.keystr(path, simple=True, separator=".")
             raise ConfigError(
                 f"{place}: is {old.dtype}{list(old.shape)} after reset and {new.dtype}{list(new.shape)} after a step"
             )
+
+
+def _check_suited(env: Environment) -> None:
+    """What run time assurance says about itself must not hold at all of a few starts."""
+    if env.rta is None or any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(env)):
+        return
+
+    def faults(env: Environment, key: jax.Array) -> Mapping[str, jax.Array]:
+        assert env.rta is not None
+        return env.rta.unsuited(env, reset(env, key)[0].sim)
+
+    if jax.eval_shape(faults, env, jax.random.key(0)):
+        found = jax.jit(jax.vmap(faults, in_axes=(None, 0)))(env, jax.random.split(jax.random.key(0), 8))
+        for fault, everywhere in found.items():
+            if everywhere.all():
+                raise ConfigError(f"rta: {fault}")

@@ -11,6 +11,8 @@ from jaxsafe.environment import Environment
 from jaxsafe.envs import _docking, docking2d, docking2d_oriented, docking3d, rejoin2d, rejoin3d
 from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.paths import set_path
+from jaxsafe.rta.filter import RTA
+from jaxsafe.rta.presets import PRESETS
 from jaxsafe.simulation.controllers import Continuous, Discrete
 
 TASKS = {
@@ -44,6 +46,7 @@ def make(
     actions: Literal["continuous", "discrete"] | None = None,
     variant: Literal["paper", "released"] | None = None,
     randomize: Mapping[str, Sequence[float]] | None = None,
+    rta: str | RTA | None = None,
 ) -> Environment:
     """Return an environment, ready for `reset` and `step`.
 
@@ -55,6 +58,8 @@ def make(
         variant: `paper`, or `released` for the semantics of the published SafeRL code; None is `paper`.
         randomize: numbers drawn anew for each episode, by dotted path with their interval, for instance
             `{"deputy.mass": [10, 14]}`.
+        rta: run time assurance: the name of a preset of the task, `default` for the recommended one, a filter, or `none`
+            to remove what a file has; None leaves the environment as it is (the tasks by name have none).
 
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.
@@ -81,6 +86,8 @@ def make(
         env = _with_variant(env, name, variant)
     if actions is not None:
         env = _with_actions(env, actions)
+    if rta is not None:
+        env = _with_rta(env, name, rta)
     random = {} if randomize is None else {"randomize": randomize}
     return override(env, {**(overrides or {}), **random})
 
@@ -91,6 +98,15 @@ def _with_variant(env: Environment, task: str, variant: str) -> Environment:
     if task not in TASKS:
         raise ConfigError(f"variant: {task} says itself what it is; a variant is for {', '.join(TASKS)}")
     return override(env, VARIANTS[variant].get(task, {}))
+
+
+def _with_rta(env: Environment, task: str, rta: str | RTA) -> Environment:
+    if isinstance(rta, RTA):
+        return override(env, {"rta": rta})
+    presets = {"none": lambda: None, **PRESETS.get(task, {})}
+    if not isinstance(rta, str) or rta not in presets:
+        raise ConfigError(f"rta: {task} has no preset {rta!r}; choose from {nearest(rta, presets)}")
+    return override(env, {"rta": presets[rta]()})
 
 
 def _with_actions(env: Environment, actions: str) -> Environment:

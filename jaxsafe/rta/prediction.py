@@ -5,28 +5,34 @@ Prediction uses the plant's own map over one step, so a certificate speaks about
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsafe.errors import part
+from jaxsafe.simulation.controllers import Controls
 from jaxsafe.types import Sim
 
 
 def advance(env: Any, sim: Sim, control: Float[Array, " m"]) -> Sim:
-    """The simulation one step later under a control of the agent in physical units, without regions and statuses."""
-    controls = dict(zip(env.action_names, control, strict=True))
-    return sim.replace(time=sim.time + env.dt, platforms=advance_platforms(env, sim, controls), regions={}, status={})
+    """The simulation one step later under a control of the agent in physical units.
 
-
-def advance_platforms(env: Any, sim: Sim, controls: Mapping[str, Array]) -> dict[str, Any]:
-    """The platforms' next states, all from the old simulation: they move at once."""
+    All platforms move at once. Regions and statuses are left out.
+    """
     platforms = {}
     for platform in env.platforms:
-        own = controls if platform.name == env.agent else platform.controller.control(jnp.zeros(0), sim)
-        platforms[platform.name] = platform.step(sim.platforms[platform.name], own, env.dt)
-    return platforms
+        with part("platforms", platform.name):
+            controls = commanded(env, platform, sim, control)
+            platforms[platform.name] = platform.step(sim.platforms[platform.name], controls, env.dt)
+    return sim.replace(time=sim.time + env.dt, platforms=platforms, regions={}, status={})
+
+
+def commanded(env: Any, platform: Any, sim: Sim, control: Float[Array, " m"]) -> Controls:
+    """The controls of a platform: the agent's are given, the others follow their controllers."""
+    if platform.name == env.agent:
+        return dict(zip(env.action_names, control, strict=True))
+    return platform.controller.control(jnp.zeros(0), sim)
 
 
 def judge(env: Any, sim: Sim, before: Sim | None = None) -> Sim:

@@ -20,8 +20,8 @@ def safe_norm(vector: Float[Array, " d"]) -> Float[Array, ""]:
     derivative by zero.
     """
     squared = jnp.sum(vector * vector, axis=-1)
-    positive = squared > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1.0)), 0.0)
+    zero = squared == 0.0  # what is not a number stays so
+    return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
 
 
 def closest_approach(before: Float[Array, " d"], after: Float[Array, " d"]) -> Float[Array, ""]:

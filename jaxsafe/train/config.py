@@ -33,6 +33,7 @@ class TrainConfig(Component):
     steps: Count = 500_000
     actions: Literal["continuous", "discrete"] | None = None  # None: as the environment says
     variant: Literal["paper", "released"] | None = None  # None: paper
+    rta: str | None = None  # None: as the environment says; default, or another preset of the task
     out: str | None = None  # None: a new directory in runs/
     eval_every: Count | None = None  # steps; None: a tenth of the run
     eval_episodes: Count = 100  # of each evaluation during training
@@ -67,7 +68,7 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
     config = TrainConfig()
     for path, value in arguments.options.items():  # first, so that a misspelt option is told before a slow start
         config = set_path(config, path, value, to_value)
-    env = make(task, overrides, actions=config.actions, variant=config.variant)
+    env = make(task, overrides, actions=config.actions, variant=config.variant, rta=config.rta)
     config = normalise(TrainConfig())
     for path, value in {**recipe(task, arguments.options.get("preset")), **arguments.options}.items():
         config = set_path(config, path, value, to_value)

@@ -1,0 +1,119 @@
+"""Policies that try to leave the safe set: they see the whole state and command extreme controls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.rta.prediction import advance, bounds, constraint, judge
+from jaxsafe.simulation.geometry import safe_norm
+from jaxsafe.types import Key, Sim
+
+Adversary = Callable[[Any, Sim, Key], Float[Array, " m"]]
+"""`adversary(env, sim, key)`: a control in physical units."""
+
+
+def uniform(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+    """Any control."""
+    low, high = bounds(env)
+    return low + (high - low) * jax.random.uniform(key, low.shape)
+
+
+def bang_bang(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+    """Every actuator at one of its bounds."""
+    low, high = bounds(env)
+    return jnp.where(jax.random.bernoulli(key, shape=low.shape), low, high)
+
+
+def greedy(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+    """The control that lowers the smallest h after the step most steeply; a random one where it has no influence."""
+
+    def h(u: Float[Array, " m"]) -> Float[Array, ""]:
+        later = judge(env, advance(env, sim, u))
+        return jnp.min(jnp.stack([one.margin(later) for one in env.constraints]))
+
+    return _steer(env, h, -1.0, key)
+
+
+def inward(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+    """Towards the other platform: pursuit, ramming from behind."""
+    return _towards(env, sim, _to_target(env, sim), key)
+
+
+def outward(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+    """Away from the other platform."""
+    return _towards(env, sim, -_to_target(env, sim), key)
+
+
+def sideways(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+    """Across the velocity, which bends the path without changing the speed at first."""
+    velocity = sim.platforms[env.agent].velocity
+    across = jnp.stack([-velocity[1], velocity[0], *jnp.zeros(velocity.size - 2)])
+    return _towards(env, sim, across, key)
+
+
+def accelerate(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+    """Along the velocity."""
+    return _towards(env, sim, sim.platforms[env.agent].velocity, key)
+
+
+def intercept(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+    """Towards the point at which the other platform can be met at the present speed."""
+    own, other = sim.platforms[env.agent], _target(env, sim)
+    ahead = other.position - own.position
+    speed = jnp.maximum(safe_norm(own.velocity), 1e-3)
+    time = safe_norm(ahead) / speed
+    for _ in range(4):
+        time = safe_norm(ahead + other.velocity * time) / speed
+    return _towards(env, sim, ahead + other.velocity * time, key)
+
+
+def head_on(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+    """Gets 2 500 ft or m ahead of the other platform first, then turns on it."""
+    own, other = sim.platforms[env.agent], _target(env, sim)
+    course = other.velocity / jnp.maximum(safe_norm(other.velocity), 1e-3)
+    ahead = jnp.sum((own.position - other.position) * course)
+    aim = jnp.where(ahead > 1500.0, 0.0, 2500.0) * course + other.position
+    return _towards(env, sim, aim - own.position, key)
+
+
+ADVERSARIES: dict[str, Adversary] = {
+    each.__name__: each for each in (uniform, bang_bang, greedy, inward, outward, sideways, accelerate, intercept, head_on)
+}
+"""By name."""
+
+
+def _target(env: Any, sim: Sim) -> Any:
+    return sim.platforms[next(platform.name for platform in env.platforms if platform.name != env.agent)]
+
+
+def _to_target(env: Any, sim: Sim) -> Float[Array, " d"]:
+    return _target(env, sim).position - sim.platforms[env.agent].position
+
+
+def _towards(env: Any, sim: Sim, aim: Float[Array, " d"], key: Key) -> Float[Array, " m"]:
+    """The control that turns the velocity over the next steps most towards a direction."""
+    aim = aim / jnp.maximum(safe_norm(aim), 1e-6)
+
+    def along(u: Float[Array, " m"]) -> Float[Array, ""]:
+        later = advance(env, sim, u)
+        return jnp.sum(aim * advance(env, later, jnp.zeros_like(u)).platforms[env.agent].velocity)
+
+    return _steer(env, along, 1.0, key)
+
+
+def _steer(env: Any, value: Callable[[Array], Array], sign: float, key: Key) -> Float[Array, " m"]:
+    """Every actuator at the bound that its derivative favours; where there is none, at random."""
+    low, high = bounds(env)
+    slope = sign * jax.grad(value)((low + high) / 2.0)
+    return jnp.where(slope == 0.0, bang_bang(env, None, key), jnp.where(slope > 0.0, high, low))  # type: ignore[arg-type]
+
+
+def smallest_margin(env: Any, sim: Sim, before: Sim | None = None) -> Float[Array, ""]:
+    """The smallest h of all constraints; with `before`, distances on the straight way from there."""
+    judged = judge(env, sim, before)
+    return jnp.min(jnp.stack([constraint(env, one.name).margin(judged) for one in env.constraints]))

@@ -1,0 +1,145 @@
+"""Backup controllers and the sets in which they stay safe for ever."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxsafe.component import Range, Unit
+from jaxsafe.rta.asif import speed_ball
+from jaxsafe.rta.filter import BackupController, TerminalSet
+from jaxsafe.rta.prediction import bounds
+from jaxsafe.rta.projection import project_box_ball
+from jaxsafe.simulation.geometry import direction, safe_norm
+from jaxsafe.types import ConstraintName, Length, Number, PlatformName, Positive, Radians, Seconds, Sim
+
+TWO_PI = 2.0 * jnp.pi
+
+
+class Brake(BackupController, type="brake"):
+    """Thrust that brings the velocity to 0 at the end of the step, or as near as the bounds allow (dead beat)."""
+
+    def control(self, env: Any, sim: Sim) -> Float[Array, " m"]:
+        plant, names = env.agent_platform, env.action_names
+
+        def velocity(u: Float[Array, " m"]) -> Array:
+            return plant.step(sim.platforms[env.agent], dict(zip(names, u, strict=True)), env.dt).velocity
+
+        drift, push = jax.linearize(velocity, jnp.zeros(len(names), env.dt.dtype))
+        pushed = jax.vmap(push)(jnp.eye(len(names), dtype=env.dt.dtype))
+        return -jnp.sum(pushed * drift, axis=-1) / jnp.max(jnp.sum(pushed * pushed, axis=-1))
+
+
+class AlignAndBrake(BackupController, type="align_and_brake"):
+    """Turns the thrust axis along the velocity and brakes, for an oriented spacecraft.
+
+    The attitude follows the rate sign(e)·√(1.6 α|e|) for the error e between ±body axis and velocity, α the bound of the
+    wheel. While |e| > `aligned` the thrust is the smallest that keeps the speed limit with twice the `margin`, which holds
+    the boundary while the craft turns; then it nulls the velocity along the body.
+    """
+
+    constraint: ConstraintName
+    margin: Annotated[Number, Unit("m/s"), Range(0.0)]
+    aligned: Annotated[Radians, Positive] = jnp.pi / 30
+
+    def control(self, env: Any, sim: Sim) -> Float[Array, " 2"]:
+        state = sim.platforms[env.agent]
+        low, high = bounds(env)
+        error = misalignment(state)
+        ceiling = env.agent_platform.attitude_rate_limits[1]
+        rate = jnp.sign(error) * jnp.minimum(ceiling, _safe_sqrt(1.6 * high[1] * jnp.abs(error)))
+        turn = jnp.clip((rate - state.attitude_rate) / env.dt, low[1], high[1])
+
+        ball = speed_ball(env, sim, jnp.stack([jnp.zeros_like(turn), turn]), self.constraint, 2.0 * self.margin, free=1)
+        hold, _ = project_box_ball(jnp.zeros(1, turn.dtype), low[:1], high[:1], *ball)
+        along = jnp.sum(state.velocity * direction(state.attitude))
+        brake = -along * env.agent_platform.mass / env.dt
+        return jnp.stack([jnp.where(jnp.abs(error) <= self.aligned, brake, hold[0]), turn])
+
+
+class Slow(TerminalSet, type="slow"):
+    """Hardly any speed: below a speed limit everywhere, and a brake that can stop within a few steps keeps it so."""
+
+    speed: Annotated[Number, Unit("m/s"), Positive]
+
+    def contains(self, env: Any, sim: Sim) -> Bool[Array, ""]:
+        return safe_norm(sim.platforms[env.agent].velocity) <= self.speed
+
+
+class AlignedOrSlow(TerminalSet, type="aligned_or_slow"):
+    """The thrust axis within `angle` of the velocity, so that braking has authority, or hardly any speed."""
+
+    angle: Annotated[Radians, Positive]
+    speed: Annotated[Number, Unit("m/s"), Positive]
+
+    def contains(self, env: Any, sim: Sim) -> Bool[Array, ""]:
+        state = sim.platforms[env.agent]
+        return (jnp.abs(misalignment(state)) <= self.angle) | (safe_norm(state.velocity) <= self.speed)
+
+
+class MatchVelocity(BackupController, type="match_velocity"):
+    """Turns one way to the lead's next heading and takes its speed; then the relative position stays as it is.
+
+    In space it banks by tan φ = v ω/g for the turn ω = 0.25 e + ψ̇_lead of a heading error e, and climbs or dives at the
+    steepest angle while the error is large, |e| above 0.45 rad, less so down to 0.15 rad, then flies the lead's angle.
+    """
+
+    lead: PlatformName
+    turn: Literal["left", "right"]
+    climb: Literal["up", "down"] | None = None  # in space
+    dead_zone: Annotated[Radians, Range(0.0)] = 0.2
+
+    def control(self, env: Any, sim: Sim) -> Float[Array, " m"]:
+        own, lead = sim.platforms[env.agent], sim.platforms[self.lead]
+        ahead = next(one for one in env.platforms if one.name == self.lead)
+        later = ahead.step(lead, ahead.controller.control(jnp.zeros(0), sim), env.dt)
+        sign = 1.0 if self.turn == "left" else -1.0
+        error = sign * (jnp.mod(sign * (later.heading - own.heading) + self.dead_zone, TWO_PI) - self.dead_zone)
+        wanted = {"acceleration": (later.speed - own.speed) / env.dt}
+        if self.climb is None:
+            wanted["heading_rate"] = error / env.dt
+        else:
+            wanted |= self._in_space(env, own, later, error, (later.heading - lead.heading) / env.dt)
+        return jnp.stack([wanted[name] for name in env.action_names])
+
+    def _in_space(self, env: Any, own: Any, later: Any, error: Array, turning: Array) -> dict[str, Array]:
+        plant = env.agent_platform
+        bank = jnp.arctan(own.speed * (0.25 * error + turning) / plant.gravity)
+        bank = jnp.clip(bank, plant.roll_limits[0], plant.roll_limits[1])
+        steep = plant.flight_path_angle_limits[0 if self.climb == "up" else 1]  # ż = −v sin γ
+        share = jnp.clip((jnp.abs(error) - 0.15) / 0.3, 0.0, 1.0)
+        gamma = later.flight_path_angle + share * (steep - later.flight_path_angle)
+        return {
+            "roll_rate": (bank - own.roll) / env.dt,
+            "flight_path_angle_rate": (gamma - own.flight_path_angle) / env.dt,
+        }
+
+
+class VelocityMatched(TerminalSet, type="velocity_matched"):
+    """Relative speed below `tolerance` and, with `drift` seconds of it, still at least `clearance` apart."""
+
+    of: PlatformName
+    to: PlatformName
+    tolerance: Annotated[Number, Unit("ft/s"), Positive]
+    clearance: Annotated[Length, Positive]
+    drift: Seconds = 1.0
+
+    def contains(self, env: Any, sim: Sim) -> Bool[Array, ""]:
+        one, other = sim.platforms[self.of], sim.platforms[self.to]
+        relative = safe_norm(one.velocity - other.velocity)
+        apart = safe_norm(one.position - other.position)
+        return (relative < self.tolerance) & (apart >= self.clearance + self.drift * relative)
+
+
+def misalignment(state: Any) -> Float[Array, ""]:
+    """Angle from the nearer end of the body's axis to the velocity, in [−π/2, π/2); 0 at rest."""
+    course = jnp.arctan2(state.velocity[1], jnp.where(safe_norm(state.velocity) > 0.0, state.velocity[0], 1.0))
+    return jnp.mod(course - state.attitude + jnp.pi / 2, jnp.pi) - jnp.pi / 2
+
+
+def _safe_sqrt(x: Array) -> Array:
+    positive = x > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)

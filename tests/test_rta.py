@@ -1,0 +1,376 @@
+"""Run time assurance inside the step: what it guarantees, what it lets pass, and what it does with nonsense."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import jaxsafe
+from jaxsafe import ConfigError, Environment
+from jaxsafe.config import dump, load
+from jaxsafe.envs import TASKS
+from jaxsafe.rta.adversaries import ADVERSARIES
+from jaxsafe.rta.asif import ExplicitASIF, Polynomial
+from jaxsafe.rta.cascade import Cascade, Stage
+from jaxsafe.rta.falsify import attack
+from jaxsafe.rta.prediction import advance, bounds, constraint, judge
+from jaxsafe.rta.presets import DOCKING as DOCKING_FILTER
+from jaxsafe.rta.presets import PRESETS
+from jaxsafe.rta.simplex import Blend, CollisionSimplex, Simplex
+
+DOCKING = ("docking2d", "docking3d")
+SHORT = [
+    ("discrete_asif", "docking2d", ("bang_bang", "greedy")),
+    ("discrete_asif", "docking3d", ("sideways",)),
+    ("explicit_simplex", "docking3d", ("greedy",)),
+    ("implicit_simplex", "docking2d", ("greedy",)),
+    ("implicit_asif", "docking2d", ("greedy",)),
+    ("implicit_simplex", "docking2d_oriented", ("greedy",)),
+    ("implicit_simplex", "rejoin2d", ("intercept",)),
+]
+COMPARED = ("explicit_asif", "released")  # of the literature; they guarantee nothing
+LONG = [(preset, task, tuple(ADVERSARIES)) for task in PRESETS for preset in PRESETS[task] if preset not in COMPARED]
+
+BRAKE = {"type": "brake", "name": "brake"}
+SLOW = {"type": "slow", "speed": 0.1}
+
+step = jax.jit(jaxsafe.step)
+reset = jax.jit(jaxsafe.reset)
+
+
+@pytest.mark.parametrize(("preset", "task", "policies"), SHORT)
+def test_no_adversary_breaks_the_filter(preset: str, task: str, policies: tuple[str, ...]) -> None:
+    env = jaxsafe.make(task, rta=preset)
+    for policy in policies:
+        assert_unbroken(env, attack(env, policy, 150, 32, jax.random.key(1)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("preset", "task", "policies"), LONG)
+def test_no_adversary_breaks_any_filter(preset: str, task: str, policies: tuple[str, ...]) -> None:
+    env = jaxsafe.make(task, rta=preset)
+    for policy in policies:
+        assert_unbroken(env, attack(env, policy, 300, 64, jax.random.key(1)))
+
+
+def assert_unbroken(env: Environment, row: dict[str, Any]) -> None:
+    assert row["violating_steps"] == row["violating_steps_inside"] == row["uncertified_steps"] == 0, row
+    assert row["unsafe_starts"] == 0.0
+    assert env.rta is not None
+    assert row["worst_margin"] >= float(env.rta.margin) - 1e-4
+
+
+@pytest.mark.parametrize(("task", "policy"), [("docking2d", "greedy"), ("rejoin2d", "intercept")])
+def test_the_same_adversaries_break_the_bare_task(task: str, policy: str) -> None:
+    row = attack(jaxsafe.make(task), policy, 150, 32, jax.random.key(1))
+    assert row["violating_steps_inside"] > 0
+    assert row["intervention_rate"] == 0.0
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_an_environment_with_a_filter_is_written_and_read(task: str) -> None:
+    for preset in PRESETS[task]:
+        env = jaxsafe.make(task, rta=preset)
+        assert load(dump(env)) == env
+        assert jaxsafe.make(task, rta="none") == jaxsafe.make(task) == jaxsafe.override(env, {"rta": None})
+    with pytest.raises(ConfigError, match=rf"^rta: {task} has no preset 'defualt'; choose from none, .*default"):
+        jaxsafe.make(task, rta="defualt")
+
+
+@pytest.mark.parametrize("task", [*DOCKING, "rejoin2d"])
+def test_a_control_that_is_certified_passes_unaltered(task: str) -> None:
+    env = jaxsafe.make(task, rta="default")
+    state, timestep = reset(env, jax.random.key(0))
+    assert timestep.info.rta.certified
+    state, timestep = step(env, state, 0.01 * jnp.ones(env.action_size))
+    info = timestep.info
+    np.testing.assert_array_equal(info.control_actual, info.control_desired)
+    assert not info.intervening
+    assert info.rta.correction == 0.0
+    assert info.rta.certified
+    np.testing.assert_allclose(info.rta.predicted_margin, min(info.margins.values()), rtol=1e-6)
+
+
+def fast(env: Environment) -> Any:
+    """A start at the speed limit, moving across."""
+    position, velocity = 100.0 * np.eye(env.action_size)[0], (0.2 + 2 * 0.001027 * 100.0) * np.eye(env.action_size)[1]
+    return jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": 0.999 * velocity}})[0]
+
+
+@pytest.mark.parametrize("task", DOCKING)
+def test_an_intervention_is_reported_in_full(task: str) -> None:
+    env = jaxsafe.make(task, rta="default")
+    _, timestep = step(env, fast(env), jnp.eye(env.action_size)[1])
+    info = timestep.info
+    assert info.intervening
+    assert info.margins["velocity_limit"] >= 0.0
+    np.testing.assert_allclose(info.control_desired, jnp.eye(env.action_size)[1])
+    np.testing.assert_allclose(info.rta.correction, np.linalg.norm(info.control_actual - info.control_desired), rtol=1e-6)
+    delta_v = np.linalg.norm(info.control_actual) / 12.0  # the reward is for the thrust that acted
+    np.testing.assert_allclose(info.status["delta_v"], delta_v, rtol=1e-5)
+    _, bare = step(jaxsafe.make(task), fast(env), jnp.eye(env.action_size)[1])
+    assert bare.info.margins["velocity_limit"] < 0.0
+    assert bare.info.rta is None
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("task", [*DOCKING, "rejoin2d"])
+def test_what_is_not_a_number_never_reaches_the_plant(task: str, value: float) -> None:
+    env = jaxsafe.make(task, rta="default")
+    state, _ = reset(env, jax.random.key(0))
+    after, timestep = step(env, state, jnp.full(env.action_size, value))
+    assert np.isfinite(timestep.info.control_actual).all()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(after.sim.platforms))
+    assert np.isfinite(timestep.observation).all()
+    if np.isnan(value):
+        assert timestep.info.intervening
+        assert timestep.info.rta.certified
+
+
+@pytest.mark.parametrize("preset", PRESETS["rejoin2d"])
+def test_a_state_that_is_not_a_number_still_gives_a_control(preset: str) -> None:
+    env = jaxsafe.make("rejoin2d", rta=preset)
+    state, _ = reset(env, jax.random.key(0))
+    wingman = state.sim.platforms["wingman"].replace(heading=jnp.float32(jnp.nan))
+    broken = state.replace(sim=state.sim.replace(platforms={**state.sim.platforms, "wingman": wingman}))
+    _, timestep = step(env, broken, jnp.array([0.5, -0.5]))
+    assert np.isfinite(timestep.info.control_actual).all()
+    assert not timestep.info.rta.certified
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_reset_and_step_agree_in_structure(task: str) -> None:
+    env = jaxsafe.make(task, rta="default")
+
+    def both(env: Environment) -> Any:
+        state, first = jaxsafe.reset(env, jax.random.key(0))
+        return (state, first), jaxsafe.step(env, state, jnp.zeros(env.action_size))
+
+    start, after = jax.eval_shape(both, env)
+    assert jax.tree.structure(start) == jax.tree.structure(after)
+    assert [(a.shape, a.dtype) for a in jax.tree.leaves(start)] == [(a.shape, a.dtype) for a in jax.tree.leaves(after)]
+
+
+@pytest.mark.parametrize("task", DOCKING)
+@pytest.mark.usefixtures("x64")
+def test_the_sampled_data_filter_changes_no_more_than_it_must(task: str) -> None:
+    """Against the true optimum, whose constraint h(x′) ≥ margin is not convex."""
+    env = jaxsafe.make(task, rta="discrete_asif")
+    rng = np.random.default_rng(0)
+    altered = 0
+    for _ in range(25):
+        state = fast(env)
+        turn = np.linalg.qr(rng.normal(size=(env.action_size,) * 2))[0]
+        deputy = state.sim.platforms["deputy"]
+        start = {"position": turn @ deputy.position, "velocity": turn @ deputy.velocity}
+        state = jaxsafe.reset_to(env, {"deputy": start})[0]
+        desired = rng.uniform(-1, 1, env.action_size)
+        _, timestep = step(env, state, desired)
+        found = np.asarray(timestep.info.control_actual)
+
+        def h(u: np.ndarray, state: Any = state) -> float:
+            later = judge(env, advance(env, state.sim, jnp.asarray(u)))
+            return float(constraint(env, "velocity_limit").margin(later) - env.rta.margin)
+
+        assert h(found) > -1e-9
+        best = minimize(
+            lambda u, desired=desired: np.sum((u - desired) ** 2),
+            found,
+            constraints=[{"type": "ineq", "fun": h}],
+            bounds=[(-1, 1)] * env.action_size,
+            method="SLSQP",
+            options={"ftol": 1e-14},
+        )
+        assert np.linalg.norm(found - desired) <= np.linalg.norm(best.x - desired) + 1e-6
+        altered += bool(timestep.info.intervening)
+    assert 5 < altered < 25
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.usefixtures("x64")
+def test_the_derivative_of_every_plant_is_that_of_its_step(task: str) -> None:
+    env = jaxsafe.make(task)
+    tiny = jaxsafe.override(env, {"dt": 1e-6})
+    sim = jaxsafe.reset(env, jax.random.key(3))[0].sim
+    low, high = bounds(env)
+    control = low + 0.7 * (high - low)
+    controls = dict(zip(env.action_names, control, strict=True))
+    before = sim.platforms[env.agent]
+    rate = env.agent_platform.derivative(before, controls)
+    after = advance(tiny, sim, control).platforms[env.agent]
+    for name, slope in vars(rate).items():
+        if name != "delta_v":
+            change = (getattr(after, name) - getattr(before, name)) / 1e-6
+            np.testing.assert_allclose(slope, change, rtol=2e-3, atol=2e-4 * float(np.abs(change).max() + 1e-3))
+
+
+@pytest.mark.parametrize(("task", "degree"), [("docking2d", 1), ("docking3d", 1), ("rejoin2d", 2)])
+@pytest.mark.usefixtures("x64")
+def test_barrier_rows_are_the_change_of_h_along_the_plant(task: str, degree: int) -> None:
+    env = jaxsafe.make(task)
+    name = env.constraints[0].name
+    rta = ExplicitASIF(constraints=(name,), backups=(), strengthening=Polynomial(linear=jnp.asarray(0.3)), degree=degree)
+    sim = jaxsafe.reset(env, jax.random.key(1))[0].sim
+    rows, offsets = rta.rows(env, sim, env.action_size)
+    low, high = bounds(env)
+    u, t = low + 0.8 * (high - low), 1e-3
+
+    def h(duration: float) -> float:
+        moved = advance(jaxsafe.override(env, {"dt": duration}), sim, u)
+        return float(constraint(env, name).margin(judge(env, moved)))
+
+    now = float(constraint(env, name).margin(judge(env, sim)))
+    if degree == 1:
+        expected = (h(t) - now) / t + 0.3 * now  # ḣ + α(h)
+    else:
+        slope, bend = (h(2 * t) - now) / (2 * t), (h(2 * t) - 2 * h(t) + now) / t**2
+        expected = bend + 2 * 0.3 * (slope - bend * t) + 0.09 * now  # ψ̇₁ + α(ψ₁), ψ₁ = ḣ + αh
+    np.testing.assert_allclose(float(rows[0] @ u - offsets[0]), expected, rtol=2e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("task", DOCKING)
+def test_derivatives_through_the_filter_are_numbers_at_every_kink(task: str) -> None:
+    env = jaxsafe.make(task, rta="default")
+    size = env.action_size
+    zero, unit = np.zeros(size), np.eye(size)[0]
+    starts = [(zero, zero), (zero, 0.2 * unit), (100 * unit, zero), (100 * unit, 0.405 * unit), (100 * unit, 5.0 * unit)]
+
+    def outputs(action: jax.Array, sim: Any, state: Any) -> jax.Array:
+        _, timestep = jaxsafe.step(env, state.replace(sim=sim), action)
+        return jnp.sum(timestep.observation) + jnp.sum(timestep.info.control_actual) + timestep.reward
+
+    slopes = jax.jit(jax.grad(outputs, argnums=(0, 1), allow_int=True))
+    for position, velocity in starts:
+        state = jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})[0]
+        for action in (zero, unit, -np.ones(size)):
+            for leaf in jax.tree.leaves(slopes(jnp.asarray(action, jnp.float32), state.sim, state)):
+                assert leaf.dtype == jax.dtypes.float0 or np.isfinite(leaf).all()
+
+
+@pytest.mark.parametrize(("release", "held"), [(0.0, False), (0.1, True)])
+def test_release_holds_control_back_for_longer(release: float, held: bool) -> None:
+    env = jaxsafe.make("docking2d", {"rta.release": release}, rta="explicit_simplex")
+    state, timestep = step(env, fast(env), jnp.array([0.0, 1.0]))
+    assert timestep.info.intervening
+    assert 0.0 < timestep.info.margins["velocity_limit"] < 0.1
+    _, timestep = step(env, state, jnp.zeros(2))  # would be safe by itself
+    assert bool(timestep.info.intervening) == held
+
+
+def test_a_start_outside_the_safe_set_is_flagged_and_braked() -> None:
+    env = jaxsafe.make("docking2d", rta="default")
+    start = {"position": [100.0, 0.0], "velocity": [0.0, 1.0]}
+    state, timestep = jaxsafe.reset_to(env, {"deputy": start})
+    assert not timestep.info.rta.certified
+    for _ in range(12):
+        state, timestep = step(env, state, jnp.array([0.0, 1.0]))
+    assert timestep.info.rta.certified
+    assert timestep.info.margins["velocity_limit"] >= 0.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rta.constraints": ["velocity_limi"]}, r"rta\.constraints: nothing is called 'velocity_limi'.*Did you mean"),
+        ({"rta.margin": -1}, r"rta\.margin: expected a number .*≥ 0, found -1"),
+        ({"rta.backups": [BRAKE, BRAKE]}, r"rta: without a horizon there is one backup controller"),
+        ({"rta.horizon": 5, "rta.terminal": SLOW, "rta.backups": [BRAKE, BRAKE]}, r"rta: the name 'brake' is there twice"),
+        ({"rta.backups": []}, r"rta: expected at least one constraint and one backup controller"),
+        ({"rta.horizon": 5}, r"rta: a horizon needs a terminal set"),
+        ({"rta.gamma": 0}, r"rta\.gamma: expected a number in \(0, 1\], found 0"),
+        ({"rta": {"type": "simplx"}}, r"rta: unknown type 'simplx'; choose from .*Did you mean 'simplex'\?"),
+    ],
+)
+def test_a_filter_that_does_not_fit_is_told_in_one_line(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        jaxsafe.make("docking2d", changes, rta="default")
+    assert "\n" not in str(caught.value)
+
+
+def test_the_filters_of_the_literature_are_there_to_be_broken() -> None:
+    """The continuous-time barrier against a control that is held, and a monitor that never looks at the desired control."""
+    row = attack(jaxsafe.make("docking2d", rta="explicit_asif"), "intercept", 150, 32, jax.random.key(1))
+    assert row["violating_steps"] == row["uncertified_steps"] > 0  # and the filter knows
+    env = jaxsafe.make("docking2d", {"rta.enforce": True}, rta="explicit_asif")
+    assert attack(env, "intercept", 150, 32, jax.random.key(1))["violating_steps"] == 0
+    row = attack(jaxsafe.make("rejoin2d", rta="released"), "head_on", 150, 32, jax.random.key(1))
+    assert row["violating_steps_inside"] > 0
+
+
+@pytest.mark.parametrize("share", [1, 4, 16])
+def test_a_blend_takes_the_largest_share_that_is_certified(share: int) -> None:
+    env = jaxsafe.make("docking2d", rta=Blend(**DOCKING_FILTER, parts=share))
+    desired = jnp.array([0.0, 1.0])
+    _, timestep = step(env, fast(env), desired)
+    _, simplex = step(jaxsafe.make("docking2d", rta="explicit_simplex"), fast(env), desired)
+    backup, actual = simplex.info.control_actual, timestep.info.control_actual
+    part = (actual - backup)[1] / (desired - backup)[1]
+    np.testing.assert_allclose(part * share, np.round(part * share), atol=1e-4)
+    assert (share == 1) == (part == 0.0)
+    assert timestep.info.rta.certified
+    more = judge(env, advance(env, fast(env).sim, backup + (part + 1 / share) * (desired - backup)))
+    assert constraint(env, "velocity_limit").margin(more) < env.rta.margin
+
+
+def test_an_implicit_asif_changes_less_than_simplex() -> None:
+    """And no more than half a percent more than the exact projection, which linearising in rounds approaches."""
+    desired = jnp.array([0.0, 1.0])
+    corrections = {}
+    for preset in ("implicit_simplex", "implicit_asif", "discrete_asif"):
+        env = jaxsafe.make("docking2d", rta=preset)
+        _, timestep = step(env, fast(env), desired)
+        assert timestep.info.rta.certified
+        corrections[preset] = float(timestep.info.rta.correction)
+    assert 1.0001 * corrections["discrete_asif"] <= 1.0005 * corrections["implicit_asif"]
+    assert corrections["implicit_asif"] < 1.005 * corrections["discrete_asif"]
+    assert corrections["implicit_asif"] < 0.51 * corrections["implicit_simplex"]
+
+
+def test_stages_follow_each_other() -> None:
+    """The last stage has the last word, and where it intervenes the certificate of the first is void."""
+    loose = Stage(name="loose", rta=Simplex(**DOCKING_FILTER))
+    tight = Stage(name="tight", rta=Simplex(**{**DOCKING_FILTER, "margin": 0.05}))
+    env = jaxsafe.make("docking2d", rta=Cascade(stages=(loose, tight)))
+    assert load(dump(env)) == env
+    assert jaxsafe.override(env, {"rta.stages.tight.rta.margin": 0.1}) != env
+    start = {"deputy": {"position": [100.0, 0.0], "velocity": [0.0, 0.3]}}
+    alone = {name: jaxsafe.make("docking2d", rta=stage.rta) for name, stage in (("loose", loose), ("tight", tight))}
+    seen = set()
+    for push in (-0.5, 0.0, 0.8, 1.0):
+        desired = jnp.array([0.0, push])
+        _, both = step(env, jaxsafe.reset_to(env, start)[0], desired)
+        _, last = step(alone["tight"], jaxsafe.reset_to(alone["tight"], start)[0], desired)
+        np.testing.assert_array_equal(both.info.control_actual, last.info.control_actual)
+        assert both.info.intervening == last.info.intervening
+        assert both.info.rta.certified == ~both.info.intervening
+        seen.add(bool(both.info.intervening))
+    assert seen == {True, False}
+    with pytest.raises(ConfigError, match=r"^rta: expected at least one stage"):
+        jaxsafe.make("docking2d", rta=Cascade(stages=()))
+
+
+def test_rejoin_needs_barriers_of_a_higher_degree() -> None:
+    """A turn moves the distance only after two derivatives: of degree 1 the row is empty, which is told at once."""
+    with pytest.raises(ConfigError, match=r"^rta: of degree 1 the control has no influence on 'collision'"):
+        jaxsafe.make("rejoin2d", {"rta.degree": 1}, rta="explicit_asif")
+
+
+def test_slack_lets_a_barrier_be_missed_at_a_price() -> None:
+    desired = jnp.array([0.0, 1.0])
+    corrections = []
+    for slack in (None, 1e4, 1e-4):
+        env = jaxsafe.make("docking2d", {"rta.slack": slack}, rta="explicit_asif")
+        _, timestep = step(env, fast(env), desired)
+        corrections.append(float(timestep.info.rta.correction))
+    hard, dear, cheap = corrections
+    assert cheap < 0.01 < 0.9 * hard < dear < 1.0001 * hard
+
+
+def test_the_released_filter_only_fits_where_it_can_turn() -> None:
+    with pytest.raises(ConfigError, match=r"^rta: cannot be computed"):
+        jaxsafe.make("docking2d", rta=CollisionSimplex(other="chief"))
+    with pytest.raises(ConfigError, match=r"^rta\.other: nothing is called 'leed'.*Did you mean 'lead'"):
+        jaxsafe.make("rejoin2d", {"rta.other": "leed"}, rta="released")
