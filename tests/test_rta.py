@@ -12,7 +12,6 @@ import jaxsafe
 from jaxsafe import ConfigError, Environment
 from jaxsafe.config import dump, load
 from jaxsafe.envs import TASKS
-from jaxsafe.rta.adversaries import ADVERSARIES
 from jaxsafe.rta.asif import ExplicitASIF, Polynomial
 from jaxsafe.rta.cascade import Cascade, Stage
 from jaxsafe.rta.falsify import attack
@@ -32,7 +31,7 @@ SHORT = [
     ("implicit_simplex", "rejoin2d", ("intercept",)),
 ]
 COMPARED = ("explicit_asif", "released")  # of the literature; they guarantee nothing
-LONG = [(preset, task, tuple(ADVERSARIES)) for task in PRESETS for preset in PRESETS[task] if preset not in COMPARED]
+LONG = [(preset, task) for task in PRESETS for preset in PRESETS[task] if preset not in (*COMPARED, "default")]
 
 BRAKE = {"type": "brake", "name": "brake"}
 SLOW = {"type": "slow", "speed": 0.1}
@@ -49,10 +48,10 @@ def test_no_adversary_breaks_the_filter(preset: str, task: str, policies: tuple[
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("preset", "task", "policies"), LONG)
-def test_no_adversary_breaks_any_filter(preset: str, task: str, policies: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(("preset", "task"), LONG)
+def test_no_adversary_breaks_any_filter(preset: str, task: str) -> None:
     env = jaxsafe.make(task, rta=preset)
-    for policy in policies:
+    for policy in ("bang_bang", "greedy", "sideways", "intercept"):
         assert_unbroken(env, attack(env, policy, 300, 64, jax.random.key(1)))
 
 
