@@ -28,6 +28,7 @@ METRICS = (
     "episode_violation_severity_mean",
     "episode_violation_severity_max",
     "mean_reward",
+    "intervention_rate",
 )
 """The names that `summarise` returns."""
 
@@ -43,6 +44,7 @@ class Episode(Record):
     violating_steps: Int[Array, ""]  # steps with h < 0
     severity_sum: Float[Array, ""]  # Σ max(0, −h)/limit
     severity_max: Float[Array, ""]
+    interventions: Int[Array, ""]  # steps on which run time assurance changed the control
     reward_totals: Mapping[str, Float[Array, ""]]  # Σ of each reward term
 
 
@@ -50,7 +52,7 @@ def begin(timestep: TimeStep) -> Episode:
     """Sums at the start of an episode: all zero, in the shapes of `timestep`."""
     zero, count = jnp.zeros_like(timestep.reward), jnp.zeros(timestep.reward.shape, jnp.int32)
     totals = jax.tree.map(jnp.zeros_like, timestep.info.reward_totals)
-    return Episode(zero, count, count, zero, zero, count, zero, zero, totals)
+    return Episode(zero, count, count, zero, zero, count, zero, zero, count, totals)
 
 
 def accumulate(episode: Episode, timestep: TimeStep) -> Episode:
@@ -66,17 +68,19 @@ def accumulate(episode: Episode, timestep: TimeStep) -> Episode:
         episode.violating_steps + (timestep.cost > 0.0),
         episode.severity_sum + severity,
         jnp.maximum(episode.severity_max, severity),
+        episode.interventions + info.intervening,
         info.reward_totals,
     )
 
 
-def summarise(episodes: Episode, success: int, has_delta_v: bool = True) -> dict[str, float | None]:
+def summarise(episodes: Episode, success: int, has_delta_v: bool = True, has_rta: bool = False) -> dict[str, float | None]:
     """The metrics over a set of finished episodes.
 
     Args:
         episodes: sums of the episodes, each field of shape (episodes,).
         success: index of the outcome that counts as success.
         has_delta_v: whether control usage means anything in this task; if not it is None.
+        has_rta: whether there was run time assurance; if not its share of steps is None.
 
     Returns:
         Every name of `METRICS`: rates as fractions in [0, 1], Δv in m/s, length in steps, severity as a share of the limit
@@ -95,6 +99,7 @@ def summarise(episodes: Episode, success: int, has_delta_v: bool = True) -> dict
         "episode_violation_severity_mean": mean["severity_sum"] / violating if violating else 0.0,
         "episode_violation_severity_max": float(np.max(episodes.severity_max)),
         "mean_reward": mean["episode_return"] / max(steps, 1e-9),
+        "intervention_rate": mean["interventions"] / max(steps, 1e-9) if has_rta else None,
     }
 
 

@@ -45,6 +45,16 @@ def test_a_control_never_exceeds_its_limits(action: float, zero_centred: bool, r
     assert np.float32(-0.17) <= control <= np.float32(96.5)
 
 
+@settings(deadline=None, max_examples=50)
+@given(share=st.floats(0.0, 1.0, width=32), zero_centred=st.booleans(), rescale=st.booleans())
+def test_a_control_leads_back_to_the_action_that_gives_it(share: float, zero_centred: bool, rescale: bool) -> None:
+    one = actuator(-1.0, 2.0, zero_centred=zero_centred, rescale=rescale)
+    control = jnp.float32(-1.0 + 3.0 * share)
+    np.testing.assert_allclose(one.from_continuous(one.to_continuous(control)), control, atol=5e-7)
+    still = actuator(0.0, 0.0, zero_centred=zero_centred, rescale=rescale)
+    assert jnp.isfinite(still.to_continuous(jnp.float32(0.0)))
+
+
 def test_the_gradient_of_a_control_is_finite_on_both_sides_of_every_kink() -> None:
     for options in ({}, {"zero_centred": True}, {"rescale": False}):
         for action in (-2.0, -1.0, 0.0, 1.0, 2.0):

@@ -39,7 +39,7 @@ def time_step(
         reward_totals={"term": jnp.asarray(10.0 * reward)},
         control_desired=jnp.zeros(1),
         control_actual=jnp.zeros(1),
-        intervening=jnp.asarray(False),
+        intervening=jnp.asarray(severity[0] > 0.0),  # so that some are
         margins=margins,
         severity={name: jnp.asarray(share) for name, share in zip("ab", severity, strict=True)},
         rta=None,
@@ -84,6 +84,7 @@ def test_steps_add_up(episodes: Episode) -> None:
         "violating_steps": [0, 2, 1],
         "severity_sum": [0.0, 2.5, 0.1],
         "severity_max": [0.0, 2.0, 0.1],
+        "interventions": [0, 1, 1],
     }
     assert set(vars(episodes)) == {*expected, "reward_totals"}
     for name, values in expected.items():
@@ -110,7 +111,7 @@ def test_sums_work_on_batches_and_without_delta_v() -> None:
 
 
 def test_the_metrics_of_three_episodes_are_those_worked_out_by_hand(episodes: Episode) -> None:
-    found = summarise(episodes, SUCCESS)
+    found = summarise(episodes, SUCCESS, has_rta=True)
     assert tuple(found) == METRICS
     assert found == pytest.approx(
         {
@@ -124,6 +125,7 @@ def test_the_metrics_of_three_episodes_are_those_worked_out_by_hand(episodes: Ep
             "episode_violation_severity_mean": 2.6 / 3,  # over the three violating steps
             "episode_violation_severity_max": 2.0,
             "mean_reward": 3.0 / 7,
+            "intervention_rate": 2.0 / 7,
         },
         rel=1e-6,
     )
@@ -140,6 +142,7 @@ def test_without_violations_severity_is_zero() -> None:
 
 def test_control_usage_is_none_where_there_is_no_delta_v(episodes: Episode) -> None:
     found = summarise(episodes, SUCCESS, has_delta_v=False)
+    assert found["intervention_rate"] is None
     assert found["control_usage"] is None
     assert found["control_usage_l1"] is None
 

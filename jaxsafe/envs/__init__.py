@@ -87,7 +87,7 @@ def make(
     if actions is not None:
         env = _with_actions(env, actions)
     if rta is not None:
-        env = _with_rta(env, name, rta)
+        env = with_rta(env, name, rta)
     random = {} if randomize is None else {"randomize": randomize}
     return override(env, {**(overrides or {}), **random})
 
@@ -100,7 +100,12 @@ def _with_variant(env: Environment, task: str, variant: str) -> Environment:
     return override(env, VARIANTS[variant].get(task, {}))
 
 
-def _with_rta(env: Environment, task: str, rta: str | RTA) -> Environment:
+def with_rta(env: Environment, task: str, rta: str | RTA) -> Environment:
+    """The environment with a filter: one of the task's presets by name, a filter, or `none`.
+
+    Raises:
+        ConfigError: the task has no such preset.
+    """
     if isinstance(rta, RTA):
         return override(env, {"rta": rta})
     presets = {"none": lambda: None, **PRESETS.get(task, {})}

@@ -9,7 +9,7 @@ from typing import Any
 from jaxsafe import cli
 from jaxsafe.train.seeds import claim_cores
 
-OPTIONS = ("run", "episodes", "seed", "checkpoint", "deterministic", "out")
+OPTIONS = ("run", "rta", "episodes", "seed", "checkpoint", "deterministic", "out")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -17,13 +17,14 @@ def main(argv: Sequence[str]) -> int:
     claim_cores()
     cli.enable_compilation_cache()
     from jaxsafe.config import override
+    from jaxsafe.envs import with_rta
     from jaxsafe.errors import ConfigError
     from jaxsafe.evaluate.report import evaluate_run
     from jaxsafe.train import directory
     from jaxsafe.train.results import table
 
     arguments = cli.Arguments.parse(argv)
-    run, out, checkpoint = (arguments.pop_text(name) for name in ("run", "out", "checkpoint"))
+    run, out, checkpoint, rta = (arguments.pop_text(name) for name in ("run", "out", "checkpoint", "rta"))
     changes = arguments.pop_overrides()
     episodes, seed = arguments.pop_count("episodes", 1000), arguments.pop_count("seed", 0, least=0)
     deterministic = arguments.pop("deterministic")
@@ -34,12 +35,12 @@ def main(argv: Sequence[str]) -> int:
         raise ConfigError(f"deterministic: expected true or false, found {deterministic!r}")
     kinds = {None: ("stochastic", "deterministic"), True: ("deterministic",), False: ("stochastic",)}[deterministic]
     config, env, name = directory.read(Path(run), "run")
-    changed = override(env, changes)
+    changed = override(env if rta is None else with_rta(env, name, rta), changes)
     request: dict[str, Any] = {
         "episodes": episodes,
         "evaluation_seed": seed,
         "checkpoint": checkpoint or "last",
-        "changes": changes,
+        "changes": changes if rta is None else {"rta": rta, **changes},
     }
     path, results = evaluate_run(Path(run), config, (env, changed), name, kinds, request, out)
     print(table(results, path))
@@ -53,6 +54,7 @@ def usage() -> str:
         "  episodes=N             episodes of each seed (default 1000)\n"
         "  seed=N                 evaluation key: other starts and other noise (default 0, as in the run's own results)\n"
         "  checkpoint=last|best|N best is per seed by success in the evaluations during training (default last)\n"
+        "  rta=none|default|…     run time assurance (default as in training)\n"
         "  deterministic=true|false   one kind only (default both)\n"
         "  env.PATH=VALUE         change the environment, for instance env.deputy.start.position.distance=[1000,1000]\n"
         "  out=DIR                where to write (default: a new directory in RUN/evaluations)"

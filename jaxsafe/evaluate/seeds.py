@@ -72,7 +72,7 @@ def batch_keys(seed: int, batches: int) -> Iterator[Key]:
 def episode_rows(env: Environment, episodes: Episode, first_seed: int, **common: Any) -> list[dict[str, Any]]:
     """A row for each episode of each seed, for `eval.jsonl`."""
     success = success_index(env)
-    names = ("episode_return", "length", "delta_v", "delta_v_l1", "violating_steps", "severity_max")
+    names = ("episode_return", "length", "delta_v", "delta_v_l1", "violating_steps", "severity_max", "interventions")
     columns = {name: np.asarray(getattr(episodes, name)).tolist() for name in names}
     outcomes = np.asarray(episodes.outcome)
     return [
@@ -91,9 +91,9 @@ def episode_rows(env: Environment, episodes: Episode, first_seed: int, **common:
 
 def metrics_over_seeds(env: Environment, episodes: Episode) -> dict[str, Any]:
     """Every metric of Section 5: mean, interval, interquartile mean and per seed."""
-    has_delta_v = any(status.name == "delta_v" for status in env.status)
+    has_delta_v, has_rta = any(status.name == "delta_v" for status in env.status), env.rta is not None
     seeds = range(np.asarray(episodes.outcome).shape[0])
-    each = [summarise(jax.tree.map(lambda x, i=i: x[i], episodes), success_index(env), has_delta_v) for i in seeds]
+    each = [summarise(jax.tree.map(lambda x, i=i: x[i], episodes), success_index(env), has_delta_v, has_rta) for i in seeds]
     return {name: over_seeds([one[name] for one in each]) for name in METRICS}
 
 
@@ -105,6 +105,7 @@ def success_index(env: Environment) -> int:
 def _step_row(env: Environment, state: Any, timestep: Any, t: int) -> dict[str, Any]:
     info = timestep.info
     platforms = {name: {field: value[t] for field, value in vars(one).items()} for name, one in state.sim.platforms.items()}
+    assurance = {} if info.rta is None else {"intervening": info.intervening, **vars(info.rta)}
     pick = lambda tree: {name: _plain(value[t]) for name, value in tree.items()}  # noqa: E731
     return {
         "t": _plain(state.sim.time[t]),
@@ -113,6 +114,7 @@ def _step_row(env: Environment, state: Any, timestep: Any, t: int) -> dict[str, 
         "control_actual": dict(zip(env.action_names, _plain(info.control_actual[t]), strict=True)),
         "status": pick(info.status),
         "margins": pick(info.margins),
+        **({"rta": pick(assurance)} if assurance else {}),
         "reward_terms": pick(info.reward_terms),
         "reward": _plain(timestep.reward[t]),
         "outcome": env.outcomes[int(info.outcome[t])],

@@ -154,6 +154,15 @@ class DeltaVCost(Reward, type="delta_v"):
         return self.scale * sim.status[self.delta_v]
 
 
+class Intervention(Reward, type="intervention"):
+    """A constant on every step on which run time assurance changed the control: what a policy pays for leaning on it."""
+
+    scale: Dimensionless = -0.01
+
+    def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
+        return jnp.where(sim.intervening, self.scale, 0.0)
+
+
 class Success(Reward, type="success"):
     """value − t/t_max when the episode ends with `outcome`: sooner is better."""
 

@@ -46,6 +46,16 @@ class Actuator(Component):
             return jnp.where(share < 0.0, -self.low * share, self.high * share)
         return self.low + (share + 1.0) * (self.high - self.low) / 2.0
 
+    def to_continuous(self, control: Float[Array, ""]) -> Float[Array, ""]:
+        """Map a physical control within the limits to the action that gives it."""
+        if not self.rescale:
+            return control
+        if self.zero_centred:
+            bound = jnp.where(control < 0.0, -self.low, self.high)
+            return control / jnp.where(bound > 0.0, bound, 1.0)
+        width = self.high - self.low
+        return 2.0 * (control - self.low) / jnp.where(width > 0.0, width, 1.0) - 1.0
+
     def from_discrete(self, index: Array) -> Float[Array, ""]:
         """Map an index in 0 … points − 1 (clipped) to the physical control."""
         share = jnp.clip(index, 0, self.points - 1).astype(self.low.dtype) / (self.points - 1)
@@ -95,6 +105,10 @@ class Continuous(AgentController, type="continuous"):
 
     def control(self, action: Float[Array, " actuators"], sim: Sim) -> Controls:
         return {actuator.name: actuator.from_continuous(action[i]) for i, actuator in enumerate(self.actuators)}
+
+    def action(self, control: Float[Array, " actuators"]) -> Float[Array, " actuators"]:
+        """Return the action that gives a control within the limits, physical units in action order."""
+        return jnp.stack([actuator.to_continuous(control[i]) for i, actuator in enumerate(self.actuators)])
 
 
 class Discrete(AgentController, type="discrete"):

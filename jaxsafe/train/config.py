@@ -11,12 +11,13 @@ import jax.numpy as jnp
 
 from jaxsafe.cli import Arguments
 from jaxsafe.component import Component, Range, fields, normalise
-from jaxsafe.config import yaml
+from jaxsafe.config import override, yaml
 from jaxsafe.config.convert import expects, to_value
 from jaxsafe.environment import Environment
 from jaxsafe.envs import make
 from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.paths import set_path
+from jaxsafe.processors.reward import Intervention
 from jaxsafe.train.agent import Agent
 from jaxsafe.train.log import tensorboard_writer
 from jaxsafe.train.ppo import PPO
@@ -34,6 +35,7 @@ class TrainConfig(Component):
     actions: Literal["continuous", "discrete"] | None = None  # None: as the environment says
     variant: Literal["paper", "released"] | None = None  # None: paper
     rta: str | None = None  # None: as the environment says; default, or another preset of the task
+    rta_training: Literal["unpunished", "punished", "corrected"] = "unpunished"  # what PPO is told of interventions
     out: str | None = None  # None: a new directory in runs/
     eval_every: Count | None = None  # steps; None: a tenth of the run
     eval_episodes: Count = 100  # of each evaluation during training
@@ -68,10 +70,16 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
     config = TrainConfig()
     for path, value in arguments.options.items():  # first, so that a misspelt option is told before a slow start
         config = set_path(config, path, value, to_value)
-    env = make(task, overrides, actions=config.actions, variant=config.variant, rta=config.rta)
+    env = make(task, actions=config.actions, variant=config.variant, rta=config.rta)
+    if config.rta_training == "punished" and not any(isinstance(term, Intervention) for term in env.reward):
+        env = env.replace(reward=(*env.reward, normalise(Intervention(name="intervention"))))
+    env = override(env, overrides)
     config = normalise(TrainConfig())
     for path, value in {**recipe(task, arguments.options.get("preset")), **arguments.options}.items():
         config = set_path(config, path, value, to_value)
+    if config.rta_training == "corrected":
+        config = set_path(config, "ppo.learns_from", "actual", to_value)
+    _check_rta(config, env)
     if config.ppo.batch_size % config.ppo.num_minibatches:
         raise ConfigError(
             f"ppo.num_minibatches: expected a divisor of ppo.num_envs × ppo.num_steps = {config.ppo.batch_size},"
@@ -84,6 +92,13 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
     observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
     jax.eval_shape(lambda o: config.agent.inputs(env, o), observation)  # refuses features that this task cannot have
     return config, env, Path(task).stem
+
+
+def _check_rta(config: TrainConfig, env: Environment) -> None:
+    if config.rta_training != "unpunished" and env.rta is None:
+        raise ConfigError(f"rta_training: {config.rta_training!r} needs run time assurance, for instance rta=default")
+    if config.ppo.learns_from == "actual" and env.num_action_points:
+        raise ConfigError("ppo.learns_from: the actual control is no choice of discrete actions; use actions=continuous")
 
 
 def recipe(task: str, preset: str | None) -> dict[str, Any]:

@@ -76,7 +76,7 @@ def progress_rows(env: Environment, curves: dict[str, np.ndarray], seed: int, ba
 
 def columns(env: Environment) -> list[str]:
     """The measured columns of the progress log, averages over the window, in order."""
-    first = ["success_rate", "return", "length", "delta_v", "violating_steps"]
+    first = ["success_rate", "return", "length", "delta_v", "violating_steps", *(["interventions"] if env.rta else [])]
     return [*first, *(f"outcome/{name}" for name in env.outcomes[1:]), *(f"reward/{term.name}" for term in env.reward)]
 
 

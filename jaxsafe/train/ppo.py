@@ -6,7 +6,7 @@ devices and files are the caller's business. Hyperparameters that are numbers ar
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from jaxsafe.rollout import reset_batch, step_or_reset_batch
 from jaxsafe.train.agent import Agent, Params
 from jaxsafe.train.shuffle import shuffle
 from jaxsafe.train.window import Window, empty_window, push
-from jaxsafe.types import Dimensionless, Key, Positive, Record, State
+from jaxsafe.types import Dimensionless, Key, Positive, Record, State, TimeStep
 
 Share = Range(0.0, 1.0)
 
@@ -40,6 +40,7 @@ class PPO(Component):
     value_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.5
     entropy_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.0
     max_grad_norm: Annotated[Dimensionless, Positive] = 0.5
+    learns_from: Literal["desired", "actual"] = "desired"  # control, where run time assurance changed it
 
     @property
     def batch_size(self) -> int:
@@ -117,6 +118,8 @@ def collect(env: Environment, agent: Agent, ppo: PPO, state: TrainState, key: Ke
         policy = agent.distribution(env, state.params, inputs)
         action = policy.sample(key_act)
         (env_state, observation), timestep = step_or_reset_batch(env, env_state, action, key_reset)
+        if ppo.learns_from == "actual":
+            action = _acted(env, action, timestep)
         done, episode = timestep.done, accumulate(episode, timestep)
         transition = Transition(
             inputs, action, policy.log_prob(action), timestep.reward, timestep.terminated, done,
@@ -131,6 +134,13 @@ def collect(env: Environment, agent: Agent, ppo: PPO, state: TrainState, key: Ke
     start = (state.env_state, state.observation, state.episode)
     end, transitions = jax.lax.scan(one_step, start, jax.random.split(key, ppo.num_steps))
     return state.replace(env_state=end[0], observation=end[1], episode=end[2]), transitions
+
+
+def _acted(env: Environment, action: Array, timestep: TimeStep) -> Array:
+    """The actions, where run time assurance intervened those that give the control that acted."""
+    controller: Any = env.agent_platform.controller
+    acted = jax.vmap(controller.action)(timestep.info.control_actual)
+    return jnp.where(timestep.info.intervening[:, None], acted, action)
 
 
 def gae(reward: Array, value: Array, next_value: Array, terminated: Array, done: Array, gamma: Array, lam: Array) -> Array:

@@ -24,6 +24,7 @@ _ROWS = (
     ("episode_safety_violation_rate", "violating steps", "%"),
     ("episode_violation_severity_mean", "violation severity, mean", "%"),
     ("episode_violation_severity_max", "violation severity, max", "%"),
+    ("intervention_rate", "steps with an intervention", "%"),
 )
 
 

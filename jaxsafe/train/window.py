@@ -48,6 +48,7 @@ def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:
         "length": jnp.sum(weight * episodes.length),
         "delta_v": jnp.sum(weight * episodes.delta_v),
         "violating_steps": jnp.sum(weight * episodes.violating_steps / jnp.maximum(episodes.length, 1)),
+        "interventions": jnp.sum(weight * episodes.interventions / jnp.maximum(episodes.length, 1)),
         **{f"outcome/{name}": value for name, value in share.items()},
         **{f"reward/{name}": jnp.sum(weight * total) for name, total in episodes.reward_totals.items()},
     }

@@ -1,0 +1,123 @@
+"""Training and evaluating with run time assurance in the loop: what PPO is told of interventions, and what is reported."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tiny import TINY
+
+import jaxsafe
+from jaxsafe.cli import Arguments
+from jaxsafe.component import normalise
+from jaxsafe.errors import ConfigError
+from jaxsafe.evaluate.__main__ import main as evaluate
+from jaxsafe.train.__main__ import main as train
+from jaxsafe.train.agent import Agent
+from jaxsafe.train.config import TrainConfig, resolve
+from jaxsafe.train.ppo import PPO, Transition, collect, init
+
+step = jax.jit(jaxsafe.step)
+FAST = {"deputy": {"position": [100.0, 0.0], "velocity": [0.0, 0.405]}}
+
+
+def resolved(*words: str) -> tuple[TrainConfig, jaxsafe.Environment]:
+    return resolve(Arguments.parse(["env=docking2d", *words]))[:2]
+
+
+def collected(learns_from: str) -> Transition:
+    env = jaxsafe.make("docking2d", rta="default")
+    agent, ppo = normalise(Agent(hidden=(8,))), normalise(PPO(num_envs=16, num_steps=32, learns_from=learns_from))
+    state = init(env, agent, ppo, jax.random.key(0))
+    return jax.jit(lambda state, key: collect(env, agent, ppo, state, key)[1])(state, jax.random.key(1))
+
+
+def test_ppo_learns_from_the_desired_or_the_actual_control() -> None:
+    desired, actual = np.asarray(collected("desired").action), np.asarray(collected("actual").action)
+    altered = (desired != actual).any(axis=-1)
+    assert 0.01 < altered.mean() < 0.9
+    assert (np.abs(actual[altered]) <= 1.0).all()  # what acted was within its bounds
+    assert (np.abs(desired[~altered]) == np.abs(actual[~altered])).all()
+
+
+def test_the_log_probability_is_that_of_the_stored_action() -> None:
+    env = jaxsafe.make("docking2d", rta="default")
+    agent, ppo = normalise(Agent(hidden=(8,))), normalise(PPO(num_envs=16, num_steps=32, learns_from="actual"))
+    params = init(env, agent, ppo, jax.random.key(0)).params
+    found = collected("actual")
+    expected = agent.distribution(env, params, found.inputs).log_prob(found.action)
+    np.testing.assert_allclose(found.log_prob, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_an_intervention_costs_what_its_term_says() -> None:
+    _, env = resolved("rta=default", "rta_training=punished", "env.reward.intervention.scale=-0.25")
+    state, first = jaxsafe.reset_to(env, FAST)
+    assert first.info.reward_terms["intervention"] == 0.0
+    for push, cost in [(1.0, -0.25), (-1.0, 0.0)]:
+        _, timestep = step(env, state, jnp.array([0.0, push]))
+        assert timestep.info.intervening == (cost < 0.0)
+        assert timestep.info.reward_terms["intervention"] == cost
+    again = resolve(Arguments.parse(["env=docking2d", "rta=default"]))[1]
+    assert [term.name for term in again.reward] == [term.name for term in env.reward][:-1]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["rta_training=punished"], r"^rta_training: 'punished' needs run time assurance, for instance rta=default"),
+        (["rta=default", "rta_training=punishd"], r"^rta_training: .*Did you mean 'punished'"),
+        (["rta=default", "rta_training=corrected", "actions=discrete"], r"^ppo\.learns_from: .*use actions=continuous"),
+        (["rta=released"], r"^rta: docking2d has no preset 'released'"),
+    ],
+)
+def test_what_does_not_go_together_is_told(words: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        resolved(*words)
+
+
+def test_corrected_is_a_setting_of_ppo() -> None:
+    config, env = resolved("rta=default", "rta_training=corrected")
+    assert config.ppo.learns_from == "actual"
+    assert env.rta is not None
+    assert resolved()[0].ppo.learns_from == "desired"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("rta") / "run"
+    assert train([*TINY, "rta=explicit_simplex", "rta_training=punished", f"out={out}"]) == 0
+    return out
+
+
+def results(path: Path) -> Any:
+    return json.loads((path / "results.json").read_text())["evaluation"]["stochastic"]
+
+
+def test_a_run_reports_how_often_it_was_corrected(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert results(run)["intervention_rate"]["mean"] > 0.0
+    assert results(run)["episode_safety_violation_rate"]["mean"] == 0.0
+    rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
+    assert any(row["interventions"] for row in rows)
+    assert any(row["reward/intervention"] for row in rows)
+    logged = [json.loads(line) for file in run.rglob("*.jsonl") for line in file.read_text().splitlines()]
+    steps = [row["rta"] for row in logged if "rta" in row]
+    assert any(row["intervening"] for row in steps)
+    assert all(row["certified"] for row in steps)
+
+
+def test_an_evaluation_switches_the_filter(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert evaluate([f"run={run}", "episodes=6", f"out={tmp_path / 'own'}"]) == 0
+    assert results(tmp_path / "own") == results(run)
+    assert "steps with an intervention" in capsys.readouterr().out
+    assert evaluate([f"run={run}", "episodes=6", "rta=none", f"out={tmp_path / 'none'}"]) == 0
+    assert "intervention" not in capsys.readouterr().out
+    assert results(tmp_path / "none")["intervention_rate"]["mean"] is None
+    assert results(tmp_path / "none")["episode_safety_violation_rate"]["mean"] > 0.0
+    assert json.loads((tmp_path / "none" / "results.json").read_text())["changes"] == {"rta": "none"}
+    assert evaluate([f"run={run}", "episodes=6", "rta=discrete_asif", f"out={tmp_path / 'other'}"]) == 0
+    assert results(tmp_path / "other") != results(run)
+    with pytest.raises(ConfigError, match=r"^rta: docking2d has no preset 'of'"):
+        evaluate([f"run={run}", "rta=of"])
