@@ -114,6 +114,6 @@ def _steer(env: Any, value: Callable[[Array], Array], sign: float, key: Key) -> 
 
 
 def smallest_margin(env: Any, sim: Sim, before: Sim | None = None) -> Float[Array, ""]:
-    """The smallest h of all constraints; with `before`, distances on the straight way from there."""
+    """The smallest h of all constraints; with `before`, distances on the way from there."""
     judged = judge(env, sim, before)
     return jnp.min(jnp.stack([constraint(env, one.name).margin(judged) for one in env.constraints]))

@@ -73,7 +73,7 @@ class CertifiedRTA(RTA):
     A control is certified if after the step every constraint keeps its `margin`, h ≥ margin, and, with a `horizon`, also on
     the way of a backup controller from there over that many steps, which must end in the `terminal` set. What is not
     certified is replaced by the backup controller of the last certificate. After an intervention control returns to the
-    agent only with `release` on top of the margin. With `swept`, distances count on the straight way between steps as well.
+    agent only with `release` on top of the margin. With `swept`, a lower bound of distances between steps counts as well.
     Without `enforce` a feasible proposal acts whatever the prediction says, as filters of the literature do: to compare.
     """
 

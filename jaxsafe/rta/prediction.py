@@ -38,8 +38,8 @@ def commanded(env: Any, platform: Any, sim: Sim, control: Float[Array, " m"]) ->
 def judge(env: Any, sim: Sim, before: Sim | None = None) -> Sim:
     """Regions and statuses from the platforms alone; statuses with memory are taken as at a reset.
 
-    With `before`, one step earlier, distances are the smallest on the straight way from there, so that nothing slips
-    through between two instants.
+    With `before`, one step earlier, distances are lower bounds on the way from there, so that nothing slips through between
+    two instants.
     """
     sim = sim.replace(regions={region.name: region.place(sim.platforms) for region in env.regions}, status={})
     earlier = None if before is None else judge(env, before)

@@ -35,16 +35,16 @@ TURN: dict[str, Any] = {
 
 MATCH_2D: dict[str, Any] = {
     "constraints": ("collision",),
-    "margin": 6.0,  # ft; a relative path bends by up to 4.4 ft between samples
+    "margin": 1.0,  # ft; for what prediction and plant may differ by in float32
     "swept": True,
     "backups": tuple(MatchVelocity(name=turn, lead="lead", turn=turn) for turn in ("left", "right")),
     "horizon": 40,
-    "terminal": VelocityMatched(of="wingman", to="lead", tolerance=1.0, clearance=106.0),
+    "terminal": VelocityMatched(of="wingman", to="lead", tolerance=1.0, clearance=101.0),
 }
 
 MATCH_3D: dict[str, Any] = {
     "constraints": ("collision",),
-    "margin": 8.0,
+    "margin": 2.0,
     "swept": True,
     "backups": tuple(
         MatchVelocity(name=f"{turn}_{climb}", lead="lead", turn=turn, climb=climb)
@@ -52,7 +52,7 @@ MATCH_3D: dict[str, Any] = {
         for climb in ("up", "down")
     ),
     "horizon": 60,
-    "terminal": VelocityMatched(of="wingman", to="lead", tolerance=8.0, clearance=108.0, drift=8.0),
+    "terminal": VelocityMatched(of="wingman", to="lead", tolerance=8.0, clearance=102.0, drift=8.0),
 }
 
 

@@ -1,0 +1,232 @@
+"""What does run time assurance cost, and how much does it change?
+
+Filter calls a second in a batch of 4096 states met on the way under random actions, float32, compiling apart, medians; the
+small quadratic program; how often and how much each docking filter alters random actions; and what a filter in the loop
+adds to the wall time of training, in turns with training without one. Where cbfpy or run-time-assurance are installed
+their filters run in the same invocation. Writes `benchmarks/results/rta.json` and prints the tables:
+
+    python benchmarks/rta.py [parts=calls,qp,change,training] [repeats=7]
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxsafe
+from jaxsafe.component import normalise
+from jaxsafe.rollout import reset_batch, step_or_reset_batch
+from jaxsafe.rta.attack import attack
+from jaxsafe.rta.prediction import bounds
+from jaxsafe.rta.presets import PRESETS
+from jaxsafe.rta.qp import nearest_control
+from jaxsafe.train.agent import Agent
+from jaxsafe.train.ppo import PPO, init, update
+
+OUT = Path(__file__).parent / "results" / "rta.json"
+BATCH = 4096
+
+
+def main() -> None:
+    """Run, write, print."""
+    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
+    repeats = int(options.get("repeats", "7"))
+    parts = {"calls": calls, "qp": programs, "change": changes, "training": training}
+    chosen = options.get("parts", ",".join(parts)).split(",")
+    known = json.loads(OUT.read_text()) if OUT.exists() else {}
+    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
+    about = {"commit": commit, "jax": jax.__version__, "device": jax.devices()[0].device_kind, "cores": os.cpu_count()}
+    for name in chosen:
+        rows = parts[name](repeats)
+        known[name] = {**about, "rows": rows}
+        print(f"\n{name}\n" + table(rows))
+        OUT.parent.mkdir(exist_ok=True)
+        OUT.write_text(json.dumps(known, indent=1) + "\n")
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Markdown, a column for each key."""
+    names = list(rows[0])
+    lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
+    return "\n".join(lines + ["| " + " | ".join(_short(row[name]) for name in names) + " |" for row in rows])
+
+
+def timed(run: Callable[[], Any], repeats: int) -> tuple[float, float]:
+    """Median wall time of a run and that of the first, in seconds."""
+    began = time.perf_counter()
+    jax.block_until_ready(run())
+    first, times = time.perf_counter() - began, []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        jax.block_until_ready(run())
+        times.append(time.perf_counter() - began)
+    return statistics.median(times), first
+
+
+def calls(repeats: int) -> list[dict[str, Any]]:
+    """Filter calls a second."""
+    rows = []
+    for task, presets in PRESETS.items():
+        for preset in (name for name in presets if name != "default"):
+            env = jaxsafe.make(task, rta=preset)
+            states, desired = met(env)
+
+            def run(env: Any = env, states: Any = states, desired: Any = desired) -> Any:
+                return _filter(env, states, desired)
+
+            seconds, first = timed(run, repeats)
+            rows.append({"task": task, "filter": preset, "calls_per_s": BATCH / seconds, "compile_s": first - seconds})
+            print(rows[-1], flush=True)
+    return rows + peers(repeats)
+
+
+@jax.jit
+def _filter(env: Any, states: Any, desired: Any) -> Any:
+    return jax.vmap(lambda state, u: env.rta.filter(env, state.sim, state.memory.rta, u))(states, desired)
+
+
+def met(env: jaxsafe.Environment) -> tuple[Any, jax.Array]:
+    """States after 100 steps of random actions, and random controls."""
+    size, (low, high) = env.action_size, bounds(env)
+
+    @jax.jit
+    def run(env: Any, key: jax.Array) -> Any:
+        state, timestep = reset_batch(env, key, BATCH)
+
+        def one(carry: Any, key: jax.Array) -> tuple[Any, None]:
+            key_action, key_reset = jax.random.split(key)
+            action = jax.random.uniform(key_action, (BATCH, size), minval=-1.0)
+            return step_or_reset_batch(env, carry[0], action, key_reset)[0], None
+
+        return jax.lax.scan(one, (state, timestep.observation), jax.random.split(key, 100))[0][0]
+
+    desired = low + (high - low) * jax.random.uniform(jax.random.key(1), (BATCH, size))
+    return run(env, jax.random.key(0)), desired
+
+
+def peers(repeats: int) -> list[dict[str, Any]]:
+    """The filter of cbfpy for the docking constraint in a batch, where it is installed."""
+    try:
+        cbfpy = importlib.import_module("cbfpy")
+    except ImportError:
+        return []
+    n, mass = 0.001027, 12.0
+
+    class Docking(cbfpy.CBFConfig):
+        def __init__(self) -> None:
+            super().__init__(n=4, m=2, u_min=-np.ones(2), u_max=np.ones(2))
+
+        def f(self, z: jax.Array) -> jax.Array:
+            return jnp.array([z[2], z[3], 3 * n**2 * z[0] + 2 * n * z[3], -2 * n * z[2]])
+
+        def g(self, z: jax.Array) -> jax.Array:
+            return jnp.concatenate([jnp.zeros((2, 2)), jnp.eye(2) / mass])
+
+        def h_1(self, z: jax.Array) -> jax.Array:
+            return jnp.array([0.2 + 2 * n * jnp.linalg.norm(z[:2]) - jnp.linalg.norm(z[2:])])
+
+        def alpha(self, h: jax.Array) -> jax.Array:
+            return 0.05 * h + 0.1 * h**3
+
+    cbf = cbfpy.CBF.from_config(Docking())
+    env = jaxsafe.make("docking2d", rta="explicit_asif")
+    states, desired = met(env)
+    deputy = states.sim.platforms["deputy"]
+    z = jnp.concatenate([deputy.position, deputy.velocity], axis=-1)
+    batched = jax.jit(jax.vmap(cbf.safety_filter))
+    seconds, first = timed(lambda: batched(z, desired), repeats)
+    return [{"task": "docking2d", "filter": "cbfpy", "calls_per_s": BATCH / seconds, "compile_s": first - seconds}]
+
+
+def programs(repeats: int) -> list[dict[str, Any]]:
+    """The small quadratic program: solutions a second, and its distance from the same in float64."""
+    rng, rows = np.random.default_rng(0), []
+    solve = jax.jit(jax.vmap(nearest_control))
+    for m in range(1, 7):
+        problem = [
+            rng.uniform(-1.0, 1.0, (BATCH, m)), -np.ones((BATCH, m)), np.ones((BATCH, m)),
+            rng.normal(size=(BATCH, 2, m)), 0.5 * rng.normal(size=(BATCH, 2)),
+        ]  # fmt: skip
+        single = [each.astype(np.float32) for each in problem]
+        seconds, _ = timed(lambda single=single: solve(*single), repeats)
+        found, feasible = solve(*single)
+        with jax.enable_x64():
+            exact, possible = solve(*(each.astype(np.float64) for each in single))
+        error = np.abs(found - exact).max(axis=1)[np.asarray(feasible & possible)]
+        rows.append(
+            {
+                "variables": m,
+                "rows": 2,
+                "solutions_per_s": BATCH / seconds,
+                "median_error": np.median(error),
+                "error_99_percent": np.quantile(error, 0.99),
+            }
+        )
+    return rows
+
+
+def changes(repeats: int) -> list[dict[str, Any]]:
+    """How often and how much random actions are altered, and what is violated all the same."""
+    del repeats
+    rows = []
+    for task in ("docking2d", "docking3d"):
+        for preset in ("discrete_asif", "explicit_simplex", "implicit_asif", "explicit_asif"):
+            for policy in ("uniform", "bang_bang"):
+                row = attack(jaxsafe.make(task, rta=preset), policy, 1000, 128, jax.random.key(0))
+                names = ("violating_steps", "intervention_rate", "mean_correction", "worst_margin")
+                rows.append({"task": task, "filter": preset, "actions": policy, **{name: row[name] for name in names}})
+    return rows
+
+
+def training(repeats: int) -> list[dict[str, Any]]:
+    """Wall time of an update of PPO with a filter in the loop, as a share of that without."""
+    agent, ppo, rows = normalise(Agent()), normalise(PPO(num_envs=64, num_steps=128)), []
+    step = jax.jit(lambda env, state: update(env, agent, ppo, 100, state))
+    for task, presets in {
+        "docking2d": ("explicit_simplex", "discrete_asif"),
+        "docking3d": ("explicit_simplex", "discrete_asif"),
+        "docking2d_oriented": ("default",),
+        "rejoin2d": ("default",),
+        "rejoin3d": ("default",),
+    }.items():
+        envs = {name: jaxsafe.make(task, rta=name) for name in ("none", *presets)}
+        states = {name: init(env, agent, ppo, jax.random.key(0)) for name, env in envs.items()}
+        times: dict[str, list[float]] = {name: [] for name in envs}
+        for _ in range(repeats + 1):  # in turns; the first compiles
+            for name, env in envs.items():
+                times[name].append(timed(functools.partial(step, env, states[name]), 1)[0])
+        bare = times["none"][1:]
+        for name in presets:
+            ratios = [a / b for a, b in zip(times[name][1:], bare, strict=True)]
+            rows.append(
+                {
+                    "task": task,
+                    "filter": name,
+                    "update_s": statistics.median(times[name][1:]),
+                    "without_s": statistics.median(bare),
+                    "ratio": statistics.median(ratios),
+                }
+            )
+            print(rows[-1], flush=True)
+    return rows
+
+
+def _short(value: Any) -> str:
+    return f"{value:.3g}" if isinstance(value, float) else str(value)
+
+
+if __name__ == "__main__":
+    main()
