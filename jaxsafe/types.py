@@ -110,7 +110,7 @@ class RTAInfo(Record):
     correction: Float[Array, ""]  # ‖u_act − u_des‖, physical units
     feasible: Bool[Array, ""]  # whether some control met the filter's constraints
     certified: Bool[Array, ""]  # whether the control that acts is known to be safe
-    predicted_margin: Float[Array, ""]  # smallest h after the step, as predicted
+    predicted_margin: Float[Array, ""]  # smallest h after the step, for separations also on the way, as predicted
     backup_index: Int[Array, ""]  # the backup controller in reserve
 
 

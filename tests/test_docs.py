@@ -97,7 +97,7 @@ def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax
     return outcome, cost.sum(), margin.min()
 
 
-@pytest.mark.parametrize("page", ["compose", "extend", "deviations"])
+@pytest.mark.parametrize("page", ["compose", "extend", "extend_rta", "rta", "deviations"])
 def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_path: Path) -> None:
     """Blocks that begin with the name of a file are written to it; the others run in one program, in their order.
 
@@ -125,6 +125,18 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_pa
     process = run(["program.py"], tmp_path)
     assert process.returncode == 0, process.stderr
     assert process.stdout.split(f"{MARK}\n")[:-1] == expected
+
+
+@pytest.mark.slow
+def test_terminal_sets_hold_where_the_page_says_so(tmp_path: Path) -> None:
+    page = (ROOT / "docs" / "rta.md").read_text(encoding="utf-8")
+    script = next(text for _, text in BLOCK.findall(page) if text.startswith("# terminal_sets.py\n"))
+    (tmp_path / "terminal_sets.py").write_text(script, encoding="utf-8")
+    process = run(["terminal_sets.py"], tmp_path)
+    assert process.returncode == 0, process.stderr
+    lines = process.stdout.splitlines()
+    assert len(lines) == 2
+    assert all(line.endswith("below the margin: 0") for line in lines), process.stdout
 
 
 def run(arguments: list[str], directory: Path) -> subprocess.CompletedProcess[str]:

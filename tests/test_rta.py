@@ -60,7 +60,7 @@ def assert_unbroken(env: Environment, row: dict[str, Any]) -> None:
     assert row["unsafe_starts"] == 0.0
     assert env.rta is not None
     assert row["worst_margin"] >= float(env.rta.margin) - 1e-4
-    if env.rta.swept:
+    if env.constraints[0].between:
         assert row["worst_margin_inside"] >= float(env.rta.margin) - 0.5  # ft; the bound is looser on shorter steps
 
 
@@ -92,7 +92,7 @@ def test_a_control_that_is_certified_passes_unaltered(task: str) -> None:
     assert not info.intervening
     assert info.rta.correction == 0.0
     assert info.rta.certified
-    np.testing.assert_allclose(info.rta.predicted_margin, min(info.margins.values()), rtol=1e-6)
+    np.testing.assert_allclose(info.rta.predicted_margin, min(info.margins.values()), rtol=1e-4)  # a bound in between
 
 
 def fast(env: Environment) -> Any:
@@ -188,6 +188,28 @@ def test_the_sampled_data_filter_changes_no_more_than_it_must(task: str) -> None
         assert np.linalg.norm(found - desired) <= np.linalg.norm(best.x - desired) + 1e-6
         altered += bool(timestep.info.intervening)
     assert 5 < altered < 25
+
+
+@pytest.mark.parametrize("task", DOCKING)
+def test_in_float32_every_projection_is_certified(task: str) -> None:
+    env = jaxsafe.make(task, rta="discrete_asif")
+    size = env.action_size
+
+    def one(key: jax.Array) -> tuple[jax.Array, ...]:
+        keys = jax.random.split(key, 4)
+        way, course = jax.random.normal(keys[0], (2, size))
+        distance = 2000.0 * jax.random.uniform(keys[1]) ** 2
+        speed = (0.2 + 2 * 0.001027 * distance) * jax.random.uniform(keys[2], minval=0.99)
+        start = {"position": distance * way / jnp.linalg.norm(way), "velocity": speed * course / jnp.linalg.norm(course)}
+        state, first = jaxsafe.reset_to(env, {"deputy": start})
+        desired = jax.random.uniform(keys[3], (size,), minval=-1.0)
+        projected, feasible = env.rta.propose(env, state.sim, desired, jnp.zeros(size))
+        actual, _, _ = env.rta.filter(env, state.sim, state.memory.rta, desired)
+        return first.info.rta.certified & feasible, jnp.any(actual != projected), jnp.any(projected != desired)
+
+    known, backed_up, altered = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(0), 20_000))
+    assert (known & altered).sum() > 5000
+    assert not (known & backed_up).any()
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from jaxtyping import Array, Float
 
@@ -14,6 +14,8 @@ class Constraint(Component):
     """A signed margin h, safe where h ≥ 0, and the limit of which a violation is a share."""
 
     name: str
+    between: ClassVar[bool] = False
+    """Whether h can fall far below 0 between two safe instants; then filters bound it on the way, `Status.on_the_way`."""
 
     def margin(self, sim: Sim) -> Float[Array, ""]:
         """Return h, in the units of the limit."""
@@ -40,6 +42,7 @@ class SpeedLimit(Constraint, type="speed_limit"):
 class Separation(Constraint, type="separation"):
     """h = distance − minimum, Eqs. (8), (11)."""
 
+    between: ClassVar[bool] = True
     distance: StatusName
     minimum: Annotated[Length, Positive]
 

@@ -42,8 +42,8 @@ class Distance(Status, type="distance"):
         return safe_norm(self._apart(sim))
 
     def on_the_way(self, before: Sim, sim: Sim) -> Float[Array, ""]:
-        change = _velocity(sim, self.of) - _velocity(before, self.of) - _velocity(sim, self.to) + _velocity(before, self.to)
-        return closest_approach(self._apart(before), self._apart(sim)) - _bend(change, sim.time - before.time)
+        bend = _bend(before, sim, self.of) + _bend(before, sim, self.to)
+        return closest_approach(self._apart(before), self._apart(sim)) - bend
 
     def _apart(self, sim: Sim) -> Float[Array, " d"]:
         return sim.platforms[self.of].position - sim.platforms[self.to].position
@@ -59,8 +59,8 @@ class RegionDistance(Status, type="region_distance"):
         return safe_norm(self._apart(sim))
 
     def on_the_way(self, before: Sim, sim: Sim) -> Float[Array, ""]:
-        change = _velocity(sim, self.of) - _velocity(before, self.of)  # a region is taken to move straight on
-        return closest_approach(self._apart(before), self._apart(sim)) - _bend(change, sim.time - before.time)
+        bend = _bend(before, sim, self.of)  # a region is taken to move straight on
+        return closest_approach(self._apart(before), self._apart(sim)) - bend
 
     def _apart(self, sim: Sim) -> Float[Array, " d"]:
         return sim.platforms[self.of].position - sim.regions[self.region].position
@@ -137,13 +137,10 @@ class DeltaV(Status, type="delta_v"):
         return safe_norm(delta_v) if self.norm == "l2" else jnp.sum(jnp.abs(delta_v))
 
 
-def _velocity(sim: Sim, name: str) -> Float[Array, " d"]:
-    return sim.platforms[name].velocity
-
-
-def _bend(change: Float[Array, " d"], duration: Float[Array, ""]) -> Float[Array, ""]:
-    """How far a path may leave the straight line between its ends while its velocity changes by `change`.
+def _bend(before: Sim, sim: Sim, name: str) -> Float[Array, ""]:
+    """How far a platform's path may leave the straight line between two instants, from its change of velocity.
 
     ‖Δv‖Δt/8 at a constant acceleration, and up to 32/27 of that where it stops on the way, at a limit.
     """
-    return 0.15 * safe_norm(change) * duration
+    change = sim.platforms[name].velocity - before.platforms[name].velocity
+    return 0.15 * safe_norm(change) * (sim.time - before.time)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.rta.prediction import advance, bounds, constraint, judge
+from jaxsafe.rta.prediction import advance, bounds, smallest_margin
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.types import Key, Sim
 
@@ -33,8 +33,7 @@ def greedy(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
     """The control that lowers the smallest h after the step most steeply; a random one where it has no influence."""
 
     def h(u: Float[Array, " m"]) -> Float[Array, ""]:
-        later = judge(env, advance(env, sim, u))
-        return jnp.min(jnp.stack([one.margin(later) for one in env.constraints]))
+        return smallest_margin(env, advance(env, sim, u))
 
     return _steer(env, h, -1.0, key)
 
@@ -111,9 +110,3 @@ def _steer(env: Any, value: Callable[[Array], Array], sign: float, key: Key) -> 
     low, high = bounds(env)
     slope = sign * jax.grad(value)((low + high) / 2.0)
     return jnp.where(slope == 0.0, bang_bang(env, None, key), jnp.where(slope > 0.0, high, low))  # type: ignore[arg-type]
-
-
-def smallest_margin(env: Any, sim: Sim, before: Sim | None = None) -> Float[Array, ""]:
-    """The smallest h of all constraints; with `before`, distances on the way from there."""
-    judged = judge(env, sim, before)
-    return jnp.min(jnp.stack([constraint(env, one.name).margin(judged) for one in env.constraints]))

@@ -25,7 +25,7 @@ class DiscreteASIF(CertifiedRTA, type="discrete_asif"):
 
     The velocity after the step is v̄ + Bu and the limit at least c + gᵀu, as a norm is convex. With columns of B that are
     orthogonal and of equal length √β, ‖v̄ + Bu‖ ≤ c + gᵀu follows from β‖u‖² + 2(Bᵀv̄ − cg)·u + ‖v̄‖² − c² ≤ 0, a ball, and
-    the projection onto box and ball is closed.
+    the projection onto box and ball is closed. It aims some rounding errors inside, so that its solution is certified.
     """
 
     gamma: Annotated[Number, Unit("1"), Range(0.0, 1.0, open_low=True)] = 1.0
@@ -37,7 +37,9 @@ class DiscreteASIF(CertifiedRTA, type="discrete_asif"):
         self, env: Any, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
         spare = jnp.maximum(constraint(env, self.constraints[0]).margin(judge(env, sim)) - self.margin, 0.0)
-        ball = speed_ball(env, sim, jnp.zeros_like(desired), self.constraints[0], self.margin + (1.0 - self.gamma) * spare)
+        rounding = 16.0 * jnp.finfo(desired.dtype).eps * constraint(env, self.constraints[0]).limit(judge(env, sim))
+        margin = self.margin + (1.0 - self.gamma) * spare + rounding
+        ball = speed_ball(env, sim, jnp.zeros_like(desired), self.constraints[0], margin)
         return project_box_ball(desired, *bounds(env), *ball)
 
 

@@ -1,7 +1,7 @@
 """Adversaries at work on an environment, with or without a filter, and what is counted while they are.
 
 Violations are counted at the samples, and inside the steps by moving the platforms to `PARTS` instants of each with the
-control held, with a lower bound of distances between two of them.
+control held, separations also between two of them.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from jaxtyping import Array, Float
 from jaxsafe.environment import Environment, step
 from jaxsafe.paths import set_path
 from jaxsafe.rollout import reset_batch
-from jaxsafe.rta.adversaries import ADVERSARIES, smallest_margin
-from jaxsafe.rta.prediction import advance, bounds
+from jaxsafe.rta.adversaries import ADVERSARIES
+from jaxsafe.rta.prediction import advance, bounds, smallest_margin
 from jaxsafe.simulation.controllers import Continuous
 from jaxsafe.types import Key, Sim, State, TimeStep
 

@@ -46,6 +46,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.errors import ConfigError, nearest
     from jaxsafe.rta.adversaries import ADVERSARIES
     from jaxsafe.rta.attack import SEARCH, attack
+    from jaxsafe.rta.presets import PRESETS
     from jaxsafe.train.files import write_text
 
     arguments = cli.Arguments.parse(argv)
@@ -61,7 +62,9 @@ def main(argv: Sequence[str]) -> int:
     for name in policies if isinstance(policies, list) else [policies]:
         if name not in known:
             raise ConfigError(f"policies: unknown policy {name!r}; choose from {nearest(name, known)}")
-    env = make(task, changes, **{**options, "rta": options["rta"] or "default"})
+    if options["rta"] is None and task in PRESETS:
+        options["rta"] = "default"
+    env = make(task, changes, **options)
     if not env.constraints:
         raise ConfigError(f"env: {task} has no safety constraint")
     rows = []
@@ -80,7 +83,7 @@ def usage() -> str:
     """The help text."""
     return (
         "usage: python -m jaxsafe.rta.falsify env=TASK [key=value …]\n\n"
-        "  rta=default            the filter to attack; none attacks the bare task\n"
+        "  rta=default            the filter to attack (that of a file: its own); none attacks the bare task\n"
         "  steps=N                steps of each adversary (default 100000), over lanes=N episodes at once (default 256)\n"
         "  policies=[a,b]         some adversaries only\n"
         "  seed=N                 (default 0)\n"

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.component import Component, Range, Unit
-from jaxsafe.rta.prediction import advance, bounds, constraint, judge
+from jaxsafe.rta.prediction import advance, bounds, smallest_margin
 from jaxsafe.types import ConstraintName, Number, Record, RTAInfo, Sim
 
 Margin = Annotated[Number, Unit("as the constraint"), Range(0.0)]
@@ -73,7 +73,7 @@ class CertifiedRTA(RTA):
     A control is certified if after the step every constraint keeps its `margin`, h ≥ margin, and, with a `horizon`, also on
     the way of a backup controller from there over that many steps, which must end in the `terminal` set. What is not
     certified is replaced by the backup controller of the last certificate. After an intervention control returns to the
-    agent only with `release` on top of the margin. With `swept`, a lower bound of distances between steps counts as well.
+    agent only with `release` on top of the margin.
     Without `enforce` a feasible proposal acts whatever the prediction says, as filters of the literature do: to compare.
     """
 
@@ -83,7 +83,6 @@ class CertifiedRTA(RTA):
     horizon: Annotated[int, Range(0)] = 0
     terminal: TerminalSet | None = None
     release: Margin = 0.0
-    swept: bool = False
     enforce: bool = True
 
     def problem(self) -> str | None:
@@ -150,9 +149,8 @@ class CertifiedRTA(RTA):
         return actual, memory, info
 
     def lowest(self, env: Any, before: Sim, sim: Sim) -> Float[Array, ""]:
-        """Return the smallest h of the constraints."""
-        judged = judge(env, sim, before if self.swept else None)
-        return jnp.min(jnp.stack([constraint(env, name).margin(judged) for name in self.constraints]))
+        """Return the smallest h of the constraints at `sim` and, for separations, on the way from `before`."""
+        return smallest_margin(env, sim, before, self.constraints)
 
     def certify(self, env: Any, before: Sim, sim: Sim) -> Float[Array, " backups"]:
         """Return for each backup controller the smallest h on its way from `sim`; −∞ if it ends outside the last set."""

@@ -5,6 +5,7 @@ Prediction uses the plant's own map over one step, so a certificate speaks about
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import jax.numpy as jnp
@@ -52,6 +53,20 @@ def judge(env: Any, sim: Sim, before: Sim | None = None) -> Sim:
 def constraint(env: Any, name: str) -> Any:
     """A safety constraint by name."""
     return next(one for one in env.constraints if one.name == name)
+
+
+def smallest_margin(
+    env: Any, sim: Sim, before: Sim | None = None, names: Collection[str] | None = None
+) -> Float[Array, ""]:
+    """The smallest h of some safety constraints, None for all.
+
+    With `before`, one step earlier, of constraints that can be broken between two instants (`Constraint.between`) a lower
+    bound on the way from there counts.
+    """
+    now = judge(env, sim)
+    way = now if before is None else judge(env, sim, before)
+    chosen = [one for one in env.constraints if names is None or one.name in names]
+    return jnp.min(jnp.stack([one.margin(way if one.between else now) for one in chosen]))
 
 
 def bounds(env: Any) -> tuple[Float[Array, " m"], Float[Array, " m"]]:

@@ -36,7 +36,6 @@ TURN: dict[str, Any] = {
 MATCH_2D: dict[str, Any] = {
     "constraints": ("collision",),
     "margin": 1.0,  # ft; for what prediction and plant may differ by in float32
-    "swept": True,
     "backups": tuple(MatchVelocity(name=turn, lead="lead", turn=turn) for turn in ("left", "right")),
     "horizon": 40,
     "terminal": VelocityMatched(of="wingman", to="lead", tolerance=1.0, clearance=101.0),
@@ -45,7 +44,6 @@ MATCH_2D: dict[str, Any] = {
 MATCH_3D: dict[str, Any] = {
     "constraints": ("collision",),
     "margin": 2.0,
-    "swept": True,
     "backups": tuple(
         MatchVelocity(name=f"{turn}_{climb}", lead="lead", turn=turn, climb=climb)
         for turn in ("left", "right")
