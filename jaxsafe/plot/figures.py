@@ -1,8 +1,10 @@
-"""Figures of a run from its own log files: training curves (Figs. 12-16), trajectories (18), speed and distance (19)."""
+"""Figures of a run from its own log files: training curves (Figs. 12-16), trajectories (18), speed and distance (19).
+
+Of a run with run time assurance also what it altered, see `interventions`.
+"""
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -17,11 +19,11 @@ from matplotlib.figure import Figure
 from jaxsafe.config import from_data, yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
-from jaxsafe.train.files import read_rows, write_bytes
+from jaxsafe.plot.interventions import interventions, most_altered
+from jaxsafe.plot.style import BLUE, GREY, ORANGE, length_unit, save
+from jaxsafe.train.files import read_rows
 from jaxsafe.train.log import NEEDS
-from jaxsafe.types import units
 
-BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#8A8A8A"  # of the Okabe-Ito palette, safe for colour-blind readers
 LAST_COLOUR = 0.85  # the end of the colour map is too light on white
 CURVES = (
     ("success_rate", "success rate [%]", 100.0),
@@ -50,10 +52,13 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
     figures = {f"training_{x}": training_curves(rows, x, title)}
     episodes = _episodes(run / "episodes.jsonl")
     if episodes:
-        figures["trajectories"] = trajectories(episodes, title, _unit(content))
-        if "velocity_limit" in episodes[0][1][0]["status"]:
+        env = from_data(content["environment"], "environment")
+        figures["trajectories"] = trajectories(episodes, title, length_unit(env))
+        if {"docking_distance", "speed", "velocity_limit"} <= episodes[0][1][0]["status"].keys():
             figures["speed_distance"] = speed_distance(episodes, title)
-    return [_save(figure, run / "figures" / f"{name}.png") for name, figure in figures.items()]
+        if "rta" in episodes[-1][1][0]:
+            figures["interventions"] = interventions(most_altered(episodes), env, title)
+    return [save(figure, run / "figures" / f"{name}.png") for name, figure in figures.items()]
 
 
 def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figure:
@@ -175,18 +180,3 @@ def _colours(episodes: Sequence[tuple[int, Any]]) -> tuple[ScalarMappable, Any]:
 def _title(content: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
     count = len({row["seed"] for row in rows})
     return f"{content['env']}, preset {content['training']['preset']}, {count} seed{'s' * (count != 1)}"
-
-
-def _unit(content: dict[str, Any]) -> str:
-    """The unit of positions."""
-    platform = from_data(content["environment"], "environment").agent_platform
-    return units(type(platform.rest()))["position"]
-
-
-def _save(figure: Figure, path: Path) -> Path:
-    for panel in figure.axes:
-        panel.spines[["top", "right"]].set_visible(False)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=150, format="png")
-    write_bytes(path, buffer.getvalue())
-    return path

@@ -51,7 +51,7 @@ def main(argv: Sequence[str]) -> int:
 
     arguments = cli.Arguments.parse(argv)
     task, out = arguments.pop_text("env"), arguments.pop_text("out")
-    options = {name: arguments.pop_text(name) for name in ("rta", "variant", "actions")}
+    options: dict[str, Any] = {name: arguments.pop_text(name) for name in ("rta", "variant", "actions")}
     changes = arguments.pop_overrides()
     steps, lanes = arguments.pop_count("steps", 100_000), arguments.pop_count("lanes", 256)
     known = (*ADVERSARIES, SEARCH)

@@ -1,0 +1,41 @@
+"""What all figures share: colours that are safe for colour-blind readers, and how a figure is saved."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+
+from jaxsafe.processors.constraint import Separation, SpeedLimit
+from jaxsafe.train.files import write_bytes
+from jaxsafe.types import units
+
+BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#8A8A8A"  # of the Okabe-Ito palette, safe for colour-blind readers
+
+
+def length_unit(env: Any) -> str:
+    """The unit of positions: m or ft."""
+    return units(type(env.agent_platform.rest()))["position"]
+
+
+def margin_unit(constraint: Any, length: str) -> str | None:
+    """The unit of a constraint's h, given that of positions; None if it is not known."""
+    known = {SpeedLimit: f"{length}/s", Separation: length}
+    return next((unit for kind, unit in known.items() if isinstance(constraint, kind)), None)
+
+
+def labelled(quantity: str, unit: str | None) -> str:
+    """The label of an axis."""
+    return f"{quantity} [{unit}]" if unit else quantity
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """Write a figure as a PNG file and return its path."""
+    for panel in figure.axes:
+        panel.spines[["top", "right"]].set_visible(False)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, dpi=150, format="png")
+    write_bytes(path, buffer.getvalue())
+    return path
