@@ -287,3 +287,10 @@ def test_a_state_holds_the_numbers_drawn_for_its_episode(env: Environment) -> No
     assert set(state.parameters) == {"deputy.mass", "dt"}
     after, _ = step(random, state, jnp.zeros(2))
     chex.assert_trees_all_equal(after.parameters, state.parameters)
+
+
+def test_reset_to_takes_arrays_inside_a_compiled_function() -> None:
+    env = jaxsafe.make("docking2d")
+    position, velocity = jnp.array([100.0, 0.0]), jnp.array([0.0, 0.1])
+    state = jax.jit(lambda env: jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})[0])(env)
+    assert (state.sim.platforms["deputy"].position == position).all()

@@ -423,3 +423,13 @@ def test_the_released_filter_only_fits_where_it_can_turn() -> None:
         jaxsafe.make("docking2d", rta=CollisionSimplex(other="chief"))
     with pytest.raises(ConfigError, match=r"^rta\.other: nothing is called 'leed'.*Did you mean 'lead'"):
         jaxsafe.make("rejoin2d", {"rta.other": "leed"}, rta="released")
+
+
+def test_a_filter_and_the_constraint_that_it_needs_come_together() -> None:
+    renamed = {"type": "speed_limit", "name": "slow", "speed": "speed", "velocity_limit": "velocity_limit"}
+    rta = Simplex(**{**DOCKING_FILTER, "constraints": ("slow",)})
+    env = jaxsafe.make("docking2d", {"constraints": [renamed], "rta.margin": 0.01}, rta=rta)
+    assert [one.name for one in env.constraints] == ["slow"]
+    _, timestep = step(env, fast(env), jnp.array([0.0, 1.0]))
+    assert timestep.info.intervening
+    assert timestep.info.margins["slow"] >= 0.01

@@ -86,10 +86,9 @@ def make(
         env = _with_variant(env, name, variant)
     if actions is not None:
         env = _with_actions(env, actions)
-    if rta is not None:
-        env = with_rta(env, name, rta)
+    filters = {} if rta is None else {"rta": _filter(name, rta)}  # fits together with the overrides, not without
     random = {} if randomize is None else {"randomize": randomize}
-    return override(env, {**(overrides or {}), **random})
+    return override(env, {**filters, **(overrides or {}), **random})
 
 
 def _with_variant(env: Environment, task: str, variant: str) -> Environment:
@@ -106,12 +105,16 @@ def with_rta(env: Environment, task: str, rta: str | RTA) -> Environment:
     Raises:
         ConfigError: the task has no such preset.
     """
+    return override(env, {"rta": _filter(task, rta)})
+
+
+def _filter(task: str, rta: str | RTA) -> RTA | None:
     if isinstance(rta, RTA):
-        return override(env, {"rta": rta})
+        return rta
     presets = {"none": lambda: None, **PRESETS.get(task, {})}
     if not isinstance(rta, str) or rta not in presets:
         raise ConfigError(f"rta: {task} has no preset {rta!r}; choose from {nearest(rta, presets)}")
-    return override(env, {"rta": presets[rta]()})
+    return presets[rta]()
 
 
 def _with_actions(env: Environment, actions: str) -> Environment:

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
@@ -102,6 +103,6 @@ def placed(name: str, value: Any, like: Array) -> Array:
         raise ConfigError(f"reset_to: {name}: expected numbers, found {value!r}") from None
     if value is None or array.shape != like.shape:
         raise ConfigError(f"reset_to: {name}: expected shape {like.shape}, found {array.shape}")
-    if not isinstance(array, Tracer) and not bool(jnp.all(jnp.isfinite(array))):
+    if not isinstance(array, Tracer) and not np.isfinite(np.asarray(array)).all():
         raise ConfigError(f"reset_to: {name}: expected finite numbers, found {value!r}")
     return array
