@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -265,6 +266,23 @@ def test_angles_rest_at_their_limits() -> None:
     np.testing.assert_allclose([state.roll for state in states], [0.0, 0.6, *3 * [math.pi / 3]], rtol=1e-6)
     gammas = [0.0, -0.3, *3 * [-math.pi / 9]]
     np.testing.assert_allclose([state.flight_path_angle for state in states], gammas, rtol=1e-6)
+
+
+@pytest.mark.parametrize("aircraft", [Dubins2D(name="a"), Dubins3D(name="a")])
+@pytest.mark.usefixtures("x64")
+def test_a_step_that_reaches_no_limit_before_its_end_may_be_taken_in_one_piece(aircraft: Any) -> None:
+    limits = {name: value for name, value in vars(normalise(aircraft)).items() if name.endswith("_limits")}
+    rates = {"roll": "roll_rate", "flight_path_angle": "flight_path_angle_rate", "speed": "acceleration"}
+    rng = np.random.default_rng(0)
+    for share in (0.0, 0.5, 1.0):  # of the way to a limit; 1 ends the step on it
+        state, controls = aircraft.rest(), {}
+        for name, (low, high) in ((name.removesuffix("_limits"), value) for name, value in limits.items()):
+            x, goal = rng.uniform(low, high), rng.choice([low, high])
+            state, controls = state.replace(**{name: jnp.asarray(x)}), controls | {rates[name]: share * (goal - x)}
+        if isinstance(aircraft, Dubins2D):
+            controls["heading_rate"] = 0.17
+        both = aircraft.step(state, controls, 1.0), aircraft.step_within_limits(state, controls, jnp.ones(()))
+        chex.assert_trees_all_close(*both, rtol=1e-10, atol=1e-6)
 
 
 @settings(deadline=None, max_examples=50)

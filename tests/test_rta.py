@@ -1,6 +1,6 @@
 """Run time assurance inside the step: what it guarantees, what it lets pass, and what it does with nonsense."""
 
-from typing import Any
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -15,10 +15,12 @@ from jaxsafe.envs import TASKS
 from jaxsafe.rta.asif import ExplicitASIF, Polynomial
 from jaxsafe.rta.attack import attack
 from jaxsafe.rta.cascade import Cascade, Stage
-from jaxsafe.rta.prediction import advance, bounds, constraint, judge
+from jaxsafe.rta.prediction import advance, bounds, constraint, judge, others_later, others_react
 from jaxsafe.rta.presets import DOCKING as DOCKING_FILTER
 from jaxsafe.rta.presets import PRESETS
 from jaxsafe.rta.simplex import Blend, CollisionSimplex, Simplex
+from jaxsafe.simulation.scripted import Command
+from jaxsafe.types import Length, PlatformName, Positive, Sim
 
 DOCKING = ("docking2d", "docking3d")
 SHORT = [
@@ -433,3 +435,54 @@ def test_a_filter_and_the_constraint_that_it_needs_come_together() -> None:
     _, timestep = step(env, fast(env), jnp.array([0.0, 1.0]))
     assert timestep.info.intervening
     assert timestep.info.margins["slow"] >= 0.01
+
+
+class Shy(Command, type="tests_shy"):
+    """Turns away from another platform that comes near."""
+
+    other: PlatformName
+    radius: Annotated[Length, Positive] = 500.0
+
+    def value(self, sim: Sim) -> jax.Array:
+        apart = sim.platforms["lead"].position - sim.platforms[self.other].position
+        return jnp.where(jnp.sum(apart**2) < self.radius**2, 0.1, 0.0)
+
+
+SHY = {"type": "tests_shy", "name": "heading_rate", "other": "wingman"}
+
+
+@pytest.mark.parametrize(
+    ("task", "changes", "reacts"),
+    [
+        ("rejoin2d", {}, False),
+        ("rejoin2d", {"platforms.lead.controller": {"type": "scripted", "commands": [SHY]}}, True),
+        ("rejoin3d", {}, False),
+    ],
+)
+def test_a_certificate_is_the_least_h_on_the_way_of_each_backup(task: str, changes: dict[str, Any], reacts: bool) -> None:
+    env = jaxsafe.make(task, changes, rta="default")
+    rta, away = env.rta, jnp.zeros(2 if task == "rejoin2d" else 3)
+    assert isinstance(rta, Simplex)
+    lead = {"position": away, "heading": 0.0, "speed": 250.0}
+    wingman = {"position": away.at[:2].set(jnp.array([-300.0, 250.0])), "heading": 0.1, "speed": 300.0}
+    sim = jaxsafe.reset_to(env, {"lead": lead, "wingman": wingman})[0].sim.replace(regions={}, status={})
+    assert others_react(env, sim) == reacts
+
+    @jax.jit
+    def follow(env: Any, sim: Sim) -> list[jax.Array]:
+        values = []
+        for backup in env.rta.backups:
+
+            def one(carry: Any, _: None, backup: Any = backup) -> Any:
+                at, least = carry
+                later = others_later(env, at)
+                after = advance(env, at, jnp.clip(backup.control(env, at, later), *bounds(env)), later)
+                return (after, jnp.minimum(least, env.rta.lowest(env, at, after))), None
+
+            (last, least), _ = jax.lax.scan(one, (sim, env.rta.lowest(env, sim, sim)), length=rta.horizon)
+            values.append(jnp.where(env.rta.terminal.contains(env, last), least, -jnp.inf))
+        return values
+
+    certified = jax.jit(lambda env, sim: env.rta.certify(env, sim, sim))(env, sim)
+    np.testing.assert_allclose(certified, follow(env, sim), rtol=0.0, atol=0.02)  # ft
+    assert np.isfinite(certified).any()

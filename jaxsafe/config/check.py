@@ -43,7 +43,9 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
     for section in _SECTIONS:
         for index, part in enumerate(getattr(env, section)):
             for place, refers, name in _references(part, f"{section}.{part.name}"):
-                ordered = refers.section == section and section in ("platforms", "status")  # later ones are not there yet
+                # Later ones are not there yet when a start is drawn, or a status evaluated.
+                early = section == "status" or place.startswith(f"platforms.{part.name}.start")
+                ordered = refers.section == section and early
                 known = names[refers.section][: index if ordered else None]
                 _reference(place, name, known, " listed before it" if ordered else "")
     for place, refers, name in _references(env.rta, "rta") if env.rta else ():

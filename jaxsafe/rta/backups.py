@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +11,10 @@ from jaxtyping import Array, Bool, Float
 from jaxsafe.component import Range, Unit
 from jaxsafe.rta.asif import speed_ball
 from jaxsafe.rta.filter import BackupController, TerminalSet
-from jaxsafe.rta.prediction import bounds
+from jaxsafe.rta.prediction import Others, bounds
 from jaxsafe.rta.projection import project_box_ball
 from jaxsafe.simulation.geometry import direction, safe_norm
-from jaxsafe.types import ConstraintName, Length, Number, PlatformName, Positive, Radians, Seconds, Sim
+from jaxsafe.types import ConstraintName, Length, Number, PlatformName, Positive, Radians, Sim
 
 TWO_PI = 2.0 * jnp.pi
 
@@ -22,7 +22,7 @@ TWO_PI = 2.0 * jnp.pi
 class Brake(BackupController, type="brake"):
     """Thrust that brings the velocity to 0 at the end of the step, or as near as the bounds allow (dead beat)."""
 
-    def control(self, env: Any, sim: Sim) -> Float[Array, " m"]:
+    def control(self, env: Any, sim: Sim, later: Others) -> Float[Array, " m"]:
         plant, names = env.agent_platform, env.action_names
 
         def velocity(u: Float[Array, " m"]) -> Array:
@@ -45,7 +45,7 @@ class AlignAndBrake(BackupController, type="align_and_brake"):
     margin: Annotated[Number, Unit("m/s"), Range(0.0)]
     aligned: Annotated[Radians, Positive] = jnp.pi / 30
 
-    def control(self, env: Any, sim: Sim) -> Float[Array, " 2"]:
+    def control(self, env: Any, sim: Sim, later: Others) -> Float[Array, " 2"]:
         state = sim.platforms[env.agent]
         low, high = bounds(env)
         error = misalignment(state)
@@ -81,37 +81,41 @@ class AlignedOrSlow(TerminalSet, type="aligned_or_slow"):
 
 
 class MatchVelocity(BackupController, type="match_velocity"):
-    """Turns one way to the lead's next heading and takes its speed; then the relative position stays as it is.
+    """Turns one way to the lead's heading and takes its speed; then the relative position stays as it is.
 
-    In space it banks by tan φ = v ω/g for the turn ω = 0.25 e + ψ̇_lead of a heading error e, and climbs or dives at the
-    steepest angle while the error is large, |e| above 0.45 rad, less so down to 0.15 rad, then flies the lead's angle.
+    In the plane it takes the heading and the speed that the lead will have after the step. In space it banks by
+    tan φ = v ω/g for the turn ω = 0.25 e + ψ̇_lead of the present heading error e, and climbs or dives at the steepest angle
+    while the error is large, |e| above 0.45 rad, less so down to 0.15 rad, then flies the lead's angle.
     """
 
     lead: PlatformName
     turn: Literal["left", "right"]
     climb: Literal["up", "down"] | None = None  # in space
     dead_zone: Annotated[Radians, Range(0.0)] = 0.2
+    within_limits: ClassVar[bool] = True
 
-    def control(self, env: Any, sim: Sim) -> Float[Array, " m"]:
-        own, lead = sim.platforms[env.agent], sim.platforms[self.lead]
-        ahead = next(one for one in env.platforms if one.name == self.lead)
-        later = ahead.step(lead, ahead.controller.control(jnp.zeros(0), sim), env.dt)
+    def control(self, env: Any, sim: Sim, later: Others) -> Float[Array, " m"]:
+        own, lead, ahead = sim.platforms[env.agent], sim.platforms[self.lead], later[self.lead]
         sign = 1.0 if self.turn == "left" else -1.0
-        error = sign * (jnp.mod(sign * (later.heading - own.heading) + self.dead_zone, TWO_PI) - self.dead_zone)
-        wanted = {"acceleration": (later.speed - own.speed) / env.dt}
+        goal = ahead.heading if self.climb is None else lead.heading
+        error = sign * (jnp.mod(sign * (goal - own.heading) + self.dead_zone, TWO_PI) - self.dead_zone)
+        speed = jnp.clip(ahead.speed, *env.agent_platform.speed_limits)
+        wanted = {"acceleration": (speed - own.speed) / env.dt}
         if self.climb is None:
             wanted["heading_rate"] = error / env.dt
         else:
-            wanted |= self._in_space(env, own, later, error, (later.heading - lead.heading) / env.dt)
+            wanted |= self._in_space(env, own, ahead, error, (ahead.heading - lead.heading) / env.dt)
         return jnp.stack([wanted[name] for name in env.action_names])
 
-    def _in_space(self, env: Any, own: Any, later: Any, error: Array, turning: Array) -> dict[str, Array]:
+    def _in_space(self, env: Any, own: Any, ahead: Any, error: Array, turning: Array) -> dict[str, Array]:
         plant = env.agent_platform
         bank = jnp.arctan(own.speed * (0.25 * error + turning) / plant.gravity)
         bank = jnp.clip(bank, plant.roll_limits[0], plant.roll_limits[1])
-        steep = plant.flight_path_angle_limits[0 if self.climb == "up" else 1]  # ż = −v sin γ
+        lowest, highest = plant.flight_path_angle_limits
+        steep = lowest if self.climb == "up" else highest  # ż = −v sin γ
+        level = jnp.clip(ahead.flight_path_angle, lowest, highest)
         share = jnp.clip((jnp.abs(error) - 0.15) / 0.3, 0.0, 1.0)
-        gamma = later.flight_path_angle + share * (steep - later.flight_path_angle)
+        gamma = level + share * (steep - level)
         return {
             "roll_rate": (bank - own.roll) / env.dt,
             "flight_path_angle_rate": (gamma - own.flight_path_angle) / env.dt,
@@ -119,19 +123,31 @@ class MatchVelocity(BackupController, type="match_velocity"):
 
 
 class VelocityMatched(TerminalSet, type="velocity_matched"):
-    """Relative speed below `tolerance` and, with `drift` seconds of it, still at least `clearance` apart."""
+    """Relative speed below `tolerance` and, with `drift` seconds of it, still at least `clearance` apart.
+
+    Where turning is a state, `lag` seconds of the relative acceleration count as relative speed.
+    """
 
     of: PlatformName
     to: PlatformName
     tolerance: Annotated[Number, Unit("ft/s"), Positive]
     clearance: Annotated[Length, Positive]
-    drift: Seconds = 1.0
+    drift: Annotated[Number, Unit("s"), Range(0.0)] = 1.0
+    lag: Annotated[Number, Unit("s"), Range(0.0)] = 0.0
 
     def contains(self, env: Any, sim: Sim) -> Bool[Array, ""]:
         one, other = sim.platforms[self.of], sim.platforms[self.to]
-        relative = safe_norm(one.velocity - other.velocity)
+        accelerating = _acceleration(env, sim, self.of) - _acceleration(env, sim, self.to)
+        relative = safe_norm(one.velocity - other.velocity) + self.lag * safe_norm(accelerating)
         apart = safe_norm(one.position - other.position)
         return (relative < self.tolerance) & (apart >= self.clearance + self.drift * relative)
+
+
+def _acceleration(env: Any, sim: Sim, name: str) -> Float[Array, " d"]:
+    """v̇ of a platform, the agent's without control."""
+    platform, state = next(one for one in env.platforms if one.name == name), sim.platforms[name]
+    controls = {} if name == env.agent else platform.controller.control(jnp.zeros(0), sim)
+    return jax.jvp(lambda state: state.velocity, (state,), (platform.derivative(state, controls),))[1]
 
 
 def misalignment(state: Any) -> Float[Array, ""]:

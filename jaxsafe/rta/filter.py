@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.component import Component, Range, Unit
-from jaxsafe.rta.prediction import advance, bounds, smallest_margin
+from jaxsafe.rta.prediction import (
+    Others,
+    advance,
+    bounds,
+    commanded,
+    later_sim,
+    others_later,
+    others_react,
+    repeat,
+    smallest_margin,
+)
 from jaxsafe.types import ConstraintName, Number, Record, RTAInfo, Sim
 
 Margin = Annotated[Number, Unit("as the constraint"), Range(0.0)]
@@ -53,9 +62,17 @@ class BackupController(Component):
     """A control that keeps safe or leads to where it does; named, as several may stand side by side."""
 
     name: str
+    within_limits: ClassVar[bool] = False
+    """Whether no state of the plant reaches a limit before the end of a step, which makes prediction cheaper."""
 
-    def control(self, env: Any, sim: Sim) -> Float[Array, " m"]:
-        """Return the control in physical units, action order; the filter clips it."""
+    def control(self, env: Any, sim: Sim, later: Others) -> Float[Array, " m"]:
+        """Return the control in physical units, action order; the filter clips it.
+
+        Args:
+            env: the environment.
+            sim: the simulation before the step.
+            later: the other platforms' states after it, by name.
+        """
         raise NotImplementedError
 
 
@@ -119,17 +136,18 @@ class CertifiedRTA(RTA):
     ) -> tuple[Float[Array, " m"], RTAMemory, RTAInfo]:
         """Propose, certify, else back up."""
         wanted, finite = admissible(env, desired)
-        backup = self._backup(env, sim, memory)
+        later = others_later(env, sim)
+        backup = self._backup(env, sim, memory, later)
         proposal, feasible = self.propose(env, sim, wanted, backup)
 
-        after = advance(env, sim, proposal)
+        after = advance(env, sim, proposal, later)
         values = self.certify(env, sim, after)
         best = _highest(values)
         required = self.margin + jnp.where(memory.intervening, self.release, 0.0)
         safe = values[best] >= required
         passes = finite & (safe if self.enforce else feasible)
 
-        fallback = self.lowest(env, sim, advance(env, sim, backup))
+        fallback = self.lowest(env, sim, advance(env, sim, backup, later))
         kept = fallback >= self.margin if self.horizon == 0 else memory.certified & ~jnp.isnan(fallback)
         actual = jnp.where(passes, proposal, backup)
         correction = jnp.where(jnp.isfinite(desired), actual - wanted, actual)
@@ -157,23 +175,40 @@ class CertifiedRTA(RTA):
         first = self.lowest(env, before, sim)
         if self.terminal is None:
             return first[None]
-        return jnp.stack([self._follow(env, backup, first, sim) for backup in self.backups])
+        together = [[one] for one in self.backups] if others_react(env, sim) else [self.backups]
+        return jnp.concatenate([self._follow(env, backups, first, sim) for backups in together])
 
-    def _follow(self, env: Any, backup: BackupController, first: Float[Array, ""], sim: Sim) -> Float[Array, ""]:
+    def _follow(
+        self, env: Any, backups: Sequence[BackupController], first: Float[Array, ""], sim: Sim
+    ) -> Float[Array, " backups"]:
+        """`certify` for backup controllers among whom the other platforms move alike, and so are predicted once."""
         low, high = bounds(env)
+        plant, terminal = env.agent_platform, self.terminal
+        assert terminal is not None
 
-        def one(carry: tuple[Sim, Array], _: None) -> tuple[tuple[Sim, Array], None]:
-            sim, least = carry
-            later = advance(env, sim, jnp.clip(backup.control(env, sim), low, high))
-            return (later, jnp.minimum(least, self.lowest(env, sim, later))), None
+        def placed(sim: Sim, own: Any) -> Sim:
+            return sim.replace(platforms={**sim.platforms, env.agent: own})
+
+        def one(carry: tuple[Sim, list[Any], list[Array]]) -> tuple[Sim, list[Any], list[Array]]:
+            sim, crafts, least = carry
+            later = others_later(env, sim)
+            after = later_sim(env, sim, {**later, env.agent: crafts[0]})
+            for i, backup in enumerate(backups):
+                before = placed(sim, crafts[i])
+                control = jnp.clip(backup.control(env, before, later), low, high)
+                move = plant.step_within_limits if backup.within_limits else plant.step
+                crafts[i] = move(crafts[i], commanded(env, plant, before, control), env.dt)
+                least[i] = jnp.minimum(least[i], self.lowest(env, before, placed(after, crafts[i])))
+            return placed(after, crafts[0]), crafts, least
 
         sim = sim.replace(regions={}, status={})
-        (last, least), _ = jax.lax.scan(one, (sim, first), length=self.horizon)
-        assert self.terminal is not None
-        return jnp.where(self.terminal.contains(env, last), least, -jnp.inf)
+        start = (sim, [sim.platforms[env.agent]] * len(backups), [first] * len(backups))
+        last, crafts, least = repeat(one, start, self.horizon)
+        reached = jnp.stack([terminal.contains(env, placed(last, own)) for own in crafts])
+        return jnp.where(reached, jnp.stack(least), -jnp.inf)
 
-    def _backup(self, env: Any, sim: Sim, memory: RTAMemory) -> Float[Array, " m"]:
-        each = jnp.stack([backup.control(env, sim) for backup in self.backups])
+    def _backup(self, env: Any, sim: Sim, memory: RTAMemory, later: Others) -> Float[Array, " m"]:
+        each = jnp.stack([backup.control(env, sim, later) for backup in self.backups])
         chosen = each[memory.backup_index] if len(self.backups) > 1 else each[0]
         return admissible(env, chosen)[0]
 

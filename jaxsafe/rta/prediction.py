@@ -5,9 +5,10 @@ Prediction uses the plant's own map over one step, so a certificate speaks about
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import Any
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -15,18 +16,54 @@ from jaxsafe.errors import part
 from jaxsafe.simulation.controllers import Controls
 from jaxsafe.types import Sim
 
+T = TypeVar("T")
+Others = Mapping[str, Any]
+"""The states of all platforms but the agent's, by name."""
 
-def advance(env: Any, sim: Sim, control: Float[Array, " m"]) -> Sim:
+
+def advance(env: Any, sim: Sim, control: Float[Array, " m"], later: Others | None = None) -> Sim:
     """The simulation one step later under a control of the agent in physical units.
 
-    All platforms move at once. Regions and statuses are left out.
+    All platforms move at once. Regions and statuses are left out. Where `others_later` is known already, give it.
     """
-    platforms = {}
-    for platform in env.platforms:
-        with part("platforms", platform.name):
-            controls = commanded(env, platform, sim, control)
-            platforms[platform.name] = platform.step(sim.platforms[platform.name], controls, env.dt)
+    platforms = {**(others_later(env, sim) if later is None else later)}
+    plant = env.agent_platform
+    with part("platforms", plant.name):
+        platforms[env.agent] = plant.step(sim.platforms[env.agent], commanded(env, plant, sim, control), env.dt)
+    return later_sim(env, sim, platforms)
+
+
+def later_sim(env: Any, sim: Sim, platforms: Others) -> Sim:
+    """The simulation one step later, from its platforms then."""
     return sim.replace(time=sim.time + env.dt, platforms=platforms, regions={}, status={})
+
+
+def others_later(env: Any, sim: Sim) -> Others:
+    """The platforms that are not the agent's one step later; no control of this step can change that."""
+    later = {}
+    for platform in env.platforms:
+        if platform.name != env.agent:
+            with part("platforms", platform.name):
+                controls = platform.controller.control(jnp.zeros(0), sim)
+                later[platform.name] = platform.step(sim.platforms[platform.name], controls, env.dt)
+    return later
+
+
+def others_react(env: Any, sim: Sim) -> bool:
+    """Whether any other platform looks at the agent's state, so that it moves otherwise after other controls.
+
+    Found by tracing, so it costs nothing at run time: what looks at a mapped state is mapped itself.
+    """
+
+    def later(own: Any) -> Others:
+        return others_later(env, sim.replace(platforms={**sim.platforms, env.agent: own}, regions={}, status={}))
+
+    two = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), sim.platforms[env.agent])
+    try:
+        jax.eval_shape(jax.vmap(later, out_axes=None), two)
+    except ValueError:
+        return True
+    return False
 
 
 def commanded(env: Any, platform: Any, sim: Sim, control: Float[Array, " m"]) -> Controls:
@@ -48,6 +85,25 @@ def judge(env: Any, sim: Sim, before: Sim | None = None) -> Sim:
         value = status.process(status.init(sim), sim) if earlier is None else status.on_the_way(earlier, sim)
         sim = sim.replace(status={**sim.status, status.name: value})
     return sim
+
+
+def repeat(function: Callable[[T], T], start: T, count: int) -> T:
+    """A function applied over and over.
+
+    Between two applications every number is a variable of its own. A batch of them is then contiguous, while in a batch of
+    vectors XLA interleaves their elements and computes one at a time: for aircraft several times slower.
+    """
+    leaves, tree = jax.tree.flatten(start)
+    shapes = [leaf.shape for leaf in leaves]
+
+    def apart(whole: T) -> list[list[Array]]:
+        return [list(leaf.reshape(-1)) for leaf in jax.tree.leaves(whole)]
+
+    def together(parts: list[list[Array]]) -> T:
+        return jax.tree.unflatten(tree, [jnp.stack(part).reshape(shape) for part, shape in zip(parts, shapes, strict=True)])
+
+    parts, _ = jax.lax.scan(lambda parts, _: (apart(function(together(parts))), None), apart(start), length=count)
+    return together(parts)
 
 
 def constraint(env: Any, name: str) -> Any:

@@ -50,7 +50,7 @@ MATCH_3D: dict[str, Any] = {
         for climb in ("up", "down")
     ),
     "horizon": 60,
-    "terminal": VelocityMatched(of="wingman", to="lead", tolerance=8.0, clearance=102.0, drift=8.0),
+    "terminal": VelocityMatched(of="wingman", to="lead", tolerance=4.0, clearance=102.0, drift=9.0, lag=1.0),
 }
 
 

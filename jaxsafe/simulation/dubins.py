@@ -38,6 +38,9 @@ SPEEDS = (200.0, 400.0)
 SpeedLimits = Annotated[Number, Unit("ft/s", length=2), Positive]
 AngleLimits = Annotated[Number, Unit("rad", length=2), Range(-jnp.pi / 2, jnp.pi / 2, open_low=True, open_high=True)]
 
+Ramps = Sequence[tuple[Any, Any, Any]]
+"""Value, rate and limits of what changes linearly over a step."""
+
 
 class Dubins2DState(Record):
     """State of an aircraft at one altitude."""
@@ -79,6 +82,14 @@ class Dubins2D(Platform, type="dubins2d"):
         stop = time_to_limit(speed, acceleration, self.speed_limits, dt)
         moved = _arc(state.heading, speed, turn, acceleration, stop)
         moved = moved + _arc(state.heading + turn * stop, final, turn, 0.0, dt - stop)
+        return Dubins2DState(state.position + moved, state.heading + turn * dt, final)
+
+    def step_within_limits(self, state: Dubins2DState, controls: Controls, dt: Seconds) -> Dubins2DState:
+        """`step` in one arc."""
+        turn, acceleration = controls.get("heading_rate", 0.0), controls.get("acceleration", 0.0)
+        speed = ramp(state.speed, 0.0, self.speed_limits, 0.0)
+        moved = _arc(state.heading, speed, turn, acceleration, dt)
+        final = ramp(speed, acceleration, self.speed_limits, dt)
         return Dubins2DState(state.position + moved, state.heading + turn * dt, final)
 
     def derivative(self, state: Dubins2DState, controls: Controls) -> Dubins2DState:
@@ -130,27 +141,44 @@ class Dubins3D(Platform, type="dubins3d"):
 
     def step(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Dubins3DState:
         """Advance by quadrature over the pieces between which no limit is reached, within 1e-3 ft in 1 s, mostly 1e-5."""
-        ramps = {
-            "roll": (state.roll, self._roll_rate(state, controls, dt), self.roll_limits),
-            "gamma": (state.flight_path_angle, controls.get("flight_path_angle_rate", 0.0), self.flight_path_angle_limits),
-            "speed": (state.speed, controls.get("acceleration", 0.0), self.speed_limits),
-        }
-        ramps = {name: (ramp(x, 0.0, limits, 0.0), rate, limits) for name, (x, rate, limits) in ramps.items()}
-        spans = pieces([time_to_limit(*each, dt) for each in ramps.values()], dt)
-
-        def follow(carry: tuple[Array, ...], span: tuple[Array, Array]) -> tuple[tuple[Array, ...], None]:
-            (heading, *moved), (begin, length) = carry, span
-            nodes = [tuple(ramp(*each, begin + node * length) for each in ramps.values()) for node in NODES]
-            turns = [length * self.gravity / speed * tan(roll) for roll, _, speed in nodes]  # ψ̇ × length
-            for (_, gamma, speed), weight, partial in zip(nodes, WEIGHTS, PARTIAL_WEIGHTS, strict=True):
-                forward = _forward(heading + _dot(partial, turns), gamma)
-                moved = [total + weight * length * speed * part for total, part in zip(moved, forward, strict=True)]
-            return (heading + _dot(WEIGHTS, turns), *moved), None
+        ramps = self._ramps(state, controls, dt)
+        spans = pieces([time_to_limit(*each, dt) for each in ramps], dt)
 
         # A loop, not four copies: it keeps what it computed for one piece, where XLA would compute it again for each use.
         still = jnp.zeros_like(state.heading)
-        (heading, *moved), _ = jax.lax.scan(follow, (state.heading, still, still, still), spans)
-        roll, gamma, speed = (ramp(*each, dt) for each in ramps.values())
+        start = (state.heading, still, still, still)
+        (heading, *moved), _ = jax.lax.scan(lambda carry, span: (self._fly(ramps, carry, span), None), start, spans)
+        return self._arrived(state, ramps, dt, heading, moved)
+
+    def step_within_limits(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Dubins3DState:
+        """`step` in one piece."""
+        ramps = self._ramps(state, controls, dt)
+        heading, *moved = self._fly(ramps, (state.heading, 0.0, 0.0, 0.0), (jnp.zeros_like(dt), dt))
+        return self._arrived(state, ramps, dt, heading, moved)
+
+    def _ramps(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Ramps:
+        """Those of roll, flight path angle and speed."""
+        ramps = [
+            (state.roll, self._roll_rate(state, controls, dt), self.roll_limits),
+            (state.flight_path_angle, controls.get("flight_path_angle_rate", 0.0), self.flight_path_angle_limits),
+            (state.speed, controls.get("acceleration", 0.0), self.speed_limits),
+        ]
+        return [(ramp(x, 0.0, limits, 0.0), rate, limits) for x, rate, limits in ramps]
+
+    def _fly(self, ramps: Ramps, before: tuple[Any, ...], span: tuple[Array, Array]) -> tuple[Any, ...]:
+        """Heading and way moved after a piece of the step, of which begin and length are given, from those before it."""
+        (heading, *moved), (begin, length) = before, span
+        nodes = [[ramp(*each, begin + node * length) for each in ramps] for node in NODES]
+        turns = [length * self.gravity / speed * tan(roll) for roll, _, speed in nodes]  # ψ̇ × length
+        for (_, gamma, speed), weight, partial in zip(nodes, WEIGHTS, PARTIAL_WEIGHTS, strict=True):
+            forward = _forward(heading + _dot(partial, turns), gamma)
+            moved = [total + weight * length * speed * part for total, part in zip(moved, forward, strict=True)]
+        return (heading + _dot(WEIGHTS, turns), *moved)
+
+    def _arrived(
+        self, state: Dubins3DState, ramps: Ramps, dt: Seconds, heading: Array, moved: Sequence[Array]
+    ) -> Dubins3DState:
+        roll, gamma, speed = (ramp(*each, dt) for each in ramps)
         return Dubins3DState(state.position + jnp.stack(moved), heading, speed, gamma, roll)
 
     def derivative(self, state: Dubins3DState, controls: Controls) -> Dubins3DState:

@@ -54,6 +54,10 @@ class Platform(Component):
         """Return the state after `dt` seconds with the controls held constant."""
         raise NotImplementedError
 
+    def step_within_limits(self, state: Any, controls: Controls, dt: Seconds) -> Any:
+        """`step` for controls under which no state reaches a limit before the end, which may be cheaper to compute."""
+        return self.step(state, controls, dt)
+
     def derivative(self, state: Any, controls: Controls) -> Any:
         """Return the time derivative of the state, a record like it: f(x) + g(x)u, Eq. (3)."""
         raise NotImplementedError
