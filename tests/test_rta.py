@@ -192,6 +192,26 @@ def test_the_sampled_data_filter_changes_no_more_than_it_must(task: str) -> None
     assert 5 < altered < 25
 
 
+@pytest.mark.parametrize("task", TASKS)
+def test_a_batch_of_any_size_is_filtered_alike(task: str) -> None:
+    """jaxlib 0.10.2 went wrong beyond 32 768 numbers, silently."""
+    env, num = jaxsafe.make(task, rta="default"), 20_480
+    low, high = bounds(env)
+    states, _ = jax.jit(jax.vmap(reset, in_axes=(None, 0)))(env, jax.random.split(jax.random.key(0), num))
+    desired = low + (high - low) * jax.random.uniform(jax.random.key(1), (num, env.action_size))
+
+    @jax.jit
+    def both(env: Any, state: Any, desired: jax.Array) -> Any:
+        backups = [one.control(env, state.sim, others_later(env, state.sim)) for one in env.rta.backups]
+        return backups, env.rta.propose(env, state.sim, desired, desired)[0]
+
+    batched = jax.vmap(both, in_axes=(None, 0, 0))
+    apart = jax.tree.map(lambda x: x.reshape(20, -1, *x.shape[1:]), (states, desired))
+    small = jax.jit(lambda lanes: jax.lax.map(lambda part: batched(env, *part), lanes))(apart)
+    small = jax.tree.map(lambda x: x.reshape(num, *x.shape[2:]), small)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4), batched(env, states, desired), small)
+
+
 @pytest.mark.parametrize("task", DOCKING)
 def test_in_float32_every_projection_is_certified(task: str) -> None:
     env = jaxsafe.make(task, rta="discrete_asif")
