@@ -6,7 +6,8 @@ held thrust, which is what a plant with a finite step needs.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from collections.abc import Callable
+from typing import Annotated, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,8 @@ from jaxsafe.rta.prediction import advance, bounds, commanded, constraint, judge
 from jaxsafe.rta.projection import project_box_ball, project_box_halfspace
 from jaxsafe.rta.qp import nearest_control
 from jaxsafe.types import Number, Sim
+
+T = TypeVar("T")
 
 
 class DiscreteASIF(CertifiedRTA, type="discrete_asif"):
@@ -63,11 +66,17 @@ def speed_ball(
         return later.platforms[env.agent].velocity, constraint(env, name).limit(judge(env, later))
 
     origin = jnp.zeros(count, control.dtype)
-    (velocity, limit), push = jax.linearize(after, origin)
-    pushed, gained = jax.vmap(push)(jnp.eye(count, dtype=control.dtype))  # Bᵀ, g
+    (velocity, limit), (pushed, gained) = linear(after, origin)  # v̄ and c, Bᵀ and g
     c = limit - margin
     beta = jnp.max(jnp.sum(pushed * pushed, axis=-1))
     return beta, jnp.sum(pushed * velocity, axis=-1) - c * gained, jnp.sum(velocity**2) - c * c
+
+
+def linear(function: Callable[[Array], T], at: Float[Array, " m"]) -> tuple[T, T]:
+    """The value of a function and its derivatives, an axis of m in front; forwards, so that nothing is stored."""
+    basis = jnp.eye(at.shape[0], dtype=at.dtype)
+    values, columns = zip(*(jax.jvp(function, (at,), (tangent,)) for tangent in basis), strict=True)
+    return values[0], jax.tree.map(lambda *parts: jnp.stack(parts), *columns)
 
 
 SlackCost = Annotated[Number, Unit("1"), Range(0.0, open_low=True)]
@@ -134,8 +143,7 @@ class ExplicitASIF(CertifiedRTA, type="explicit_asif"):
             value, slope = jax.jvp(lifted, (sim.platforms,), (_derivative(env, sim, sim.platforms, u),))
             return slope, value
 
-        (drift, value), push = jax.linearize(rate, jnp.zeros(size, env.dt.dtype))
-        gains, _ = jax.vmap(push)(jnp.eye(size, dtype=env.dt.dtype))
+        (drift, value), (gains, _) = linear(rate, jnp.zeros(size, env.dt.dtype))
         return gains, -(drift + self.strengthening.of(value))
 
     def _lift(self, env: Any, sim: Sim, psi: Any, size: int) -> Any:
@@ -166,19 +174,18 @@ class ImplicitASIF(CertifiedRTA, type="implicit_asif"):
         def least(u: Float[Array, " m"]) -> Float[Array, " backups"]:
             return self.certify(env, sim, advance(env, sim, u))
 
-        proposal, feasible = desired, jnp.ones((), bool)
-        for _ in range(self.rounds):
-            values, push = jax.linearize(least, proposal)
-            gains = jax.vmap(push)(jnp.eye(desired.shape[0], dtype=desired.dtype))
+        def improve(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+            proposal, feasible = carry
+            values, gains = linear(least, proposal)
             best = jnp.argmax(values)
             known = jnp.isfinite(values[best])
             row = jnp.where(known, gains[:, best], 0.0)
             short = jnp.where(known, self.margin + self.spare - values[best], 0.0)
             projected, feasible = project_box_halfspace(desired, low, high, row, short + jnp.sum(row * proposal))
             safe = values[best] >= self.margin
-            proposal = jnp.where(safe, proposal, projected)
-            feasible = safe | (known & feasible)
-        return proposal, feasible
+            return (jnp.where(safe, proposal, projected), safe | (known & feasible)), None
+
+        return jax.lax.scan(improve, (desired, jnp.ones((), bool)), length=self.rounds)[0]
 
 
 def _derivative(env: Any, sim: Sim, platforms: Any, control: Float[Array, " m"]) -> Any:

@@ -7,9 +7,12 @@ monotonically; the piece on which it is met is found from its value at the bends
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxsafe.simulation.integrate import ascending
 from jaxsafe.types import Number
 
 
@@ -32,12 +35,11 @@ def project_box_halfspace(
     """
     slope = jnp.where(a != 0.0, a, 1.0)
     bends = [jnp.where(a != 0.0, (bound - u) / slope, 0.0) for bound in (low, high)]
-    bends = jnp.sort(jnp.maximum(jnp.concatenate([jnp.zeros(1, u.dtype), *bends]), 0.0))
-    values = jnp.sum(a * jnp.clip(u + bends[:, None] * a, low, high), axis=-1)  # at each bend, in ascending order
+    bends = ascending([jnp.zeros_like(u[0]), *jnp.maximum(jnp.concatenate(bends), 0.0)])
+    values = [jnp.sum(a * jnp.clip(u + bend * a, low, high)) for bend in bends]
 
-    after = jnp.argmax(values >= b)  # the first bend at which the constraint is met
-    middle = (bends[after] + bends[jnp.maximum(after - 1, 0)]) / 2.0
-    moving = u + middle * a
+    before, after = _change(bends, [value >= b for value in values])
+    moving = u + (after + before) / 2.0 * a
     free = (moving > low) & (moving < high)
     fixed = jnp.sum(jnp.where(free, 0.0, a * jnp.clip(moving, low, high)))
     curvature = jnp.sum(jnp.where(free, a * a, 0.0))
@@ -71,13 +73,11 @@ def project_box_ball(
     bound = jnp.where(towards > 0.0, high, low)
     moves = towards != 0.0
     times = jnp.clip(jnp.where(moves, (bound - u) / jnp.where(moves, towards, 1.0), 1.0), 0.0, 1.0)
-    bends = jnp.sort(jnp.concatenate([jnp.zeros(1, u.dtype), times, jnp.ones(1, u.dtype)]))
-    points = jnp.clip(u + bends[:, None] * towards, low, high)
-    values = _quadratic(points, beta, p, k)
+    bends = [jnp.zeros_like(u[0]), *ascending(list(times)), jnp.ones_like(u[0])]
+    values = [_quadratic(jnp.clip(u + bend * towards, low, high), beta, p, k) for bend in bends]
 
-    after = jnp.argmax(values <= 0.0)
-    before = jnp.maximum(after - 1, 0)
-    free = times > (bends[after] + bends[before]) / 2.0
+    before, after = _change(bends, [value <= 0.0 for value in values])
+    free = times > (after + before) / 2.0
     resting = jnp.where(free, u, jnp.clip(bound, low, high))
     rate = jnp.where(free, towards, 0.0)
     c2 = beta * jnp.sum(rate * rate)  # q = c2 t² + 2 c1 t + c0 on this piece
@@ -89,8 +89,17 @@ def project_box_ball(
     t = c0 / jnp.where(divisor > 0.0, divisor, 1.0)
 
     met, feasible = values[0] <= 0.0, values[-1] <= 0.0
-    t = jnp.where(met, 0.0, jnp.where(feasible, jnp.clip(t, bends[before], bends[after]), 1.0))
+    t = jnp.where(met, 0.0, jnp.where(feasible, jnp.clip(t, before, after), 1.0))
     return jnp.clip(u + t * towards, low, high), feasible
+
+
+def _change(bends: Sequence[Array], met: Sequence[Array]) -> tuple[Array, Array]:
+    """The last bend before the constraint is met and the first one where it is; both the first bend where it never is."""
+    before, after = bends[0], bends[0]
+    for i in reversed(range(len(bends))):
+        after = jnp.where(met[i], bends[i], after)
+        before = jnp.where(met[i], bends[max(i - 1, 0)], before)
+    return before, after
 
 
 def _quadratic(w: Float[Array, "*n m"], beta: Number, p: Float[Array, " m"], k: Number) -> Float[Array, "*n"]:
