@@ -1,5 +1,6 @@
 """Aerospace SafeRL benchmarks as pure JAX functions."""
 
+import jaxsafe.quiet  # noqa: F401 before anything imports jaxlib
 from jaxsafe.config import override
 from jaxsafe.environment import Environment, reset, reset_to, step
 from jaxsafe.envs import make
