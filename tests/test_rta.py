@@ -457,7 +457,7 @@ def test_a_filter_and_the_constraint_that_it_needs_come_together() -> None:
     assert timestep.info.margins["slow"] >= 0.01
 
 
-class Shy(Command, type="tests_shy"):
+class Shy(Command, type="of_tests_shy"):
     """Turns away from another platform that comes near."""
 
     other: PlatformName
@@ -468,7 +468,7 @@ class Shy(Command, type="tests_shy"):
         return jnp.where(jnp.sum(apart**2) < self.radius**2, 0.1, 0.0)
 
 
-SHY = {"type": "tests_shy", "name": "heading_rate", "other": "wingman"}
+SHY = {"type": "of_tests_shy", "name": "heading_rate", "other": "wingman"}
 
 
 @pytest.mark.parametrize(

@@ -184,7 +184,8 @@ def test_a_policy_file_acts_like_the_trained_network(whole: Path) -> None:
     jax.tree.map(np.testing.assert_array_equal, params, trained)
     _, timestep = env.reset(jax.random.key(0))
     action = load_policy(whole / "policy" / "seed_1.npz")(jax.random.key(1), timestep.observation)
-    np.testing.assert_array_equal(action, agent.act(env, trained, jax.random.key(1), timestep.observation, True))
+    expected = agent.act(env, trained, jax.random.key(1), timestep.observation, True)
+    np.testing.assert_allclose(action, expected, rtol=1e-6)  # not compiled as one program
 
 
 @pytest.mark.slow
