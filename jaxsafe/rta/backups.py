@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsafe.component import Range, Unit
-from jaxsafe.rta.asif import speed_ball
+from jaxsafe.rta.asif import linear, speed_ball
 from jaxsafe.rta.filter import BackupController, TerminalSet
 from jaxsafe.rta.prediction import Others, bounds
 from jaxsafe.rta.projection import project_box_ball
@@ -28,8 +28,7 @@ class Brake(BackupController, type="brake"):
         def velocity(u: Float[Array, " m"]) -> Array:
             return plant.step(sim.platforms[env.agent], dict(zip(names, u, strict=True)), env.dt).velocity
 
-        drift, push = jax.linearize(velocity, jnp.zeros(len(names), env.dt.dtype))
-        pushed = jax.vmap(push)(jnp.eye(len(names), dtype=env.dt.dtype))
+        drift, pushed = linear(velocity, jnp.zeros(len(names), env.dt.dtype))
         return -jnp.sum(pushed * drift, axis=-1) / jnp.max(jnp.sum(pushed * pushed, axis=-1))
 
 
