@@ -20,6 +20,7 @@ import numpy as np
 import jaxsafe
 from jaxsafe.component import Component, fields
 from jaxsafe.envs import TASKS
+from jaxsafe.plot.style import control_unit, length_unit
 from jaxsafe.processors.observation import Observation, Observe, ObserveAngle, ObserveRegion
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.types import units
@@ -53,9 +54,6 @@ CAPTION = {
 }
 """What the figure shows, by agent."""
 
-CONTROL_UNITS = {"thrust": "N", "rate": "rad/s", "attitude_acceleration": "rad/s²", "acceleration": "ft/s²"}
-"""Unit of an actuator by the words in its name, the first that fits."""
-
 SECTIONS = (
     ("Regions", "", "regions"),
     ("Statuses", "Facts about the state, computed in this order; those below may use those above.", "status"),
@@ -73,7 +71,7 @@ SECTIONS = (
 def page(task: str) -> str:
     """The Markdown page of a task."""
     env = jaxsafe.make(task)
-    length = next(unit for _, unit, _ in state_fields(env.platforms[0]))
+    length = length_unit(env)
     paths = f"A path is what `jaxsafe.make({task!r}, {{path: value}})` takes, followed by a dot and the number's name."
     blocks = [
         f"<!-- Written by docs/make_tasks.py. -->\n# {task}",
@@ -144,7 +142,7 @@ def state_fields(platform: Platform) -> list[tuple[str, str, int]]:
 def actions(env: jaxsafe.Environment) -> Iterator[tuple[str, ...]]:
     """A row for each actuator."""
     for index, one in enumerate(env.agent_platform.controller.actuators):  # type: ignore[attr-defined]
-        unit = next(unit for word, unit in CONTROL_UNITS.items() if word in one.name)
+        unit = control_unit(one.name, length_unit(env)) or ""
         mapped = "[low, 0] and [0, high], so that 0 stays 0" if one.zero_centred else "[low, high]"
         yield str(index), f"`{one.name}`", unit, number(one.low), number(one.high), mapped, str(one.points)
 

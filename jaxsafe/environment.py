@@ -63,10 +63,14 @@ class Environment(Component):
         """Same as `jaxsafe.step(env, state, action)`."""
         return step(self, state, action)
 
+    def platform(self, name: str) -> Platform:
+        """A platform by name."""
+        return next(platform for platform in self.platforms if platform.name == name)
+
     @property
     def agent_platform(self) -> Platform:
         """The platform that the actions drive."""
-        return next(platform for platform in self.platforms if platform.name == self.agent)
+        return self.platform(self.agent)
 
     @property
     def outcomes(self) -> tuple[str, ...]:

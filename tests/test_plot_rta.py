@@ -14,7 +14,8 @@ from jaxsafe.config import describe, yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.plot import safe_set
 from jaxsafe.plot.figures import draw_all
-from jaxsafe.plot.interventions import control_unit, interventions, most_altered
+from jaxsafe.plot.interventions import interventions, most_altered
+from jaxsafe.plot.style import control_unit
 from jaxsafe.rta.cascade import Cascade, Stage
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxsafe.plot.style import BLUE, GREY, ORANGE, labelled, length_unit, margin_unit
+from jaxsafe.plot.style import BLUE, GREY, ORANGE, control_unit, labelled, length_unit, margin_unit
 
 GREEN, SHADE = "#009E73", "#F0E442"  # of the same palette
 Rows = list[dict[str, Any]]
@@ -67,12 +67,6 @@ def interventions(rows: Rows, env: Any, title: str) -> Figure:
         f"{title}\naltered on {100.0 * share:.0f} % of the steps, ended with {rows[-1]['outcome']}", fontsize="medium"
     )
     return figure
-
-
-def control_unit(name: str, length: str) -> str | None:
-    """The unit of a control by the words in its name, given that of lengths; None if it is not known."""
-    known = {"thrust": "N", "rate": "rad/s", "attitude_acceleration": "rad/s²", "acceleration": f"{length}/s²"}
-    return next((unit for word, unit in known.items() if word in name), None)
 
 
 def _control(panel: Axes, times: np.ndarray, rows: Rows, actuator: Any) -> None:

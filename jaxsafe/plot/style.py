@@ -20,6 +20,12 @@ def length_unit(env: Any) -> str:
     return units(type(env.agent_platform.rest()))["position"]
 
 
+def control_unit(name: str, length: str) -> str | None:
+    """The unit of a control by the words in its name, given that of lengths; None if it is not known."""
+    known = {"thrust": "N", "rate": "rad/s", "attitude_acceleration": "rad/s²", "acceleration": f"{length}/s²"}
+    return next((unit for word, unit in known.items() if word in name), None)
+
+
 def margin_unit(constraint: Any, length: str) -> str | None:
     """The unit of a constraint's h, given that of positions; None if it is not known."""
     known = {SpeedLimit: f"{length}/s", Separation: length}

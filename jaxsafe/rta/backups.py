@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsafe.component import Range, Unit
 from jaxsafe.rta.asif import linear, speed_ball
 from jaxsafe.rta.filter import BackupController, TerminalSet
-from jaxsafe.rta.prediction import Others, bounds
+from jaxsafe.rta.prediction import Others, bounds, undirected
 from jaxsafe.rta.projection import project_box_ball
 from jaxsafe.simulation.geometry import direction, safe_norm
 from jaxsafe.types import ConstraintName, Length, Number, PlatformName, Positive, Radians, Sim
@@ -144,8 +144,8 @@ class VelocityMatched(TerminalSet, type="velocity_matched"):
 
 def _acceleration(env: Any, sim: Sim, name: str) -> Float[Array, " d"]:
     """v̇ of a platform, the agent's without control."""
-    platform, state = next(one for one in env.platforms if one.name == name), sim.platforms[name]
-    controls = {} if name == env.agent else platform.controller.control(jnp.zeros(0), sim)
+    platform, state = env.platform(name), sim.platforms[name]
+    controls = {} if name == env.agent else undirected(platform, sim)
     return jax.jvp(lambda state: state.velocity, (state,), (platform.derivative(state, controls),))[1]
 
 

@@ -44,8 +44,7 @@ def others_later(env: Any, sim: Sim) -> Others:
     for platform in env.platforms:
         if platform.name != env.agent:
             with part("platforms", platform.name):
-                controls = platform.controller.control(jnp.zeros(0), sim)
-                later[platform.name] = platform.step(sim.platforms[platform.name], controls, env.dt)
+                later[platform.name] = platform.step(sim.platforms[platform.name], undirected(platform, sim), env.dt)
     return later
 
 
@@ -70,6 +69,11 @@ def commanded(env: Any, platform: Any, sim: Sim, control: Float[Array, " m"]) ->
     """The controls of a platform: the agent's are given, the others follow their controllers."""
     if platform.name == env.agent:
         return dict(zip(env.action_names, control, strict=True))
+    return undirected(platform, sim)
+
+
+def undirected(platform: Any, sim: Sim) -> Controls:
+    """The controls of a platform that is not the agent: no action reaches it."""
     return platform.controller.control(jnp.zeros(0), sim)
 
 

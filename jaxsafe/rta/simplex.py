@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsafe.component import Range
 from jaxsafe.rta.filter import RTA, CertifiedRTA, RTAMemory, admissible
-from jaxsafe.rta.prediction import advance
+from jaxsafe.rta.prediction import advance, undirected
 from jaxsafe.simulation.geometry import direction, safe_norm, to_body
 from jaxsafe.types import Length, PlatformName, Positive, RadiansPerSecond, RTAInfo, Seconds, Sim
 
@@ -83,8 +83,7 @@ class CollisionSimplex(RTA, type="collision_simplex"):
     def _predict(self, env: Any, sim: Sim) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Smallest distance on the backup's way, and the turn that it makes."""
         own, other = sim.platforms[env.agent], sim.platforms[self.other]
-        ahead = next(platform for platform in env.platforms if platform.name == self.other)
-        rate = ahead.controller.control(jnp.zeros(0), sim).get("heading_rate", jnp.zeros_like(sim.time))
+        rate = undirected(env.platform(self.other), sim).get("heading_rate", jnp.zeros_like(sim.time))
         bearing = to_body(own.orientation, other.position - own.position)
         turn = jnp.where(bearing[1] >= 0.0, -self.turn_rate, self.turn_rate)
         times = jnp.linspace(0.0, 1.0, self.points) * self.window
