@@ -71,10 +71,12 @@ def main(argv: Sequence[str]) -> int:
     for name in policies if isinstance(policies, list) else [policies]:
         rows.append(attack(env, name, -(-steps // lanes), lanes, jax.random.key(seed)))
         print(report(rows[-1:]).splitlines()[1] if len(rows) > 1 else "\n".join(report(rows).splitlines()[:2]), flush=True)
+        if out:  # after each, so that nothing is lost if the run is stopped
+            facts = {"env": task, **options, "seed": seed, "policies": rows}
+            write_text(Path(out), json.dumps(facts, indent=1) + "\n")
     if report(rows).splitlines()[-1].endswith("confidence"):
         print(report(rows).splitlines()[-1])
     if out:
-        write_text(Path(out), json.dumps({"env": task, **options, "seed": seed, "policies": rows}, indent=1) + "\n")
         print(f"written to {out}")
     return int(any(row["violating_steps"] for row in rows))
 
