@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsafe.simulation.trig import sin_cos, tan
+from jaxsafe.simulation.trig import arctan, sin_cos, tan, wrap
 
 
 @pytest.mark.parametrize("span", [1.0, 10.0, 200.0, 1e4])
@@ -50,3 +50,24 @@ def test_derivatives_are_cosine_and_minus_sine() -> None:
 def test_the_tangent_is_sine_over_cosine() -> None:
     x = np.linspace(-1.05, 1.05, 2001, dtype=np.float32)
     np.testing.assert_allclose(tan(x), np.tan(x.astype(float)), rtol=3e-7)
+
+
+def test_the_arctangent_is_within_two_bits_everywhere() -> None:
+    spread = [np.linspace(-3.0, 3.0, 100_001), np.geomspace(1e-8, 1e8, 10_001), [0.0, np.inf, -np.inf]]
+    x = np.concatenate(spread).astype(np.float32)
+    np.testing.assert_allclose(jax.jit(arctan)(x), np.arctan(x.astype(float)), atol=2e-7, rtol=3e-7)
+    assert np.isnan(arctan(jnp.float32(np.nan)))
+    slopes = jax.vmap(jax.grad(arctan))(x)
+    np.testing.assert_allclose(slopes, 1.0 / (1.0 + x.astype(float) ** 2), atol=2e-7)
+
+
+@pytest.mark.parametrize(("low", "period"), [(-np.pi, 2 * np.pi), (-np.pi / 2, np.pi), (-0.2, 2 * np.pi)])
+def test_a_wrapped_angle_is_in_its_range_and_differs_by_whole_periods(low: float, period: float) -> None:
+    x = np.random.default_rng(0).uniform(-50.0, 50.0, 10_000).astype(np.float32)
+    found = np.asarray(wrap(x, low, period), float)
+    assert (found >= low - 1e-5).all()
+    assert (found < low + period + 1e-5).all()
+    turns = (x - found) / period
+    np.testing.assert_allclose(turns, np.round(turns), atol=1e-5)
+    inside = x[(x > low + 0.01) & (x < low + period - 0.01)]
+    np.testing.assert_array_equal(wrap(inside, low, period), inside)

@@ -14,9 +14,8 @@ from jaxsafe.rta.filter import BackupController, TerminalSet
 from jaxsafe.rta.prediction import Others, bounds, undirected
 from jaxsafe.rta.projection import project_box_ball
 from jaxsafe.simulation.geometry import direction, safe_norm
+from jaxsafe.simulation.trig import arctan, wrap
 from jaxsafe.types import ConstraintName, Length, Number, PlatformName, Positive, Radians, Sim
-
-TWO_PI = 2.0 * jnp.pi
 
 
 class Brake(BackupController, type="brake"):
@@ -97,7 +96,7 @@ class MatchVelocity(BackupController, type="match_velocity"):
         own, lead, ahead = sim.platforms[env.agent], sim.platforms[self.lead], later[self.lead]
         sign = 1.0 if self.turn == "left" else -1.0
         goal = ahead.heading if self.climb is None else lead.heading
-        error = sign * (jnp.mod(sign * (goal - own.heading) + self.dead_zone, TWO_PI) - self.dead_zone)
+        error = sign * wrap(sign * (goal - own.heading), -self.dead_zone, 2.0 * jnp.pi)
         speed = jnp.clip(ahead.speed, *env.agent_platform.speed_limits)
         wanted = {"acceleration": (speed - own.speed) / env.dt}
         if self.climb is None:
@@ -108,7 +107,7 @@ class MatchVelocity(BackupController, type="match_velocity"):
 
     def _in_space(self, env: Any, own: Any, ahead: Any, error: Array, turning: Array) -> dict[str, Array]:
         plant = env.agent_platform
-        bank = jnp.arctan(own.speed * (0.25 * error + turning) / plant.gravity)
+        bank = arctan(own.speed * (0.25 * error + turning) / plant.gravity)
         bank = jnp.clip(bank, plant.roll_limits[0], plant.roll_limits[1])
         lowest, highest = plant.flight_path_angle_limits
         steep = lowest if self.climb == "up" else highest  # ż = −v sin γ
@@ -152,7 +151,7 @@ def _acceleration(env: Any, sim: Sim, name: str) -> Float[Array, " d"]:
 def misalignment(state: Any) -> Float[Array, ""]:
     """Angle from the nearer end of the body's axis to the velocity, in [−π/2, π/2); 0 at rest."""
     course = jnp.arctan2(state.velocity[1], jnp.where(safe_norm(state.velocity) > 0.0, state.velocity[0], 1.0))
-    return jnp.mod(course - state.attitude + jnp.pi / 2, jnp.pi) - jnp.pi / 2
+    return wrap(course - state.attitude, -jnp.pi / 2, jnp.pi)
 
 
 def _safe_sqrt(x: Array) -> Array:

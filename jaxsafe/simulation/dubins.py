@@ -26,7 +26,7 @@ from jaxsafe.simulation.integrate import (
     time_to_limit,
 )
 from jaxsafe.simulation.platform import Platform
-from jaxsafe.simulation.trig import sin_cos, tan
+from jaxsafe.simulation.trig import arctan, sin_cos, tan
 from jaxsafe.types import Number, Positive, Record, Seconds
 
 GRAVITY = 32.17
@@ -191,7 +191,7 @@ class Dubins3D(Platform, type="dubins3d"):
     def _roll_rate(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Any:
         if "heading_rate" not in controls:
             return controls.get("roll_rate", 0.0)
-        return (jnp.arctan(controls["heading_rate"] * state.speed / self.gravity) - state.roll) / dt
+        return (arctan(controls["heading_rate"] * state.speed / self.gravity) - state.roll) / dt
 
 
 def _number(controls: Controls, name: str, like: Array) -> Array:

@@ -13,12 +13,11 @@ from jaxsafe.simulation.cwh import MASS, MEAN_MOTION, cwh_acceleration, cwh_flow
 from jaxsafe.simulation.geometry import direction, rotation
 from jaxsafe.simulation.integrate import NODES, WEIGHTS, ramp, time_to_limit
 from jaxsafe.simulation.platform import Platform
+from jaxsafe.simulation.trig import wrap
 from jaxsafe.types import Kilograms, Number, RadiansPerSecond, Record, Seconds
 
 RATE_LIMIT = jnp.pi / 90.0
 """Fastest turn [rad/s], Table 4: 2°/s."""
-
-TWO_PI = 2.0 * jnp.pi
 
 
 class OrientedState(Record):
@@ -94,6 +93,6 @@ class OrientedSpacecraft(Platform, type="oriented_spacecraft"):
 
 def wrapped(angle: Float[Array, ""]) -> Float[Array, ""]:
     """The angle in [−π, π); one that lies there is not touched by rounding."""
-    turned = jnp.mod(angle + jnp.pi, TWO_PI) - jnp.pi
+    turned = wrap(angle, -jnp.pi, 2.0 * jnp.pi)
     turned = jnp.where(turned < jnp.pi, turned, -jnp.pi)
     return jnp.where((angle >= -jnp.pi) & (angle < jnp.pi), angle, turned)
