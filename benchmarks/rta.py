@@ -191,8 +191,8 @@ def programs(repeats: int) -> list[dict[str, Any]]:
                 "variables": m,
                 "rows": 2,
                 "solutions_per_s": BATCH / seconds,
-                "median_error": np.median(error),
-                "error_99_percent": np.quantile(error, 0.99),
+                "median_error": float(np.median(error)),
+                "error_99_percent": float(np.quantile(error, 0.99)),
             }
         )
     return rows
