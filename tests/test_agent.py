@@ -58,19 +58,3 @@ def test_an_untrained_policy_is_centred_and_as_wide_as_configured(actions: str) 
     pushes = np.asarray(actions_drawn) / 5.0 - 1.0 if actions == "discrete" else np.asarray(actions_drawn)
     assert abs(pushes.mean()) < 0.05
     assert pushes.std() == pytest.approx(0.3, abs=0.02)
-
-
-def test_docking_features_are_direction_and_log_distance() -> None:
-    env = jaxsafe.make("docking3d")
-    agent = Agent(features="docking")
-    _, timestep = jaxsafe.reset_to(env, {"deputy": {"position": [30.0, 0.0, 40.0], "velocity": [0.0, 0.0, 0.0]}})
-    inputs = agent.inputs(env, timestep.observation)
-    np.testing.assert_array_equal(inputs[:8], timestep.observation)
-    np.testing.assert_allclose(inputs[8:], [0.3 / 0.51, 0.0, 0.4 / 0.51, np.log(0.505)], rtol=1e-6)
-    assert agent.init(KEY, env)["actor"][0]["kernel"].shape == (12, 64)
-
-
-def test_plain_agents_see_the_observation_and_nothing_else() -> None:
-    env = jaxsafe.make("docking2d")
-    _, timestep = env.reset(KEY)
-    np.testing.assert_array_equal(Agent(features="none").inputs(env, timestep.observation), timestep.observation)

@@ -15,22 +15,18 @@ from jaxtyping import Array, Float
 
 from jaxsafe.component import Component, Range
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError
 from jaxsafe.rollout import Policy
+from jaxsafe.train.features import FEATURES
 from jaxsafe.types import Dimensionless, Key, Positive
 
 Params = dict[str, Any]
 
 
 class Agent(Component):
-    """Actor and critic of the same shape, with nothing shared, for a given environment's spaces.
-
-    The `docking` features append to the observation the direction p/(‖p‖ + 0.01) and log(‖p‖ + 0.005) of the observed
-    position p: the target is 0.005 wide in units of p, which a plain perceptron resolves late or never.
-    """
+    """Actor and critic of the same shape, with nothing shared, for a given environment's spaces."""
 
     hidden: Annotated[tuple[int, ...], Range(1)] = (64, 64)
-    features: Literal["none", "docking"] = "none"
+    features: Literal["none", "docking", "rejoin"] = "none"  # what is appended to the observation, see `features`
     log_std: Dimensionless = -0.7  # initial, of continuous actions in [−1, 1]; learnt, the same for all states
     prior_std: Annotated[Dimensionless, Positive] = 0.3  # of discrete actions at the start, in units of half the range
 
@@ -47,11 +43,7 @@ class Agent(Component):
 
     def inputs(self, env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
         """Return what the networks see of an observation."""
-        if self.features == "none":
-            return observation
-        position = observation[..., jnp.array(_position_elements(env))]
-        distance = jnp.linalg.norm(position, axis=-1, keepdims=True)
-        return jnp.concatenate([observation, position / (distance + 0.01), jnp.log(distance + 0.005)], axis=-1)
+        return FEATURES[self.features](env, observation)
 
     def distribution(self, env: Environment, params: Params, inputs: Float[Array, "*batch i"]) -> Gaussian | Categorical:
         """Return the policy π(·|s)."""
@@ -146,10 +138,3 @@ def _init_mlp(key: Key, sizes: Sequence[int], last_gain: float) -> list[Params]:
 def _prior(points: Sequence[int], std: Array | float) -> Float[Array, " points"]:
     """Constant logits −(u/u_max/std)²/2, u from −1 to 1: an untrained policy is nearly a normal of that width about 0."""
     return jnp.concatenate([-0.5 * (jnp.linspace(-1.0, 1.0, n) / std) ** 2 for n in points])
-
-
-def _position_elements(env: Environment) -> list[int]:
-    found = [i for i, name in enumerate(env.observation_names) if name.startswith("position.")]
-    if not found:
-        raise ConfigError("agent.features: 'docking' needs an observation called 'position'; choose none")
-    return found

@@ -1,0 +1,72 @@
+"""What the agent computes from an observation before its networks see it; what is observed stays the paper's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.environment import Environment
+from jaxsafe.errors import ConfigError
+
+Features = Callable[[Environment, Float[Array, "*batch o"]], Float[Array, "*batch i"]]
+
+
+def none(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch o"]:
+    """The observation and nothing else."""
+    return observation
+
+
+def docking(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
+    """Append the direction p/(‖p‖ + 0.01) and log(‖p‖ + 0.005) of the observed position p.
+
+    The target is 0.005 wide in units of p, which a plain perceptron resolves late or never.
+    """
+    position = _vector(env, observation, "position", "docking")
+    distance = jnp.linalg.norm(position, axis=-1, keepdims=True)
+    return jnp.concatenate([observation, position / (distance + 0.01), jnp.log(distance + 0.005)], axis=-1)
+
+
+def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
+    """Append the lead's relative velocity and how far both will miss each other if neither manoeuvres.
+
+    With the direction p of the lead and the relative velocity w, both observed: w, the cosine between them, the part of p
+    across w, 0 on a collision course, and that part times the observed distance: the miss distance, unless it is clipped.
+    """
+    distance = _elements(env, observation, "lead_position.magnitude", "rejoin")
+    velocities = [
+        _elements(env, observation, f"{name}.magnitude", "rejoin") * _vector(env, observation, name, "rejoin")
+        for name in ("lead_velocity", "wingman_velocity")
+    ]
+    bearing, relative = _vector(env, observation, "lead_position", "rejoin"), velocities[0] - velocities[1]
+    course = relative / (jnp.linalg.norm(relative, axis=-1, keepdims=True) + 0.01)
+    closing = jnp.sum(bearing * course, axis=-1, keepdims=True)
+    across = bearing - closing * course
+    approaching = jnp.maximum(-closing, 0.0)
+    sine2 = jnp.sum(across * across, axis=-1, keepdims=True)
+    danger = [approaching * jnp.exp(-sine2 * scale) for scale in (1.0 / 0.15**2, distance**2 / 0.2**2)]
+    return jnp.concatenate([observation, relative, closing, 4.0 * across, 4.0 * across * distance, *danger], axis=-1)
+
+
+FEATURES: Mapping[str, Features] = {each.__name__: each for each in (none, docking, rejoin)}
+"""By name, as in `agent.features`."""
+
+
+def _vector(env: Environment, observation: Float[Array, "*batch o"], name: str, features: str) -> Float[Array, "*batch d"]:
+    axes = [f"{name}.{axis}" for axis in "xyz" if f"{name}.{axis}" in env.observation_names]
+    return jnp.concatenate([_elements(env, observation, axis, features) for axis in axes or [f"{name}.x"]], axis=-1)
+
+
+def _elements(
+    env: Environment, observation: Float[Array, "*batch o"], name: str, features: str
+) -> Float[Array, "*batch 1"]:
+    """An element of the observation.
+
+    Raises:
+        ConfigError: the environment does not observe it.
+    """
+    if name not in env.observation_names:
+        raise ConfigError(f"agent.features: {features!r} needs an observation called {name!r}; choose none")
+    index = env.observation_names.index(name)
+    return observation[..., index : index + 1]

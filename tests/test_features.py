@@ -1,0 +1,77 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsafe
+from jaxsafe.errors import ConfigError
+from jaxsafe.train.agent import Agent
+
+KEY = jax.random.key(3)
+COURSE = np.array([-300.0, 250.0])
+"""The lead's velocity seen from the wingman, when one flies along x at 300 ft/s and the other along y at 250."""
+
+
+def observed(task: str, ahead: np.ndarray) -> tuple[jaxsafe.Environment, jax.Array]:
+    """What the wingman observes with the lead at a place relative to it."""
+    env = jaxsafe.make(task)
+    rest = [0.0] * (env.observation_names.count("lead_position.z"))
+    lead = {"position": [*ahead, *rest], "heading": np.pi / 2, "speed": 250.0}
+    wingman = {"position": [0.0, 0.0, *rest], "heading": 0.0, "speed": 300.0}
+    _, timestep = jaxsafe.reset_to(env, {"lead": lead, "wingman": wingman})
+    return env, timestep.observation
+
+
+def test_docking_features_are_direction_and_log_distance() -> None:
+    env = jaxsafe.make("docking3d")
+    agent = Agent(features="docking")
+    _, timestep = jaxsafe.reset_to(env, {"deputy": {"position": [30.0, 0.0, 40.0], "velocity": [0.0, 0.0, 0.0]}})
+    inputs = agent.inputs(env, timestep.observation)
+    np.testing.assert_array_equal(inputs[:8], timestep.observation)
+    np.testing.assert_allclose(inputs[8:], [0.3 / 0.51, 0.0, 0.4 / 0.51, np.log(0.505)], rtol=1e-6)
+    assert agent.init(KEY, env)["actor"][0]["kernel"].shape == (12, 64)
+
+
+def test_plain_agents_see_the_observation_and_nothing_else() -> None:
+    env = jaxsafe.make("docking2d")
+    _, timestep = env.reset(KEY)
+    np.testing.assert_array_equal(Agent(features="none").inputs(env, timestep.observation), timestep.observation)
+
+
+@pytest.mark.parametrize("task", ["rejoin2d", "rejoin3d"])
+def test_rejoin_features_tell_a_collision_course(task: str) -> None:
+    env, observation = observed(task, -2.0 * COURSE)
+    inputs = np.asarray(Agent(features="rejoin").inputs(env, observation))
+    size, d = env.observation_size, 3 if task == "rejoin3d" else 2
+    np.testing.assert_array_equal(inputs[:size], observation)
+    relative, closing, across, miss, danger = np.split(inputs[size:], np.cumsum([d, 1, d, d]))
+    np.testing.assert_allclose(relative[:2], COURSE / 400.0, atol=1e-6)
+    np.testing.assert_allclose(closing, -1.0, atol=0.02)  # the direction of w has length ‖w‖/(‖w‖ + 0.01)
+    np.testing.assert_allclose([*across, *miss], 0.0, atol=0.1)
+    np.testing.assert_allclose(danger, 1.0, atol=0.05)
+
+
+@pytest.mark.parametrize("task", ["rejoin2d", "rejoin3d"])
+def test_rejoin_features_measure_by_how_much_the_lead_is_missed(task: str) -> None:
+    left = 300.0 * np.array([-COURSE[1], COURSE[0]]) / np.linalg.norm(COURSE)
+    env, observation = observed(task, -COURSE + left)
+    inputs = np.asarray(Agent(features="rejoin").inputs(env, observation))
+    d = 3 if task == "rejoin3d" else 2
+    miss, danger = inputs[-2 - d : -2], inputs[-2:]
+    np.testing.assert_allclose(1000.0 * miss[:2] / 4.0, left, atol=10.0)
+    assert (danger < 0.15).all()
+    env, observation = observed(task, COURSE)  # it flies away
+    np.testing.assert_array_equal(Agent(features="rejoin").inputs(env, observation)[-2:], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("features", "task", "missing"),
+    [
+        ("docking", "rejoin2d", "position.x"),
+        ("rejoin", "docking3d", "lead_position.magnitude"),
+    ],
+)
+def test_features_of_another_task_are_refused(features: str, task: str, missing: str) -> None:
+    env = jaxsafe.make(task)
+    with pytest.raises(ConfigError, match=f"agent.features: '{features}' needs an observation called '{missing}'"):
+        Agent(features=features).inputs(env, jnp.zeros(env.observation_size))  # type: ignore[arg-type]
