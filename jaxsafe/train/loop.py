@@ -118,7 +118,7 @@ class Training:
         """Compile the chunk ahead of time, so that its cost is known."""
 
         def advance(shared: tuple, state: TrainState) -> tuple[TrainState, dict]:
-            return _chunk(shared, state, self.chunk, self.config.num_updates)
+            return chunk(shared, state, self.chunk, self.config.num_updates)
 
         begin = time.monotonic()
         compiled = self.mapper.map(advance).lower(self.shared, self.state).compile()
@@ -169,8 +169,8 @@ def _init(shared: tuple, key: jax.Array) -> TrainState:
     return ppo.init(env, agent, hyper, key)
 
 
-def _chunk(shared: tuple, state: TrainState, length: int, limit: int) -> tuple[TrainState, dict[str, jax.Array]]:
-    """`length` updates, fewer at the end of the run, with the averages of the window after each."""
+def chunk(shared: tuple, state: TrainState, length: int, limit: int) -> tuple[TrainState, dict[str, jax.Array]]:
+    """`length` updates of one seed, fewer at the end of the run, with the averages of the window after each."""
     env, agent, hyper = shared
 
     def one(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:

@@ -1,0 +1,36 @@
+"""Curves of a sweep: how success grew with each setting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.figure import Figure
+
+from jaxsafe.plot.style import GREY, save
+
+NAMED = 8
+"""Settings that get a colour and a name, the best ones."""
+
+
+def sweep_curves(path: Path, curves: Sequence[tuple[str, dict[str, Any]]]) -> Path:
+    """Draw the success rate, averaged over seeds, of each setting, best first, and return the file."""
+    figure = Figure(figsize=(7.6, 4.4), layout="constrained")
+    panel = figure.subplots()
+    for place, (label, curve) in reversed(list(enumerate(curves))):
+        steps, success = np.array(curve["steps"]), 100.0 * np.mean(np.array(curve["success_rate"], float), axis=0)
+        named = place < NAMED
+        colour = colormaps["viridis"](0.85 * place / max(min(len(curves), NAMED) - 1, 1)) if named else GREY
+        panel.plot(
+            steps, success, color=colour, linewidth=1.6 if named else 0.6, label=label if named else None, zorder=-place
+        )
+    panel.axhline(80.0, color="black", linestyle=":", linewidth=1.0)
+    panel.set(xlabel="environment steps per seed", ylabel="success rate [%], last 100 episodes", ylim=(-3, 103))
+    panel.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
+    panel.margins(x=0.0)
+    handles, labels = panel.get_legend_handles_labels()
+    figure.legend(handles[::-1], labels[::-1], loc="outside right upper", fontsize="small", frameon=False)
+    return save(figure, path / "curves.png")

@@ -1,0 +1,70 @@
+"""`python -m jaxsafe.tune env=docking2d seeds=4 sweep.ppo.gamma=[0.95,0.97]`: train every setting, rank them in a table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxsafe import cli
+from jaxsafe.train.seeds import claim_cores
+
+RANKS = ("steps", "success", "deterministic")
+EPISODES = 200
+"""Of the evaluation of each seed, unless the user says otherwise."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    claim_cores()
+    cli.enable_compilation_cache()
+    from tqdm import tqdm
+
+    from jaxsafe.errors import ConfigError, nearest
+    from jaxsafe.tune import results
+    from jaxsafe.tune.lanes import train_all
+    from jaxsafe.tune.settings import alike, pop_sweep, settings
+
+    arguments, path = cli.Arguments.parse(argv), None
+    resume = arguments.pop_text("resume")
+    if resume is not None:
+        arguments.refuse_rest(["resume"])
+        path, arguments = Path(resume), results.read_request(Path(resume))
+    request, out = dict(arguments.options), arguments.pop_text("out")
+    rank = arguments.pop("rank", RANKS[0])
+    if rank not in RANKS:
+        raise ConfigError(f"rank: unknown order {rank!r}; choose from {nearest(rank, RANKS)}")
+    samples = arguments.pop_count("samples", 0) if "samples" in arguments.options else None
+    draw = arguments.pop_count("draw", 0, least=0)
+    arguments.options.setdefault("episodes", EPISODES)
+    sweep = pop_sweep(arguments)
+    found = settings(arguments, sweep, samples, draw)
+    path = path or results.create(out, request)
+    rows = results.read(path)
+    left = [i for i in range(len(found)) if i not in rows]
+    print(
+        f"{len(found)} settings × {found[0].config.seeds} seeds, {len(alike(found, left))} to compile, in {path}",
+        flush=True,
+    )
+    with tqdm(total=sum(found[i].config.num_updates for i in left), unit=" updates") as bar:
+        for done in train_all(found, left, bar.update):
+            results.add(path, done)
+            rows |= done
+    print(results.finish(path, rows, list(sweep), rank))
+    return 0
+
+
+def usage() -> str:
+    """The help text."""
+    return (
+        "usage: python -m jaxsafe.tune env=TASK sweep.OPTION=[a,b,…] [key=value …]      or      resume=DIR\n\n"
+        "  sweep.OPTION=[a,b]     values of an option of jaxsafe.train, or of env.PATH; several make a grid\n"
+        "  sweep.OPTION='log(1e-4,1e-2)' or 'uniform(0.9,1)'   an interval to draw from, with samples=N\n"
+        "  samples=N              draw N settings instead of trying all combinations; draw=SEED chooses others\n"
+        "  rank=steps|success|deterministic   order of the table (default steps to 80 % success in training)\n"
+        "  seeds, steps, episodes, …   any option of jaxsafe.train, the same for all settings\n"
+        "  out=DIR                where to write (default: a new directory in runs/)"
+    )
+
+
+if __name__ == "__main__":
+    cli.run(main, usage, cli.at_once)

@@ -1,0 +1,108 @@
+"""Training many settings at once: a lane is one seed of one setting, and all lanes run the same compiled program."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsafe.evaluate.episodes import run_episodes
+from jaxsafe.evaluate.seeds import BATCH, KINDS, batch_keys, success_index
+from jaxsafe.metrics import interaction_efficiency
+from jaxsafe.train import ppo
+from jaxsafe.train.loop import EVALUATION_SEED, chunk
+from jaxsafe.train.seeds import SeedMapper
+from jaxsafe.tune.settings import Setting, alike, lane
+
+CHUNKS = 20
+"""Pieces that a training is cut into, so that Ctrl-C and the bar do not wait for its end."""
+
+
+def train_all(
+    found: Sequence[Setting], chosen: Sequence[int], tick: Callable[[int], object]
+) -> Iterator[dict[int, dict[str, Any]]]:
+    """Train and evaluate the chosen settings, some at a time: their results by index.
+
+    Args:
+        found: all settings of a sweep.
+        chosen: indices of those to train.
+        tick: called with numbers of finished updates, one for each setting.
+    """
+    for group in alike(found, chosen):
+        lanes = Lanes(found[group[0]], len(group))
+        for begin in range(0, len(group), lanes.at_once):
+            some = group[begin : begin + lanes.at_once]
+            yield dict(zip(some, lanes.run([found[i] for i in some], tick), strict=True))
+
+
+class Lanes:
+    """Compiled once for settings that differ in numbers only."""
+
+    def __init__(self, like: Setting, count: int) -> None:
+        """Prepare for `count` settings such as `like`: on a CPU a few at a time that keep all cores busy, else all."""
+        self.like, self.seeds, devices = like, like.config.seeds, jax.devices()
+        on_cpu = devices[0].platform == "cpu"
+        self.at_once = math.lcm(self.seeds, len(devices)) // self.seeds if on_cpu else count
+        self.mapper = SeedMapper(self.at_once * self.seeds)
+        self.length = -(-like.config.num_updates // CHUNKS)
+        self._init = self.mapper.map(_one_init)
+        self._advance = self.mapper.map(self._one_chunk)
+        self._evaluate = self.mapper.map(_one_evaluation)
+
+    def run(self, some: Sequence[Setting], tick: Callable[[int], object]) -> list[dict[str, Any]]:
+        """Train and evaluate at most `at_once` settings; a result for each."""
+        places = self.mapper.pad(np.arange(self.at_once * self.seeds))
+        trees = [lane(some[min(place // self.seeds, len(some) - 1)]) for place in places]
+        lanes = self.mapper.place(jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees))
+        keys = jax.vmap(jax.random.key)(jnp.asarray(self.like.config.seed + places % self.seeds))
+        state = self._init((), (lanes, self.mapper.place(keys)))
+        curves = []
+        for begin in range(0, self.like.config.num_updates, self.length):
+            count = min(self.length, self.like.config.num_updates - begin)
+            state, rows = self._advance((), (lanes, state))
+            curves.append(self.mapper.gather({name: rows[name][:, :count] for name in ("success_rate", "count", "return")}))
+            tick(count * len(some))
+        curve = {name: np.concatenate([one[name] for one in curves], axis=1) for name in curves[0]}
+        rates = {kind: self._success(lanes, state.params, kind == "deterministic") for kind in KINDS}
+        split = lambda table: table.reshape(self.at_once, self.seeds, *table.shape[1:])[: len(some)]  # noqa: E731
+        curve, rates = jax.tree.map(split, (curve, rates))
+        return [self._result(setting, *jax.tree.map(lambda x, i=i: x[i], (curve, rates))) for i, setting in enumerate(some)]
+
+    def _one_chunk(self, _: tuple, one: tuple[Any, Any]) -> tuple[Any, dict[str, jax.Array]]:
+        return chunk(*one, self.length, self.like.config.num_updates)
+
+    def _success(self, lanes: Any, params: Any, deterministic: bool) -> np.ndarray:
+        """Success rate of every lane."""
+        count, outcomes = self.like.config.episodes, []
+        for key in batch_keys(EVALUATION_SEED, -(-count // BATCH)):
+            shared = self.mapper.replicate((key, np.asarray(deterministic)))
+            outcomes.append(self.mapper.gather(self._evaluate(shared, (lanes, params))))
+        return np.mean(np.concatenate(outcomes, axis=1)[:, :count] == success_index(self.like.env), axis=1)
+
+    def _result(self, setting: Setting, curve: dict[str, np.ndarray], rates: dict[str, np.ndarray]) -> dict[str, Any]:
+        steps = (1 + np.arange(setting.config.num_updates)) * setting.config.ppo.batch_size
+        success, episodes = curve["success_rate"].T, curve["count"].T
+        last = curve["return"][:, -1]
+        return {
+            **setting.changes,
+            "steps": int(steps[-1]),
+            "interaction_efficiency": interaction_efficiency(steps, success, episodes),
+            "training_success": success[-1].tolist(),
+            "training_return": last.tolist(),
+            **{f"{kind}_success": rate.tolist() for kind, rate in rates.items()},
+            "curve": {"steps": steps.tolist(), "success_rate": np.round(success.T, 4).tolist()},
+        }
+
+
+def _one_init(_: tuple, one: tuple[Any, Any]) -> Any:
+    (env, agent, hyper), key = one
+    return ppo.init(env, agent, hyper, key)
+
+
+def _one_evaluation(shared: tuple, one: tuple[Any, Any]) -> jax.Array:
+    (key, deterministic), ((env, agent, _), params) = shared, one
+    return run_episodes(env, agent.policy(env, params, deterministic), key, BATCH).outcome

@@ -1,0 +1,110 @@
+"""The files of a sweep, and its table."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsafe.cli import Arguments
+from jaxsafe.config import yaml
+from jaxsafe.errors import ConfigError
+from jaxsafe.train import directory
+from jaxsafe.train.files import append_rows, keep_rows, write_csv, write_json, write_text
+
+Rows = dict[int, dict[str, Any]]
+"""The results of settings, by their place in the sweep."""
+
+SHOWN = 20
+"""Lines of the printed table."""
+
+LONGEST = 36
+"""Letters of a legend's entry."""
+
+
+def create(out: str | None, request: Mapping[str, Any]) -> Path:
+    """Make the directory of a sweep and write down what was asked for."""
+    path = directory.make(out, Path("runs"), f"tune_{Path(str(request['env'])).stem}")
+    write_text(path / "sweep.yaml", yaml.write({"request": dict(request), "versions": directory.versions()}))
+    return path
+
+
+def read_request(path: Path) -> Arguments:
+    """The options of a sweep that was begun.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    if not (path / "sweep.yaml").is_file():
+        raise ConfigError(f"resume: no sweep in {str(path)!r} (a directory with sweep.yaml)")
+    return Arguments(dict(yaml.read(path / "sweep.yaml")["request"]))
+
+
+def read(path: Path) -> Rows:
+    """The results so far; a line that a kill cut short is cut off."""
+    return {row.pop("setting"): row for row in keep_rows(path / "settings.jsonl", lambda _: True, ("setting",))}
+
+
+def add(path: Path, rows: Mapping[int, dict[str, Any]]) -> None:
+    """Write down results as they come, so that a killed sweep goes on after them."""
+    append_rows(path / "settings.jsonl", ({"setting": index, **row} for index, row in rows.items()))
+
+
+def finish(path: Path, rows: Rows, swept: Sequence[str], rank: str) -> str:
+    """Write `results.json`, `results.csv` and the figure; return the table, best first."""
+    from jaxsafe.plot.sweep import sweep_curves
+
+    order = sorted(rows, key=lambda index: (_key(rows[index], rank), index))
+    flat = [{"setting": index, **_flat(rows[index], swept)} for index in order]
+    write_json(path / "results.json", {"rank": rank, "settings": [{"setting": i, **rows[i]} for i in order]})
+    write_csv(path / "results.csv", flat)
+    figure = sweep_curves(path, [(_label(i, rows[i], swept), rows[i]["curve"]) for i in order])
+    lines = _table(flat[:SHOWN])
+    if len(flat) > SHOWN:
+        lines.append(f"… and {len(flat) - SHOWN} more")
+    return "\n".join([*lines, f"results in {path / 'results.csv'}, figure {figure}"])
+
+
+def _key(row: dict[str, Any], rank: str) -> tuple[float, float, float]:
+    """Small is good: the chosen quantity first, then the others."""
+    steps = row["interaction_efficiency"]["timesteps"] or float("inf")
+    success, deterministic = (-float(np.mean(row[f"{kind}_success"])) for kind in ("stochastic", "deterministic"))
+    area = -float(np.mean(row["curve"]["success_rate"]))
+    return {
+        "steps": (steps, area, success),
+        "success": (success, deterministic, steps),
+        "deterministic": (deterministic, success, steps),
+    }[rank]
+
+
+def _flat(row: dict[str, Any], swept: Sequence[str]) -> dict[str, Any]:
+    mean = lambda name: round(float(np.mean(row[name])), 4)  # noqa: E731
+    each = row["interaction_efficiency"]["per_seed"]
+    return {
+        **{name: json.dumps(row[name]) if isinstance(row[name], (list, dict)) else row[name] for name in swept},
+        "80 % after": row["interaction_efficiency"]["timesteps"],
+        "seeds at 80 %": f"{sum(step is not None for step in each)}/{len(each)}",
+        "training": mean("training_success"),
+        "stochastic": mean("stochastic_success"),
+        "worst": round(min(row["stochastic_success"]), 4),
+        "deterministic": mean("deterministic_success"),
+    }
+
+
+def _label(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
+    """The setting's number, and its values where they fit."""
+    values = ", ".join(f"{'.'.join(name.split('.')[-2:])} {row[name]}" for name in swept)
+    return f"{index}: {values}" if len(values) <= LONGEST else f"setting {index}"
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> list[str]:
+    cells = [[*rows[0]], *([_cell(value) for value in row.values()] for row in rows)]
+    widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
+    return ["  ".join(f"{cell:>{width}}" for cell, width in zip(line, widths, strict=True)) for line in cells]
+
+
+def _cell(value: Any) -> str:
+    return "never" if value is None else f"{value:,}" if isinstance(value, int) else str(value)

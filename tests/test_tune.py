@@ -1,0 +1,131 @@
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny import TINY
+
+from jaxsafe import cli
+from jaxsafe.errors import ConfigError
+from jaxsafe.tune import __main__ as command
+from jaxsafe.tune.settings import Range, alike, pop_sweep, settings
+
+BASE = [word for word in TINY if not word.startswith("ppo.num_steps")]
+SWEEP = [*BASE, "sweep.ppo.gamma=[0.95,0.99]", "sweep.ppo.num_steps=[16,32]"]
+
+
+def options(*words: str) -> cli.Arguments:
+    swept = {word.partition("=")[0] for word in words}
+    return cli.Arguments.parse([*(word for word in TINY if f"sweep.{word.partition('=')[0]}" not in swept), *words])
+
+
+def results(path: Path) -> dict[int, dict[str, Any]]:
+    rows = [json.loads(line) for line in (path / "settings.jsonl").read_text().splitlines()]
+    return {row["setting"]: row for row in rows}
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("sweep") / "whole"
+    assert command.main([*SWEEP, f"out={path}"]) == 0
+    return path
+
+
+def test_a_grid_has_every_combination() -> None:
+    arguments = options("sweep.ppo.gamma=[0.9,0.95,1]", "sweep.env.reward.delta_v.scale=[-0.01,-0.02]")
+    found = settings(arguments, pop_sweep(arguments), None, 0)
+    assert len({tuple(each.changes.values()) for each in found}) == 6
+    for each in found:
+        assert float(each.config.ppo.gamma) == pytest.approx(each.changes["ppo.gamma"])
+        term = next(term for term in each.env.reward if term.name == "delta_v")
+        assert float(term.scale) == pytest.approx(each.changes["env.reward.delta_v.scale"])  # type: ignore[attr-defined]
+    assert alike(found, range(6)) == [list(range(6))]
+
+
+def test_draws_lie_in_their_range_and_can_be_repeated() -> None:
+    arguments = options("sweep.ppo.learning_rate=log(1e-4,1e-2)", "sweep.ppo.gamma=[0.9,0.99]")
+    sweep = pop_sweep(arguments)
+    assert sweep["ppo.learning_rate"] == Range(1e-4, 1e-2, log=True)
+    first, again, other = (settings(arguments, sweep, 30, draw) for draw in (0, 0, 1))
+    assert [each.changes for each in first] == [each.changes for each in again]
+    assert [each.changes for each in first] != [each.changes for each in other]
+    rates = np.array([each.changes["ppo.learning_rate"] for each in first])
+    assert ((rates >= 1e-4) & (rates <= 1e-2)).all()
+    assert 6 < (rates < 1e-3).sum() < 24  # half of them, as the logarithm is uniform
+    assert {each.changes["ppo.gamma"] for each in first} == {0.9, 0.99}
+
+
+def test_settings_that_differ_in_sizes_are_compiled_apart() -> None:
+    arguments = options("sweep.agent.hidden=[[8],[8,8]]", "sweep.ppo.clip=[0.1,0.2]")
+    found = settings(arguments, pop_sweep(arguments), None, 0)
+    assert alike(found, range(4)) == [[0, 1], [2, 3]]
+    assert alike(found, [1, 2]) == [[1], [2]]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "sweep: nothing to sweep; for instance sweep.ppo.gamma=[0.95,0.97,0.99]"),
+        (
+            ["sweep.ppo.gamma=0.9"],
+            "sweep.ppo.gamma: expected a list [a,b,…], uniform(low,high) or log(low,high), found 0.9",
+        ),
+        (["sweep.ppo.gamma=[]"], "sweep.ppo.gamma: expected a list"),
+        (["sweep.ppo.gamma=log(0,1)"], "sweep.ppo.gamma: expected low < high, for log above 0, found 'log(0,1)'"),
+        (["sweep.ppo.gamma=uniform(a,b)"], "sweep.ppo.gamma: expected two numbers in the brackets"),
+        (["sweep.ppo.gamma=uniform(0.9,1)"], "sweep.ppo.gamma: a range needs samples=N"),
+        (["sweep.ppo.gamma=[0.9,1.5]"], "ppo.gamma: expected a number in [0, 1], found 1.5"),
+        (["sweep.ppo.gama=[0.9]"], "ppo.gama: unknown field 'gama'"),
+        (["sweep.seeds=[1,2]"], "sweep.seeds: must be the same in all settings; give seeds=… instead"),
+        (["sweep.agent.hidden=[[8]]"], "sweep.agent.hidden: agent.hidden is given as well; leave one out"),
+        (["sweep.ppo.clip=[0.1]", "rank=speed"], "rank: unknown order 'speed'; choose from steps, success, deterministic"),
+        (["sweep.ppo.clip=[0.1]", "samples=0"], "samples: expected a whole number ≥ 1, found 0"),
+        (["resume=nowhere"], "resume: no sweep in 'nowhere'"),
+    ],
+)
+def test_what_cannot_be_swept_is_said_in_one_line(words: list[str], message: str) -> None:
+    given = words if any(word.startswith("resume") for word in words) else [*TINY, *words]
+    with pytest.raises(ConfigError) as raised:
+        command.main(given)
+    assert str(raised.value).startswith(message)
+
+
+def test_a_setting_learns_what_the_same_training_learns(swept: Path, whole: Path) -> None:
+    """Of the fixture `whole`: the same options, γ = 0.95 and batches of 16 steps from the recipe and from `TINY`."""
+    row = next(row for row in results(swept).values() if (row["ppo.gamma"], row["ppo.num_steps"]) == (0.95, 16))
+    progress = [json.loads(line) for line in (whole / "progress.jsonl").read_text().splitlines()]
+    for seed in range(3):
+        own = [each for each in progress if each["seed"] == seed]
+        assert row["curve"]["steps"] == [each["step"] for each in own]
+        np.testing.assert_allclose(
+            row["curve"]["success_rate"][seed], [each["success_rate"] or 0.0 for each in own], atol=1e-4
+        )
+        assert row["training_return"][seed] == pytest.approx(own[-1]["return"], rel=1e-4)
+    evaluation = json.loads((whole / "results.json").read_text())["evaluation"]
+    assert row["stochastic_success"] == evaluation["stochastic"]["success_rate"]["per_seed"]
+    other = next(row for row in results(swept).values() if (row["ppo.gamma"], row["ppo.num_steps"]) == (0.99, 16))
+    assert other["training_return"] != row["training_return"]
+
+
+def test_the_table_ranks_every_setting(swept: Path) -> None:
+    rows = list(csv.DictReader((swept / "results.csv").read_text().splitlines()))
+    assert sorted(row["setting"] for row in rows) == ["0", "1", "2", "3"]
+    assert {(row["ppo.gamma"], row["ppo.num_steps"]) for row in rows} == {
+        (g, n) for g in ("0.95", "0.99") for n in ("16", "32")
+    }
+    assert (swept / "curves.png").stat().st_size > 10_000
+    ranked = json.loads((swept / "results.json").read_text())["settings"]
+    assert [str(row["setting"]) for row in ranked] == [row["setting"] for row in rows]
+
+
+def test_a_killed_sweep_goes_on_and_ends_the_same(swept: Path, tmp_path: Path) -> None:
+    path = tmp_path / "killed"
+    path.mkdir()
+    (path / "sweep.yaml").write_text((swept / "sweep.yaml").read_text())
+    lines = (swept / "settings.jsonl").read_text().splitlines(keepends=True)
+    (path / "settings.jsonl").write_text(lines[0] + lines[1][:40])
+    assert command.main([f"resume={path}"]) == 0
+    assert results(path) == results(swept)
+    assert (path / "results.csv").read_text() == (swept / "results.csv").read_text()
