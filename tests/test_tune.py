@@ -129,3 +129,15 @@ def test_a_killed_sweep_goes_on_and_ends_the_same(swept: Path, tmp_path: Path) -
     assert command.main([f"resume={path}"]) == 0
     assert results(path) == results(swept)
     assert (path / "results.csv").read_text() == (swept / "results.csv").read_text()
+
+
+def test_an_interrupted_sweep_says_how_to_go_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("jaxsafe.tune.lanes.train_all", interrupted)
+    assert command.main([*SWEEP, f"out={tmp_path / 'sweep'}"]) == cli.INTERRUPTED
+    said = capsys.readouterr().out.splitlines()[-1]
+    assert said == f"stopped with 0 of 4 settings; go on with: python -m jaxsafe.tune resume={tmp_path / 'sweep'}"

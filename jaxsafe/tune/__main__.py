@@ -45,10 +45,16 @@ def main(argv: Sequence[str]) -> int:
         f"{len(found)} settings × {found[0].config.seeds} seeds, {len(alike(found, left))} to compile, in {path}",
         flush=True,
     )
-    with tqdm(total=sum(found[i].config.num_updates for i in left), unit=" updates") as bar:
-        for done in train_all(found, left, bar.update):
-            results.add(path, done)
-            rows |= done
+    total = sum(found[i].config.num_updates for i in left)
+    try:
+        with tqdm(total=total, unit=" updates", disable=None) as bar:  # none where there is no terminal
+            for done in train_all(found, left, bar.update):
+                results.add(path, done)
+                rows |= done
+                tqdm.write("\n".join(results.line(i, row, list(sweep)) for i, row in done.items()))
+    except KeyboardInterrupt:
+        print(f"stopped with {len(rows)} of {len(found)} settings; go on with: python -m jaxsafe.tune resume={path}")
+        return cli.INTERRUPTED
     print(results.finish(path, rows, list(sweep), rank))
     return 0
 

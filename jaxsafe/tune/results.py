@@ -68,6 +68,13 @@ def finish(path: Path, rows: Rows, swept: Sequence[str], rank: str) -> str:
     return "\n".join([*lines, f"results in {path / 'results.csv'}, figure {figure}"])
 
 
+def line(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
+    """One setting in short, as it is finished."""
+    facts = _flat(row, swept)
+    values = ", ".join(f"{name} {facts[name]}" for name in swept)
+    return f"setting {index}: {values}: 80 % after {_cell(facts['80 % after'])}, then {facts['stochastic']:.1%}"
+
+
 def _key(row: dict[str, Any], rank: str) -> tuple[float, float, float]:
     """Small is good: the chosen quantity first, then the others."""
     steps = row["interaction_efficiency"]["timesteps"] or float("inf")
