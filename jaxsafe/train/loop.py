@@ -97,7 +97,7 @@ class Training:
     def _restore_or_init(self) -> None:
         steps = self.checkpoints.steps
         if not steps:
-            self.state = self.mapper.map(_init)(self.shared, self.mapper.keys(self.config.seed))
+            self.state = self.mapper.map(begin)(self.shared, self.mapper.keys(self.config.seed))
             self.best = {"params": self.state.params, "success": self.mapper.place(jnp.full(self.mapper.padded, -1.0))}
             return
         content, facts = self.checkpoints.restore(steps[-1], structure(self.mapper, self.env, self.config))
@@ -164,7 +164,8 @@ class Training:
         self.checkpoints.save(self.step, {"state": self.state, "best": self.best}, facts)
 
 
-def _init(shared: tuple, key: jax.Array) -> TrainState:
+def begin(shared: tuple, key: jax.Array) -> TrainState:
+    """Fresh networks and episodes of one seed."""
     env, agent, hyper = shared
     return ppo.init(env, agent, hyper, key)
 

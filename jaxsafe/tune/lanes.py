@@ -13,8 +13,7 @@ import numpy as np
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.evaluate.seeds import BATCH, KINDS, batch_keys, success_index
 from jaxsafe.metrics import interaction_efficiency
-from jaxsafe.train import ppo
-from jaxsafe.train.loop import EVALUATION_SEED, chunk
+from jaxsafe.train.loop import EVALUATION_SEED, begin, chunk
 from jaxsafe.train.seeds import SeedMapper
 from jaxsafe.tune.settings import Setting, alike, lane
 
@@ -34,8 +33,8 @@ def train_all(
     """
     for group in alike(found, chosen):
         lanes = Lanes(found[group[0]], len(group))
-        for begin in range(0, len(group), lanes.at_once):
-            some = group[begin : begin + lanes.at_once]
+        for first in range(0, len(group), lanes.at_once):
+            some = group[first : first + lanes.at_once]
             yield dict(zip(some, lanes.run([found[i] for i in some], tick), strict=True))
 
 
@@ -49,7 +48,7 @@ class Lanes:
         self.at_once = math.lcm(self.seeds, len(devices)) // self.seeds if on_cpu else count
         self.mapper = SeedMapper(self.at_once * self.seeds)
         self.length = -(-like.config.num_updates // CHUNKS)
-        self._init = self.mapper.map(_one_init)
+        self._init = self.mapper.map(lambda _, one: begin(*one))
         self._advance = self.mapper.map(self._one_chunk)
         self._evaluate = self.mapper.map(_one_evaluation)
 
@@ -61,8 +60,8 @@ class Lanes:
         keys = jax.vmap(jax.random.key)(jnp.asarray(self.like.config.seed + places % self.seeds))
         state = self._init((), (lanes, self.mapper.place(keys)))
         curves = []
-        for begin in range(0, self.like.config.num_updates, self.length):
-            count = min(self.length, self.like.config.num_updates - begin)
+        for first in range(0, self.like.config.num_updates, self.length):
+            count = min(self.length, self.like.config.num_updates - first)
             state, rows = self._advance((), (lanes, state))
             curves.append(self.mapper.gather({name: rows[name][:, :count] for name in ("success_rate", "count", "return")}))
             tick(count * len(some))
@@ -96,11 +95,6 @@ class Lanes:
             **{f"{kind}_success": rate.tolist() for kind, rate in rates.items()},
             "curve": {"steps": steps.tolist(), "success_rate": np.round(success.T, 4).tolist()},
         }
-
-
-def _one_init(_: tuple, one: tuple[Any, Any]) -> Any:
-    (env, agent, hyper), key = one
-    return ppo.init(env, agent, hyper, key)
 
 
 def _one_evaluation(shared: tuple, one: tuple[Any, Any]) -> jax.Array:
