@@ -142,7 +142,8 @@ def state_fields(platform: Platform) -> list[tuple[str, str, int]]:
 def actions(env: jaxsafe.Environment) -> Iterator[tuple[str, ...]]:
     """A row for each actuator."""
     for index, one in enumerate(env.agent_platform.controller.actuators):  # type: ignore[attr-defined]
-        unit = control_unit(one.name, length_unit(env)) or ""
+        unit = control_unit(one.name, length_unit(env))
+        assert unit, f"no unit is known for {one.name}"
         mapped = "[low, 0] and [0, high], so that 0 stays 0" if one.zero_centred else "[low, high]"
         yield str(index), f"`{one.name}`", unit, number(one.low), number(one.high), mapped, str(one.points)
 
