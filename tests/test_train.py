@@ -16,6 +16,7 @@ import pytest
 from tiny import TINY
 
 from jaxsafe import cli
+from jaxsafe.envs import TASKS
 from jaxsafe.errors import ConfigError
 from jaxsafe.train import __main__ as command
 from jaxsafe.train import directory
@@ -164,6 +165,47 @@ def test_ctrl_c_stops_after_a_chunk_with_a_checkpoint_and_resumes(
     assert_same_end(run, whole)
 
 
+def _two_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let docking2d and a twin of it be all tasks, so that both run the program of `whole`."""
+    for name in set(TASKS) - {"docking2d"}:
+        monkeypatch.delitem(TASKS, name)
+    monkeypatch.setitem(TASKS, "twin", TASKS["docking2d"])
+
+
+def test_all_tasks_run_one_after_another_and_resume(
+    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _two_tasks(monkeypatch)
+    path = tmp_path / "all"
+    words = [word for word in TINY if not word.startswith("env=")]
+    same = ["agent.features=docking", "ppo.learning_rate=2e-3", "ppo.gamma=0.95", "agent.log_std=-0.4"]
+    original = Training._write_progress
+
+    def interrupt(self: Training, *args: Any) -> None:
+        original(self, *args)
+        if self.run.name == "twin" and self.step == 448:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Training, "_write_progress", interrupt)
+        assert command.main(["env=all", *words, *same, f"out={path}"]) == cli.INTERRUPTED
+    assert f"go on with: python -m jaxsafe.train resume={path}" in capsys.readouterr().out
+    assert command.main([f"resume={path}"]) == 0
+    said = capsys.readouterr().out
+    assert f"{path / 'docking2d'} is complete" in said
+    last = [line.split() for line in said.splitlines()[-2:]]
+    assert [line[:2] for line in last] == [["docking2d", "1,280"], ["twin", "1,280"]]
+    for name in ("docking2d", "twin"):
+        assert logs(path / name) == logs(whole)
+
+
+def test_options_that_do_not_fit_all_tasks_are_told_with_the_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match=r"^env=all: rejoin2d: deputy: unknown field 'deputy'"):
+        command.main(["env=all", "env.deputy.mass=14"])
+    assert not list(tmp_path.iterdir())
+
+
 def test_resuming_a_complete_run_changes_nothing(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = {path: path.stat().st_mtime_ns for path in whole.rglob("*")}
     assert command.main([f"resume={whole}"]) == 0
@@ -179,13 +221,14 @@ def test_runs_without_a_name_take_the_next_free_one(tmp_path: Path, monkeypatch:
 
 
 def test_a_policy_file_acts_like_the_trained_network(whole: Path) -> None:
-    env, agent, params = read_policy(whole / "policy" / "seed_1.npz")
+    env, agent, params, about = read_policy(whole / "policy" / "seed_1.npz")
     trained = jax.tree.map(lambda x: x[1], final_state(whole)["state"].params)
     jax.tree.map(np.testing.assert_array_equal, params, trained)
     _, timestep = env.reset(jax.random.key(0))
     action = load_policy(whole / "policy" / "seed_1.npz")(jax.random.key(1), timestep.observation)
     expected = agent.act(env, trained, jax.random.key(1), timestep.observation, True)
     np.testing.assert_allclose(action, expected, rtol=1e-6)  # not compiled as one program
+    assert about == {"env": "docking2d", "preset": "features", "seed": 1, "step": 1280}
 
 
 @pytest.mark.slow

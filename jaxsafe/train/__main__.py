@@ -16,37 +16,51 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     claim_cores()
     cli.enable_compilation_cache()
-    from jaxsafe.plot.figures import draw_all
     from jaxsafe.train import directory
-    from jaxsafe.train.config import resolve
-    from jaxsafe.train.loop import Training
-    from jaxsafe.train.results import finish, table
+    from jaxsafe.train.config import resolve_all
+    from jaxsafe.train.results import summary
 
     arguments = cli.Arguments.parse(argv)
     resume = arguments.pop_text("resume")
     if resume is None:
-        config, env, name = resolve(arguments)
-        run = directory.create(config, env, name)
+        path = directory.create_all(resolve_all(arguments))
     else:
         arguments.refuse_rest(["resume"])
-        run = Path(resume)
-        config, env, name = directory.read(run, "resume")
-        if (run / "results.json").exists():
-            print(f"{run} is complete; nothing is left to do")
-            if not (run / "figures").exists():  # killed between the results and the figures
-                draw_all(run)
-            return 0
+        path = Path(resume)
+    runs, began = directory.runs(path, "resume"), BEGAN
+    for run in runs:
+        if not _train(run, path, began):
+            return cli.INTERRUPTED
+        began = time.monotonic()
+    if len(runs) > 1:
+        print(summary(runs))
+    return 0
+
+
+def _train(run: Path, path: Path, began: float) -> bool:
+    """Do what is left of a run, of those in `path`; False if the user asked to stop before its end."""
+    from jaxsafe.plot.figures import draw_all
+    from jaxsafe.train import directory
+    from jaxsafe.train.loop import Training
+    from jaxsafe.train.results import finish, table
+
+    config, env, name = directory.read(run, "resume")
+    if (run / "results.json").exists():
+        print(f"{run} is complete; nothing is left to do")
+        if not (run / "figures").exists():  # killed between the results and the figures
+            draw_all(run)
+        return True
     print(
         f"{name}: {config.seeds} seeds × {config.num_updates * config.ppo.batch_size:,} steps,"
         f" preset {config.preset}, in {run}"
     )
-    training = Training(config, env, run, BEGAN)
+    training = Training(config, env, run, began)
     if not training.train():
-        print(f"stopped at step {training.step:,}; go on with: python -m jaxsafe.train resume={run}")
-        return cli.INTERRUPTED
+        print(f"stopped at step {training.step:,}; go on with: python -m jaxsafe.train resume={path}")
+        return False
     print(table(finish(training, config, env, name), run / "results.json"))
     print("figures: " + ", ".join(str(figure) for figure in draw_all(run)))
-    return 0
+    return True
 
 
 def usage() -> str:

@@ -14,7 +14,7 @@ from jaxsafe.component import Component, Range, fields, normalise
 from jaxsafe.config import override, yaml
 from jaxsafe.config.convert import expects, to_value
 from jaxsafe.environment import Environment
-from jaxsafe.envs import make
+from jaxsafe.envs import TASKS, make
 from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.paths import set_path
 from jaxsafe.processors.reward import Intervention
@@ -54,6 +54,23 @@ class TrainConfig(Component):
     def every(self, steps: int | None) -> int:
         """An interval in updates; a tenth of the run without one."""
         return -(-self.num_updates // 10) if steps is None else max(1, round(steps / self.ppo.batch_size))
+
+
+def resolve_all(arguments: Arguments) -> list[tuple[TrainConfig, Environment, str]]:
+    """What `resolve` returns, with `env=all` for each of the five tasks.
+
+    Raises:
+        ConfigError: as `resolve`, with the task in front where the same options do not fit all five.
+    """
+    if arguments.options.get("env") != "all":
+        return [resolve(arguments)]
+    found = []
+    for task in TASKS:
+        try:
+            found.append(resolve(Arguments({**arguments.options, "env": task})))
+        except ConfigError as error:
+            raise ConfigError(f"env=all: {task}: {error}") from None
+    return found
 
 
 def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
@@ -124,7 +141,8 @@ def configs() -> Path:
 def usage() -> str:
     """Every option with its default and what it takes."""
     lines = ["usage: python -m jaxsafe.train env=TASK [key=value …]      or      resume=RUN", ""]
-    lines += ["  env=TASK or env=FILE.yaml; env.PATH=VALUE changes it, for instance env.reward.delta_v.scale=-0.02", ""]
+    lines += ["  env=TASK, env=FILE.yaml, or env=all for the five tasks one after another"]
+    lines += ["  env.PATH=VALUE changes it, for instance env.reward.delta_v.scale=-0.02", ""]
     for section, cls in (("", TrainConfig), ("agent.", Agent), ("ppo.", PPO)):
         for name, field in fields(cls).items():
             if not isinstance(field.default, Component):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import platform
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from jaxsafe.component import normalise
 from jaxsafe.config import yaml
 from jaxsafe.config.convert import to_component, to_data
 from jaxsafe.environment import Environment
+from jaxsafe.envs import TASKS
 from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.files import write_text
@@ -39,6 +41,30 @@ def create(config: TrainConfig, env: Environment, name: str) -> Path:
     return path
 
 
+def create_all(resolved: Sequence[tuple[TrainConfig, Environment, str]]) -> Path:
+    """Make the directory of one run, or of several with a directory for each in it; see `create`."""
+    if len(resolved) == 1:
+        return create(*resolved[0])
+    path = make(resolved[0][0].out, Path("runs"), "all")
+    for config, env, name in resolved:
+        create(config.replace(out=str(path / name)), env, name)
+    return path
+
+
+def runs(path: Path, option: str) -> list[Path]:
+    """The run that `path` is, or the runs in it: first the tasks in their order, then others by name.
+
+    Raises:
+        ConfigError: there is none; `option` is what the user called it.
+    """
+    inside = sorted(found.parent for found in path.glob("*/config.yaml"))
+    if (path / "config.yaml").is_file() or not inside:
+        _require(path, option)
+        return [path]
+    order = [*TASKS]
+    return sorted(inside, key=lambda run: order.index(run.name) if run.name in order else len(order))
+
+
 def make(out: str | None, parent: Path, name: str) -> Path:
     """Make the directory that `out` asks for, or else the next free one of a name in `parent`.
 
@@ -62,10 +88,7 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
     Raises:
         ConfigError: there is no run; `option` is what the user called it.
     """
-    if not (path / "config.yaml").is_file():
-        beside = [str(found.parent) for found in path.parent.glob("*/config.yaml")] if path.parent.is_dir() else []
-        choice = f"; choose from {nearest(path, sorted(beside))}" if beside else ""
-        raise ConfigError(f"{option}: no run in {str(path)!r} (a directory with config.yaml){choice}")
+    _require(path, option)
     content = yaml.read(path / "config.yaml")
     place = f"{path / 'config.yaml'}: "
     if not isinstance(content, dict) or not {"env", "training", "environment"} <= set(content):
@@ -84,6 +107,14 @@ def versions() -> dict[str, Any]:
         "python": platform.python_version(),
         "device": f"{len(jax.devices())} × {jax.devices()[0].device_kind}",
     }
+
+
+def _require(path: Path, option: str) -> None:
+    """Raise a ConfigError if there is no run."""
+    if not (path / "config.yaml").is_file():
+        beside = [str(found.parent) for found in path.parent.glob("*/config.yaml")] if path.parent.is_dir() else []
+        choice = f"; choose from {nearest(path, sorted(beside))}" if beside else ""
+        raise ConfigError(f"{option}: no run in {str(path)!r} (a directory with config.yaml){choice}")
 
 
 def _next_free(parent: Path, name: str) -> Path:

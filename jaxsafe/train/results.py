@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ from jaxsafe.evaluate.seeds import metrics_over_seeds
 from jaxsafe.metrics import Episode, interaction_efficiency
 from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.directory import versions
-from jaxsafe.train.files import write_json
+from jaxsafe.train.files import read_json, write_json
 from jaxsafe.train.loop import Training
 from jaxsafe.train.policy import save_policy
 
@@ -75,6 +76,22 @@ def table(results: dict[str, Any], path: Path) -> str:
         lines += ["", f"80 % training success after {steps:,} steps" if steps else "80 % training success not reached"]
         lines += [f"{results['wall_s']:.1f} s in total, {results['compile_s']:.1f} s of it compiling the training"]
     return "\n".join([*lines, f"results in {path}"])
+
+
+def summary(runs: Sequence[Path]) -> str:
+    """A line for each of several runs."""
+    heads = ("steps", "80 % after", "stochastic", "deterministic", "worst seed", "wall [s]")
+    lines = [" " * 20 + "".join(f"{head:>15}" for head in heads)]
+    for run in runs:
+        results = read_json(run / "results.json")
+        success = [results["evaluation"][kind]["success_rate"] for kind in ("stochastic", "deterministic")]
+        reached = results["interaction_efficiency"]["timesteps"]
+        lines.append(
+            f"{results['env']:20}{results['steps']:>15,}{f'{reached:,}' if reached else 'never':>15}"
+            f"{success[0]['mean']:>15.2%}{success[1]['mean']:>15.2%}"
+            f"{min(min(one['per_seed']) for one in success):>15.1%}{results['wall_s']:>15.1f}"
+        )
+    return "\n".join(lines)
 
 
 def _efficiency(training: Training) -> dict[str, Any]:
