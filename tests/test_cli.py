@@ -56,8 +56,8 @@ def fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], t
         (["env=docking3d", "ppo.gamma=true"], "ppo.gamma: expected a number in [0, 1], found True"),
         (["env=docking3d", "ppo.learning_rate=.nan"], "ppo.learning_rate: expected a number > 0, found nan"),
         (["env=docking3d", "ppo.num_minibatches=3"], "ppo.num_minibatches: expected a divisor of"),
-        (["env=docking3d", "agent.features=dock"], "agent.features: found 'dock'; choose from none, docking, rejoin. "
-         "Did you mean 'docking'?"),
+        (["env=docking3d", "agent.features=dock"], "agent.features: found 'dock'; choose from none, docking, approach, "
+         "rejoin. Did you mean 'docking'?"),
         (["env=docking3d", "actions=discret"], "Did you mean 'discrete'?"),
         (["env=docking3d", "tensorboard=maybe"], "tensorboard: expected true or false, found 'maybe'"),
         (["env=docking3d", "env.reward.delta_v.scal=1"], "reward.delta_v.scal: unknown field 'scal'"),
@@ -98,6 +98,9 @@ def test_an_unwritable_output_is_told_in_one_line(fails: Callable[..., str], tmp
         (["run=runs/x"], "run: no run in 'runs/x'"),
         (["run=runs/x", "episodes=0"], "episodes: expected a whole number ≥ 1, found 0"),
         (["run=runs/x", "deterministic=maybe"], "deterministic: expected true or false, found 'maybe'"),
+        (["run=pretrained/x"], "policy: 'pretrained/x' is no .npz file and not pretrained"),
+        (["run=x.npz"], "x.npz: cannot be read: No such file or directory"),
+        (["run=runs/x", "render=mp4"], "render: found 'mp4'; choose from gif"),
         (["run=runs/x", "episods=5"], "episods: unknown option; choose from"),
     ],
 )

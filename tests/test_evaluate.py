@@ -5,6 +5,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 
 import jaxsafe
 from jaxsafe.errors import ConfigError
@@ -25,6 +26,23 @@ def test_the_runs_own_results_come_out_again(whole: Path, tmp_path: Path, capsys
     assert "success rate" in capsys.readouterr().out
     rows = [json.loads(line) for line in (tmp_path / "again" / "eval.jsonl").read_text().splitlines()]
     assert len(rows) == 2 * 3 * 6
+
+
+def test_a_policy_file_gives_the_results_of_its_seed(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = whole / "policy" / "seed_2.npz"
+    assert main([f"run={file}", "episodes=6", "deterministic=true", "render=gif"]) == 0
+    place = tmp_path / "evaluations" / "seed_2" / "last-6-seed0"
+    found = json.loads((place / "results.json").read_text())
+    own = json.loads((whole / "results.json").read_text())["evaluation"]["deterministic"]
+    assert found["seed"] == 2
+    assert found["steps"] == 1280
+    for name, metric in found["evaluation"]["deterministic"].items():
+        assert metric["per_seed"] == [own[name]["per_seed"][2]]
+    with Image.open(place / "episode_deterministic.gif") as image:
+        assert image.n_frames > 10  # type: ignore[attr-defined]
+    with pytest.raises(ConfigError, match=r"checkpoint: .* is a single policy; leave checkpoint=best out"):
+        main([f"run={file}", "checkpoint=best"])
 
 
 def test_evaluations_get_directories_of_their_own(whole: Path, tmp_path: Path) -> None:

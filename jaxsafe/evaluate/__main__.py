@@ -1,15 +1,14 @@
-"""`python -m jaxsafe.evaluate run=runs/x`: metrics of a run's policies, in its own environment or a changed one."""
+"""`python -m jaxsafe.evaluate run=runs/x`: metrics of trained policies, in their own environment or a changed one."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from jaxsafe import cli
 from jaxsafe.train.seeds import claim_cores
 
-OPTIONS = ("run", "rta", "episodes", "seed", "checkpoint", "deterministic", "out")
+OPTIONS = ("run", "rta", "episodes", "seed", "checkpoint", "deterministic", "render", "out")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -19,30 +18,33 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.config import override
     from jaxsafe.envs import with_rta
     from jaxsafe.errors import ConfigError
-    from jaxsafe.evaluate.report import evaluate_run
-    from jaxsafe.train import directory
+    from jaxsafe.evaluate.report import evaluate
+    from jaxsafe.evaluate.subject import load
     from jaxsafe.train.results import table
 
     arguments = cli.Arguments.parse(argv)
-    run, out, checkpoint, rta = (arguments.pop_text(name) for name in ("run", "out", "checkpoint", "rta"))
+    run, out, checkpoint, rta, render = (arguments.pop_text(name) for name in ("run", "out", "checkpoint", "rta", "render"))
     changes = arguments.pop_overrides()
     episodes, seed = arguments.pop_count("episodes", 1000), arguments.pop_count("seed", 0, least=0)
     deterministic = arguments.pop("deterministic")
     arguments.refuse_rest([*OPTIONS, "env.…"])
     if run is None:
-        raise ConfigError("run: missing; for instance run=runs/docking3d")
+        raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
     if not (deterministic is None or isinstance(deterministic, bool)):
         raise ConfigError(f"deterministic: expected true or false, found {deterministic!r}")
+    if render not in (None, "gif"):
+        raise ConfigError(f"render: found {render!r}; choose from gif")
     kinds = {None: ("stochastic", "deterministic"), True: ("deterministic",), False: ("stochastic",)}[deterministic]
-    config, env, name = directory.read(Path(run), "run")
-    changed = override(env if rta is None else with_rta(env, name, rta), changes)
+    subject = load(run, checkpoint)
+    env = override(subject.env if rta is None else with_rta(subject.env, subject.name, rta), changes)
     request: dict[str, Any] = {
+        "run": run,
         "episodes": episodes,
         "evaluation_seed": seed,
         "checkpoint": checkpoint or "last",
         "changes": changes if rta is None else {"rta": rta, **changes},
     }
-    path, results = evaluate_run(Path(run), config, (env, changed), name, kinds, request, out)
+    path, results = evaluate(subject, env, kinds, request, out, render is not None)
     print(table(results, path))
     return 0
 
@@ -51,13 +53,15 @@ def usage() -> str:
     """The help text."""
     return (
         "usage: python -m jaxsafe.evaluate run=RUN [key=value …]\n\n"
+        "  run=RUN                a run directory, a policy file (.npz), or pretrained/TASK\n"
         "  episodes=N             episodes of each seed (default 1000)\n"
         "  seed=N                 evaluation key: other starts and other noise (default 0, as in the run's own results)\n"
         "  checkpoint=last|best|N best is per seed by success in the evaluations during training (default last)\n"
         "  rta=none|default|…     run time assurance (default as in training)\n"
         "  deterministic=true|false   one kind only (default both)\n"
+        "  render=gif             draw the first episode of the first seed as an animation\n"
         "  env.PATH=VALUE         change the environment, for instance env.deputy.start.position.distance=[1000,1000]\n"
-        "  out=DIR                where to write (default: a new directory in RUN/evaluations)"
+        "  out=DIR                where to write (default: a new directory in RUN/evaluations, or in evaluations/)"
     )
 
 

@@ -1,4 +1,4 @@
-"""Evaluating a run after training, into a directory of its own."""
+"""Evaluating trained policies into a directory of its own."""
 
 from __future__ import annotations
 
@@ -6,59 +6,56 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+
 from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate.seeds import Evaluator, episode_rows
+from jaxsafe.evaluate.subject import Subject
 from jaxsafe.train import directory
-from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.files import append_rows, write_json
-from jaxsafe.train.restore import load_params
-from jaxsafe.train.results import evaluation, facts
-from jaxsafe.train.seeds import SeedMapper
+from jaxsafe.train.results import evaluation
 
 
-def evaluate_run(
-    run: Path,
-    config: TrainConfig,
-    envs: tuple[Environment, Environment],
-    name: str,
-    kinds: Sequence[str],
-    request: dict[str, Any],
-    out: str | None,
+def evaluate(
+    subject: Subject, env: Environment, kinds: Sequence[str], request: dict[str, Any], out: str | None, render: bool = False
 ) -> tuple[Path, dict[str, Any]]:
-    """Evaluate every seed's policy; write `results.json` and `eval.jsonl` and return their place and the results.
+    """Evaluate every policy; write `results.json` and `eval.jsonl` and return the place of the first and its content.
 
     Args:
-        run: the run directory.
-        config: its configuration.
-        envs: the environment it was trained in, and the one to evaluate in.
-        name: the environment's name.
+        subject: the policies.
+        env: the environment to evaluate in.
         kinds: of `stochastic` and `deterministic`.
-        request: `episodes`, `evaluation_seed`, `checkpoint`, and anything else to put into the results.
-        out: a new directory; None makes one in `<run>/evaluations`.
+        request: `run`, `episodes`, `evaluation_seed`, `checkpoint`, `changes`: what was asked for, part of the results.
+        out: a new directory; None makes one in `subject.place`.
+        render: whether to draw the first episode of the first policy as `episode_<kind>.gif` as well.
 
     Raises:
-        ConfigError: there is no such checkpoint, `out` holds something, or the policies do not fit the environment.
+        ConfigError: `out` holds something, or the policies do not fit the environment.
     """
-    own, env = envs
     for what in ("observation_size", "action_names", "num_action_points"):
-        found, needed = getattr(env, what), getattr(own, what)
+        found, needed = getattr(env, what), getattr(subject.env, what)
         if found != needed:
-            raise ConfigError(f"env: the change gives {what} {found}, the policies of {run} have {needed}")
-    mapper = SeedMapper(config.seeds)
-    params, step = load_params(mapper, run, config, own, request["checkpoint"])
-    label = f"{request['checkpoint']}-{request['episodes']}-seed{request['evaluation_seed']}"
-    path = directory.make(out, run / "evaluations", label + "-changed" * bool(request["changes"]))
-    evaluator = Evaluator(mapper, env, config.agent)
-    episodes = {
-        kind: evaluator.run(params, request["episodes"], request["evaluation_seed"], kind == "deterministic")
-        for kind in kinds
-    }
-    for kind, one in episodes.items():
-        append_rows(path / "eval.jsonl", episode_rows(env, one, config.seed, step=step, kind=kind, final=True))
-    results = {
-        **facts(config, name), **request, "run": str(run), "steps": step,
-        "versions": directory.versions(), "evaluation": evaluation(env, episodes),
-    }  # fmt: skip
+            raise ConfigError(f"env: the change gives {what} {found}, the policies of {request['run']} have {needed}")
+    episodes, seed = request["episodes"], request["evaluation_seed"]
+    path = directory.make(
+        out, subject.place, f"{request['checkpoint']}-{episodes}-seed{seed}" + "-changed" * bool(request["changes"])
+    )
+    evaluator = Evaluator(subject.mapper, env, subject.agent)
+    sums = {kind: evaluator.run(subject.params, episodes, seed, kind == "deterministic") for kind in kinds}
+    for kind, one in sums.items():
+        rows = episode_rows(env, one, subject.facts["seed"], step=subject.facts["steps"], kind=kind, final=True)
+        append_rows(path / "eval.jsonl", rows)
+    results = {**subject.facts, **request, "versions": directory.versions(), "evaluation": evaluation(env, sums)}
     write_json(path / "results.json", results)
+    for kind in kinds if render else ():
+        _render(subject, evaluator, seed, kind, path)
     return path / "results.json", results
+
+
+def _render(subject: Subject, evaluator: Evaluator, seed: int, kind: str, path: Path) -> None:
+    from jaxsafe.plot.animation import animate
+
+    first = jax.tree.map(lambda x: x[0], subject.mapper.gather(subject.params))
+    [episode] = evaluator.episodes(first, 1, seed, kind == "deterministic")
+    animate(evaluator.env, episode, path / f"episode_{kind}.gif", f"{subject.name}, {kind}")

@@ -13,7 +13,7 @@ from jaxsafe.evaluate.episodes import longest, record_episodes, run_episodes
 from jaxsafe.metrics import METRICS, Episode, over_seeds, summarise
 from jaxsafe.train.agent import Agent, Params
 from jaxsafe.train.seeds import SeedMapper
-from jaxsafe.types import Key
+from jaxsafe.types import Key, State, TimeStep
 
 BATCH = 100
 """Episodes that run side by side; the noise of a batch is drawn together, so this number is part of the results."""
@@ -46,6 +46,13 @@ class Evaluator:
         self, params: Params, num_episodes: int, seed: int, deterministic: bool = True
     ) -> Iterator[list[dict[str, Any]]]:
         """Every step of the first episodes that `run` runs with one seed's parameters, as rows for a log."""
+        for state, timestep in self.episodes(params, num_episodes, seed, deterministic):
+            yield [_step_row(self.env, state, timestep, t) for t in range(len(timestep.reward))]
+
+    def episodes(
+        self, params: Params, num_episodes: int, seed: int, deterministic: bool = True
+    ) -> Iterator[tuple[State, TimeStep]]:
+        """States and time steps, [steps + 1], of each of the episodes that `record` describes."""
         steps = int(longest(self.env))
         for batch, key in enumerate(batch_keys(seed, -(-num_episodes // BATCH))):
             count = min(BATCH, num_episodes - batch * BATCH)
@@ -53,7 +60,7 @@ class Evaluator:
             for episode in range(count):
                 state, timestep = jax.tree.map(lambda x, i=episode: np.asarray(x)[:, i], recorded)
                 ended = np.flatnonzero(timestep.done)
-                yield [_step_row(self.env, state, timestep, t) for t in range((ended[0] if ended.size else steps) + 1)]
+                yield jax.tree.map(lambda x, n=(ended[0] if ended.size else steps): x[: n + 1], (state, timestep))
 
     def _one_seed(self, shared: tuple, params: Params) -> Episode:
         env, agent, key, deterministic = shared

@@ -12,7 +12,7 @@ from jaxsafe.processors.constraint import Separation, SpeedLimit
 from jaxsafe.train.files import write_bytes
 from jaxsafe.types import units
 
-BLUE, ORANGE, GREY = "#0072B2", "#D55E00", "#8A8A8A"  # of the Okabe-Ito palette, safe for colour-blind readers
+BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8A8A8A"  # Okabe-Ito, safe for colour-blind readers
 
 
 def length_unit(env: Any) -> str:

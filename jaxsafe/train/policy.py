@@ -1,4 +1,7 @@
-"""Policies as small .npz files: arrays and one JSON string, read without pickle, so a stranger's file is only data."""
+"""Policies as small .npz files: arrays and one JSON string, read without pickle, so a stranger's file is only data.
+
+Those in `jaxsafe/pretrained/` come with the package and are known by the names of their tasks.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ import json
 import os
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +19,7 @@ import numpy as np
 from jaxsafe.component import normalise
 from jaxsafe.config.convert import to_component, to_data
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError
+from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.rollout import Policy
 from jaxsafe.train.agent import Agent, Params
 from jaxsafe.train.files import write_bytes
@@ -34,8 +37,23 @@ def save_policy(path: Path, env: Environment, agent: Agent, params: Params, abou
     write_bytes(path, buffer.getvalue())
 
 
-def read_policy(path: str | os.PathLike) -> tuple[Environment, Agent, Params]:
-    """Read a policy file: the environment, the agent and its parameters.
+PRETRAINED = "pretrained/"
+"""Before a name where a run may be given as well."""
+
+_PRETRAINED = Path(__file__).resolve().parent.parent / "pretrained"
+
+
+class SavedPolicy(NamedTuple):
+    """What a policy file holds."""
+
+    env: Environment
+    agent: Agent
+    params: Params
+    about: dict[str, Any]  # env (its name), preset, seed and step of the training that it came from
+
+
+def read_policy(path: str | os.PathLike) -> SavedPolicy:
+    """Read a policy file.
 
     Raises:
         ConfigError: the file cannot be read, or holds something else.
@@ -48,24 +66,45 @@ def read_policy(path: str | os.PathLike) -> tuple[Environment, Agent, Params]:
         raise ConfigError(f"{path}: cannot be read: {error.strerror or 'not a policy file'}") from None
     except (ValueError, KeyError, EOFError, zipfile.BadZipFile):
         raise ConfigError(f"{path}: not a policy file (.npz without pickles, as in <run>/policy/)") from None
-    if not isinstance(header, dict) or header.get("format") != "jaxsafe policy 1":
+    if not isinstance(header, dict) or header.pop("format", None) != "jaxsafe policy 1":
         raise ConfigError(f"{path}: not a policy file: expected format 'jaxsafe policy 1'")
     from jaxsafe.config import build
 
-    env = build(to_component(header.get("environment"), Environment, f"{path}: environment"))
-    agent = normalise(to_component(header.get("agent"), Agent, f"{path}: agent"))
+    env = build(to_component(header.pop("environment", None), Environment, f"{path}: environment"))
+    agent = normalise(to_component(header.pop("agent", None), Agent, f"{path}: agent"))
     like = jax.eval_shape(lambda key: agent.init(key, env), jax.random.key(0))
-    return env, agent, _fill(like, arrays, str(path))
+    return SavedPolicy(env, agent, _fill(like, arrays, str(path)), header)
 
 
-def load_policy(path: str | os.PathLike, deterministic: bool = True) -> Policy:
-    """Return `policy(key, observation) -> action` from a policy file; observations may have leading batch axes.
+def load_policy(policy: str | os.PathLike, deterministic: bool = True) -> Policy:
+    """Return `policy(key, observation) -> action`; observations may have leading batch axes.
+
+    Args:
+        policy: the name of a task, for the policy that comes with the package, or a policy file such as
+            `runs/docking3d/policy/seed_0.npz`.
+        deterministic: whether to act by the mode of the distribution over actions; then the key means nothing.
 
     Raises:
-        ConfigError: the file cannot be read, or holds something else.
+        ConfigError: there is no such policy, or the file holds something else.
     """
-    env, agent, params = read_policy(path)
-    return jax.jit(agent.policy(env, params, deterministic))  # or each call would work out the observation anew
+    saved = read_policy(find_policy(policy))
+    act = saved.agent.policy(saved.env, saved.params, deterministic)
+    return jax.jit(act)  # or each call would work out the inputs anew
+
+
+def find_policy(policy: str | os.PathLike) -> Path:
+    """The file of a policy, given by a path, by the name of a task, or by `pretrained/` and that name.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    path, known = Path(policy), {file.stem: file for file in sorted(_PRETRAINED.glob("*.npz"))}
+    if path.suffix == ".npz":
+        return path
+    name = str(policy).removeprefix(PRETRAINED)
+    if name not in known:
+        raise ConfigError(f"policy: {str(policy)!r} is no .npz file and not pretrained; choose from {nearest(name, known)}")
+    return known[name]
 
 
 def _fill(like: Any, arrays: dict[str, np.ndarray], path: str) -> Any:

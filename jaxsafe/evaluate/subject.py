@@ -1,0 +1,55 @@
+"""What is evaluated: the policies of all seeds of a run, or the one in a policy file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jaxsafe.environment import Environment
+from jaxsafe.errors import ConfigError
+from jaxsafe.train import directory
+from jaxsafe.train.agent import Agent, Params
+from jaxsafe.train.policy import PRETRAINED, find_policy, read_policy
+from jaxsafe.train.restore import load_params
+from jaxsafe.train.results import facts
+from jaxsafe.train.seeds import SeedMapper
+
+
+class Subject(NamedTuple):
+    """Policies that were trained together, and where they come from."""
+
+    name: str  # of the environment
+    env: Environment  # in which they were trained
+    agent: Agent
+    mapper: SeedMapper
+    params: Params  # [mapper.padded], placed
+    facts: dict[str, Any]  # env, preset, seeds, seed (the first) and steps, for the results
+    place: Path  # where evaluations of them are written
+
+
+def load(run: str, checkpoint: str | None) -> Subject:
+    """Read a run directory, a policy file, or a policy that comes with the package, `pretrained/<task>`.
+
+    Raises:
+        ConfigError: there is no such run, policy or checkpoint.
+    """
+    if run.endswith(".npz") or (run.startswith(PRETRAINED) and not Path(run).exists()):
+        if checkpoint is not None:
+            raise ConfigError(f"checkpoint: {run} is a single policy; leave checkpoint={checkpoint} out")
+        return _of_file(find_policy(run))
+    config, env, name = directory.read(Path(run), "run")
+    mapper = SeedMapper(config.seeds)
+    params, step = load_params(mapper, Path(run), config, env, checkpoint or "last")
+    found = {**facts(config, name), "steps": step}
+    return Subject(name, env, config.agent, mapper, params, found, Path(run) / "evaluations")
+
+
+def _of_file(path: Path) -> Subject:
+    saved, mapper = read_policy(path), SeedMapper(1)
+    params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], saved.params))
+    about = {"env": path.stem, "preset": "unknown", "seed": 0, "step": 0} | saved.about
+    found = {"env": about["env"], "preset": about["preset"], "seeds": 1, "seed": about["seed"], "steps": about["step"]}
+    return Subject(str(about["env"]), saved.env, saved.agent, mapper, params, found, Path("evaluations") / path.stem)

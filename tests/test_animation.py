@@ -1,0 +1,44 @@
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from PIL import Image
+
+import jaxsafe
+from jaxsafe.evaluate.episodes import record_episodes
+from jaxsafe.plot.animation import Scene, animate
+
+
+def recorded(env: jaxsafe.Environment, steps: int) -> Any:
+    """An episode of random actions."""
+    policy = lambda key, o: jax.random.uniform(key, (*o.shape[:-1], env.action_size), minval=-1.0)  # noqa: E731
+    episode = jax.jit(record_episodes, static_argnums=(1, 3, 4))(env, policy, jax.random.key(0), 1, steps)
+    return jax.tree.map(lambda x: np.asarray(x)[:, 0], episode)
+
+
+@pytest.mark.parametrize(("task", "maps"), [("docking2d_oriented", 1), ("rejoin3d", 2)])
+def test_a_scene_shows_the_agent_where_it_is(task: str, maps: int) -> None:
+    env = jaxsafe.make(task)
+    scene = Scene(env, recorded(env, 12), task)
+    assert len(scene.maps) == maps
+    first, last = scene.draw(0), scene.draw(12)
+    assert first.dtype == np.uint8
+    assert first.shape == last.shape
+    assert (first != last).any()
+    shown = scene.moving[0]["platforms"][env.agent][1].get_xydata()[0]
+    sim = scene.sim
+    other = next(name for name in sim.platforms if name != env.agent)
+    expected = sim.platforms[env.agent].position[12] - sim.platforms[other].position[12]
+    np.testing.assert_allclose(shown, expected[:2], rtol=1e-5)
+    assert all(abs(expected[i]) < scene.maps[0].get_xlim()[1] for i in (0, 1))
+
+
+def test_an_animation_repeats_and_rests_at_the_end(tmp_path: Path) -> None:
+    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 10.0})
+    with Image.open(animate(env, recorded(env, 11), tmp_path / "x.gif", "docking2d")) as image:
+        assert image.n_frames == 12  # type: ignore[attr-defined]
+        assert image.info["loop"] == 0
+        image.seek(11)
+        assert image.info["duration"] == 1500
