@@ -32,6 +32,24 @@ def test_docking_features_are_direction_and_log_distance() -> None:
     assert agent.init(KEY, env)["actor"][0]["kernel"].shape == (12, 64)
 
 
+@pytest.mark.parametrize("task", ["docking2d", "docking3d", "docking2d_oriented"])
+def test_approach_features_measure_the_velocity_by_its_limit(task: str) -> None:
+    env = jaxsafe.make(task)
+    rest = [0.0] * env.observation_names.count("position.z")
+    deputy = {"position": [60.0, 0.0, *rest], "velocity": [-0.1, 0.2, *rest]}
+    _, timestep = jaxsafe.reset_to(env, {"deputy": deputy | ({"attitude": 0.0} if task == "docking2d_oriented" else {})})
+    inputs = np.asarray(Agent(features="approach").inputs(env, timestep.observation))
+    sign = -1.0 if task == "docking2d_oriented" else 1.0  # whose observation is of the chief, seen from the deputy
+    velocity = np.array([-0.1, 0.2, *rest]) / (0.2 + 0.002054 * 60.0)
+    d, size = velocity.size, env.observation_size
+    found, along, across, speed = np.split(inputs[size + d + 1 :], np.cumsum([d, 1, d]))
+    np.testing.assert_allclose(found, velocity, rtol=1e-5)
+    np.testing.assert_allclose(along, sign * velocity[0], rtol=3e-3)  # the direction has length ‖p‖/(‖p‖ + 0.001)
+    np.testing.assert_allclose(across, [0.0, *velocity[1:]], atol=2e-3)
+    np.testing.assert_allclose(speed, np.linalg.norm(velocity), rtol=1e-5)
+    np.testing.assert_array_equal(inputs[: size + d + 1], Agent(features="docking").inputs(env, timestep.observation))
+
+
 def test_plain_agents_see_the_observation_and_nothing_else() -> None:
     env = jaxsafe.make("docking2d")
     _, timestep = env.reset(KEY)

@@ -7,7 +7,7 @@ from probes import Constant, Match, Position, probe
 from jaxsafe.component import normalise
 from jaxsafe.environment import Environment
 from jaxsafe.train.agent import Agent
-from jaxsafe.train.ppo import PPO, TrainState, gae, init, update
+from jaxsafe.train.ppo import PPO, TrainState, discount, gae, init, update
 
 AGENT = normalise(Agent(hidden=(16,)))
 SMALL = normalise(
@@ -98,6 +98,26 @@ def test_the_learning_rate_falls_linearly_to_its_end() -> None:
     earlier = update(env, AGENT, frozen, 20, state)
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), earlier.params, state.params)
     assert max(jax.tree.leaves(moved)) > 1e-4
+
+
+def test_the_horizon_grows_exponentially_to_its_end() -> None:
+    ppo = normalise(PPO(gamma=0.9, horizon_growth=4.0))
+    horizons = [1.0 / (1.0 - float(discount(ppo, progress))) for progress in (0.0, 0.5, 1.0)]
+    np.testing.assert_allclose(horizons, [10.0, 20.0, 40.0], rtol=1e-5)
+    assert float(discount(normalise(PPO(gamma=0.97)), 0.7)) == pytest.approx(0.97)
+
+
+def test_the_discount_of_an_update_is_that_of_its_progress() -> None:
+    env = probe(Position(name="reward"), steps=4)
+    growing = SMALL.replace(gamma=jnp.array(0.5), horizon_growth=jnp.array(10.0))
+    state = init(env, AGENT, growing, jax.random.key(0)).replace(num_updates=jnp.array(10))
+    found, *others = (
+        jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(update(env, AGENT, ppo, 10, state).params)])
+        for ppo in (growing, SMALL.replace(gamma=jnp.array(0.95)), SMALL.replace(gamma=jnp.array(0.5)))
+    )
+    at_the_end, at_the_start = (float(jnp.abs(found - other).max()) for other in others)
+    assert at_the_end < 1e-5
+    assert at_the_start > 1e-4
 
 
 def test_hyperparameters_are_leaves_that_vmap() -> None:

@@ -26,7 +26,7 @@ class Agent(Component):
     """Actor and critic of the same shape, with nothing shared, for a given environment's spaces."""
 
     hidden: Annotated[tuple[int, ...], Range(1)] = (64, 64)
-    features: Literal["none", "docking", "rejoin"] = "none"  # what is appended to the observation, see `features`
+    features: Literal["none", "docking", "approach", "rejoin"] = "none"  # appended to the observation
     log_std: Dimensionless = -0.7  # initial, of continuous actions in [−1, 1]; learnt, the same for all states
     prior_std: Annotated[Dimensionless, Positive] = 0.3  # of discrete actions at the start, in units of half the range
 

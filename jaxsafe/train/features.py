@@ -28,6 +28,21 @@ def docking(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Ar
     return jnp.concatenate([observation, position / (distance + 0.01), jnp.log(distance + 0.005)], axis=-1)
 
 
+def approach(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
+    """Append to `docking` the velocity as a share of the speed limit: its parts along and across the way to the chief.
+
+    With the direction p of the chief and v/limit, both in the frame of the observation: v/limit, p·v/limit, what is left of
+    v/limit across p, and ‖v‖/limit, which is 1 at the limit.
+    """
+    position = _vector(env, observation, "position", "approach")
+    relative_to_limit = 1.0 / _elements(env, observation, "velocity_limit", "approach")
+    velocity = 0.5 * _vector(env, observation, "velocity", "approach") * relative_to_limit
+    direction = position / (jnp.linalg.norm(position, axis=-1, keepdims=True) + 1e-3)
+    along = jnp.sum(direction * velocity, axis=-1, keepdims=True)
+    speed = _elements(env, observation, "speed", "approach") * relative_to_limit
+    return jnp.concatenate([docking(env, observation), velocity, along, velocity - along * direction, speed], axis=-1)
+
+
 def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
     """Append the lead's relative velocity and how far both will miss each other if neither manoeuvres.
 
@@ -49,7 +64,7 @@ def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Arr
     return jnp.concatenate([observation, relative, closing, 4.0 * across, 4.0 * across * distance, *danger], axis=-1)
 
 
-FEATURES: Mapping[str, Features] = {each.__name__: each for each in (none, docking, rejoin)}
+FEATURES: Mapping[str, Features] = {each.__name__: each for each in (none, docking, approach, rejoin)}
 """By name, as in `agent.features`."""
 
 

@@ -35,8 +35,10 @@ class PPO(Component):
     learning_rate: Annotated[Dimensionless, Positive] = 3e-3
     final_learning_rate: Annotated[Dimensionless, Range(0.0)] = 3e-4  # reached linearly at the end
     gamma: Annotated[Dimensionless, Share] = 0.97
+    horizon_growth: Annotated[Dimensionless, Positive] = 1.0  # factor on 1/(1 − γ), reached exponentially at the end
     gae_lambda: Annotated[Dimensionless, Share] = 1.0
     clip: Annotated[Dimensionless, Positive] = 0.2
+    noise_decay: Annotated[Dimensionless, Range(0.0)] = 0.0  # how far log_std falls by the end, besides what is learnt
     value_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.5
     entropy_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.0
     max_grad_norm: Annotated[Dimensionless, Positive] = 0.5
@@ -100,12 +102,23 @@ def update(env: Environment, agent: Agent, ppo: PPO, total_updates: Array | int,
     """Collect one batch with the current policy and improve policy and value on it."""
     key_collect, key_learn = jax.random.split(jax.random.fold_in(state.key, state.num_updates))
     state, transitions = collect(env, agent, ppo, state, key_collect)
-    batch = _to_batch(agent, ppo, state.params, transitions)
     progress = state.num_updates / total_updates
+    gamma = discount(ppo, progress)
+    batch = _to_batch(agent, ppo, gamma, state.params, transitions)
     learning_rate = ppo.learning_rate + (ppo.final_learning_rate - ppo.learning_rate) * progress
     params, optimizer = learn(env, agent, ppo, learning_rate, state, batch, key_learn)
+    if "log_std" in params:
+        params = {**params, "log_std": params["log_std"] - ppo.noise_decay / total_updates}
     window = push(state.window, transitions.episode, transitions.done)
     return state.replace(params=params, optimizer=optimizer, window=window, num_updates=state.num_updates + 1)
+
+
+def discount(ppo: PPO, progress: Array | float) -> Array:
+    """The discount factor after a share of the training: its horizon 1/(1 − γ) grows exponentially by `horizon_growth`.
+
+    A short horizon finds the way early; a long one then finds the quick way.
+    """
+    return 1.0 - (1.0 - jnp.asarray(ppo.gamma)) / jnp.asarray(ppo.horizon_growth) ** progress
 
 
 def collect(env: Environment, agent: Agent, ppo: PPO, state: TrainState, key: Key) -> tuple[TrainState, Transition]:
@@ -191,11 +204,11 @@ def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch)
     return jnp.mean(-surrogate + ppo.value_coefficient * value_error - ppo.entropy_coefficient * entropy)
 
 
-def _to_batch(agent: Agent, ppo: PPO, params: Params, transitions: Transition) -> Batch:
+def _to_batch(agent: Agent, ppo: PPO, gamma: Array, params: Params, transitions: Transition) -> Batch:
     """Advantages, normalised over the whole batch, and value targets; all samples in one row."""
     t = transitions
     value, next_value = agent.value(params, t.inputs), agent.value(params, t.next_inputs)
-    advantage = gae(t.reward, value, next_value, t.terminated, t.done, ppo.gamma, ppo.gae_lambda)
+    advantage = gae(t.reward, value, next_value, t.terminated, t.done, gamma, ppo.gae_lambda)
     target = advantage + value
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     batch = Batch(t.inputs, t.action, t.log_prob, advantage, target)
