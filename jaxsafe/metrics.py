@@ -7,7 +7,7 @@ the share with one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
@@ -143,6 +143,26 @@ def over_seeds(per_seed: list[float | None]) -> dict[str, Any]:
         "ci95": [float(bound) for bound in bootstrap_interval(values[None])[:, 0]],
         "iqm": float(trim_mean(values, 0.25)),
         "per_seed": [float(value) for value in values],
+    }
+
+
+def stratified_iqm(scores: Sequence[Sequence[float]], resamples: int = 2000) -> dict[str, Any]:
+    """Interquartile mean over all runs of all tasks, with its 95 % stratified-bootstrap interval.
+
+    The mean of the middle half of all scores, where each task's runs are resampled among themselves (Agarwal et al. 2021).
+
+    Args:
+        scores: a sequence of scores, one for each run, for each task.
+        resamples: bootstrap samples.
+    """
+    from scipy.stats import trim_mean
+
+    generator, tasks = np.random.default_rng(0), [np.asarray(one, float) for one in scores]
+    drawn = [one[generator.integers(len(one), size=(resamples, len(one)))] for one in tasks]
+    spread = trim_mean(np.concatenate(drawn, axis=1), 0.25, axis=1)
+    return {
+        "iqm": float(trim_mean(np.concatenate(tasks), 0.25)),
+        "ci95": [float(bound) for bound in np.percentile(spread, [2.5, 97.5])],
     }
 
 

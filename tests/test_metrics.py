@@ -20,6 +20,7 @@ from jaxsafe.metrics import (
     bootstrap_interval,
     interaction_efficiency,
     over_seeds,
+    stratified_iqm,
     summarise,
 )
 from jaxsafe.types import Info, TimeStep
@@ -246,3 +247,14 @@ def test_one_seed_has_an_interval_of_no_width() -> None:
 
 def test_a_metric_without_a_meaning_stays_none() -> None:
     assert over_seeds([None, None]) == {"mean": None, "ci95": None, "iqm": None, "per_seed": [None, None]}
+
+
+def test_the_interquartile_mean_drops_the_outer_quarters_over_all_tasks() -> None:
+    found = stratified_iqm([[0.0, 0.8, 0.9, 1.0], [0.9, 0.9, 0.9, 0.9]])
+    assert found["iqm"] == pytest.approx(0.9)  # of 0, 0.8, 0.9 × 5, 1 the middle four
+    low, high = found["ci95"]
+    assert 0.6 <= low <= 0.9 <= high <= 1.0
+
+
+def test_the_stratified_bootstrap_resamples_within_tasks() -> None:
+    assert stratified_iqm([[0.0] * 5, [1.0] * 5])["ci95"] == [0.5, 0.5]  # every resample has five of each

@@ -104,7 +104,10 @@ def test_a_setting_learns_what_the_same_training_learns(swept: Path, whole: Path
         )
         assert row["training_return"][seed] == pytest.approx(own[-1]["return"], rel=1e-4)
     evaluation = json.loads((whole / "results.json").read_text())["evaluation"]
-    assert row["stochastic_success"] == evaluation["stochastic"]["success_rate"]["per_seed"]
+    for kind, metrics in evaluation.items():
+        for name, metric in metrics.items():
+            found, expected = (np.array(values, float) for values in (row["evaluation"][kind][name], metric["per_seed"]))
+            np.testing.assert_allclose(found, expected, rtol=1e-4, err_msg=name)
     other = next(row for row in results(swept).values() if (row["ppo.gamma"], row["ppo.num_steps"]) == (0.99, 16))
     assert other["training_return"] != row["training_return"]
 

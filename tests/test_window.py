@@ -31,6 +31,14 @@ def test_the_window_keeps_the_last_hundred_finished_episodes_in_order() -> None:
     assert int(window.count) == len(finished) > SIZE
 
 
+def test_the_cost_counts_the_violating_steps_of_all_finished_episodes() -> None:
+    episodes = episodes_like(np.zeros((150, 2), np.float32))
+    episodes = episodes.replace(violating_steps=jnp.arange(300).reshape(150, 2))
+    done = jnp.asarray(np.arange(300).reshape(150, 2) % 3 == 0)
+    window = push(push(empty_window(episodes), episodes, done), episodes, done)
+    assert int(window.cost) == 2 * sum(range(0, 300, 3))
+
+
 def test_a_batch_with_more_episodes_than_the_window_leaves_its_last_ones() -> None:
     values = np.arange(300, dtype=np.float32).reshape(100, 3)
     window = push(empty_window(episodes_like(values)), episodes_like(values), jnp.ones((100, 3), bool))

@@ -98,10 +98,15 @@ def episode_rows(env: Environment, episodes: Episode, first_seed: int, **common:
 
 def metrics_over_seeds(env: Environment, episodes: Episode) -> dict[str, Any]:
     """Every metric of Section 5: mean, interval, interquartile mean and per seed."""
+    return {name: over_seeds(values) for name, values in metrics_per_seed(env, episodes).items()}
+
+
+def metrics_per_seed(env: Environment, episodes: Episode) -> dict[str, list[float | None]]:
+    """Every metric of Section 5 for each seed, from sums [seeds, episodes]."""
     has_delta_v, has_rta = any(status.name == "delta_v" for status in env.status), env.rta is not None
     seeds = range(np.asarray(episodes.outcome).shape[0])
     each = [summarise(jax.tree.map(lambda x, i=i: x[i], episodes), success_index(env), has_delta_v, has_rta) for i in seeds]
-    return {name: over_seeds([one[name] for one in each]) for name in METRICS}
+    return {name: [one[name] for one in each] for name in METRICS}
 
 
 def success_index(env: Environment) -> int:

@@ -5,7 +5,7 @@ Of a run with run time assurance also what it altered, see `interventions`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -70,7 +70,7 @@ def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figur
     for panel in panels[len(curves) :]:
         panel.remove()
     for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
-        at, values = _table(rows, column, name)
+        at, values = curve_table(rows, column, name)
         _curve(panel, at, factor * values)
         panel.set(xlabel=label, ylabel=quantity)
         panel.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
@@ -141,7 +141,9 @@ def _curve(panel: Axes, at: np.ndarray, values: np.ndarray) -> None:
     panel.margins(x=0.0)
 
 
-def _table(rows: Sequence[dict[str, Any]], column: str, name: str, most: int = 300) -> tuple[np.ndarray, np.ndarray]:
+def curve_table(
+    rows: Sequence[Mapping[str, Any]], column: str, name: str, most: int = 300
+) -> tuple[np.ndarray, np.ndarray]:
     """One column as (updates, seeds) at the values of the x column, thinned to at most `most` points."""
     steps = sorted({row["step"] for row in rows})
     steps = sorted({steps[i] for i in np.linspace(0, len(steps) - 1, min(most, len(steps))).astype(int)})

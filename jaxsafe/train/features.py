@@ -44,11 +44,16 @@ def approach(env: Environment, observation: Float[Array, "*batch o"]) -> Float[A
 
 
 def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
-    """Append the lead's relative velocity and how far both will miss each other if neither manoeuvres.
+    """Append the way to the rejoin point, the lead's relative velocity, and how far both will miss each other.
 
-    With the direction p of the lead and the relative velocity w, both observed: w, the cosine between them, the part of p
-    across w, 0 on a collision course, and that part times the observed distance: the miss distance, unless it is clipped.
+    The way as a vector, which is small near the point where its direction turns quickly, once more five times as long and
+    clipped. With the direction p of the lead and the relative velocity w, both observed: w, the cosine between them, the
+    part of p across w, 0 on a collision course, and that part times the observed distance: the miss distance if neither
+    manoeuvres, unless it is clipped.
     """
+    way = _elements(env, observation, "rejoin_position.magnitude", "rejoin") * _vector(
+        env, observation, "rejoin_position", "rejoin"
+    )
     distance = _elements(env, observation, "lead_position.magnitude", "rejoin")
     velocities = [
         _elements(env, observation, f"{name}.magnitude", "rejoin") * _vector(env, observation, name, "rejoin")
@@ -61,7 +66,10 @@ def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Arr
     approaching = jnp.maximum(-closing, 0.0)
     sine2 = jnp.sum(across * across, axis=-1, keepdims=True)
     danger = [approaching * jnp.exp(-sine2 * scale) for scale in (1.0 / 0.15**2, distance**2 / 0.2**2)]
-    return jnp.concatenate([observation, relative, closing, 4.0 * across, 4.0 * across * distance, *danger], axis=-1)
+    near = jnp.clip(5.0 * way, -1.0, 1.0)
+    return jnp.concatenate(
+        [observation, way, near, relative, closing, 4.0 * across, 4.0 * across * distance, *danger], axis=-1
+    )
 
 
 FEATURES: Mapping[str, Features] = {each.__name__: each for each in (none, docking, approach, rejoin)}

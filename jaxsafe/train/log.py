@@ -13,7 +13,7 @@ from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError
 from jaxsafe.train.files import append_csv, append_rows, keep_rows, write_csv
 
-NEEDS = ("seed", "step", "wall_s", "episodes", "success_rate", "return", "length")
+NEEDS = ("seed", "step", "wall_s", "episodes", "cost", "success_rate", "return", "length")
 """Columns that every row of the progress log has."""
 
 
@@ -67,6 +67,7 @@ def progress_rows(env: Environment, curves: dict[str, np.ndarray], seed: int, ba
             "step": int(curves["update"][i, j]) * batch_size,
             "wall_s": round(wall_s, 3),
             "episodes": int(curves["count"][i, j]),
+            "cost": int(curves["cost"][i, j]),
             **{name: float(f"{curves[name][i, j]:.6g}") if curves["count"][i, j] else None for name in measured},
         }
         for j in range(num_updates)

@@ -177,8 +177,8 @@ def chunk(shared: tuple, state: TrainState, length: int, limit: int) -> tuple[Tr
     def one(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
         going = state.num_updates < limit
         state = jax.lax.cond(going, lambda s: ppo.update(env, agent, hyper, limit, s), lambda s: s, state)
-        row = {"update": state.num_updates, "count": state.window.count, **window.means(state.window, env.outcomes)}
-        return state, row
+        counts = {"update": state.num_updates, "count": state.window.count, "cost": state.window.cost}
+        return state, {**counts, **window.means(state.window, env.outcomes)}
 
     return jax.lax.scan(one, state, None, length=length)
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.seeds import metrics_over_seeds
-from jaxsafe.metrics import Episode, interaction_efficiency
+from jaxsafe.metrics import Episode, interaction_efficiency, over_seeds
 from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.directory import versions
 from jaxsafe.train.files import read_json, write_json
@@ -42,6 +42,7 @@ def finish(training: Training, config: TrainConfig, env: Environment, name: str)
         "compile_s": round(training.compile_s, 2),
         "versions": versions(),
         "interaction_efficiency": _efficiency(training),
+        "training_cost": over_seeds(training.log.curve("cost")[1][-1].tolist()),  # violating steps of finished episodes
         "evaluation": evaluation(env, episodes),
     }
     write_json(training.run / "results.json", results)

@@ -1,4 +1,4 @@
-"""The latest finished episodes of a seed, kept inside the compiled training step: the training curve of Table 2."""
+"""The finished episodes of a seed, kept inside the compiled training step: the training curve of Table 2, and its cost."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ SIZE = 100
 
 
 class Window(Record):
-    """A ring of the last `SIZE` finished episodes and the number of all finished ones."""
+    """A ring of the last `SIZE` finished episodes, and counts over all finished ones."""
 
     episodes: Episode  # each field [SIZE]; slots never filled are zero
-    count: Int[Array, ""]
+    count: Int[Array, ""]  # episodes
+    cost: Int[Array, ""]  # steps with a violation
 
 
 def empty_window(like: Episode) -> Window:
     """A window in which no episode has finished yet; `like` gives dtypes."""
     episodes = jax.tree.map(lambda x: jnp.zeros(SIZE, x.dtype), like)
-    return Window(episodes, jnp.zeros((), jnp.int32))
+    return Window(episodes, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
 
 
 def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
@@ -33,7 +34,8 @@ def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
     latest = finished & (order >= order[-1] + 1 - SIZE)
     slot = jnp.where(latest, (window.count + order) % SIZE, SIZE)  # out of range: dropped
     ring = jax.tree.map(lambda old, new: old.at[slot].set(new.ravel(), mode="drop"), window.episodes, episodes)
-    return Window(ring, window.count + order[-1] + 1)
+    cost = jnp.sum(jnp.where(done, episodes.violating_steps, 0))
+    return Window(ring, window.count + order[-1] + 1, window.cost + cost)
 
 
 def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:

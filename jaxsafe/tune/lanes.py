@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.evaluate.episodes import run_episodes
-from jaxsafe.evaluate.seeds import BATCH, KINDS, batch_keys, success_index
-from jaxsafe.metrics import interaction_efficiency
+from jaxsafe.evaluate.seeds import BATCH, KINDS, batch_keys, metrics_per_seed
+from jaxsafe.metrics import Episode, interaction_efficiency
 from jaxsafe.train.loop import EVALUATION_SEED, begin, chunk
 from jaxsafe.train.seeds import SeedMapper
 from jaxsafe.tune.settings import Setting, alike, lane
@@ -66,23 +66,23 @@ class Lanes:
             curves.append(self.mapper.gather({name: rows[name][:, :count] for name in ("success_rate", "count", "return")}))
             tick(count * len(some))
         curve = {name: np.concatenate([one[name] for one in curves], axis=1) for name in curves[0]}
-        rates = {kind: self._success(lanes, state.params, kind == "deterministic") for kind in KINDS}
+        sums = {kind: self._episodes(lanes, state.params, kind == "deterministic") for kind in KINDS}
         split = lambda table: table.reshape(self.at_once, self.seeds, *table.shape[1:])[: len(some)]  # noqa: E731
-        curve, rates = jax.tree.map(split, (curve, rates))
-        return [self._result(setting, *jax.tree.map(lambda x, i=i: x[i], (curve, rates))) for i, setting in enumerate(some)]
+        curve, sums = jax.tree.map(split, (curve, sums))
+        return [self._result(setting, *jax.tree.map(lambda x, i=i: x[i], (curve, sums))) for i, setting in enumerate(some)]
 
     def _one_chunk(self, _: tuple, one: tuple[Any, Any]) -> tuple[Any, dict[str, jax.Array]]:
         return chunk(*one, self.length, self.like.config.num_updates)
 
-    def _success(self, lanes: Any, params: Any, deterministic: bool) -> np.ndarray:
-        """Success rate of every lane."""
-        count, outcomes = self.like.config.episodes, []
+    def _episodes(self, lanes: Any, params: Any, deterministic: bool) -> Episode:
+        """The evaluation episodes of every lane: each field [lanes, episodes]."""
+        count, batches = self.like.config.episodes, []
         for key in batch_keys(EVALUATION_SEED, -(-count // BATCH)):
             shared = self.mapper.replicate((key, np.asarray(deterministic)))
-            outcomes.append(self.mapper.gather(self._evaluate(shared, (lanes, params))))
-        return np.mean(np.concatenate(outcomes, axis=1)[:, :count] == success_index(self.like.env), axis=1)
+            batches.append(self.mapper.gather(self._evaluate(shared, (lanes, params))))
+        return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :count], *batches)
 
-    def _result(self, setting: Setting, curve: dict[str, np.ndarray], rates: dict[str, np.ndarray]) -> dict[str, Any]:
+    def _result(self, setting: Setting, curve: dict[str, np.ndarray], sums: dict[str, Episode]) -> dict[str, Any]:
         steps = (1 + np.arange(setting.config.num_updates)) * setting.config.ppo.batch_size
         success, episodes = curve["success_rate"].T, curve["count"].T
         last = curve["return"][:, -1]
@@ -92,11 +92,11 @@ class Lanes:
             "interaction_efficiency": interaction_efficiency(steps, success, episodes),
             "training_success": success[-1].tolist(),
             "training_return": last.tolist(),
-            **{f"{kind}_success": rate.tolist() for kind, rate in rates.items()},
+            "evaluation": {kind: metrics_per_seed(setting.env, episodes) for kind, episodes in sums.items()},
             "curve": {"steps": steps.tolist(), "success_rate": np.round(success.T, 4).tolist()},
         }
 
 
-def _one_evaluation(shared: tuple, one: tuple[Any, Any]) -> jax.Array:
+def _one_evaluation(shared: tuple, one: tuple[Any, Any]) -> Episode:
     (key, deterministic), ((env, agent, _), params) = shared, one
-    return run_episodes(env, agent.policy(env, params, deterministic), key, BATCH).outcome
+    return run_episodes(env, agent.policy(env, params, deterministic), key, BATCH)

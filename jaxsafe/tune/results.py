@@ -78,7 +78,7 @@ def line(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
 def _key(row: dict[str, Any], rank: str) -> tuple[float, float, float]:
     """Small is good: the chosen quantity first, then the others."""
     steps = row["interaction_efficiency"]["timesteps"] or float("inf")
-    success, deterministic = (-float(np.mean(row[f"{kind}_success"])) for kind in ("stochastic", "deterministic"))
+    success, deterministic = (-_mean(row, kind, "success_rate") for kind in ("stochastic", "deterministic"))
     area = -float(np.mean(row["curve"]["success_rate"]))
     return {
         "steps": (steps, area, success),
@@ -88,17 +88,23 @@ def _key(row: dict[str, Any], rank: str) -> tuple[float, float, float]:
 
 
 def _flat(row: dict[str, Any], swept: Sequence[str]) -> dict[str, Any]:
-    mean = lambda name: round(float(np.mean(row[name])), 4)  # noqa: E731
     each = row["interaction_efficiency"]["per_seed"]
     return {
         **{name: json.dumps(row[name]) if isinstance(row[name], (list, dict)) else row[name] for name in swept},
         "80 % after": row["interaction_efficiency"]["timesteps"],
         "seeds at 80 %": f"{sum(step is not None for step in each)}/{len(each)}",
-        "training": mean("training_success"),
-        "stochastic": mean("stochastic_success"),
-        "worst": round(min(row["stochastic_success"]), 4),
-        "deterministic": mean("deterministic_success"),
+        "training": round(float(np.mean(row["training_success"])), 4),
+        "stochastic": round(_mean(row, "stochastic", "success_rate"), 4),
+        "worst": round(min(row["evaluation"]["stochastic"]["success_rate"]), 4),
+        "deterministic": round(_mean(row, "deterministic", "success_rate"), 4),
+        "length": round(_mean(row, "deterministic", "episode_length"), 1),
+        "violating": round(_mean(row, "deterministic", "episode_safety_violation_rate"), 5),
     }
+
+
+def _mean(row: dict[str, Any], kind: str, metric: str) -> float:
+    """The average of a metric over seeds."""
+    return float(np.mean(row["evaluation"][kind][metric]))
 
 
 def _label(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:

@@ -1,0 +1,46 @@
+"""Training curves of several runs of one task in one figure, Figs. 12-16."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from jaxsafe.metrics import bootstrap_interval
+from jaxsafe.plot.figures import ALWAYS, AXES, CURVES, curve_table
+from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE
+
+COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", GREY)
+
+
+def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> Figure:
+    """A panel for each quantity, in it the mean and the 95 % interval over seeds of each run.
+
+    Args:
+        runs: rows of the progress log by the run's label.
+        title: of the figure.
+    """
+    every = [row for rows in runs.values() for row in rows]
+    curves = [curve for curve in CURVES if curve[0] in ALWAYS or any(row[curve[0]] for row in every)]
+    figure = Figure(figsize=(3.6 * len(curves), 3.3), layout="constrained")
+    panels = figure.subplots(1, len(curves))
+    column, label = AXES["steps"]
+    for panel, (name, quantity, factor) in zip(panels, curves, strict=True):
+        for colour, (run, rows) in zip(COLOURS, runs.items(), strict=False):
+            at, values = curve_table(rows, column, name)
+            known = ~np.isnan(values).any(axis=1)
+            at, values = at[known], factor * values[known]
+            panel.plot(at, values.mean(axis=1), color=colour, linewidth=1.6, label=run)
+            if values.shape[1] > 1 and len(at):
+                panel.fill_between(at, *bootstrap_interval(values), color=colour, alpha=0.2, linewidth=0)
+        panel.set(xlabel=label, ylabel=quantity)
+        panel.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
+        panel.margins(x=0.0)
+        if name == "success_rate":
+            panel.set_ylim(-3, 103)
+            panel.axhline(80.0, color="black", linestyle=":", linewidth=1.0)
+    panels[0].legend(loc="lower right", fontsize="small", frameon=False)
+    figure.suptitle(f"{title}: the last 100 training episodes, mean and 95 % interval over seeds", fontsize="medium")
+    return figure

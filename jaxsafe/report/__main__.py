@@ -1,0 +1,80 @@
+"""`python -m jaxsafe.report`: train and evaluate the baselines, and write the page with their tables and figures."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxsafe import cli
+from jaxsafe.errors import ConfigError
+
+SEEDS = 10
+"""Of every training, unless the user says otherwise."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    from jaxsafe.envs import TASKS
+    from jaxsafe.report.page import Report
+    from jaxsafe.report.plan import KINDS, plan
+    from jaxsafe.report.run import evaluate, train
+    from jaxsafe.train.config import resolve
+
+    arguments = cli.Arguments.parse(argv)
+    out, runs = Path(arguments.pop_text("out") or "report"), Path(arguments.pop_text("runs") or "runs/report")
+    tasks, kinds = (_names(name, arguments.pop(name), [*known]) for name, known in (("tasks", TASKS), ("kinds", KINDS)))
+    film = arguments.pop("film", True)
+    rest = [word for word in argv if word.partition("=")[0] in arguments.options]
+    items = plan(tasks, kinds, rest if "seeds" in arguments.options else [f"seeds={SEEDS}", *rest])
+    episodes = [resolve(cli.Arguments.parse(item.words))[0].episodes for item in items]  # errors before anything is done
+    found = {}
+    try:
+        for item, count in zip(items, episodes, strict=True):
+            found[item] = train(item, runs)
+            evaluate(item, found[item], count, bool(film) and item.kind == "features")
+    except KeyboardInterrupt:
+        print(f"stopped; the same command goes on with what is in {runs}")
+        return cli.INTERRUPTED
+    page = Report(found, " ".join(["python -m jaxsafe.report", *argv]), _commit()).write(out)
+    print(f"\n{page}")
+    return 0
+
+
+def _names(option: str, value: Any, known: Sequence[str]) -> list[str]:
+    if value is None:
+        return list(known)
+    names = value if isinstance(value, list) else [value]
+    if not names:
+        raise ConfigError(f"{option}: expected at least one of {', '.join(known)}, found none")
+    return [str(name) for name in names]
+
+
+def _commit() -> str | None:
+    """Of the checkout that this runs in, if it does."""
+    git = shutil.which("git")
+    if git is None:
+        return None
+    place = Path(__file__).resolve().parent
+    found = subprocess.run([git, "-C", str(place), "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
+    return found.stdout.strip() or None
+
+
+def usage() -> str:
+    """The help text."""
+    return (
+        "usage: python -m jaxsafe.report [key=value …]\n\n"
+        "  trains every task in every way with ten seeds, evaluates, and writes OUT/baselines.md; takes hours\n"
+        "  tasks=[docking2d,…]    some tasks only\n"
+        "  kinds=[features,…]     some of features, plain, discrete, rta\n"
+        "  runs=DIR               where the runs are (default runs/report); what is complete there is not done again\n"
+        "  out=DIR                where to write the page (default report)\n"
+        "  film=false             no animations\n"
+        "  seeds, steps, …        any option of jaxsafe.train, the same for all"
+    )
+
+
+if __name__ == "__main__":
+    cli.run(main, usage, cli.at_once)

@@ -1,0 +1,77 @@
+"""What the report trains and evaluates: each item is a command line that anyone can repeat."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxsafe.envs import TASKS
+from jaxsafe.errors import ConfigError, nearest
+
+PAPER_STEPS = {
+    "rejoin2d": 300_000,
+    "rejoin3d": 2_300_000,
+    "docking2d": 340_000,
+    "docking3d": 660_000,
+    "docking2d_oriented": 1_500_000,
+}
+"""Table 2 of the paper: environment steps to 80 % success in training."""
+
+KINDS: Mapping[str, Sequence[str]] = {
+    "features": [],
+    "plain": ["preset=plain"],
+    "discrete": ["actions=discrete"],
+    "rta": ["rta=default"],
+}
+"""How each task is trained: options of `jaxsafe.train` by the name that the page uses."""
+
+_DOCKING_STARTS = {
+    "from 1 km": ["env.deputy.start.position.distance=[1000,1000]"],
+    "from 10 km": ["env.deputy.start.position.distance=[10000,10000]", "env.terminal.timeout.limit=6000"],
+}
+_REJOIN_STARTS = {
+    "from 15 000 ft": ["env.wingman.start.position.distance=[15000,15000]"],
+    "from 30 000 ft": ["env.wingman.start.position.distance=[30000,30000]"],
+}
+STARTS = {task: _REJOIN_STARTS if task.startswith("rejoin") else _DOCKING_STARTS for task in TASKS}
+"""Starts outside those of training, by task and name."""
+
+WITH_RTA, WITHOUT_RTA = "filtered", "unfiltered"
+
+
+class Item(NamedTuple):
+    """One training of all seeds, and the evaluations of its policies beyond the run's own."""
+
+    task: str
+    kind: str
+    words: tuple[str, ...]  # what follows `python -m jaxsafe.train`
+
+    @property
+    def name(self) -> str:
+        """Of its directory and its files."""
+        return f"{self.task}-{self.kind}"
+
+    @property
+    def evaluations(self) -> dict[str, list[str]]:
+        """By name, what follows `python -m jaxsafe.evaluate run=…`."""
+        if self.kind == "features":
+            return {**STARTS[self.task], WITH_RTA: ["rta=default"]}
+        return {WITHOUT_RTA: ["rta=none"]} if self.kind == "rta" else {}
+
+    def evaluation_directory(self, run: Path, name: str) -> Path:
+        """Where an evaluation of a run is written."""
+        return run / "evaluations" / name.replace(" ", "_")
+
+
+def plan(tasks: Sequence[str], kinds: Sequence[str], words: Sequence[str]) -> list[Item]:
+    """Every kind of training of every task, the same further options for all.
+
+    Raises:
+        ConfigError: there is no such task or kind.
+    """
+    for name, chosen, known in (("tasks", tasks, TASKS), ("kinds", kinds, KINDS)):
+        for one in chosen:
+            if one not in known:
+                raise ConfigError(f"{name}: found {one!r}; choose from {nearest(str(one), known)}")
+    return [Item(task, kind, (f"env={task}", *KINDS[kind], *words)) for kind in kinds for task in tasks]

@@ -1,0 +1,72 @@
+"""Carrying out a plan: every training and evaluation is a process of its own, and what is done is not done again."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from jaxsafe.cli import INTERRUPTED, Arguments
+from jaxsafe.config import describe, yaml
+from jaxsafe.config.convert import to_data
+from jaxsafe.errors import ConfigError
+from jaxsafe.report.plan import Item
+from jaxsafe.train.config import resolve
+
+FILM = "episode_deterministic.gif"
+
+
+def train(item: Item, runs: Path) -> Path:
+    """Train, or go on with a training that was interrupted, or do nothing if it is complete; returns the run directory.
+
+    Raises:
+        ConfigError: the directory holds a run with other options, or the training failed.
+        KeyboardInterrupt: the user stopped it.
+    """
+    run = runs / item.name
+    if (run / "config.yaml").exists():
+        _refuse_other(item, run)
+        if not (run / "results.json").exists():
+            _call("jaxsafe.train", [f"resume={run}"])
+    else:
+        _call("jaxsafe.train", [*item.words, f"out={run}"])
+    return run
+
+
+def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
+    """Do those evaluations of a run that are still to do.
+
+    Raises:
+        ConfigError: an evaluation failed.
+        KeyboardInterrupt: the user stopped it.
+    """
+    for name, options in item.evaluations.items():
+        out = item.evaluation_directory(run, name)
+        if not (out / "results.json").exists():
+            shutil.rmtree(out, ignore_errors=True)  # of an evaluation that was interrupted
+            _call("jaxsafe.evaluate", [f"run={run}", f"episodes={episodes}", *options, f"out={out}"])
+    film = run / "film"
+    if render and not (film / FILM).exists():
+        shutil.rmtree(film, ignore_errors=True)
+        policy = next(iter(sorted((run / "policy").iterdir())))
+        _call("jaxsafe.evaluate", [f"run={policy}", "episodes=10", "deterministic=true", "render=gif", f"out={film}"])
+
+
+def _refuse_other(item: Item, run: Path) -> None:
+    """The numbers of an old run must not pass as those of a new recipe."""
+    config, env, _ = resolve(Arguments.parse([*item.words, f"out={run}"]))
+    wanted = {"training": to_data(config), "environment": describe(env)}
+    content = yaml.read(run / "config.yaml")
+    if any(content[part] != value for part, value in wanted.items()):
+        raise ConfigError(f"runs: {run} was trained with other options; remove it, or give another directory")
+
+
+def _call(module: str, words: Sequence[str]) -> None:
+    print(f"\n$ python -m {module} {' '.join(words)}", flush=True)
+    code = subprocess.run([sys.executable, "-m", module, *words], check=False).returncode
+    if code == INTERRUPTED:
+        raise KeyboardInterrupt
+    if code:
+        raise ConfigError(f"python -m {module} {' '.join(words)}: ended with code {code}")

@@ -1,0 +1,111 @@
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from tiny import TINY
+
+from jaxsafe.envs import TASKS
+from jaxsafe.errors import ConfigError
+from jaxsafe.evaluate import __main__ as evaluate
+from jaxsafe.report import __main__ as command
+from jaxsafe.report import run as running
+from jaxsafe.report.plan import KINDS, Item, plan
+from jaxsafe.train import __main__ as train
+from jaxsafe.train.config import resolve_all
+
+REST = [word for word in TINY if not word.startswith("env=")]
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[list[str]]:
+    """The commands that a report runs; they run in this process, which has their programs already."""
+    made: list[list[str]] = []
+
+    def call(module: str, words: Sequence[str]) -> None:
+        made.append([module, *words])
+        assert {"jaxsafe.train": train, "jaxsafe.evaluate": evaluate}[module].main(words) == 0
+
+    monkeypatch.setattr(running, "_call", call)
+    monkeypatch.setattr(Item, "evaluations", property(lambda item: {"heavy": ["env.deputy.mass=24"]}))
+    monkeypatch.chdir(tmp_path)
+    return made
+
+
+def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str]]) -> None:
+    words = ["tasks=docking2d", "kinds=features", *REST]
+    assert command.main(words) == 0
+    page = Path("report/baselines.md").read_text()
+    assert f"`python -m jaxsafe.report {' '.join(words)}`" in page
+    for section in ("Interaction efficiency", "After training", "Quality of docking", "Safety", "Starts outside training"):
+        assert f"## {section}" in page
+    results = json.loads(Path("runs/report/docking2d-features/results.json").read_text())
+    rate = results["evaluation"]["deterministic"]["episode_safety_violation_rate"]["mean"]
+    assert f"| docking2d | features | deterministic | {100 * rate:.2f} [" in page
+    for file in ("docking2d_training.png", "docking2d_trajectories.png", "docking2d_speed_distance.png", "docking2d.gif"):
+        assert Path("report/baselines", file).stat().st_size > 1000
+        assert f"(baselines/{file})" in page
+    with open("report/baselines/docking2d-features.csv") as file:
+        rows = list(csv.DictReader(file))
+    assert [(int(row["step"]), int(row["seed"])) for row in rows] == [
+        (64 * (i + 1), s) for i in range(20) for s in range(3)
+    ]
+    assert {"success_rate", "return", "cost"} <= rows[0].keys()
+    assert [module for module, *_ in calls] == ["jaxsafe.train", "jaxsafe.evaluate", "jaxsafe.evaluate"]
+    assert command.main(words) == 0  # all is there
+    assert len(calls) == 3
+
+
+def test_an_interrupted_report_goes_on(calls: list[list[str]], whole: Path) -> None:
+    run = Path("runs/report/docking2d-features")
+    assert train.main([*TINY, f"out={run}"]) == 0
+    (run / "results.json").unlink()
+    (run / "evaluations" / "heavy").mkdir(parents=True)
+    (run / "evaluations" / "heavy" / "eval.jsonl").write_text("")  # of a kill
+    assert command.main(["tasks=docking2d", "kinds=features", "film=false", *REST]) == 0
+    assert calls[0] == ["jaxsafe.train", f"resume={run}"]
+    assert len(calls) == 2
+
+
+def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:
+    assert train.main([*TINY, "out=runs/report/docking2d-features"]) == 0
+    with pytest.raises(ConfigError, match=r"runs: .* was trained with other options; remove it"):
+        command.main(["tasks=docking2d", "kinds=features", *REST, "ppo.gamma=0.9"])
+    assert not calls
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["tasks=docking4d"], "tasks: found 'docking4d'; choose from rejoin2d"),
+        (
+            ["kinds=[features,plane]"],
+            "kinds: found 'plane'; choose from features, plain, discrete, rta. Did you mean 'plain'?",
+        ),
+        (["tasks=[]"], "tasks: expected at least one of rejoin2d"),
+        (["sedes=3"], "sedes: unknown field 'sedes'"),
+    ],
+)
+def test_bad_options_of_report_are_told(words: list[str], message: str) -> None:
+    with pytest.raises(ConfigError) as raised:
+        command.main(words)
+    assert str(raised.value).startswith(message)
+
+
+def test_every_command_of_the_plan_is_valid() -> None:
+    from jaxsafe import cli
+    from jaxsafe.config import override
+    from jaxsafe.envs import with_rta
+
+    items = plan([*TASKS], [*KINDS], ["seeds=10"])
+    assert len({item.name for item in items}) == 20
+    for item in items:
+        [(config, env, _)] = resolve_all(cli.Arguments.parse(item.words))
+        assert config.seeds == 10
+        for words in item.evaluations.values():
+            arguments = cli.Arguments.parse(words)
+            rta = arguments.pop_text("rta")
+            changed = override(env if rta is None else with_rta(env, item.task, rta), arguments.pop_overrides())
+            assert changed.observation_size == env.observation_size
+            assert not arguments.options
