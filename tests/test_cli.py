@@ -56,6 +56,8 @@ def fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], t
         (["env=docking3d", "ppo.gamma=true"], "ppo.gamma: expected a number in [0, 1], found True"),
         (["env=docking3d", "ppo.learning_rate=.nan"], "ppo.learning_rate: expected a number > 0, found nan"),
         (["env=docking3d", "ppo.num_minibatches=3"], "ppo.num_minibatches: expected a divisor of"),
+        (["env=docking3d", "ppo.learning_rate_decay=exponential", "ppo.final_learning_rate=0"],
+         "ppo.final_learning_rate: expected a number > 0 for an exponential decay, found 0"),
         (["env=docking3d", "agent.features=dock"], "agent.features: found 'dock'; choose from none, docking, approach, "
          "rejoin. Did you mean 'docking'?"),
         (["env=docking3d", "actions=discret"], "Did you mean 'discrete'?"),

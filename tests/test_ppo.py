@@ -7,7 +7,7 @@ from probes import Constant, Match, Position, probe
 from jaxsafe.component import normalise
 from jaxsafe.environment import Environment
 from jaxsafe.train.agent import Agent
-from jaxsafe.train.ppo import PPO, TrainState, discount, gae, init, update
+from jaxsafe.train.ppo import PPO, TrainState, discount, gae, init, learning_rate, update
 
 AGENT = normalise(Agent(hidden=(16,)))
 SMALL = normalise(
@@ -98,6 +98,21 @@ def test_the_learning_rate_falls_linearly_to_its_end() -> None:
     earlier = update(env, AGENT, frozen, 20, state)
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), earlier.params, state.params)
     assert max(jax.tree.leaves(moved)) > 1e-4
+
+
+def test_the_learning_rate_falls_as_it_is_told() -> None:
+    for decay, middle in (("linear", 5.05e-3), ("exponential", 1e-3)):
+        ppo = normalise(PPO(learning_rate=1e-2, final_learning_rate=1e-4, learning_rate_decay=decay))
+        rates = [float(learning_rate(ppo, progress)) for progress in (0.0, 0.5, 1.0)]
+        np.testing.assert_allclose(rates, [1e-2, middle, 1e-4], rtol=1e-5)
+
+
+def test_the_noise_falls_besides_what_is_learnt() -> None:
+    env = probe(Constant(name="reward"))
+    state = init(env, AGENT, SMALL, jax.random.key(0))
+    kept = update(env, AGENT, SMALL, 10, state).params["log_std"]
+    less = update(env, AGENT, SMALL.replace(noise_decay=jnp.array(2.0)), 10, state).params["log_std"]
+    np.testing.assert_allclose(kept - less, 0.2, rtol=1e-5)
 
 
 def test_the_horizon_grows_exponentially_to_its_end() -> None:

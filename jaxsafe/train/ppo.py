@@ -33,7 +33,8 @@ class PPO(Component):
     num_epochs: Annotated[int, Range(1)] = 10
     num_minibatches: Annotated[int, Range(1)] = 2
     learning_rate: Annotated[Dimensionless, Positive] = 3e-3
-    final_learning_rate: Annotated[Dimensionless, Range(0.0)] = 3e-4  # reached linearly at the end
+    final_learning_rate: Annotated[Dimensionless, Range(0.0)] = 3e-4  # reached at the end
+    learning_rate_decay: Literal["linear", "exponential"] = "linear"  # on the way there
     gamma: Annotated[Dimensionless, Share] = 0.97
     horizon_growth: Annotated[Dimensionless, Positive] = 1.0  # factor on 1/(1 − γ), reached exponentially at the end
     gae_lambda: Annotated[Dimensionless, Share] = 1.0
@@ -105,12 +106,19 @@ def update(env: Environment, agent: Agent, ppo: PPO, total_updates: Array | int,
     progress = state.num_updates / total_updates
     gamma = discount(ppo, progress)
     batch = _to_batch(agent, ppo, gamma, state.params, transitions)
-    learning_rate = ppo.learning_rate + (ppo.final_learning_rate - ppo.learning_rate) * progress
-    params, optimizer = learn(env, agent, ppo, learning_rate, state, batch, key_learn)
+    params, optimizer = learn(env, agent, ppo, learning_rate(ppo, progress), state, batch, key_learn)
     if "log_std" in params:
         params = {**params, "log_std": params["log_std"] - ppo.noise_decay / total_updates}
     window = push(state.window, transitions.episode, transitions.done)
     return state.replace(params=params, optimizer=optimizer, window=window, num_updates=state.num_updates + 1)
+
+
+def learning_rate(ppo: PPO, progress: Array | float) -> Array:
+    """The step size after a share of the training."""
+    first, last = jnp.asarray(ppo.learning_rate), jnp.asarray(ppo.final_learning_rate)
+    if ppo.learning_rate_decay == "exponential":
+        return first * (last / first) ** progress
+    return first + (last - first) * progress
 
 
 def discount(ppo: PPO, progress: Array | float) -> Array:
@@ -175,7 +183,7 @@ def gae(reward: Array, value: Array, next_value: Array, terminated: Array, done:
 
 
 def learn(
-    env: Environment, agent: Agent, ppo: PPO, learning_rate: Array, state: TrainState, batch: Batch, key: Key
+    env: Environment, agent: Agent, ppo: PPO, step_size: Array, state: TrainState, batch: Batch, key: Key
 ) -> tuple[Params, optax.OptState]:
     """Some epochs of minibatch steps, each epoch over a new shuffle of the batch."""
 
@@ -184,7 +192,7 @@ def learn(
         minibatch = jax.tree.map(lambda x: x[rows], batch)
         gradient = jax.grad(loss)(params, env, agent, ppo, minibatch)
         step, optimizer = _optimizer(ppo).update(gradient, optimizer)
-        return (jax.tree.map(lambda p, s: p - learning_rate * s, params, step), optimizer), None
+        return (jax.tree.map(lambda p, s: p - step_size * s, params, step), optimizer), None
 
     def epoch(carry: tuple[Params, optax.OptState], key: Key) -> tuple[tuple[Params, optax.OptState], None]:
         rows = shuffle(key, ppo.batch_size).reshape(ppo.num_minibatches, -1)
