@@ -6,5 +6,6 @@ from jaxsafe.environment import Environment, reset, reset_to, step
 from jaxsafe.envs import make
 from jaxsafe.errors import ConfigError
 from jaxsafe.rollout import rollout
+from jaxsafe.train.policy import load_policy
 
-__all__ = ["ConfigError", "Environment", "make", "override", "reset", "reset_to", "rollout", "step"]
+__all__ = ["ConfigError", "Environment", "load_policy", "make", "override", "reset", "reset_to", "rollout", "step"]

@@ -58,6 +58,8 @@ def fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], t
         (["env=docking3d", "ppo.num_minibatches=3"], "ppo.num_minibatches: expected a divisor of"),
         (["env=docking3d", "ppo.learning_rate_decay=exponential", "ppo.final_learning_rate=0"],
          "ppo.final_learning_rate: expected a number > 0 for an exponential decay, found 0"),
+        (["env=docking3d", "agent.log_std=[-1,-2]"],
+         "agent.log_std: expected one number or 3, one for each action, found 2"),
         (["env=docking3d", "agent.features=dock"], "agent.features: found 'dock'; choose from none, docking, approach, "
          "rejoin. Did you mean 'docking'?"),
         (["env=docking3d", "actions=discret"], "Did you mean 'discrete'?"),
@@ -72,7 +74,7 @@ def fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], t
 )  # fmt: skip
 def test_bad_options_of_train_are_told_in_one_line(fails: Callable[..., str], words: list[str], message: str) -> None:
     assert message in fails(train, *words)
-    assert not list(Path.cwd().iterdir())  # and nothing was begun
+    assert list(Path.cwd().rglob("*")) == []  # and nothing was begun
 
 
 def test_numbers_in_exponent_form_are_numbers(fails: Callable[..., str]) -> None:

@@ -62,11 +62,29 @@ def test_rejoin_features_tell_a_collision_course(task: str) -> None:
     inputs = np.asarray(Agent(features="rejoin").inputs(env, observation))
     size, d = env.observation_size, 3 if task == "rejoin3d" else 2
     np.testing.assert_array_equal(inputs[:size], observation)
-    relative, closing, across, miss, danger = np.split(inputs[size:], np.cumsum([d, 1, d, d]))
+    level = d if task == "rejoin3d" else 0
+    _, way, near, relative, closing, across, miss, danger = np.split(inputs[size:], np.cumsum([level, d, d, d, 1, d, d]))
+    assert np.abs(way).max() <= 1.0
+    np.testing.assert_allclose(near, np.clip(5.0 * way, -1.0, 1.0), rtol=1e-6)
     np.testing.assert_allclose(relative[:2], COURSE / 400.0, atol=1e-6)
     np.testing.assert_allclose(closing, -1.0, atol=0.02)  # the direction of w has length ‖w‖/(‖w‖ + 0.01)
     np.testing.assert_allclose([*across, *miss], 0.0, atol=0.1)
     np.testing.assert_allclose(danger, 1.0, atol=0.05)
+
+
+def test_rejoin_features_are_level_however_the_wingman_rolls() -> None:
+    env = jaxsafe.make("rejoin3d")
+    inputs = []
+    for roll, climb in ((0.0, 0.0), (0.7, 0.2), (-0.9, -0.3)):
+        lead = {"position": [600.0, -300.0, 100.0], "heading": 0.4, "speed": 250.0}
+        wingman = {"position": [0.0, 0.0, 0.0], "heading": 0.2, "speed": 300.0, "roll": roll, "flight_path_angle": climb}
+        _, timestep = jaxsafe.reset_to(env, {"lead": lead, "wingman": wingman})
+        inputs.append(np.asarray(Agent(features="rejoin").inputs(env, timestep.observation))[env.observation_size :])
+    turn = np.array([[np.cos(0.2), np.sin(0.2), 0.0], [-np.sin(0.2), np.cos(0.2), 0.0], [0.0, 0.0, 1.0]])
+    ahead = turn @ [600.0, -300.0, 100.0]
+    np.testing.assert_allclose(inputs[0][:3], ahead / np.linalg.norm(ahead), atol=1e-6)
+    for other in inputs[1:]:
+        np.testing.assert_allclose(other[:9], inputs[0][:9], atol=1e-5)  # the lead, and the way to the rejoin point
 
 
 @pytest.mark.parametrize("task", ["rejoin2d", "rejoin3d"])

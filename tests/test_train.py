@@ -21,6 +21,7 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.train import __main__ as command
 from jaxsafe.train import directory
 from jaxsafe.train.checkpoint import Checkpoints
+from jaxsafe.train.config import recipe
 from jaxsafe.train.loop import Training
 from jaxsafe.train.policy import load_policy, read_policy
 from jaxsafe.train.restore import structure
@@ -178,7 +179,8 @@ def test_all_tasks_run_one_after_another_and_resume(
     _two_tasks(monkeypatch)
     path = tmp_path / "all"
     words = [word for word in TINY if not word.startswith("env=")]
-    same = ["agent.features=docking", "ppo.learning_rate=2e-3", "ppo.gamma=0.95", "agent.log_std=-0.4"]
+    given = {word.partition("=")[0] for word in words} | {"preset"}
+    same = [f"{key}={value}" for key, value in recipe("docking2d", None).items() if key not in given]
     original = Training._write_progress
 
     def interrupt(self: Training, *args: Any) -> None:

@@ -9,11 +9,13 @@ from tiny import TINY
 
 from jaxsafe import cli
 from jaxsafe.errors import ConfigError
+from jaxsafe.train.config import recipe
 from jaxsafe.tune import __main__ as command
 from jaxsafe.tune.settings import Range, alike, pop_sweep, settings
 
 BASE = [word for word in TINY if not word.startswith("ppo.num_steps")]
-SWEEP = [*BASE, "sweep.ppo.gamma=[0.95,0.99]", "sweep.ppo.num_steps=[16,32]"]
+GAMMA = recipe("docking2d", None)["ppo.gamma"]
+SWEEP = [*BASE, f"sweep.ppo.gamma=[{GAMMA},0.99]", "sweep.ppo.num_steps=[16,32]"]
 
 
 def options(*words: str) -> cli.Arguments:
@@ -93,8 +95,8 @@ def test_what_cannot_be_swept_is_said_in_one_line(words: list[str], message: str
 
 
 def test_a_setting_learns_what_the_same_training_learns(swept: Path, whole: Path) -> None:
-    """Of the fixture `whole`: the same options, γ = 0.95 and batches of 16 steps from the recipe and from `TINY`."""
-    row = next(row for row in results(swept).values() if (row["ppo.gamma"], row["ppo.num_steps"]) == (0.95, 16))
+    """Of the fixture `whole`: the same options, γ and batches of 16 steps as in the recipe and in `TINY`."""
+    row = next(row for row in results(swept).values() if (row["ppo.gamma"], row["ppo.num_steps"]) == (GAMMA, 16))
     progress = [json.loads(line) for line in (whole / "progress.jsonl").read_text().splitlines()]
     for seed in range(3):
         own = [each for each in progress if each["seed"] == seed]
@@ -116,7 +118,7 @@ def test_the_table_ranks_every_setting(swept: Path) -> None:
     rows = list(csv.DictReader((swept / "results.csv").read_text().splitlines()))
     assert sorted(row["setting"] for row in rows) == ["0", "1", "2", "3"]
     assert {(row["ppo.gamma"], row["ppo.num_steps"]) for row in rows} == {
-        (g, n) for g in ("0.95", "0.99") for n in ("16", "32")
+        (g, n) for g in (str(GAMMA), "0.99") for n in ("16", "32")
     }
     assert (swept / "curves.png").stat().st_size > 10_000
     ranked = json.loads((swept / "results.json").read_text())["settings"]

@@ -13,11 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.component import Component, Range
+from jaxsafe.component import ANY, Component, Range, Unit
 from jaxsafe.environment import Environment
 from jaxsafe.rollout import Policy
 from jaxsafe.train.features import FEATURES
-from jaxsafe.types import Dimensionless, Key, Positive
+from jaxsafe.types import Dimensionless, Key, Number, Positive
 
 Params = dict[str, Any]
 
@@ -27,7 +27,8 @@ class Agent(Component):
 
     hidden: Annotated[tuple[int, ...], Range(1)] = (64, 64)
     features: Literal["none", "docking", "approach", "rejoin"] = "none"  # appended to the observation
-    log_std: Dimensionless = -0.7  # initial, of continuous actions in [−1, 1]; learnt, the same for all states
+    log_std: Annotated[Number, Unit("1", length=ANY)] = -0.7
+    """Initial, of continuous actions in [−1, 1], one number or one for each; learnt, the same for all states."""
     prior_std: Annotated[Dimensionless, Positive] = 0.3  # of discrete actions at the start, in units of half the range
 
     def init(self, key: Key, env: Environment) -> Params:
@@ -39,7 +40,9 @@ class Agent(Component):
             "actor": _init_mlp(key_actor, (inputs, *self.hidden, outputs), last_gain=0.01),
             "critic": _init_mlp(key_critic, (inputs, *self.hidden, 1), last_gain=1.0),
         }
-        return params if env.num_action_points else {**params, "log_std": jnp.full(env.action_size, self.log_std)}
+        if env.num_action_points:
+            return params
+        return {**params, "log_std": jnp.broadcast_to(jnp.asarray(self.log_std), env.action_size)}
 
     def inputs(self, env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
         """Return what the networks see of an observation."""

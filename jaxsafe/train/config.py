@@ -108,6 +108,9 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
         raise ConfigError(f"seeds: seed + seeds must not exceed 2³¹, found {config.seed} + {config.seeds}")
     if config.tensorboard:
         tensorboard_writer()
+    if jnp.size(config.agent.log_std) not in (1, env.action_size):
+        count, found = env.action_size, jnp.size(config.agent.log_std)
+        raise ConfigError(f"agent.log_std: expected one number or {count}, one for each action, found {found}")
     observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
     jax.eval_shape(lambda o: config.agent.inputs(env, o), observation)  # refuses features that this task cannot have
     return config, env, Path(task).stem

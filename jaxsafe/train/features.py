@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 
 from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError
+from jaxsafe.simulation.geometry import rotation
 
 Features = Callable[[Environment, Float[Array, "*batch o"]], Float[Array, "*batch i"]]
 
@@ -46,34 +47,49 @@ def approach(env: Environment, observation: Float[Array, "*batch o"]) -> Float[A
 def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
     """Append the way to the rejoin point, the lead's relative velocity, and how far both will miss each other.
 
-    The way as a vector, which is small near the point where its direction turns quickly, once more five times as long and
-    clipped. With the direction p of the lead and the relative velocity w, both observed: w, the cosine between them, the
-    part of p across w, 0 on a collision course, and that part times the observed distance: the miss distance if neither
+    All vectors are turned from the wingman's body into its level frame, in which left is left however it rolls. The way as
+    a vector, which is small near the point where its direction turns quickly, once more five times as long and clipped.
+    With the direction p of the lead (in space appended as well) and the relative velocity w: w, the cosine between them,
+    the part of p across w, 0 on a collision course, and that part times the observed distance: the miss distance if neither
     manoeuvres, unless it is clipped.
     """
-    way = _elements(env, observation, "rejoin_position.magnitude", "rejoin") * _vector(
-        env, observation, "rejoin_position", "rejoin"
+    distance, bearing = _magnitude_and_direction(env, observation, "lead_position")
+    far, towards = _magnitude_and_direction(env, observation, "rejoin_position")
+    (speed, along), (own_speed, own) = (
+        _magnitude_and_direction(env, observation, f"{name}_velocity") for name in ("lead", "wingman")
     )
-    distance = _elements(env, observation, "lead_position.magnitude", "rejoin")
-    velocities = [
-        _elements(env, observation, f"{name}.magnitude", "rejoin") * _vector(env, observation, name, "rejoin")
-        for name in ("lead_velocity", "wingman_velocity")
-    ]
-    bearing, relative = _vector(env, observation, "lead_position", "rejoin"), velocities[0] - velocities[1]
+    way, relative = far * towards, speed * along - own_speed * own
     course = relative / (jnp.linalg.norm(relative, axis=-1, keepdims=True) + 0.01)
     closing = jnp.sum(bearing * course, axis=-1, keepdims=True)
     across = bearing - closing * course
     approaching = jnp.maximum(-closing, 0.0)
     sine2 = jnp.sum(across * across, axis=-1, keepdims=True)
     danger = [approaching * jnp.exp(-sine2 * scale) for scale in (1.0 / 0.15**2, distance**2 / 0.2**2)]
-    near = jnp.clip(5.0 * way, -1.0, 1.0)
-    return jnp.concatenate(
-        [observation, way, near, relative, closing, 4.0 * across, 4.0 * across * distance, *danger], axis=-1
-    )
+    near, miss = jnp.clip(5.0 * way, -1.0, 1.0), 4.0 * across * distance
+    level = () if "roll" not in env.observation_names else (bearing,)  # in the plane the observation has it
+    return jnp.concatenate([observation, *level, way, near, relative, closing, 4.0 * across, miss, *danger], axis=-1)
 
 
 FEATURES: Mapping[str, Features] = {each.__name__: each for each in (none, docking, approach, rejoin)}
 """By name, as in `agent.features`."""
+
+
+def _magnitude_and_direction(
+    env: Environment, observation: Float[Array, "*batch o"], name: str
+) -> tuple[Float[Array, "*batch 1"], Float[Array, "*batch d"]]:
+    """An observed vector in the wingman's level frame, R_y(γ)·R_x(φ) times what it is in the body frame."""
+    magnitude, direction = (
+        _elements(env, observation, f"{name}.magnitude", "rejoin"),
+        _vector(env, observation, name, "rejoin"),
+    )
+    if "roll" in env.observation_names:
+        scales = {one.name: one.scale for one in env.observation}
+        pitch, roll = (
+            scales[angle] * _elements(env, observation, angle, "rejoin")[..., 0] for angle in ("flight_path_angle", "roll")
+        )
+        turn = rotation(jnp.zeros_like(roll), pitch, roll)
+        direction = jnp.sum(turn * direction[..., None, :], axis=-1)
+    return magnitude, direction
 
 
 def _vector(env: Environment, observation: Float[Array, "*batch o"], name: str, features: str) -> Float[Array, "*batch d"]:
