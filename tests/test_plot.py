@@ -99,6 +99,6 @@ def test_a_run_without_rows_is_told_in_one_line(whole: Path, tmp_path: Path) -> 
     shutil.copy(whole / "config.yaml", tmp_path / "config.yaml")
     with pytest.raises(ConfigError, match=r"has no rows in progress\.jsonl yet"):
         draw_all(tmp_path)
-    (tmp_path / "progress.jsonl").write_text(json.dumps(rows(1)[0] | {"episodes": 0}) + "\nbroken\n{}\n")
+    (tmp_path / "progress.jsonl").write_text(json.dumps(rows(1)[0] | {"episodes": 0, "cost": 0}) + "\nbroken\n{}\n")
     with pytest.raises(ConfigError, match=r"progress\.jsonl, line 2"):
         draw_all(tmp_path)
