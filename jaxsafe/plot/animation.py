@@ -27,8 +27,6 @@ FRAMES = 80
 PAUSE_MS, LAST_MS = 75, 1500
 """How long a frame stays, and the last one."""
 
-Step = int
-
 
 def animate(env: Environment, episode: tuple[State, TimeStep], path: Path, title: str) -> Path:
     """Write an episode as a GIF file that repeats.
@@ -76,7 +74,7 @@ class Scene:
         self.draw(max(range(len(self.sim.time)), key=self._reach))  # the widest numbers
         self.figure.set_layout_engine("none")  # or the panels would jump with the width of their numbers
 
-    def draw(self, step: Step) -> np.ndarray:
+    def draw(self, step: int) -> np.ndarray:
         """The picture of a step, red, green and blue in 8 bits: (height, width, 3)."""
         sim = self.sim
         ended = [name for name, flag in sim.ended.items() if flag[step]]
@@ -98,7 +96,7 @@ class Scene:
         canvas.draw()
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
-    def _reach(self, step: Step) -> float:
+    def _reach(self, step: int) -> float:
         """Half the width of the map: all platforms and regions are on it, and it closes in with the agent."""
         centres = [np.abs(one.position - self.origin)[step].max() for one in self.sim.regions.values()]
         sizes = [float(getattr(region, "radius", 0.0)) for region in self.env.regions]

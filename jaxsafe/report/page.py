@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxsafe.config import yaml
 from jaxsafe.metrics import stratified_iqm
 from jaxsafe.plot.compare import compare_curves
 from jaxsafe.plot.style import save
@@ -34,6 +35,8 @@ class Report:
             for item, run in items.items()
             for name in item.evaluations
         }
+        self.rows = {item: read_rows(run / "progress.jsonl") for item, run in items.items()}
+        self.episodes = yaml.read(next(iter(items.values())) / "config.yaml")["training"]["episodes"]
         self.kinds = list(dict.fromkeys(item.kind for item in items))
         self.tasks = list(dict.fromkeys(item.task for item in items))
 
@@ -41,14 +44,14 @@ class Report:
         """Write `baselines.md` and beside it the directory `baselines` with figures, films and curves."""
         files = out / "baselines"
         for item, run in self.runs.items():
-            write_csv(files / f"{item.name}.csv", _thinned(read_rows(run / "progress.jsonl")))
+            write_csv(files / f"{item.name}.csv", _thinned(self.rows[item]))
             for figure in ("trajectories", "speed_distance") if item.kind == "features" else ():
                 if (run / "figures" / f"{figure}.png").exists():
                     shutil.copy(run / "figures" / f"{figure}.png", files / f"{item.task}_{figure}.png")
             if (run / "film" / FILM).exists():
                 shutil.copy(run / "film" / FILM, files / f"{item.task}.gif")
         for task in self.tasks:
-            rows = {item.kind: read_rows(run / "progress.jsonl") for item, run in self.runs.items() if item.task == task}
+            rows = {item.kind: rows for item, rows in self.rows.items() if item.task == task}
             save(compare_curves(rows, task), files / f"{task}_training.png")
         page = out / "baselines.md"
         write_text(page, self.text(files))
@@ -84,7 +87,7 @@ class Report:
             *(f"- **{kind}**: {kinds.get(kind, kind)}" for kind in self.kinds),
             "",
             f"Seeds {one['seed']} to {one['seed'] + one['seeds'] - 1} of every training; all recipes were found on other"
-            f" seeds (100 and above). Evaluations are of {self._count():,} episodes a seed from starts that no training"
+            f" seeds (100 and above). Evaluations are of {self.episodes:,} episodes a seed from starts that no training"
             " chose, the same for all policies, with sampled actions (stochastic) and with the policy's mode"
             " (deterministic)."
             " In brackets: 95 % percentile-bootstrap intervals over seeds.",
@@ -153,7 +156,7 @@ class Report:
             cost = found["training_cost"]
             for kind, one in found["evaluation"].items():
                 rows.append([
-                    item.task, item.kind, kind, _rate(one["safety_violation_rate"], self._count() * found["seeds"]),
+                    item.task, item.kind, kind, _rate(one["safety_violation_rate"], self.episodes * found["seeds"]),
                     _percent(one["episode_safety_violation_rate"]),
                     *(f"{100 * one[f'episode_violation_severity_{name}']['mean']:.1f} %" for name in ("mean", "max")),
                     _number(cost, 0) if kind == "stochastic" else "",
@@ -179,7 +182,7 @@ class Report:
                 share = one["intervention_rate"]
                 rows.append([
                     item.task, trained, label, _percent(one["success_rate"]),
-                    _rate(one["safety_violation_rate"], self._count() * results["seeds"]),
+                    _rate(one["safety_violation_rate"], self.episodes * results["seeds"]),
                     _percent(share) if share["mean"] is not None else "–",
                     _number(own["training_cost"], 0) if label == trained else "",
                 ])  # fmt: skip
@@ -278,13 +281,6 @@ class Report:
                 for options in item.evaluations.values()
             ]
         return "\n".join([*lines, "```"])
-
-    def _count(self) -> int:
-        """Evaluation episodes of each seed."""
-        item, run = next(iter(self.runs.items()))
-        rows = read_rows(run / "eval.jsonl", ("final", "seed", "kind"))
-        first = self.results[item]["seed"]
-        return sum(row["final"] and row["seed"] == first and row["kind"] == "stochastic" for row in rows)
 
 
 def _section(title: str, text: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

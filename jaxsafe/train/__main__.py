@@ -27,7 +27,7 @@ def main(argv: Sequence[str]) -> int:
     else:
         arguments.refuse_rest(["resume"])
         path = Path(resume)
-    runs, began = directory.runs(path, "resume"), BEGAN
+    runs, began = directory.runs(path), BEGAN
     for run in runs:
         if not _train(run, path, began):
             return cli.INTERRUPTED

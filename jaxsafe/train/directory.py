@@ -51,15 +51,10 @@ def create_all(resolved: Sequence[tuple[TrainConfig, Environment, str]]) -> Path
     return path
 
 
-def runs(path: Path, option: str) -> list[Path]:
-    """The run that `path` is, or the runs in it: first the tasks in their order, then others by name.
-
-    Raises:
-        ConfigError: there is none; `option` is what the user called it.
-    """
+def runs(path: Path) -> list[Path]:
+    """The runs in a directory, first the tasks in their order, then others by name; the path itself if there are none."""
     inside = sorted(found.parent for found in path.glob("*/config.yaml"))
     if (path / "config.yaml").is_file() or not inside:
-        _require(path, option)
         return [path]
     order = [*TASKS]
     return sorted(inside, key=lambda run: order.index(run.name) if run.name in order else len(order))
@@ -88,7 +83,10 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
     Raises:
         ConfigError: there is no run; `option` is what the user called it.
     """
-    _require(path, option)
+    if not (path / "config.yaml").is_file():
+        beside = [str(found.parent) for found in path.parent.glob("*/config.yaml")] if path.parent.is_dir() else []
+        choice = f"; choose from {nearest(path, sorted(beside))}" if beside else ""
+        raise ConfigError(f"{option}: no run in {str(path)!r} (a directory with config.yaml){choice}")
     content = yaml.read(path / "config.yaml")
     place = f"{path / 'config.yaml'}: "
     if not isinstance(content, dict) or not {"env", "training", "environment"} <= set(content):
@@ -107,14 +105,6 @@ def versions() -> dict[str, Any]:
         "python": platform.python_version(),
         "device": f"{len(jax.devices())} × {jax.devices()[0].device_kind}",
     }
-
-
-def _require(path: Path, option: str) -> None:
-    """Raise a ConfigError if there is no run."""
-    if not (path / "config.yaml").is_file():
-        beside = [str(found.parent) for found in path.parent.glob("*/config.yaml")] if path.parent.is_dir() else []
-        choice = f"; choose from {nearest(path, sorted(beside))}" if beside else ""
-        raise ConfigError(f"{option}: no run in {str(path)!r} (a directory with config.yaml){choice}")
 
 
 def _next_free(parent: Path, name: str) -> Path:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError
 from jaxsafe.simulation.geometry import rotation
+from jaxsafe.types import Number
 
 Features = Callable[[Environment, Float[Array, "*batch o"]], Float[Array, "*batch i"]]
 
@@ -37,7 +38,7 @@ def approach(env: Environment, observation: Float[Array, "*batch o"]) -> Float[A
     """
     position = _vector(env, observation, "position", "approach")
     relative_to_limit = 1.0 / _elements(env, observation, "velocity_limit", "approach")
-    velocity = 0.5 * _vector(env, observation, "velocity", "approach") * relative_to_limit
+    velocity = _scale(env, "velocity") * _vector(env, observation, "velocity", "approach") * relative_to_limit
     direction = position / (jnp.linalg.norm(position, axis=-1, keepdims=True) + 1e-3)
     along = jnp.sum(direction * velocity, axis=-1, keepdims=True)
     speed = _elements(env, observation, "speed", "approach") * relative_to_limit
@@ -83,13 +84,18 @@ def _magnitude_and_direction(
         _vector(env, observation, name, "rejoin"),
     )
     if "roll" in env.observation_names:
-        scales = {one.name: one.scale for one in env.observation}
         pitch, roll = (
-            scales[angle] * _elements(env, observation, angle, "rejoin")[..., 0] for angle in ("flight_path_angle", "roll")
+            _scale(env, angle) * _elements(env, observation, angle, "rejoin")[..., 0]
+            for angle in ("flight_path_angle", "roll")
         )
         turn = rotation(jnp.zeros_like(roll), pitch, roll)
         direction = jnp.sum(turn * direction[..., None, :], axis=-1)
     return magnitude, direction
+
+
+def _scale(env: Environment, name: str) -> Number:
+    """What an observation was divided by."""
+    return next(one.scale for one in env.observation if one.name == name)
 
 
 def _vector(env: Environment, observation: Float[Array, "*batch o"], name: str, features: str) -> Float[Array, "*batch d"]:
