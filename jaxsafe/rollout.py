@@ -62,12 +62,17 @@ def reset_batch(env: Environment, key: Key, num_envs: int) -> tuple[State, TimeS
     return jax.vmap(reset, in_axes=(None, 0))(env, jax.random.split(key, num_envs))
 
 
-def step_or_reset_batch(env: Environment, state: State, action: Array, key: Key) -> tuple[tuple[State, Array], TimeStep]:
+def step_or_reset_batch(
+    env: Environment, state: State, action: Array, key: Key, max_episode_steps: Array | float = jnp.inf
+) -> tuple[tuple[State, Array], TimeStep]:
     """`step_or_reset` for a batch, [num_envs]; starts are drawn only on steps on which some episode ends.
 
-    Drawing a start costs many times a step, and with few environments most steps end no episode.
+    Drawing a start costs many times a step, and with few environments most steps end no episode. An episode still running
+    after `max_episode_steps` is truncated, without an outcome.
     """
     state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, state, action)
+    cut = ~timestep.done & (state.num_steps >= max_episode_steps)
+    timestep = timestep.replace(truncated=timestep.truncated | cut)
     done = timestep.done
 
     def draw(old: tuple[State, Array]) -> tuple[State, Array]:

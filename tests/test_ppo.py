@@ -7,7 +7,7 @@ from probes import Constant, Match, Position, probe
 from jaxsafe.component import normalise
 from jaxsafe.environment import Environment
 from jaxsafe.train.agent import Agent
-from jaxsafe.train.ppo import PPO, TrainState, discount, gae, init, learning_rate, update
+from jaxsafe.train.ppo import PPO, TrainState, collect, discount, gae, init, learning_rate, update
 
 AGENT = normalise(Agent(hidden=(16,)))
 SMALL = normalise(
@@ -75,6 +75,16 @@ def test_a_terminated_episode_counts_nothing_beyond_its_end() -> None:
 def test_a_truncated_episode_counts_what_would_follow() -> None:
     state = train(probe(Constant(name="reward"), steps=2, ends="truncated"), updates=150)
     assert value(state, 1.0) == pytest.approx(1.0 / (1.0 - 0.9), rel=0.1)
+
+
+def test_an_episode_of_training_is_truncated_after_its_limit() -> None:
+    limited = SMALL.replace(max_episode_steps=jnp.array(3.0))
+    state = init(probe(Constant(name="reward"), steps=1000), AGENT, limited, jax.random.key(0))
+    _, transitions = collect(probe(Constant(name="reward"), steps=1000), AGENT, limited, state, jax.random.key(1))
+    done = jnp.arange(1, SMALL.num_steps + 1) % 3 == 0
+    np.testing.assert_array_equal(transitions.done, jnp.broadcast_to(done[:, None], transitions.done.shape))
+    assert not transitions.terminated.any()
+    assert not transitions.episode.outcome.any()
 
 
 @pytest.mark.parametrize("discrete", [False, True], ids=["gaussian", "categorical"])

@@ -145,6 +145,16 @@ def test_every_kind_of_end_is_followed_by_a_start(ends: str) -> None:
         assert np.array_equal(observation, timestep.observation) == (expected != 0)
 
 
+def test_a_limit_truncates_what_still_runs(env: Environment) -> None:
+    state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(1), 4)
+    state = state.replace(num_steps=jnp.asarray([0, 1, 2, LENGTH - 1]))  # the last one's own time is over
+    (after, _), timestep = jax.jit(step_or_reset_batch)(env, state, jnp.zeros((4, 2)), jax.random.key(2), 2)
+    assert timestep.truncated.tolist() == [False, True, True, False]
+    assert timestep.terminated.tolist() == [False, False, False, True]
+    assert [env.outcomes[i] for i in timestep.info.outcome] == ["running", "running", "running", "timeout"]
+    assert after.num_steps.tolist() == [1, 0, 0, 0]
+
+
 def test_a_rollout_under_jit_is_the_same_and_compiles_once(env: Environment, single: TimeStep) -> None:
     plain = jaxsafe.rollout(env, policy, jax.random.key(0), NUM_STEPS)
     chex.assert_trees_all_close(single, plain, atol=1e-5)

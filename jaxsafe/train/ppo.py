@@ -30,6 +30,7 @@ class PPO(Component):
 
     num_envs: Annotated[int, Range(1)] = 16  # episodes run side by side
     num_steps: Annotated[int, Range(1)] = 128  # steps of each between updates
+    max_episode_steps: Annotated[Dimensionless, Range(1.0)] = 1e6  # episodes of training are truncated after as many
     num_epochs: Annotated[int, Range(1)] = 10
     num_minibatches: Annotated[int, Range(1)] = 2
     learning_rate: Annotated[Dimensionless, Positive] = 3e-3
@@ -138,7 +139,7 @@ def collect(env: Environment, agent: Agent, ppo: PPO, state: TrainState, key: Ke
         inputs = agent.inputs(env, observation)
         policy = agent.distribution(env, state.params, inputs)
         action = policy.sample(key_act)
-        (env_state, observation), timestep = step_or_reset_batch(env, env_state, action, key_reset)
+        (env_state, observation), timestep = step_or_reset_batch(env, env_state, action, key_reset, ppo.max_episode_steps)
         if ppo.learns_from == "actual":
             action = _acted(env, action, timestep)
         done, episode = timestep.done, accumulate(episode, timestep)
