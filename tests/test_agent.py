@@ -58,3 +58,17 @@ def test_an_untrained_policy_is_centred_and_as_wide_as_configured(actions: str) 
     pushes = np.asarray(actions_drawn) / 5.0 - 1.0 if actions == "discrete" else np.asarray(actions_drawn)
     assert abs(pushes.mean()) < 0.05
     assert pushes.std() == pytest.approx(0.3, abs=0.02)
+
+
+def test_the_critic_sees_the_totals_in_any_order_and_the_actor_does_not() -> None:
+    env = jaxsafe.make("docking2d")
+    blind, seeing = Agent(), Agent(critic_sees_totals=True)
+    inputs = jnp.arange(6.0)
+    totals = {term.name: jnp.array(float(i)) for i, term in enumerate(env.reward)}
+    np.testing.assert_array_equal(blind.critic_inputs(inputs, totals), inputs)
+    seen = seeing.critic_inputs(inputs, totals)
+    np.testing.assert_array_equal(seen, seeing.critic_inputs(inputs, dict(reversed(totals.items()))))
+    np.testing.assert_array_equal(np.sort(seen[6:]), np.arange(len(env.reward)))
+    shapes = jax.tree.map(jnp.shape, [normalise(agent).init(KEY, env) for agent in (blind, seeing)])
+    assert shapes[0]["actor"] == shapes[1]["actor"]
+    assert shapes[1]["critic"][0]["kernel"][0] == shapes[0]["critic"][0]["kernel"][0] + len(env.reward)

@@ -15,9 +15,9 @@ SMALL = normalise(
 )
 
 
-def train(env: Environment, updates: int = 40, ppo: PPO = SMALL) -> TrainState:
+def train(env: Environment, updates: int = 40, ppo: PPO = SMALL, agent: Agent = AGENT) -> TrainState:
     def run(key: jax.Array) -> TrainState:
-        return jax.lax.fori_loop(0, updates, lambda _, s: update(env, AGENT, ppo, updates, s), init(env, AGENT, ppo, key))
+        return jax.lax.fori_loop(0, updates, lambda _, s: update(env, agent, ppo, updates, s), init(env, agent, ppo, key))
 
     return jax.jit(run)(jax.random.key(0))
 
@@ -70,6 +70,14 @@ def test_a_terminated_episode_counts_nothing_beyond_its_end() -> None:
     state = train(probe(Constant(name="reward"), steps=2), updates=80)
     # The two steps look alike, so the critic learns the mean of 1 and 1 + γ.
     assert value(state, 1.0) == pytest.approx((1.0 + 1.9) / 2, abs=0.1)
+
+
+def test_a_critic_that_sees_the_totals_tells_first_steps_from_second_ones() -> None:
+    agent = AGENT.replace(critic_sees_totals=True)
+    state = train(probe(Constant(name="reward"), steps=2), updates=80, agent=agent)
+    for total, expected in ((0.0, 1.9), (1.0, 1.0)):
+        inputs = agent.critic_inputs(jnp.array([1.0]), {"reward": jnp.array(total)})
+        assert float(agent.value(state.params, inputs)) == pytest.approx(expected, abs=0.1)
 
 
 def test_a_truncated_episode_counts_what_would_follow() -> None:

@@ -6,7 +6,7 @@ environment's observation is the paper's in every preset.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import jax
@@ -30,15 +30,19 @@ class Agent(Component):
     log_std: Annotated[Number, Unit("1", length=ANY)] = -0.7
     """Initial, of continuous actions in [−1, 1], one number or one for each; learnt, the same for all states."""
     prior_std: Annotated[Dimensionless, Positive] = 0.3  # of discrete actions at the start, in units of half the range
+    critic_sees_totals: bool = False
+    """Whether the critic, which only training needs, also sees what each reward term has summed to in the episode. What a
+    term will still pay may depend on that, and the observation hides it."""
 
     def init(self, key: Key, env: Environment) -> Params:
         """Return fresh parameters."""
         key_actor, key_critic = jax.random.split(key)
         inputs = self.inputs(env, jnp.zeros(env.observation_size)).shape[-1]
         outputs = sum(env.num_action_points) or env.action_size
+        seen = len(env.reward) if self.critic_sees_totals else 0
         params = {
             "actor": _init_mlp(key_actor, (inputs, *self.hidden, outputs), last_gain=0.01),
-            "critic": _init_mlp(key_critic, (inputs, *self.hidden, 1), last_gain=1.0),
+            "critic": _init_mlp(key_critic, (inputs + seen, *self.hidden, 1), last_gain=1.0),
         }
         if env.num_action_points:
             return params
@@ -55,9 +59,16 @@ class Agent(Component):
             return Gaussian(mean=out, log_std=params["log_std"])
         return Categorical(logits=out + _prior(env.num_action_points, self.prior_std), points=env.num_action_points)
 
-    def value(self, params: Params, inputs: Float[Array, "*batch i"]) -> Float[Array, "*batch"]:
+    def critic_inputs(
+        self, inputs: Float[Array, "*batch i"], reward_totals: Mapping[str, Float[Array, "*batch"]]
+    ) -> Float[Array, "*batch c"]:
+        """Return what the critic sees: the inputs of the actor, and perhaps the totals of the episode."""
+        seen = sorted(reward_totals) if self.critic_sees_totals else ()  # a dict's order does not survive compilation
+        return jnp.concatenate([inputs, *(reward_totals[name][..., None] for name in seen)], axis=-1)
+
+    def value(self, params: Params, critic_inputs: Float[Array, "*batch c"]) -> Float[Array, "*batch"]:
         """Return the critic's V(s)."""
-        return mlp(params["critic"], inputs)[..., 0]
+        return mlp(params["critic"], critic_inputs)[..., 0]
 
     def act(self, env: Environment, params: Params, key: Key, observation: Array, deterministic: Array | bool) -> Array:
         """Return an action for each observation: a sample, or the mode."""
