@@ -11,7 +11,7 @@ from jaxsafe.config import yaml
 from jaxsafe.metrics import stratified_iqm
 from jaxsafe.plot.compare import compare_curves
 from jaxsafe.plot.style import save
-from jaxsafe.report.plan import PAPER_STEPS, WITH_RTA, WITHOUT_RTA, Item
+from jaxsafe.report.plan import KINDS, PAPER_STEPS, WITH_RTA, WITHOUT_RTA, Item
 from jaxsafe.report.run import FILM
 from jaxsafe.train.files import read_json, read_rows, write_csv, write_text
 
@@ -68,12 +68,6 @@ class Report:
     def _head(self) -> str:
         one = next(iter(self.results.values()))
         versions = ", ".join(f"{name} {version}" for name, version in one["versions"].items() if name != "device")
-        kinds = {
-            "features": "the recipe of the task: continuous actions, features computed from the observation by the agent",
-            "plain": "the same with the paper's observation straight into the networks",
-            "discrete": "the recipe with the paper's discrete actions",
-            "rta": "the recipe with run time assurance during training (`rta=default`)",
-        }
         return "\n".join([
             "# Baselines",
             "",
@@ -84,7 +78,7 @@ class Report:
             "",
             "Each task is trained in these ways, by PPO:",
             "",
-            *(f"- **{kind}**: {kinds.get(kind, kind)}" for kind in self.kinds),
+            *(f"- **{kind}**: {KINDS[kind].about}" for kind in self.kinds),
             "",
             f"Seeds {one['seed']} to {one['seed'] + one['seeds'] - 1} of every training; all recipes were found on other"
             f" seeds (100 and above). Evaluations are of {self.episodes:,} episodes a seed from starts that no training"

@@ -18,13 +18,21 @@ PAPER_STEPS = {
 }
 """Table 2 of the paper: environment steps to 80 % success in training."""
 
-KINDS: Mapping[str, Sequence[str]] = {
-    "features": [],
-    "plain": ["preset=plain"],
-    "discrete": ["actions=discrete"],
-    "rta": ["rta=default"],
+
+class Kind(NamedTuple):
+    """A way to train each task."""
+
+    options: tuple[str, ...]  # of `jaxsafe.train`
+    about: str  # on the page
+
+
+KINDS: Mapping[str, Kind] = {
+    "features": Kind((), "the recipe of the task: continuous actions, features computed from the observation by the agent"),
+    "plain": Kind(("preset=plain",), "the paper's observation straight into the networks"),
+    "discrete": Kind(("actions=discrete",), "the recipe with the paper's discrete actions"),
+    "rta": Kind(("rta=default",), "the recipe with run time assurance during training (`rta=default`)"),
 }
-"""How each task is trained: options of `jaxsafe.train` by the name that the page uses."""
+"""By the name that the page uses."""
 
 _DOCKING_STARTS = {
     "from 1 km": ["env.deputy.start.position.distance=[1000,1000]"],
@@ -74,4 +82,4 @@ def plan(tasks: Sequence[str], kinds: Sequence[str], words: Sequence[str]) -> li
         for one in chosen:
             if one not in known:
                 raise ConfigError(f"{name}: found {one!r}; choose from {nearest(str(one), known)}")
-    return [Item(task, kind, (f"env={task}", *KINDS[kind], *words)) for kind in kinds for task in tasks]
+    return [Item(task, kind, (f"env={task}", *KINDS[kind].options, *words)) for kind in kinds for task in tasks]
