@@ -63,10 +63,14 @@ def test_rejoin_features_tell_a_collision_course(task: str) -> None:
     size, d = env.observation_size, 3 if task == "rejoin3d" else 2
     np.testing.assert_array_equal(inputs[:size], observation)
     level = d if task == "rejoin3d" else 0
-    _, way, near, relative, closing, across, miss, danger = np.split(inputs[size:], np.cumsum([level, d, d, d, 1, d, d]))
+    _, way, near, relative, change, urgent, closing, across, miss, danger = np.split(
+        inputs[size:], np.cumsum([level, d, d, d, d, d, 1, d, d])
+    )
     assert np.abs(way).max() <= 1.0
     np.testing.assert_allclose(near, np.clip(5.0 * way, -1.0, 1.0), rtol=1e-6)
     np.testing.assert_allclose(relative[:2], COURSE / 400.0, atol=1e-6)
+    np.testing.assert_allclose(400.0 * change, 400.0 * relative + 1000.0 * way / 10.0, rtol=1e-5)
+    np.testing.assert_allclose(urgent, np.clip(5.0 * change, -1.0, 1.0), rtol=1e-6)
     np.testing.assert_allclose(closing, -1.0, atol=0.02)  # the direction of w has length ‖w‖/(‖w‖ + 0.01)
     np.testing.assert_allclose([*across, *miss], 0.0, atol=0.1)
     np.testing.assert_allclose(danger, 1.0, atol=0.05)

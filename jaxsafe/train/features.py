@@ -49,10 +49,12 @@ def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Arr
     """Append the way to the rejoin point, the lead's relative velocity, and how far both will miss each other.
 
     All vectors are turned from the wingman's body into its level frame, in which left is left however it rolls. The way as
-    a vector, which is small near the point where its direction turns quickly, once more five times as long and clipped.
-    With the direction p of the lead (in space appended as well) and the relative velocity w: w, the cosine between them,
-    the part of p across w, 0 on a collision course, and that part times the observed distance: the miss distance if neither
-    manoeuvres, unless it is clipped.
+    a vector, which is small near the point where its direction turns quickly; the relative velocity w; and w + way/10 s,
+    the change of velocity that would take it to the point in 10 s: a pilot who keeps that at zero arrives, and stays. The
+    way and the change once more five times as long and clipped.
+    With the direction p of the lead (in space appended as well): the cosine between p and w, the part of p across w, 0 on
+    a collision course, and that part times the observed distance: the miss distance if neither manoeuvres, unless it is
+    clipped.
     """
     distance, bearing = _magnitude_and_direction(env, observation, "lead_position")
     far, towards = _magnitude_and_direction(env, observation, "rejoin_position")
@@ -66,9 +68,13 @@ def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Arr
     approaching = jnp.maximum(-closing, 0.0)
     sine2 = jnp.sum(across * across, axis=-1, keepdims=True)
     danger = [approaching * jnp.exp(-sine2 * scale) for scale in (1.0 / 0.15**2, distance**2 / 0.2**2)]
-    near, miss = jnp.clip(5.0 * way, -1.0, 1.0), 4.0 * across * distance
+    miss = 4.0 * across * distance
+    per_10_s = _scale(env, "rejoin_position")[0] / (10.0 * _scale(env, "wingman_velocity")[0])
+    change = relative + per_10_s * way
+    near, urgent = (jnp.clip(5.0 * vector, -1.0, 1.0) for vector in (way, change))
     level = () if "roll" not in env.observation_names else (bearing,)  # in the plane the observation has it
-    return jnp.concatenate([observation, *level, way, near, relative, closing, 4.0 * across, miss, *danger], axis=-1)
+    aim = (*level, way, near, relative, change, urgent)
+    return jnp.concatenate([observation, *aim, closing, 4.0 * across, miss, *danger], axis=-1)
 
 
 FEATURES: Mapping[str, Features] = {each.__name__: each for each in (none, docking, approach, rejoin)}
