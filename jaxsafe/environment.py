@@ -98,7 +98,7 @@ class Environment(Component):
         """Number of choices of each element of a discrete action; `()` if actions are continuous."""
         return self.agent_platform.controller.points
 
-    @property
+    @functools.cached_property  # asked for often, and each answer traces a reset
     def observation_names(self) -> tuple[str, ...]:
         """A name for each element of the observation."""
         names: list[str] = []

@@ -104,6 +104,14 @@ def test_rejoin_features_measure_by_how_much_the_lead_is_missed(task: str) -> No
     np.testing.assert_array_equal(Agent(features="rejoin").inputs(env, observation)[-2:], 0.0)
 
 
+def test_the_names_of_an_observation_are_worked_out_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    env, observation = observed("rejoin3d", COURSE)
+    traced, reset = [], jaxsafe.environment.reset
+    monkeypatch.setattr("jaxsafe.environment.reset", lambda *args: traced.append(1) or reset(*args))
+    Agent(features="rejoin").inputs(env.replace(dt=env.dt), observation)
+    assert len(traced) == 1
+
+
 @pytest.mark.parametrize(
     ("features", "task", "missing"),
     [
