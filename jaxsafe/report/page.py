@@ -100,8 +100,8 @@ class Report:
         return _section(
             "Interaction efficiency",
             "Environment steps per seed until 80 % of the last 100 training episodes succeeded, on the average over seeds:"
-            " Table 2 of the paper, by its definition; an episode that the recipe truncates counts as a failed one. The wall"
-            " time is that of the whole command for all seeds: imports, compilation, training, evaluation.",
+            " Table 2 of the paper, by its definition; an episode that the recipe truncates counts as a failed one. The"
+            " wall time is that of the whole command for all seeds: imports, compilation, training, evaluation.",
             ["task", "", "paper", "here", "paper / here", "seeds at 80 %", "steps", "wall [s]", "of it compiling [s]"],
             rows,
         )
