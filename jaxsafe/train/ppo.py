@@ -6,6 +6,7 @@ devices and files are the caller's business. Hyperparameters that are numbers ar
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
@@ -69,13 +70,13 @@ class Transition(NamedTuple):
     """One step of every environment, stacked [num_steps, num_envs]."""
 
     inputs: Float[Array, "t n i"]  # what the actor saw
-    critic_inputs: Float[Array, "t n c"]
+    totals: Mapping[str, Float[Array, "t n"]]  # of each reward term before the step, if the critic sees them
     action: Array
     log_prob: Float[Array, "t n"]
     reward: Float[Array, "t n"]
     terminated: Bool[Array, "t n"]
     done: Bool[Array, "t n"]
-    next_critic_inputs: Float[Array, "t n c"]  # of the true next state, before any reset
+    next_inputs: Float[Array, "t n i"]  # of the true next observation, before any reset
     episode: Episode  # sums including this step
 
 
@@ -83,7 +84,7 @@ class Batch(NamedTuple):
     """What the loss needs of each sample."""
 
     inputs: Array
-    critic_inputs: Array
+    totals: Mapping[str, Array]
     action: Array
     log_prob: Array
     advantage: Array
@@ -139,17 +140,16 @@ def collect(env: Environment, agent: Agent, ppo: PPO, state: TrainState, key: Ke
         env_state, observation, episode = carry
         key_act, key_reset = jax.random.split(key)
         inputs = agent.inputs(env, observation)
-        critic_inputs = agent.critic_inputs(inputs, env_state.reward_totals)
+        totals = env_state.reward_totals if agent.critic_sees_totals else {}
         policy = agent.distribution(env, state.params, inputs)
         action = policy.sample(key_act)
         (env_state, observation), timestep = step_or_reset_batch(env, env_state, action, key_reset, ppo.max_episode_steps)
         if ppo.learns_from == "actual":
             action = _acted(env, action, timestep)
         done, episode = timestep.done, accumulate(episode, timestep)
-        next_critic_inputs = agent.critic_inputs(agent.inputs(env, timestep.observation), timestep.info.reward_totals)
         transition = Transition(
-            inputs, critic_inputs, action, policy.log_prob(action), timestep.reward, timestep.terminated, done,
-            next_critic_inputs, episode,
+            inputs, totals, action, policy.log_prob(action), timestep.reward, timestep.terminated, done,
+            agent.inputs(env, timestep.observation), episode,
         )  # fmt: skip
         return (
             env_state,
@@ -212,7 +212,8 @@ def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch)
     ratio = jnp.exp(policy.log_prob(batch.action) - batch.log_prob)
     clipped = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
-    value_error = 0.5 * (agent.value(params, batch.critic_inputs) - batch.value_target) ** 2
+    value = agent.value(params, agent.critic_inputs(batch.inputs, batch.totals))
+    value_error = 0.5 * (value - batch.value_target) ** 2
     entropy = policy.entropy()
     return jnp.mean(-surrogate + ppo.value_coefficient * value_error - ppo.entropy_coefficient * entropy)
 
@@ -220,11 +221,14 @@ def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch)
 def _to_batch(agent: Agent, ppo: PPO, gamma: Array, params: Params, transitions: Transition) -> Batch:
     """Advantages, normalised over the whole batch, and value targets; all samples in one row."""
     t = transitions
-    value, next_value = agent.value(params, t.critic_inputs), agent.value(params, t.next_critic_inputs)
+    value, next_value = (
+        agent.value(params, agent.critic_inputs(*seen))
+        for seen in ((t.inputs, t.totals), (t.next_inputs, t.episode.reward_totals))
+    )
     advantage = gae(t.reward, value, next_value, t.terminated, t.done, gamma, ppo.gae_lambda)
     target = advantage + value
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-    batch = Batch(t.inputs, t.critic_inputs, t.action, t.log_prob, advantage, target)
+    batch = Batch(t.inputs, t.totals, t.action, t.log_prob, advantage, target)
     return jax.tree.map(lambda x: x.reshape(ppo.batch_size, *x.shape[2:]), batch)
 
 
