@@ -272,7 +272,7 @@ def _check_suited(env: Environment) -> None:
 
     def faults(env: Environment, key: jax.Array) -> Mapping[str, jax.Array]:
         assert env.rta is not None
-        return env.rta.unsuited(env, reset(env, key)[0].sim)
+        return env.rta.unsuited(env, reset(env.replace(rta=None), key)[0].sim)
 
     if jax.eval_shape(faults, env, jax.random.key(0)):
         found = jax.jit(jax.vmap(faults, in_axes=(None, 0)))(env, jax.random.split(jax.random.key(0), 8))
