@@ -6,6 +6,7 @@ held thrust, which is what a plant with a finite step needs.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Annotated, Any, TypeVar
 
@@ -74,9 +75,8 @@ def speed_ball(
 
 def linear(function: Callable[[Array], T], at: Float[Array, " m"]) -> tuple[T, T]:
     """The value of a function and its derivatives, an axis of m in front; forwards, so that nothing is stored."""
-    basis = jnp.eye(at.shape[0], dtype=at.dtype)
-    values, columns = zip(*(jax.jvp(function, (at,), (tangent,)) for tangent in basis), strict=True)
-    return values[0], jax.tree.map(lambda *parts: jnp.stack(parts), *columns)
+    along = functools.partial(jax.jvp, function, (at,))
+    return jax.vmap(along, out_axes=(None, 0))((jnp.eye(at.shape[0], dtype=at.dtype),))
 
 
 SlackCost = Annotated[Number, Unit("1"), Range(0.0, open_low=True)]
