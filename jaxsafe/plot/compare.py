@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle, product
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,8 @@ from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.figures import ALWAYS, AXES, CURVES, curve_table
 from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE
 
-COLOURS = (BLUE, ORANGE, GREEN, "#CC79A7", GREY)
+LOOKS = tuple(product(("-", "--"), (BLUE, ORANGE, GREEN, "#CC79A7", GREY)))
+"""Line style and colour of each run in turn."""
 
 
 def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> Figure:
@@ -28,11 +30,11 @@ def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str) 
     panels = figure.subplots(1, len(curves))
     column, label = AXES["steps"]
     for panel, (name, quantity, factor) in zip(panels, curves, strict=True):
-        for colour, (run, rows) in zip(COLOURS, runs.items(), strict=False):
+        for (line, colour), (run, rows) in zip(cycle(LOOKS), runs.items(), strict=False):
             at, values = curve_table(rows, column, name)
             known = ~np.isnan(values).any(axis=1)
             at, values = at[known], factor * values[known]
-            panel.plot(at, values.mean(axis=1), color=colour, linewidth=1.6, label=run)
+            panel.plot(at, values.mean(axis=1), color=colour, linestyle=line, linewidth=1.6, label=run)
             if values.shape[1] > 1 and len(at):
                 panel.fill_between(at, *bootstrap_interval(values), color=colour, alpha=0.2, linewidth=0)
         panel.set(xlabel=label, ylabel=quantity)
