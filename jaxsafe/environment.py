@@ -201,8 +201,10 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
 
 def _draw_parameters(env: Environment, key: Key) -> Parameters:
     """Numbers for one episode, from a key of their own so that platforms start alike with and without them."""
-    keys = jax.random.split(jax.random.fold_in(key, len(env.platforms)), max(len(env.randomize), 1))
-    return {path: uniform(key_i, env.randomize[path]) for path, key_i in zip(env.randomize, keys, strict=False)}
+    if not env.randomize:
+        return {}
+    drawn = uniform(jax.random.fold_in(key, len(env.platforms)), *env.randomize.values())
+    return dict(zip(env.randomize, drawn, strict=True))
 
 
 def _chosen_parameters(env: Environment, parameters: Mapping[str, Any]) -> Parameters:

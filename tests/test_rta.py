@@ -75,10 +75,12 @@ def test_the_same_adversaries_break_the_bare_task(task: str, policy: str) -> Non
 
 @pytest.mark.parametrize("task", TASKS)
 def test_an_environment_with_a_filter_is_written_and_read(task: str) -> None:
+    bare = jaxsafe.make(task)
+    assert jaxsafe.make(task, rta="none") == bare
     for preset in PRESETS[task]:
         env = jaxsafe.make(task, rta=preset)
         assert load(dump(env)) == env
-        assert jaxsafe.make(task, rta="none") == jaxsafe.make(task) == jaxsafe.override(env, {"rta": None})
+        assert jaxsafe.override(env, {"rta": None}) == bare
     with pytest.raises(ConfigError, match=rf"^rta: {task} has no preset 'defualt'; choose from none, .*default"):
         jaxsafe.make(task, rta="defualt")
 
@@ -86,7 +88,7 @@ def test_an_environment_with_a_filter_is_written_and_read(task: str) -> None:
 @pytest.mark.parametrize("task", [*DOCKING, "rejoin2d"])
 def test_a_control_that_is_certified_passes_unaltered(task: str) -> None:
     env = jaxsafe.make(task, rta="default")
-    state, timestep = reset(env, jax.random.key(0))
+    state, timestep = reset(env, jax.random.key(1))
     assert timestep.info.rta.certified
     state, timestep = step(env, state, 0.01 * jnp.ones(env.action_size))
     info = timestep.info
@@ -269,7 +271,7 @@ def test_barrier_rows_are_the_change_of_h_along_the_plant(task: str, degree: int
 
     now = float(constraint(env, name).margin(judge(env, sim)))
     if degree == 1:
-        expected = (h(t) - now) / t + 0.3 * now  # ḣ + α(h)
+        expected = (4 * h(t) - h(2 * t) - 3 * now) / (2 * t) + 0.3 * now  # ḣ + α(h)
     else:
         slope, bend = (h(2 * t) - now) / (2 * t), (h(2 * t) - 2 * h(t) + now) / t**2
         expected = bend + 2 * 0.3 * (slope - bend * t) + 0.09 * now  # ψ̇₁ + α(ψ₁), ψ₁ = ḣ + αh

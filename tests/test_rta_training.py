@@ -88,7 +88,7 @@ def test_corrected_is_a_setting_of_ppo() -> None:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("rta") / "run"
-    assert train([*TINY, "rta=explicit_simplex", "rta_training=punished", f"out={out}"]) == 0
+    assert train([*TINY, "seed=2", "rta=explicit_simplex", "rta_training=punished", f"out={out}"]) == 0
     return out
 
 

@@ -174,10 +174,10 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
         if initializer.name not in rest:
             raise ConfigError(f"{here}: no such state field; choose from {nearest(initializer.name, rest)}")
         if getattr(initializer, "direction", None) is not None:
-            drawn = jax.eval_shape(initializer.direction.draw, jax.random.key(0)).shape  # type: ignore[attr-defined]
-            if drawn != rest[initializer.name].shape:
+            drawn = 1 + len(initializer.direction.intervals)  # type: ignore[attr-defined]
+            if (drawn,) != rest[initializer.name].shape:
                 raise ConfigError(
-                    f"{here}.direction: draws {drawn[0]} numbers, the platform has {platform.dimension} dimensions;"
+                    f"{here}.direction: draws {drawn} numbers, the platform has {platform.dimension} dimensions;"
                     " give a polar range in space, none in the plane"
                 )
 

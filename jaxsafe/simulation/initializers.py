@@ -42,10 +42,10 @@ class Direction(Component):
     azimuth: Angles = (0.0, TWO_PI)
     polar: Angles | None = None
 
-    def draw(self, key: Key) -> Float[Array, " d"]:
-        """Return a unit vector, (2,) without and (3,) with a polar range."""
-        key_azimuth, key_polar = jax.random.split(key)
-        return direction(uniform(key_azimuth, self.azimuth), None if self.polar is None else uniform(key_polar, self.polar))
+    @property
+    def intervals(self) -> tuple[Float[Array, " 2"], ...]:
+        """Of its angles: one in the plane, two in space."""
+        return (self.azimuth,) if self.polar is None else (self.azimuth, self.polar)
 
 
 class Fixed(Initializer, type="fixed"):
@@ -80,10 +80,8 @@ class AtDistance(Initializer, type="at_distance"):
     direction: Direction = Direction()
 
     def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Float[Array, " d"]:
-        key_distance, key_direction = jax.random.split(key)
-        return sim.platforms[self.about].position + uniform(key_distance, self.distance) * self.direction.draw(
-            key_direction
-        )
+        distance, *angles = uniform(key, self.distance, *self.direction.intervals)
+        return sim.platforms[self.about].position + distance * direction(*angles)
 
 
 class AroundAtAltitude(Initializer, type="around_at_altitude"):
@@ -95,9 +93,8 @@ class AroundAtAltitude(Initializer, type="around_at_altitude"):
     altitude: Interval
 
     def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Float[Array, " 3"]:
-        key_distance, key_azimuth, key_altitude = jax.random.split(key, 3)
-        planar = uniform(key_distance, self.distance) * direction(uniform(key_azimuth, self.azimuth))
-        return jnp.append(sim.platforms[self.about].position[:2] + planar, uniform(key_altitude, self.altitude))
+        distance, azimuth, altitude = uniform(key, self.distance, self.azimuth, self.altitude)
+        return jnp.append(sim.platforms[self.about].position[:2] + distance * direction(azimuth), altitude)
 
 
 class BelowSpeedLimit(Initializer, type="below_speed_limit"):
@@ -110,12 +107,12 @@ class BelowSpeedLimit(Initializer, type="below_speed_limit"):
     direction: Direction = Direction()
 
     def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Float[Array, " d"]:
-        key_speed, key_direction = jax.random.split(key)
+        share, *angles = uniform(key, self.share, *self.direction.intervals)
         limit = self.floor + self.slope * safe_norm(drawn["position"] - sim.platforms[self.about].position)
-        return limit * uniform(key_speed, self.share) * self.direction.draw(key_direction)
+        return limit * share * direction(*angles)
 
 
-def uniform(key: Key, interval: Float[Array, " 2"]) -> Float[Array, ""]:
-    """A number uniform in [low, high]."""
-    low, high = interval[0], interval[1]
-    return low + (high - low) * jax.random.uniform(key, dtype=interval.dtype)
+def uniform(key: Key, *intervals: Float[Array, " 2"]) -> Float[Array, " n"]:
+    """A number uniform in [low, high] for each interval, all from one draw: every draw compiles to a loop of its own."""
+    low, high = jnp.stack(intervals, axis=-1)
+    return low + (high - low) * jax.random.uniform(key, low.shape, low.dtype)

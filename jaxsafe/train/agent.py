@@ -7,10 +7,12 @@ environment's observation is the paper's in every preset.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsafe.component import ANY, Component, Range, Unit
@@ -36,13 +38,14 @@ class Agent(Component):
 
     def init(self, key: Key, env: Environment) -> Params:
         """Return fresh parameters."""
-        key_actor, key_critic = jax.random.split(key)
         inputs = self.inputs(env, jnp.zeros(env.observation_size)).shape[-1]
         outputs = sum(env.num_action_points) or env.action_size
         seen = len(env.reward) if self.critic_sees_totals else 0
+        actor, critic = (inputs, *self.hidden, outputs), (inputs + seen, *self.hidden, 1)
+        normals = _normals(key, [*pairwise(actor), *pairwise(critic)])
         params = {
-            "actor": _init_mlp(key_actor, (inputs, *self.hidden, outputs), last_gain=0.01),
-            "critic": _init_mlp(key_critic, (inputs + seen, *self.hidden, 1), last_gain=1.0),
+            "actor": _layers(normals[: len(actor) - 1], last_gain=0.01),
+            "critic": _layers(normals[len(actor) - 1 :], last_gain=1.0),
         }
         if env.num_action_points:
             return params
@@ -139,14 +142,27 @@ def mlp(layers: Sequence[Params], x: Float[Array, "*batch i"]) -> Float[Array, "
     return x @ layers[-1]["kernel"] + layers[-1]["bias"]
 
 
-def _init_mlp(key: Key, sizes: Sequence[int], last_gain: float) -> list[Params]:
+def _normals(key: Key, shapes: Sequence[tuple[int, int]]) -> list[Array]:
+    """Standard normal matrices, all from one draw: every draw compiles to a loop of its own."""
+    ends = np.cumsum([rows * columns for rows, columns in shapes])
+    parts = jnp.split(jax.random.normal(key, (ends[-1],)), ends[:-1])
+    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+
+
+def _layers(normals: Sequence[Array], last_gain: float) -> list[Params]:
     """Orthogonal kernels, gain √2 and `last_gain` at the end, zero biases."""
-    gains = [2.0**0.5] * (len(sizes) - 2) + [last_gain]
-    keys = jax.random.split(key, len(gains))
+    gains = [2.0**0.5] * (len(normals) - 1) + [last_gain]
     return [
-        {"kernel": jax.nn.initializers.orthogonal(gain)(key_i, (fan_in, fan_out)), "bias": jnp.zeros(fan_out)}
-        for key_i, fan_in, fan_out, gain in zip(keys, sizes[:-1], sizes[1:], gains, strict=True)
+        {"kernel": gain * _orthogonal(normal), "bias": jnp.zeros(normal.shape[1])}
+        for gain, normal in zip(gains, normals, strict=True)
     ]
+
+
+def _orthogonal(normal: Float[Array, "m n"]) -> Float[Array, "m n"]:
+    """Orthonormal rows or columns, whichever are fewer, uniform over all such matrices: Q of QR, signs of diag R."""
+    q, r = jnp.linalg.qr(normal if normal.shape[0] >= normal.shape[1] else normal.T)
+    q = q * jnp.sign(jnp.diagonal(r))
+    return q if q.shape == normal.shape else q.T
 
 
 def _prior(points: Sequence[int], std: Array | float) -> Float[Array, " points"]:

@@ -234,4 +234,4 @@ def _to_batch(agent: Agent, ppo: PPO, gamma: Array, params: Params, transitions:
 
 def _optimizer(ppo: PPO) -> optax.GradientTransformation:
     """Gradient clipping and Adam's direction; the step size is the schedule's."""
-    return optax.chain(optax.clip_by_global_norm(ppo.max_grad_norm), optax.scale_by_adam(eps=1e-5))
+    return optax.flatten(optax.chain(optax.clip_by_global_norm(ppo.max_grad_norm), optax.scale_by_adam(eps=1e-5)))

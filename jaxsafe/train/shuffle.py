@@ -18,9 +18,8 @@ def shuffle(key: Key, size: int) -> Int[Array, " size"]:
     the range onto itself, so their composition is a permutation, and no element needs to know of another (Hoang, Morris
     and Rogaway, "An enciphering scheme based on a card shuffle", CRYPTO 2012).
     """
-    key_offset, key_salt = jax.random.split(key)
-    offsets = jax.random.randint(key_offset, (ROUNDS,), 0, size, jnp.int32)
-    salts = jax.random.bits(key_salt, (ROUNDS,), jnp.uint32)
+    offsets, salts = jax.random.bits(key, (2 * ROUNDS,), jnp.uint32).reshape(2, ROUNDS)
+    offsets = (offsets % size).astype(jnp.int32)  # some offsets are likelier than others by less than size/2³²
 
     def swap_or_not(order: Array, round_: tuple[Array, Array]) -> tuple[Array, None]:
         offset, salt = round_

@@ -33,7 +33,8 @@ def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
     order = jnp.cumsum(finished) - 1
     latest = finished & (order >= order[-1] + 1 - SIZE)
     slot = jnp.where(latest, (window.count + order) % SIZE, SIZE)  # out of range: dropped
-    ring = jax.tree.map(lambda old, new: old.at[slot].set(new.ravel(), mode="drop"), window.episodes, episodes)
+    row = jnp.full(SIZE, -1).at[slot].set(jnp.arange(slot.size), mode="drop")  # one scatter, which is dear to compile
+    ring = jax.tree.map(lambda old, new: jnp.where(row < 0, old, new.ravel()[row]), window.episodes, episodes)
     cost = jnp.sum(jnp.where(done, episodes.violating_steps, 0))
     return Window(ring, window.count + order[-1] + 1, window.cost + cost)
 
