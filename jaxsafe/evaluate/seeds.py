@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -36,11 +36,12 @@ class Evaluator:
 
     def run(self, params: Params, num_episodes: int, seed: int, deterministic: bool) -> Episode:
         """Episodes of every seed's policy: each field [seeds, num_episodes], on the host."""
-        batches = []
-        for key in batch_keys(seed, -(-num_episodes // BATCH)):
+
+        def batch(key: Key) -> Episode:
             shared = (*self._shared, *self.mapper.replicate((key, np.asarray(deterministic))))
-            batches.append(self.mapper.gather(self._run(shared, params)))
-        return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :num_episodes], *batches)
+            return self.mapper.gather(self._run(shared, params))
+
+        return in_batches(batch, num_episodes, seed)
 
     def record(
         self, params: Params, num_episodes: int, seed: int, deterministic: bool = True
@@ -68,6 +69,12 @@ class Evaluator:
 
     def _one_record(self, params: Params, key: Key, num_episodes: int, steps: int, deterministic: Any) -> Any:
         return record_episodes(self.env, self.agent.policy(self.env, params, deterministic), key, num_episodes, steps)
+
+
+def in_batches(run: Callable[[Key], Episode], num_episodes: int, seed: int) -> Episode:
+    """Join the episodes of as many batches as that takes: each field [seeds, num_episodes]."""
+    batches = [run(key) for key in batch_keys(seed, -(-num_episodes // BATCH))]
+    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :num_episodes], *batches)
 
 
 def batch_keys(seed: int, batches: int) -> Iterator[Key]:

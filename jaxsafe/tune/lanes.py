@@ -11,11 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.evaluate.episodes import run_episodes
-from jaxsafe.evaluate.seeds import BATCH, KINDS, batch_keys, metrics_per_seed
+from jaxsafe.evaluate.seeds import BATCH, KINDS, in_batches, metrics_per_seed
 from jaxsafe.metrics import Episode, interaction_efficiency
 from jaxsafe.train.loop import EVALUATION_SEED, begin, chunk
 from jaxsafe.train.seeds import SeedMapper
 from jaxsafe.tune.settings import Setting, alike, lane
+from jaxsafe.types import Key
 
 CHUNKS = 20
 """Pieces that a training is cut into, so that Ctrl-C and the bar do not wait for its end."""
@@ -76,11 +77,12 @@ class Lanes:
 
     def _episodes(self, lanes: Any, params: Any, deterministic: bool) -> Episode:
         """The evaluation episodes of every lane: each field [lanes, episodes]."""
-        count, batches = self.like.config.episodes, []
-        for key in batch_keys(EVALUATION_SEED, -(-count // BATCH)):
+
+        def batch(key: Key) -> Episode:
             shared = self.mapper.replicate((key, np.asarray(deterministic)))
-            batches.append(self.mapper.gather(self._evaluate(shared, (lanes, params))))
-        return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :count], *batches)
+            return self.mapper.gather(self._evaluate(shared, (lanes, params)))
+
+        return in_batches(batch, self.like.config.episodes, EVALUATION_SEED)
 
     def _result(self, setting: Setting, curve: dict[str, np.ndarray], sums: dict[str, Episode]) -> dict[str, Any]:
         steps = (1 + np.arange(setting.config.num_updates)) * setting.config.ppo.batch_size
