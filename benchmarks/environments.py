@@ -12,9 +12,7 @@ from __future__ import annotations
 import functools
 import importlib
 import json
-import os
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -23,6 +21,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from machine import about
 
 import jaxsafe
 from jaxsafe.envs import TASKS
@@ -45,10 +44,8 @@ def main() -> None:
     runs = {task: functools.partial(episode_steps, jaxsafe.make(task)) for task in tasks}
     runs |= gymnax_pendulum()
     results = [measure(name, run, num, repeats) for num in lanes for name, run in runs.items()]
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
-    about = {"commit": commit, "jax": jax.__version__, "device": jax.devices()[0].device_kind, "cores": os.cpu_count()}
     OUT.parent.mkdir(exist_ok=True)
-    OUT.write_text(json.dumps({**about, "released_steps_per_s": RELEASED, "runs": results}, indent=1) + "\n")
+    OUT.write_text(json.dumps({**about(), "released_steps_per_s": RELEASED, "runs": results}, indent=1) + "\n")
     print(table(results, lanes))
 
 

@@ -13,9 +13,7 @@ from __future__ import annotations
 import functools
 import importlib
 import json
-import os
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -25,6 +23,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from machine import about
 
 import jaxsafe
 from jaxsafe.component import normalise
@@ -48,11 +47,9 @@ def main() -> None:
     parts = {"calls": calls, "qp": programs, "change": changes, "training": training}
     chosen = options.get("parts", ",".join(parts)).split(",")
     known = json.loads(OUT.read_text()) if OUT.exists() else {}
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
-    about = {"commit": commit, "jax": jax.__version__, "device": jax.devices()[0].device_kind, "cores": os.cpu_count()}
     for name in chosen:
         rows = parts[name](repeats)
-        known[name] = {**about, "rows": rows}
+        known[name] = {**about(), "rows": rows}
         print(f"\n{name}\n" + table(rows))
         OUT.parent.mkdir(exist_ok=True)
         OUT.write_text(json.dumps(known, indent=1) + "\n")
