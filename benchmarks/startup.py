@@ -43,7 +43,8 @@ def main() -> None:
     repeats = int(options.get("repeats", "3"))
     rows = [measured(name, rta, repeats) for name, rta in chosen]
     OUT.parent.mkdir(exist_ok=True)
-    OUT.write_text(json.dumps({**about(), "unit": "s", "repeats": repeats, "columns": COLUMNS, "rows": rows}, indent=1) + "\n")
+    content = {**about(), "unit": "s", "repeats": repeats, "columns": COLUMNS, "rows": rows}
+    OUT.write_text(json.dumps(content, indent=1) + "\n")
     print("| s | " + " | ".join(COLUMNS) + " |\n|---|" + "---|" * len(COLUMNS))
     for row in rows:
         label = row["name"] if row["rta"] == "none" else f"{row['name']}, {row['rta']}"

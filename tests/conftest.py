@@ -1,17 +1,20 @@
 """Settings for all tests: two devices, one thread each, and compiled programs kept between runs.
 
-Tests compile far more than they run: XLA's older emitter of kernels takes a third less time, for slower programs.
+Tests compile far more than they run: XLA's older emitter of kernels takes a third less time, for slower programs. Only some
+versions can choose it, and others stop at an unknown flag.
 """
 
 import os
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 from jaxsafe.train.seeds import claim_cores
 
-os.environ.setdefault("XLA_FLAGS", "--xla_force_host_platform_device_count=2 --xla_cpu_use_fusion_emitters=false")
+emitter = " --xla_cpu_use_fusion_emitters=false" * version("jaxlib").startswith("0.10.")
+os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count=2{emitter}")
 claim_cores()
 
 import jax  # noqa: E402
