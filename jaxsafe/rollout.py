@@ -71,8 +71,7 @@ def step_or_reset_batch(
     after `max_episode_steps` is truncated, without an outcome.
     """
     state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, state, action)
-    cut = ~timestep.done & (state.num_steps >= max_episode_steps)
-    timestep = timestep.replace(truncated=timestep.truncated | cut)
+    timestep = cut_short(state, timestep, max_episode_steps)
     done = timestep.done
 
     def draw(old: tuple[State, Array]) -> tuple[State, Array]:
@@ -80,6 +79,12 @@ def step_or_reset_batch(
         return _where(done, (fresh_state, fresh.observation), old)
 
     return jax.lax.cond(jnp.any(done), draw, lambda old: old, (state, timestep.observation)), timestep
+
+
+def cut_short(state: State, timestep: TimeStep, max_episode_steps: Array | float) -> TimeStep:
+    """The time step, truncated if its episode is still running after `max_episode_steps`."""
+    cut = ~timestep.done & (state.num_steps >= max_episode_steps)
+    return timestep.replace(truncated=timestep.truncated | cut)
 
 
 def _where(done: Array, fresh: tuple[State, Array], old: tuple[State, Array]) -> tuple[State, Array]:

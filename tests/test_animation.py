@@ -21,7 +21,8 @@ def recorded(env: jaxsafe.Environment, steps: int) -> Any:
 @pytest.mark.parametrize(("task", "maps"), [("docking2d_oriented", 1), ("rejoin3d", 2)])
 def test_a_scene_shows_the_agent_where_it_is(task: str, maps: int) -> None:
     env = jaxsafe.make(task)
-    scene = Scene(env, recorded(env, 12), task)
+    states, timesteps = recorded(env, 12)
+    scene = Scene(env, states.sim, timesteps.info.margins, task)
     assert len(scene.maps) == maps
     first, last = scene.draw(0), scene.draw(12)
     assert first.dtype == np.uint8

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, labelled, length_unit,
 from jaxsafe.processors.constraint import Separation
 from jaxsafe.processors.status import Distance
 from jaxsafe.train.files import write_bytes
-from jaxsafe.types import State, TimeStep
+from jaxsafe.types import Sim, State, TimeStep
 
 FRAMES = 80
 """At most; longer episodes leave steps out."""
@@ -37,8 +38,9 @@ def animate(env: Environment, episode: tuple[State, TimeStep], path: Path, title
         path: of the file.
         title: what to write above it; time and outcome are added.
     """
-    scene = Scene(env, episode, title)
-    last = len(episode[0].sim.time) - 1
+    states, timesteps = episode
+    scene = Scene(env, states.sim, timesteps.info.margins, title)
+    last = len(states.sim.time) - 1
     steps = np.unique(np.linspace(0, last, min(FRAMES, last + 1)).round().astype(int))
     images = [Image.fromarray(scene.draw(step)) for step in steps]
     palette = images[-1].quantize(128)
@@ -53,14 +55,13 @@ def animate(env: Environment, episode: tuple[State, TimeStep], path: Path, title
 class Scene:
     """The picture of one step: the paths of all platforms as seen from the first, and two curves over time."""
 
-    def __init__(self, env: Environment, episode: tuple[State, TimeStep], title: str) -> None:
-        """Draw what does not move."""
-        states, timesteps = episode
-        self.env, self.sim, self.margins, self.title = env, states.sim, timesteps.info.margins, title
-        others = [name for name in states.sim.platforms if name != env.agent]
-        origin = states.sim.platforms[others[0] if others else env.agent].position
+    def __init__(self, env: Environment, sim: Sim, margins: Mapping[str, Any], title: str) -> None:
+        """Draw what does not move; every field [steps]."""
+        self.env, self.sim, self.margins, self.title = env, sim, margins, title
+        others = [name for name in sim.platforms if name != env.agent]
+        origin = sim.platforms[others[0] if others else env.agent].position
         self.origin = origin if others else np.zeros_like(origin)
-        self.paths = {name: one.position - self.origin for name, one in states.sim.platforms.items()}
+        self.paths = {name: one.position - self.origin for name, one in sim.platforms.items()}
         self.planes = [(0, 1)] if origin.shape[1] == 2 else [(0, 1), (0, 2)]
         self.figure = Figure(figsize=(4.0 * len(self.planes) + 3.6, 4.2), dpi=80, layout="constrained")
         FigureCanvasAgg(self.figure)

@@ -1,0 +1,207 @@
+import subprocess
+import sys
+from typing import Any
+
+import gymnasium as gym
+import jax
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+import jaxsafe
+from jaxsafe import ConfigError
+from jaxsafe.adapters.gymnasium import GymEnv, GymVectorEnv
+from jaxsafe.adapters.registration import IDS
+
+SOON = {"terminal.distance.limit": 130.0}
+"""Starts are 100 to 150 m away, so some episodes end with the first step and others last."""
+
+
+def actions(env: Any, steps: int) -> list[np.ndarray]:
+    env.action_space.seed(3)
+    return [env.action_space.sample() for _ in range(steps)]
+
+
+def same(ours: Any, theirs: Any, where: np.ndarray, name: str) -> None:
+    """Infos alike, in the lanes that have them."""
+    if isinstance(theirs, dict):
+        assert ours.keys() == theirs.keys(), name
+        for key in theirs:
+            mask = theirs.get(f"_{key}", where)
+            same(ours[key], theirs[key], where & mask, f"{name}.{key}")
+    elif theirs.dtype == object and name.endswith("final_obs"):
+        np.testing.assert_allclose(ours[where], np.stack(theirs[where]), rtol=1e-5, atol=1e-6)
+    elif theirs.dtype == object or theirs.dtype == bool:
+        assert (ours[where] == theirs[where]).all(), name
+    else:
+        np.testing.assert_allclose(ours[where], theirs[where], rtol=1e-4, atol=1e-5, err_msg=name)
+
+
+@pytest.mark.filterwarnings("ignore:.*A Box observation space (min|max)imum value is:UserWarning")
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        pytest.param(name, kind, marks=[pytest.mark.slow] if kind == "discrete" and name != "jaxsafe/Docking2D-v0" else [])
+        for name in IDS
+        for kind in ("continuous", "discrete")
+    ],
+)
+def test_gymnasiums_own_checks_find_nothing(name: str, kind: str) -> None:
+    env = gym.make(name, actions=kind, render_mode="rgb_array")
+    check_env(env.unwrapped)
+    assert isinstance(env.action_space, gym.spaces.MultiDiscrete if kind == "discrete" else gym.spaces.Box)
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_a_batch_is_what_single_environments_are_step_by_step(mode: AutoresetMode) -> None:
+    options: dict[str, Any] = {"overrides": SOON, "rta": "explicit_simplex", "max_episode_steps": 7}
+    ours = GymVectorEnv("docking2d", 6, autoreset_mode=mode, **options)
+    theirs = SyncVectorEnv([lambda: GymEnv("docking2d", **options)] * 6, autoreset_mode=mode)
+    assert ours.single_observation_space == theirs.single_observation_space
+    assert (ours.action_space, ours.metadata["autoreset_mode"]) == (theirs.action_space, mode)
+    everywhere, ends = np.ones(6, bool), 0
+    for (observation, infos), (expected, their_infos) in [(ours.reset(seed=5), theirs.reset(seed=5))]:
+        np.testing.assert_allclose(observation, expected, rtol=1e-6)
+        same(infos, their_infos, everywhere, "reset")
+    for action in actions(theirs, 30):
+        (*found, infos), (*expected, their_infos) = ours.step(action), theirs.step(action)
+        for one, other in zip(found, expected, strict=True):
+            assert one.dtype == other.dtype
+            np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+        same(infos, their_infos, everywhere, "step")
+        done = found[2] | found[3]
+        ends += int(done.sum())
+        if mode is AutoresetMode.DISABLED and done.any():
+            with pytest.raises(ResetNeeded, match="episodes of lanes"):
+                ours.step(action)
+            mask = {"reset_mask": done}
+            (observation, infos), (expected, their_infos) = (e.reset(options=dict(mask)) for e in (ours, theirs))
+            np.testing.assert_allclose(observation, expected, rtol=1e-5, atol=1e-6)
+            same(infos, their_infos, everywhere, "reset")
+    assert ends > 20
+
+
+def test_final_observations_may_be_written_to_and_wrappers_count_episodes() -> None:
+    env = RecordEpisodeStatistics(GymVectorEnv("docking2d", 4, autoreset_mode="SameStep", max_episode_steps=3))
+    env.reset(seed=0)
+    zero = np.zeros((4, 2), np.float32)
+    *_, infos = [env.step(zero) for _ in range(3)][-1]
+    assert infos["final_info"]["outcome"].tolist() == ["running"] * 4  # cut short by the limit alone
+    infos["final_obs"][:] = 0.0
+    assert infos["episode"]["l"].tolist() == [3] * 4
+
+
+def test_seeds_are_chains_of_keys() -> None:
+    env = gym.make("jaxsafe:jaxsafe/Docking2D-v0")
+    first, _ = env.reset(seed=7)
+    second, _ = env.reset()
+    assert not np.array_equal(first, second)
+    assert np.array_equal(env.reset(seed=7)[0], first)
+    assert np.array_equal(env.reset()[0], second)
+    _, now = jax.random.split(jax.random.key(7))
+    np.testing.assert_allclose(jaxsafe.make("docking2d").reset(now)[1].observation, first, rtol=1e-6)
+    other = gym.make("jaxsafe/Docking2D-v0")
+    assert not np.array_equal(other.reset()[0], gym.make("jaxsafe/Docking2D-v0").reset()[0])
+    other.reset(seed=2**40)
+
+
+def test_lanes_are_seeded_one_by_one() -> None:
+    env = gym.make_vec("jaxsafe/Docking2D-v0", num_envs=3)
+    observation, _ = env.reset(seed=[4, 5, 6])
+    assert np.array_equal(env.reset(seed=4)[0], observation)
+    again, _ = env.reset(seed=[None, 5, None])
+    assert np.array_equal(again[1], observation[1])
+    assert not np.array_equal(again[0], observation[0])
+    unseeded = [gym.make_vec("jaxsafe/Docking2D-v0", num_envs=2).reset()[0] for _ in range(2)]
+    assert not np.array_equal(*unseeded)
+
+
+def test_info_says_what_happened() -> None:
+    env = gym.make("jaxsafe/Docking2D-v0", rta="explicit_simplex")
+    fast = {"deputy": {"position": [30.0, 0.0], "velocity": [-0.9, 0.0]}}
+    observation, info = env.reset(options={"start": fast})
+    assert observation[0] == pytest.approx(0.3)
+    assert (info["cost"], info["outcome"]) == (0.0, "running")
+    *_, info = env.step(np.array([-1.0, 0.0], np.float32))
+    assert (info["cost"], info["is_success"], info["intervening"]) == (1.0, False, True)
+    assert info["margins"]["velocity_limit"] < 0.0 < info["severity"]["velocity_limit"]
+    assert isinstance(info["cost"], float)
+    assert isinstance(info["rta"]["certified"], bool)
+    assert not np.array_equal(info["control_desired"], info["control_actual"])
+    assert sum(info["reward_terms"].values()) == pytest.approx(sum(info["reward_totals"].values()))
+
+
+def test_every_option_of_make_is_understood() -> None:
+    options: dict[str, Any] = {
+        "actions": "discrete", "variant": "released", "rta": "explicit_simplex", "randomize": {"deputy.mass": [10, 14]},
+        "overrides": {"reward.delta_v.scale": -0.5},
+    }  # fmt: skip
+    env = gym.make("jaxsafe/Docking2D-v0", **options)
+    expected = jaxsafe.make("docking2d", **options)
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool((a == b).all()), env.unwrapped.env, expected))
+    same_env = GymEnv(expected)
+    env.reset(seed=1), same_env.reset(seed=1)
+    for _ in range(3):
+        assert env.step(np.array([0, 10]))[1] == same_env.step([0, 10])[1]
+
+
+def test_an_episode_can_be_watched() -> None:
+    env = gym.make("jaxsafe/Rejoin2D-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    for _ in range(3):
+        env.step(np.array([1.0, 0.0], np.float32))
+    second = env.render()
+    assert first.shape == second.shape
+    assert first.dtype == np.uint8
+    assert (first != second).any()
+    env.reset()
+    assert len(env.unwrapped._frames._past) == 1
+    batch = gym.make_vec("jaxsafe/Rejoin2D-v0", num_envs=2, render_mode="rgb_array", max_episode_steps=2)
+    batch.reset(seed=0)
+    for _ in range(3):
+        batch.step(np.zeros((2, 2), np.float32))
+    assert np.array_equal(batch.render()[0].shape, first.shape)
+    assert len(batch.unwrapped._frames[0]._past) == 1
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda: GymEnv("doking3d"), "Did you mean 'docking3d'"),
+        (lambda: GymEnv("docking2d", action="discrete"), "action: unknown option; choose from .*'actions'"),
+        (lambda: GymEnv("docking2d", render_mode="human"), "render_mode: found 'human'; choose from rgb_array"),
+        (lambda: GymEnv("docking2d", max_episode_steps=0), "max_episode_steps: expected a whole number ≥ 1, found 0"),
+        (lambda: GymEnv(jaxsafe.make("docking2d"), rta="default"), "rta: the environment is made already"),
+        (lambda: GymVectorEnv("docking2d", 0), "num_envs: expected a whole number ≥ 1, found 0"),
+        (lambda: GymVectorEnv("docking2d", 2, autoreset_mode="Same"), "autoreset_mode: unknown mode 'Same'"),
+        (lambda: GymEnv("docking2d").reset(options={"from": 3}), "reset: options: unknown 'from'; choose from start"),
+        (lambda: GymVectorEnv("docking2d", 2).reset(seed=[1, 2, 3]), "seed: expected 2 seeds, found 3"),
+        (lambda: GymVectorEnv("docking2d", 2).reset(options={"reset_mask": [True, False]}), "reset_mask: expected a bool"),
+    ],
+)
+def test_mistakes_are_named(build: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        build()
+
+
+def test_wrong_actions_and_wrong_order_are_named() -> None:
+    env, batch = GymEnv("docking2d", actions="discrete"), GymVectorEnv("docking2d", 2)
+    for one in (env, batch):
+        with pytest.raises(ResetNeeded, match="step: call reset first"):
+            one.step(one.action_space.sample())
+    with pytest.raises(ResetNeeded, match="first reset takes no reset_mask"):
+        batch.reset(options={"reset_mask": np.array([True, False])})
+    env.reset(seed=0), batch.reset(seed=0)
+    with pytest.raises(ConfigError, match="whole numbers"):
+        env.step(np.array([0.5, 0.5]))
+    with pytest.raises(ConfigError, match=r"actions: expected shape \(2, 2\), found \(2,\)"):
+        batch.step(np.zeros(2))
+
+
+def test_importing_jaxsafe_is_enough() -> None:
+    code = "import jaxsafe, gymnasium; print(gymnasium.spec('jaxsafe/Docking2DOriented-v0').kwargs['task'])"
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "docking2d_oriented"
