@@ -79,6 +79,11 @@ class Environment(Component):
         return ("running", *(condition.name for condition in self.terminal), *bounds)
 
     @property
+    def success(self) -> int:
+        """The index of the outcome `success`; −1, which nothing ends with, where the task has none."""
+        return self.outcomes.index("success") if "success" in self.outcomes else -1
+
+    @property
     def can_truncate(self) -> bool:
         """Whether any end is a truncation."""
         return "truncated" in self._ends.values()

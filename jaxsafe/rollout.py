@@ -53,8 +53,13 @@ def step_or_reset(env: Environment, state: State, action: Array, key: Key) -> tu
         The next state with the observation to act on, and the time step taken, with the observation it led to.
     """
     state, timestep = step(env, state, action)
+    return restarted(env, state, timestep, key), timestep
+
+
+def restarted(env: Environment, state: State, timestep: TimeStep, key: Key) -> tuple[State, Array]:
+    """State and observation to go on from: a fresh start where the time step ended the episode."""
     fresh_state, fresh = reset(env, key)
-    return _where(timestep.done, (fresh_state, fresh.observation), (state, timestep.observation)), timestep
+    return _where(timestep.done, (fresh_state, fresh.observation), (state, timestep.observation))
 
 
 def reset_batch(env: Environment, key: Key, num_envs: int) -> tuple[State, TimeStep]:

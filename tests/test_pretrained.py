@@ -11,7 +11,6 @@ from jaxsafe.envs import TASKS
 from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate.__main__ import main
 from jaxsafe.evaluate.episodes import run_episodes
-from jaxsafe.evaluate.seeds import success_index
 from jaxsafe.train.policy import find_policy, read_policy
 
 
@@ -31,7 +30,7 @@ def flown(task: str, episodes: int) -> float:
     """The share of successes."""
     env, policy = jaxsafe.make(task), jaxsafe.load_policy(task)
     found = jax.jit(lambda env, key: run_episodes(env, policy, key, episodes))(env, jax.random.key(7))
-    return float(np.mean(np.asarray(found.outcome) == success_index(env)))
+    return float(np.mean(np.asarray(found.outcome) == env.success))
 
 
 def test_the_policy_of_docking_docks() -> None:

@@ -22,9 +22,8 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Array
 
-from jaxsafe.config import override
+from jaxsafe.adapters import environment, observation_bounds
 from jaxsafe.environment import Environment, reset, reset_to, step
-from jaxsafe.envs import make
 from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.rollout import cut_short
 from jaxsafe.types import Key, Record, State, TimeStep
@@ -66,7 +65,7 @@ class GymEnv(gym.Env[np.ndarray, np.ndarray]):
         Raises:
             ConfigError: as `jaxsafe.make`.
         """
-        self.env = _environment(task, overrides, options)
+        self.env = environment(task, overrides, options)
         self.render_mode = _checked_render_mode(render_mode)
         self.observation_space, self.action_space = spaces(self.env)
         self._limit = _checked_limit(max_episode_steps)
@@ -148,7 +147,7 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         Raises:
             ConfigError: as `jaxsafe.make`.
         """
-        self.env = _environment(task, overrides, options)
+        self.env = environment(task, overrides, options)
         self.num_envs = _checked_count("num_envs", num_envs)
         self.render_mode = _checked_render_mode(render_mode)
         self.autoreset_mode = _checked_mode(autoreset_mode)
@@ -348,13 +347,9 @@ class Frames:
 
 
 def spaces(env: Environment) -> tuple[gym.spaces.Box, Space]:
-    """Of observations, with the bounds of those that are clipped, and of actions."""
-    low, high = [], []
-    for item in env.observation:
-        size = sum(name == item.name or name.startswith(f"{item.name}.") for name in env.observation_names)
-        bounds = (-np.inf, np.inf) if item.clip is None else np.asarray(item.clip).tolist()
-        low, high = low + size * [bounds[0]], high + size * [bounds[1]]
+    """Of observations and of actions."""
     dtype = jnp.result_type(float)
+    low, high = observation_bounds(env)
     observation = gym.spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
     if env.num_action_points:
         return observation, gym.spaces.MultiDiscrete(list(env.num_action_points))
@@ -368,7 +363,7 @@ def facts(env: Environment, timestep: TimeStep) -> dict[str, Any]:
     found = {
         "cost": timestep.cost,
         "outcome": outcomes[info.outcome],
-        "is_success": outcomes[info.outcome] == "success",
+        "is_success": info.outcome == env.success,
         **{name: getattr(info, name) for name in _FACTS},
     }
     return found if info.rta is None else {**found, "rta": vars(info.rta)}
@@ -386,22 +381,6 @@ def _masked(found: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
         masked[name] = _masked(value, mask) if isinstance(value, Mapping) else np.asarray(value)
         masked[f"_{name}"] = mask.copy()
     return masked
-
-
-def _environment(
-    task: str | os.PathLike | Environment, overrides: Mapping[str, Any] | None, options: Mapping[str, Any]
-) -> Environment:
-    for option in options:
-        if option not in _OPTIONS:
-            raise ConfigError(f"{option}: unknown option; choose from {nearest(option, _OPTIONS)}")
-    if isinstance(task, Environment):
-        if options:
-            raise ConfigError(f"{next(iter(options))}: the environment is made already; give it to jaxsafe.make instead")
-        return override(task, overrides) if overrides else task
-    return make(task, overrides, **options)
-
-
-_OPTIONS = ("actions", "variant", "randomize", "rta", "overrides", "render_mode", "max_episode_steps", "autoreset_mode")
 
 
 def _keys(seeds: list[int]) -> Key:

@@ -85,7 +85,7 @@ def batch_keys(seed: int, batches: int) -> Iterator[Key]:
 
 def episode_rows(env: Environment, episodes: Episode, first_seed: int, **common: Any) -> list[dict[str, Any]]:
     """A row for each episode of each seed, for `eval.jsonl`."""
-    success = success_index(env)
+    success = env.success
     names = ("episode_return", "length", "delta_v", "delta_v_l1", "violating_steps", "severity_max", "interventions")
     columns = {name: np.asarray(getattr(episodes, name)).tolist() for name in names}
     outcomes = np.asarray(episodes.outcome)
@@ -112,13 +112,8 @@ def metrics_per_seed(env: Environment, episodes: Episode) -> dict[str, list[floa
     """Every metric of Section 5 for each seed, from sums [seeds, episodes]."""
     has_delta_v, has_rta = any(status.name == "delta_v" for status in env.status), env.rta is not None
     seeds = range(np.asarray(episodes.outcome).shape[0])
-    each = [summarise(jax.tree.map(lambda x, i=i: x[i], episodes), success_index(env), has_delta_v, has_rta) for i in seeds]
+    each = [summarise(jax.tree.map(lambda x, i=i: x[i], episodes), env.success, has_delta_v, has_rta) for i in seeds]
     return {name: [one[name] for one in each] for name in METRICS}
-
-
-def success_index(env: Environment) -> int:
-    """Which outcome is success; none, −1, where the task has no outcome of that name."""
-    return env.outcomes.index("success") if "success" in env.outcomes else -1
 
 
 def _step_row(env: Environment, state: Any, timestep: Any, t: int) -> dict[str, Any]:

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.environment import Environment
-from jaxsafe.evaluate.seeds import KINDS, Evaluator, episode_rows, success_index
+from jaxsafe.evaluate.seeds import KINDS, Evaluator, episode_rows
 from jaxsafe.metrics import Episode
 from jaxsafe.train import ppo, window
 from jaxsafe.train.checkpoint import Checkpoints
@@ -140,7 +140,7 @@ class Training:
         """Periodic evaluation: rows, one logged episode, and the best parameters of each seed so far."""
         episodes = self._run_episodes("deterministic", self.config.eval_episodes, final=False)
         self._record(self.config.eval_episodes, final=False)
-        rate = np.mean(np.asarray(episodes.outcome) == success_index(self.env), axis=1)
+        rate = np.mean(np.asarray(episodes.outcome) == self.env.success, axis=1)
         success = self.mapper.place(jnp.asarray(self.mapper.pad(rate), jnp.float32))
         self.best = _keep_best(self.best, {"params": self.state.params, "success": success})
 

@@ -1,0 +1,139 @@
+"""The tasks as Brax environments, for its PPO, SAC and APG: `ppo.train(BraxEnv("docking2d"), wrap_env_fn=wrap, …)`."""
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from jaxsafe.adapters import environment, missing
+from jaxsafe.environment import Environment, reset, step
+from jaxsafe.errors import ConfigError
+from jaxsafe.types import Key, TimeStep
+
+try:
+    from brax.envs.base import Env, State, Wrapper
+    from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
+except ImportError:
+    raise missing("brax", "brax") from None
+
+
+class BraxEnv(Env):
+    """One task. `pipeline_state` is our state.
+
+    `metrics` are `cost`, `success` and `reward_…` of each term, which Brax sums over episodes.
+
+    `done` is 1 where the task ended. A task that truncates by itself (none of the five does) looks to Brax as if it had
+    terminated; the limit that Brax knows of is its own `episode_length`.
+    """
+
+    def __init__(
+        self, task: str | os.PathLike | Environment, overrides: Mapping[str, Any] | None = None, **options: Any
+    ) -> None:
+        """Make the environment; `options` are `variant`, `randomize`, `rta` of `jaxsafe.make`.
+
+        Raises:
+            ConfigError: as `jaxsafe.make`; or actions are discrete, which Brax's agents do not know.
+        """
+        self.env = environment(task, overrides, options)
+        if self.env.num_action_points:
+            raise ConfigError("actions: Brax's agents need continuous actions")
+
+    def reset(self, rng: Key) -> State:
+        """A random start."""
+        state, timestep = reset(self.env, rng)
+        return State(state, timestep.observation, timestep.reward, _number(timestep.done), self._metrics(timestep), {})
+
+    def step(self, state: State, action: Array) -> State:
+        """Advance one time step of the task."""
+        following, timestep = step(self.env, state.pipeline_state, action)
+        return state.replace(
+            pipeline_state=following,
+            obs=timestep.observation,
+            reward=timestep.reward,
+            done=_number(timestep.done),
+            metrics={**state.metrics, **self._metrics(timestep)},
+        )
+
+    @property
+    def observation_size(self) -> int:
+        return self.env.observation_size
+
+    @property
+    def action_size(self) -> int:
+        return self.env.action_size
+
+    @property
+    def backend(self) -> str:
+        return "jaxsafe"
+
+    @property
+    def dt(self) -> Array:
+        return self.env.dt
+
+    def _metrics(self, timestep: TimeStep) -> dict[str, Array]:
+        terms = {f"reward_{name}": value for name, value in timestep.info.reward_terms.items()}
+        return {"cost": timestep.cost, "success": _number(timestep.info.outcome == self.env.success), **terms}
+
+
+class FreshStarts(Wrapper):
+    """Starts each episode anew. Brax's own AutoResetWrapper begins every episode of a lane where its first began."""
+
+    def reset(self, rng: Key) -> State:
+        state = self.env.reset(rng)
+        state.info["starts"] = _split(rng)[0]
+        return state
+
+    def step(self, state: State, action: Array) -> State:
+        begun = state.replace(done=jnp.zeros_like(state.done))
+        begun.info["steps"] = jnp.where(state.done, 0.0, state.info["steps"])
+        taken = self.env.step(begun, action)
+        keys, now = _split(taken.info["starts"])
+
+        def draw(taken: State) -> State:
+            fresh = self.env.reset(now)
+            pick = lambda a, b: jnp.where(taken.done.reshape(-1, *(1,) * (a.ndim - 1)), a, b)  # noqa: E731
+            kept = {"pipeline_state": fresh.pipeline_state, "obs": fresh.obs}
+            return taken.replace(**jax.tree.map(pick, kept, {name: getattr(taken, name) for name in kept}))
+
+        following = jax.lax.cond(jnp.any(taken.done), draw, lambda taken: taken, taken)
+        following.info["starts"] = keys
+        return following
+
+
+def wrap(env: Env, episode_length: int = 1000, action_repeat: int = 1, randomization_fn: Callable | None = None) -> Wrapper:
+    """What to give Brax's trainers as `wrap_env_fn`: many episodes side by side, each with a fresh start.
+
+    Raises:
+        ConfigError: with a `randomization_fn`, which is for Brax's own physics.
+    """
+    if randomization_fn is not None:
+        raise ConfigError("randomization_fn: give BraxEnv randomize={path: [low, high]} instead")
+    return FreshStarts(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
+
+
+def mend_brax() -> None:
+    """Put back `jax.device_put_replicated`, which Brax 0.14.2 calls and JAX 0.10 no longer has."""
+    if hasattr(jax, "device_put_replicated"):
+        return
+
+    def device_put_replicated(tree: Any, devices: Any) -> Any:
+        copies = jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
+        mesh = jax.sharding.Mesh(devices, ("i",))
+        return jax.device_put(copies, jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("i")))
+
+    jax.device_put_replicated = device_put_replicated
+
+
+def _number(flag: Array) -> Array:
+    return flag.astype(jnp.result_type(float))
+
+
+def _split(keys: Key) -> tuple[Key, Key]:
+    pairs = jax.vmap(jax.random.split)(keys)
+    return pairs[:, 0], pairs[:, 1]

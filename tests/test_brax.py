@@ -1,0 +1,83 @@
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsafe
+from jaxsafe import ConfigError
+
+pytestmark = [pytest.mark.peer, pytest.mark.filterwarnings("default")]
+SHORT = {"terminal.timeout.limit": 3.0}
+
+
+@pytest.fixture
+def brax() -> Any:
+    from jaxsafe.adapters import brax
+
+    return brax
+
+
+def test_a_step_is_ours(brax: Any) -> None:
+    env, core = brax.BraxEnv("docking2d", SHORT), jaxsafe.make("docking2d", SHORT)
+    state = env.reset(jax.random.key(0))
+    expected, _ = core.reset(jax.random.key(0))
+    action = jnp.array([0.5, -0.5])
+    for _ in range(4):
+        state = env.step(state, action)
+        expected, timestep = core.step(expected, action)
+        np.testing.assert_allclose(state.obs, timestep.observation, rtol=1e-6)
+        np.testing.assert_allclose(state.reward, timestep.reward, rtol=1e-6)
+        assert state.metrics["cost"] == timestep.cost
+    assert float(state.done) == 1.0
+    assert (env.observation_size, env.action_size) == (6, 2)
+
+
+def test_episodes_start_anew_each_time(brax: Any) -> None:
+    env = brax.wrap(brax.BraxEnv("docking2d", SHORT), episode_length=100)
+    state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
+    starts, step = [state.obs], jax.jit(env.step)
+    for _ in range(12):
+        state = step(state, jnp.zeros((3, 2)))
+        if state.done.all():
+            starts.append(state.obs)
+    assert len(starts) == 4
+    assert len({float(x) for start in starts for x in start[:, 0]}) == 12
+    assert state.info["steps"].tolist() == [4.0] * 3
+
+
+def test_episodes_may_be_cut(brax: Any) -> None:
+    env = brax.wrap(brax.BraxEnv("docking2d"), episode_length=2)
+    state = env.reset(jax.random.split(jax.random.PRNGKey(0), 2))
+    for _ in range(2):
+        state = env.step(state, jnp.zeros((2, 2)))
+    assert state.done.tolist() == state.info["truncation"].tolist() == [1.0, 1.0]
+
+
+def test_a_return_has_a_gradient(brax: Any) -> None:
+    env = brax.BraxEnv("docking2d")
+    start = env.reset(jax.random.key(0))
+
+    def total(action: jax.Array) -> jax.Array:
+        return jax.lax.scan(lambda s, _: ((n := env.step(s, action)), n.reward), start, None, length=20)[1].sum()
+
+    gradient = jax.grad(total)(jnp.array([0.1, 0.1]))
+    assert np.isfinite(gradient).all()
+    assert np.abs(gradient).min() > 0.0
+
+
+def test_mistakes_are_named(brax: Any) -> None:
+    with pytest.raises(ConfigError, match="actions: Brax's agents need continuous actions"):
+        brax.BraxEnv("docking2d", actions="discrete")
+    with pytest.raises(ConfigError, match="randomization_fn: give BraxEnv randomize="):
+        brax.wrap(brax.BraxEnv("docking2d"), randomization_fn=lambda: None)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("algorithm", ["ppo", "sac", "apg"])
+def test_braxs_own_trainers_run(algorithm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend("examples")
+    import brax_docking2d
+
+    assert brax_docking2d.train(algorithm)["eval/episode_reward"] > -2.0

@@ -1,0 +1,87 @@
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsafe
+
+pytestmark = [pytest.mark.peer, pytest.mark.filterwarnings("default")]
+
+
+@pytest.fixture
+def make() -> Any:
+    from jaxsafe.adapters.gymnax import GymnaxEnv
+
+    return GymnaxEnv
+
+
+def test_a_step_is_ours_and_resets_by_itself(make: Any) -> None:
+    env, core = (
+        make("docking2d", {"terminal.timeout.limit": 3.0}),
+        jaxsafe.make("docking2d", {"terminal.timeout.limit": 3.0}),
+    )
+    params = env.default_params
+    observation, state = env.reset(jax.random.key(0), params)
+    expected, timestep = core.reset(jax.random.key(0))
+    np.testing.assert_allclose(observation, timestep.observation, rtol=1e-6)
+    action = jnp.array([0.5, -0.5])
+    for index in range(4):
+        key = jax.random.key(index)
+        observation, state, reward, terminated, truncated, info = env.step(key, state, action, params)
+        expected, timestep = core.step(expected, action)
+        np.testing.assert_allclose(reward, timestep.reward, rtol=1e-5)
+        np.testing.assert_allclose(info["final_observation"], timestep.observation, rtol=1e-5)
+        assert (bool(terminated), bool(truncated)) == (index == 3, False)
+    np.testing.assert_allclose(observation, core.reset(key)[1].observation, rtol=1e-6)
+    assert int(state.num_steps) == 0
+
+
+def test_older_libraries_get_five_values(make: Any) -> None:
+    env = make("docking2d", legacy=True)
+    _, state = env.reset(jax.random.key(0))
+    assert len(env.step(jax.random.key(1), state, jnp.zeros(2))) == 5
+
+
+def test_parameters_are_a_pytree_to_map_over(make: Any) -> None:
+    env = make("docking2d")
+    masses = jnp.array([10.0, 14.0])
+    params = jax.vmap(lambda mass: env.default_params.replace(env=jaxsafe.override(env.env, {"deputy.mass": mass})))(masses)
+    _, state = env.reset(jax.random.key(0))
+    observation, *_ = jax.vmap(env.step, in_axes=(None, None, None, 0))(jax.random.key(1), state, jnp.ones(2), params)
+    assert observation[0, 2] > observation[1, 2]  # the lighter one is faster
+
+
+def test_a_limit_of_its_own_truncates(make: Any) -> None:
+    env = make("docking2d")
+    params = env.default_params.replace(max_steps_in_episode=1)
+    _, state = env.reset(jax.random.key(0), params)
+    *_, terminated, truncated, _ = env.step(jax.random.key(1), state, jnp.zeros(2), params)
+    assert (bool(terminated), bool(truncated)) == (False, True)
+
+
+def test_discrete_actions_are_one_choice(make: Any) -> None:
+    env, core = make("docking2d", actions="discrete"), jaxsafe.make("docking2d", actions="discrete")
+    assert env.action_space().n == env.num_actions == 121
+    _, state = env.reset(jax.random.key(0))
+    expected, _ = core.reset(jax.random.key(0))
+    found = env.step(jax.random.key(1), state, jnp.int32(3 * 11 + 7))
+    np.testing.assert_allclose(found[2], core.step(expected, jnp.array([3, 7]))[1].reward, rtol=1e-5)
+
+
+def test_spaces_are_those_of_gymnax(make: Any) -> None:
+    env = make("rejoin2d")
+    observation, _ = env.reset(jax.random.key(0))
+    assert env.observation_space(env.default_params).contains(observation)
+    assert env.action_space(env.default_params).sample(jax.random.key(0)).shape == (2,)
+
+
+@pytest.mark.slow
+def test_rejax_trains_unmodified(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("rejax")
+    monkeypatch.syspath_prepend("examples")
+    import rejax_docking2d
+
+    _, returns = rejax_docking2d.train(400_000)
+    assert float(returns[:, -1].mean(axis=-1).max()) > float(returns[:, 0].mean()) + 3.0

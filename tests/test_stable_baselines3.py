@@ -1,0 +1,55 @@
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytestmark = [pytest.mark.peer, pytest.mark.filterwarnings("default")]
+
+
+@pytest.fixture
+def make() -> Any:
+    from jaxsafe.adapters.stable_baselines3 import SB3VecEnv
+
+    return SB3VecEnv
+
+
+def test_the_end_of_an_episode_is_told_as_the_library_wants_it(make: Any) -> None:
+    env = make("docking2d", 3, {"terminal.timeout.limit": 2.0})
+    env.seed(5)
+    first = env.reset()
+    zero = np.zeros((3, 2), np.float32)
+    for _ in range(2):
+        *_, done, infos = env.step(zero)
+        assert not done.any()
+        assert infos == [{"cost": 0.0}] * 3
+    observation, reward, done, infos = env.step(zero)
+    assert done.all()
+    assert reward.dtype == np.float32
+    assert (observation != first).any()
+    for lane, info in enumerate(infos):
+        assert (info["outcome"], info["is_success"], info["TimeLimit.truncated"]) == ("timeout", False, False)
+        assert (info["terminal_observation"] != observation[lane]).any()
+    env.seed(5)
+    assert np.array_equal(env.reset(), first)
+
+
+def test_a_limit_is_a_truncation(make: Any) -> None:
+    env = make("docking2d", 2, max_episode_steps=1)
+    env.reset()
+    assert [info["TimeLimit.truncated"] for info in env.step(np.zeros((2, 2)))[3]] == [True, True]
+
+
+def test_the_library_accepts_single_environments() -> None:
+    from stable_baselines3.common.env_checker import check_env
+
+    from jaxsafe.adapters.gymnasium import GymEnv
+
+    check_env(GymEnv("rejoin2d"))
+
+
+@pytest.mark.slow
+def test_its_ppo_learns_docking(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend("examples")
+    import stable_baselines3_docking2d as example
+
+    assert example.success_rate(example.train()) >= 0.9
