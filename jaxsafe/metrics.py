@@ -1,6 +1,7 @@
 """The metrics of Section 5 of the paper, from running sums over any stream of time steps.
 
 `accumulate` follows one episode step by step; `summarise` turns finished episodes into the paper's metrics.
+`episode_cost`, the violating steps of an episode, is not the paper's but what constrained RL calls cost.
 The paper defines the safety violation rate as the share of tests *without* a violation and calls lower better; here it is
 the share with one.
 """
@@ -25,6 +26,7 @@ METRICS = (
     "control_usage_l1",
     "safety_violation_rate",
     "episode_safety_violation_rate",
+    "episode_cost",
     "episode_violation_severity_mean",
     "episode_violation_severity_max",
     "mean_reward",
@@ -96,6 +98,7 @@ def summarise(episodes: Episode, success: int, has_delta_v: bool = True, has_rta
         "control_usage_l1": mean["delta_v_l1"] if has_delta_v else None,
         "safety_violation_rate": float(np.mean(np.asarray(episodes.violating_steps) > 0)),
         "episode_safety_violation_rate": violating / max(steps, 1e-9),
+        "episode_cost": violating,
         "episode_violation_severity_mean": mean["severity_sum"] / violating if violating else 0.0,
         "episode_violation_severity_max": float(np.max(episodes.severity_max)),
         "mean_reward": mean["episode_return"] / max(steps, 1e-9),

@@ -8,8 +8,10 @@ from jaxtyping import Array, Float
 
 from jaxsafe.config import build
 from jaxsafe.environment import Environment
+from jaxsafe.processors.constraint import SpeedLimit
 from jaxsafe.processors.observation import Observe
 from jaxsafe.processors.reward import Reward
+from jaxsafe.processors.status import Status
 from jaxsafe.processors.terminal import Timeout
 from jaxsafe.simulation.controllers import Actuator, Continuous, Controls, Discrete
 from jaxsafe.simulation.initializers import Initializer
@@ -63,8 +65,24 @@ class Match(Reward):
         return 1.0 - (point.push - 0.5 * point.position[0]) ** 2
 
 
-def probe(reward: Reward, steps: int = 1, ends: str = "terminated", discrete: bool = False) -> Environment:
-    """An episode of `steps` steps at a random sign."""
+class Hard(Status):
+    """How hard the last push was."""
+
+    def process(self, memory: Any, sim: Sim) -> Array:
+        return jnp.abs(sim.platforms["point"].push)
+
+
+class Allowed(Status):
+    most: Dimensionless
+
+    def process(self, memory: Any, sim: Sim) -> Array:
+        return self.most * jnp.ones(())
+
+
+def probe(
+    reward: Reward, steps: int = 1, ends: str = "terminated", discrete: bool = False, most: float | None = None
+) -> Environment:
+    """An episode of `steps` steps at a random sign; to push harder than `most` costs."""
     actuators = (Actuator(name="push", low=-1.0, high=1.0, points=5),)
     controller = Discrete(actuators=actuators) if discrete else Continuous(actuators=actuators)
     return build(
@@ -72,6 +90,8 @@ def probe(reward: Reward, steps: int = 1, ends: str = "terminated", discrete: bo
             agent="point",
             platforms=(Point(name="point", dimension=1, start=(Sign(name="position"),), controller=controller),),
             terminal=(Timeout(name="timeout", limit=steps - 0.5, ends=ends),),  # type: ignore[arg-type]
+            status=() if most is None else (Hard(name="hard"), Allowed(name="allowed", most=most)),
+            constraints=() if most is None else (SpeedLimit(name="push", speed="hard", velocity_limit="allowed"),),
             reward=(reward,),
             observation=(Observe(name="position", of="point", what="position"),),
         )

@@ -123,6 +123,7 @@ def test_the_metrics_of_three_episodes_are_those_worked_out_by_hand(episodes: Ep
             "control_usage_l1": 0.9 / 3,
             "safety_violation_rate": 2.0 / 3,  # episodes
             "episode_safety_violation_rate": 3.0 / 7,  # steps
+            "episode_cost": 3.0 / 3,
             "episode_violation_severity_mean": 2.6 / 3,  # over the three violating steps
             "episode_violation_severity_max": 2.0,
             "mean_reward": 3.0 / 7,

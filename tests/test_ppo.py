@@ -7,7 +7,8 @@ from probes import Constant, Match, Position, probe
 from jaxsafe.component import normalise
 from jaxsafe.environment import Environment
 from jaxsafe.train.agent import Agent
-from jaxsafe.train.ppo import PPO, TrainState, collect, discount, gae, init, learning_rate, update
+from jaxsafe.train.ppo import PPO, TrainState, collect, discount, dual_ascent, gae, init, learning_rate, update
+from jaxsafe.types import Sim
 
 AGENT = normalise(Agent(hidden=(16,)))
 SMALL = normalise(
@@ -169,3 +170,38 @@ def test_no_gradient_is_larger_than_allowed() -> None:
     after = update(env, AGENT, tiny, 10, state)  # clipped below Adam's ε: the networks hardly move
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), after.params, state.params)
     assert max(jax.tree.leaves(moved)) < 1e-6
+
+
+class Push(Match):
+    """The harder to the right, the better."""
+
+    def process(self, memory: object, sim: Sim) -> jax.Array:
+        return sim.platforms["point"].push
+
+
+@pytest.mark.parametrize(("limit", "low", "high"), [(0.5, 0.0, 0.5), (0.1, 0.0, 0.1), (5.0, 0.95, 1.0)])
+def test_costs_are_kept_within_their_limit(limit: float, low: float, high: float) -> None:
+    env = probe(Push(name="reward"), most=0.2)  # pays to break the rule; an episode of one step costs 0 or 1
+    agent, ppo = AGENT.replace(cost_critic=True), SMALL.replace(cost_limit=limit, multiplier=2.0)
+    state = train(env, 200, ppo, agent)
+    assert low <= float(jnp.mean(state.window.episodes.violating_steps)) <= high
+    assert float(state.multiplier) < 2.0  # it fell where nothing exceeded the limit
+
+
+def test_the_critic_of_costs_expects_what_a_step_costs() -> None:
+    env = probe(Constant(name="reward"), steps=3, most=-1.0)  # every push is too hard
+    agent = AGENT.replace(cost_critic=True)
+    state = train(env, 60, agent=agent)
+    assert float(agent.cost_rate(state.params, jnp.ones(1))) == pytest.approx(0.1 * (2.71 + 1.9 + 1.0) / 3, abs=0.05)
+
+
+def test_the_multiplier_follows_the_excess() -> None:
+    env = probe(Constant(name="reward"), most=-1.0)
+    state = init(env, AGENT.replace(cost_critic=True), SMALL, jax.random.key(0))
+    costs = state.window.episodes.replace(violating_steps=jnp.full(100, 3))
+    window, some, none = state.window.replace(episodes=costs, count=jnp.array(100)), jnp.array([True]), jnp.array([False])
+    rate = float(SMALL.multiplier_rate)
+    for limit, change in ((3.0, 0.0), (6.0, -0.5 * rate), (2.0, 0.5 * rate), (0.1, rate)):
+        found = dual_ascent(SMALL.replace(cost_limit=jnp.array(limit)), jnp.array(2.0), window, some)
+        assert float(found) == pytest.approx(2.0 * np.exp(change), rel=1e-5)
+        assert float(dual_ascent(SMALL, jnp.array(2.0), window, none)) == 2.0  # nothing new is known

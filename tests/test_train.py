@@ -317,3 +317,34 @@ def test_a_corrupt_checkpoint_leaves_one_line_on_standard_error(tmp_path: Path, 
     assert found.returncode == 2
     assert found.stderr.count("\n") == 1, found.stderr
     assert "checkpoint cannot be read" in found.stderr
+
+
+def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(tmp_path: Path) -> None:
+    words = [*TINY, "algorithm=ppo_lagrangian", "cost_limit=3"]
+    straight, stopped = tmp_path / "straight", tmp_path / "stopped"
+    assert command.main([*words, f"out={straight}"]) == 0
+    rows = logs(straight)["progress.jsonl"]
+    assert all(row["multiplier"] > 0.0 for row in rows if row["episodes"])
+    assert len({row["multiplier"] for row in rows}) > 3
+    policy = load_policy(straight / "policy" / "seed_0.npz")
+    assert policy(jax.random.key(0), np.zeros(6, np.float32)).shape == (2,)
+    shutil.copytree(straight, stopped)
+    last = max(int(path.name) for path in (stopped / "checkpoints").iterdir() if path.name.isdecimal())
+    shutil.rmtree(stopped / "checkpoints" / str(last))
+    (stopped / "results.json").unlink()
+    assert command.main([f"resume={stopped}"]) == 0
+    assert [row["multiplier"] for row in logs(stopped)["progress.jsonl"]] == [row["multiplier"] for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["algorithm=ppo_lagrangian"], "cost_limit: missing; the violating steps"),
+        (["cost_limit=5"], "cost_limit: plain PPO has none; add algorithm=ppo_lagrangian"),
+        (["algorithm=ppo_lagrangian", "cost_limit=0"], "cost_limit: expected a number > 0"),
+        (["algorithm=trpo"], "algorithm: found .trpo.; choose from ppo, ppo_lagrangian"),
+    ],
+)
+def test_a_cost_limit_needs_the_algorithm_for_it(words: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        command.main(["env=docking2d", *words])

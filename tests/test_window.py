@@ -1,11 +1,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxsafe
 from jaxsafe.metrics import Episode, begin
 from jaxsafe.rollout import reset_batch
-from jaxsafe.train.window import SIZE, empty_window, means, push
+from jaxsafe.train.window import SIZE, empty_window, latest_cost, means, push
 
 ENV = jaxsafe.make("docking2d")
 
@@ -53,3 +54,17 @@ def test_averages_are_over_the_filled_part_only() -> None:
     assert float(row["length"]) == 7.0
     assert float(row["success_rate"]) == float(row["outcome/success"]) == 1.0
     assert float(row["outcome/crash"]) == 0.0
+
+
+def test_the_latest_cost_is_that_of_the_last_episodes() -> None:
+    rng = np.random.default_rng(1)
+    window = empty_window(episodes_like(np.zeros(1, np.float32)))
+    assert float(latest_cost(window)) == 0.0
+    finished: list[int] = []
+    for _ in range(60):
+        costs, done = rng.integers(0, 50, (4, 2)), rng.random((4, 2)) < 0.5
+        episodes = episodes_like(np.zeros((4, 2), np.float32)).replace(violating_steps=jnp.asarray(costs, jnp.int32))
+        window = jax.jit(push)(window, episodes, jnp.asarray(done))
+        finished += costs[done].tolist()
+        assert float(latest_cost(window, 25)) == pytest.approx(np.mean(finished[-25:]))
+    assert len(finished) > 2 * SIZE

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxsafe.metrics import bootstrap_interval
-from jaxsafe.plot.figures import ALWAYS, AXES, CURVES, curve_table
+from jaxsafe.plot.figures import ALWAYS, AXES, CURVES, curve_table, panel_grid
 from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE
 
 LOOKS = tuple(product(("-", "--"), (BLUE, ORANGE, GREEN, "#CC79A7", GREY)))
@@ -25,11 +25,10 @@ def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str) 
         title: of the figure.
     """
     every = [row for rows in runs.values() for row in rows]
-    curves = [curve for curve in CURVES if curve[0] in ALWAYS or any(row[curve[0]] for row in every)]
-    figure = Figure(figsize=(3.6 * len(curves), 3.3), layout="constrained")
-    panels = figure.subplots(1, len(curves))
+    curves = [curve for curve in CURVES if curve[0] in ALWAYS or any(row.get(curve[0]) for row in every)]
+    figure, panels = panel_grid(len(curves), 3.6)
     column, label = AXES["steps"]
-    for panel, (name, quantity, factor) in zip(panels, curves, strict=True):
+    for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
         for (line, colour), (run, rows) in zip(cycle(LOOKS), runs.items(), strict=False):
             at, values = curve_table(rows, column, name)
             known = ~np.isnan(values).any(axis=1)

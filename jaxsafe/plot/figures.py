@@ -31,6 +31,7 @@ CURVES = (
     ("length", "episode length [steps]", 1.0),
     ("delta_v", "Δv per episode [m/s]", 1.0),
     ("violating_steps", "violating steps [%]", 100.0),
+    ("episode_cost", "violating steps per episode", 1.0),
 )
 ALWAYS = ("success_rate", "return", "length")
 AXES = {"steps": ("step", "environment steps per seed"), "wall": ("wall_s", "wall time [s]")}
@@ -64,11 +65,8 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
 def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figure:
     """A panel for each quantity: every seed thin, their mean, and the 95 % interval of the mean."""
     column, label = AXES[x]
-    curves = [curve for curve in CURVES if curve[0] in ALWAYS or any(row[curve[0]] for row in rows)]
-    figure = Figure(figsize=(4.2 * min(len(curves), 3), 3.1 * -(-len(curves) // 3)), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(-(-len(curves) // 3), min(len(curves), 3))).ravel()
-    for panel in panels[len(curves) :]:
-        panel.remove()
+    curves = [curve for curve in CURVES if curve[0] in ALWAYS or any(row.get(curve[0]) for row in rows)]
+    figure, panels = panel_grid(len(curves), 4.2)
     for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
         at, values = curve_table(rows, column, name)
         _curve(panel, at, factor * values)
@@ -81,6 +79,16 @@ def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figur
         panels[0].legend(loc="best", fontsize="small", frameon=False)
     figure.suptitle(f"{title}: the last 100 training episodes", fontsize="medium")
     return figure
+
+
+def panel_grid(count: int, width: float) -> tuple[Figure, np.ndarray]:
+    """A figure with as many panels, three in a row."""
+    rows, columns = -(-count // 3), min(count, 3)
+    figure = Figure(figsize=(width * columns, 3.1 * rows), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
+    for panel in panels[count:]:
+        panel.remove()
+    return figure, panels
 
 
 def trajectories(episodes: Episodes, title: str, unit: str) -> Figure:

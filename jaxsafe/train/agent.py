@@ -35,6 +35,7 @@ class Agent(Component):
     critic_sees_totals: bool = False
     """Whether the critic, which only training needs, also sees what each reward term has summed to in the episode. What a
     term will still pay may depend on that, and the observation hides it."""
+    cost_critic: bool = False  # whether a second critic expects the cost to come, as `algorithm=ppo_lagrangian` needs
 
     def init(self, key: Key, env: Environment) -> Params:
         """Return fresh parameters."""
@@ -42,10 +43,11 @@ class Agent(Component):
         outputs = sum(env.num_action_points) or env.action_size
         seen = len(env.reward) if self.critic_sees_totals else 0
         actor, critic = (inputs, *self.hidden, outputs), (inputs + seen, *self.hidden, 1)
-        normals = _normals(key, [*pairwise(actor), *pairwise(critic)])
-        params = {
-            "actor": _layers(normals[: len(actor) - 1], last_gain=0.01),
-            "critic": _layers(normals[len(actor) - 1 :], last_gain=1.0),
+        networks = {"actor": actor, "critic": critic, **({"cost_critic": critic} if self.cost_critic else {})}
+        normals = iter(_normals(key, [shape for sizes in networks.values() for shape in pairwise(sizes)]))
+        params: Params = {
+            name: _layers([next(normals) for _ in pairwise(sizes)], last_gain=0.01 if name == "actor" else 1.0)
+            for name, sizes in networks.items()
         }
         if env.num_action_points:
             return params
@@ -72,6 +74,10 @@ class Agent(Component):
     def value(self, params: Params, critic_inputs: Float[Array, "*batch c"]) -> Float[Array, "*batch"]:
         """Return the critic's V(s)."""
         return mlp(params["critic"], critic_inputs)[..., 0]
+
+    def cost_rate(self, params: Params, critic_inputs: Float[Array, "*batch c"]) -> Float[Array, "*batch"]:
+        """Return the cost critic's (1 − γ)·V_C(s): what a step costs on the average from here on, whatever the horizon."""
+        return mlp(params["cost_critic"], critic_inputs)[..., 0]
 
     def act(self, env: Environment, params: Params, key: Key, observation: Array, deterministic: Array | bool) -> Array:
         """Return an action for each observation: a sample, or the mode."""

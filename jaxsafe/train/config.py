@@ -21,6 +21,7 @@ from jaxsafe.processors.reward import Intervention
 from jaxsafe.train.agent import Agent
 from jaxsafe.train.log import tensorboard_writer
 from jaxsafe.train.ppo import PPO
+from jaxsafe.types import Dimensionless, Positive
 
 Count = Annotated[int, Range(1)]
 
@@ -29,6 +30,8 @@ class TrainConfig(Component):
     """Options of `python -m jaxsafe.train`; steps and episodes are per seed."""
 
     preset: str = "features"
+    algorithm: Literal["ppo", "ppo_lagrangian"] = "ppo"
+    cost_limit: Annotated[Dimensionless, Positive] | None = None  # of ppo_lagrangian: violating steps per episode
     seeds: Count = 1
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0  # the first; seeds=10 is seed … seed + 9
     steps: Count = 500_000
@@ -96,6 +99,7 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
         config = set_path(config, path, value, to_value)
     if config.rta_training == "corrected":
         config = set_path(config, "ppo.learns_from", "actual", to_value)
+    config = _with_algorithm(config)
     _check_rta(config, env)
     if config.ppo.batch_size % config.ppo.num_minibatches:
         raise ConfigError(
@@ -114,6 +118,17 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
     observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
     jax.eval_shape(lambda o: config.agent.inputs(env, o), observation)  # refuses features that this task cannot have
     return config, env, Path(task).stem
+
+
+def _with_algorithm(config: TrainConfig) -> TrainConfig:
+    if config.algorithm == "ppo":
+        if config.cost_limit is not None:
+            raise ConfigError("cost_limit: plain PPO has none; add algorithm=ppo_lagrangian")
+        return config
+    if config.cost_limit is None:
+        raise ConfigError("cost_limit: missing; the violating steps that an episode may have, for instance cost_limit=5")
+    agent, ppo = config.agent.replace(cost_critic=True), config.ppo.replace(cost_limit=config.cost_limit)
+    return config.replace(agent=agent, ppo=ppo)
 
 
 def _check_rta(config: TrainConfig, env: Environment) -> None:

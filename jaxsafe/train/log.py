@@ -60,7 +60,7 @@ class ProgressLog:
 def progress_rows(env: Environment, curves: dict[str, np.ndarray], seed: int, batch_size: int, wall_s: float) -> list[dict]:
     """Rows from the arrays [seeds, updates] that a chunk returns, update after update."""
     num_seeds, num_updates = curves["count"].shape
-    measured = columns(env)
+    measured = columns(env) + (["multiplier"] if "multiplier" in curves else [])
     return [
         {
             "seed": seed + i,
@@ -77,7 +77,15 @@ def progress_rows(env: Environment, curves: dict[str, np.ndarray], seed: int, ba
 
 def columns(env: Environment) -> list[str]:
     """The measured columns of the progress log, averages over the window, in order."""
-    first = ["success_rate", "return", "length", "delta_v", "violating_steps", *(["interventions"] if env.rta else [])]
+    first = [
+        "success_rate",
+        "return",
+        "length",
+        "delta_v",
+        "violating_steps",
+        "episode_cost",
+        *(["interventions"] if env.rta else []),
+    ]
     return [*first, *(f"outcome/{name}" for name in env.outcomes[1:]), *(f"reward/{term.name}" for term in env.reward)]
 
 

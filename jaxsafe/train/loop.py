@@ -178,6 +178,8 @@ def chunk(shared: tuple, state: TrainState, length: int, limit: int) -> tuple[Tr
         going = state.num_updates < limit
         state = jax.lax.cond(going, lambda s: ppo.update(env, agent, hyper, limit, s), lambda s: s, state)
         counts = {"update": state.num_updates, "count": state.window.count, "cost": state.window.cost}
+        if agent.cost_critic:
+            counts["multiplier"] = state.multiplier
         return state, {**counts, **window.means(state.window, env.outcomes)}
 
     return jax.lax.scan(one, state, None, length=length)

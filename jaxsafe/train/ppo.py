@@ -1,5 +1,8 @@
 """Proximal policy optimisation, one seed, as a pure function from training state to training state.
 
+With an agent that has a critic of the cost it is PPO-Lagrangian (Ray, Achiam and Amodei 2019): rewards less a multiplier
+times costs, and the multiplier grows while the episodes cost more than `cost_limit`.
+
 `update` reads like the algorithm: collect a batch, estimate advantages, improve the networks over some epochs. Seeds,
 devices and files are the caller's business. Hyperparameters that are numbers are leaves; sizes are structure.
 """
@@ -20,7 +23,7 @@ from jaxsafe.metrics import Episode, accumulate, begin
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 from jaxsafe.train.agent import Agent, Params
 from jaxsafe.train.shuffle import shuffle
-from jaxsafe.train.window import Window, empty_window, push
+from jaxsafe.train.window import Window, empty_window, latest_cost, push
 from jaxsafe.types import Dimensionless, Key, Positive, Record, State, TimeStep
 
 Share = Range(0.0, 1.0)
@@ -46,6 +49,9 @@ class PPO(Component):
     entropy_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.0
     max_grad_norm: Annotated[Dimensionless, Positive] = 0.5
     learns_from: Literal["desired", "actual"] = "desired"  # control, where run time assurance changed it
+    cost_limit: Annotated[Dimensionless, Positive] = 25.0  # PPO-Lagrangian: violating steps that an episode may have
+    multiplier: Annotated[Dimensionless, Positive] = 0.01  # at the start, in reward per violating step
+    multiplier_rate: Annotated[Dimensionless, Range(0.0)] = 0.03  # by which its logarithm changes in an update, at most
 
     @property
     def batch_size(self) -> int:
@@ -64,6 +70,7 @@ class TrainState(Record):
     window: Window  # the latest finished episodes
     key: Key  # of the whole run; update i uses fold_in(key, i)
     num_updates: Int[Array, ""]
+    multiplier: Any = ()  # of the cost, with PPO-Lagrangian
 
 
 class Transition(NamedTuple):
@@ -78,6 +85,7 @@ class Transition(NamedTuple):
     done: Bool[Array, "t n"]
     next_inputs: Float[Array, "t n i"]  # of the true next observation, before any reset
     episode: Episode  # sums including this step
+    cost: Any = ()  # if there is a critic of it
 
 
 class Batch(NamedTuple):
@@ -89,6 +97,7 @@ class Batch(NamedTuple):
     log_prob: Array
     advantage: Array
     value_target: Array
+    cost_target: Any = ()  # (1 − γ) times the discounted cost to come, if there is a critic of it
 
 
 def init(env: Environment, agent: Agent, ppo: PPO, key: Key) -> TrainState:
@@ -100,6 +109,7 @@ def init(env: Environment, agent: Agent, ppo: PPO, key: Key) -> TrainState:
     return TrainState(
         params, _optimizer(ppo).init(params), env_state, timestep.observation, episode,
         empty_window(episode), key_run, jnp.zeros((), jnp.int32),
+        jnp.asarray(ppo.multiplier) if agent.cost_critic else (),
     )  # fmt: skip
 
 
@@ -109,12 +119,27 @@ def update(env: Environment, agent: Agent, ppo: PPO, total_updates: Array | int,
     state, transitions = collect(env, agent, ppo, state, key_collect)
     progress = state.num_updates / total_updates
     gamma = discount(ppo, progress)
-    batch = _to_batch(agent, ppo, gamma, state.params, transitions)
+    batch = _to_batch(agent, ppo, gamma, state, transitions)
     params, optimizer = learn(env, agent, ppo, learning_rate(ppo, progress), state, batch, key_learn)
     if "log_std" in params:
         params = {**params, "log_std": params["log_std"] - ppo.noise_decay / total_updates}
     window = push(state.window, transitions.episode, transitions.done)
-    return state.replace(params=params, optimizer=optimizer, window=window, num_updates=state.num_updates + 1)
+    multiplier = dual_ascent(ppo, state.multiplier, window, transitions.done) if agent.cost_critic else ()
+    return state.replace(
+        params=params, optimizer=optimizer, window=window, num_updates=state.num_updates + 1,
+        multiplier=multiplier,
+    )  # fmt: skip
+
+
+def dual_ascent(ppo: PPO, multiplier: Array, window: Window, done: Array) -> Array:
+    """The multiplier after an update in which episodes ended: log λ rises by rate·clip(J_C/limit − 1, −1, 1).
+
+    J_C is the mean cost of the latest finished episodes. On the logarithm, because what a violating step is worth in
+    reward differs by orders of magnitude between tasks.
+    """
+    excess = jnp.clip(latest_cost(window) / ppo.cost_limit - 1.0, -1.0, 1.0)
+    following = jnp.clip(multiplier * jnp.exp(ppo.multiplier_rate * excess), 1e-4, 1e2)
+    return jnp.where(jnp.any(done), following, multiplier)
 
 
 def learning_rate(ppo: PPO, progress: Array | float) -> Array:
@@ -149,7 +174,7 @@ def collect(env: Environment, agent: Agent, ppo: PPO, state: TrainState, key: Ke
         done, episode = timestep.done, accumulate(episode, timestep)
         transition = Transition(
             inputs, totals, action, policy.log_prob(action), timestep.reward, timestep.terminated, done,
-            agent.inputs(env, timestep.observation), episode,
+            agent.inputs(env, timestep.observation), episode, timestep.cost if agent.cost_critic else (),
         )  # fmt: skip
         return (
             env_state,
@@ -214,21 +239,27 @@ def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
     value = agent.value(params, agent.critic_inputs(batch.inputs, batch.totals))
     value_error = 0.5 * (value - batch.value_target) ** 2
+    if agent.cost_critic:
+        cost_rate = agent.cost_rate(params, agent.critic_inputs(batch.inputs, batch.totals))
+        value_error += 0.5 * (cost_rate - batch.cost_target) ** 2
     entropy = policy.entropy()
     return jnp.mean(-surrogate + ppo.value_coefficient * value_error - ppo.entropy_coefficient * entropy)
 
 
-def _to_batch(agent: Agent, ppo: PPO, gamma: Array, params: Params, transitions: Transition) -> Batch:
-    """Advantages, normalised over the whole batch, and value targets; all samples in one row."""
-    t = transitions
-    value, next_value = (
-        agent.value(params, agent.critic_inputs(*seen))
-        for seen in ((t.inputs, t.totals), (t.next_inputs, t.episode.reward_totals))
-    )
+def _to_batch(agent: Agent, ppo: PPO, gamma: Array, state: TrainState, transitions: Transition) -> Batch:
+    """Advantages, normalised over the whole batch, and targets of the critics; all samples in one row."""
+    t, params = transitions, state.params
+    seen = [agent.critic_inputs(*one) for one in ((t.inputs, t.totals), (t.next_inputs, t.episode.reward_totals))]
+    value, next_value = (agent.value(params, one) for one in seen)
     advantage = gae(t.reward, value, next_value, t.terminated, t.done, gamma, ppo.gae_lambda)
-    target = advantage + value
+    target, cost_target = advantage + value, ()
+    if agent.cost_critic:
+        rate, next_rate = (agent.cost_rate(params, one) for one in seen)
+        cost_advantage = gae((1.0 - gamma) * t.cost, rate, next_rate, t.terminated, t.done, gamma, ppo.gae_lambda)
+        cost_target = cost_advantage + rate
+        advantage -= state.multiplier * cost_advantage / (1.0 - gamma)
     advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-    batch = Batch(t.inputs, t.totals, t.action, t.log_prob, advantage, target)
+    batch = Batch(t.inputs, t.totals, t.action, t.log_prob, advantage, target, cost_target)
     return jax.tree.map(lambda x: x.reshape(ppo.batch_size, *x.shape[2:]), batch)
 
 

@@ -23,6 +23,7 @@ _ROWS = (
     ("control_usage_l1", "control usage Δv, L1 [m/s]", ""),
     ("safety_violation_rate", "episodes with a violation", "%"),
     ("episode_safety_violation_rate", "violating steps", "%"),
+    ("episode_cost", "violating steps per episode", ""),
     ("episode_violation_severity_mean", "violation severity, mean", "%"),
     ("episode_violation_severity_max", "violation severity, max", "%"),
     ("intervention_rate", "steps with an intervention", "%"),

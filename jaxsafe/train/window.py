@@ -39,6 +39,13 @@ def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
     return Window(ring, window.count + order[-1] + 1, window.cost + cost)
 
 
+def latest_cost(window: Window, number: int = 25) -> Array:
+    """The mean cost, in violating steps, of the latest finished episodes; 0 while there are none."""
+    known = jnp.minimum(window.count, number)
+    age = (window.count - 1 - jnp.arange(SIZE)) % SIZE
+    return jnp.sum(jnp.where(age < known, window.episodes.violating_steps, 0)) / jnp.maximum(known, 1)
+
+
 def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:
     """Averages over the episodes in the window, by column name of the progress log; 0 while it is empty."""
     filled = jnp.arange(SIZE) < window.count
@@ -51,6 +58,7 @@ def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:
         "length": jnp.sum(weight * episodes.length),
         "delta_v": jnp.sum(weight * episodes.delta_v),
         "violating_steps": jnp.sum(weight * episodes.violating_steps / jnp.maximum(episodes.length, 1)),
+        "episode_cost": jnp.sum(weight * episodes.violating_steps),
         "interventions": jnp.sum(weight * episodes.interventions / jnp.maximum(episodes.length, 1)),
         **{f"outcome/{name}": value for name, value in share.items()},
         **{f"reward/{name}": jnp.sum(weight * total) for name, total in episodes.reward_totals.items()},
