@@ -1,0 +1,122 @@
+"""`python -m jaxsafe.export run=pretrained/docking2d format=onnx`: a policy as a file for other tools."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from jaxsafe import cli
+from jaxsafe.errors import ConfigError, nearest
+
+if TYPE_CHECKING:
+    from jaxsafe.export.functions import Exported
+
+FORMATS = ("onnx", "stablehlo", "vnnlib")
+INPUTS = ("observation", "network", "state")
+BOX = {"position": (70.0, 106.0), "velocity": (-0.28, 0.28)}
+"""Starts of the closed-loop docking property of the verification community, in m and m/s, over 40 s."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    import jax
+    import jax.numpy as jnp
+
+    from jaxsafe.export import functions
+    from jaxsafe.train.files import write_bytes
+    from jaxsafe.train.policy import PRETRAINED, find_policy, read_policy
+
+    arguments = cli.Arguments.parse(argv)
+    run, form, inputs, out = (arguments.pop_text(name) for name in ("run", "format", "inputs", "out"))
+    batch, steps, seed = arguments.pop_count("batch", 1), arguments.pop_count("steps", 40), arguments.pop_text("seed")
+    box = {word[4:]: arguments.pop(word) for word in list(arguments.options) if word.startswith("box.")}
+    arguments.refuse_rest(["run", "format", "inputs", "batch", "steps", "seed", "box.FIELD", "out"])
+    if run is None:
+        raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
+    for name, value, known in (("format", form or "onnx", FORMATS), ("inputs", inputs or "observation", INPUTS)):
+        if value not in known:
+            raise ConfigError(f"{name}: found {value!r}; choose from {nearest(value, known)}")
+    single = run.endswith(".npz") or run.startswith(PRETRAINED)
+    path = find_policy(run) if single else Path(run) / "policy" / f"seed_{seed or 0}.npz"
+    saved, stem = read_policy(path), path.stem if single else f"{Path(run).name}_{path.stem}"
+    about = {"policy": stem, "jaxsafe": "https://pypi.org/project/jaxsafe"}
+    if form == "vnnlib":
+        loops = functions.closed_loop(saved, steps, unrolled=True), functions.closed_loop(saved, steps)
+        return _vnnlib(*loops, box, Path(out or f"{stem}_closed_loop.vnnlib"), about)
+    exported = {"network": functions.network, "observation": functions.action, "state": functions.control}[
+        inputs or "observation"
+    ](saved)
+    if form == "stablehlo":
+        target = Path(out or f"{stem}.stablehlo")
+        shape = jax.export.symbolic_shape(f"batch, {len(exported.inputs)}")
+        made = jax.export.export(jax.jit(exported.function))(jax.ShapeDtypeStruct(shape, jnp.float32))
+        write_bytes(target, bytes(made.serialize()))
+    else:
+        from jaxsafe.export.onnx import write_onnx
+
+        target = Path(out or f"{stem}.onnx")
+        facts = {"inputs": ", ".join(exported.inputs), "outputs": ", ".join(exported.outputs)}
+        write_onnx(target, exported.function, (batch, len(exported.inputs)), {**about, **facts})
+    print(f"{target}: {', '.join(exported.inputs)} -> {', '.join(exported.outputs)}")
+    return 0
+
+
+def _vnnlib(unrolled: Exported, looped: Exported, given: dict[str, object], path: Path, about: dict[str, str]) -> int:
+    """Write graph and property, and say what a search for a counterexample finds."""
+    import jax
+
+    from jaxsafe.export.onnx import write_onnx
+    from jaxsafe.export.vnnlib import search, write_vnnlib
+
+    box = _box(unrolled.inputs, given)
+    graph = write_onnx(path.with_suffix(".onnx"), unrolled.function, (1, len(unrolled.inputs)), about)
+    print(f"{graph}\n{write_vnnlib(path, unrolled, box)}", flush=True)
+    worst = search(looped, box, jax.random.key(0))
+    start = ", ".join(f"{name} {value:.4g}" for name, value in zip(looped.inputs, worst.start, strict=True))
+    found = "violated" if worst.margin < 0.0 else f"no counterexample among {worst.tried:,} starts, which proves nothing"
+    print(f"least margin {worst.margin:.4g} from {start}: {found}")
+    return 0
+
+
+def _box(names: Sequence[str], given: dict[str, object]) -> list[tuple[float, float]]:
+    """The interval of each element: by its own name, its field's, or the field's without the platform."""
+    bounds, used = {**BOX, **given}, set()
+    box = []
+    for name in names:
+        parts = name.split(".")
+        keys = [name, ".".join(parts[:2]), parts[1]]
+        key = next((key for key in keys if key in bounds), None)
+        interval = bounds.get(key) if key else None
+        if not (isinstance(interval, (list, tuple)) and len(interval) == 2 and interval[0] <= interval[1]):
+            raise ConfigError(f"box.{parts[1]}: expected [low, high] for {name}, found {interval!r}")
+        used.add(key)
+        box.append((float(interval[0]), float(interval[1])))
+    for key in given:
+        if key not in used:
+            raise ConfigError(f"box.{key}: the state has no such field; it has {', '.join(names)}")
+    return box
+
+
+def usage() -> str:
+    """The help text."""
+    return (
+        "usage: python -m jaxsafe.export run=RUN [key=value …]\n\n"
+        "  run=RUN             a run directory, a policy file (.npz), or pretrained/TASK\n"
+        "  seed=N              which policy of a run (default 0)\n"
+        "  format=onnx         a graph of opset 17 with a fixed batch (default); needs jaxsafe[export]\n"
+        "  format=stablehlo    a jax.export artefact, any batch\n"
+        "  format=vnnlib       the closed loop over steps as ONNX, the property that no safety margin is negative from\n"
+        "                      any start in the box as VNN-LIB, and the worst start that a search finds\n"
+        "  inputs=observation  from the paper's observation to the action, features included (default)\n"
+        "  inputs=network      from the features to the output of the network: matrix products and tanh only\n"
+        "  inputs=state        from the state at a start to the control in physical units\n"
+        "  batch=N             (default 1)\n"
+        "  steps=N             of the closed loop (default 40)\n"
+        "  box.FIELD=[a,b]     starts of the property (default position [70, 106], velocity [-0.28, 0.28])\n"
+        "  out=FILE            (default: the policy's name)"
+    )
+
+
+if __name__ == "__main__":
+    cli.run(main, usage)

@@ -1,0 +1,121 @@
+"""What is exported of a policy: its network, its action on an observation, its control of a state, or the closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.environment import Environment, reset_to, step
+from jaxsafe.train.policy import SavedPolicy
+from jaxsafe.types import State, TimeStep
+
+Function = Callable[[Float[Array, "batch i"]], Float[Array, "batch o"]]
+
+
+class Exported(NamedTuple):
+    """A function of one batch of vectors, and what their elements mean."""
+
+    function: Function
+    inputs: tuple[str, ...]  # a name for each element
+    outputs: tuple[str, ...]
+
+
+def network(saved: SavedPolicy) -> Exported:
+    """The actor alone: from what it sees (features) to means, or logits of discrete actions."""
+    size = saved.params["actor"][0]["kernel"].shape[0]
+    count = saved.params["actor"][-1]["bias"].size
+    names = saved.env.action_names if count == saved.env.action_size else tuple(f"logit_{i}" for i in range(count))
+
+    def function(features: Array) -> Array:
+        distribution = saved.agent.distribution(saved.env, saved.params, features)
+        return distribution.mean if hasattr(distribution, "mean") else distribution.logits  # type: ignore[union-attr]
+
+    return Exported(function, tuple(f"feature_{i}" for i in range(size)), names)
+
+
+def action(saved: SavedPolicy) -> Exported:
+    """From the observation to the action that the environment takes: the mode, features included."""
+
+    def function(observation: Array) -> Array:
+        inputs = saved.agent.inputs(saved.env, observation)
+        return saved.agent.distribution(saved.env, saved.params, inputs).mode().astype(jnp.float32)
+
+    return Exported(function, saved.env.observation_names, saved.env.action_names)
+
+
+def control(saved: SavedPolicy) -> Exported:
+    """From the state at which an episode may start to the control that acts first, in physical units."""
+    act = action(saved).function
+
+    def one(start: Array) -> Array:
+        env = saved.env
+        state, timestep = reset_to(env, _placed(env, start))
+        _, following = step(env, state, _as_action(env, act(timestep.observation)))
+        return following.info.control_actual
+
+    return Exported(jax.vmap(one), state_names(saved.env), saved.env.action_names)
+
+
+def closed_loop(saved: SavedPolicy, steps: int, unrolled: bool = False) -> Exported:
+    """From the state at a start to every safety margin h at the start and after each of some steps: safe where all ≥ 0.
+
+    `unrolled` without a loop, as an ONNX graph needs it; compiled by XLA that would take minutes.
+    """
+    act, env = action(saved).function, saved.env
+
+    def margins(timestep: TimeStep) -> Array:
+        return jnp.stack([timestep.info.margins[constraint.name] for constraint in env.constraints])
+
+    def advance(carry: tuple[State, Array], _: None) -> tuple[tuple[State, Array], Array]:
+        state, timestep = step(env, carry[0], _as_action(env, act(carry[1])))
+        return (state, timestep.observation), margins(timestep)
+
+    def one(start: Array) -> Array:
+        state, timestep = reset_to(env, _placed(env, start))
+        carry, found = (state, timestep.observation), [margins(timestep)]
+        if not unrolled:
+            return jnp.concatenate([found[0], jax.lax.scan(advance, carry, None, steps)[1].ravel()])
+        for _ in range(steps):
+            carry, following = advance(carry, None)
+            found.append(following)
+        return jnp.concatenate(found)
+
+    names = tuple(f"{constraint.name}_{t}" for t in range(steps + 1) for constraint in env.constraints)
+    return Exported(jax.vmap(one), state_names(env), names)
+
+
+def state_names(env: Environment) -> tuple[str, ...]:
+    """Every number that a start draws, `platform.field` or `platform.field.axis`, in the order of the exported state."""
+    names = []
+    for path, size in _fields(env):
+        names += [path] if size == 0 else [f"{path}.{'xyz'[axis]}" for axis in range(size)]
+    return tuple(names)
+
+
+def _fields(env: Environment) -> list[tuple[str, int]]:
+    """Field by field its path and number of elements, 0 for a scalar."""
+    found = []
+    for platform in env.platforms:
+        rest = platform.rest()
+        for initializer in platform.start:
+            shape = jnp.shape(getattr(rest, initializer.name))
+            found.append((f"{platform.name}.{initializer.name}", shape[0] if shape else 0))
+    return found
+
+
+def _placed(env: Environment, start: Array) -> dict[str, dict[str, Array]]:
+    placed: dict[str, dict[str, Array]] = {}
+    at = 0
+    for path, size in _fields(env):
+        platform, field = path.split(".")
+        placed.setdefault(platform, {})[field] = start[at : at + size] if size else start[at]
+        at += size or 1
+    return placed
+
+
+def _as_action(env: Environment, action: Array) -> Array:
+    return action.astype(jnp.int32) if env.num_action_points else action

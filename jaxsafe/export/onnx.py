@@ -1,0 +1,215 @@
+"""JAX functions as ONNX graphs: each primitive becomes the ONNX operators that say the same.
+
+Only primitives that policies, features and dynamics of the tasks are made of; anything else is refused by name. Shapes are
+fixed, opset 17, float32: what verifiers and small runtimes understand.
+"""
+# pyright: reportMissingImports=false
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend import core
+
+from jaxsafe.adapters import missing
+from jaxsafe.errors import ConfigError
+from jaxsafe.train.files import write_bytes
+
+try:
+    from onnx import TensorProto, checker, helper, numpy_helper
+except ImportError:
+    raise missing("onnx", "export") from None
+
+OPSET = 17
+
+_SAME = {
+    "add": "Add", "add_any": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "max": "Max", "min": "Min", "neg": "Neg",
+    "exp": "Exp", "log": "Log", "sqrt": "Sqrt", "tanh": "Tanh", "abs": "Abs", "sin": "Sin", "cos": "Cos", "atan": "Atan",
+    "sign": "Sign", "floor": "Floor", "round": "Round", "lt": "Less", "gt": "Greater", "le": "LessOrEqual",
+    "ge": "GreaterOrEqual", "eq": "Equal", "and": "And", "or": "Or", "not": "Not", "copy": "Identity",
+    "stop_gradient": "Identity",
+}  # fmt: skip
+_INSIDE = {"jit": "jaxpr", "pjit": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
+_TYPES = {"float32": TensorProto.FLOAT, "int32": TensorProto.INT32, "bool": TensorProto.BOOL}
+
+
+def write_onnx(path: Path, function: Callable[[Any], Any], shape: Sequence[int], about: dict[str, str]) -> Path:
+    """Write `function`, of one float array of that shape, as a checked ONNX file.
+
+    The graph has one input, `input`, and one output, `output`; `about` becomes its metadata.
+
+    Raises:
+        ConfigError: the function is made of something that has no counterpart here.
+    """
+    model = to_onnx(function, shape)
+    helper.set_model_props(model, about)
+    write_bytes(path, model.SerializeToString())
+    return path
+
+
+def to_onnx(function: Callable[[Any], Any], shape: Sequence[int]) -> Any:
+    """The model of `write_onnx`."""
+    closed = jax.make_jaxpr(function)(jnp.zeros(shape, jnp.float32))
+    graph = _Graph()
+    [output] = graph.inline(closed.jaxpr, closed.consts, ["input"])
+    graph.node("Identity", [output], "output")
+    graph.prune("output")
+    [result] = closed.out_avals
+    made = helper.make_graph(
+        graph.nodes,
+        "jaxsafe",
+        [helper.make_tensor_value_info("input", TensorProto.FLOAT, shape)],
+        [helper.make_tensor_value_info("output", _TYPES[result.dtype.name], result.shape)],
+        graph.constants,
+    )
+    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jaxsafe", ir_version=8)
+    checker.check_model(model, full_check=True)
+    return model
+
+
+class _Graph:
+    def __init__(self) -> None:
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+        self._count = 0
+
+    def node(self, kind: str, inputs: Sequence[str], output: str | None = None, **attributes: Any) -> str:
+        output = output or self._name()
+        self.nodes.append(helper.make_node(kind, list(inputs), [output], **attributes))
+        return output
+
+    def constant(self, value: Any) -> str:
+        name, array = self._name(), np.asarray(value)
+        if array.dtype == np.float64:
+            array = array.astype(np.float32)
+        self.constants.append(numpy_helper.from_array(array, name))
+        return name
+
+    def integers(self, *values: int) -> str:
+        return self.constant(np.array(values, np.int64))
+
+    def inline(self, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[str]) -> list[str]:
+        """Add the equations of a jaxpr; the names of its results."""
+        names: dict[Any, str] = dict(zip(jaxpr.invars, inputs, strict=True))
+        names |= {var: self.constant(value) for var, value in zip(jaxpr.constvars, consts, strict=True)}
+        read = lambda atom: self.constant(atom.val) if isinstance(atom, core.Literal) else names[atom]  # noqa: E731
+        for equation in jaxpr.eqns:
+            results = self._equation(equation, [read(atom) for atom in equation.invars])
+            names |= dict(zip(equation.outvars, results, strict=True))
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def prune(self, *outputs: str) -> None:
+        """Leave out what nothing needs."""
+        needed, kept = set(outputs), []
+        for node in reversed(self.nodes):
+            if needed & set(node.output):
+                needed |= set(node.input)
+                kept.append(node)
+        self.nodes = kept[::-1]
+        self.constants = [constant for constant in self.constants if constant.name in needed]
+
+    def _name(self) -> str:
+        self._count += 1
+        return f"x{self._count}"
+
+    def _equation(self, equation: Any, inputs: list[str]) -> list[str]:
+        kind, params = equation.primitive.name, equation.params
+        if kind in _INSIDE:
+            inner = params[_INSIDE[kind]]
+            return self.inline(inner.jaxpr, inner.consts, inputs)
+        if kind == "and" and equation.outvars[0].aval.dtype != bool:
+            return [self._masked(inputs[0], equation.invars[1])]
+        if kind in _SAME:
+            return [self.node(_SAME[kind], inputs)]
+        if kind == "split":
+            sizes = self.integers(*params["sizes"])
+            results = [self._name() for _ in params["sizes"]]
+            self.nodes.append(helper.make_node("Split", [inputs[0], sizes], results, axis=params["axis"]))
+            return results
+        translate = getattr(self, f"_{kind}", None)
+        if translate is None:
+            raise ConfigError(f"onnx: {kind!r} has no counterpart here")
+        shapes = [tuple(atom.aval.shape) for atom in equation.invars]
+        return [translate(inputs, shapes, equation.outvars[0].aval, params)]
+
+    def _masked(self, whole: str, mask: Any) -> str:
+        """One bit m of a whole number: (x mod 2m) − (x mod m). ONNX has bitwise operators from opset 18 on only."""
+        bit = int(mask.val) if isinstance(mask, core.Literal) else 0
+        if bit <= 0 or bit & (bit - 1):
+            raise ConfigError("onnx: 'and' of whole numbers has a counterpart for one bit only")
+        high, low = (self.node("Mod", [whole, self.constant(np.int32(n))]) for n in (2 * bit, bit))
+        return self.node("Sub", [high, low])
+
+    def _iota(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
+        axis = params["dimension"]
+        along = np.arange(out.shape[axis]).reshape([-1 if i == axis else 1 for i in range(len(out.shape))])
+        return self.constant(np.broadcast_to(along, out.shape).astype(out.dtype))
+
+    def _ne(self, inputs: list[str], *_: Any) -> str:
+        return self.node("Not", [self.node("Equal", inputs)])
+
+    def _square(self, inputs: list[str], *_: Any) -> str:
+        return self.node("Mul", [inputs[0], inputs[0]])
+
+    def _integer_pow(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
+        return self.node("Pow", [inputs[0], self.constant(np.float32(params["y"]))])
+
+    def _rsqrt(self, inputs: list[str], *_: Any) -> str:
+        return self.node("Reciprocal", [self.node("Sqrt", inputs)])
+
+    def _clamp(self, inputs: list[str], *_: Any) -> str:
+        return self.node("Min", [self.node("Max", [inputs[1], inputs[0]]), inputs[2]])
+
+    def _select_n(self, inputs: list[str], *_: Any) -> str:
+        return self.node("Where", [inputs[0], inputs[2], inputs[1]])
+
+    def _convert_element_type(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
+        return self.node("Cast", inputs, to=_TYPES[out.dtype.name])
+
+    def _concatenate(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
+        return self.node("Concat", inputs, axis=params["dimension"])
+
+    def _stack(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
+        axis = params.get("axis", params.get("dimension", 0))
+        return self.node("Concat", [self.node("Unsqueeze", [one, self.integers(axis)]) for one in inputs], axis=axis)
+
+    def _reshape(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
+        return self.node("Reshape", [inputs[0], self.integers(*out.shape)])
+
+    _squeeze = _expand_dims = _reshape
+
+    def _broadcast_in_dim(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
+        aligned = [1] * len(out.shape)
+        for size, axis in zip(shapes[0], params["broadcast_dimensions"], strict=True):
+            aligned[axis] = size
+        reshaped = self.node("Reshape", [inputs[0], self.integers(*aligned)])
+        return reshaped if tuple(aligned) == out.shape else self.node("Expand", [reshaped, self.integers(*out.shape)])
+
+    def _slice(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
+        begin, end, strides = params["start_indices"], params["limit_indices"], params["strides"]
+        bounds = (begin, end, range(len(begin)), strides or [1] * len(begin))
+        return self.node("Slice", [inputs[0], *(self.integers(*one) for one in bounds)])
+
+    def _transpose(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
+        return self.node("Transpose", inputs, perm=list(params["permutation"]))
+
+    def _reduce_sum(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
+        return self.node("ReduceSum", [inputs[0], self.integers(*params["axes"])], keepdims=0)
+
+    def _reduce_max(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
+        return self.node("ReduceMax", inputs, axes=list(params["axes"]), keepdims=0)
+
+    def _argmax(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
+        [axis] = params["axes"]
+        return self.node("Cast", [self.node("ArgMax", inputs, axis=axis, keepdims=0)], to=_TYPES[out.dtype.name])
+
+    def _dot_general(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
+        (left, right), batch = params["dimension_numbers"][0], params["dimension_numbers"][1]
+        if any(batch) or tuple(left) != (len(shapes[0]) - 1,) or tuple(right) != (0,) or len(shapes[1]) > 2:
+            raise ConfigError(f"onnx: a product of shapes {shapes} over axes {left} and {right} has no counterpart here")
+        return self.node("MatMul", inputs)

@@ -1,0 +1,132 @@
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+
+import jaxsafe
+from jaxsafe.errors import ConfigError
+from jaxsafe.export import functions
+from jaxsafe.export.__main__ import main
+from jaxsafe.export.onnx import to_onnx
+from jaxsafe.export.vnnlib import search, write_vnnlib
+from jaxsafe.train.policy import SavedPolicy, find_policy, read_policy
+
+
+def saved(task: str) -> SavedPolicy:
+    return read_policy(find_policy(task))
+
+
+def run(model: Any, inputs: np.ndarray) -> np.ndarray:
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(model.SerializeToString(), options).run(None, {"input": inputs})[0]
+
+
+@pytest.mark.parametrize("task", ["docking2d", "docking3d", "docking2d_oriented", "rejoin2d", "rejoin3d"])
+def test_another_runtime_acts_alike(task: str) -> None:
+    policy = saved(task)
+    observations = np.random.default_rng(0).uniform(-1, 1, (10_000, policy.env.observation_size)).astype(np.float32)
+    expected = jaxsafe.load_policy(task)(jax.random.key(0), observations)
+    found = run(to_onnx(functions.action(policy).function, observations.shape), observations)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    network = functions.network(policy)
+    features = np.asarray(policy.agent.inputs(policy.env, jnp.asarray(observations)))
+    model = to_onnx(network.function, features.shape)
+    np.testing.assert_allclose(run(model, features), expected, atol=1e-5)
+    assert {node.op_type for node in model.graph.node} <= {"MatMul", "Add", "Tanh", "Reshape", "Expand", "Identity"}
+
+
+def test_discrete_policies_choose_alike() -> None:
+    policy = saved("docking2d")
+    env = jaxsafe.make("docking2d", actions="discrete")
+    params = policy.agent.init(jax.random.key(0), env)
+    policy = policy._replace(env=env, params=jax.tree.map(lambda x: 30.0 * x, params))
+    observations = np.random.default_rng(0).uniform(-1, 1, (500, 6)).astype(np.float32)
+    expected = policy.agent.act(env, policy.params, jax.random.key(0), jnp.asarray(observations), True)
+    found = run(to_onnx(functions.action(policy).function, observations.shape), observations)
+    assert np.mean(found == expected) > 0.999
+    assert len(np.unique(found)) >= 3
+
+
+def test_the_state_goes_in_and_the_control_comes_out() -> None:
+    policy = saved("docking2d")
+    exported = functions.control(policy)
+    assert exported.inputs == ("deputy.position.x", "deputy.position.y", "deputy.velocity.x", "deputy.velocity.y")
+    start = np.array([[80.0, -60.0, 0.1, -0.05]], np.float32)
+    env = policy.env
+    state, timestep = jaxsafe.reset_to(env, {"deputy": {"position": start[0, :2], "velocity": start[0, 2:]}})
+    _, timestep = env.step(state, jaxsafe.load_policy("docking2d")(jax.random.key(0), timestep.observation))
+    found = run(to_onnx(exported.function, start.shape), start)
+    np.testing.assert_allclose(found[0], timestep.info.control_actual, atol=1e-5)
+
+
+def test_the_closed_loop_is_the_environments_own() -> None:
+    policy = saved("docking2d")
+    start = np.array([[80.0, -60.0, 0.1, -0.05], [70.0, 106.0, -0.28, 0.28]], np.float32)
+    looped = functions.closed_loop(policy, 3)
+    expected = jax.jit(looped.function)(start)
+    found = run(to_onnx(functions.closed_loop(policy, 3, unrolled=True).function, start.shape), start)
+    np.testing.assert_allclose(found, expected, atol=1e-5)
+    assert looped.outputs == tuple(f"velocity_limit_{t}" for t in range(4))
+    speed = np.linalg.norm(start[:, 2:], axis=1)
+    limit = 0.2 + 2 * 0.001027 * np.linalg.norm(start[:, :2], axis=1)
+    np.testing.assert_allclose(expected[:, 0], limit - speed, atol=1e-6)
+
+
+def test_a_property_names_its_box_and_what_must_not_happen(tmp_path: Path) -> None:
+    exported = functions.Exported(lambda x: x, ("a", "b"), ("h_0", "h_1"))
+    text = write_vnnlib(tmp_path / "x.vnnlib", exported, [(0.5, 1.5), (-2.0, 3.0)]).read_text()
+    assert [line for line in text.splitlines() if line.startswith("(assert (")] == [
+        "(assert (>= X_0 0.5))", "(assert (<= X_0 1.5))", "(assert (>= X_1 -2.0))", "(assert (<= X_1 3.0))", "(assert (or",
+    ]  # fmt: skip
+    assert text.count("(and (<= Y_") == 2
+    assert text.count("(") == text.count(")")
+
+
+def test_a_search_finds_the_least_margin() -> None:
+    bowl = lambda x: jnp.sum((x - jnp.array([0.31, -0.7])) ** 2, axis=-1, keepdims=True) - 0.01  # noqa: E731
+    worst = search(functions.Exported(bowl, ("a", "b"), ("h",)), [(-1, 1), (-1, 1)], jax.random.key(0), starts=50)
+    assert worst.margin == pytest.approx(-0.01, abs=1e-4)
+    np.testing.assert_allclose(worst.start, [0.31, -0.7], atol=0.02)
+
+
+def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    for words in (["inputs=network", "batch=3"], ["format=stablehlo"], ["format=vnnlib", "steps=2"]):
+        assert main(["run=pretrained/docking2d", *words]) == 0
+    assert "docking2d.onnx: feature_0" in capsys.readouterr().out
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "docking2d.onnx", "docking2d.stablehlo", "docking2d_closed_loop.onnx", "docking2d_closed_loop.vnnlib",
+    }  # fmt: skip
+    onnx.checker.check_model(onnx.load("docking2d_closed_loop.onnx"), full_check=True)
+    loaded = jax.export.deserialize(bytearray(Path("docking2d.stablehlo").read_bytes()))
+    observations = np.random.default_rng(0).uniform(-1, 1, (7, 6)).astype(np.float32)
+    expected = jaxsafe.load_policy("docking2d")(jax.random.key(0), observations)
+    np.testing.assert_allclose(loaded.call(observations), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["run=pretrained/doking"], "Did you mean 'docking2d'|choose from"),
+        (["run=pretrained/docking2d", "format=torch"], "format: found 'torch'; choose from onnx, stablehlo, vnnlib"),
+        (["run=pretrained/docking2d", "inputs=image"], "inputs: found 'image'"),
+        (["run=pretrained/docking2d", "format=vnnlib", "box.speed=[0,1]"], "box.speed: the state has no such field"),
+        (["run=pretrained/docking2d", "format=vnnlib", "box.position=3"], r"box.position: expected \[low, high\]"),
+        (["run=pretrained/rejoin2d", "format=vnnlib"], r"box.heading: expected \[low, high\] for lead.heading"),
+        (["format=onnx"], "run: missing"),
+    ],
+)
+def test_mistakes_are_named(words: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        main(words)
+
+
+def test_what_has_no_counterpart_is_named() -> None:
+    with pytest.raises(ConfigError, match="onnx: 'erf' has no counterpart here"):
+        to_onnx(jax.scipy.special.erf, (1, 2))
