@@ -97,7 +97,7 @@ def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax
     return outcome, cost.sum(), margin.min()
 
 
-@pytest.mark.parametrize("page", ["compose", "extend", "extend_rta", "rta", "deviations"])
+@pytest.mark.parametrize("page", ["compose", "extend", "extend_rta", "rta", "deviations", "adapters/gymnasium"])
 def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_path: Path) -> None:
     """Blocks that begin with the name of a file are written to it; the others run in one program, in their order.
 
