@@ -205,3 +205,15 @@ def test_the_multiplier_follows_the_excess() -> None:
         found = dual_ascent(SMALL.replace(cost_limit=jnp.array(limit)), jnp.array(2.0), window, some)
         assert float(found) == pytest.approx(2.0 * np.exp(change), rel=1e-5)
         assert float(dual_ascent(SMALL, jnp.array(2.0), window, none)) == 2.0  # nothing new is known
+
+
+def test_the_kept_networks_are_those_of_training_or_their_average() -> None:
+    env = probe(Match(name="reward"))
+    plain, averaged = train(env), train(env, ppo=SMALL.replace(averaging=0.5))
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool((a == b).all()), plain.average, plain.params))
+    assert jax.tree.all(jax.tree.map(lambda a, b: bool((a == b).all()), averaged.params, plain.params))
+    few = {n: train(env, n, SMALL.replace(averaging=1.0, final_learning_rate=SMALL.learning_rate)) for n in (1, 2)}
+    start = init(env, AGENT, SMALL, jax.random.key(0)).params
+    expected = jax.tree.map(lambda a, b, c: 0.25 * a + 0.25 * b + 0.5 * c, start, few[1].params, few[2].params)
+    for found, wanted in zip(jax.tree.leaves(few[2].average), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(found, wanted, atol=1e-5)

@@ -83,7 +83,7 @@ class Training:
 
     def params(self) -> list[Any]:
         """The networks of each seed, on the host."""
-        stacked = self.mapper.gather(self.state.params)
+        stacked = self.mapper.gather(self.state.average)
         return [jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(self.config.seeds)]
 
     def evaluate_finally(self) -> dict[str, Episode]:
@@ -98,7 +98,7 @@ class Training:
         steps = self.checkpoints.steps
         if not steps:
             self.state = self.mapper.map(begin)(self.shared, self.mapper.keys(self.config.seed))
-            self.best = {"params": self.state.params, "success": self.mapper.place(jnp.full(self.mapper.padded, -1.0))}
+            self.best = {"params": self.state.average, "success": self.mapper.place(jnp.full(self.mapper.padded, -1.0))}
             return
         content, facts = self.checkpoints.restore(steps[-1], structure(self.mapper, self.env, self.config))
         self.state, self.best = content["state"], content["best"]
@@ -142,11 +142,11 @@ class Training:
         self._record(self.config.eval_episodes, final=False)
         rate = np.mean(np.asarray(episodes.outcome) == self.env.success, axis=1)
         success = self.mapper.place(jnp.asarray(self.mapper.pad(rate), jnp.float32))
-        self.best = _keep_best(self.best, {"params": self.state.params, "success": success})
+        self.best = _keep_best(self.best, {"params": self.state.average, "success": success})
 
     def _run_episodes(self, kind: str, num_episodes: int, final: bool) -> Episode:
         deterministic = kind == "deterministic"
-        episodes = self.evaluator.run(self.state.params, num_episodes, EVALUATION_SEED, deterministic)
+        episodes = self.evaluator.run(self.state.average, num_episodes, EVALUATION_SEED, deterministic)
         rows = episode_rows(self.env, episodes, self.config.seed, step=self.step, kind=kind, final=final)
         append_rows(self.run / "eval.jsonl", rows)
         return episodes

@@ -48,6 +48,7 @@ class PPO(Component):
     value_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.5
     entropy_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.0
     max_grad_norm: Annotated[Dimensionless, Positive] = 0.5
+    averaging: Annotated[Dimensionless, Share] = 0.0  # share of the training over which the kept networks are averaged
     learns_from: Literal["desired", "actual"] = "desired"  # control, where run time assurance changed it
     cost_limit: Annotated[Dimensionless, Positive] = 25.0  # PPO-Lagrangian: violating steps that an episode may have
     multiplier: Annotated[Dimensionless, Positive] = 0.01  # at the start, in reward per violating step
@@ -70,6 +71,7 @@ class TrainState(Record):
     window: Window  # the latest finished episodes
     key: Key  # of the whole run; update i uses fold_in(key, i)
     num_updates: Int[Array, ""]
+    average: Params  # of the networks over the latest updates: what is evaluated and kept
     multiplier: Any = ()  # of the cost, with PPO-Lagrangian
 
 
@@ -108,7 +110,7 @@ def init(env: Environment, agent: Agent, ppo: PPO, key: Key) -> TrainState:
     episode = begin(timestep)
     return TrainState(
         params, _optimizer(ppo).init(params), env_state, timestep.observation, episode,
-        empty_window(episode), key_run, jnp.zeros((), jnp.int32),
+        empty_window(episode), key_run, jnp.zeros((), jnp.int32), params,
         jnp.asarray(ppo.multiplier) if agent.cost_critic else (),
     )  # fmt: skip
 
@@ -125,8 +127,10 @@ def update(env: Environment, agent: Agent, ppo: PPO, total_updates: Array | int,
         params = {**params, "log_std": params["log_std"] - ppo.noise_decay / total_updates}
     window = push(state.window, transitions.episode, transitions.done)
     multiplier = dual_ascent(ppo, state.multiplier, window, transitions.done) if agent.cost_critic else ()
+    share = 1.0 / jnp.maximum(ppo.averaging * total_updates, 1.0)
+    average = jax.tree.map(lambda old, new: (1.0 - share) * old + share * new, state.average, params)
     return state.replace(
-        params=params, optimizer=optimizer, window=window, num_updates=state.num_updates + 1,
+        params=params, optimizer=optimizer, window=window, num_updates=state.num_updates + 1, average=average,
         multiplier=multiplier,
     )  # fmt: skip
 

@@ -25,7 +25,7 @@ def structure(mapper: SeedMapper, env: Environment, config: TrainConfig) -> dict
 
     state = jax.eval_shape(seeds, jax.random.key(0))
     success = jax.ShapeDtypeStruct((mapper.padded,), jnp.float32)
-    return mapper.place_like({"state": state, "best": {"params": state.params, "success": success}})
+    return mapper.place_like({"state": state, "best": {"params": state.average, "success": success}})
 
 
 def load_params(mapper: SeedMapper, run: Path, config: TrainConfig, env: Environment, which: str) -> tuple[Params, int]:
@@ -42,4 +42,4 @@ def load_params(mapper: SeedMapper, run: Path, config: TrainConfig, env: Environ
         raise ConfigError(f"checkpoint: found {which!r}; choose from {nearest(which, choices)}")
     step = int(which) if which.isdecimal() else checkpoints.steps[-1]
     content, _ = checkpoints.restore(step, structure(mapper, env, config))
-    return content["best"]["params"] if which == "best" else content["state"].params, step
+    return content["best"]["params"] if which == "best" else content["state"].average, step

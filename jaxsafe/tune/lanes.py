@@ -67,7 +67,7 @@ class Lanes:
             curves.append(self.mapper.gather({name: rows[name][:, :count] for name in ("success_rate", "count", "return")}))
             tick(count * len(some))
         curve = {name: np.concatenate([one[name] for one in curves], axis=1) for name in curves[0]}
-        sums = {kind: self._episodes(lanes, state.params, kind == "deterministic") for kind in KINDS}
+        sums = {kind: self._episodes(lanes, state.average, kind == "deterministic") for kind in KINDS}
         split = lambda table: table.reshape(self.at_once, self.seeds, *table.shape[1:])[: len(some)]  # noqa: E731
         curve, sums = jax.tree.map(split, (curve, sums))
         return [self._result(setting, *jax.tree.map(lambda x, i=i: x[i], (curve, sums))) for i, setting in enumerate(some)]
