@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from jaxsafe import cli
 from jaxsafe.train.seeds import claim_cores
 
-OPTIONS = ("run", "rta", "episodes", "seed", "checkpoint", "deterministic", "render", "out")
+OPTIONS = ("run", "env", "activation", "rta", "episodes", "seed", "checkpoint", "deterministic", "render", "out")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -19,11 +20,12 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.envs import with_rta
     from jaxsafe.errors import ConfigError
     from jaxsafe.evaluate.report import evaluate
-    from jaxsafe.evaluate.subject import load
+    from jaxsafe.evaluate.subject import load, load_foreign
     from jaxsafe.train.results import table
 
     arguments = cli.Arguments.parse(argv)
     run, out, checkpoint, rta, render = (arguments.pop_text(name) for name in ("run", "out", "checkpoint", "rta", "render"))
+    task, activation = arguments.pop_text("env"), arguments.pop_text("activation")
     changes = arguments.pop_overrides()
     episodes, seed = arguments.pop_count("episodes", 1000), arguments.pop_count("seed", 0, least=0)
     deterministic = arguments.pop("deterministic")
@@ -35,7 +37,9 @@ def main(argv: Sequence[str]) -> int:
     if render not in (None, "gif"):
         raise ConfigError(f"render: found {render!r}; choose from gif")
     kinds = {None: ("stochastic", "deterministic"), True: ("deterministic",), False: ("stochastic",)}[deterministic]
-    subject = load(run, checkpoint)
+    if run.endswith(".onnx") and task is None:
+        raise ConfigError(f"env: missing; the task in which {run} shall act, for instance env=docking2d")
+    subject = load(run, checkpoint) if task is None else load_foreign(Path(run), task, activation or "tanh")
     env = override(subject.env if rta is None else with_rta(subject.env, subject.name, rta), changes)
     request: dict[str, Any] = {
         "run": run,
@@ -54,6 +58,7 @@ def usage() -> str:
     return (
         "usage: python -m jaxsafe.evaluate run=RUN [key=value …]\n\n"
         "  run=RUN                a run directory, a policy file (.npz), or pretrained/TASK\n"
+        "  run=FILE env=TASK      a policy from elsewhere: .onnx, or .npz with kernel_0, bias_0, … (activation=tanh)\n"
         "  episodes=N             episodes of each seed (default 1000)\n"
         "  seed=N                 evaluation key: other starts and other noise (default 0, as in the run's own results)\n"
         "  checkpoint=last|best|N best is per seed by success in the evaluations during training (default last)\n"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -11,7 +11,8 @@ import numpy as np
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.episodes import longest, record_episodes, run_episodes
 from jaxsafe.metrics import METRICS, Episode, over_seeds, summarise
-from jaxsafe.train.agent import Agent, Params
+from jaxsafe.rollout import Policy
+from jaxsafe.train.agent import Params
 from jaxsafe.train.seeds import SeedMapper
 from jaxsafe.types import Key, State, TimeStep
 
@@ -24,10 +25,18 @@ RECORDED = 10
 KINDS = ("stochastic", "deterministic")
 
 
+class Acting(Protocol):
+    """What evaluation asks of an agent."""
+
+    def policy(self, env: Environment, params: Any, deterministic: Any) -> Policy:
+        """As `Agent.policy`."""
+        ...
+
+
 class Evaluator:
     """Compiled once; runs whole batches of episodes for every seed."""
 
-    def __init__(self, mapper: SeedMapper, env: Environment, agent: Agent) -> None:
+    def __init__(self, mapper: SeedMapper, env: Environment, agent: Acting) -> None:
         """Evaluate in `env`."""
         self.mapper, self.env, self.agent = mapper, env, agent
         self._shared = mapper.replicate((env, agent))

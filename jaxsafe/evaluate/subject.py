@@ -9,7 +9,9 @@ import jax
 import numpy as np
 
 from jaxsafe.environment import Environment
+from jaxsafe.envs import make
 from jaxsafe.errors import ConfigError
+from jaxsafe.evaluate.foreign import ForeignAgent, read_foreign
 from jaxsafe.train import directory
 from jaxsafe.train.agent import Agent, Params
 from jaxsafe.train.policy import PRETRAINED, find_policy, read_policy
@@ -23,11 +25,25 @@ class Subject(NamedTuple):
 
     name: str  # of the environment
     env: Environment  # in which they were trained
-    agent: Agent
+    agent: Agent | ForeignAgent
     mapper: SeedMapper
     params: Params  # [mapper.padded], placed
     facts: dict[str, Any]  # env, preset, seeds, seed (the first) and steps, for the results
     place: Path  # where evaluations of them are written
+
+
+def load_foreign(path: Path, task: str, activation: str) -> Subject:
+    """A policy that was trained elsewhere, to act in a task; see `foreign`.
+
+    Raises:
+        ConfigError: there is no such task, or the policy does not fit it.
+    """
+    env, mapper = make(task), SeedMapper(1)
+    agent, weights = read_foreign(path, env, activation)
+    params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], weights))
+    name = Path(task).stem
+    about = {"env": name, "preset": path.name, "seeds": 1, "seed": 0, "steps": 0}
+    return Subject(name, env, agent, mapper, params, about, Path("evaluations") / path.stem)
 
 
 def load(run: str, checkpoint: str | None) -> Subject:

@@ -1,0 +1,129 @@
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import onnx
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+import jaxsafe
+from jaxsafe.errors import ConfigError
+from jaxsafe.evaluate.__main__ import main
+from jaxsafe.evaluate.foreign import read_foreign
+from jaxsafe.export import functions
+from jaxsafe.export.onnx import write_onnx
+from jaxsafe.train.files import read_json
+from jaxsafe.train.policy import find_policy, read_policy
+
+
+def exported(task: str, path: Path) -> Path:
+    saved = read_policy(find_policy(task))
+    return write_onnx(path / f"{task}.onnx", functions.action(saved).function, (1, saved.env.observation_size), {})
+
+
+def as_torch_writes_it(path: Path, layers: list[tuple[np.ndarray, np.ndarray]]) -> Path:
+    """Gemm with transposed weights, and ReLU."""
+    nodes, constants, name = [], [], "obs"
+    for i, (kernel, bias) in enumerate(layers):
+        constants += [numpy_helper.from_array(kernel.T.copy(), f"w{i}"), numpy_helper.from_array(bias, f"b{i}")]
+        nodes.append(helper.make_node("Gemm", [name, f"w{i}", f"b{i}"], [f"z{i}"], transB=1))
+        name = f"z{i}"
+        if i < len(layers) - 1:
+            nodes.append(helper.make_node("Relu", [name], [f"a{i}"]))
+            name = f"a{i}"
+    sizes = layers[0][0].shape[0], layers[-1][0].shape[1]
+    values = [
+        helper.make_tensor_value_info(n, TensorProto.FLOAT, ["batch", k]) for n, k in zip(("obs", name), sizes, strict=True)
+    ]
+    onnx.save(helper.make_model(helper.make_graph(nodes, "net", values[:1], values[1:], constants)), path)
+    return path
+
+
+def random_layers(*sizes: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    rng = np.random.default_rng(0)
+    normal = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
+    return [(normal(a, b), normal(b)) for a, b in zip(sizes, sizes[1:], strict=False)]
+
+
+@pytest.mark.parametrize("task", ["docking3d", "rejoin3d"])
+def test_what_was_exported_comes_back(task: str, tmp_path: Path) -> None:
+    env = jaxsafe.make(task)
+    agent, weights = read_foreign(exported(task, tmp_path), env)
+    observations = np.random.default_rng(0).uniform(-1, 1, (200, env.observation_size)).astype(np.float32)
+    found = jax.jit(agent.policy(env, weights, True))(jax.random.key(0), observations)
+    np.testing.assert_allclose(found, jaxsafe.load_policy(task)(jax.random.key(0), observations), atol=2e-5)
+
+
+def test_networks_of_other_libraries_are_understood(tmp_path: Path) -> None:
+    env, layers = jaxsafe.make("docking2d"), random_layers(6, 16, 8, 2)
+    observations = np.random.default_rng(1).normal(size=(50, 6)).astype(np.float32)
+    expected = observations
+    for i, (kernel, bias) in enumerate(layers):
+        expected = expected @ kernel + bias
+        expected = np.maximum(expected, 0.0) if i < 2 else expected
+    arrays = {f"kernel_{i}": kernel for i, (kernel, _) in enumerate(layers)}
+    arrays |= {f"bias_{i}": bias for i, (_, bias) in enumerate(layers)}
+    np.savez(tmp_path / "net.npz", **arrays)
+    for path in (as_torch_writes_it(tmp_path / "net.onnx", layers), tmp_path / "net.npz"):
+        agent, weights = read_foreign(path, env, "relu")
+        found = agent.policy(env, weights, True)(jax.random.key(0), jnp.asarray(observations))
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_discrete_networks_give_logits(tmp_path: Path) -> None:
+    env = jaxsafe.make("docking2d", actions="discrete")
+    agent, weights = read_foreign(as_torch_writes_it(tmp_path / "net.onnx", random_layers(6, 8, 22)), env)
+    found = agent.policy(env, weights, True)(jax.random.key(0), jnp.ones((3, 6)))
+    assert found.shape == (3, 2)
+    assert found.dtype == jnp.int32
+
+
+def test_an_evaluation_of_it_is_that_of_the_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    exported("docking2d", tmp_path)
+    words = ["episodes=20", "deterministic=true", "env.terminal.timeout.limit=60"]
+    assert main(["run=docking2d.onnx", "env=docking2d", "out=theirs", *words]) == 0
+    assert main(["run=pretrained/docking2d", "out=ours", *words]) == 0
+    theirs, ours = (
+        read_json(tmp_path / name / "results.json")["evaluation"]["deterministic"] for name in ("theirs", "ours")
+    )
+    for metric in ("average_return", "episode_length", "control_usage"):
+        assert theirs[metric]["mean"] == pytest.approx(ours[metric]["mean"], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (
+            lambda path: as_torch_writes_it(path / "x.onnx", random_layers(5, 2)),
+            "does not take an observation of 6 numbers",
+        ),
+        (
+            lambda path: as_torch_writes_it(path / "x.onnx", random_layers(6, 3)),
+            r"expected 2 outputs \(thrust_x, thrust_y\)",
+        ),
+        (lambda path: path / "none.onnx", "none.onnx: cannot be read"),
+        (lambda path: path / "none.npz", "none.npz: cannot be read: No such file"),
+    ],
+)
+def test_what_does_not_fit_is_named(make: Any, message: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=message):
+        read_foreign(make(tmp_path), jaxsafe.make("docking2d"))
+
+
+def test_more_mistakes_are_named(tmp_path: Path) -> None:
+    env = jaxsafe.make("docking2d")
+    np.savez(tmp_path / "x.npz", w=np.ones(3))
+    with pytest.raises(ConfigError, match="expected kernel_0, bias_0, kernel_1, …, found w"):
+        read_foreign(tmp_path / "x.npz", env)
+    with pytest.raises(ConfigError, match="activation: found 'gelu'; choose from"):
+        read_foreign(tmp_path / "x.npz", env, "gelu")
+    with pytest.raises(ConfigError, match=r"env: missing; the task in which x\.onnx shall act"):
+        main(["run=x.onnx"])
+    node = helper.make_node("Erf", ["obs"], ["out"])
+    values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 6]) for name in ("obs", "out")]
+    onnx.save(helper.make_model(helper.make_graph([node], "net", values[:1], values[1:])), tmp_path / "erf.onnx")
+    with pytest.raises(ConfigError, match="the operator Erf is not known here"):
+        read_foreign(tmp_path / "erf.onnx", env)
