@@ -1,0 +1,87 @@
+"""OmniSafe's PPO-Lagrangian learns docking2d under a budget of violations.
+
+OmniSafe 0.5 asks for Safety-Gymnasium, which is tied to Gymnasium 0.28.1, and for pandas 2.0.3; neither is needed here:
+
+    pip install 'jaxsafe' torch tensorboard wandb moviepy typer seaborn pandas gdown rich xmltodict
+    pip install --no-deps omnisafe
+    python examples/omnisafe_docking2d.py
+"""
+
+from __future__ import annotations
+
+import sys
+import types
+from typing import Any, ClassVar
+
+import torch
+
+from jaxsafe.adapters.safety_gymnasium import SafetyEnv
+
+sys.modules.setdefault("safety_gymnasium", types.ModuleType("safety_gymnasium"))  # OmniSafe imports it for its own tasks
+import omnisafe  # noqa: E402
+from omnisafe.envs.core import CMDP, env_register  # noqa: E402
+
+
+@env_register
+class Docking(CMDP):
+    """The compiled batch with OmniSafe's tensors."""
+
+    _support_envs: ClassVar[list[str]] = ["jaxsafe-docking2d"]
+    need_auto_reset_wrapper = False
+    need_time_limit_wrapper = False
+
+    def __init__(self, env_id: str, num_envs: int = 1, device: str = "cpu", **options: Any) -> None:
+        """Make as many environments."""
+        super().__init__(env_id)
+        self._env = SafetyEnv(env_id.removeprefix("jaxsafe-"), num_envs, **options)
+        self._num_envs, self._device, self._metadata = num_envs, device, self._env.metadata
+        self._action_space = self._env.env.single_action_space
+        self._observation_space = self._env.env.single_observation_space
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Of the task itself."""
+        return 2001
+
+    def step(self, action: torch.Tensor) -> tuple:
+        """Six values."""
+        *found, info = self._env.step(action.detach().cpu().numpy())
+        if "final_observation" in info:
+            info["final_observation"] = self._tensor(info["final_observation"])
+        return *(self._tensor(x) for x in found), info
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[torch.Tensor, dict]:
+        """Start every lane."""
+        observation, info = self._env.reset(seed=seed, options=options)
+        return self._tensor(observation), info
+
+    def set_seed(self, seed: int) -> None:
+        """Begin the chains of keys."""
+        self.reset(seed=seed)
+
+    def render(self) -> Any:
+        """Nothing without a render mode."""
+        return self._env.render()
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+    def _tensor(self, array: Any) -> torch.Tensor:
+        return torch.as_tensor(array, dtype=torch.float32, device=self._device)
+
+
+def train(steps: int = 500_000, cost_limit: float = 5.0) -> Any:
+    """PPO-Lagrangian with OmniSafe's own settings but for sizes and the budget."""
+    agent = omnisafe.Agent("PPOLag", "jaxsafe-docking2d", custom_cfgs={
+        "train_cfgs": {"total_steps": steps, "vector_env_nums": 16, "torch_threads": 1},
+        "algo_cfgs": {"steps_per_epoch": 16_384, "update_iters": 10, "batch_size": 1024, "gamma": 0.98, "cost_gamma": 0.98,
+                      "obs_normalize": False, "entropy_coef": 0.0},
+        "lagrange_cfgs": {"cost_limit": cost_limit},
+        "logger_cfgs": {"use_wandb": False, "use_tensorboard": False, "save_model_freq": 10_000},
+    })  # fmt: skip
+    agent.learn()
+    return agent
+
+
+if __name__ == "__main__":
+    train(*map(int, sys.argv[1:2]))
