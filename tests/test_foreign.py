@@ -1,3 +1,4 @@
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ def as_torch_writes_it(path: Path, layers: list[tuple[np.ndarray, np.ndarray]]) 
 def random_layers(*sizes: int) -> list[tuple[np.ndarray, np.ndarray]]:
     rng = np.random.default_rng(0)
     normal = lambda *shape: rng.normal(size=shape).astype(np.float32)  # noqa: E731
-    return [(normal(a, b), normal(b)) for a, b in zip(sizes, sizes[1:], strict=False)]
+    return [(normal(a, b), normal(b)) for a, b in itertools.pairwise(sizes)]
 
 
 @pytest.mark.parametrize("task", ["docking3d", "rejoin3d"])
