@@ -112,7 +112,7 @@ class GymEnv(gym.Env[np.ndarray, np.ndarray]):
         return self._frames.draw()
 
     def _receive(self, packed: Array) -> tuple[np.ndarray, float, bool, bool, dict]:
-        timestep = self._unpack(np.asarray(packed))
+        timestep = self._unpack(packed)
         if self._frames is not None:
             self._frames.add(jax.device_get(self._state.sim), timestep.info.margins)
         info = jax.tree.map(
@@ -157,6 +157,8 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._limit = _checked_limit(max_episode_steps)
         self._lanes: Any = None  # until the first reset
+        self._over = np.zeros(self.num_envs, bool)
+        self._unpack = _Unpacker(self.env)
         self._frames = [Frames(self.env) for _ in range(self.num_envs)] if render_mode else []
 
     def reset(
@@ -173,8 +175,9 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             seeded = mask & np.array([one is not None for one, _ in seeds])
             keys = _keys([one or 0 for one, _ in seeds])
             self._lanes = restart(self.env, mask, seed_lanes(self._lanes, seeded, keys))
-        timestep = jax.device_get(self._lanes.timestep)
-        self._film(mask)
+        timestep = self._unpack(_pack_lanes(self._lanes.timestep))
+        self._over = np.where(mask, False, self._over)
+        self._film(mask, timestep)
         return np.array(timestep.observation), _masked(facts(self.env, timestep), mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
@@ -186,22 +189,23 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         if self._lanes is None:
             raise ResetNeeded("step: call reset first")
-        over = np.asarray(self._lanes.timestep.done)
+        over = self._over
         if self.autoreset_mode is AutoresetMode.DISABLED and over.any():
             lanes = np.flatnonzero(over).tolist()
             raise ResetNeeded(f"step: the episodes of lanes {lanes} are over; reset them with options={{'reset_mask': …}}")
         action = _checked_action(self.env, actions)
         if action.shape != self.action_space.shape:
             raise ConfigError(f"actions: expected shape {self.action_space.shape}, found {action.shape}")
-        self._lanes, taken = advance(self.env, self._lanes, action, self._limit, self.autoreset_mode)
-        taken, now = jax.device_get((taken, self._lanes.timestep))
-        done, everywhere = taken.terminated | taken.truncated, np.ones(self.num_envs, bool)
+        self._lanes, packed, ended = advance(self.env, self._lanes, action, self._limit, self.autoreset_mode)
+        now = self._unpack(packed)
+        taken = now if ended is None else self._unpack(ended)  # differ where a lane has started anew in the same step
+        self._over, everywhere = taken.terminated | taken.truncated, np.ones(self.num_envs, bool)
         infos = _masked(facts(self.env, now), everywhere)
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and done.any():
+        if ended is not None and self._over.any():
             final = {"final_obs": np.array(taken.observation), "final_info": facts(self.env, taken)}
-            infos |= _masked(final, done)
-        restarted = {AutoresetMode.NEXT_STEP: over, AutoresetMode.SAME_STEP: done}
-        self._film(restarted.get(self.autoreset_mode, ~everywhere))
+            infos |= _masked(final, self._over)
+        restarted = {AutoresetMode.NEXT_STEP: over, AutoresetMode.SAME_STEP: self._over}
+        self._film(restarted.get(self.autoreset_mode, ~everywhere), now)
         rewards = taken.reward.astype(np.float64)
         return np.array(now.observation), rewards, np.array(taken.terminated), np.array(taken.truncated), infos
 
@@ -226,11 +230,11 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         entropy: Any = self.np_random_seed
         return [(one, entropy + lane) for lane, one in enumerate(base)]
 
-    def _film(self, restarted: np.ndarray) -> None:
+    def _film(self, restarted: np.ndarray, timestep: TimeStep) -> None:
         """Remember what pictures show."""
         if not self._frames:
             return
-        sim, margins = jax.device_get((self._lanes.state.sim, self._lanes.timestep.info.margins))
+        sim, margins = jax.device_get(self._lanes.state.sim), timestep.info.margins
         for lane, frames in enumerate(self._frames):
             if restarted[lane]:
                 frames.clear()
@@ -269,20 +273,22 @@ def seed_lanes(lanes: Lanes, mask: Array, keys: Key) -> Lanes:
 
 
 @functools.partial(jax.jit, static_argnames="mode")
-def advance(env: Environment, lanes: Lanes, action: Array, limit: float, mode: AutoresetMode) -> tuple[Lanes, TimeStep]:
-    """One step of every lane: what is to be acted on next, and the time step taken.
+def advance(
+    env: Environment, lanes: Lanes, action: Array, limit: float, mode: AutoresetMode
+) -> tuple[Lanes, Array, Array | None]:
+    """One step of every lane: the lanes, the time steps to act on next, and with `SameStep` those that ended, packed.
 
-    With `NextStep` a lane whose episode is over starts anew instead, and that start is the time step taken.
+    With `NextStep` a lane whose episode is over starts anew instead of taking the step.
     """
     state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, lanes.state, action)
     timestep = cut_short(state, timestep, limit)
     taken = lanes.replace(state=state, timestep=timestep)
     if mode is AutoresetMode.NEXT_STEP:
         taken = restart(env, lanes.timestep.done, taken)
-        return taken, taken.timestep
     if mode is AutoresetMode.SAME_STEP:
-        return restart(env, timestep.done, taken), timestep
-    return taken, timestep
+        following = restart(env, timestep.done, taken)
+        return following, _pack_lanes(following.timestep), _pack_lanes(timestep)
+    return taken, _pack_lanes(taken.timestep), None
 
 
 def _start(env: Environment, key: Key) -> tuple[Key, State, TimeStep]:
@@ -310,6 +316,14 @@ def _pack(timestep: TimeStep) -> Array:
 _pack_one = jax.jit(_pack)
 
 
+@jax.jit
+def _pack_lanes(timestep: TimeStep) -> Array:
+    """All numbers of a batch, [numbers, num_envs]."""
+    number = timestep.reward.shape[0]
+    dtype = jnp.result_type(float)
+    return jnp.concatenate([x.reshape(number, -1).astype(dtype).T for x in jax.tree.leaves(timestep)])
+
+
 class _Unpacker:
     """The inverse of `_pack`, on the host."""
 
@@ -318,8 +332,10 @@ class _Unpacker:
         ends = np.cumsum([shape.size for shape in shapes]).tolist()
         self._parts = [(end - shape.size, end, shape.shape, shape.dtype) for shape, end in zip(shapes, ends, strict=True)]
 
-    def __call__(self, packed: np.ndarray) -> TimeStep:
-        leaves = [packed[a:b].reshape(shape).astype(dtype) for a, b, shape, dtype in self._parts]
+    def __call__(self, packed: Array) -> Any:  # a TimeStep of NumPy arrays
+        host = np.asarray(packed)
+        lanes = host.shape[1:]  # () of a single environment
+        leaves = [host[a:b].T.reshape((*lanes, *shape)).astype(dtype, copy=False) for a, b, shape, dtype in self._parts]
         return jax.tree.unflatten(self._structure, leaves)
 
 
@@ -376,10 +392,12 @@ _FACTS = (
 
 def _masked(found: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
     """Gymnasium's form of a batch of infos: beside each entry, under `_` and its name, which lanes have it."""
+    mask = mask.copy()  # one for all, since it must not change
+    mask.setflags(write=False)
     masked = {}
     for name, value in found.items():
         masked[name] = _masked(value, mask) if isinstance(value, Mapping) else np.asarray(value)
-        masked[f"_{name}"] = mask.copy()
+        masked[f"_{name}"] = mask
     return masked
 
 

@@ -1,0 +1,186 @@
+"""How fast are the tasks through Gymnasium, and what does each adapter cost beside the pure functions?
+
+Steps a second with actions chosen beforehand: `GymVectorEnv` at some numbers of environments; Gymnasium's SyncVectorEnv of
+the same task; Gymnasium's NumPy-vectorised CartPole; EnvPool's CartPole, where it is installed; the pure step with
+automatic reset called from Python in the same way; and the adapters for gymnax and Brax where those are. Compile time
+apart; the median of some repeats, in turns. Writes `benchmarks/results/adapters.json` and prints a table:
+
+    python benchmarks/adapters.py [task=docking2d] [envs=1,64,1024,4096] [repeats=5]
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import jax
+import jax.numpy as jnp
+import numpy as np
+from gymnasium.vector import SyncVectorEnv
+from machine import about
+
+import jaxsafe
+from jaxsafe.adapters.gymnasium import GymEnv, GymVectorEnv
+from jaxsafe.rollout import reset_batch, step_or_reset_batch
+
+OUT = Path(__file__).parent / "results" / "adapters.json"
+SECONDS = 1.0
+"""About how long one measurement takes."""
+
+Step = Callable[[], Any]
+
+
+def main() -> None:
+    """Run, write, print."""
+    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
+    task, repeats = options.get("task", "docking2d"), int(options.get("repeats", "5"))
+    numbers = [int(number) for number in options.get("envs", "1,64,1024,4096").split(",")]
+    results = [{"envs": number, **measure(peers(task, number), number, repeats)} for number in numbers]
+    OUT.parent.mkdir(exist_ok=True)
+    OUT.write_text(json.dumps({**about(), "gymnasium": gym.__version__, "task": task, "runs": results}, indent=1) + "\n")
+    print(table(results))
+
+
+def peers(task: str, number: int) -> dict[str, Step]:
+    """A function that takes one step of all environments, by name."""
+    found = {
+        "pure functions, called from Python": pure(task, number),
+        "GymVectorEnv": vector(GymVectorEnv(task, number, autoreset_mode="SameStep")),
+        "Gymnasium CartPole, NumPy": vector(gym.make_vec("CartPole-v1", num_envs=number)),
+    }
+    if number == 1:
+        found["GymEnv"] = single(GymEnv(task))
+    if number <= 64:
+        found["SyncVectorEnv of GymEnv"] = vector(SyncVectorEnv([lambda: GymEnv(task)] * number))
+    for name, package, build in (
+        ("EnvPool CartPole", "envpool", envpool_cartpole),
+        ("GymnaxEnv", "gymnax", gymnax_env),
+        ("BraxEnv", "brax", brax_env),
+    ):
+        if importlib.util.find_spec(package):
+            found[name] = build(task, number)
+    return found
+
+
+def pure(task: str, number: int) -> Step:
+    """The compiled step with automatic reset."""
+    env = jaxsafe.make(task)
+    step = jax.jit(step_or_reset_batch)
+    state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(0), number)
+    action, key = np.random.default_rng(0).uniform(-1, 1, (number, env.action_size)).astype(np.float32), jax.random.key(1)
+
+    def one() -> Any:
+        nonlocal state
+        (state, observation), timestep = step(env, state, action, key)
+        return np.asarray(observation), np.asarray(timestep.reward), np.asarray(timestep.terminated)
+
+    return one
+
+
+def vector(env: Any) -> Step:
+    """A Gymnasium vector environment."""
+    env.reset(seed=0)
+    env.action_space.seed(0)
+    action = env.action_space.sample()
+    return lambda: env.step(action)
+
+
+def single(env: gym.Env) -> Step:
+    """A single Gymnasium environment, reset where its episode ends."""
+    env.reset(seed=0)
+    action = env.action_space.sample()
+
+    def one() -> None:
+        *_, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            env.reset()
+
+    return one
+
+
+def envpool_cartpole(task: str, number: int) -> Step:
+    """CartPole-v1 in C++ threads."""
+    envpool = importlib.import_module("envpool")
+    env = envpool.make("CartPole-v1", env_type="gymnasium", num_envs=number, seed=0)
+    env.reset()
+    action = np.ones(number, np.int32)
+    return lambda: env.step(action)
+
+
+def gymnax_env(task: str, number: int) -> Step:
+    """The gymnax adapter, mapped over lanes."""
+    env = importlib.import_module("jaxsafe.adapters.gymnax").GymnaxEnv(task)
+    params, keys = env.default_params, jax.random.split(jax.random.key(0), number)
+    _, state = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
+    step, action = jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None))), jnp.zeros((number, env.env.action_size))
+
+    def one() -> Any:
+        nonlocal state
+        observation, state, reward, *_ = step(keys, state, action, params)
+        return np.asarray(observation), np.asarray(reward)
+
+    return one
+
+
+def brax_env(task: str, number: int) -> Step:
+    """The Brax adapter with fresh starts."""
+    brax = importlib.import_module("jaxsafe.adapters.brax")
+    env = brax.wrap(brax.BraxEnv(task), 10_000)
+    state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), number))
+    step, action = jax.jit(env.step), jnp.zeros((number, env.action_size))
+
+    def one() -> Any:
+        nonlocal state
+        state = step(state, action)
+        return np.asarray(state.obs), np.asarray(state.reward)
+
+    return one
+
+
+def measure(found: dict[str, Step], number: int, repeats: int) -> dict[str, Any]:
+    """Steps a second of each, in turns so that a slow moment of the machine hits all."""
+    counts, first = {}, {}
+    for name, step in found.items():
+        begin = time.perf_counter()
+        step()
+        first[name] = time.perf_counter() - begin
+        begin = time.perf_counter()
+        for _ in range(10):
+            step()
+        counts[name] = max(10, int(SECONDS / repeats * 10 / (time.perf_counter() - begin)))
+    rates: dict[str, list[float]] = {name: [] for name in found}
+    for _ in range(repeats):
+        for name, step in found.items():
+            begin = time.perf_counter()
+            for _ in range(counts[name]):
+                step()
+            rates[name].append(number * counts[name] / (time.perf_counter() - begin))
+    return {
+        "steps_per_s": {name: round(statistics.median(values), 1) for name, values in rates.items()},
+        "slowest": {name: round(min(values), 1) for name, values in rates.items()},
+        "fastest": {name: round(max(values), 1) for name, values in rates.items()},
+        "first_step_s": {name: round(value, 2) for name, value in first.items()},
+    }
+
+
+def table(results: list[dict[str, Any]]) -> str:
+    """Markdown: thousand steps a second."""
+    names = dict.fromkeys(name for run in results for name in run["steps_per_s"])
+    lines = ["| thousand steps/s | " + " | ".join(f"{run['envs']:,}" for run in results) + " |"]
+    lines.append("|---|" + "---|" * len(results))
+    for name in names:
+        cells = [f"{run['steps_per_s'][name] / 1e3:.3g}" if name in run["steps_per_s"] else "–" for run in results]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
