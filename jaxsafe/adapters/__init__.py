@@ -42,6 +42,10 @@ def observation_bounds(env: Environment) -> tuple[list[float], list[float]]:
     return [low for low, _ in bounds], [high for _, high in bounds]
 
 
-def missing(package: str, extra: str) -> ImportError:
+class MissingError(ConfigError, ImportError):
+    """A package of an extra is not installed."""
+
+
+def missing(package: str, extra: str) -> MissingError:
     """What to raise where a package of an extra is not installed."""
-    return ImportError(f"{package} is not installed; pip install 'jaxsafe[{extra}]'", name=package)
+    return MissingError(f"{package} is not installed; pip install 'jaxsafe[{extra}]'")

@@ -1,0 +1,38 @@
+import importlib
+import sys
+
+import pytest
+
+from jaxsafe.adapters import observation_bounds
+from jaxsafe.envs import make
+
+
+@pytest.mark.parametrize(
+    ("module", "blocked", "message"),
+    [
+        ("jaxsafe.adapters.brax", "brax.envs.base", r"brax is not installed; pip install 'jaxsafe\[brax\]'"),
+        ("jaxsafe.adapters.gymnax", "gymnax.environments", r"gymnax is not installed; pip install 'jaxsafe\[gymnax\]'"),
+        (
+            "jaxsafe.adapters.stable_baselines3",
+            "stable_baselines3.common.vec_env",
+            r"stable_baselines3 is not installed; pip install 'jaxsafe\[sb3\]'",
+        ),
+        ("jaxsafe.export.onnx", "onnx", r"onnx is not installed; pip install 'jaxsafe\[export\]'"),
+    ],
+)
+def test_a_missing_package_names_its_extra(
+    module: str, blocked: str, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, blocked, None)
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    with pytest.raises(ImportError, match=message):
+        importlib.import_module(module)
+
+
+def test_observations_are_bounded_where_they_are_clipped() -> None:
+    env = make("docking2d", {"observation.speed.clip": [-1.0, 2.0]})
+    low, high = observation_bounds(env)
+    assert len(low) == len(high) == env.observation_size
+    at = env.observation_names.index("speed")
+    assert (low[at], high[at]) == (-1.0, 2.0)
+    assert set(low[:at]) == {-float("inf")}
