@@ -127,15 +127,21 @@ class _Graph:
         if kind in _SAME:
             return [self.node(_SAME[kind], inputs)]
         if kind == "split":
-            sizes = self.integers(*params["sizes"])
-            results = [self._name() for _ in params["sizes"]]
-            self.nodes.append(helper.make_node("Split", [inputs[0], sizes], results, axis=params["axis"]))
-            return results
+            return self._pieces(inputs[0], params["sizes"], params["axis"])
+        if kind == "unstack":
+            pieces = self._pieces(inputs[0], [1] * len(equation.outvars), params["axis"])
+            shape = self.integers(*equation.outvars[0].aval.shape)
+            return [self.node("Reshape", [piece, shape]) for piece in pieces]
         translate = getattr(self, f"_{kind}", None)
         if translate is None:
             raise ConfigError(f"onnx: {kind!r} has no counterpart here")
         shapes = [tuple(atom.aval.shape) for atom in equation.invars]
         return [translate(inputs, shapes, equation.outvars[0].aval, params)]
+
+    def _pieces(self, whole: str, sizes: Sequence[int], axis: int) -> list[str]:
+        results = [self._name() for _ in sizes]
+        self.nodes.append(helper.make_node("Split", [whole, self.integers(*sizes)], results, axis=axis))
+        return results
 
     def _masked(self, whole: str, mask: Any) -> str:
         """One bit m of a whole number: (x mod 2m) − (x mod m). ONNX has bitwise operators from opset 18 on only."""
