@@ -162,7 +162,7 @@ def test_help_names_the_options(module: str, capsys: pytest.CaptureFixture[str],
 
 
 def test_import_draws_in_only_what_the_core_needs() -> None:
-    heavy = ("yaml", "orbax", "optax", "matplotlib", "gymnasium", "flax", "tqdm")
+    heavy = ("yaml", "orbax", "optax", "matplotlib", "jaxsafe.adapters.gymnasium", "flax", "tqdm")
     code = f"import sys, jaxsafe; print([name for name in {heavy} if name in sys.modules])"
     found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert found.stdout.strip() == "[]"
