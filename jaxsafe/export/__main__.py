@@ -24,6 +24,7 @@ def main(argv: Sequence[str]) -> int:
     import jax.numpy as jnp
 
     from jaxsafe.export import functions
+    from jaxsafe.train.directory import versions
     from jaxsafe.train.files import write_bytes
     from jaxsafe.train.policy import PRETRAINED, find_policy, read_policy
 
@@ -40,7 +41,7 @@ def main(argv: Sequence[str]) -> int:
     single = run.endswith(".npz") or run.startswith(PRETRAINED)
     path = find_policy(run) if single else Path(run) / "policy" / f"seed_{seed or 0}.npz"
     saved, stem = read_policy(path), path.stem if single else f"{Path(run).name}_{path.stem}"
-    about = {"policy": stem, "jaxsafe": "https://pypi.org/project/jaxsafe"}
+    about = {"policy": stem, "jaxsafe": versions()["jaxsafe"]}
     if form == "vnnlib":
         loops = functions.closed_loop(saved, steps, unrolled=True), functions.closed_loop(saved, steps)
         return _vnnlib(*loops, box, Path(out or f"{stem}_closed_loop.vnnlib"), about)
