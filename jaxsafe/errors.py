@@ -26,3 +26,12 @@ def part(*path: str) -> Iterator[None]:
     except Exception as error:
         error.add_note("in " + ".".join(path))
         raise
+
+
+class MissingError(ConfigError, ImportError):
+    """A package of an extra is not installed."""
+
+
+def missing(package: str, extra: str) -> MissingError:
+    """What to raise where a package of an extra is not installed."""
+    return MissingError(f"{package} is not installed; pip install 'jaxsafe[{extra}]'")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,8 @@ from jaxtyping import Array
 
 from jaxsafe.environment import Environment, reset, step
 from jaxsafe.types import Key, State, TimeStep
+
+Tree = TypeVar("Tree")
 
 Policy = Callable[[Key, Array], Array]
 """`policy(key, observation) -> action`, batched where the observations are."""
@@ -59,7 +62,7 @@ def step_or_reset(env: Environment, state: State, action: Array, key: Key) -> tu
 def restarted(env: Environment, state: State, timestep: TimeStep, key: Key) -> tuple[State, Array]:
     """State and observation to go on from: a fresh start where the time step ended the episode."""
     fresh_state, fresh = reset(env, key)
-    return _where(timestep.done, (fresh_state, fresh.observation), (state, timestep.observation))
+    return choose(timestep.done, (fresh_state, fresh.observation), (state, timestep.observation))
 
 
 def reset_batch(env: Environment, key: Key, num_envs: int) -> tuple[State, TimeStep]:
@@ -81,7 +84,7 @@ def step_or_reset_batch(
 
     def draw(old: tuple[State, Array]) -> tuple[State, Array]:
         fresh_state, fresh = reset_batch(env, key, done.shape[0])
-        return _where(done, (fresh_state, fresh.observation), old)
+        return choose(done, (fresh_state, fresh.observation), old)
 
     return jax.lax.cond(jnp.any(done), draw, lambda old: old, (state, timestep.observation)), timestep
 
@@ -92,5 +95,6 @@ def cut_short(state: State, timestep: TimeStep, max_episode_steps: Array | float
     return timestep.replace(truncated=timestep.truncated | cut)
 
 
-def _where(done: Array, fresh: tuple[State, Array], old: tuple[State, Array]) -> tuple[State, Array]:
-    return jax.tree.map(lambda a, b: jnp.where(done.reshape(done.shape + (1,) * (a.ndim - done.ndim)), a, b), fresh, old)
+def choose(where: Array, fresh: Tree, old: Tree) -> Tree:
+    """One of two trees lane by lane; `where` has the leading axes of all their leaves."""
+    return jax.tree.map(lambda a, b: jnp.where(where.reshape(where.shape + (1,) * (a.ndim - where.ndim)), a, b), fresh, old)

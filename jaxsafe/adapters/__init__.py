@@ -40,12 +40,3 @@ def observation_bounds(env: Environment) -> tuple[list[float], list[float]]:
         size = sum(name == item.name or name.startswith(f"{item.name}.") for name in env.observation_names)
         bounds += size * [(-math.inf, math.inf) if item.clip is None else (float(item.clip[0]), float(item.clip[1]))]
     return [low for low, _ in bounds], [high for _, high in bounds]
-
-
-class MissingError(ConfigError, ImportError):
-    """A package of an extra is not installed."""
-
-
-def missing(package: str, extra: str) -> MissingError:
-    """What to raise where a package of an extra is not installed."""
-    return MissingError(f"{package} is not installed; pip install 'jaxsafe[{extra}]'")

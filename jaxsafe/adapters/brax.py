@@ -11,9 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxsafe.adapters import environment, missing
+from jaxsafe.adapters import environment
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.errors import ConfigError
+from jaxsafe.errors import ConfigError, missing
+from jaxsafe.rollout import choose
 from jaxsafe.types import Key, TimeStep
 
 try:
@@ -97,9 +98,8 @@ class FreshStarts(Wrapper):
 
         def draw(taken: State) -> State:
             fresh = self.env.reset(now)
-            pick = lambda a, b: jnp.where(taken.done.reshape(-1, *(1,) * (a.ndim - 1)), a, b)  # noqa: E731
-            kept = {"pipeline_state": fresh.pipeline_state, "obs": fresh.obs}
-            return taken.replace(**jax.tree.map(pick, kept, {name: getattr(taken, name) for name in kept}))
+            begun = choose(taken.done, (fresh.pipeline_state, fresh.obs), (taken.pipeline_state, taken.obs))
+            return taken.replace(pipeline_state=begun[0], obs=begun[1])
 
         following = jax.lax.cond(jnp.any(taken.done), draw, lambda taken: taken, taken)
         following.info["starts"] = keys

@@ -17,8 +17,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxsafe.adapters import environment, missing, observation_bounds
+from jaxsafe.adapters import environment, observation_bounds
 from jaxsafe.environment import Environment, reset, step
+from jaxsafe.errors import missing
 from jaxsafe.rollout import cut_short, restarted
 from jaxsafe.types import Key, Record, State
 

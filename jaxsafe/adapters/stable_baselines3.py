@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxsafe.adapters import missing
 from jaxsafe.adapters.gymnasium import GymVectorEnv
 from jaxsafe.environment import Environment
+from jaxsafe.errors import missing
 
 try:
     from stable_baselines3.common.vec_env import VecEnv

@@ -17,9 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.adapters import missing
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.errors import ConfigError, missing, nearest
 from jaxsafe.rollout import Policy
 from jaxsafe.train.agent import Categorical
 

@@ -16,8 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
-from jaxsafe.adapters import missing
-from jaxsafe.errors import ConfigError
+from jaxsafe.errors import ConfigError, missing
 from jaxsafe.train.files import write_bytes
 
 try:

@@ -20,6 +20,7 @@ import numpy as np
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.seeds import KINDS, Evaluator, episode_rows
 from jaxsafe.metrics import Episode
+from jaxsafe.rollout import choose
 from jaxsafe.train import ppo, window
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import TrainConfig
@@ -189,7 +190,7 @@ def chunk(shared: tuple, state: TrainState, length: int, limit: int) -> tuple[Tr
 def _keep_best(best: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
     """Per seed, whichever succeeded more often; the later one if equal."""
     better = now["success"] >= best["success"]
-    return jax.tree.map(lambda a, b: jnp.where(better.reshape(-1, *(1,) * (a.ndim - 1)), a, b), now, best)
+    return choose(better, now, best)
 
 
 class _StopRequest:

@@ -241,11 +241,11 @@ def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch)
     ratio = jnp.exp(policy.log_prob(batch.action) - batch.log_prob)
     clipped = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
-    value = agent.value(params, agent.critic_inputs(batch.inputs, batch.totals))
+    seen = agent.critic_inputs(batch.inputs, batch.totals)
+    value = agent.value(params, seen)
     value_error = 0.5 * (value - batch.value_target) ** 2
     if agent.cost_critic:
-        cost_rate = agent.cost_rate(params, agent.critic_inputs(batch.inputs, batch.totals))
-        value_error += 0.5 * (cost_rate - batch.cost_target) ** 2
+        value_error += 0.5 * (agent.cost_rate(params, seen) - batch.cost_target) ** 2
     entropy = policy.entropy()
     return jnp.mean(-surrogate + ppo.value_coefficient * value_error - ppo.entropy_coefficient * entropy)
 
