@@ -8,7 +8,6 @@ Observations, rewards and infos are NumPy arrays and Python numbers.
 
 from __future__ import annotations
 
-import functools
 import os
 from collections.abc import Mapping
 from typing import Any
@@ -20,13 +19,12 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from jaxtyping import Array
 
 from jaxsafe.adapters import environment, observation_bounds
-from jaxsafe.environment import Environment, reset, reset_to, step
+from jaxsafe.adapters.lanes import Episodes, Lanes
+from jaxsafe.environment import Environment, reset_to
 from jaxsafe.errors import ConfigError, nearest
-from jaxsafe.rollout import choose, cut_short
-from jaxsafe.types import Key, Record, State, TimeStep
+from jaxsafe.types import TimeStep
 
 Space = gym.spaces.Box | gym.spaces.MultiDiscrete
 
@@ -68,26 +66,23 @@ class GymEnv(gym.Env[np.ndarray, np.ndarray]):
         self.env = environment(task, overrides, options)
         self.render_mode = _checked_render_mode(render_mode)
         self.observation_space, self.action_space = spaces(self.env)
-        self._limit = _checked_limit(max_episode_steps)
-        self._unpack = _Unpacker(self.env)
-        self._key: Any = None  # until the first reset
-        self._state: Any = None
+        self._lanes = Lanes(self.env, 1, _checked_limit(max_episode_steps))
         self._frames = Frames(self.env) if render_mode else None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Start an episode: see the class."""
         super().reset(seed=seed)
-        if seed is not None or self._key is None:
-            self._key = jax.random.key(self.np_random_seed % 2**32)
         chosen = _checked_options(options, ("start", "parameters"))
+        if seed is not None or not self._lanes.running:
+            self._lanes.seed(_ALONE, _seeds([self.np_random_seed]))
         if chosen:
-            self._state, timestep = reset_to(self.env, chosen.get("start", {}), chosen.get("parameters"))
-            packed = _pack(timestep)
+            placed = reset_to(self.env, chosen.get("start", {}), chosen.get("parameters"))
+            self._lanes.place(jax.tree.map(lambda x: x[None], Episodes(*placed)))
         else:
-            self._key, self._state, packed = _reset_one(self.env, self._key)
+            self._lanes.restart(_ALONE)
         if self._frames is not None:
             self._frames.clear()
-        observation, _, _, _, info = self._receive(packed)
+        observation, _, _, _, info = self._receive(self._lanes.now)
         return observation, info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
@@ -97,29 +92,27 @@ class GymEnv(gym.Env[np.ndarray, np.ndarray]):
             ResetNeeded: before the first reset.
             ConfigError: the action has another shape, or is not whole numbers where actions are discrete.
         """
-        if self._state is None:
+        if not self._lanes.running:
             raise ResetNeeded("step: call reset first")
-        self._state, packed = _step_one(self.env, self._state, _checked_action(self.env, action), self._limit)
-        return self._receive(packed)
+        self._lanes.step(_checked_action(self.env, action)[None])
+        return self._receive(self._lanes.now)
 
     def render(self) -> Any:
         """A picture of the episode so far, (height, width, 3), if there is a render mode."""
         if self._frames is None:
             gym.logger.warn("render: no render_mode was chosen; make the environment with render_mode='rgb_array'")
             return None
-        if self._state is None:
+        if not self._lanes.running:
             raise ResetNeeded("render: call reset first")
         return self._frames.draw()
 
-    def _receive(self, packed: Array) -> tuple[np.ndarray, float, bool, bool, dict]:
-        timestep = self._unpack(packed)
+    def _receive(self, episodes: Episodes) -> tuple[np.ndarray, float, bool, bool, dict]:
+        timestep: Any = jax.tree.map(lambda x: x[0], episodes.timestep)
         if self._frames is not None:
-            self._frames.add(jax.device_get(self._state.sim), timestep.info.margins)
-        info = jax.tree.map(
-            lambda x: x.item() if isinstance(x, np.ndarray) and not x.ndim else x, facts(self.env, timestep)
-        )
+            self._frames.add(jax.tree.map(lambda x: x[0], episodes.state.sim), timestep.info.margins)
+        info = jax.tree.map(lambda x: x.item() if isinstance(x, np.generic) else x, facts(self.env, timestep))
         flags = bool(timestep.terminated), bool(timestep.truncated)
-        return np.asarray(timestep.observation), float(timestep.reward), *flags, info
+        return timestep.observation.copy(), float(timestep.reward), *flags, info
 
 
 class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -155,10 +148,8 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.single_observation_space, self.single_action_space = spaces(self.env)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._limit = _checked_limit(max_episode_steps)
-        self._lanes: Any = None  # until the first reset
+        self._lanes = Lanes(self.env, self.num_envs, _checked_limit(max_episode_steps))
         self._over = np.zeros(self.num_envs, bool)
-        self._unpack = _Unpacker(self.env)
         self._frames = [Frames(self.env) for _ in range(self.num_envs)] if render_mode else []
 
     def reset(
@@ -166,19 +157,16 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, dict]:
         """Start an episode in each lane, or where `options["reset_mask"]` says."""
         mask = _checked_mask(_checked_options(options, ("reset_mask",)).get("reset_mask"), self.num_envs)
-        if self._lanes is None and not mask.all():
+        if not self._lanes.running and not mask.all():
             raise ResetNeeded("reset: the first reset takes no reset_mask")
-        seeds = self._seeds(seed)
-        if self._lanes is None:
-            self._lanes = begin(self.env, _keys([entropy if one is None else one for one, entropy in seeds]))
-        else:
-            seeded = mask & np.array([one is not None for one, _ in seeds])
-            keys = _keys([one or 0 for one, _ in seeds])
-            self._lanes = restart(self.env, mask, seed_lanes(self._lanes, seeded, keys))
-        timestep = self._unpack(_pack(self._lanes.timestep))
+        asked = self._seeds(seed)
+        seeded = mask & np.array([one is not None or not self._lanes.running for one, _ in asked])
+        self._lanes.seed(seeded, _seeds([entropy if one is None else one for one, entropy in asked]))
+        self._lanes.restart(mask)
+        episodes = self._lanes.now
         self._over = np.where(mask, False, self._over)
-        self._film(mask, timestep)
-        return np.array(timestep.observation), _masked(facts(self.env, timestep), mask)
+        self._film(mask, episodes)
+        return np.array(episodes.timestep.observation), _masked(facts(self.env, episodes.timestep), mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
         """Advance every lane one time step of the task.
@@ -187,7 +175,7 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ResetNeeded: before the first reset, or with `Disabled` where a lane's episode is over.
             ConfigError: the actions have another shape, or are not whole numbers where actions are discrete.
         """
-        if self._lanes is None:
+        if not self._lanes.running:
             raise ResetNeeded("step: call reset first")
         over = self._over
         if self.autoreset_mode is AutoresetMode.DISABLED and over.any():
@@ -196,25 +184,30 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         action = _checked_action(self.env, actions)
         if action.shape != self.action_space.shape:
             raise ConfigError(f"actions: expected shape {self.action_space.shape}, found {action.shape}")
-        self._lanes, packed, ended = advance(self.env, self._lanes, action, self._limit, self.autoreset_mode)
-        now = self._unpack(packed)
-        taken = now if ended is None else self._unpack(ended)  # differ where a lane has started anew in the same step
-        self._over, everywhere = taken.terminated | taken.truncated, np.ones(self.num_envs, bool)
-        infos = _masked(facts(self.env, now), everywhere)
-        if ended is not None and self._over.any():
+        self._lanes.step(action)
+        restarted, final = over, {}
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP and over.any():
+            self._lanes.restart(over)  # instead of the step
+        episodes = self._lanes.now
+        taken = episodes.timestep
+        self._over = taken.terminated | taken.truncated
+        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._over.any():
+            restarted = self._over
+            self._lanes.restart(restarted)
+            episodes = self._lanes.now
             final = {"final_obs": np.array(taken.observation), "final_info": facts(self.env, taken)}
-            infos |= _masked(final, self._over)
-        restarted = {AutoresetMode.NEXT_STEP: over, AutoresetMode.SAME_STEP: self._over}
-        self._film(restarted.get(self.autoreset_mode, ~everywhere), now)
+        self._film(restarted, episodes)
+        infos = _masked(facts(self.env, episodes.timestep), np.ones(self.num_envs, bool)) | _masked(final, restarted)
         rewards = taken.reward.astype(np.float64)
-        return np.array(now.observation), rewards, np.array(taken.terminated), np.array(taken.truncated), infos
+        flags = np.array(taken.terminated), np.array(taken.truncated)
+        return np.array(episodes.timestep.observation), rewards, *flags, infos
 
     def render(self) -> Any:
         """A picture of each lane's episode so far, if there is a render mode."""
         if not self._frames:
             gym.logger.warn("render: no render_mode was chosen; make the environments with render_mode='rgb_array'")
             return None
-        if self._lanes is None:
+        if not self._lanes.running:
             raise ResetNeeded("render: call reset first")
         return tuple(frames.draw() for frames in self._frames)
 
@@ -230,103 +223,12 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         entropy: Any = self.np_random_seed
         return [(one, entropy + lane) for lane, one in enumerate(base)]
 
-    def _film(self, restarted: np.ndarray, timestep: TimeStep) -> None:
+    def _film(self, restarted: np.ndarray, episodes: Episodes) -> None:
         """Remember what pictures show."""
-        if not self._frames:
-            return
-        sim, margins = jax.device_get(self._lanes.state.sim), timestep.info.margins
         for lane, frames in enumerate(self._frames):
             if restarted[lane]:
                 frames.clear()
-            frames.add(*jax.tree.map(lambda x, lane=lane: x[lane], (sim, margins)))
-
-
-class Lanes(Record):
-    """A batch of episodes, [num_envs], each with the chain of keys that its starts come from."""
-
-    key: Key
-    state: State
-    timestep: TimeStep  # the latest
-
-
-@jax.jit
-def begin(env: Environment, keys: Key) -> Lanes:
-    """Start an episode in each lane."""
-    return Lanes(*jax.vmap(_start, in_axes=(None, 0))(env, keys))
-
-
-@jax.jit
-def restart(env: Environment, mask: Array, lanes: Lanes) -> Lanes:
-    """Start a new episode where the mask says; starts are drawn only if there is any such lane."""
-
-    def draw(lanes: Lanes) -> Lanes:
-        return choose(mask, begin(env, lanes.key), lanes)
-
-    return jax.lax.cond(jnp.any(mask), draw, lambda lanes: lanes, lanes)
-
-
-@jax.jit
-def seed_lanes(lanes: Lanes, mask: Array, keys: Key) -> Lanes:
-    """Begin new chains of keys where the mask says."""
-    return lanes.replace(key=jnp.where(mask, keys, lanes.key))
-
-
-@functools.partial(jax.jit, static_argnames="mode")
-def advance(
-    env: Environment, lanes: Lanes, action: Array, limit: float, mode: AutoresetMode
-) -> tuple[Lanes, Array, Array | None]:
-    """One step of every lane: the lanes, the time steps to act on next, and with `SameStep` those that ended, packed.
-
-    With `NextStep` a lane whose episode is over starts anew instead of taking the step.
-    """
-    state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, lanes.state, action)
-    timestep = cut_short(state, timestep, limit)
-    taken = lanes.replace(state=state, timestep=timestep)
-    if mode is AutoresetMode.NEXT_STEP:
-        taken = restart(env, lanes.timestep.done, taken)
-    if mode is AutoresetMode.SAME_STEP:
-        following = restart(env, timestep.done, taken)
-        return following, _pack(following.timestep), _pack(timestep)
-    return taken, _pack(taken.timestep), None
-
-
-def _start(env: Environment, key: Key) -> tuple[Key, State, TimeStep]:
-    following, now = jax.random.split(key)
-    return following, *reset(env, now)
-
-
-@jax.jit
-def _reset_one(env: Environment, key: Key) -> tuple[Key, State, Array]:
-    key, state, timestep = _start(env, key)
-    return key, state, _pack(timestep)
-
-
-@jax.jit
-def _step_one(env: Environment, state: State, action: Array, limit: float) -> tuple[State, Array]:
-    state, timestep = step(env, state, action)
-    return state, _pack(cut_short(state, timestep, limit))
-
-
-@jax.jit
-def _pack(timestep: TimeStep) -> Array:
-    """All numbers in one array, [numbers] or [numbers, num_envs]: thirty take many times as long to hand over."""
-    lanes, dtype = timestep.reward.shape, jnp.result_type(float)
-    return jnp.concatenate([x.reshape((*lanes, -1)).astype(dtype).T for x in jax.tree.leaves(timestep)])
-
-
-class _Unpacker:
-    """The inverse of `_pack`, on the host."""
-
-    def __init__(self, env: Environment) -> None:
-        shapes, self._structure = jax.tree.flatten(jax.eval_shape(reset, env, jax.random.key(0))[1])
-        ends = np.cumsum([shape.size for shape in shapes]).tolist()
-        self._parts = [(end - shape.size, end, shape.shape, shape.dtype) for shape, end in zip(shapes, ends, strict=True)]
-
-    def __call__(self, packed: Array) -> Any:  # a TimeStep of NumPy arrays
-        host = np.asarray(packed)
-        lanes = host.shape[1:]  # () of a single environment
-        leaves = [host[a:b].T.reshape((*lanes, *shape)).astype(dtype, copy=False) for a, b, shape, dtype in self._parts]
-        return jax.tree.unflatten(self._structure, leaves)
+            frames.add(*jax.tree.map(lambda x, lane=lane: x[lane], (episodes.state.sim, episodes.timestep.info.margins)))
 
 
 class Frames:
@@ -391,8 +293,12 @@ def _masked(found: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
     return masked
 
 
-def _keys(seeds: list[int]) -> Key:
-    return jax.vmap(jax.random.key)(np.array([seed % 2**32 for seed in seeds], np.uint32))
+_ALONE = np.ones(1, bool)
+"""The mask of the only lane."""
+
+
+def _seeds(seeds: list[Any]) -> np.ndarray:
+    return np.array([seed % 2**32 for seed in seeds], np.uint32)
 
 
 def _checked_action(env: Environment, action: Any) -> np.ndarray:

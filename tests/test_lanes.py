@@ -1,0 +1,47 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsafe
+from jaxsafe.adapters.lanes import Episodes, Lanes, packing
+
+
+def test_packing_loses_no_bit() -> None:
+    tree = {
+        "flag": jnp.array([True, False]),
+        "count": jnp.array([-7, 2**31 - 1]),
+        "point": jnp.array([[1.1, jnp.nan, -0.0], [jnp.inf, 1e-42, 3.3]]),
+        "matrix": jnp.arange(12.0).reshape(2, 3, 2),
+    }
+    layout = packing(tree, lanes=1)
+    words = jax.jit(layout.pack)(tree)
+    assert words.shape == (1 + 1 + 3 + 6, 2)
+    for found in (layout.receive(words), jax.jit(layout.unpack)(words)):
+        for ours, expected in zip(jax.tree.leaves(found), jax.tree.leaves(tree), strict=True):
+            assert (ours.shape, ours.dtype) == (expected.shape, expected.dtype)
+            assert np.asarray(ours).tobytes() == np.asarray(expected).tobytes()
+
+
+def test_environments_of_one_structure_share_a_layout() -> None:
+    env, other = jaxsafe.make("docking2d"), jaxsafe.make("docking2d", {"deputy.mass": 11.0})
+    assert packing(env) is packing(other)
+    assert packing(env) is not packing(jaxsafe.make("docking2d", rta="explicit_simplex"))
+
+
+@pytest.mark.parametrize("actions", ["continuous", "discrete"])
+def test_lanes_do_what_the_pure_functions_do(actions: str) -> None:
+    env = jaxsafe.make("docking2d", actions=actions)
+    lanes, seeds = Lanes(env, 3, np.inf), np.array([4, 5, 6], np.uint32)
+    lanes.seed(np.ones(3, bool), seeds)
+    lanes.restart(np.ones(3, bool))
+    action = np.array([[0, 10], [3, 3], [7, 1]], np.int32) if actions == "discrete" else np.eye(3, 2, dtype=np.float32)
+    keys = [jax.random.split(jax.random.key(seed)) for seed in seeds]
+    expected = [Episodes(*env.reset(now)) for _, now in keys]
+    for _ in range(3):
+        lanes.step(action)
+        expected = [Episodes(*env.step(one.state, a)) for one, a in zip(expected, action, strict=True)]
+    lanes.restart(np.array([False, True, False]))
+    expected[1] = Episodes(*env.reset(jax.random.split(keys[1][0])[1]))
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *expected)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), lanes.now, stacked)
