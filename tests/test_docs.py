@@ -52,6 +52,15 @@ def test_links_lead_to_files(page: Path) -> None:
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
+def test_the_site_builds_without_a_warning(tmp_path: Path) -> None:
+    built = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", str(ROOT / "docs"), str(tmp_path)]
+    ran = subprocess.run(built, capture_output=True, text=True, check=False)
+    assert (ran.returncode, ran.stderr) == (0, "")
+    first = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert 'href="tasks/docking3d.html"' in first  # what the README calls docs/tasks/docking3d.md
+    assert "jaxsafe.environment.reset_to" in (tmp_path / "api.html").read_text(encoding="utf-8")
+
+
 def test_the_composed_environment_survives_a_round_trip() -> None:
     env = load(CUSTOM)
     assert load(dump(env)) == env

@@ -34,9 +34,9 @@ class Brake(BackupController, type="brake"):
 class AlignAndBrake(BackupController, type="align_and_brake"):
     """Turns the thrust axis along the velocity and brakes, for an oriented spacecraft.
 
-    The attitude follows the rate sign(e)·√(1.6 α|e|) for the error e between ±body axis and velocity, α the bound of the
-    wheel. While |e| > `aligned` the thrust is the smallest that keeps the speed limit with twice the `margin`, which holds
-    the boundary while the craft turns; then it nulls the velocity along the body.
+    The attitude follows the rate sign(e) √(1.6 α abs(e)) for the error e between ±body axis and velocity, α the bound of
+    the wheel. While abs(e) > `aligned` the thrust is the smallest that keeps the speed limit with twice the `margin`, which
+    holds the boundary while the craft turns; then it nulls the velocity along the body.
     """
 
     constraint: ConstraintName
@@ -83,7 +83,7 @@ class MatchVelocity(BackupController, type="match_velocity"):
 
     In the plane it takes the heading and the speed that the lead will have after the step. In space it banks by
     tan φ = v ω/g for the turn ω = 0.25 e + ψ̇_lead of the present heading error e, and climbs or dives at the steepest angle
-    while the error is large, |e| above 0.45 rad, less so down to 0.15 rad, then flies the lead's angle.
+    while the error is large, abs(e) above 0.45 rad, less so down to 0.15 rad, then flies the lead's angle.
     """
 
     lead: PlatformName

@@ -58,7 +58,7 @@ class Agent(Component):
         return FEATURES[self.features](env, observation)
 
     def distribution(self, env: Environment, params: Params, inputs: Float[Array, "*batch i"]) -> Gaussian | Categorical:
-        """Return the policy π(·|s)."""
+        """Return the policy, a distribution over actions."""
         out = mlp(params["actor"], inputs)
         if not env.num_action_points:
             return Gaussian(mean=out, log_std=params["log_std"])
