@@ -17,7 +17,7 @@ html_theme = "furo"
 html_title = "jaxsafe"
 html_theme_options = {"navigation_with_keys": True}
 
-autodoc_default_options = {"members": True, "member-order": "bysource"}
+autodoc_default_options = {"members": True, "member-order": "bysource", "no-value": True}
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 autodoc_preserve_defaults = True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -73,6 +73,12 @@ class Arguments:
         """Take out the `env.<path>=value` options, without their prefix."""
         paths = [key for key in self.options if key.startswith("env.")]
         return {key.removeprefix("env."): self.options.pop(key) for key in paths}
+
+    def refuse_beside(self, keys: Iterable[str], situation: str) -> None:
+        """Raise a ConfigError for an option that would change nothing in this situation."""
+        for key in keys:
+            if key in self.options:
+                raise ConfigError(f"{key}: means nothing {situation}; leave it out")
 
     def refuse_rest(self, known: Sequence[str]) -> None:
         """Raise a ConfigError for an option that nobody took."""

@@ -120,6 +120,13 @@ def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFi
         (["run=pretrained/docking2d", "format=vnnlib", "box.position=3"], r"box.position: expected \[low, high\]"),
         (["run=pretrained/rejoin2d", "format=vnnlib"], r"box.heading: expected \[low, high\] for lead.heading"),
         (["format=onnx"], "run: missing"),
+        (
+            ["run=pretrained/docking2d", "seed=1"],
+            "seed: means nothing beside pretrained/docking2d, which is a single policy",
+        ),
+        (["run=pretrained/docking2d", "format=vnnlib", "batch=2"], "batch: means nothing with format=vnnlib"),
+        (["run=pretrained/docking2d", "format=stablehlo", "batch=2"], "batch: means nothing with format=stablehlo"),
+        (["run=pretrained/docking2d", "box.position=[1,2]"], "box.position: means nothing without format=vnnlib"),
     ],
 )
 def test_mistakes_are_named(words: list[str], message: str) -> None:

@@ -123,6 +123,11 @@ def test_more_mistakes_are_named(tmp_path: Path) -> None:
         read_foreign(tmp_path / "x.npz", env, "gelu")
     with pytest.raises(ConfigError, match=r"env: missing; the task in which x\.onnx shall act"):
         main(["run=x.onnx"])
+    with pytest.raises(ConfigError, match="checkpoint: means nothing for a policy from elsewhere"):
+        main(["run=x.npz", "env=docking2d", "checkpoint=best"])
+    for words in (["run=x.onnx", "env=docking2d"], ["run=pretrained/docking2d"]):
+        with pytest.raises(ConfigError, match=r"activation: means nothing but for the layers in an \.npz with env=TASK"):
+            main([*words, "activation=relu"])
     node = helper.make_node("Erf", ["obs"], ["out"])
     values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 6]) for name in ("obs", "out")]
     onnx.save(helper.make_model(helper.make_graph([node], "net", values[:1], values[1:])), tmp_path / "erf.onnx")

@@ -24,21 +24,26 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.train.results import table
 
     arguments = cli.Arguments.parse(argv)
-    run, out, checkpoint, rta, render = (arguments.pop_text(name) for name in ("run", "out", "checkpoint", "rta", "render"))
-    task, activation = arguments.pop_text("env"), arguments.pop_text("activation")
+    run, task = arguments.pop_text("run"), arguments.pop_text("env")
+    if run is None:
+        raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
+    if run.endswith(".onnx") and task is None:
+        raise ConfigError(f"env: missing; the task in which {run} shall act, for instance env=docking2d")
+    arguments.refuse_beside(["checkpoint"] if task else [], "for a policy from elsewhere, which env= says it is")
+    layers = task is not None and not run.endswith(".onnx")
+    arguments.refuse_beside([] if layers else ["activation"], "but for the layers in an .npz with env=TASK")
+    out, checkpoint, rta, render, activation = (
+        arguments.pop_text(name) for name in ("out", "checkpoint", "rta", "render", "activation")
+    )
     changes = arguments.pop_overrides()
     episodes, seed = arguments.pop_count("episodes", 1000), arguments.pop_count("seed", 0, least=0)
     deterministic = arguments.pop("deterministic")
     arguments.refuse_rest([*OPTIONS, "env.…"])
-    if run is None:
-        raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
     if not (deterministic is None or isinstance(deterministic, bool)):
         raise ConfigError(f"deterministic: expected true or false, found {deterministic!r}")
     if render not in (None, "gif"):
         raise ConfigError(f"render: found {render!r}; choose from gif")
     kinds = {None: ("stochastic", "deterministic"), True: ("deterministic",), False: ("stochastic",)}[deterministic]
-    if run.endswith(".onnx") and task is None:
-        raise ConfigError(f"env: missing; the task in which {run} shall act, for instance env=docking2d")
     subject = load(run, checkpoint) if task is None else load_foreign(Path(run), task, activation or "tanh")
     env = override(subject.env if rta is None else with_rta(subject.env, subject.name, rta), changes)
     request: dict[str, Any] = {

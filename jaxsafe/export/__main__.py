@@ -29,25 +29,28 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.train.policy import PRETRAINED, find_policy, read_policy
 
     arguments = cli.Arguments.parse(argv)
-    run, form, inputs, out = (arguments.pop_text(name) for name in ("run", "format", "inputs", "out"))
-    batch, steps, seed = arguments.pop_count("batch", 1), arguments.pop_count("steps", 40), arguments.pop_text("seed")
-    box = {word[4:]: arguments.pop(word) for word in list(arguments.options) if word.startswith("box.")}
-    arguments.refuse_rest(["run", "format", "inputs", "batch", "steps", "seed", "box.FIELD", "out"])
+    run, form, out = (arguments.pop_text(name) for name in ("run", "format", "out"))
     if run is None:
         raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
-    for name, value, known in (("format", form or "onnx", FORMATS), ("inputs", inputs or "observation", INPUTS)):
-        if value not in known:
-            raise ConfigError(f"{name}: found {value!r}; choose from {nearest(value, known)}")
+    form = _one_of("format", form or "onnx", FORMATS)
     single = run.endswith(".npz") or run.startswith(PRETRAINED)
-    path = find_policy(run) if single else Path(run) / "policy" / f"seed_{seed or 0}.npz"
+    boxes = [word for word in arguments.options if word.startswith("box.")]
+    arguments.refuse_beside(["seed"] if single else [], f"beside {run}, which is a single policy")
+    arguments.refuse_beside(
+        {"onnx": [], "stablehlo": ["batch"], "vnnlib": ["batch", "inputs"]}[form], f"with format={form}"
+    )
+    arguments.refuse_beside([] if form == "vnnlib" else ["steps", *boxes], "without format=vnnlib")
+    inputs = _one_of("inputs", arguments.pop_text("inputs") or "observation", INPUTS)
+    batch, steps = arguments.pop_count("batch", 1), arguments.pop_count("steps", 40)
+    seed, box = arguments.pop_count("seed", 0, least=0), {word[4:]: arguments.pop(word) for word in boxes}
+    arguments.refuse_rest(["run", "format", "inputs", "batch", "steps", "seed", "box.FIELD", "out"])
+    path = find_policy(run) if single else Path(run) / "policy" / f"seed_{seed}.npz"
     saved, stem = read_policy(path), path.stem if single else f"{Path(run).name}_{path.stem}"
     about = {"policy": stem, "jaxsafe": versions()["jaxsafe"]}
     if form == "vnnlib":
         loops = functions.closed_loop(saved, steps, unrolled=True), functions.closed_loop(saved, steps)
         return _vnnlib(*loops, box, Path(out or f"{stem}_closed_loop.vnnlib"), about)
-    exported = {"network": functions.network, "observation": functions.action, "state": functions.control}[
-        inputs or "observation"
-    ](saved)
+    exported = {"network": functions.network, "observation": functions.action, "state": functions.control}[inputs](saved)
     if form == "stablehlo":
         target = Path(out or f"{stem}.stablehlo")
         shape = jax.export.symbolic_shape(f"batch, {len(exported.inputs)}")
@@ -61,6 +64,12 @@ def main(argv: Sequence[str]) -> int:
         write_onnx(target, exported.function, (batch, len(exported.inputs)), {**about, **facts})
     print(f"{target}: {', '.join(exported.inputs)} -> {', '.join(exported.outputs)}")
     return 0
+
+
+def _one_of(name: str, value: str, known: Sequence[str]) -> str:
+    if value not in known:
+        raise ConfigError(f"{name}: found {value!r}; choose from {nearest(value, known)}")
+    return value
 
 
 def _vnnlib(unrolled: Exported, looped: Exported, given: dict[str, object], path: Path, about: dict[str, str]) -> int:
