@@ -102,3 +102,27 @@ def test_a_run_without_rows_is_told_in_one_line(whole: Path, tmp_path: Path) -> 
     (tmp_path / "progress.jsonl").write_text(json.dumps(rows(1)[0] | {"episodes": 0, "cost": 0}) + "\nbroken\n{}\n")
     with pytest.raises(ConfigError, match=r"progress\.jsonl, line 2"):
         draw_all(tmp_path)
+
+
+def test_several_runs_in_one_figure_with_a_table(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("ppo", "limited"):
+        shutil.copytree(whole, name)
+    assert main(["run=[ppo,limited]", "x=wall", "out=both.png"]) == 0
+    heads, first, second, written = capsys.readouterr().out.splitlines()
+    assert "cost/episode" in heads
+    assert (first.split()[0], second.split()[0], written) == ("ppo", "limited", "both.png")
+    assert imread("both.png").shape[2] == 4
+    (tmp_path / "limited" / "results.json").unlink()
+    for runs, message in (
+        ("[ppo]", "expected several directories of different names, found ppo"),
+        ("[ppo,x/ppo]", "expected several directories of different names"),
+        ("[ppo,limited]", "limited has no results.json; finish it with"),
+        ("[ppo,none]", "no run in 'none'"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            main([f"run={runs}"])
+    with pytest.raises(ConfigError, match="out: means nothing but for several runs"):
+        main(["run=ppo", "out=x.png"])

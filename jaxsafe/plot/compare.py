@@ -17,17 +17,18 @@ LOOKS = tuple(product(("-", "--"), (BLUE, ORANGE, GREEN, "#CC79A7", GREY)))
 """Line style and colour of each run in turn."""
 
 
-def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> Figure:
+def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, x: str = "steps") -> Figure:
     """A panel for each quantity, in it the mean and the 95 % interval over seeds of each run.
 
     Args:
         runs: rows of the progress log by the run's label.
         title: of the figure.
+        x: `steps` or `wall`.
     """
     every = [row for rows in runs.values() for row in rows]
     curves = [curve for curve in CURVES if curve[0] in ALWAYS or any(row.get(curve[0]) for row in every)]
     figure, panels = panel_grid(len(curves), 3.6)
-    column, label = AXES["steps"]
+    column, label = AXES[x]
     for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
         for (line, colour), (run, rows) in zip(cycle(LOOKS), runs.items(), strict=False):
             at, values = curve_table(rows, column, name)

@@ -45,9 +45,7 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
     Raises:
         ConfigError: the run has no progress log.
     """
-    rows = read_rows(run / "progress.jsonl", NEEDS)
-    if not rows:
-        raise ConfigError(f"run: {run} has no rows in progress.jsonl yet; nothing to draw")
+    rows = progress(run)
     content = yaml.read(run / "config.yaml")
     title = _title(content, rows)
     figures = {f"training_{x}": training_curves(rows, x, title)}
@@ -60,6 +58,18 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
         if "rta" in episodes[-1][1][0]:
             figures["interventions"] = interventions(most_altered(episodes), env, title)
     return [save(figure, run / "figures" / f"{name}.png") for name, figure in figures.items()]
+
+
+def progress(run: Path) -> list[dict[str, Any]]:
+    """The progress log of a run.
+
+    Raises:
+        ConfigError: it has no rows.
+    """
+    rows = read_rows(run / "progress.jsonl", NEEDS)
+    if not rows:
+        raise ConfigError(f"run: {run} has no rows in progress.jsonl yet; nothing to draw")
+    return rows
 
 
 def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figure:

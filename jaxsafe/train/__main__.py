@@ -33,7 +33,7 @@ def main(argv: Sequence[str]) -> int:
             return cli.INTERRUPTED
         began = time.monotonic()
     if len(runs) > 1:
-        print(summary(runs))
+        print(summary({run.name: run for run in runs}))
     return 0
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -80,18 +80,22 @@ def table(results: dict[str, Any], path: Path) -> str:
     return "\n".join([*lines, f"results in {path}"])
 
 
-def summary(runs: Sequence[Path]) -> str:
-    """A line for each of several runs."""
-    heads = ("steps", "80 % after", "stochastic", "deterministic", "worst seed", "wall [s]")
-    lines = [" " * 20 + "".join(f"{head:>15}" for head in heads)]
-    for run in runs:
+def summary(runs: Mapping[str, Path]) -> str:
+    """A line for each of several runs, by name: success after training, and violating steps during and after it."""
+    heads = (
+        "steps", "80 % after", "stochastic", "deterministic", "worst seed", "cost/episode", "cost of training", "wall [s]",
+    )  # fmt: skip
+    lines = [" " * 20 + "".join(f"{head:>17}" for head in heads)]
+    for name, run in runs.items():
         results = read_json(run / "results.json")
-        success = [results["evaluation"][kind]["success_rate"] for kind in ("stochastic", "deterministic")]
+        found = [results["evaluation"][kind] for kind in ("stochastic", "deterministic")]
+        success = [one["success_rate"] for one in found]
         reached = results["interaction_efficiency"]["timesteps"]
         lines.append(
-            f"{results['env']:20}{results['steps']:>15,}{f'{reached:,}' if reached else 'never':>15}"
-            f"{success[0]['mean']:>15.2%}{success[1]['mean']:>15.2%}"
-            f"{min(min(one['per_seed']) for one in success):>15.1%}{results['wall_s']:>15.1f}"
+            f"{name:20}{results['steps']:>17,}{f'{reached:,}' if reached else 'never':>17}"
+            f"{success[0]['mean']:>17.2%}{success[1]['mean']:>17.2%}"
+            f"{min(min(one['per_seed']) for one in success):>17.1%}{found[0]['episode_cost']['mean']:>17.2f}"
+            f"{results['training_cost']['mean']:>17,.0f}{results['wall_s']:>17.1f}"
         )
     return "\n".join(lines)
 
