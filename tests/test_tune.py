@@ -11,7 +11,7 @@ from jaxsafe import cli
 from jaxsafe.errors import ConfigError
 from jaxsafe.train.config import recipe
 from jaxsafe.tune import __main__ as command
-from jaxsafe.tune.settings import Range, alike, pop_sweep, settings
+from jaxsafe.tune.settings import Span, alike, pop_sweep, settings
 
 BASE = [word for word in TINY if not word.startswith("ppo.num_steps")]
 GAMMA = recipe("docking2d", None)["ppo.gamma"]
@@ -49,7 +49,7 @@ def test_a_grid_has_every_combination() -> None:
 def test_draws_lie_in_their_range_and_can_be_repeated() -> None:
     arguments = options("sweep.ppo.learning_rate=log(1e-4,1e-2)", "sweep.ppo.gamma=[0.9,0.99]")
     sweep = pop_sweep(arguments)
-    assert sweep["ppo.learning_rate"] == Range(1e-4, 1e-2, log=True)
+    assert sweep["ppo.learning_rate"] == Span(1e-4, 1e-2, log=True)
     first, again, other = (settings(arguments, sweep, 30, draw) for draw in (0, 0, 1))
     assert [each.changes for each in first] == [each.changes for each in again]
     assert [each.changes for each in first] != [each.changes for each in other]

@@ -24,7 +24,7 @@ COMMON = ("seeds", "seed", "episodes", "out", "preset")
 _RANGE = re.compile(r"(log|uniform)\(\s*([^,\s]+)\s*,\s*([^,\s]+)\s*\)")
 
 
-class Range(NamedTuple):
+class Span(NamedTuple):
     """An interval from which values are drawn, uniformly or uniformly in the logarithm."""
 
     low: float
@@ -46,7 +46,7 @@ class Setting(NamedTuple):
     env: Environment
 
 
-def pop_sweep(arguments: Arguments) -> dict[str, list[Any] | Range]:
+def pop_sweep(arguments: Arguments) -> dict[str, list[Any] | Span]:
     """Take the `sweep.<option>=…` options out, without their prefix: lists of values, or ranges.
 
     Raises:
@@ -58,7 +58,7 @@ def pop_sweep(arguments: Arguments) -> dict[str, list[Any] | Range]:
     return {key.removeprefix(PREFIX): _choices(key, arguments.options.pop(key)) for key in names}
 
 
-def settings(arguments: Arguments, sweep: Mapping[str, list[Any] | Range], samples: int | None, draw: int) -> list[Setting]:
+def settings(arguments: Arguments, sweep: Mapping[str, list[Any] | Span], samples: int | None, draw: int) -> list[Setting]:
     """Every setting of a grid, or `samples` random ones.
 
     Args:
@@ -78,7 +78,7 @@ def settings(arguments: Arguments, sweep: Mapping[str, list[Any] | Range], sampl
             raise ConfigError(f"{PREFIX}{name}: {name} is given as well; leave one out")
     if samples is None:
         for name, values in sweep.items():
-            if isinstance(values, Range):
+            if isinstance(values, Span):
                 raise ConfigError(f"{PREFIX}{name}: a range needs samples=N, the number of settings to draw")
         points = list(itertools.product(*sweep.values()))
     else:
@@ -107,7 +107,7 @@ def lane(setting: Setting) -> tuple[Any, Any, Any]:
     return setting.env, setting.config.agent, setting.config.ppo
 
 
-def _choices(key: str, value: Any) -> list[Any] | Range:
+def _choices(key: str, value: Any) -> list[Any] | Span:
     if isinstance(value, list) and value:
         return value
     match = _RANGE.fullmatch(value) if isinstance(value, str) else None
@@ -119,8 +119,8 @@ def _choices(key: str, value: Any) -> list[Any] | Range:
         raise ConfigError(f"{key}: expected two numbers in the brackets, found {value!r}") from None
     if not low < high or (match[1] == "log" and low <= 0.0) or not math.isfinite(high - low):
         raise ConfigError(f"{key}: expected low < high, for log above 0, found {value!r}")
-    return Range(low, high, match[1] == "log")
+    return Span(low, high, match[1] == "log")
 
 
-def _draw(values: list[Any] | Range, generator: np.random.Generator) -> Any:
-    return values.draw(generator) if isinstance(values, Range) else values[generator.integers(len(values))]
+def _draw(values: list[Any] | Span, generator: np.random.Generator) -> Any:
+    return values.draw(generator) if isinstance(values, Span) else values[generator.integers(len(values))]
