@@ -106,6 +106,8 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
             f"ppo.num_minibatches: expected a divisor of ppo.num_envs × ppo.num_steps = {config.ppo.batch_size},"
             f" found {config.ppo.num_minibatches}"
         )
+    if config.ppo.batch_size >= 2**31:
+        raise ConfigError(f"ppo.num_envs × ppo.num_steps: expected less than 2³¹, found {config.ppo.batch_size:,}")
     if config.ppo.learning_rate_decay == "exponential" and not config.ppo.final_learning_rate > 0.0:
         raise ConfigError("ppo.final_learning_rate: expected a number > 0 for an exponential decay, found 0")
     if config.seed + config.seeds > 2**31:

@@ -21,7 +21,7 @@ from jaxsafe.environment import Environment
 from jaxsafe.evaluate.seeds import KINDS, Evaluator, episode_rows
 from jaxsafe.metrics import Episode
 from jaxsafe.rollout import choose
-from jaxsafe.train import ppo, window
+from jaxsafe.train import memory, ppo, window
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.files import append_rows, keep_rows, read_rows
@@ -32,6 +32,10 @@ from jaxsafe.train.seeds import SeedMapper
 
 EVALUATION_SEED = 0
 """Of the evaluations during and after training; `python -m jaxsafe.evaluate seed=…` chooses others."""
+
+
+MEMORY = "ppo.num_envs, ppo.num_steps, seeds"
+"""What decides how much of it a training needs."""
 
 
 class Training:
@@ -96,12 +100,13 @@ class Training:
         return found
 
     def _restore_or_init(self) -> None:
-        steps = self.checkpoints.steps
+        steps, content = self.checkpoints.steps, structure(self.mapper, self.env, self.config)
+        memory.require(memory.size(content) // self.mapper.num_devices, self.mapper.num_devices, MEMORY)
         if not steps:
             self.state = self.mapper.map(begin)(self.shared, self.mapper.keys(self.config.seed))
             self.best = {"params": self.state.average, "success": self.mapper.place(jnp.full(self.mapper.padded, -1.0))}
             return
-        content, facts = self.checkpoints.restore(steps[-1], structure(self.mapper, self.env, self.config))
+        content, facts = self.checkpoints.restore(steps[-1], content)
         self.state, self.best = content["state"], content["best"]
         self.updates, self.elapsed, self.compile_s = facts["updates"], facts["wall_s"], facts["compile_s"]
 
@@ -124,6 +129,9 @@ class Training:
         begin = time.monotonic()
         compiled = self.mapper.map(advance).lower(self.shared, self.state).compile()
         self.compile_s += time.monotonic() - begin
+        memory.require(
+            memory.footprint(compiled) - memory.size(self.state) // self.mapper.num_devices, self.mapper.num_devices, MEMORY
+        )
         return compiled
 
     def _due(self, before: int, every: int | None) -> bool:

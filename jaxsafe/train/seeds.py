@@ -43,6 +43,7 @@ class SeedMapper:
         devices = jax.devices()[: max(1, min(num_seeds, len(jax.devices())))]
         self.num_seeds = num_seeds
         self.padded = -(-num_seeds // len(devices)) * len(devices)
+        self.num_devices = len(devices)
         self.mesh = Mesh(np.array(devices), ("seeds",))
         self.one_by_one = devices[0].platform == "cpu"
 
