@@ -52,4 +52,5 @@ def test_its_ppo_learns_docking(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend("examples")
     import stable_baselines3_docking2d as example
 
-    assert example.success_rate(example.train()) >= 0.5
+    model = example.train()
+    assert min(example.success_rate(model, deterministic) for deterministic in (False, True)) >= 0.95

@@ -25,7 +25,6 @@ from jaxsafe.train.config import recipe
 from jaxsafe.train.loop import Training
 from jaxsafe.train.policy import load_policy, read_policy
 from jaxsafe.train.restore import structure
-from jaxsafe.train.seeds import SeedMapper
 
 
 def logs(run: Path) -> dict[str, list[dict[str, Any]]]:
@@ -40,8 +39,8 @@ def logs(run: Path) -> dict[str, list[dict[str, Any]]]:
 
 def final_state(run: Path) -> Any:
     config, env, _ = directory.read(run, "run")
-    mapper, checkpoints = SeedMapper(config.seeds), Checkpoints(run)
-    content, facts = checkpoints.restore(checkpoints.steps[-1], structure(mapper, env, config))
+    checkpoints = Checkpoints(run)
+    content, facts = checkpoints.restore(checkpoints.steps[-1], structure(env, config))
     state = content["state"].replace(key=jax.random.key_data(content["state"].key))
     return {"state": state, "best": content["best"], "updates": facts["updates"]}
 

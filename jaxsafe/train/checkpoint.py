@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from jaxsafe.errors import ConfigError, nearest
 
@@ -39,13 +41,13 @@ class Checkpoints:
         return sorted(self._manager.all_steps()) if hasattr(self, "_manager") else []
 
     def save(self, step: int, state: Any, facts: dict[str, Any]) -> None:
-        """Write one checkpoint: a pytree of arrays and some JSON."""
+        """Write one checkpoint: a pytree of arrays on the host, of keys their words, and some JSON."""
         ocp = self._ocp
         args = ocp.args.Composite(state=ocp.args.StandardSave(state), facts=ocp.args.JsonSave(facts))
         self._manager.save(step, args=args, force=True)
 
     def restore(self, step: int, like: Any) -> tuple[Any, dict[str, Any]]:
-        """Read one checkpoint into the structure, shapes and placement of `like`.
+        """Read one checkpoint, as arrays on the host, into the structure and shapes of `like`.
 
         Raises:
             ConfigError: there is none at this step, or it is broken or of another run.
@@ -55,7 +57,7 @@ class Checkpoints:
                 f"checkpoint: no step {step} in {self.directory}; choose from {nearest(step, self.steps) or 'none'}"
             )
         ocp = self._ocp
-        abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, like)
+        abstract = jax.tree.map(_empty, like)
         args = ocp.args.Composite(state=ocp.args.StandardRestore(abstract), facts=ocp.args.JsonRestore())
         with contextlib.redirect_stderr(io.StringIO()):  # threads of a failed read complain one by one
             try:
@@ -64,4 +66,17 @@ class Checkpoints:
                 time.sleep(SETTLE_S)
                 reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
                 raise ConfigError(f"{self.directory / str(step)}: checkpoint cannot be read: {reason}") from None
-        return restored["state"], restored["facts"]
+        return jax.tree.map(_as, restored["state"], like), restored["facts"]
+
+
+def _is_key(shape: Any) -> bool:
+    return jnp.issubdtype(shape.dtype, jax.dtypes.prng_key)
+
+
+def _empty(shape: Any) -> np.ndarray:
+    words = jax.eval_shape(jax.random.key_data, shape) if _is_key(shape) else shape
+    return np.empty(words.shape, words.dtype)
+
+
+def _as(x: Any, shape: Any) -> Any:
+    return jax.random.wrap_key_data(jnp.asarray(x)) if _is_key(shape) else x

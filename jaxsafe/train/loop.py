@@ -14,14 +14,13 @@ from types import FrameType
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.seeds import KINDS, Evaluator, episode_rows
 from jaxsafe.metrics import Episode
 from jaxsafe.rollout import choose
-from jaxsafe.train import memory, ppo, window
+from jaxsafe.train import hosts, memory, ppo, window
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.files import append_rows, keep_rows, read_rows
@@ -41,15 +40,25 @@ MEMORY = "ppo.num_envs, ppo.num_steps, seeds"
 class Training:
     """One run: all seeds of one configuration."""
 
-    def __init__(self, config: TrainConfig, env: Environment, run: Path, began: float) -> None:
-        """Prepare the compiled functions and the state, fresh or from the latest checkpoint of `run`."""
+    def __init__(
+        self, config: TrainConfig, env: Environment, run: Path, began: float, checkpoints: Path | None = None
+    ) -> None:
+        """Prepare the compiled functions and the state, fresh or from the latest checkpoint of `checkpoints`.
+
+        Args:
+            config: of the run.
+            env: of the run.
+            run: the directory for logs and results.
+            began: `time.monotonic()` when the command began.
+            checkpoints: the run directory that holds the checkpoints, if it is another.
+        """
         self.config, self.env, self.run, self.began = config, env, run, began
         self.mapper = SeedMapper(config.seeds)
         self.shared = self.mapper.replicate((env, config.agent, config.ppo))
         intervals = (config.every(config.eval_every), config.every(config.checkpoint_every))
         self.chunk = max(1, min(config.num_updates // 50, 100_000 // config.ppo.batch_size, *intervals))
         self.evaluator = Evaluator(self.mapper, env, config.agent)
-        self.checkpoints = Checkpoints(run, create=True)
+        self.checkpoints = Checkpoints(checkpoints or run, create=True)
         self.elapsed = self.compile_s = 0.0
         self.updates = 0
         self._restore_or_init()
@@ -80,6 +89,7 @@ class Training:
                 self._write_progress(curves, self.updates - before, display)
                 if self._due(before, self.config.eval_every):
                     self._evaluate()
+                stop.requested = hosts.anyone(stop.requested)
                 if self._due(before, self.config.checkpoint_every) or stop.requested:
                     self._save()
         display.close()
@@ -100,14 +110,16 @@ class Training:
         return found
 
     def _restore_or_init(self) -> None:
-        steps, content = self.checkpoints.steps, structure(self.mapper, self.env, self.config)
-        memory.require(memory.size(content) // self.mapper.num_devices, self.mapper.num_devices, MEMORY)
+        steps, content = self.checkpoints.steps, structure(self.env, self.config)
+        each = memory.size(content) // self.config.seeds * (self.mapper.padded // self.mapper.num_devices)
+        memory.require(each, self.mapper.num_devices, MEMORY)
         if not steps:
             self.state = self.mapper.map(begin)(self.shared, self.mapper.keys(self.config.seed))
-            self.best = {"params": self.state.average, "success": self.mapper.place(jnp.full(self.mapper.padded, -1.0))}
+            never = self.mapper.place(np.full(self.config.seeds, -1.0, np.float32))
+            self.best = {"params": self.state.average, "success": never}
             return
         content, facts = self.checkpoints.restore(steps[-1], content)
-        self.state, self.best = content["state"], content["best"]
+        self.state, self.best = self.mapper.place(content["state"]), self.mapper.place(content["best"])
         self.updates, self.elapsed, self.compile_s = facts["updates"], facts["wall_s"], facts["compile_s"]
 
     def _keep_copies(self) -> None:
@@ -150,7 +162,7 @@ class Training:
         episodes = self._run_episodes("deterministic", self.config.eval_episodes, final=False)
         self._record(self.config.eval_episodes, final=False)
         rate = np.mean(np.asarray(episodes.outcome) == self.env.success, axis=1)
-        success = self.mapper.place(jnp.asarray(self.mapper.pad(rate), jnp.float32))
+        success = self.mapper.place(rate.astype(np.float32))
         self.best = _keep_best(self.best, {"params": self.state.average, "success": success})
 
     def _run_episodes(self, kind: str, num_episodes: int, final: bool) -> Episode:
@@ -170,7 +182,7 @@ class Training:
 
     def _save(self) -> None:
         facts = {"updates": self.updates, "wall_s": self.wall_s, "compile_s": self.compile_s}
-        self.checkpoints.save(self.step, {"state": self.state, "best": self.best}, facts)
+        self.checkpoints.save(self.step, self.mapper.gather({"state": self.state, "best": self.best}), facts)
 
 
 def begin(shared: tuple, key: jax.Array) -> TrainState:

@@ -17,15 +17,17 @@ from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.seeds import SeedMapper
 
 
-def structure(mapper: SeedMapper, env: Environment, config: TrainConfig) -> dict[str, Any]:
-    """Shapes, types and placement of what a checkpoint holds: the training state and the best parameters of each seed."""
+def structure(env: Environment, config: TrainConfig) -> dict[str, Any]:
+    """Shapes and types of what a checkpoint holds, [seeds]: the training state and the best parameters of each seed."""
 
-    def seeds(key: jax.Array) -> ppo.TrainState:
-        return jax.vmap(lambda one: ppo.init(env, config.agent, config.ppo, one))(jax.random.split(key, mapper.padded))
+    def seeds(keys: jax.Array) -> ppo.TrainState:
+        return jax.vmap(lambda one: ppo.init(env, config.agent, config.ppo, one))(keys)
 
-    state = jax.eval_shape(seeds, jax.random.key(0))
-    success = jax.ShapeDtypeStruct((mapper.padded,), jnp.float32)
-    return mapper.place_like({"state": state, "best": {"params": state.average, "success": success}})
+    state = jax.eval_shape(seeds, jax.random.split(jax.random.key(0), config.seeds))
+    return {
+        "state": state,
+        "best": {"params": state.average, "success": jax.ShapeDtypeStruct((config.seeds,), jnp.float32)},
+    }
 
 
 def load_params(mapper: SeedMapper, run: Path, config: TrainConfig, env: Environment, which: str) -> tuple[Params, int]:
@@ -41,5 +43,5 @@ def load_params(mapper: SeedMapper, run: Path, config: TrainConfig, env: Environ
         choices = ["last", "best", *map(str, checkpoints.steps)]
         raise ConfigError(f"checkpoint: found {which!r}; choose from {nearest(which, choices)}")
     step = int(which) if which.isdecimal() else checkpoints.steps[-1]
-    content, _ = checkpoints.restore(step, structure(mapper, env, config))
-    return content["best"]["params"] if which == "best" else content["state"].average, step
+    content, _ = checkpoints.restore(step, structure(env, config))
+    return mapper.place(content["best"]["params"] if which == "best" else content["state"].average), step

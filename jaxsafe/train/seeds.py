@@ -8,12 +8,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from itertools import zip_longest
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jaxsafe.errors import ConfigError
+from jaxsafe.train import hosts
 
 _SEEDS = PartitionSpec("seeds")
 
@@ -39,8 +43,16 @@ class SeedMapper:
     """Maps functions over the leading seed axis of their second argument, sharded over devices."""
 
     def __init__(self, num_seeds: int) -> None:
-        """Use as many devices as there are seeds, at most; each takes the same number, padded with repeats."""
-        devices = jax.devices()[: max(1, min(num_seeds, len(jax.devices())))]
+        """Use as many devices as there are seeds, at most; each takes the same number, padded with repeats.
+
+        Raises:
+            ConfigError: there are more processes than seeds.
+        """
+        if num_seeds < jax.process_count():
+            raise ConfigError(f"seeds: expected one for each of {jax.process_count()} processes, found {num_seeds}")
+        each = [jax.local_devices(process) for process in range(jax.process_count())]
+        in_turn = [device for turn in zip_longest(*each) for device in turn if device is not None]
+        devices = in_turn[: max(1, min(num_seeds, len(in_turn)))]
         self.num_seeds = num_seeds
         self.padded = -(-num_seeds // len(devices)) * len(devices)
         self.num_devices = len(devices)
@@ -65,25 +77,34 @@ class SeedMapper:
         return self.place(jax.vmap(jax.random.key)(jnp.asarray(seeds)))
 
     def place(self, tree: Any) -> Any:
-        """Distribute arrays with a leading seed axis over the devices."""
-        return jax.device_put(tree, NamedSharding(self.mesh, _SEEDS))
+        """Distribute arrays [num_seeds] or [padded] over the devices; every process has all of them."""
+        return jax.tree.map(lambda x: _spread(self.pad(x), NamedSharding(self.mesh, _SEEDS)), tree)
 
     def place_like(self, shapes: Any) -> Any:
         """The shapes with the placement that `place` gives, for restoring."""
         sharding = NamedSharding(self.mesh, _SEEDS)
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes)
 
-    def pad(self, values: np.ndarray) -> np.ndarray:
+    def pad(self, values: Any) -> Any:
         """Repeat the last seed's entry up to `padded`."""
-        return values[np.minimum(np.arange(self.padded), self.num_seeds - 1)]
+        return values[np.minimum(np.arange(self.padded), len(values) - 1)]
 
     def replicate(self, tree: Any) -> Any:
         """Give every device a copy."""
-        return jax.device_put(tree, NamedSharding(self.mesh, PartitionSpec()))
+        return jax.tree.map(lambda x: _spread(x, NamedSharding(self.mesh, PartitionSpec())), tree)
 
     def gather(self, tree: Any) -> Any:
-        """Arrays on the host, without the padding."""
-        return jax.tree.map(lambda x: np.asarray(x)[: self.num_seeds], tree)
+        """Arrays on the host of every process, without the padding; of keys the words."""
+        return jax.tree.map(lambda x: hosts.gather(x)[: self.num_seeds], tree)
+
+
+def _spread(x: Any, sharding: NamedSharding) -> jax.Array:
+    if jnp.issubdtype(jnp.result_type(x), jax.dtypes.prng_key):
+        return jax.random.wrap_key_data(_spread(jax.random.key_data(x), sharding))
+    if sharding.is_fully_addressable:
+        return jax.device_put(x, sharding)
+    host = np.asarray(x, jnp.result_type(x))
+    return jax.make_array_from_callback(host.shape, sharding, lambda index: host[index])
 
 
 def _isolated(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:

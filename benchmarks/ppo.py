@@ -1,0 +1,180 @@
+"""How many samples a second does PPO learn from, beside other implementations with the same settings on the same task?
+
+2048 environments × 32 steps, 4 epochs of 8 minibatches, actor and critic of 2 × 64 tanh, on the task's observation. rejax,
+Brax and Stable-Baselines3 (64 × 1024, whose own loop it is) take the task through `jaxsafe.adapters`. Each measurement is a
+process of its own, on one pinned core and on all; peers run in environments that this script builds in `benchmarks/peers`,
+since their versions exclude each other. Compile time apart; the median of some repeats, in turns. Also ten seeds at once
+against one, and this PPO with the sort of `jax.random.permutation` for its shuffle. Writes `benchmarks/results/ppo.json`:
+
+    python benchmarks/ppo.py [task=docking2d] [peers=rejax,brax,sb3] [repeats=3]
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+HERE = Path(__file__).parent
+OUT = HERE / "results" / "ppo.json"
+NUM_ENVS, NUM_STEPS, NUM_EPOCHS, NUM_MINIBATCHES, HIDDEN, UPDATES = 2048, 32, 4, 8, (64, 64), 8
+BATCH = NUM_ENVS * NUM_STEPS
+PEERS = {
+    "rejax": ["rejax", "gymnax==0.0.9", "--pre", "tfp-nightly"],
+    "brax": ["brax"],
+    "sb3": ["stable-baselines3"],
+}
+"""What pip installs for each beside jaxsafe."""
+
+
+def main() -> None:
+    """Run, write, print."""
+    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
+    task, repeats = options.get("task", "docking2d"), int(options.get("repeats", "3"))
+    if "probe" in options:
+        print(json.dumps(PROBES[options["probe"]](task)))
+        return
+    from machine import about
+
+    peers = [name for name in options.get("peers", ",".join(PEERS)).split(",") if name]
+    python = {name: interpreter(name) if name in peers else sys.executable for name in PROBES}
+    cores = [1, os.cpu_count() or 1]
+    names = [name for name in PROBES if name in peers or name not in PEERS]
+    found: dict[tuple[str, int], list[float]] = {(name, count): [] for name in names for count in cores}
+    for _ in range(repeats):
+        for name, count in found:
+            found[name, count].append(probe(python[name], name, task, count))
+    rows = [{"peer": name, "cores": count, "samples_per_s": rates} for (name, count), rates in found.items()]
+    OUT.parent.mkdir(exist_ok=True)
+    OUT.write_text(json.dumps({**about(), "task": task, "repeats": repeats, "runs": rows}, indent=1) + "\n")
+    print(f"| {task}, thousand samples/s | 1 core | {cores[-1]} cores |\n|---|---|---|")
+    for name in names:
+        print(f"| {name} | " + " | ".join(f"{statistics.median(found[name, n]) / 1e3:.3g}" for n in cores) + " |")
+
+
+def interpreter(name: str) -> str:
+    """Python with a peer beside jaxsafe; built the first time."""
+    place = HERE / "peers" / name
+    python = place / "bin" / "python"
+    if not python.exists():
+        subprocess.run([sys.executable, "-m", "venv", place], check=True)
+        subprocess.run([python, "-m", "pip", "install", "-q", "-e", HERE.parent, *PEERS[name]], check=True)
+    return str(python)
+
+
+def probe(python: str, name: str, task: str, cores: int) -> float:
+    """Samples a second in a process of its own on some cores."""
+    usable = sorted(os.sched_getaffinity(0))[:cores]
+    command = [python, __file__, f"probe={name}", f"task={task}"]
+    ran = subprocess.run(command, capture_output=True, text=True, preexec_fn=lambda: os.sched_setaffinity(0, usable))
+    if ran.returncode:
+        sys.exit(f"{name}: {ran.stderr[-2000:]}")
+    return float(ran.stdout.splitlines()[-1])
+
+
+def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
+    """Our PPO as `jaxsafe.train` runs it, `seeds` of them; samples of all seeds together."""
+    from jaxsafe.train.seeds import SeedMapper, claim_cores
+
+    claim_cores()
+    import jax
+
+    from jaxsafe import cli
+    from jaxsafe.train import ppo
+    from jaxsafe.train.config import resolve
+    from jaxsafe.train.loop import begin, chunk
+
+    if sort:
+        ppo.shuffle = jax.random.permutation
+    settings = {
+        "num_envs": NUM_ENVS, "num_steps": NUM_STEPS, "num_epochs": NUM_EPOCHS, "num_minibatches": NUM_MINIBATCHES,
+    }  # fmt: skip
+    words = [f"env={task}", "preset=plain", f"agent.hidden={list(HIDDEN)}", f"steps={10 * UPDATES * BATCH}"]
+    config, env, _ = resolve(cli.Arguments.parse([*words, *(f"ppo.{key}={value}" for key, value in settings.items())]))
+    mapper = SeedMapper(seeds)
+    shared = mapper.replicate((env, config.agent, config.ppo))
+    state = mapper.map(begin)(shared, mapper.keys(0))
+    advance = mapper.map(lambda shared, state: chunk(shared, state, UPDATES, config.num_updates))
+    state, _ = advance.lower(shared, state).compile()(shared, state)
+    start = time.perf_counter()
+    jax.block_until_ready(advance(shared, state))
+    return seeds * UPDATES * BATCH / (time.perf_counter() - start)
+
+
+def rejax(task: str) -> float:
+    """The PPO of rejax, without its evaluations."""
+    import jax
+    from rejax import PPO  # pyright: ignore[reportMissingImports]
+
+    from jaxsafe.adapters.gymnax import GymnaxEnv
+
+    env = GymnaxEnv(task, legacy=True)
+    algorithm = PPO.create(
+        env=env, env_params=env.default_params, total_timesteps=UPDATES * BATCH, eval_freq=UPDATES * BATCH,
+        eval_callback=lambda *_: (), skip_initial_evaluation=True, num_envs=NUM_ENVS, num_steps=NUM_STEPS,
+        num_epochs=NUM_EPOCHS, num_minibatches=NUM_MINIBATCHES, learning_rate=3e-4,
+        agent_kwargs={"hidden_layer_sizes": HIDDEN, "activation": "tanh"},
+    )  # fmt: skip
+    train = jax.jit(algorithm.train).lower(jax.random.PRNGKey(0)).compile()
+    jax.block_until_ready(train(jax.random.PRNGKey(0)))
+    start = time.perf_counter()
+    jax.block_until_ready(train(jax.random.PRNGKey(1)))
+    return UPDATES * BATCH / (time.perf_counter() - start)
+
+
+def brax(task: str) -> float:
+    """Brax's PPO; what it reports itself, without evaluations and without the first epoch, which compiles."""
+    from brax.training.agents.ppo import train as ppo  # pyright: ignore[reportMissingImports]
+    from brax.training.agents.ppo.networks import make_ppo_networks  # pyright: ignore[reportMissingImports]
+    from jax.nn import tanh
+
+    from jaxsafe.adapters.brax import BraxEnv, mend_brax, wrap
+
+    mend_brax()
+    seen = []
+    networks = partial(
+        make_ppo_networks, activation=tanh, policy_hidden_layer_sizes=HIDDEN, value_hidden_layer_sizes=HIDDEN
+    )
+    ppo.train(
+        BraxEnv(task), 2 * UPDATES * BATCH, wrap_env_fn=wrap, episode_length=2000, num_envs=NUM_ENVS, num_evals=3,
+        unroll_length=NUM_STEPS, batch_size=NUM_ENVS // NUM_MINIBATCHES, num_minibatches=NUM_MINIBATCHES, num_eval_envs=1,
+        num_updates_per_batch=NUM_EPOCHS, network_factory=networks, progress_fn=lambda _, metrics: seen.append(metrics),
+    )  # fmt: skip
+    return float(seen[-1]["training/sps"])
+
+
+def sb3(task: str) -> float:
+    """Stable-Baselines3's PPO, two rollouts of 64 × 1024."""
+    import torch  # pyright: ignore[reportMissingImports]
+    from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
+
+    from jaxsafe.adapters.stable_baselines3 import SB3VecEnv
+
+    torch.set_num_threads(len(os.sched_getaffinity(0)))
+    model = PPO(
+        "MlpPolicy", SB3VecEnv(task, 64), n_steps=BATCH // 64, batch_size=BATCH // NUM_MINIBATCHES, n_epochs=NUM_EPOCHS,
+        policy_kwargs={"net_arch": list(HIDDEN)},
+    )  # fmt: skip
+    model.learn(BATCH)
+    start = time.perf_counter()
+    model.learn(2 * BATCH)
+    return 2 * BATCH / (time.perf_counter() - start)
+
+
+PROBES: dict[str, Callable[[str], float]] = {
+    "jaxsafe": ours,
+    "jaxsafe, ten seeds": partial(ours, seeds=10),
+    "jaxsafe, sorting": partial(ours, sort=True),
+    "rejax": rejax,
+    "brax": brax,
+    "sb3": sb3,
+}
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,125 @@
+"""Several processes, on one machine or on many, that train the seeds of one run together.
+
+Each runs the same program on its own devices; process 0 writes the run directory, all of them its checkpoints.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsafe.errors import ConfigError
+
+LONGEST = 4096
+"""Of what process 0 tells the others, in bytes."""
+
+_LOST = re.compile("gloo|nccl|heartbeat|coordination|unavailable|deadline", re.IGNORECASE)
+"""In what collectives raise when one of the others has gone."""
+
+
+def join() -> None:
+    """Find the other processes, by the environment of Slurm, Open MPI or another launcher that JAX knows.
+
+    Raises:
+        ConfigError: there is no such launcher, or not all processes came.
+    """
+    try:
+        jax.distributed.initialize()
+    except (RuntimeError, ValueError) as error:
+        reason = (str(error).splitlines() or [""])[0]
+        raise ConfigError(f"distributed: start one process for each device by srun or mpirun: {reason[:200]}") from None
+
+
+def leads() -> bool:
+    """Whether this is process 0, or the only one."""
+    return jax.process_index() == 0
+
+
+def from_leader(decide: Callable[[], str]) -> str:
+    """What process 0 decides, in every process.
+
+    Raises:
+        ConfigError: in every process, if process 0 could not.
+    """
+    if jax.process_count() == 1:
+        return decide()
+    from jax.experimental.multihost_utils import broadcast_one_to_all
+
+    failed, text = False, ""
+    if leads():
+        try:
+            text = decide()
+        except ConfigError as error:
+            failed, text = True, str(error)
+    words = np.zeros(LONGEST, np.uint8)
+    content = text.encode()[: LONGEST - 1]
+    words[0], words[1 : 1 + len(content)] = failed, np.frombuffer(content, np.uint8)
+    found = np.asarray(broadcast_one_to_all(words))
+    text = found[1:].tobytes().rstrip(b"\0").decode(errors="replace")
+    if found[0]:
+        raise ConfigError(text)
+    return text
+
+
+def anyone(wants: bool) -> bool:
+    """Whether this holds in some process: what all of them must do together is decided so."""
+    if jax.process_count() == 1:
+        return wants
+    from jax.experimental.multihost_utils import process_allgather
+
+    return bool(np.any(process_allgather(np.asarray(wants))))
+
+
+def gather(x: Any) -> np.ndarray:
+    """An array, or the words of keys, on the host of every process, wherever its parts are."""
+    if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+        x = jax.random.key_data(x)
+    if x.is_fully_addressable:
+        return np.asarray(x)
+    from jax.experimental.multihost_utils import process_allgather
+
+    return np.asarray(process_allgather(x, tiled=True))
+
+
+@contextlib.contextmanager
+def own_files(run: Path) -> Iterator[Path]:
+    """The run directory; in the other processes a copy of its logs, which nobody will read, and nothing is printed."""
+    if leads():
+        _meet("copied")
+        yield run
+        return
+    with tempfile.TemporaryDirectory() as place, open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+        for file in run.iterdir():
+            if file.is_file():
+                shutil.copy(file, place)
+        _meet("copied")
+        yield Path(place)
+
+
+@contextlib.contextmanager
+def loss_told(advice: str) -> Iterator[None]:
+    """What fails because another process has gone becomes a ConfigError with this advice."""
+    try:
+        yield
+    except (jax.errors.JaxRuntimeError, ValueError) as error:
+        if jax.process_count() == 1 or not _LOST.search(str(error)):
+            raise
+        reason = (str(error).splitlines() or [""])[0][:200]
+        raise ConfigError(f"distributed: another process of this run has ended ({reason}); {advice}") from None
+
+
+def _meet(name: str) -> None:
+    if jax.process_count() > 1:
+        from jax.experimental.multihost_utils import sync_global_devices
+
+        sync_global_devices(name)

@@ -1,0 +1,70 @@
+"""Processes that train together, found by what Slurm tells them."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from test_train import assert_same_end
+from tiny import TINY
+
+LONG = [word for word in TINY if not word.startswith(("steps=", "checkpoint_every="))]
+LONG += ["steps=4000000", "checkpoint_every=12800"]
+
+
+def start(place: Path, *words: str, devices: tuple[int, ...] = (1, 1)) -> list[subprocess.Popen]:
+    job = str(random.SystemRandom().randrange(1, 4000))  # decides the port
+    processes = []
+    for rank, count in enumerate(devices):
+        slurm = {"JOB_ID": job, "STEP_NODELIST": "localhost", "NTASKS": len(devices), "PROCID": rank, "LOCALID": rank}
+        env = {**os.environ, **{f"SLURM_{name}": str(value) for name, value in slurm.items()}}
+        env["XLA_FLAGS"] = env["XLA_FLAGS"].replace("device_count=2", f"device_count={count}")
+        command = [sys.executable, "-m", "jaxsafe.train", "distributed=true", *words]
+        with open(place / f"log{rank}", "w") as log:
+            processes.append(subprocess.Popen(command, env=env, stdout=log, stderr=log))
+    return processes
+
+
+def test_two_processes_train_what_one_trains(whole: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    processes = start(tmp_path, *TINY, f"out={run}")
+    assert [process.wait(300) for process in processes] == [0, 0], (tmp_path / "log0").read_text()
+    assert_same_end(run, whole)
+    assert "results in" in (tmp_path / "log0").read_text()
+    assert "steps" not in (tmp_path / "log1").read_text()  # only process 0 tells
+    again = start(tmp_path, *TINY, f"out={run}")
+    assert [process.wait(300) for process in again] == [2, 2]
+    for rank in range(2):
+        assert "already holds something and is never overwritten" in (tmp_path / f"log{rank}").read_text()
+
+
+@pytest.mark.slow
+def test_a_lost_process_ends_the_run_and_another_number_goes_on(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    processes = start(tmp_path, *LONG, f"out={run}")
+    grows(run, processes[0])
+    processes[1].send_signal(signal.SIGKILL)
+    assert processes[0].wait(60) == 2
+    told = (tmp_path / "log0").read_text().splitlines()[-1]
+    assert told.startswith("error: distributed: another process of this run has ended")
+    assert f"resume={run}" in told
+    alone = subprocess.Popen([sys.executable, "-m", "jaxsafe.train", f"resume={run}"], stdout=subprocess.PIPE, text=True)
+    grows(run, alone)
+    alone.send_signal(signal.SIGINT)
+    assert "stopped at step" in alone.communicate(timeout=60)[0]
+    three = start(tmp_path, f"resume={run}", devices=(1, 1, 1))
+    grows(run, three[0])
+    three[2].send_signal(signal.SIGTERM)  # one of them is asked to stop: all do
+    assert [process.wait(60) for process in three] == [130] * 3
+
+
+def grows(run: Path, process: subprocess.Popen) -> None:
+    """Wait for a checkpoint more."""
+    before = len(list(run.glob("checkpoints/*/state")))
+    while len(list(run.glob("checkpoints/*/state"))) == before:
+        assert process.poll() is None
+        time.sleep(0.2)
