@@ -117,10 +117,11 @@ def rejax(task: str) -> float:
     env = GymnaxEnv(task, legacy=True)
     algorithm = PPO.create(
         env=env, env_params=env.default_params, total_timesteps=UPDATES * BATCH, eval_freq=UPDATES * BATCH,
-        eval_callback=lambda *_: (), skip_initial_evaluation=True, num_envs=NUM_ENVS, num_steps=NUM_STEPS,
+        skip_initial_evaluation=True, num_envs=NUM_ENVS, num_steps=NUM_STEPS,
         num_epochs=NUM_EPOCHS, num_minibatches=NUM_MINIBATCHES, learning_rate=3e-4,
         agent_kwargs={"hidden_layer_sizes": HIDDEN, "activation": "tanh"},
     )  # fmt: skip
+    algorithm = algorithm.replace(eval_callback=lambda *_: ())
     train = jax.jit(algorithm.train).lower(jax.random.PRNGKey(0)).compile()
     jax.block_until_ready(train(jax.random.PRNGKey(0)))
     start = time.perf_counter()

@@ -37,7 +37,7 @@ def join() -> None:
         jax.distributed.initialize()
     except (RuntimeError, ValueError) as error:
         reason = (str(error).splitlines() or [""])[0]
-        raise ConfigError(f"distributed: start one process for each device by srun or mpirun: {reason[:200]}") from None
+        raise ConfigError(f"distributed: start the processes by srun or mpirun: {reason[:200]}") from None
 
 
 def leads() -> bool:
