@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any, Self, dataclass_transform
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.component import Range, Refers, Unit
@@ -55,6 +56,11 @@ class Record:
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed."""
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]
+
+
+def is_key(x: Any) -> bool:
+    """Whether this is a typed PRNG key, an array of them, or the shape of one; files and hosts hold their words."""
+    return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
 def units(record: type[Record]) -> dict[str, str]:

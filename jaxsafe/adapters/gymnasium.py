@@ -161,7 +161,8 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise ResetNeeded("reset: the first reset takes no reset_mask")
         asked = self._seeds(seed)
         seeded = mask & np.array([one is not None or not self._lanes.running for one, _ in asked])
-        self._lanes.seed(seeded, _seeds([entropy if one is None else one for one, entropy in asked]))
+        if seeded.any():
+            self._lanes.seed(seeded, _seeds([entropy if one is None else one for one, entropy in asked]))
         self._lanes.restart(mask)
         episodes = self._lanes.now
         self._over = np.where(mask, False, self._over)

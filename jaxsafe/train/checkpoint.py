@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.types import is_key
 
 logging.getLogger("absl").setLevel(logging.ERROR)
 
@@ -69,14 +70,10 @@ class Checkpoints:
         return jax.tree.map(_as, restored["state"], like), restored["facts"]
 
 
-def _is_key(shape: Any) -> bool:
-    return jnp.issubdtype(shape.dtype, jax.dtypes.prng_key)
-
-
 def _empty(shape: Any) -> np.ndarray:
-    words = jax.eval_shape(jax.random.key_data, shape) if _is_key(shape) else shape
+    words = jax.eval_shape(jax.random.key_data, shape) if is_key(shape) else shape
     return np.empty(words.shape, words.dtype)
 
 
 def _as(x: Any, shape: Any) -> Any:
-    return jax.random.wrap_key_data(jnp.asarray(x)) if _is_key(shape) else x
+    return jax.random.wrap_key_data(jnp.asarray(x)) if is_key(shape) else x

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.errors import ConfigError
+from jaxsafe.types import is_key
 
 LONGEST = 4096
 """Of what process 0 tells the others, in bytes."""
@@ -82,7 +82,7 @@ def anyone(wants: bool) -> bool:
 
 def gather(x: Any) -> np.ndarray:
     """An array, or the words of keys, on the host of every process, wherever its parts are."""
-    if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+    if is_key(x):
         x = jax.random.key_data(x)
     if x.is_fully_addressable:
         return np.asarray(x)

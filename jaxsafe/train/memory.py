@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 
 from jaxsafe.errors import ConfigError
+from jaxsafe.types import is_key
 
 GIB = 2**30
 
@@ -74,4 +74,4 @@ def _lines(path: str) -> list[str]:
 
 def _raw(tree: Any) -> Any:
     """Keys as the words that they are."""
-    return jax.tree.map(lambda x: jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x, tree)
+    return jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, tree)

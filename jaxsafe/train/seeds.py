@@ -18,6 +18,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxsafe.errors import ConfigError
 from jaxsafe.train import hosts
+from jaxsafe.types import is_key
 
 _SEEDS = PartitionSpec("seeds")
 
@@ -99,7 +100,7 @@ class SeedMapper:
 
 
 def _spread(x: Any, sharding: NamedSharding) -> jax.Array:
-    if jnp.issubdtype(jnp.result_type(x), jax.dtypes.prng_key):
+    if is_key(x):
         return jax.random.wrap_key_data(_spread(jax.random.key_data(x), sharding))
     if sharding.is_fully_addressable:
         return jax.device_put(x, sharding)
