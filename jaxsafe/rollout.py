@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxsafe.environment import Environment, reset, step
+from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.types import Key, State, TimeStep
 
 Tree = TypeVar("Tree")
@@ -65,13 +66,18 @@ def restarted(env: Environment, state: State, timestep: TimeStep, key: Key) -> t
     return choose(timestep.done, (fresh_state, fresh.observation), (state, timestep.observation))
 
 
-def reset_batch(env: Environment, key: Key, num_envs: int) -> tuple[State, TimeStep]:
-    """Independent random starts, [num_envs]."""
-    return jax.vmap(reset, in_axes=(None, 0))(env, jax.random.split(key, num_envs))
+def reset_batch(env: Environment, key: Key, num_envs: int, shard: Shard = WHOLE) -> tuple[State, TimeStep]:
+    """Independent random starts, [num_envs], of which a shard has its part."""
+    return jax.vmap(reset, in_axes=(None, 0))(env, shard.draw(jax.random.split, key, (num_envs // shard.count,)))
 
 
 def step_or_reset_batch(
-    env: Environment, state: State, action: Array, key: Key, max_episode_steps: Array | float = jnp.inf
+    env: Environment,
+    state: State,
+    action: Array,
+    key: Key,
+    max_episode_steps: Array | float = jnp.inf,
+    shard: Shard = WHOLE,
 ) -> tuple[tuple[State, Array], TimeStep]:
     """`step_or_reset` for a batch, [num_envs]; starts are drawn only on steps on which some episode ends.
 
@@ -83,7 +89,7 @@ def step_or_reset_batch(
     done = timestep.done
 
     def draw(old: tuple[State, Array]) -> tuple[State, Array]:
-        fresh_state, fresh = reset_batch(env, key, done.shape[0])
+        fresh_state, fresh = reset_batch(env, key, done.shape[0] * shard.count, shard)
         return choose(done, (fresh_state, fresh.observation), old)
 
     return jax.lax.cond(jnp.any(done), draw, lambda old: old, (state, timestep.observation)), timestep

@@ -56,6 +56,7 @@ def fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], t
         (["env=docking3d", "ppo.gamma=true"], "ppo.gamma: expected a number in [0, 1], found True"),
         (["env=docking3d", "ppo.learning_rate=.nan"], "ppo.learning_rate: expected a number > 0, found nan"),
         (["env=docking3d", "ppo.num_minibatches=3"], "ppo.num_minibatches: expected a divisor of"),
+        (["env=docking3d", "devices_per_seed=3"], "devices_per_seed: expected one of 1, 2, 4, 8, 16, which divide"),
         (["env=docking3d", "ppo.learning_rate_decay=exponential", "ppo.final_learning_rate=0"],
          "ppo.final_learning_rate: expected a number > 0 for an exponential decay, found 0"),
         (["env=docking3d", "agent.log_std=[-1,-2]"],

@@ -8,9 +8,12 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 from test_train import assert_same_end
 from tiny import TINY
+
+from jaxsafe.train.__main__ import main
 
 LONG = [word for word in TINY if not word.startswith(("steps=", "checkpoint_every="))]
 LONG += ["steps=4000000", "checkpoint_every=12800"]
@@ -43,11 +46,26 @@ def test_two_processes_train_what_one_trains(whole: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
+def test_two_processes_share_one_seed(tmp_path: Path) -> None:
+    one = ["seeds=1", "steps=320", "ppo.num_minibatches=1", "devices_per_seed=2"]  # of five updates, with TINY's batches
+    words = [word for word in TINY if not word.startswith(("seeds=", "steps="))]
+    processes = start(tmp_path, *words, *one, f"out={tmp_path / 'two'}")
+    assert [process.wait(300) for process in processes] == [0, 0], (tmp_path / "log0").read_text()
+    assert main([*words, *one, f"out={tmp_path / 'one'}"]) == 0
+    found, expected = (np.load(tmp_path / name / "policy" / "seed_0.npz") for name in ("two", "one"))
+    assert list(found) == list(expected)
+    for name in found:
+        if found[name].dtype.kind == "f":
+            np.testing.assert_allclose(found[name], expected[name], atol=1e-4)
+
+
+@pytest.mark.slow
 def test_a_lost_process_ends_the_run_and_another_number_goes_on(tmp_path: Path) -> None:
     run = tmp_path / "run"
     processes = start(tmp_path, *LONG, f"out={run}")
     grows(run, processes[0])
-    processes[1].send_signal(signal.SIGKILL)
+    processes[1].kill()
+    processes[1].wait()
     assert processes[0].wait(60) == 2
     told = (tmp_path / "log0").read_text().splitlines()[-1]
     assert told.startswith("error: distributed: another process of this run has ended")

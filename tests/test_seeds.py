@@ -1,12 +1,13 @@
-from typing import Any
-
 import jax
 import numpy as np
 import pytest
 
 import jaxsafe
 from jaxsafe.component import normalise
+from jaxsafe.errors import ConfigError
+from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.train.agent import Agent
+from jaxsafe.train.loop import STATE
 from jaxsafe.train.ppo import PPO, TrainState, init, update
 from jaxsafe.train.seeds import SeedMapper
 
@@ -16,15 +17,20 @@ HYPER = normalise(PPO(num_envs=4, num_steps=32, num_epochs=2))
 UPDATES = 5
 
 
-def train(shared: tuple, key: jax.Array) -> TrainState:
+def train(shared: tuple, key: jax.Array, updates: int = UPDATES, shard: Shard = WHOLE) -> TrainState:
     env, agent, ppo = shared
-    return jax.lax.fori_loop(0, UPDATES, lambda _, s: update(env, agent, ppo, UPDATES, s), init(env, agent, ppo, key))
+    begin = init(env, agent, ppo, key, shard)
+    return jax.lax.fori_loop(0, updates, lambda _, state: update(env, agent, ppo, UPDATES, state, shard), begin)
 
 
-def seeds(first: int, count: int) -> dict[str, Any]:
-    mapper = SeedMapper(count)
-    state = mapper.map(train)(mapper.replicate((ENV, AGENT, HYPER)), mapper.keys(first))
-    return mapper.gather({"params": state.params, "observation": state.observation})
+def seeds(first: int, count: int, share: int = 1, updates: int = UPDATES) -> TrainState:
+    mapper = SeedMapper(count, (share,))
+
+    def train_shared(shared: tuple, key: jax.Array) -> TrainState:
+        return train(shared, key, updates, mapper.shard)
+
+    state = mapper.map(train_shared, returned=STATE)(mapper.replicate((ENV, AGENT, HYPER)), mapper.keys(first))
+    return mapper.gather(state)
 
 
 @pytest.fixture(scope="module")
@@ -33,20 +39,28 @@ def three() -> TrainState:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_seed_of_many_is_bit_for_bit_the_seed_alone(three: dict[str, Any], seed: int) -> None:
+def test_a_seed_of_many_is_bit_for_bit_the_seed_alone(three: TrainState, seed: int) -> None:
     alone = seeds(seed, 1)
-    jax.tree.map(lambda many, one: np.testing.assert_array_equal(many[seed], one[0]), three["params"], alone["params"])
-    np.testing.assert_array_equal(three["observation"][seed], alone["observation"][0])
+    jax.tree.map(lambda many, one: np.testing.assert_array_equal(many[seed], one[0]), three, alone)
 
 
-def test_a_seed_is_to_rounding_the_same_run_under_vmap(three: dict[str, Any]) -> None:
+@pytest.mark.parametrize(("updates", "share"), [(0, 2), (UPDATES, 2)])
+def test_devices_that_share_a_seed_train_what_one_trains_to_rounding(updates: int, share: int) -> None:
+    alone, shared = seeds(0, 1, 1, updates), seeds(0, 1, share, updates)
+    if not updates:
+        jax.tree.map(np.testing.assert_array_equal, alone, shared)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), alone, shared)
+    assert alone.num_updates == updates
+
+
+def test_a_seed_is_to_rounding_the_same_run_under_vmap(three: TrainState) -> None:
     keys = jax.vmap(jax.random.key)(np.arange(3))
     together = jax.jit(jax.vmap(train, in_axes=(None, 0)))((ENV, AGENT, HYPER), keys)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), three["params"], together.params)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), three.params, together.params)
 
 
-def test_seeds_differ(three: dict[str, Any]) -> None:
-    kernel = three["params"]["actor"][0]["kernel"]
+def test_seeds_differ(three: TrainState) -> None:
+    kernel = three.params["actor"][0]["kernel"]
     assert np.abs(kernel[0] - kernel[1]).max() > 0.01
 
 
@@ -56,3 +70,12 @@ def test_seeds_are_spread_over_devices_and_padded() -> None:
     assert mapper.mesh.size == 2
     assert mapper.padded == 4
     np.testing.assert_array_equal(mapper.pad(np.array([5, 6, 7])), [5, 6, 7, 7])
+
+
+def test_devices_share_a_seed_where_there_are_more_than_seeds() -> None:
+    assert SeedMapper(1, (1, 2)).mesh.shape == {"seeds": 1, "lanes": 2}
+    assert SeedMapper(2, (1, 2)).mesh.shape == {"seeds": 2, "lanes": 1}
+    assert SeedMapper(1, (1,)).mesh.size == 1
+    assert SeedMapper(3, (2,)).mesh.shape == {"seeds": 1, "lanes": 2}
+    with pytest.raises(ConfigError, match=r"^devices_per_seed: found 4, there are 2 devices$"):
+        SeedMapper(1, (4,))

@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from jaxsafe.component import ANY, Component, Range, Unit
 from jaxsafe.environment import Environment
 from jaxsafe.rollout import Policy
+from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.train.features import FEATURES
 from jaxsafe.types import Dimensionless, Key, Number, Positive
 
@@ -100,8 +101,8 @@ class Gaussian(Component):
     def mode(self) -> Float[Array, "*batch a"]:
         return self.mean
 
-    def sample(self, key: Key) -> Float[Array, "*batch a"]:
-        return self.mean + jnp.exp(self.log_std) * jax.random.normal(key, self.mean.shape, self.mean.dtype)
+    def sample(self, key: Key, shard: Shard = WHOLE) -> Float[Array, "*batch a"]:
+        return self.mean + jnp.exp(self.log_std) * shard.draw(jax.random.normal, key, self.mean.shape, self.mean.dtype)
 
     def log_prob(self, action: Float[Array, "*batch a"]) -> Float[Array, "*batch"]:
         z = (action - self.mean) * jnp.exp(-self.log_std)
@@ -121,8 +122,8 @@ class Categorical(Component):
     def mode(self) -> Array:
         return jnp.stack([jnp.argmax(block, axis=-1) for block in self._blocks()], axis=-1).astype(jnp.int32)
 
-    def sample(self, key: Key) -> Array:
-        gumbel = jax.random.gumbel(key, self.logits.shape, self.logits.dtype)
+    def sample(self, key: Key, shard: Shard = WHOLE) -> Array:
+        gumbel = shard.draw(jax.random.gumbel, key, self.logits.shape, self.logits.dtype)
         return Categorical(logits=self.logits + gumbel, points=self.points).mode()
 
     def log_prob(self, action: Array) -> Float[Array, "*batch"]:

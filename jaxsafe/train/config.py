@@ -25,6 +25,9 @@ from jaxsafe.types import Dimensionless, Positive
 
 Count = Annotated[int, Range(1)]
 
+WORTHWHILE = 128
+"""Samples of a minibatch for each device that shares a seed, at least: fewer take less time than to exchange gradients."""
+
 
 class TrainConfig(Component):
     """Options of `python -m jaxsafe.train`; steps and episodes are per seed."""
@@ -34,6 +37,7 @@ class TrainConfig(Component):
     cost_limit: Annotated[Dimensionless, Positive] | None = None  # of ppo_lagrangian: violating steps per episode
     seeds: Count = 1
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0  # the first; seeds=10 is seed … seed + 9
+    devices_per_seed: Count | None = None  # that share its environments; None: as many as there are, while each has work
     steps: Count = 500_000
     actions: Literal["continuous", "discrete"] | None = None  # None: as the environment says
     variant: Literal["paper", "released"] | None = None  # None: paper
@@ -53,6 +57,14 @@ class TrainConfig(Component):
     def num_updates(self) -> int:
         """Updates of each seed: `steps`, rounded up to whole batches."""
         return -(-self.steps // self.ppo.batch_size)
+
+    @property
+    def shares(self) -> list[int]:
+        """Numbers of devices that may share a seed."""
+        if self.devices_per_seed is not None:
+            return [self.devices_per_seed]
+        minibatch = self.ppo.batch_size // self.ppo.num_minibatches
+        return [count for count in self.ppo.shares if count == 1 or minibatch >= count * WORTHWHILE]
 
     def every(self, steps: int | None) -> int:
         """An interval in updates; a tenth of the run without one."""
@@ -105,6 +117,11 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
         raise ConfigError(
             f"ppo.num_minibatches: expected a divisor of ppo.num_envs × ppo.num_steps = {config.ppo.batch_size},"
             f" found {config.ppo.num_minibatches}"
+        )
+    if config.devices_per_seed is not None and config.devices_per_seed not in config.ppo.shares:
+        raise ConfigError(
+            f"devices_per_seed: expected one of {', '.join(map(str, config.ppo.shares))}, which divide ppo.num_envs and the"
+            f" samples of a minibatch, found {config.devices_per_seed}"
         )
     if config.ppo.batch_size >= 2**31:
         raise ConfigError(f"ppo.num_envs × ppo.num_steps: expected less than 2³¹, found {config.ppo.batch_size:,}")

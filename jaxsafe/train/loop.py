@@ -9,6 +9,7 @@ from __future__ import annotations
 import shutil
 import signal
 import time
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -20,6 +21,7 @@ from jaxsafe.environment import Environment
 from jaxsafe.evaluate.seeds import KINDS, Evaluator, episode_rows
 from jaxsafe.metrics import Episode
 from jaxsafe.rollout import choose
+from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.train import hosts, memory, ppo, window
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import TrainConfig
@@ -27,11 +29,13 @@ from jaxsafe.train.files import append_rows, keep_rows, read_rows
 from jaxsafe.train.log import Display, ProgressLog, progress_rows
 from jaxsafe.train.ppo import TrainState
 from jaxsafe.train.restore import structure
-from jaxsafe.train.seeds import SeedMapper
+from jaxsafe.train.seeds import LANES, SEEDS, SeedMapper
 
 EVALUATION_SEED = 0
 """Of the evaluations during and after training; `python -m jaxsafe.evaluate seed=…` chooses others."""
 
+STATE = ppo.over_devices(SEEDS, LANES)
+"""How the training states of all seeds lie on the devices."""
 
 MEMORY = "ppo.num_envs, ppo.num_steps, seeds"
 """What decides how much of it a training needs."""
@@ -53,7 +57,7 @@ class Training:
             checkpoints: the run directory that holds the checkpoints, if it is another.
         """
         self.config, self.env, self.run, self.began = config, env, run, began
-        self.mapper = SeedMapper(config.seeds)
+        self.mapper = SeedMapper(config.seeds, config.shares)
         self.shared = self.mapper.replicate((env, config.agent, config.ppo))
         intervals = (config.every(config.eval_every), config.every(config.checkpoint_every))
         self.chunk = max(1, min(config.num_updates // 50, 100_000 // config.ppo.batch_size, *intervals))
@@ -111,15 +115,16 @@ class Training:
 
     def _restore_or_init(self) -> None:
         steps, content = self.checkpoints.steps, structure(self.env, self.config)
-        each = memory.size(content) // self.config.seeds * (self.mapper.padded // self.mapper.num_devices)
-        memory.require(each, self.mapper.num_devices, MEMORY)
+        each = memory.size(content) // self.config.seeds * (self.mapper.padded // self.mapper.mesh.shape["seeds"])
+        memory.require(each, self.mapper.mesh.size, MEMORY)
         if not steps:
-            self.state = self.mapper.map(begin)(self.shared, self.mapper.keys(self.config.seed))
+            fresh = self.mapper.map(partial(begin, shard=self.mapper.shard), returned=STATE)
+            self.state = fresh(self.shared, self.mapper.keys(self.config.seed))
             never = self.mapper.place(np.full(self.config.seeds, -1.0, np.float32))
             self.best = {"params": self.state.average, "success": never}
             return
         content, facts = self.checkpoints.restore(steps[-1], content)
-        self.state, self.best = self.mapper.place(content["state"]), self.mapper.place(content["best"])
+        self.state, self.best = self.mapper.place(content["state"], STATE), self.mapper.place(content["best"])
         self.updates, self.elapsed, self.compile_s = facts["updates"], facts["wall_s"], facts["compile_s"]
 
     def _keep_copies(self) -> None:
@@ -136,14 +141,13 @@ class Training:
         """Compile the chunk ahead of time, so that its cost is known."""
 
         def advance(shared: tuple, state: TrainState) -> tuple[TrainState, dict]:
-            return chunk(shared, state, self.chunk, self.config.num_updates)
+            return chunk(shared, state, self.chunk, self.config.num_updates, self.mapper.shard)
 
         begin = time.monotonic()
-        compiled = self.mapper.map(advance).lower(self.shared, self.state).compile()
+        compiled = self.mapper.map(advance, STATE, (STATE, SEEDS)).lower(self.shared, self.state).compile()
         self.compile_s += time.monotonic() - begin
-        memory.require(
-            memory.footprint(compiled) - memory.size(self.state) // self.mapper.num_devices, self.mapper.num_devices, MEMORY
-        )
+        devices = self.mapper.mesh.size
+        memory.require(memory.footprint(compiled) - memory.size(self.state) // devices, devices, MEMORY)
         return compiled
 
     def _due(self, before: int, every: int | None) -> bool:
@@ -185,19 +189,21 @@ class Training:
         self.checkpoints.save(self.step, self.mapper.gather({"state": self.state, "best": self.best}), facts)
 
 
-def begin(shared: tuple, key: jax.Array) -> TrainState:
+def begin(shared: tuple, key: jax.Array, shard: Shard = WHOLE) -> TrainState:
     """Fresh networks and episodes of one seed."""
     env, agent, hyper = shared
-    return ppo.init(env, agent, hyper, key)
+    return ppo.init(env, agent, hyper, key, shard)
 
 
-def chunk(shared: tuple, state: TrainState, length: int, limit: int) -> tuple[TrainState, dict[str, jax.Array]]:
+def chunk(
+    shared: tuple, state: TrainState, length: int, limit: int, shard: Shard = WHOLE
+) -> tuple[TrainState, dict[str, jax.Array]]:
     """`length` updates of one seed, fewer at the end of the run, with the averages of the window after each."""
     env, agent, hyper = shared
 
     def one(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
         going = state.num_updates < limit
-        state = jax.lax.cond(going, lambda s: ppo.update(env, agent, hyper, limit, s), lambda s: s, state)
+        state = jax.lax.cond(going, lambda s: ppo.update(env, agent, hyper, limit, s, shard), lambda s: s, state)
         counts = {"update": state.num_updates, "count": state.window.count, "cost": state.window.cost}
         if agent.cost_critic:
             counts["multiplier"] = state.multiplier

@@ -9,6 +9,8 @@ devices and files are the caller's business. Hyperparameters that are numbers ar
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -21,12 +23,16 @@ from jaxsafe.component import Component, Range
 from jaxsafe.environment import Environment
 from jaxsafe.metrics import Episode, accumulate, begin
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
+from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.train.agent import Agent, Params
 from jaxsafe.train.shuffle import shuffle
 from jaxsafe.train.window import Window, empty_window, latest_cost, push
 from jaxsafe.types import Dimensionless, Key, Positive, Record, State, TimeStep
 
 Share = Range(0.0, 1.0)
+
+CHUNK = 512
+"""Samples of a minibatch whose gradients a CPU takes at once: so many activations stay in a core's cache."""
 
 
 class PPO(Component):
@@ -58,6 +64,12 @@ class PPO(Component):
     def batch_size(self) -> int:
         """Environment steps in one update."""
         return self.num_envs * self.num_steps
+
+    @property
+    def shares(self) -> list[int]:
+        """Numbers of devices that can share a seed: each has as many environments, and samples of a minibatch."""
+        most = math.gcd(self.num_envs, self.batch_size // self.num_minibatches)
+        return [count for count in range(1, most + 1) if most % count == 0]
 
 
 class TrainState(Record):
@@ -102,11 +114,18 @@ class Batch(NamedTuple):
     cost_target: Any = ()  # (1 − γ) times the discounted cost to come, if there is a critic of it
 
 
-def init(env: Environment, agent: Agent, ppo: PPO, key: Key) -> TrainState:
-    """Fresh networks and episodes for one seed."""
+def over_devices(whole: Any, split: Any) -> TrainState:
+    """Which fields of a state devices that share the environments of a seed have whole, and which by their environments."""
+    names = {field.name for field in dataclasses.fields(TrainState)}
+    by_environment = {"env_state", "observation", "episode"}
+    return TrainState(**{name: split if name in by_environment else whole for name in names})
+
+
+def init(env: Environment, agent: Agent, ppo: PPO, key: Key, shard: Shard = WHOLE) -> TrainState:
+    """Fresh networks and episodes for one seed; of a shard, its environments."""
     key_params, key_reset, key_run = jax.random.split(key, 3)
     params = agent.init(key_params, env)
-    env_state, timestep = reset_batch(env, key_reset, ppo.num_envs)
+    env_state, timestep = reset_batch(env, key_reset, ppo.num_envs, shard)
     episode = begin(timestep)
     return TrainState(
         params, _optimizer(ppo).init(params), env_state, timestep.observation, episode,
@@ -115,18 +134,24 @@ def init(env: Environment, agent: Agent, ppo: PPO, key: Key) -> TrainState:
     )  # fmt: skip
 
 
-def update(env: Environment, agent: Agent, ppo: PPO, total_updates: Array | int, state: TrainState) -> TrainState:
-    """Collect one batch with the current policy and improve policy and value on it."""
+def update(
+    env: Environment, agent: Agent, ppo: PPO, total_updates: Array | int, state: TrainState, shard: Shard = WHOLE
+) -> TrainState:
+    """Collect one batch with the current policy and improve policy and value on it.
+
+    Devices that share the environments share the work: each runs its own and takes its part of every minibatch.
+    """
     key_collect, key_learn = jax.random.split(jax.random.fold_in(state.key, state.num_updates))
-    state, transitions = collect(env, agent, ppo, state, key_collect)
+    state, transitions = collect(env, agent, ppo, state, key_collect, shard)
     progress = state.num_updates / total_updates
     gamma = discount(ppo, progress)
-    batch = _to_batch(agent, ppo, gamma, state, transitions)
-    params, optimizer = learn(env, agent, ppo, learning_rate(ppo, progress), state, batch, key_learn)
+    batch = _to_batch(agent, ppo, gamma, state, transitions, shard)
+    params, optimizer = learn(env, agent, ppo, learning_rate(ppo, progress), state, batch, key_learn, shard)
     if "log_std" in params:
         params = {**params, "log_std": params["log_std"] - ppo.noise_decay / total_updates}
-    window = push(state.window, transitions.episode, transitions.done)
-    multiplier = dual_ascent(ppo, state.multiplier, window, transitions.done) if agent.cost_critic else ()
+    episode, done = shard.join((transitions.episode, transitions.done), axis=1)
+    window = push(state.window, episode, done)
+    multiplier = dual_ascent(ppo, state.multiplier, window, done) if agent.cost_critic else ()
     share = 1.0 / jnp.maximum(ppo.averaging * total_updates, 1.0)
     average = jax.tree.map(lambda old, new: (1.0 - share) * old + share * new, state.average, params)
     return state.replace(
@@ -162,7 +187,9 @@ def discount(ppo: PPO, progress: Array | float) -> Array:
     return 1.0 - (1.0 - jnp.asarray(ppo.gamma)) / jnp.asarray(ppo.horizon_growth) ** progress
 
 
-def collect(env: Environment, agent: Agent, ppo: PPO, state: TrainState, key: Key) -> tuple[TrainState, Transition]:
+def collect(
+    env: Environment, agent: Agent, ppo: PPO, state: TrainState, key: Key, shard: Shard = WHOLE
+) -> tuple[TrainState, Transition]:
     """Run every environment for `num_steps`; episodes go on from one update to the next."""
 
     def one_step(carry: tuple[State, Array, Episode], key: Key) -> tuple[tuple[State, Array, Episode], Transition]:
@@ -171,8 +198,10 @@ def collect(env: Environment, agent: Agent, ppo: PPO, state: TrainState, key: Ke
         inputs = agent.inputs(env, observation)
         totals = env_state.reward_totals if agent.critic_sees_totals else {}
         policy = agent.distribution(env, state.params, inputs)
-        action = policy.sample(key_act)
-        (env_state, observation), timestep = step_or_reset_batch(env, env_state, action, key_reset, ppo.max_episode_steps)
+        action = policy.sample(key_act, shard)
+        (env_state, observation), timestep = step_or_reset_batch(
+            env, env_state, action, key_reset, ppo.max_episode_steps, shard
+        )
         if ppo.learns_from == "actual":
             action = _acted(env, action, timestep)
         done, episode = timestep.done, accumulate(episode, timestep)
@@ -217,14 +246,31 @@ def gae(reward: Array, value: Array, next_value: Array, terminated: Array, done:
 
 
 def learn(
-    env: Environment, agent: Agent, ppo: PPO, step_size: Array, state: TrainState, batch: Batch, key: Key
+    env: Environment,
+    agent: Agent,
+    ppo: PPO,
+    step_size: Array,
+    state: TrainState,
+    batch: Batch,
+    key: Key,
+    shard: Shard = WHOLE,
 ) -> tuple[Params, optax.OptState]:
     """Some epochs of minibatch steps, each epoch over a new shuffle of the batch."""
 
+    def gradient(params: Params, rows: Array) -> Params:
+        return jax.grad(loss)(params, env, agent, ppo, jax.tree.map(lambda x: x[rows], batch))
+
+    def mean_gradient(params: Params, rows: Array) -> Params:
+        if jax.default_backend() != "cpu" or rows.size <= CHUNK or rows.size % CHUNK:
+            return gradient(params, rows)
+        add = lambda total, part: (jax.tree.map(jnp.add, total, gradient(params, part)), None)  # noqa: E731
+        parts = rows.reshape(-1, CHUNK)
+        total, _ = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), parts)
+        return jax.tree.map(lambda x: x / len(parts), total)
+
     def minibatch_step(carry: tuple[Params, optax.OptState], rows: Array) -> tuple[tuple[Params, optax.OptState], None]:
         params, optimizer = carry
-        minibatch = jax.tree.map(lambda x: x[rows], batch)
-        gradient = jax.grad(loss)(params, env, agent, ppo, minibatch)
+        gradient = shard.mean(mean_gradient(params, shard.own(rows)))
         step, optimizer = _optimizer(ppo).update(gradient, optimizer)
         return (jax.tree.map(lambda p, s: p - step_size * s, params, step), optimizer), None
 
@@ -250,7 +296,9 @@ def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch)
     return jnp.mean(-surrogate + ppo.value_coefficient * value_error - ppo.entropy_coefficient * entropy)
 
 
-def _to_batch(agent: Agent, ppo: PPO, gamma: Array, state: TrainState, transitions: Transition) -> Batch:
+def _to_batch(
+    agent: Agent, ppo: PPO, gamma: Array, state: TrainState, transitions: Transition, shard: Shard = WHOLE
+) -> Batch:
     """Advantages, normalised over the whole batch, and targets of the critics; all samples in one row."""
     t, params = transitions, state.params
     seen = [agent.critic_inputs(*one) for one in ((t.inputs, t.totals), (t.next_inputs, t.episode.reward_totals))]
@@ -262,8 +310,9 @@ def _to_batch(agent: Agent, ppo: PPO, gamma: Array, state: TrainState, transitio
         cost_advantage = gae((1.0 - gamma) * t.cost, rate, next_rate, t.terminated, t.done, gamma, ppo.gae_lambda)
         cost_target = cost_advantage + rate
         advantage -= state.multiplier * cost_advantage / (1.0 - gamma)
-    advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-    batch = Batch(t.inputs, t.totals, t.action, t.log_prob, advantage, target, cost_target)
+    batch = shard.join(Batch(t.inputs, t.totals, t.action, t.log_prob, advantage, target, cost_target), axis=1)
+    advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8)
+    batch = batch._replace(advantage=advantage)
     return jax.tree.map(lambda x: x.reshape(ppo.batch_size, *x.shape[2:]), batch)
 
 

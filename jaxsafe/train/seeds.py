@@ -1,13 +1,14 @@
 """One program for all seeds: a shard of them on each device, and within a device one after another.
 
 On a CPU a device is a core with one thread: independent seeds side by side use both caches and need no communication, where
-`vmap` over seeds gains nothing. An accelerator gets its seeds as one `vmap`.
+`vmap` over seeds gains nothing. An accelerator gets its seeds as one `vmap`. Where there are more devices than seeds, some
+devices share the environments of a seed.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import zip_longest
 from typing import Any
 
@@ -17,10 +18,15 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from jaxsafe.errors import ConfigError
+from jaxsafe.shard import Shard
 from jaxsafe.train import hosts
 from jaxsafe.types import is_key
 
-_SEEDS = PartitionSpec("seeds")
+SEEDS = PartitionSpec("seeds")
+"""Arrays [seeds], of which every device has those of its seeds."""
+
+LANES = PartitionSpec("seeds", "lanes")
+"""Arrays [seeds, environments], of which every device has its environments."""
 
 
 def claim_cores() -> None:
@@ -43,25 +49,31 @@ def claim_cores() -> None:
 class SeedMapper:
     """Maps functions over the leading seed axis of their second argument, sharded over devices."""
 
-    def __init__(self, num_seeds: int) -> None:
-        """Use as many devices as there are seeds, at most; each takes the same number, padded with repeats.
+    def __init__(self, num_seeds: int, shares: Sequence[int] = (1,)) -> None:
+        """Use as many devices as there is work for; seeds are spread evenly, padded with repeats.
+
+        Args:
+            num_seeds: how many there are.
+            shares: numbers of devices that may share a seed; the largest is taken that leaves devices for all seeds.
 
         Raises:
-            ConfigError: there are more processes than seeds.
+            ConfigError: there are too few devices, or too few seeds for all processes.
         """
-        if num_seeds < jax.process_count():
-            raise ConfigError(f"seeds: expected one for each of {jax.process_count()} processes, found {num_seeds}")
-        each = [jax.local_devices(process) for process in range(jax.process_count())]
-        in_turn = [device for turn in zip_longest(*each) for device in turn if device is not None]
-        devices = in_turn[: max(1, min(num_seeds, len(in_turn)))]
+        groups = _groups(num_seeds, sorted(shares, reverse=True))
         self.num_seeds = num_seeds
-        self.padded = -(-num_seeds // len(devices)) * len(devices)
-        self.num_devices = len(devices)
-        self.mesh = Mesh(np.array(devices), ("seeds",))
-        self.one_by_one = devices[0].platform == "cpu"
+        self.padded = -(-num_seeds // len(groups)) * len(groups)
+        self.mesh = Mesh(np.array(groups), ("seeds", "lanes"))
+        self.shard = Shard("lanes", len(groups[0]))
+        self.one_by_one = groups[0][0].platform == "cpu"
 
-    def map(self, function: Callable[[Any, Any], Any]) -> Any:
-        """`function(shared, one)` to a jittable `(shared, all)`, all with a leading axis of `padded` seeds."""
+    def map(self, function: Callable[[Any, Any], Any], given: Any = SEEDS, returned: Any = SEEDS) -> Any:
+        """`function(shared, one)` to a jittable `(shared, all)`, all with a leading axis of `padded` seeds.
+
+        Args:
+            function: of one seed.
+            given: how the arrays of `all` lie on the devices, `SEEDS` or `LANES`, or a tree of both that stands for theirs.
+            returned: the same of what the function returns.
+        """
 
         def shard(shared: Any, local: Any) -> Any:
             if not self.one_by_one:
@@ -69,7 +81,7 @@ class SeedMapper:
             return jax.lax.map(lambda one: _isolated(function)(shared, one), local)
 
         return jax.jit(
-            jax.shard_map(shard, mesh=self.mesh, in_specs=(PartitionSpec(), _SEEDS), out_specs=_SEEDS, check_vma=False)
+            jax.shard_map(shard, mesh=self.mesh, in_specs=(PartitionSpec(), given), out_specs=returned, check_vma=False)
         )
 
     def keys(self, first: int) -> jax.Array:
@@ -77,14 +89,13 @@ class SeedMapper:
         seeds = self.pad(first + np.arange(self.num_seeds))
         return self.place(jax.vmap(jax.random.key)(jnp.asarray(seeds)))
 
-    def place(self, tree: Any) -> Any:
-        """Distribute arrays [num_seeds] or [padded] over the devices; every process has all of them."""
-        return jax.tree.map(lambda x: _spread(self.pad(x), NamedSharding(self.mesh, _SEEDS)), tree)
+    def place(self, tree: Any, specs: Any = SEEDS) -> Any:
+        """Distribute arrays [num_seeds] or [padded] over the devices, as `map` is given them; every process has all."""
 
-    def place_like(self, shapes: Any) -> Any:
-        """The shapes with the placement that `place` gives, for restoring."""
-        sharding = NamedSharding(self.mesh, _SEEDS)
-        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes)
+        def part(spec: PartitionSpec, part: Any) -> Any:
+            return jax.tree.map(lambda x: _spread(self.pad(x), NamedSharding(self.mesh, spec)), part)
+
+        return jax.tree.map(part, specs, tree)
 
     def pad(self, values: Any) -> Any:
         """Repeat the last seed's entry up to `padded`."""
@@ -97,6 +108,23 @@ class SeedMapper:
     def gather(self, tree: Any) -> Any:
         """Arrays on the host of every process, without the padding; of keys the words."""
         return jax.tree.map(lambda x: hosts.gather(x)[: self.num_seeds], tree)
+
+
+def _groups(num_seeds: int, shares: Sequence[int]) -> list[list[Any]]:
+    """The devices that take a seed together, at most `num_seeds` groups; each of one process, if that leaves none out."""
+    each = [jax.local_devices(process) for process in range(jax.process_count())]
+    for share in shares:
+        cut = lambda devices, n=share: [devices[i : i + n] for i in range(0, len(devices) - n + 1, n)]  # noqa: E731
+        in_turn = [group for turn in zip_longest(*map(cut, each)) for group in turn if group is not None]
+        across = cut([device for local in each for device in local])
+        for groups in (in_turn, across):
+            enough = len(groups) >= num_seeds or (groups and share == shares[-1])
+            reached = {device.process_index for group in groups[:num_seeds] for device in group}
+            if enough and len(reached) == len(each):
+                return groups[:num_seeds]
+    if jax.device_count() < shares[-1]:
+        raise ConfigError(f"devices_per_seed: found {shares[-1]}, there are {jax.device_count()} devices")
+    raise ConfigError(f"seeds: expected one for each of {len(each)} processes, found {num_seeds}")
 
 
 def _spread(x: Any, sharding: NamedSharding) -> jax.Array:
