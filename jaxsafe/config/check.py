@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from typing import Annotated, Any
 
 import jax
@@ -59,8 +60,7 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
         if not names[required]:
             raise ConfigError(f"{required}: an environment needs at least one")
     if before is None or _shapes(env) != _shapes(before):
-        _check_kinds(env)
-        _check_tracing(env)
+        _check_computable(*_shapes(env), jnp.result_type(float))
         _check_suited(env)
     return env
 
@@ -209,9 +209,20 @@ def _check_randomized(env: Environment) -> None:
                 raise ConfigError(f"randomize: {error}") from None
 
 
-def _shapes(env: Environment) -> tuple:
+def _shapes(env: Environment) -> tuple[Any, tuple]:
     leaves, structure = jax.tree.flatten(env)
-    return structure, [jnp.shape(leaf) for leaf in leaves]
+    return structure, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+
+
+@lru_cache(maxsize=256)
+def _check_computable(structure: Any, shapes: tuple, precision: Any) -> None:
+    """All that does not depend on numbers, traced once for environments that differ in nothing else.
+
+    `precision` is the type of a new number, which decides what comes out: part of what is remembered by.
+    """
+    env = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
+    _check_kinds(env)
+    _check_tracing(env)
 
 
 def _check_kinds(env: Environment) -> None:
@@ -269,13 +280,16 @@ def _check_suited(env: Environment) -> None:
     """What run time assurance says about itself must not hold at all of a few starts."""
     if env.rta is None or any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(env)):
         return
-
-    def faults(env: Environment, key: jax.Array) -> Mapping[str, jax.Array]:
-        assert env.rta is not None
-        return env.rta.unsuited(env, reset(env.replace(rta=None), key)[0].sim)
-
-    if jax.eval_shape(faults, env, jax.random.key(0)):
-        found = jax.jit(jax.vmap(faults, in_axes=(None, 0)))(env, jax.random.split(jax.random.key(0), 8))
+    if jax.eval_shape(_faults, env, jax.random.key(0)):
+        found = _faults_of_starts(env, jax.random.split(jax.random.key(0), 8))
         for fault, everywhere in found.items():
             if everywhere.all():
                 raise ConfigError(f"rta: {fault}")
+
+
+def _faults(env: Environment, key: jax.Array) -> Mapping[str, jax.Array]:
+    assert env.rta is not None
+    return env.rta.unsuited(env, reset(env.replace(rta=None), key)[0].sim)
+
+
+_faults_of_starts = jax.jit(jax.vmap(_faults, in_axes=(None, 0)))
