@@ -7,13 +7,15 @@ from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Int
 
 from jaxsafe.environment import Environment, reset, step
 from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.types import Key, State, TimeStep
 
 Tree = TypeVar("Tree")
+
+FEW = 32
 
 Policy = Callable[[Key, Array], Array]
 """`policy(key, observation) -> action`, batched where the observations are."""
@@ -68,7 +70,14 @@ def restarted(env: Environment, state: State, timestep: TimeStep, key: Key) -> t
 
 def reset_batch(env: Environment, key: Key, num_envs: int, shard: Shard = WHOLE) -> tuple[State, TimeStep]:
     """Independent random starts, [num_envs], of which a shard has its part."""
-    return jax.vmap(reset, in_axes=(None, 0))(env, shard.draw(jax.random.split, key, (num_envs // shard.count,)))
+    size = num_envs // shard.count
+    return _starts(env, key, shard.first(size) + jnp.arange(size))
+
+
+def _starts(env: Environment, key: Key, lanes: Int[Array, " n"]) -> tuple[State, TimeStep]:
+    """The starts of some lanes, each from a key of its own."""
+    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, lanes)
+    return jax.vmap(reset, in_axes=(None, 0))(env, keys)
 
 
 def step_or_reset_batch(
@@ -79,20 +88,43 @@ def step_or_reset_batch(
     max_episode_steps: Array | float = jnp.inf,
     shard: Shard = WHOLE,
 ) -> tuple[tuple[State, Array], TimeStep]:
-    """`step_or_reset` for a batch, [num_envs]; starts are drawn only on steps on which some episode ends.
+    """`step_or_reset` for a batch, [num_envs]; starts are drawn only where episodes end.
 
-    Drawing a start costs many times a step, and with few environments most steps end no episode. An episode still running
-    after `max_episode_steps` is truncated, without an outcome.
+    An episode still running after `max_episode_steps` is truncated, without an outcome.
     """
     state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, state, action)
     timestep = cut_short(state, timestep, max_episode_steps)
-    done = timestep.done
+    first = shard.first(action.shape[0])
 
-    def draw(old: tuple[State, Array]) -> tuple[State, Array]:
-        fresh_state, fresh = reset_batch(env, key, done.shape[0] * shard.count, shard)
-        return choose(done, (fresh_state, fresh.observation), old)
+    def draw(lanes: Array) -> tuple[State, Array]:
+        fresh_state, fresh = _starts(env, key, first + lanes)
+        return fresh_state, fresh.observation
 
-    return jax.lax.cond(jnp.any(done), draw, lambda old: old, (state, timestep.observation)), timestep
+    return renew(timestep.done, draw, (state, timestep.observation)), timestep
+
+
+def renew(where: Bool[Array, " n"], draw: Callable[[Array], Tree], old: Tree) -> Tree:
+    """The lanes of `old`, those where `where` holds replaced by `draw(lanes)`; lanes are the leading axis.
+
+    Drawing a start costs many times a step. With few lanes most steps end no episode, with many most end a few: nothing is
+    drawn, or starts for one lane in `FEW`, or, if that is not enough, for all.
+    """
+    size = where.shape[0]
+    few, count = size // FEW, jnp.sum(where)
+
+    def none(old: Tree) -> Tree:
+        return old
+
+    def some(old: Tree) -> Tree:
+        lanes = jnp.nonzero(where, size=few, fill_value=size)[0]  # beyond the last lane: dropped
+        return jax.tree.map(lambda x, new: x.at[lanes].set(new, mode="drop"), old, draw(lanes))
+
+    def every(old: Tree) -> Tree:
+        return choose(where, draw(jnp.arange(size)), old)
+
+    if size < 8 * FEW:  # one more program, which takes as long to compile, does not pay
+        return jax.lax.cond(count > 0, every, none, old)
+    return jax.lax.switch(jnp.int32(count > 0) + (count > few), [none, some, every], old)
 
 
 def cut_short(state: State, timestep: TimeStep, max_episode_steps: Array | float) -> TimeStep:

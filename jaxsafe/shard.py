@@ -28,12 +28,16 @@ class Shard:
     axis: str = ""
     count: int = 1
 
+    def first(self, size: int) -> Array | int:
+        """Where this device's part begins, if it has this size."""
+        return 0 if self.count == 1 else jax.lax.axis_index(self.axis) * size
+
     def own(self, x: Array, axis: int = 0) -> Array:
         """This device's part of what all of them have whole."""
         if self.count == 1:
             return x
         size = x.shape[axis] // self.count
-        return jax.lax.dynamic_slice_in_dim(x, jax.lax.axis_index(self.axis) * size, size, axis)
+        return jax.lax.dynamic_slice_in_dim(x, self.first(size), size, axis)
 
     def draw(self, draw: Callable[..., Array], key: Key, shape: tuple[int, ...], *options: Any) -> Array:
         """This device's part, of this shape, of one draw for the batch: `draw(key, shape, *options)`."""

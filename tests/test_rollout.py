@@ -8,7 +8,7 @@ import pytest
 
 import jaxsafe
 from jaxsafe import Environment
-from jaxsafe.rollout import reset_batch, step_or_reset, step_or_reset_batch
+from jaxsafe.rollout import renew, reset_batch, step_or_reset, step_or_reset_batch
 from jaxsafe.simulation.cwh import cwh_flow
 from jaxsafe.types import State, TimeStep
 
@@ -143,6 +143,30 @@ def test_every_kind_of_end_is_followed_by_a_start(ends: str) -> None:
         assert int(after.num_steps) == expected
         assert bool(getattr(timestep, ends)) == (expected == 0)
         assert np.array_equal(observation, timestep.observation) == (expected != 0)
+
+
+@pytest.mark.parametrize("count", [0, 1, 16, 17, 512])
+def test_lanes_are_renewed_alike_however_many_they_are(count: int) -> None:
+    old = {"a": jnp.zeros((512, 3)), "b": jnp.arange(512)}
+    where = jnp.zeros(512, bool).at[jax.random.permutation(jax.random.key(0), 512)[:count]].set(True)
+    found = jax.jit(renew, static_argnums=1)(
+        where, lambda lanes: {"a": 1.0 + lanes[:, None] + jnp.zeros((len(lanes), 3)), "b": -lanes}, old
+    )
+    lanes = np.arange(512)
+    np.testing.assert_array_equal(found["a"], np.where(where, 1.0 + lanes, 0.0)[:, None] * np.ones(3))
+    np.testing.assert_array_equal(found["b"], np.where(where, -lanes, lanes))
+
+
+def test_the_starts_of_a_large_batch_are_those_of_its_lanes() -> None:
+    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": LENGTH - 1})
+    state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(1), 256)
+    state = state.replace(num_steps=state.num_steps.at[jnp.array([3, 200])].set(LENGTH - 1))
+    key = jax.random.key(2)
+    (after, _), timestep = jax.jit(step_or_reset_batch)(env, state, jnp.zeros((256, 2)), key)
+    assert np.flatnonzero(timestep.done).tolist() == [3, 200]
+    fresh, _ = jax.jit(reset_batch, static_argnums=2)(env, key, 256)
+    for lane in (3, 200):
+        jax.tree.map(lambda a, b, i=lane: np.testing.assert_allclose(a[i], b[i], rtol=1e-6), after, fresh)
 
 
 def test_a_limit_truncates_what_still_runs(env: Environment) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.rollout import choose, cut_short
+from jaxsafe.rollout import cut_short, renew
 from jaxsafe.types import State, TimeStep
 
 
@@ -162,8 +162,8 @@ def pack(packing: Packing, tree: Any) -> Array:
 @functools.partial(jax.jit, static_argnums=0)
 def restart(layout: Layout, env: Array, keys: Array, words: Array, mask: Array) -> tuple[Array, Array]:
     """The next keys and words, with a new episode where the mask says."""
-    fresh = _start(layout.env.unpack(env), keys)
-    keys, episodes = choose(mask, fresh, (keys, layout.episodes.unpack(words)))
+    running = (keys, layout.episodes.unpack(words))
+    keys, episodes = renew(mask, lambda lanes: _start(layout.env.unpack(env), keys[lanes]), running)
     return keys, layout.episodes.pack(episodes)
 
 
