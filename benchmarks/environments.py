@@ -51,12 +51,12 @@ def main() -> None:
 
 def episode_steps(env: jaxsafe.Environment, key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
     """Steps with random actions; the sum of rewards, so that nothing can be left out."""
-    state, timestep = reset_batch(env, key, num_envs)
+    state, timestep = reset_batch(env, key, num_envs, axis=-1)
 
     def one(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
         key_action, key_reset = jax.random.split(key)
-        action = jax.random.uniform(key_action, (num_envs, env.action_size), minval=-1.0)
-        carry, timestep = step_or_reset_batch(env, carry[0], action, key_reset)
+        action = jax.random.uniform(key_action, (env.action_size, num_envs), minval=-1.0)
+        carry, timestep = step_or_reset_batch(env, carry[0], action, key_reset, axis=-1)
         return carry, jnp.sum(timestep.reward) + jnp.sum(timestep.observation)
 
     return jnp.sum(jax.lax.scan(one, (state, timestep.observation), jax.random.split(key, num_steps))[1])

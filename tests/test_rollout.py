@@ -157,6 +157,19 @@ def test_lanes_are_renewed_alike_however_many_they_are(count: int) -> None:
     np.testing.assert_array_equal(found["b"], np.where(where, -lanes, lanes))
 
 
+def test_environments_may_be_the_last_axis(env: Environment) -> None:
+    begin = jax.jit(reset_batch, static_argnames=("num_envs", "axis"))
+    advance = jax.jit(step_or_reset_batch, static_argnames="axis")
+    action = jax.random.uniform(jax.random.key(3), (300, 2), minval=-1.0)
+    found = []
+    for axis in (0, -1):
+        state, _ = begin(env, jax.random.key(1), num_envs=300, axis=axis)
+        state = state.replace(num_steps=jnp.arange(300) % LENGTH)
+        found.append(advance(env, state, action if axis == 0 else action.T, jax.random.key(2), axis=axis))
+    assert 0 < found[0][1].done.sum() < 300
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, jnp.moveaxis(b, -1, 0), rtol=1e-5, atol=1e-5), *found)
+
+
 def test_the_starts_of_a_large_batch_are_those_of_its_lanes() -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": LENGTH - 1})
     state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(1), 256)

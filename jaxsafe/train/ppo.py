@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
@@ -32,7 +33,7 @@ from jaxsafe.types import Dimensionless, Key, Positive, Record, State, TimeStep
 Share = Range(0.0, 1.0)
 
 CHUNK = 512
-"""Samples of a minibatch whose gradients a CPU takes at once: so many activations stay in a core's cache."""
+"""Samples that a CPU takes through the networks at once: so many activations stay in a core's cache."""
 
 
 class PPO(Component):
@@ -261,12 +262,12 @@ def learn(
         return jax.grad(loss)(params, env, agent, ppo, jax.tree.map(lambda x: x[rows], batch))
 
     def mean_gradient(params: Params, rows: Array) -> Params:
-        if jax.default_backend() != "cpu" or rows.size <= CHUNK or rows.size % CHUNK:
+        parts = _num_chunks(rows.size)
+        if parts == 1:
             return gradient(params, rows)
         add = lambda total, part: (jax.tree.map(jnp.add, total, gradient(params, part)), None)  # noqa: E731
-        parts = rows.reshape(-1, CHUNK)
-        total, _ = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), parts)
-        return jax.tree.map(lambda x: x / len(parts), total)
+        total, _ = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), rows.reshape(parts, -1))
+        return jax.tree.map(lambda x: x / parts, total)
 
     def minibatch_step(carry: tuple[Params, optax.OptState], rows: Array) -> tuple[tuple[Params, optax.OptState], None]:
         params, optimizer = carry
@@ -302,11 +303,11 @@ def _to_batch(
     """Advantages, normalised over the whole batch, and targets of the critics; all samples in one row."""
     t, params = transitions, state.params
     seen = [agent.critic_inputs(*one) for one in ((t.inputs, t.totals), (t.next_inputs, t.episode.reward_totals))]
-    value, next_value = (agent.value(params, one) for one in seen)
+    value, next_value = (_in_chunks(partial(agent.value, params), one) for one in seen)
     advantage = gae(t.reward, value, next_value, t.terminated, t.done, gamma, ppo.gae_lambda)
     target, cost_target = advantage + value, ()
     if agent.cost_critic:
-        rate, next_rate = (agent.cost_rate(params, one) for one in seen)
+        rate, next_rate = (_in_chunks(partial(agent.cost_rate, params), one) for one in seen)
         cost_advantage = gae((1.0 - gamma) * t.cost, rate, next_rate, t.terminated, t.done, gamma, ppo.gae_lambda)
         cost_target = cost_advantage + rate
         advantage -= state.multiplier * cost_advantage / (1.0 - gamma)
@@ -314,6 +315,18 @@ def _to_batch(
     advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8)
     batch = batch._replace(advantage=advantage)
     return jax.tree.map(lambda x: x.reshape(ppo.batch_size, *x.shape[2:]), batch)
+
+
+def _in_chunks(critic: Callable[[Array], Array], seen: Float[Array, "t n c"]) -> Float[Array, "t n"]:
+    """What a critic says of each sample."""
+    t, n, size = seen.shape
+    parts = _num_chunks(t * n)
+    return critic(seen) if parts == 1 else jax.lax.map(critic, seen.reshape(parts, -1, size)).reshape(t, n)
+
+
+def _num_chunks(samples: int) -> int:
+    """In how many parts samples go through the networks."""
+    return 1 if jax.default_backend() != "cpu" or samples % CHUNK else max(1, samples // CHUNK)
 
 
 def _optimizer(ppo: PPO) -> optax.GradientTransformation:
