@@ -1,0 +1,91 @@
+"""How much memory does a training take, for each environment and for each seed?
+
+Stated: the bytes of a state of the task, and of what a seed keeps between updates without its environments. Predicted: what
+the compiled update needs in all, by XLA, which is what a training compares with the memory that is free before it starts.
+Measured: how far the resident memory of the process rises during two updates. Each row is a process of its own; on Linux.
+Writes `benchmarks/results/memory.json` and prints the table of docs/scaling.md:
+
+    python benchmarks/memory.py [tasks=rejoin2d,…] [num_envs=1024,4096,16384]
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+OUT = Path(__file__).parent / "results" / "memory.json"
+NUM_STEPS = 32
+
+
+def main() -> None:
+    """Run, write, print."""
+    from machine import about
+
+    from jaxsafe.envs import TASKS
+
+    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
+    if "probe" in options:
+        print(json.dumps(probe(options["probe"], int(options["num_envs"]))))
+        return
+    tasks = options.get("tasks", ",".join(TASKS)).split(",")
+    sizes = [int(size) for size in options.get("num_envs", "1024,4096,16384").split(",")]
+    rows = [{"task": task, "num_envs": size, **apart(task, size)} for task in tasks for size in sizes]
+    OUT.write_text(json.dumps({**about(), "num_steps": NUM_STEPS, "runs": rows}, indent=1) + "\n")
+    print(
+        "| bytes | environment's state | seed, without environments |" + "".join(f" {n:,} × {NUM_STEPS} |" for n in sizes)
+    )
+    print("|---|---|---|" + "---|" * len(sizes))
+    for task in tasks:
+        mine = [row for row in rows if row["task"] == task]
+        cells = [f"{row['predicted'] / 2**20:.0f} / {row['measured'] / 2**20:.0f} MiB" for row in mine]
+        print(f"| {task} | {mine[0]['lane']:,} B | {mine[0]['seed'] / 1024:.0f} KiB | " + " | ".join(cells) + " |")
+
+
+def apart(task: str, num_envs: int) -> dict[str, Any]:
+    """What `probe` finds in a process of its own."""
+    command = [sys.executable, __file__, f"probe={task}", f"num_envs={num_envs}"]
+    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
+
+
+def probe(task: str, num_envs: int) -> dict[str, int]:
+    """Train two updates of one seed on one device."""
+    from jaxsafe.train.seeds import SEEDS, SeedMapper, claim_cores
+
+    claim_cores()
+    import jax
+
+    from jaxsafe import cli
+    from jaxsafe.train import memory
+    from jaxsafe.train.config import resolve
+    from jaxsafe.train.loop import STATE, begin, chunk
+
+    words = [f"env={task}", f"ppo.num_envs={num_envs}", f"ppo.num_steps={NUM_STEPS}", "ppo.num_epochs=1"]
+    config, env, _ = resolve(cli.Arguments.parse(words))
+    mapper = SeedMapper(1)
+    shared = mapper.replicate((env, config.agent, config.ppo))
+    state = mapper.map(begin, returned=STATE)(shared, mapper.keys(0))
+    two = mapper.map(lambda shared, state: chunk(shared, state, 2, 2), STATE, (STATE, SEEDS))
+    advance = two.lower(shared, state).compile()
+    lanes = memory.size((state.env_state, state.observation, state.episode))
+    Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew: compiling is not what is measured
+    before = resident("VmRSS")
+    jax.block_until_ready(advance(shared, state))
+    return {
+        "lane": lanes // num_envs,
+        "seed": memory.size(state) - lanes,
+        "predicted": memory.footprint(advance),
+        "measured": resident("VmHWM") - before + memory.size(state),
+    }
+
+
+def resident(which: str) -> int:
+    """Bytes of this process in memory, now or at most."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(which))
+
+
+if __name__ == "__main__":
+    main()
