@@ -68,7 +68,7 @@ def usage() -> str:
         "usage: python -m jaxsafe.report [key=value …]\n\n"
         "  trains every task in every way with ten seeds, evaluates, and writes OUT/baselines.md; takes hours\n"
         "  tasks=[docking2d,…]    some tasks only\n"
-        "  kinds=[features,…]     some of features, plain, discrete, rta\n"
+        "  kinds=[features,…]     some of features, plain, lanes, discrete, rta\n"
         "  runs=DIR               where the runs are (default runs/report); what is complete there is not done again\n"
         "  out=DIR                where to write the page (default report)\n"
         "  film=false             no animations\n"
