@@ -35,7 +35,8 @@ def main() -> None:
     rows = [{"task": task, "num_envs": size, **apart(task, size)} for task in tasks for size in sizes]
     OUT.write_text(json.dumps({**about(), "num_steps": NUM_STEPS, "runs": rows}, indent=1) + "\n")
     print(
-        "| bytes | environment's state | seed, without environments |" + "".join(f" {n:,} × {NUM_STEPS} |" for n in sizes)
+        "| predicted / measured | an environment's state | a seed without them |"
+        + "".join(f" {n:,} × {NUM_STEPS} |" for n in sizes)
     )
     print("|---|---|---|" + "---|" * len(sizes))
     for task in tasks:
