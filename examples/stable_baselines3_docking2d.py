@@ -35,7 +35,7 @@ class GrowingHorizon(BaseCallback):
 
 
 def train(steps: int = 1_000_000, seed: int = 0) -> PPO:
-    """PPO from 64 environments; smaller batches learn as early and then lose it again."""
+    """PPO from 64 environments."""
     torch.set_num_threads(1)  # these networks are too small for more
     env = VecMonitor(SB3VecEnv("docking2d", 64))  # counts returns and lengths of episodes
     model = PPO(

@@ -16,6 +16,7 @@ from jaxsafe.types import Key, State, TimeStep
 Tree = TypeVar("Tree")
 
 FEW = 32
+"""Of a large batch, one lane in so many gets a new start at little cost."""
 
 Policy = Callable[[Key, Array], Array]
 """`policy(key, observation) -> action`, batched where the observations are."""

@@ -46,7 +46,7 @@ class Shard:
     def join(self, tree: Tree, axis: int = 0) -> Tree:
         """The parts of all devices, one after the other; all leaves have the same leading axes up to `axis`.
 
-        What has the same type goes in one exchange: on a CPU each takes a tenth of a millisecond, however little it moves.
+        What has the same type goes in one exchange: each takes its time, however little it moves.
         """
         if self.count == 1:
             return tree

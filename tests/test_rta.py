@@ -23,6 +23,8 @@ from jaxsafe.rta.simplex import Blend, CollisionSimplex, Simplex
 from jaxsafe.simulation.scripted import Command
 from jaxsafe.types import Length, PlatformName, Positive, Sim
 
+slow = partial(pytest.param, marks=pytest.mark.slow)  # to compile
+
 DOCKING = ("docking2d", "docking3d")
 SHORT = [
     ("discrete_asif", "docking2d", ("bang_bang", "greedy")),
@@ -31,14 +33,14 @@ SHORT = [
     ("implicit_simplex", "docking2d", ("greedy",)),
     ("implicit_asif", "docking2d", ("greedy",)),
     ("implicit_simplex", "rejoin2d", ("intercept",)),
+    slow("implicit_simplex", "docking2d_oriented", ("greedy",)),
+    slow("implicit_simplex", "rejoin2d", ("search",)),
 ]
 COMPARED = ("explicit_asif", "released")  # of the literature; they guarantee nothing
 LONG = [(preset, task) for task in PRESETS for preset in PRESETS[task] if preset not in (*COMPARED, "default")]
 
 BRAKE = {"type": "brake", "name": "brake"}
 SLOW = {"type": "slow", "speed": 0.1}
-
-slow = partial(pytest.param, marks=pytest.mark.slow)  # to compile
 
 step = jax.jit(jaxsafe.step)
 reset = jax.jit(jaxsafe.reset)
