@@ -260,6 +260,16 @@ def test_a_speed_beyond_its_limits_counts_as_on_the_limit() -> None:
             assert float(jnp.linalg.norm(after.position - start.position)) == pytest.approx(rest, rel=1e-6)
 
 
+@pytest.mark.parametrize("aircraft", [Dubins2D(name="a"), Dubins3D(name="a")])
+def test_a_control_left_out_is_one_of_zero(aircraft: Any) -> None:
+    aircraft, start = normalise(aircraft), planar() if isinstance(aircraft, Dubins2D) else spatial(gamma=0.2, roll=0.5)
+    rolling = [{"roll_rate": 0.6}] if isinstance(aircraft, Dubins3D) else []
+    for controls in ({}, {"heading_rate": 0.1}, {"acceleration": 96.5}, *rolling):
+        zeros = dict.fromkeys(("acceleration", "flight_path_angle_rate", "roll_rate"), 0.0)
+        with_zeros = fly(aircraft, start, zeros | controls, 3)[-1]
+        chex.assert_trees_all_close(fly(aircraft, start, controls, 3)[-1], with_zeros, rtol=1e-6)
+
+
 def test_angles_rest_at_their_limits() -> None:
     climbing = {"flight_path_angle_rate": -0.3, "roll_rate": 0.6}
     states = fly(normalise(Dubins3D(name="a")), spatial(), climbing, 4)

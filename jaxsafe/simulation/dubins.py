@@ -76,7 +76,9 @@ class Dubins2D(Platform, type="dubins2d"):
 
     def step(self, state: Dubins2DState, controls: Controls, dt: Seconds) -> Dubins2DState:
         """Advance by the exact solution."""
-        turn, acceleration = controls.get("heading_rate", 0.0), controls.get("acceleration", 0.0)
+        if "acceleration" not in controls:
+            return self.step_within_limits(state, controls, dt)
+        turn, acceleration = controls.get("heading_rate", 0.0), controls["acceleration"]
         speed = ramp(state.speed, 0.0, self.speed_limits, 0.0)
         final = ramp(speed, acceleration, self.speed_limits, dt)
         stop = time_to_limit(speed, acceleration, self.speed_limits, dt)
@@ -115,7 +117,8 @@ class Dubins3DState(Record):
     @property
     def orientation(self) -> Float[Array, "3 3"]:
         """Rotation from the body frame, x forwards, to the global one: ZYX Euler angles ψ, γ, φ."""
-        return rotation(self.heading, self.flight_path_angle, self.roll)
+        matrix = rotation(self.heading, self.flight_path_angle, self.roll)
+        return jax.lax.optimization_barrier(matrix)  # else XLA computes its sines again for each element of each vector
 
 
 class Dubins3D(Platform, type="dubins3d"):
@@ -142,7 +145,7 @@ class Dubins3D(Platform, type="dubins3d"):
     def step(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Dubins3DState:
         """Advance by quadrature over the pieces between which no limit is reached, within 1e-3 ft in 1 s, mostly 1e-5."""
         ramps = self._ramps(state, controls, dt)
-        spans = pieces([time_to_limit(*each, dt) for each in ramps], dt)
+        spans = pieces([time_to_limit(*each, dt) for each in ramps if each[1] is not None], dt)
 
         # A loop, not four copies: it keeps what it computed for one piece, where XLA would compute it again for each use.
         still = jnp.zeros_like(state.heading)
@@ -157,11 +160,11 @@ class Dubins3D(Platform, type="dubins3d"):
         return self._arrived(state, ramps, dt, heading, moved)
 
     def _ramps(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Ramps:
-        """Those of roll, flight path angle and speed."""
+        """Those of roll, flight path angle and speed; the rate of what no control moves is None."""
         ramps = [
             (state.roll, self._roll_rate(state, controls, dt), self.roll_limits),
-            (state.flight_path_angle, controls.get("flight_path_angle_rate", 0.0), self.flight_path_angle_limits),
-            (state.speed, controls.get("acceleration", 0.0), self.speed_limits),
+            (state.flight_path_angle, controls.get("flight_path_angle_rate"), self.flight_path_angle_limits),
+            (state.speed, controls.get("acceleration"), self.speed_limits),
         ]
         return [(ramp(x, 0.0, limits, 0.0), rate, limits) for x, rate, limits in ramps]
 
@@ -190,7 +193,7 @@ class Dubins3D(Platform, type="dubins3d"):
 
     def _roll_rate(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Any:
         if "heading_rate" not in controls:
-            return controls.get("roll_rate", 0.0)
+            return controls.get("roll_rate")
         return (arctan(controls["heading_rate"] * state.speed / self.gravity) - state.roll) / dt
 
 

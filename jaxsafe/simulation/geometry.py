@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -67,11 +68,12 @@ def rotation(yaw: Float[Array, "*n"], pitch: Number | None = None, roll: Number 
 def to_body(orientation: Float[Array, "d d"], vector: Float[Array, " d"]) -> Float[Array, " d"]:
     """Components of a vector in the body frame, Rᵀv.
 
-    Written as a sum: a matrix product may be computed in reduced precision on accelerators.
+    Written out: a matrix product may be computed in reduced precision on accelerators, and a reduction keeps XLA from
+    working on many vectors at a time.
     """
     if vector.shape != orientation.shape[:1]:
         raise ValueError(f"expected a vector of {orientation.shape[0]} components to turn, found shape {vector.shape}")
-    return jnp.sum(orientation * vector[:, None], axis=0)
+    return functools.reduce(jnp.add, [row * element for row, element in zip(orientation, vector, strict=True)])
 
 
 class Offset(Component):

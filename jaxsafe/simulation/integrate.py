@@ -28,9 +28,9 @@ PARTIAL_WEIGHTS = np.linalg.solve(
 """Weights of the integrals from 0 to each node, one list a node."""
 
 
-def ramp(x: Number, rate: Number, limits: Float[Array, " 2"], t: Number) -> Any:
-    """A state that its rate moves until it rests on a limit: clip(x + rate·t, low, high)."""
-    return jnp.clip(x + rate * t, limits[0], limits[1])
+def ramp(x: Number, rate: Number | None, limits: Float[Array, " 2"], t: Number) -> Any:
+    """A state that its rate moves until it rests on a limit: clip(x + rate·t, low, high); x where the rate is None."""
+    return x if rate is None else jnp.clip(x + rate * t, limits[0], limits[1])
 
 
 def time_to_limit(x: Number, rate: Number, limits: Float[Array, " 2"], dt: Number) -> Any:
