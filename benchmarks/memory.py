@@ -53,7 +53,7 @@ def apart(task: str, num_envs: int) -> dict[str, Any]:
 
 def probe(task: str, num_envs: int) -> dict[str, int]:
     """Train two updates of one seed on one device."""
-    from jaxsafe.train.seeds import SEEDS, SeedMapper, claim_cores
+    from jaxsafe.train.seeds import SeedMapper, claim_cores
 
     claim_cores()
     import jax
@@ -61,14 +61,14 @@ def probe(task: str, num_envs: int) -> dict[str, int]:
     from jaxsafe import cli
     from jaxsafe.train import memory
     from jaxsafe.train.config import resolve
-    from jaxsafe.train.loop import STATE, begin, chunk
+    from jaxsafe.train.loop import programs
 
     words = [f"env={task}", f"ppo.num_envs={num_envs}", f"ppo.num_steps={NUM_STEPS}", "ppo.num_epochs=1"]
     config, env, _ = resolve(cli.Arguments.parse(words))
     mapper = SeedMapper(1)
     shared = mapper.replicate((env, config.agent, config.ppo))
-    state = mapper.map(begin, returned=STATE)(shared, mapper.keys(0))
-    two = mapper.map(lambda shared, state: chunk(shared, state, 2, 2), STATE, (STATE, SEEDS))
+    fresh, two = programs(mapper, 2, 2)
+    state = fresh(shared, mapper.keys(0))
     advance = two.lower(shared, state).compile()
     lanes = memory.size((state.env_state, state.observation, state.episode))
     Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew: compiling is not what is measured

@@ -80,7 +80,7 @@ def probe(python: str, name: str, task: str, cores: int) -> float:
 
 def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
     """Our PPO as `jaxsafe.train` runs it, `seeds` of them; samples of all seeds together."""
-    from jaxsafe.train.seeds import SEEDS, SeedMapper, claim_cores
+    from jaxsafe.train.seeds import SeedMapper, claim_cores
 
     claim_cores()
     import jax
@@ -88,7 +88,7 @@ def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
     from jaxsafe import cli
     from jaxsafe.train import ppo
     from jaxsafe.train.config import resolve
-    from jaxsafe.train.loop import STATE, begin, chunk
+    from jaxsafe.train.loop import programs
 
     if sort:
         ppo.shuffle = jax.random.permutation
@@ -99,9 +99,9 @@ def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
     config, env, _ = resolve(cli.Arguments.parse([*words, *(f"ppo.{key}={value}" for key, value in settings.items())]))
     mapper = SeedMapper(seeds, config.shares)
     shared = mapper.replicate((env, config.agent, config.ppo))
-    state = mapper.map(partial(begin, shard=mapper.shard), returned=STATE)(shared, mapper.keys(0))
-    updates = lambda shared, state: chunk(shared, state, UPDATES, config.num_updates, mapper.shard)  # noqa: E731
-    advance = mapper.map(updates, STATE, (STATE, SEEDS)).lower(shared, state).compile()
+    fresh, advance = programs(mapper, UPDATES, config.num_updates)
+    state = fresh(shared, mapper.keys(0))
+    advance = advance.lower(shared, state).compile()
     state, _ = jax.block_until_ready(advance(shared, state))
     start = time.perf_counter()
     jax.block_until_ready(advance(shared, state))

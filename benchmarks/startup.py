@@ -77,8 +77,8 @@ def _jaxsafe(task: str, rta: str, tick: Callable[[], None]) -> None:
     from jaxsafe import cli
     from jaxsafe.rollout import reset_batch, step_or_reset_batch
     from jaxsafe.train.config import resolve
-    from jaxsafe.train.loop import STATE, begin, chunk
-    from jaxsafe.train.seeds import SEEDS, SeedMapper, claim_cores
+    from jaxsafe.train.loop import programs
+    from jaxsafe.train.seeds import SeedMapper, claim_cores
 
     claim_cores()
     tick()
@@ -93,8 +93,8 @@ def _jaxsafe(task: str, rta: str, tick: Callable[[], None]) -> None:
     config, env, _ = resolve(cli.Arguments.parse([f"env={task}", f"rta={rta}", "seeds=10"]))
     mapper = SeedMapper(config.seeds)
     shared = mapper.replicate((env, config.agent, config.ppo))
-    fresh = mapper.map(begin, returned=STATE).lower(shared, mapper.keys(0))
-    advance = mapper.map(lambda shared, state: chunk(shared, state, 10, config.num_updates), STATE, (STATE, SEEDS))
+    fresh, advance = programs(mapper, 10, config.num_updates)
+    fresh = fresh.lower(shared, mapper.keys(0))
     updates = advance.lower(shared, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), fresh.out_info))
     tick()
     fresh.compile()

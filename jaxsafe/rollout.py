@@ -126,8 +126,7 @@ def renew(where: Bool[Array, " n"], draw: Callable[[Array], Tree], old: Tree, ax
         return jax.tree.map(lambda x, new: x.at[place].set(new, mode="drop"), old, draw(lanes))
 
     def every(old: Tree) -> Tree:
-        fresh = draw(jnp.arange(size))
-        return choose(where, fresh, old) if axis == 0 else jax.tree.map(lambda a, b: jnp.where(where, a, b), fresh, old)
+        return choose(where, draw(jnp.arange(size)), old, axis)
 
     if size < 8 * FEW:  # one more program, which takes as long to compile, does not pay
         return jax.lax.cond(count > 0, every, none, old)
@@ -140,6 +139,11 @@ def cut_short(state: State, timestep: TimeStep, max_episode_steps: Array | float
     return timestep.replace(truncated=timestep.truncated | cut)
 
 
-def choose(where: Array, fresh: Tree, old: Tree) -> Tree:
-    """One of two trees lane by lane; `where` has the leading axes of all their leaves."""
-    return jax.tree.map(lambda a, b: jnp.where(where.reshape(where.shape + (1,) * (a.ndim - where.ndim)), a, b), fresh, old)
+def choose(where: Array, fresh: Tree, old: Tree, axis: Literal[0, -1] = 0) -> Tree:
+    """One of two trees lane by lane; `where` has the leading axes of all their leaves, or with `axis=-1` the last."""
+
+    def one(a: Array, b: Array) -> Array:
+        inner = a.ndim - where.ndim if axis == 0 else 0
+        return jnp.where(where.reshape(where.shape + (1,) * inner), a, b)
+
+    return jax.tree.map(one, fresh, old)

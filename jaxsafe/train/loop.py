@@ -61,6 +61,7 @@ class Training:
         self.shared = self.mapper.replicate((env, config.agent, config.ppo))
         intervals = (config.every(config.eval_every), config.every(config.checkpoint_every))
         self.chunk = max(1, min(config.num_updates // 50, 100_000 // config.ppo.batch_size, *intervals))
+        self.fresh, self.advance = programs(self.mapper, self.chunk, config.num_updates)
         self.evaluator = Evaluator(self.mapper, env, config.agent)
         self.checkpoints = Checkpoints(checkpoints or run, create=True)
         self.elapsed = self.compile_s = 0.0
@@ -118,8 +119,7 @@ class Training:
         each = memory.size(content) // self.config.seeds * (self.mapper.padded // self.mapper.mesh.shape["seeds"])
         memory.require(each, self.mapper.mesh.size, MEMORY)
         if not steps:
-            fresh = self.mapper.map(partial(begin, shard=self.mapper.shard), returned=STATE)
-            self.state = fresh(self.shared, self.mapper.keys(self.config.seed))
+            self.state = self.fresh(self.shared, self.mapper.keys(self.config.seed))
             never = self.mapper.place(np.full(self.config.seeds, -1.0, np.float32))
             self.best = {"params": self.state.average, "success": never}
             return
@@ -139,12 +139,8 @@ class Training:
 
     def _compile(self) -> Any:
         """Compile the chunk ahead of time, so that its cost is known."""
-
-        def advance(shared: tuple, state: TrainState) -> tuple[TrainState, dict]:
-            return chunk(shared, state, self.chunk, self.config.num_updates, self.mapper.shard)
-
         begin = time.monotonic()
-        compiled = self.mapper.map(advance, STATE, (STATE, SEEDS)).lower(self.shared, self.state).compile()
+        compiled = self.advance.lower(self.shared, self.state).compile()
         self.compile_s += time.monotonic() - begin
         devices = self.mapper.mesh.size
         memory.require(memory.footprint(compiled) - memory.size(self.state) // devices, devices, MEMORY)
@@ -187,6 +183,25 @@ class Training:
     def _save(self) -> None:
         facts = {"updates": self.updates, "wall_s": self.wall_s, "compile_s": self.compile_s}
         self.checkpoints.save(self.step, self.mapper.gather({"state": self.state, "best": self.best}), facts)
+
+
+def programs(mapper: SeedMapper, length: int, limit: int) -> tuple[Any, Any]:
+    """What a training of all seeds runs on its devices, to be called or lowered; `shared` is `(env, agent, hyper)`.
+
+    Args:
+        mapper: of the seeds.
+        length: updates at a time.
+        limit: updates of the whole run.
+
+    Returns:
+        `(shared, keys) -> state` for `begin`, and `(shared, state) -> (state, curves)` for `chunk`.
+    """
+
+    def advance(shared: tuple, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
+        return chunk(shared, state, length, limit, mapper.shard)
+
+    fresh = mapper.map(partial(begin, shard=mapper.shard), returned=STATE)
+    return fresh, mapper.map(advance, STATE, (STATE, SEEDS))
 
 
 def begin(shared: tuple, key: jax.Array, shard: Shard = WHOLE) -> TrainState:
