@@ -69,6 +69,19 @@ class Arguments:
             raise ConfigError(f"{key}: expected a whole number ≥ {least}, found {value!r}")
         return value
 
+    def pop_flag(self, key: str) -> bool | None:
+        """Take out true or false; None if it was not given.
+
+        Raises:
+            ConfigError: it is something else.
+        """
+        if key not in self.options:
+            return None
+        value = self.options.pop(key)
+        if not isinstance(value, bool):
+            raise ConfigError(f"{key}: expected true or false, found {value!r}")
+        return value
+
     def pop_overrides(self) -> dict[str, Any]:
         """Take out the `env.<path>=value` options, without their prefix."""
         paths = [key for key in self.options if key.startswith("env.")]

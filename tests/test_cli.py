@@ -65,6 +65,7 @@ def fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], t
          "rejoin. Did you mean 'docking'?"),
         (["env=docking3d", "actions=discret"], "Did you mean 'discrete'?"),
         (["env=docking3d", "tensorboard=maybe"], "tensorboard: expected true or false, found 'maybe'"),
+        (["env=docking3d", "distributed=maybe"], "distributed: expected true or false, found 'maybe'"),
         (["env=docking3d", "env.reward.delta_v.scal=1"], "reward.delta_v.scal: unknown field 'scal'"),
         (["env=docking3d", "env.deputy.mass=-1"], "deputy.mass: expected a number in kg > 0, found -1"),
         (["env=nowhere.yaml"], "nowhere.yaml: cannot be read: No such file or directory"),

@@ -84,6 +84,7 @@ def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:
             "kinds: found 'plane'; choose from features, plain, lanes, discrete, rta. Did you mean 'plain'?",
         ),
         (["tasks=[]"], "tasks: expected at least one of rejoin2d"),
+        (["film=gif"], "film: expected true or false, found 'gif'"),
         (["sedes=3"], "sedes: unknown field 'sedes'"),
     ],
 )

@@ -37,10 +37,8 @@ def main(argv: Sequence[str]) -> int:
     )
     changes = arguments.pop_overrides()
     episodes, seed = arguments.pop_count("episodes", 1000), arguments.pop_count("seed", 0, least=0)
-    deterministic = arguments.pop("deterministic")
+    deterministic = arguments.pop_flag("deterministic")
     arguments.refuse_rest([*OPTIONS, "env.…"])
-    if not (deterministic is None or isinstance(deterministic, bool)):
-        raise ConfigError(f"deterministic: expected true or false, found {deterministic!r}")
     if render not in (None, "gif"):
         raise ConfigError(f"render: found {render!r}; choose from gif")
     kinds = {None: ("stochastic", "deterministic"), True: ("deterministic",), False: ("stochastic",)}[deterministic]

@@ -26,7 +26,7 @@ def main(argv: Sequence[str]) -> int:
     arguments = cli.Arguments.parse(argv)
     out, runs = Path(arguments.pop_text("out") or "report"), Path(arguments.pop_text("runs") or "runs/report")
     tasks, kinds = (_names(name, arguments.pop(name), [*known]) for name, known in (("tasks", TASKS), ("kinds", KINDS)))
-    film = arguments.pop("film", True)
+    film = arguments.pop_flag("film") is not False
     rest = [word for word in argv if word.partition("=")[0] in arguments.options]
     items = plan(tasks, kinds, rest if "seeds" in arguments.options else [f"seeds={SEEDS}", *rest])
     episodes = [resolve(cli.Arguments.parse(item.words))[0].episodes for item in items]  # errors before anything is done
@@ -34,7 +34,7 @@ def main(argv: Sequence[str]) -> int:
     try:
         for item, count in zip(items, episodes, strict=True):
             found[item] = train(item, runs)
-            evaluate(item, found[item], count, bool(film) and item.kind == "features")
+            evaluate(item, found[item], count, film and item.kind == "features")
     except KeyboardInterrupt:
         print(f"stopped; the same command goes on with what is in {runs}")
         return cli.INTERRUPTED

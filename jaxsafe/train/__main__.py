@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxsafe import cli
-from jaxsafe.errors import ConfigError
 from jaxsafe.train.seeds import claim_cores
 
 BEGAN = time.monotonic()
@@ -22,7 +21,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.train.results import summary
 
     arguments = cli.Arguments.parse(argv)
-    if _flag(arguments, "distributed"):
+    if arguments.pop_flag("distributed"):
         hosts.join()
     resume = arguments.pop_text("resume")
     if resume is None:
@@ -68,13 +67,6 @@ def _train(run: Path, path: Path, began: float) -> bool:
         print(table(finish(training, config, env, name), run / "results.json"))
         print("figures: " + ", ".join(str(figure) for figure in draw_all(own)))
     return True
-
-
-def _flag(arguments: cli.Arguments, name: str) -> bool:
-    value = arguments.pop(name, False)
-    if not isinstance(value, bool):
-        raise ConfigError(f"{name}: expected true or false, found {value!r}")
-    return value
 
 
 def usage() -> str:
