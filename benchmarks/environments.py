@@ -1,10 +1,13 @@
-"""How many steps a second do the five tasks take, at 1, 1024, 4096 and 16384 lanes?
+"""How many steps a second do the five tasks take on one core, beside environments of other libraries?
 
 Random continuous actions, automatic reset, everything inside one compiled scan; compile time apart; the median of some
-repeats. Where gymnax is installed its Pendulum-v1 runs in the same way in between. Writes
-`benchmarks/results/environments.json` and prints the README's table:
+repeats. Each row is a process of its own, pinned to one core; peers run in Python environments that this script builds in
+`benchmarks/peers`. `docking3d:usual_way` is the same task with what most JAX environments do: a key for every environment
+at every step, and a start drawn whether it is needed or not. Peers are other and mostly smaller tasks: gymnax's CartPole
+and Pendulum, Brax's inverted pendulum (spring), and CartPole of Gymnasium (NumPy) and EnvPool (one thread), whose actions
+are drawn beforehand. Writes `benchmarks/results/environments.json` and prints the README's table:
 
-    python benchmarks/environments.py [lanes=1,1024,4096,16384] [tasks=rejoin2d,…] [repeats=5]
+    python benchmarks/environments.py [lanes=1,1024,4096,16384] [names=docking3d,gymnax:Pendulum-v1,…] [repeats=5]
 """
 
 from __future__ import annotations
@@ -21,11 +24,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from machine import about
+import numpy as np
+from isolated import interpreter, probe
 
-import jaxsafe
+from jaxsafe.environment import Environment
 from jaxsafe.envs import TASKS
-from jaxsafe.rollout import reset_batch, step_or_reset_batch
+from jaxsafe.rollout import reset_batch, step_or_reset, step_or_reset_batch
 
 OUT = Path(__file__).parent / "results" / "environments.json"
 RELEASED = (1800.0, 3000.0)
@@ -35,21 +39,45 @@ NUM_STEPS = 1000
 """Steps of each lane in one measurement, many episodes long, so that resets have their share; 200 times as many for one."""
 
 
+SLOW_STEPS = 2_000_000
+"""Steps of all environments together in one measurement of what is called from Python or by far slower than the tasks."""
+
+PEERS = {"gymnax": ["gymnax"], "brax": ["brax"], "envpool": ["envpool"]}
+"""What pip installs for each beside jaxsafe, which brings Gymnasium itself."""
+
+
 def main() -> None:
     """Run, write, print."""
     options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
     lanes = [int(number) for number in options.get("lanes", "1,1024,4096,16384").split(",")]
-    tasks = options.get("tasks", ",".join(TASKS)).split(",")
-    repeats = int(options.get("repeats", "5"))
-    runs = {task: functools.partial(episode_steps, jaxsafe.make(task)) for task in tasks}
-    runs |= gymnax_pendulum()
-    results = [measure(name, run, num, repeats) for num in lanes for name, run in runs.items()]
-    OUT.parent.mkdir(exist_ok=True)
-    OUT.write_text(json.dumps({**about(), "released_steps_per_s": RELEASED, "runs": results}, indent=1) + "\n")
+    names, repeats = options.get("names", ",".join(RUNS)).split(","), int(options.get("repeats", "5"))
+    if "probe" in options:
+        print(json.dumps(RUNS[options["probe"]](lanes[0], repeats)))
+        return
+    from machine import about
+
+    libraries = {name.partition(":")[0] for name in names} & {*PEERS}
+    python = {library: interpreter(library, PEERS[library]) for library in libraries}
+    results = []
+    for num in lanes:
+        for name in names:
+            words = [f"probe={name}", f"lanes={num}", f"repeats={repeats}"]
+            found = probe(__file__, words, 1, python.get(name.partition(":")[0], sys.executable))
+            results.append({"task": name, "lanes": num, **found})
+            print(f"{name} × {num:,}: {found['steps_per_s']:,.0f}", file=sys.stderr)
+    content = {**about(), "pinned_to": 1, "released_steps_per_s": RELEASED, "runs": results}
+    OUT.write_text(json.dumps(content, indent=1) + "\n")
     print(table(results, lanes))
 
 
-def episode_steps(env: jaxsafe.Environment, key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
+def task(name: str, num_envs: int, repeats: int) -> dict[str, Any]:
+    """One of the five."""
+    import jaxsafe
+
+    return compiled(functools.partial(episode_steps, jaxsafe.make(name)), num_envs, repeats)
+
+
+def episode_steps(env: Environment, key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
     """Steps with random actions; the sum of rewards, so that nothing can be left out."""
     state, timestep = reset_batch(env, key, num_envs, axis=-1)
 
@@ -62,18 +90,38 @@ def episode_steps(env: jaxsafe.Environment, key: jax.Array, num_envs: int, num_s
     return jnp.sum(jax.lax.scan(one, (state, timestep.observation), jax.random.split(key, num_steps))[1])
 
 
-def gymnax_pendulum() -> dict[str, Callable]:
-    """Pendulum-v1 of gymnax, which resets by itself."""
-    try:
-        gymnax = importlib.import_module("gymnax")
-    except ImportError:
-        return {}
-    env, params = gymnax.make("Pendulum-v1")
+def usual_way(num_envs: int, repeats: int) -> dict[str, Any]:
+    """docking3d one environment at a time, mapped."""
+    import jaxsafe
+
+    env = jaxsafe.make("docking3d")
+
+    def run(key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
+        def one(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+            key_action, key_step = jax.random.split(key)
+            action = jax.random.uniform(key_action, (num_envs, env.action_size), minval=-1.0)
+            keys = jax.random.split(key_step, num_envs)
+            (state, observation), timestep = jax.vmap(step_or_reset, in_axes=(None, 0, 0, 0))(env, carry, action, keys)
+            return state, jnp.sum(timestep.reward) + jnp.sum(observation)
+
+        state, _ = jax.vmap(jaxsafe.reset, in_axes=(None, 0))(env, jax.random.split(key, num_envs))
+        return jnp.sum(jax.lax.scan(one, state, jax.random.split(key, num_steps))[1])
+
+    return compiled(run, num_envs, repeats)
+
+
+def gymnax(name: str, num_envs: int, repeats: int) -> dict[str, Any]:
+    """An environment of gymnax, which resets by itself."""
+    env, params = importlib.import_module("gymnax").make(name)
+    space = env.action_space(params)
 
     def run(key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
         def one(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
             key_action, key_step = jax.random.split(key)
-            action = jax.random.uniform(key_action, (num_envs, 1), minval=-2.0, maxval=2.0)
+            if hasattr(space, "n"):
+                action = jax.random.randint(key_action, (num_envs,), 0, space.n)
+            else:
+                action = jax.random.uniform(key_action, (num_envs, *space.shape), minval=space.low, maxval=space.high)
             keys = jax.random.split(key_step, num_envs)
             observation, state, reward, *_ = jax.vmap(env.step, in_axes=(0, 0, 0, None))(keys, state, action, params)
             return state, jnp.sum(reward) + jnp.sum(observation)
@@ -81,28 +129,73 @@ def gymnax_pendulum() -> dict[str, Callable]:
         _, state = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(key, num_envs), params)
         return jnp.sum(jax.lax.scan(one, state, jax.random.split(key, num_steps))[1])
 
-    return {"gymnax Pendulum-v1": run}
+    return compiled(run, num_envs, repeats)
 
 
-def measure(name: str, run: Callable, num_envs: int, repeats: int) -> dict[str, Any]:
-    """Compile once, then time."""
+def brax(num_envs: int, repeats: int) -> dict[str, Any]:
+    """Brax's inverted pendulum by its spring method, in its own wrappers."""
+    env = importlib.import_module("brax.envs").create("inverted_pendulum", backend="spring", batch_size=num_envs)
+
+    def run(key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
+        def one(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+            state = env.step(state, jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0))
+            return state, jnp.sum(state.reward) + jnp.sum(state.obs)
+
+        return jnp.sum(jax.lax.scan(one, env.reset(key), jax.random.split(key, num_steps))[1])
+
+    return compiled(run, num_envs, repeats, SLOW_STEPS // 10)
+
+
+def gymnasium(num_envs: int, repeats: int) -> dict[str, Any]:
+    """CartPole of Gymnasium, written for NumPy."""
+    env = importlib.import_module("gymnasium").make_vec("CartPole-v1", num_envs=num_envs)
+    env.reset(seed=0)
+    action = env.action_space.sample()
+    return called(lambda: env.step(action), num_envs, repeats)
+
+
+def envpool(num_envs: int, repeats: int) -> dict[str, Any]:
+    """CartPole of EnvPool, in C++."""
+    env = importlib.import_module("envpool").make("CartPole-v1", env_type="gymnasium", num_envs=num_envs, num_threads=1)
+    env.reset()
+    action = np.ones(num_envs, np.int32)
+    return called(lambda: env.step(action), num_envs, repeats)
+
+
+def compiled(run: Callable, num_envs: int, repeats: int, most: int | None = None) -> dict[str, Any]:
+    """Compile once, then time; with `most`, that many steps of all environments together."""
     num_steps = NUM_STEPS * (200 if num_envs == 1 else 1)
+    num_steps = num_steps if most is None else max(10, most // num_envs)
     begin = time.perf_counter()
-    compiled = jax.jit(run, static_argnums=(1, 2)).lower(jax.random.key(0), num_envs, num_steps).compile()
+    program = jax.jit(run, static_argnums=(1, 2)).lower(jax.random.key(0), num_envs, num_steps).compile()
     compile_s = time.perf_counter() - begin
-    rates = []
+    seconds = []
     for seed in range(repeats + 1):
         key = jax.random.key(seed)
         begin = time.perf_counter()
-        compiled(key).block_until_ready()
-        rates.append(num_envs * num_steps / (time.perf_counter() - begin))
-    rates = rates[1:]  # the first warms caches
+        program(key).block_until_ready()
+        seconds.append(time.perf_counter() - begin)
+    return rates(num_envs * num_steps, seconds, compile_s)
+
+
+def called(step: Callable[[], Any], num_envs: int, repeats: int) -> dict[str, Any]:
+    """Time what is called from Python."""
+    num_steps, seconds = max(10, min(SLOW_STEPS // num_envs, 20_000)), []
+    for _ in range(repeats + 1):
+        begin = time.perf_counter()
+        for _ in range(num_steps):
+            step()
+        seconds.append(time.perf_counter() - begin)
+    return rates(num_envs * num_steps, seconds, 0.0)
+
+
+def rates(steps: int, seconds: list[float], compile_s: float) -> dict[str, Any]:
+    """Median, slowest and fastest; the first time warms caches."""
+    found = sorted(steps / each for each in seconds[1:])
     return {
-        "task": name,
-        "lanes": num_envs,
-        "steps_per_s": statistics.median(rates),
-        "slowest": min(rates),
-        "fastest": max(rates),
+        "steps_per_s": statistics.median(found),
+        "slowest": found[0],
+        "fastest": found[-1],
         "compile_s": round(compile_s, 2),
     }
 
@@ -115,6 +208,15 @@ def table(results: list[dict[str, Any]], lanes: list[int]) -> str:
         lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
+
+RUNS: dict[str, Callable[[int, int], dict[str, Any]]] = {
+    **{name: functools.partial(task, name) for name in TASKS},
+    "docking3d:usual_way": usual_way,
+    **{f"gymnax:{name}": functools.partial(gymnax, name) for name in ("Pendulum-v1", "CartPole-v1")},
+    "brax:inverted_pendulum": brax,
+    "gymnasium:CartPole-v1": gymnasium,
+    "envpool:CartPole-v1": envpool,
+}
 
 if __name__ == "__main__":
     main()

@@ -11,10 +11,8 @@ Writes `benchmarks/results/memory.json` and prints the table of docs/scaling.md:
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 OUT = Path(__file__).parent / "results" / "memory.json"
 NUM_STEPS = 32
@@ -22,6 +20,7 @@ NUM_STEPS = 32
 
 def main() -> None:
     """Run, write, print."""
+    from isolated import probe as apart
     from machine import about
 
     from jaxsafe.envs import TASKS
@@ -32,7 +31,10 @@ def main() -> None:
         return
     tasks = options.get("tasks", ",".join(TASKS)).split(",")
     sizes = [int(size) for size in options.get("num_envs", "1024,4096,16384").split(",")]
-    rows = [{"task": task, "num_envs": size, **apart(task, size)} for task in tasks for size in sizes]
+    rows = []
+    for task in tasks:
+        for size in sizes:
+            rows.append({"task": task, "num_envs": size, **apart(__file__, [f"probe={task}", f"num_envs={size}"])})
     OUT.write_text(json.dumps({**about(), "num_steps": NUM_STEPS, "runs": rows}, indent=1) + "\n")
     print(
         "| predicted / measured | an environment's state | a seed without them |"
@@ -43,12 +45,6 @@ def main() -> None:
         mine = [row for row in rows if row["task"] == task]
         cells = [f"{row['predicted'] / 2**20:.0f} / {row['measured'] / 2**20:.0f} MiB" for row in mine]
         print(f"| {task} | {mine[0]['lane']:,} B | {mine[0]['seed'] / 1024:.0f} KiB | " + " | ".join(cells) + " |")
-
-
-def apart(task: str, num_envs: int) -> dict[str, Any]:
-    """What `probe` finds in a process of its own."""
-    command = [sys.executable, __file__, f"probe={task}", f"num_envs={num_envs}"]
-    return json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()[-1])
 
 
 def probe(task: str, num_envs: int) -> dict[str, int]:

@@ -14,15 +14,15 @@ from __future__ import annotations
 import json
 import os
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-HERE = Path(__file__).parent
-OUT = HERE / "results" / "ppo.json"
+from isolated import interpreter, probe
+
+OUT = Path(__file__).parent / "results" / "ppo.json"
 NUM_ENVS, NUM_STEPS, NUM_EPOCHS, NUM_MINIBATCHES, HIDDEN, UPDATES = 2048, 32, 4, 8, (64, 64), 8
 BATCH = NUM_ENVS * NUM_STEPS
 PEERS = {
@@ -43,39 +43,19 @@ def main() -> None:
     from machine import about
 
     peers = [name for name in options.get("peers", ",".join(PEERS)).split(",") if name]
-    python = {name: interpreter(name) if name in peers else sys.executable for name in PROBES}
+    python = {name: interpreter(name, PEERS[name]) if name in peers else sys.executable for name in PROBES}
     cores = [1, os.cpu_count() or 1]
     names = [name for name in PROBES if name in peers or name not in PEERS]
     found: dict[tuple[str, int], list[float]] = {(name, count): [] for name in names for count in cores}
     for _ in range(repeats):
         for name, count in found:
-            found[name, count].append(probe(python[name], name, task, count))
+            found[name, count].append(probe(__file__, [f"probe={name}", f"task={task}"], count, python[name]))
     rows = [{"peer": name, "cores": count, "samples_per_s": rates} for (name, count), rates in found.items()]
     OUT.parent.mkdir(exist_ok=True)
     OUT.write_text(json.dumps({**about(), "task": task, "repeats": repeats, "runs": rows}, indent=1) + "\n")
     print(f"| {task}, thousand samples/s | 1 core | {cores[-1]} cores |\n|---|---|---|")
     for name in names:
         print(f"| {name} | " + " | ".join(f"{statistics.median(found[name, n]) / 1e3:.3g}" for n in cores) + " |")
-
-
-def interpreter(name: str) -> str:
-    """Python with a peer beside jaxsafe; built the first time."""
-    place = HERE / "peers" / name
-    python = place / "bin" / "python"
-    if not python.exists():
-        subprocess.run([sys.executable, "-m", "venv", place], check=True)
-        subprocess.run([python, "-m", "pip", "install", "-q", "-e", HERE.parent, *PEERS[name]], check=True)
-    return str(python)
-
-
-def probe(python: str, name: str, task: str, cores: int) -> float:
-    """Samples a second in a process of its own on some cores."""
-    usable = sorted(os.sched_getaffinity(0))[:cores]
-    command = [python, __file__, f"probe={name}", f"task={task}"]
-    ran = subprocess.run(command, capture_output=True, text=True, preexec_fn=lambda: os.sched_setaffinity(0, usable))
-    if ran.returncode:
-        sys.exit(f"{name}: {ran.stderr[-2000:]}")
-    return float(ran.stdout.splitlines()[-1])
 
 
 def ours(task: str, seeds: int = 1, sort: bool = False) -> float:

@@ -13,13 +13,14 @@ import importlib
 import importlib.util
 import json
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
+
+from isolated import probe as apart
 
 OUT = Path(__file__).parent / "results" / "startup.json"
 LANES = 64
@@ -53,8 +54,7 @@ def main() -> None:
 
 def measured(name: str, rta: str, repeats: int) -> dict[str, Any]:
     """Medians over fresh processes."""
-    command = [sys.executable, __file__, f"probe={name},{rta}"]
-    found = [json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout) for _ in range(repeats)]
+    found = [apart(__file__, [f"probe={name},{rta}"]) for _ in range(repeats)]
     return {"name": name, "rta": rta, "seconds": [round(statistics.median(one), 3) for one in zip(*found, strict=True)]}
 
 

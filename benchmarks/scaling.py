@@ -1,0 +1,116 @@
+"""What do more cores and more seeds gain, and what would a thousand devices?
+
+Each measurement is a process of its own, pinned to one core or on all, in turns; compiling apart, the median of some:
+
+- environment steps, 4,096 environments on each core, as in `environments.py`;
+- one seed of the PPO of `ppo.py` for each core;
+- one seed, whose environments and minibatches the cores share.
+
+The projection takes the measured time of an update of one seed alone, the share of it that is left when the cores are busy
+with seeds of their own, and the time that sharing adds to a perfect split, and lets the exchange of gradients take a time
+proportional to the logarithm of the number of devices. Writes `benchmarks/results/scaling.json` and prints two tables:
+
+    python benchmarks/scaling.py [task=docking3d] [repeats=3]
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import statistics
+import sys
+import time
+from pathlib import Path
+
+import ppo
+from isolated import probe
+
+OUT = Path(__file__).parent / "results" / "scaling.json"
+LANES, NUM_STEPS = 4096, 1000
+SHARED = (1, 8, 64)
+"""Numbers of devices that share a seed, in the projection."""
+
+DEVICES = 1000
+
+
+def main() -> None:
+    """Run, write, print."""
+    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
+    task, repeats = options.get("task", "docking3d"), int(options.get("repeats", "3"))
+    if "probe" in options:
+        print(PROBES[options["probe"]](task))
+        return
+    from machine import about
+
+    cores = os.cpu_count() or 1
+    found: dict[tuple[str, int], list[float]] = {(name, count): [] for name in PROBES for count in (1, cores)}
+    for _ in range(repeats):
+        for name, count in found:
+            found[name, count].append(probe(__file__, [f"probe={name}", f"task={task}"], count))
+    rows = [{"what": name, "cores": count, "per_s": rates} for (name, count), rates in found.items()]
+    rates = {key: statistics.median(values) for key, values in found.items()}
+    projected = projection(rates, cores)
+    content = {**about(), "task": task, "repeats": repeats, "runs": rows, "projection": projected}
+    OUT.write_text(json.dumps(content, indent=1) + "\n")
+    print(f"| {task}, a second | 1 core | {cores} cores | ratio |\n|---|---|---|---|")
+    for name in PROBES:
+        one, all_ = rates[name, 1], rates[name, cores]
+        print(f"| {name} | {one / 1e3:,.3g} k | {all_ / 1e3:,.3g} k | {all_ / one:.2f} |")
+    print(f"\n| {DEVICES:,} devices | seeds | million samples/s | of a perfect split |\n|---|---|---|---|")
+    for row in projected:
+        print(f"| {row['shared']} a seed | {row['seeds']:,} | {row['samples_per_s'] / 1e6:.3g} | {row['efficiency']:.0%} |")
+
+
+def projection(rates: dict[tuple[str, int], float], cores: int) -> list[dict[str, float]]:
+    """Samples a second of `DEVICES` such cores, some of them for each seed."""
+    alone, busy, shared = rates[ONE_EACH, 1], rates[ONE_EACH, cores] / cores, rates[SHARING, cores]
+    update = ppo.BATCH / alone  # seconds, of one seed on one core
+    exchange = max(0.0, ppo.BATCH / shared - ppo.BATCH / busy / cores) / math.log2(cores) if cores > 1 else 0.0
+    rows = []
+    for count in SHARED:
+        seeds = DEVICES // count
+        seconds = ppo.BATCH / busy / count + exchange * math.log2(count)
+        rate = seeds * ppo.BATCH / seconds
+        rows.append(
+            {"shared": count, "seeds": seeds, "samples_per_s": rate, "efficiency": rate * update / ppo.BATCH / DEVICES}
+        )
+    return rows
+
+
+def steps(task: str) -> float:
+    """Environment steps a second of all cores."""
+    from jaxsafe.train.seeds import claim_cores
+
+    claim_cores()
+    import environments
+    import jax
+    import numpy as np
+    from jax.sharding import Mesh, PartitionSpec
+
+    import jaxsafe
+
+    env, mesh = jaxsafe.make(task), Mesh(np.array(jax.devices()), ("lanes",))
+    run = jax.jit(
+        jax.shard_map(
+            lambda key: environments.episode_steps(env, key[0], LANES, NUM_STEPS)[None],
+            mesh=mesh, in_specs=PartitionSpec("lanes"), out_specs=PartitionSpec("lanes"), check_vma=False,
+        )
+    )  # fmt: skip
+    keys = jax.random.split(jax.random.key(0), mesh.size)
+    run(keys).block_until_ready()
+    start = time.perf_counter()
+    run(keys).block_until_ready()
+    return mesh.size * LANES * NUM_STEPS / (time.perf_counter() - start)
+
+
+def one_each(task: str) -> float:
+    """Samples a second of as many seeds as there are cores."""
+    return ppo.ours(task, seeds=len(os.sched_getaffinity(0)))
+
+
+STEPS, ONE_EACH, SHARING = "environment steps, 4,096 a core", "samples, a seed for each core", "samples, one seed"
+PROBES = {STEPS: steps, ONE_EACH: one_each, SHARING: ppo.ours}
+
+if __name__ == "__main__":
+    main()
