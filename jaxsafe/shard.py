@@ -52,7 +52,7 @@ class Shard:
             return tree
         leaves, structure = jax.tree.flatten(tree)
         found = dict.fromkeys(range(len(leaves)))
-        for dtype in {leaf.dtype for leaf in leaves}:
+        for dtype in dict.fromkeys(leaf.dtype for leaf in leaves):  # in one order: every process must trace the same
             which = [index for index, leaf in enumerate(leaves) if leaf.dtype == dtype]
             columns = [leaves[index].reshape(*leaves[index].shape[: axis + 1], -1) for index in which]
             ends = np.cumsum([one.shape[-1] for one in columns])[:-1]

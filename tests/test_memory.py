@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 from jaxsafe.errors import ConfigError
-from jaxsafe.train import memory
+from jaxsafe.train import hosts, memory
 from jaxsafe.train.__main__ import main
 
 
@@ -24,6 +24,13 @@ def test_devices_of_one_machine_share_its_memory(monkeypatch: pytest.MonkeyPatch
     memory.require(5 * memory.GIB, 2, "x")
     with pytest.raises(ConfigError, match=r"x: this training needs 12.0 GiB of memory, 10.0 GiB are free"):
         memory.require(4 * memory.GIB, 3, "x")
+
+
+def test_every_process_refuses_what_does_not_fit_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available", lambda: 10 * memory.GIB)
+    monkeypatch.setattr(hosts, "anyone", lambda _: True)
+    with pytest.raises(ConfigError, match=r"x: this training needs 2.0 GiB of memory, another process has less"):
+        memory.require(memory.GIB, 2, "x")
 
 
 def test_what_is_counted() -> None:

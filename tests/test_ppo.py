@@ -6,6 +6,7 @@ from probes import Constant, Match, Position, probe
 
 from jaxsafe.component import normalise
 from jaxsafe.environment import Environment
+from jaxsafe.train import ppo as ppo_module
 from jaxsafe.train.agent import Agent
 from jaxsafe.train.ppo import PPO, TrainState, collect, discount, dual_ascent, gae, init, learning_rate, update
 from jaxsafe.types import Sim
@@ -65,6 +66,17 @@ def test_the_critic_learns_from_the_observation() -> None:
     state = train(probe(Position(name="reward")))
     assert value(state, 1.0) == pytest.approx(1.0, abs=0.1)
     assert value(state, -1.0) == pytest.approx(-1.0, abs=0.1)
+
+
+def test_what_is_learnt_does_not_depend_on_how_many_samples_go_through_the_networks_at_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    env, agent = probe(Position(name="reward")), AGENT.replace(cost_critic=True)
+    whole = train(env, updates=3, agent=agent)
+    monkeypatch.setattr(ppo_module, "CHUNK", 16)  # a minibatch has 64 samples, a batch 128
+    parts = train(env, updates=3, agent=agent)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), whole.params, parts.params)
+    assert not np.array_equal(whole.params["actor"][0]["kernel"], parts.params["actor"][0]["kernel"])  # in another order
 
 
 def test_a_terminated_episode_counts_nothing_beyond_its_end() -> None:

@@ -68,6 +68,7 @@ def test_seeds_are_spread_over_devices_and_padded() -> None:
     mapper = SeedMapper(3)
     assert len(jax.devices()) == 2  # as the test settings ask
     assert mapper.mesh.size == 2
+    assert mapper.num_local_devices == 2
     assert mapper.padded == 4
     np.testing.assert_array_equal(mapper.pad(np.array([5, 6, 7])), [5, 6, 7, 7])
 

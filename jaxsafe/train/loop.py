@@ -117,7 +117,7 @@ class Training:
     def _restore_or_init(self) -> None:
         steps, content = self.checkpoints.steps, structure(self.env, self.config)
         each = memory.size(content) // self.config.seeds * (self.mapper.padded // self.mapper.mesh.shape["seeds"])
-        memory.require(each, self.mapper.mesh.size, MEMORY)
+        memory.require(each, self.mapper.num_local_devices, MEMORY)
         if not steps:
             self.state = self.fresh(self.shared, self.mapper.keys(self.config.seed))
             never = self.mapper.place(np.full(self.config.seeds, -1.0, np.float32))
@@ -142,8 +142,8 @@ class Training:
         begin = time.monotonic()
         compiled = self.advance.lower(self.shared, self.state).compile()
         self.compile_s += time.monotonic() - begin
-        devices = self.mapper.mesh.size
-        memory.require(memory.footprint(compiled) - memory.size(self.state) // devices, devices, MEMORY)
+        has = memory.size(self.state) // self.mapper.mesh.size  # which is there already
+        memory.require(memory.footprint(compiled) - has, self.mapper.num_local_devices, MEMORY)
         return compiled
 
     def _due(self, before: int, every: int | None) -> bool:

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 
 from jaxsafe.errors import ConfigError
+from jaxsafe.train import hosts
 from jaxsafe.types import is_key
 
 GIB = 2**30
@@ -27,25 +28,27 @@ def footprint(compiled: jax.stages.Compiled) -> int:
 
 
 def require(needed: int, devices: int, what: str) -> None:
-    """Refuse what does not fit.
+    """Refuse what does not fit, in every process if it does not in one.
 
     Args:
         needed: bytes on each device.
-        devices: how many take part.
+        devices: how many of this process take part.
         what: the options that decide it.
 
     Raises:
         ConfigError: the devices do not have as much left; on a CPU they share what the machine has.
     """
     free = available()
-    total = needed * devices if jax.devices()[0].platform == "cpu" else needed
-    if free is not None and total > free:
-        raise ConfigError(f"{what}: this training needs {total / GIB:,.1f} GiB of memory, {free / GIB:,.1f} GiB are free")
+    total = needed * devices if jax.local_devices()[0].platform == "cpu" else needed
+    short = free is not None and total > free
+    if hosts.anyone(short):
+        found = f"{free / GIB:,.1f} GiB are free" if free is not None and short else "another process has less"
+        raise ConfigError(f"{what}: this training needs {total / GIB:,.1f} GiB of memory, {found}")
 
 
 def available() -> int | None:
     """Bytes free on an accelerator, or on this machine and within the limit of its container; None if nobody tells."""
-    device = jax.devices()[0]
+    device = jax.local_devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats() or {}
         return stats["bytes_limit"] - stats.get("bytes_in_use", 0) if "bytes_limit" in stats else None

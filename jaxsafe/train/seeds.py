@@ -65,6 +65,7 @@ class SeedMapper:
         self.mesh = Mesh(np.array(groups), ("seeds", "lanes"))
         self.shard = Shard("lanes", len(groups[0]))
         self.one_by_one = groups[0][0].platform == "cpu"
+        self.num_local_devices = sum(device.process_index == jax.process_index() for device in self.mesh.devices.flat)
 
     def map(self, function: Callable[[Any, Any], Any], given: Any = SEEDS, returned: Any = SEEDS) -> Any:
         """`function(shared, one)` to a jittable `(shared, all)`, all with a leading axis of `padded` seeds.
