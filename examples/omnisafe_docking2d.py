@@ -27,16 +27,16 @@ class Docking(CMDP):
     """The compiled batch with OmniSafe's tensors."""
 
     _support_envs: ClassVar[list[str]] = ["jaxsafe-docking2d"]
-    need_auto_reset_wrapper = False
     need_time_limit_wrapper = False
 
     def __init__(self, env_id: str, num_envs: int = 1, device: str = "cpu", **options: Any) -> None:
-        """Make as many environments."""
+        """Make as many environments; one has no batch axis, and OmniSafe resets it."""
         super().__init__(env_id)
-        self._env = SafetyEnv(env_id.removeprefix("jaxsafe-"), num_envs, **options)
+        self._env = SafetyEnv(env_id.removeprefix("jaxsafe-"), num_envs if num_envs > 1 else None, **options)
+        self.need_auto_reset_wrapper = num_envs == 1
         self._num_envs, self._device, self._metadata = num_envs, device, self._env.metadata
-        self._action_space = self._env.env.single_action_space
-        self._observation_space = self._env.env.single_observation_space
+        self._action_space = self._env.single_action_space
+        self._observation_space = self._env.single_observation_space
 
     @property
     def max_episode_steps(self) -> int:

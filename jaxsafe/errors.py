@@ -32,6 +32,8 @@ class MissingError(ConfigError, ImportError):
     """A package of an extra is not installed."""
 
 
-def missing(package: str, extra: str) -> MissingError:
-    """What to raise where a package of an extra is not installed."""
+def missing(error: ImportError, package: str, extra: str) -> ImportError:
+    """What to raise where a package of an extra fails to import; if it is installed but broken, its own error."""
+    if (error.name or "").partition(".")[0] != package:
+        return error
     return MissingError(f"{package} is not installed; pip install 'jaxsafe[{extra}]'")

@@ -5,6 +5,7 @@ import pytest
 
 from jaxsafe.adapters import observation_bounds
 from jaxsafe.envs import make
+from jaxsafe.errors import missing
 
 
 @pytest.mark.parametrize(
@@ -27,6 +28,14 @@ def test_a_missing_package_names_its_extra(
     monkeypatch.delitem(sys.modules, module, raising=False)
     with pytest.raises(ImportError, match=message):
         importlib.import_module(module)
+
+
+def test_a_broken_package_says_what_is_wrong_with_it() -> None:
+    broken = ModuleNotFoundError("No module named 'flax'", name="flax")
+    assert missing(broken, "brax", "brax") is broken
+    assert str(missing(ModuleNotFoundError(name="brax.envs"), "brax", "brax")) == (
+        "brax is not installed; pip install 'jaxsafe[brax]'"
+    )
 
 
 def test_observations_are_bounded_where_they_are_clipped() -> None:

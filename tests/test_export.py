@@ -14,6 +14,7 @@ from jaxsafe.export import functions
 from jaxsafe.export.__main__ import main
 from jaxsafe.export.onnx import to_onnx
 from jaxsafe.export.vnnlib import search, write_vnnlib
+from jaxsafe.rollout import reset_batch
 from jaxsafe.train.policy import SavedPolicy, find_policy, read_policy
 
 
@@ -30,7 +31,9 @@ def run(model: Any, inputs: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("task", ["docking2d", "docking3d", "docking2d_oriented", "rejoin2d", "rejoin3d"])
 def test_another_runtime_acts_alike(task: str) -> None:
     policy = saved(task)
-    observations = np.random.default_rng(0).uniform(-1, 1, (10_000, policy.env.observation_size)).astype(np.float32)
+    _, starts = jax.jit(reset_batch, static_argnums=2)(policy.env, jax.random.key(0), 10_000)
+    drawn = np.random.default_rng(0).uniform(-1, 1, (10_000, policy.env.observation_size))
+    observations = np.concatenate([starts.observation, drawn]).astype(np.float32)
     expected = jaxsafe.load_policy(task)(jax.random.key(0), observations)
     found = run(to_onnx(functions.action(policy).function, observations.shape), observations)
     np.testing.assert_allclose(found, expected, atol=1e-5)

@@ -94,6 +94,39 @@ def test_an_evaluation_of_it_is_that_of_the_original(tmp_path: Path, monkeypatch
         assert theirs[metric]["mean"] == pytest.approx(ours[metric]["mean"], rel=1e-3)
 
 
+def test_a_discrete_network_is_evaluated_once_by_its_modes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    as_torch_writes_it(tmp_path / "net.onnx", random_layers(6, 8, 22))
+    words = ["run=net.onnx", "env=docking2d", "actions=discrete", "episodes=2", "env.terminal.timeout.limit=10", "out=x"]
+    assert main(words) == 0
+    assert list(read_json(tmp_path / "x" / "results.json")["evaluation"]) == ["deterministic"]
+
+
+def test_constants_casts_and_extremes_are_understood(tmp_path: Path) -> None:
+    def graph(*nodes: onnx.NodeProto) -> Path:
+        values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 6]) for name in ("obs", "out")]
+        onnx.save(helper.make_model(helper.make_graph(nodes, "net", values[:1], values[1:])), tmp_path / "net.onnx")
+        return tmp_path / "net.onnx"
+
+    low = helper.make_node("Constant", [], ["low"], value_float=0.25)
+    high = helper.make_node("Constant", [], ["high"], value_floats=[0.5] * 6)
+    ends = helper.make_node("Constant", [], ["ends"], value_ints=[2])
+    begins = helper.make_node("Constant", [], ["begins"], value_ints=[0])
+    axes = helper.make_node("Constant", [], ["axes"], value_ints=[1])
+    clipped = [helper.make_node("Max", ["obs", "low", "low"], ["y"]), helper.make_node("Min", ["y", "high"], ["z"])]
+    cut = helper.make_node("Slice", ["z", "begins", "ends", "axes"], ["out"])
+    env = jaxsafe.make("docking2d")
+    agent, weights = read_foreign(graph(low, high, begins, ends, axes, *clipped, cut), env)
+    found = agent.policy(env, weights, True)(jax.random.key(0), jnp.array([[0.1, 0.4, 0.9, 0.0, 0.0, 0.0], [0.9] * 6]))
+    np.testing.assert_allclose(found, [[0.25, 0.4], [0.5, 0.5]])
+    words = [helper.make_node("Constant", [], ["a"], value_string="x"), helper.make_node("Identity", ["obs"], ["out"])]
+    with pytest.raises(ConfigError, match="a constant of kind value_string is not known here"):
+        read_foreign(graph(*words), env)
+    casts = [helper.make_node("Cast", ["obs"], ["z"], to=10), helper.make_node("Cast", ["z"], ["out"], to=1)]
+    with pytest.raises(ConfigError, match="Cast to type 10 is not known here"):
+        read_foreign(graph(*casts), env)
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -123,6 +156,10 @@ def test_more_mistakes_are_named(tmp_path: Path) -> None:
         read_foreign(tmp_path / "x.npz", env, "gelu")
     with pytest.raises(ConfigError, match=r"env: missing; the task in which x\.onnx shall act"):
         main(["run=x.onnx"])
+    with pytest.raises(ConfigError, match="deterministic: expected true or nothing, found False"):
+        main(["run=x.onnx", "env=docking2d", "deterministic=false"])
+    with pytest.raises(ConfigError, match="actions: means nothing but for a policy from elsewhere"):
+        main(["run=pretrained/docking2d", "actions=discrete"])
     with pytest.raises(ConfigError, match="checkpoint: means nothing for a policy from elsewhere"):
         main(["run=x.npz", "env=docking2d", "checkpoint=best"])
     for words in (["run=x.onnx", "env=docking2d"], ["run=pretrained/docking2d"]):

@@ -17,6 +17,8 @@ def test_the_cost_stands_between_reward_and_end() -> None:
 def test_the_cost_of_a_lane_is_that_of_the_step_even_where_it_starts_anew() -> None:
     ends = {"terminal.timeout.limit": 1.0, "reward.velocity_constraint.scale": -0.01}
     env = SafetyEnv("docking2d", 8, {**ends, "deputy.start.velocity.share": [1.5, 1.6]})  # every start is too fast
+    assert env.single_action_space.shape == (2,)
+    assert env.single_observation_space.shape == (6,)
     env.reset(seed=0)
     zero = np.zeros((8, 2), np.float32)
     costs, infos = [], []

@@ -20,8 +20,8 @@ from jaxsafe.types import Key, TimeStep
 try:
     from brax.envs.base import Env, State, Wrapper
     from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
-except ImportError:
-    raise missing("brax", "brax") from None
+except ImportError as error:
+    raise missing(error, "brax", "brax") from None
 
 
 class BraxEnv(Env):

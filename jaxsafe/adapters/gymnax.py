@@ -25,8 +25,8 @@ from jaxsafe.types import Key, Record, State
 
 try:
     from gymnax.environments import spaces
-except ImportError:
-    raise missing("gymnax", "gymnax") from None
+except ImportError as error:
+    raise missing(error, "gymnax", "gymnax") from None
 
 
 class GymnaxParams(Record):

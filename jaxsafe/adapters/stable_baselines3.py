@@ -15,8 +15,8 @@ from jaxsafe.errors import missing
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
-except ImportError:
-    raise missing("stable_baselines3", "sb3") from None
+except ImportError as error:
+    raise missing(error, "stable_baselines3", "sb3") from None
 
 
 class SB3VecEnv(VecEnv):

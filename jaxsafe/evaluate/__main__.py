@@ -9,7 +9,7 @@ from typing import Any
 from jaxsafe import cli
 from jaxsafe.train.seeds import claim_cores
 
-OPTIONS = ("run", "env", "activation", "rta", "episodes", "seed", "checkpoint", "deterministic", "render", "out")
+OPTIONS = ("run", "env", "actions", "activation", "rta", "episodes", "seed", "checkpoint", "deterministic", "render", "out")
 
 
 def main(argv: Sequence[str]) -> int:
@@ -32,8 +32,9 @@ def main(argv: Sequence[str]) -> int:
     arguments.refuse_beside(["checkpoint"] if task else [], "for a policy from elsewhere, which env= says it is")
     layers = task is not None and not run.endswith(".onnx")
     arguments.refuse_beside([] if layers else ["activation"], "but for the layers in an .npz with env=TASK")
-    out, checkpoint, rta, render, activation = (
-        arguments.pop_text(name) for name in ("out", "checkpoint", "rta", "render", "activation")
+    arguments.refuse_beside([] if task else ["actions"], "but for a policy from elsewhere, with env=TASK")
+    out, checkpoint, rta, render, activation, actions = (
+        arguments.pop_text(name) for name in ("out", "checkpoint", "rta", "render", "activation", "actions")
     )
     changes = arguments.pop_overrides()
     episodes, seed = arguments.pop_count("episodes", 1000), arguments.pop_count("seed", 0, least=0)
@@ -41,8 +42,11 @@ def main(argv: Sequence[str]) -> int:
     arguments.refuse_rest([*OPTIONS, "env.…"])
     if render not in (None, "gif"):
         raise ConfigError(f"render: found {render!r}; choose from gif")
+    if task and deterministic is False:
+        raise ConfigError("deterministic: expected true or nothing, found False; a policy from elsewhere acts by its mode")
+    deterministic = True if task else deterministic
     kinds = {None: ("stochastic", "deterministic"), True: ("deterministic",), False: ("stochastic",)}[deterministic]
-    subject = load(run, checkpoint) if task is None else load_foreign(Path(run), task, activation or "tanh")
+    subject = load_foreign(Path(run), task, activation or "tanh", actions) if task else load(run, checkpoint)
     env = override(subject.env if rta is None else with_rta(subject.env, subject.name, rta), changes)
     request: dict[str, Any] = {
         "run": run,
@@ -61,7 +65,8 @@ def usage() -> str:
     return (
         "usage: python -m jaxsafe.evaluate run=RUN [key=value …]\n\n"
         "  run=RUN                a run directory, a policy file (.npz), or pretrained/TASK\n"
-        "  run=FILE env=TASK      a policy from elsewhere: .onnx, or .npz with kernel_0, bias_0, … (activation=tanh)\n"
+        "  run=FILE env=TASK      a policy from elsewhere: .onnx, or .npz with kernel_0, bias_0, … (activation=tanh);\n"
+        "                         actions=discrete if it gives logits; it acts by its mode\n"
         "  episodes=N             episodes of each seed (default 1000)\n"
         "  seed=N                 evaluation key: other starts and other noise (default 0, as in the run's own results)\n"
         "  checkpoint=last|best|N best is per seed by success in the evaluations during training (default last)\n"

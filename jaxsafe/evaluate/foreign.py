@@ -7,6 +7,7 @@ one after the other.
 
 from __future__ import annotations
 
+import functools
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -62,8 +63,8 @@ def read_foreign(path: Path, env: Environment, activation: str = "tanh") -> tupl
     observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
     try:
         found = jax.eval_shape(network, weights, observation).shape
-    except (TypeError, ValueError) as error:
-        reason = str(error).splitlines()[0]
+    except Exception as error:  # JAX and the operators below refuse in many ways
+        reason = str(error).partition("\n")[0]
         raise ConfigError(f"{path}: does not take an observation of {env.observation_size} numbers: {reason}") from None
     if found != (wanted,):
         raise ConfigError(f"{path}: expected {wanted} outputs ({', '.join(env.action_names)}), found shape {found}")
@@ -100,8 +101,8 @@ def _onnx(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
     try:
         import onnx
         from onnx import numpy_helper
-    except ImportError:
-        raise missing("onnx", "export") from None
+    except ImportError as error:
+        raise missing(error, "onnx", "export") from None
     try:
         model = onnx.load(path)
         onnx.checker.check_model(model)
@@ -126,7 +127,7 @@ def _onnx(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
         if kind not in _OPERATORS and kind not in ("Constant", "Split"):
             raise ConfigError(f"{path}: the operator {kind} is not known here")
     constants = {
-        outputs[0]: numpy_helper.to_array(attributes["value"])
+        outputs[0]: numpy_helper.to_array(attributes["value"]) if "value" in attributes else _constant(path, attributes)
         for kind, _, outputs, attributes in nodes
         if kind == "Constant"
     }
@@ -149,6 +150,22 @@ def _onnx(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
         return values[graph.output[0].name].ravel()
 
     return network, floats
+
+
+def _constant(path: Path, attributes: Mapping[str, Any]) -> np.ndarray:
+    """A constant that is given as one number or a list."""
+    [(kind, value)] = attributes.items()
+    types = {"value_float": np.float32, "value_floats": np.float32, "value_int": np.int64, "value_ints": np.int64}
+    if kind not in types:
+        raise ConfigError(f"{path}: a constant of kind {kind} is not known here")
+    return np.asarray(value, types[kind])
+
+
+def _cast(x: list[Any], a: Mapping[str, Any]) -> Array:
+    known = {1: jnp.float32, 6: jnp.int32, 7: jnp.int32, 9: bool, 11: jnp.float32}
+    if a["to"] not in known:
+        raise TypeError(f"Cast to type {a['to']} is not known here")
+    return x[0].astype(known[a["to"]])
 
 
 def _gemm(x: list[Any], a: Mapping[str, Any]) -> Array:
@@ -184,8 +201,8 @@ def _clip(x: list[Any], a: Mapping[str, Any]) -> Array:
 
 
 _ELEMENTWISE = {
-    "Add": jnp.add, "Sub": jnp.subtract, "Mul": jnp.multiply, "Div": jnp.divide, "Pow": jnp.power, "Max": jnp.maximum,
-    "Min": jnp.minimum, "Neg": jnp.negative, "Exp": jnp.exp, "Log": jnp.log, "Sqrt": jnp.sqrt, "Tanh": jnp.tanh,
+    "Add": jnp.add, "Sub": jnp.subtract, "Mul": jnp.multiply, "Div": jnp.divide, "Pow": jnp.power,
+    "Neg": jnp.negative, "Exp": jnp.exp, "Log": jnp.log, "Sqrt": jnp.sqrt, "Tanh": jnp.tanh,
     "Abs": jnp.abs, "Sin": jnp.sin, "Cos": jnp.cos, "Atan": jnp.arctan, "Relu": jax.nn.relu, "Sigmoid": jax.nn.sigmoid,
     "Softplus": jax.nn.softplus, "Identity": lambda x: x, "Where": jnp.where, "Not": jnp.logical_not,
     "And": jnp.logical_and, "Or": jnp.logical_or, "Less": jnp.less, "Greater": jnp.greater, "LessOrEqual": jnp.less_equal,
@@ -206,7 +223,9 @@ _OPERATORS: Mapping[str, Callable[[list[Any], Mapping[str, Any]], Any]] = {
     "Squeeze": lambda x, a: jnp.squeeze(x[0], _axes(x, a)),
     "Expand": lambda x, a: x[0] * jnp.ones([int(n) for n in x[1]], x[0].dtype),
     "Transpose": lambda x, a: jnp.transpose(x[0], a.get("perm")),
-    "Cast": lambda x, a: x[0].astype({1: jnp.float32, 6: jnp.int32, 7: jnp.int32, 9: bool, 11: jnp.float32}[a["to"]]),
+    "Cast": _cast,
+    "Max": lambda x, a: functools.reduce(jnp.maximum, x),
+    "Min": lambda x, a: functools.reduce(jnp.minimum, x),
     "ReduceSum": lambda x, a: jnp.sum(x[0], axis=_axes(x, a), keepdims=bool(a.get("keepdims", 1))),
     "ReduceMax": lambda x, a: jnp.max(x[0], axis=_axes(x, a), keepdims=bool(a.get("keepdims", 1))),
     "ArgMax": lambda x, a: jnp.argmax(x[0], axis=a.get("axis", 0), keepdims=bool(a.get("keepdims", 1))),

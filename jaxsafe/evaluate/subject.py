@@ -32,13 +32,13 @@ class Subject(NamedTuple):
     place: Path  # where evaluations of them are written
 
 
-def load_foreign(path: Path, task: str, activation: str) -> Subject:
-    """A policy that was trained elsewhere, to act in a task; see `foreign`.
+def load_foreign(path: Path, task: str, activation: str, actions: Any = None) -> Subject:
+    """A policy that was trained elsewhere, to act in a task with its own or other actions; see `foreign`.
 
     Raises:
         ConfigError: there is no such task, or the policy does not fit it.
     """
-    env, mapper = make(task), SeedMapper(1)
+    env, mapper = make(task, actions=actions), SeedMapper(1)
     agent, weights = read_foreign(path, env, activation)
     params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], weights))
     name = Path(task).stem

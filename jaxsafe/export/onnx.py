@@ -21,8 +21,8 @@ from jaxsafe.train.files import write_bytes
 
 try:
     from onnx import TensorProto, checker, helper, numpy_helper
-except ImportError:
-    raise missing("onnx", "export") from None
+except ImportError as error:
+    raise missing(error, "onnx", "export") from None
 
 OPSET = 17
 

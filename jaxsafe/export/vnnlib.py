@@ -30,8 +30,11 @@ class Worst(NamedTuple):
 
 
 def write_vnnlib(path: Path, exported: Exported, box: Box) -> Path:
-    """Write the property that some output is negative for some input in the box: `unsat` means safe."""
-    lines = [f"; unsafe if any of {len(exported.outputs)} margins is negative; unsat: every start in the box is safe"]
+    """Write the property that some output is ≤ 0 for some input in the box: `unsat` means safe.
+
+    VNN-LIB knows no strict inequality, so a margin of 0, which is safe, counts as unsafe.
+    """
+    lines = [f"; unsafe if any of {len(exported.outputs)} margins is <= 0; unsat: every start in the box is safe"]
     lines += [f"; X_{i} is {name}" for i, name in enumerate(exported.inputs)]
     lines += [f"(declare-const X_{i} Real)" for i in range(len(exported.inputs))]
     lines += [f"(declare-const Y_{i} Real)" for i in range(len(exported.outputs))]
