@@ -70,12 +70,14 @@ class Docking(CMDP):
         return torch.as_tensor(array, dtype=torch.float32, device=self._device)
 
 
-def train(steps: int = 500_000, cost_limit: float = 5.0) -> Any:
-    """PPO-Lagrangian with OmniSafe's own settings but for sizes and the budget."""
+def train(steps: int = 1_000_000, cost_limit: float = 25.0) -> Any:
+    """PPO-Lagrangian with the batches and rates that suit the task, and a budget of violating steps an episode."""
+    rate = {"lr": 2e-3}
     agent = omnisafe.Agent("PPOLag", "jaxsafe-docking2d", custom_cfgs={
         "train_cfgs": {"total_steps": steps, "vector_env_nums": 16, "torch_threads": 1},
-        "algo_cfgs": {"steps_per_epoch": 16_384, "update_iters": 10, "batch_size": 1024, "gamma": 0.98, "cost_gamma": 0.98,
-                      "obs_normalize": False, "entropy_coef": 0.0},
+        "algo_cfgs": {"steps_per_epoch": 8192, "update_iters": 10, "batch_size": 1024, "gamma": 0.965, "cost_gamma": 0.965,
+                      "lam": 0.98, "lam_c": 0.98, "obs_normalize": False, "kl_early_stop": False},
+        "model_cfgs": {"actor": rate, "critic": rate},
         "lagrange_cfgs": {"cost_limit": cost_limit},
         "logger_cfgs": {"use_wandb": False, "use_tensorboard": False, "save_model_freq": 10_000},
     })  # fmt: skip

@@ -15,6 +15,7 @@ import jaxsafe
 from jaxsafe import ConfigError
 from jaxsafe.adapters.gymnasium import GymEnv, GymVectorEnv
 from jaxsafe.adapters.registration import IDS
+from jaxsafe.envs import TASKS
 
 SOON = {"terminal.distance.limit": 130.0}
 """Starts are 100 to 150 m away, so some episodes end with the first step and others last."""
@@ -55,18 +56,16 @@ def test_gymnasiums_own_checks_find_nothing(name: str, kind: str) -> None:
     assert isinstance(env.action_space, gym.spaces.MultiDiscrete if kind == "discrete" else gym.spaces.Box)
 
 
-@pytest.mark.parametrize("mode", list(AutoresetMode))
-def test_a_batch_is_what_single_environments_are_step_by_step(mode: AutoresetMode) -> None:
-    options: dict[str, Any] = {"overrides": SOON, "rta": "explicit_simplex", "max_episode_steps": 7}
-    ours = GymVectorEnv("docking2d", 6, autoreset_mode=mode, **options)
-    theirs = SyncVectorEnv([lambda: GymEnv("docking2d", **options)] * 6, autoreset_mode=mode)
+def step_by_step(ours: GymVectorEnv, theirs: SyncVectorEnv, steps: int) -> int:
+    """Hold a batch to single environments; returns how many episodes ended."""
+    mode = ours.metadata["autoreset_mode"]
     assert ours.single_observation_space == theirs.single_observation_space
-    assert (ours.action_space, ours.metadata["autoreset_mode"]) == (theirs.action_space, mode)
-    everywhere, ends = np.ones(6, bool), 0
+    assert (ours.action_space, mode) == (theirs.action_space, theirs.metadata["autoreset_mode"])
+    everywhere, ends = np.ones(ours.num_envs, bool), 0
     for (observation, infos), (expected, their_infos) in [(ours.reset(seed=5), theirs.reset(seed=5))]:
         np.testing.assert_allclose(observation, expected, rtol=1e-6)
         same(infos, their_infos, everywhere, "reset")
-    for action in actions(theirs, 30):
+    for action in actions(theirs, steps):
         (*found, infos), (*expected, their_infos) = ours.step(action), theirs.step(action)
         for one, other in zip(found, expected, strict=True):
             assert one.dtype == other.dtype
@@ -81,7 +80,24 @@ def test_a_batch_is_what_single_environments_are_step_by_step(mode: AutoresetMod
             (observation, infos), (expected, their_infos) = (e.reset(options=dict(mask)) for e in (ours, theirs))
             np.testing.assert_allclose(observation, expected, rtol=1e-5, atol=1e-6)
             same(infos, their_infos, everywhere, "reset")
-    assert ends > 20
+    return ends
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode))
+def test_a_batch_is_what_single_environments_are_step_by_step(mode: AutoresetMode) -> None:
+    options: dict[str, Any] = {"overrides": SOON, "rta": "explicit_simplex", "max_episode_steps": 7}
+    ours = GymVectorEnv("docking2d", 6, autoreset_mode=mode, **options)
+    theirs = SyncVectorEnv([lambda: GymEnv("docking2d", **options)] * 6, autoreset_mode=mode)
+    assert step_by_step(ours, theirs, 30) > 20
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", [task for task in TASKS if task != "docking2d"])
+def test_a_batch_of_any_task_and_of_discrete_actions_is_too(task: str) -> None:
+    options: dict[str, Any] = {"actions": "discrete", "max_episode_steps": 5}
+    ours = GymVectorEnv(task, 3, autoreset_mode=AutoresetMode.SAME_STEP, **options)
+    theirs = SyncVectorEnv([lambda: GymEnv(task, **options)] * 3, autoreset_mode=AutoresetMode.SAME_STEP)
+    assert step_by_step(ours, theirs, 12) >= 6
 
 
 def test_final_observations_may_be_written_to_and_wrappers_count_episodes() -> None:
