@@ -2,8 +2,9 @@
 
 Steps a second with actions chosen beforehand: `GymVectorEnv` at some numbers of environments; Gymnasium's SyncVectorEnv of
 the same task; Gymnasium's NumPy-vectorised CartPole; EnvPool's CartPole, where it is installed; the pure step with
-automatic reset called from Python in the same way; and the adapters for gymnax and Brax where those are. Compile time
-apart; the median of some repeats, in turns. Writes `benchmarks/results/adapters.json` and prints a table:
+automatic reset called from Python in the same way; `SafetyEnv`, and the adapters for gymnax, Brax and Stable-Baselines3
+where those are installed. Compile time apart; the median of some repeats, in turns. Writes
+`benchmarks/results/adapters.json` and prints a table:
 
     python benchmarks/adapters.py [task=docking2d] [envs=1,64,1024,4096] [repeats=5]
 """
@@ -29,6 +30,7 @@ from machine import about
 
 import jaxsafe
 from jaxsafe.adapters.gymnasium import GymEnv, GymVectorEnv
+from jaxsafe.adapters.safety_gymnasium import SafetyEnv
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 
 OUT = Path(__file__).parent / "results" / "adapters.json"
@@ -54,16 +56,17 @@ def peers(task: str, number: int) -> dict[str, Step]:
     found = {
         "pure functions, called from Python": pure(task, number),
         "GymVectorEnv": vector(GymVectorEnv(task, number, autoreset_mode="SameStep")),
+        "SafetyEnv": vector(SafetyEnv(task, number)),
+        "SyncVectorEnv of GymEnv": vector(SyncVectorEnv([lambda: GymEnv(task)] * number)),
         "Gymnasium CartPole, NumPy": vector(gym.make_vec("CartPole-v1", num_envs=number)),
     }
     if number == 1:
         found["GymEnv"] = single(GymEnv(task))
-    if number <= 64:
-        found["SyncVectorEnv of GymEnv"] = vector(SyncVectorEnv([lambda: GymEnv(task)] * number))
     for name, package, build in (
         ("EnvPool CartPole", "envpool", envpool_cartpole),
         ("GymnaxEnv", "gymnax", gymnax_env),
         ("BraxEnv", "brax", brax_env),
+        ("SB3VecEnv", "stable_baselines3", sb3_env),
     ):
         if importlib.util.find_spec(package):
             found[name] = build(task, number)
@@ -145,6 +148,14 @@ def brax_env(task: str, number: int) -> Step:
     return one
 
 
+def sb3_env(task: str, number: int) -> Step:
+    """The adapter for Stable-Baselines3."""
+    env = importlib.import_module("jaxsafe.adapters.stable_baselines3").SB3VecEnv(task, number)
+    env.reset()
+    action = np.zeros((number, *env.action_space.shape), np.float32)
+    return lambda: env.step(action)
+
+
 def measure(found: dict[str, Step], number: int, repeats: int) -> dict[str, Any]:
     """Steps a second of each, in turns so that a slow moment of the machine hits all."""
     counts, first = {}, {}
@@ -152,10 +163,11 @@ def measure(found: dict[str, Step], number: int, repeats: int) -> dict[str, Any]
         begin = time.perf_counter()
         step()
         first[name] = time.perf_counter() - begin
-        begin = time.perf_counter()
-        for _ in range(10):
+        begin, taken = time.perf_counter(), 0
+        while taken < 10 and time.perf_counter() - begin < SECONDS:
             step()
-        counts[name] = max(10, int(SECONDS / repeats * 10 / (time.perf_counter() - begin)))
+            taken += 1
+        counts[name] = max(1, int(SECONDS / repeats * taken / (time.perf_counter() - begin)))
     rates: dict[str, list[float]] = {name: [] for name in found}
     for _ in range(repeats):
         for name, step in found.items():
