@@ -4,8 +4,8 @@ Random continuous actions, automatic reset, everything inside one compiled scan;
 repeats. Each row is a process of its own, pinned to one core; peers run in Python environments that this script builds in
 `benchmarks/peers`. `docking3d:usual_way` is the same task with what most JAX environments do: a key for every environment
 at every step, and a start drawn whether it is needed or not. Peers are other and mostly smaller tasks: gymnax's CartPole
-and Pendulum, Brax's inverted pendulum (spring), and CartPole of Gymnasium (NumPy) and EnvPool (one thread), whose actions
-are drawn beforehand. Writes `benchmarks/results/environments.json` and prints the README's table:
+and Pendulum, Brax's inverted pendulum (spring), and CartPole of Gymnasium (NumPy) and EnvPool (one thread), which get the
+same actions at every step. Writes `benchmarks/results/environments.json` and prints the README's table:
 
     python benchmarks/environments.py [lanes=1,1024,4096,16384] [names=docking3d,gymnax:Pendulum-v1,…] [repeats=5]
 """
@@ -78,14 +78,14 @@ def task(name: str, num_envs: int, repeats: int) -> dict[str, Any]:
 
 
 def episode_steps(env: Environment, key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
-    """Steps with random actions; the sum of rewards, so that nothing can be left out."""
+    """Steps with random actions; the sum of rewards, costs and of what a policy would see, so that none is left out."""
     state, timestep = reset_batch(env, key, num_envs, axis=-1)
 
     def one(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
         key_action, key_reset = jax.random.split(key)
         action = jax.random.uniform(key_action, (env.action_size, num_envs), minval=-1.0)
         carry, timestep = step_or_reset_batch(env, carry[0], action, key_reset, axis=-1)
-        return carry, jnp.sum(timestep.reward) + jnp.sum(timestep.observation)
+        return carry, jnp.sum(timestep.reward) + jnp.sum(timestep.cost) + jnp.sum(carry[1])
 
     return jnp.sum(jax.lax.scan(one, (state, timestep.observation), jax.random.split(key, num_steps))[1])
 
@@ -102,7 +102,7 @@ def usual_way(num_envs: int, repeats: int) -> dict[str, Any]:
             action = jax.random.uniform(key_action, (num_envs, env.action_size), minval=-1.0)
             keys = jax.random.split(key_step, num_envs)
             (state, observation), timestep = jax.vmap(step_or_reset, in_axes=(None, 0, 0, 0))(env, carry, action, keys)
-            return state, jnp.sum(timestep.reward) + jnp.sum(observation)
+            return state, jnp.sum(timestep.reward) + jnp.sum(timestep.cost) + jnp.sum(observation)
 
         state, _ = jax.vmap(jaxsafe.reset, in_axes=(None, 0))(env, jax.random.split(key, num_envs))
         return jnp.sum(jax.lax.scan(one, state, jax.random.split(key, num_steps))[1])

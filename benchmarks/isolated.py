@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -18,8 +19,12 @@ def interpreter(name: str, packages: Sequence[str]) -> str:
     place = HERE / "peers" / name
     python = place / "bin" / "python"
     if not python.exists():
-        subprocess.run([sys.executable, "-m", "venv", place], check=True)
-        subprocess.run([python, "-m", "pip", "install", "-q", "-e", HERE.parent, *packages], check=True)
+        try:
+            subprocess.run([sys.executable, "-m", "venv", place], check=True)
+            subprocess.run([python, "-m", "pip", "install", "-q", "-e", HERE.parent, *packages], check=True)
+        except BaseException:
+            shutil.rmtree(place, ignore_errors=True)  # the next run builds it again
+            raise
     return str(python)
 
 

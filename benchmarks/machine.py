@@ -3,13 +3,42 @@
 from __future__ import annotations
 
 import os
+import platform
 import subprocess
+from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import jax
 
 
 def about() -> dict[str, Any]:
-    """Commit, version of JAX, device and number of cores."""
-    commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
-    return {"commit": commit, "jax": jax.__version__, "device": jax.devices()[0].device_kind, "cores": os.cpu_count()}
+    """Commit, versions, device and number of cores that may be used."""
+    return {
+        "commit": _git("rev-parse", "HEAD"),
+        "changed": bool(_git("status", "--porcelain", "--", "jaxsafe", "benchmarks/*.py", "configs")),
+        "python": platform.python_version(),
+        "jax": jax.__version__,
+        "jaxlib": version("jaxlib"),
+        "device": jax.devices()[0].device_kind,
+        "processor": _processor(),
+        "cores": usable_cores(),
+    }
+
+
+def usable_cores() -> int:
+    """How many cores this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _git(*words: str) -> str:
+    command = ["git", "-C", str(Path(__file__).resolve().parent.parent), *words]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor())

@@ -40,11 +40,11 @@ def main() -> None:
     if "probe" in options:
         print(json.dumps(PROBES[options["probe"]](task)))
         return
-    from machine import about
+    from machine import about, usable_cores
 
     peers = [name for name in options.get("peers", ",".join(PEERS)).split(",") if name]
     python = {name: interpreter(name, PEERS[name]) if name in peers else sys.executable for name in PROBES}
-    cores = [1, os.cpu_count() or 1]
+    cores = [1, usable_cores()]
     names = [name for name in PROBES if name in peers or name not in PEERS]
     found: dict[tuple[str, int], list[float]] = {(name, count): [] for name in names for count in cores}
     for _ in range(repeats):

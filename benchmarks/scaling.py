@@ -1,14 +1,17 @@
 """What do more cores and more seeds gain, and what would a thousand devices?
 
-Each measurement is a process of its own, pinned to one core or on all, in turns; compiling apart, the median of some:
+Each measurement is a process of its own, pinned to one core or on a power of two of them, in turns; compiling apart, the
+median of some:
 
 - environment steps, 4,096 environments on each core, as in `environments.py`;
 - one seed of the PPO of `ppo.py` for each core;
 - one seed, whose environments and minibatches the cores share.
 
-The projection takes the measured time of an update of one seed alone, the share of it that is left when the cores are busy
-with seeds of their own, and the time that sharing adds to a perfect split, and lets the exchange of gradients take a time
-proportional to the logarithm of the number of devices. Writes `benchmarks/results/scaling.json` and prints two tables:
+The projection is for devices such as these cores. A seed on a device of its own takes what it takes here beside other busy
+cores, and nothing goes between devices. Devices that share a seed take their part of that, and besides what sharing was
+seen to add to a perfect split, once for each doubling. It measures no network between machines, and small parts of a batch
+are less efficient than large ones, so for many devices a seed it is the best that can be hoped for. Writes
+`benchmarks/results/scaling.json` and prints two tables:
 
     python benchmarks/scaling.py [task=docking3d] [repeats=3]
 """
@@ -41,9 +44,11 @@ def main() -> None:
     if "probe" in options:
         print(PROBES[options["probe"]](task))
         return
-    from machine import about
+    from machine import about, usable_cores
 
-    cores = os.cpu_count() or 1
+    cores = 1 << (usable_cores().bit_length() - 1)
+    if cores == 1:
+        sys.exit("scaling.py: expected two cores or more, found one")
     found: dict[tuple[str, int], list[float]] = {(name, count): [] for name in PROBES for count in (1, cores)}
     for _ in range(repeats):
         for name, count in found:
@@ -66,7 +71,7 @@ def projection(rates: dict[tuple[str, int], float], cores: int) -> list[dict[str
     """Samples a second of `DEVICES` such cores, some of them for each seed."""
     alone, busy, shared = rates[ONE_EACH, 1], rates[ONE_EACH, cores] / cores, rates[SHARING, cores]
     update = ppo.BATCH / alone  # seconds, of one seed on one core
-    exchange = max(0.0, ppo.BATCH / shared - ppo.BATCH / busy / cores) / math.log2(cores) if cores > 1 else 0.0
+    exchange = max(0.0, ppo.BATCH / shared - ppo.BATCH / busy / cores) / math.log2(cores)
     rows = []
     for count in SHARED:
         seeds = DEVICES // count

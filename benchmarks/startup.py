@@ -91,7 +91,7 @@ def _jaxsafe(task: str, rta: str, tick: Callable[[], None]) -> None:
     step.compile()
     tick()
     config, env, _ = resolve(cli.Arguments.parse([f"env={task}", f"rta={rta}", "seeds=10"]))
-    mapper = SeedMapper(config.seeds)
+    mapper = SeedMapper(config.seeds, config.shares)
     shared = mapper.replicate((env, config.agent, config.ppo))
     fresh, advance = programs(mapper, 10, config.num_updates)
     fresh = fresh.lower(shared, mapper.keys(0))
