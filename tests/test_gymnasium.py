@@ -1,3 +1,4 @@
+import importlib
 import subprocess
 import sys
 from typing import Any
@@ -98,6 +99,13 @@ def test_a_batch_of_any_task_and_of_discrete_actions_is_too(task: str) -> None:
     ours = GymVectorEnv(task, 3, autoreset_mode=AutoresetMode.SAME_STEP, **options)
     theirs = SyncVectorEnv([lambda: GymEnv(task, **options)] * 3, autoreset_mode=AutoresetMode.SAME_STEP)
     assert step_by_step(ours, theirs, 12) >= 6
+
+
+def test_the_example_docks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend("examples")
+    fly = importlib.import_module("gymnasium_docking3d").fly
+    assert fly(num_envs=16)["success"] >= 0.9
+    assert fly("default", num_envs=16) == {"success": 1.0, "with a violation": 0.0}
 
 
 def test_final_observations_may_be_written_to_and_wrappers_count_episodes() -> None:
