@@ -53,11 +53,12 @@ def main() -> None:
 
 def peers(task: str, number: int) -> dict[str, Step]:
     """A function that takes one step of all environments, by name."""
+    env = jaxsafe.make(task)  # made once, not for each of thousands of single environments
     found = {
         "pure functions, called from Python": pure(task, number),
         "GymVectorEnv": vector(GymVectorEnv(task, number, autoreset_mode="SameStep")),
         "SafetyEnv": vector(SafetyEnv(task, number)),
-        "SyncVectorEnv of GymEnv": vector(SyncVectorEnv([lambda: GymEnv(task)] * number)),
+        "SyncVectorEnv of GymEnv": vector(SyncVectorEnv([lambda: GymEnv(env)] * number)),
         "Gymnasium CartPole, NumPy": vector(gym.make_vec("CartPole-v1", num_envs=number)),
     }
     if number == 1:
