@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 from isolated import interpreter, probe
 
-from jaxsafe.environment import Environment
+import jaxsafe
 from jaxsafe.envs import TASKS
 from jaxsafe.rollout import reset_batch, step_or_reset, step_or_reset_batch
 
@@ -36,8 +36,7 @@ RELEASED = (1800.0, 3000.0)
 """Steps a second of the released SafeRL code in one process, slowest and fastest task: a figure from elsewhere."""
 
 NUM_STEPS = 1000
-"""Steps of each lane in one measurement, many episodes long, so that resets have their share; 200 times as many for one."""
-
+"""Steps of each lane in one measurement, so that resets have their share; 200 times as many for one."""
 
 SLOW_STEPS = 2_000_000
 """Steps of all environments together in one measurement of what is called from Python or by far slower than the tasks."""
@@ -72,12 +71,10 @@ def main() -> None:
 
 def task(name: str, num_envs: int, repeats: int) -> dict[str, Any]:
     """One of the five."""
-    import jaxsafe
-
     return compiled(functools.partial(episode_steps, jaxsafe.make(name)), num_envs, repeats)
 
 
-def episode_steps(env: Environment, key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
+def episode_steps(env: jaxsafe.Environment, key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
     """Steps with random actions; the sum of rewards, costs and of what a policy would see, so that none is left out."""
     state, timestep = reset_batch(env, key, num_envs, axis=-1)
 
@@ -92,8 +89,6 @@ def episode_steps(env: Environment, key: jax.Array, num_envs: int, num_steps: in
 
 def usual_way(num_envs: int, repeats: int) -> dict[str, Any]:
     """docking3d one environment at a time, mapped."""
-    import jaxsafe
-
     env = jaxsafe.make("docking3d")
 
     def run(key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:

@@ -37,9 +37,8 @@ class SafetyEnv:
             self.env = GymVectorEnv(task, num_envs, overrides, autoreset_mode="SameStep", **options)
         self.num_envs = num_envs
         self.observation_space, self.action_space = self.env.observation_space, self.env.action_space
-        one = self.env if isinstance(self.env, GymVectorEnv) else None
-        self.single_observation_space = one.single_observation_space if one else self.observation_space
-        self.single_action_space = one.single_action_space if one else self.action_space
+        self.single_observation_space = getattr(self.env, "single_observation_space", self.observation_space)
+        self.single_action_space = getattr(self.env, "single_action_space", self.action_space)
         self.metadata, self.render_mode = self.env.metadata, self.env.render_mode
 
     def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
