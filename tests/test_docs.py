@@ -106,7 +106,13 @@ def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax
     return outcome, cost.sum(), margin.min()
 
 
-@pytest.mark.parametrize("page", ["compose", "extend", "extend_rta", "rta", "deviations", "adapters/gymnasium"])
+@pytest.mark.parametrize(
+    "page",
+    [
+        "compose", "extend", "extend_rta", "rta", "deviations", "adapters/gymnasium", "adapters/safety_gymnasium",
+        pytest.param("adapters/gymnax", marks=pytest.mark.peer),
+    ],
+)  # fmt: skip
 def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_path: Path) -> None:
     """Blocks that begin with the name of a file are written to it; the others run in one program, in their order.
 

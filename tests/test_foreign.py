@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
@@ -14,6 +15,7 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate.__main__ import main
 from jaxsafe.evaluate.foreign import read_foreign
 from jaxsafe.export import functions
+from jaxsafe.export.__main__ import main as export
 from jaxsafe.export.onnx import write_onnx
 from jaxsafe.train.files import read_json
 from jaxsafe.train.policy import find_policy, read_policy
@@ -51,7 +53,7 @@ def random_layers(*sizes: int) -> list[tuple[np.ndarray, np.ndarray]]:
 @pytest.mark.parametrize("task", ["docking3d", "rejoin3d"])
 def test_what_was_exported_comes_back(task: str, tmp_path: Path) -> None:
     env = jaxsafe.make(task)
-    agent, weights = read_foreign(exported(task, tmp_path), env)
+    _, agent, weights = read_foreign(exported(task, tmp_path), env)
     observations = np.random.default_rng(0).uniform(-1, 1, (200, env.observation_size)).astype(np.float32)
     found = jax.jit(agent.policy(env, weights, True))(jax.random.key(0), observations)
     np.testing.assert_allclose(found, jaxsafe.load_policy(task)(jax.random.key(0), observations), atol=2e-5)
@@ -68,14 +70,14 @@ def test_networks_of_other_libraries_are_understood(tmp_path: Path) -> None:
     arrays |= {f"bias_{i}": bias for i, (_, bias) in enumerate(layers)}
     np.savez(tmp_path / "net.npz", **arrays)
     for path in (as_torch_writes_it(tmp_path / "net.onnx", layers), tmp_path / "net.npz"):
-        agent, weights = read_foreign(path, env, "relu")
+        _, agent, weights = read_foreign(path, env, "relu")
         found = agent.policy(env, weights, True)(jax.random.key(0), jnp.asarray(observations))
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_discrete_networks_give_logits(tmp_path: Path) -> None:
     env = jaxsafe.make("docking2d", actions="discrete")
-    agent, weights = read_foreign(as_torch_writes_it(tmp_path / "net.onnx", random_layers(6, 8, 22)), env)
+    _, agent, weights = read_foreign(as_torch_writes_it(tmp_path / "net.onnx", random_layers(6, 8, 22)), env)
     found = agent.policy(env, weights, True)(jax.random.key(0), jnp.ones((3, 6)))
     assert found.shape == (3, 2)
     assert found.dtype == jnp.int32
@@ -102,6 +104,25 @@ def test_a_discrete_network_is_evaluated_once_by_its_modes(tmp_path: Path, monke
     assert list(read_json(tmp_path / "x" / "results.json")["evaluation"]) == ["deterministic"]
 
 
+def test_its_closed_loop_goes_to_a_verifier(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    as_torch_writes_it(tmp_path / "net.onnx", random_layers(6, 8, 2))
+    assert export(["run=net.onnx", "env=docking2d", "format=vnnlib", "steps=2"]) == 0
+    graph = onnxruntime.InferenceSession("net_docking2d_closed_loop.onnx")
+    start = np.array([[80.0, -60.0, 0.1, -0.05]], np.float32)
+    state, timestep = jaxsafe.reset_to(
+        env := jaxsafe.make("docking2d"), {"deputy": {"position": start[0, :2], "velocity": start[0, 2:]}}
+    )
+    margins, (_, agent, weights) = [timestep.info.margins["velocity_limit"]], read_foreign(tmp_path / "net.onnx", env)
+    for _ in range(2):
+        action = agent.policy(env, weights, True)(jax.random.key(0), timestep.observation[None])[0]
+        state, timestep = jaxsafe.step(env, state, action)
+        margins.append(timestep.info.margins["velocity_limit"])
+    np.testing.assert_allclose(graph.run(None, {"input": start})[0], [margins], atol=1e-5)
+    with pytest.raises(ConfigError, match="inputs: found 'network'; choose from observation, state"):
+        export(["run=net.onnx", "env=docking2d", "inputs=network"])
+
+
 def test_constants_casts_and_extremes_are_understood(tmp_path: Path) -> None:
     def graph(*nodes: onnx.NodeProto) -> Path:
         values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 6]) for name in ("obs", "out")]
@@ -116,7 +137,7 @@ def test_constants_casts_and_extremes_are_understood(tmp_path: Path) -> None:
     clipped = [helper.make_node("Max", ["obs", "low", "low"], ["y"]), helper.make_node("Min", ["y", "high"], ["z"])]
     cut = helper.make_node("Slice", ["z", "begins", "ends", "axes"], ["out"])
     env = jaxsafe.make("docking2d")
-    agent, weights = read_foreign(graph(low, high, begins, ends, axes, *clipped, cut), env)
+    _, agent, weights = read_foreign(graph(low, high, begins, ends, axes, *clipped, cut), env)
     found = agent.policy(env, weights, True)(jax.random.key(0), jnp.array([[0.1, 0.4, 0.9, 0.0, 0.0, 0.0], [0.9] * 6]))
     np.testing.assert_allclose(found, [[0.25, 0.4], [0.5, 0.5]])
     words = [helper.make_node("Constant", [], ["a"], value_string="x"), helper.make_node("Identity", ["obs"], ["out"])]

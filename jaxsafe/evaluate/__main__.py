@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from jaxsafe import cli
@@ -19,34 +18,29 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.config import override
     from jaxsafe.envs import with_rta
     from jaxsafe.errors import ConfigError
+    from jaxsafe.evaluate.foreign import pop_source
     from jaxsafe.evaluate.report import evaluate
     from jaxsafe.evaluate.subject import load, load_foreign
     from jaxsafe.train.results import table
 
     arguments = cli.Arguments.parse(argv)
-    run, task = arguments.pop_text("run"), arguments.pop_text("env")
+    run = arguments.pop_text("run")
     if run is None:
         raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
-    if run.endswith(".onnx") and task is None:
-        raise ConfigError(f"env: missing; the task in which {run} shall act, for instance env=docking2d")
-    arguments.refuse_beside(["checkpoint"] if task else [], "for a policy from elsewhere, which env= says it is")
-    layers = task is not None and not run.endswith(".onnx")
-    arguments.refuse_beside([] if layers else ["activation"], "but for the layers in an .npz with env=TASK")
-    arguments.refuse_beside([] if task else ["actions"], "but for a policy from elsewhere, with env=TASK")
-    out, checkpoint, rta, render, activation, actions = (
-        arguments.pop_text(name) for name in ("out", "checkpoint", "rta", "render", "activation", "actions")
-    )
+    elsewhere = pop_source(arguments, run)
+    arguments.refuse_beside(["checkpoint"] if elsewhere else [], "for a policy from elsewhere, which env= says it is")
+    out, checkpoint, rta, render = (arguments.pop_text(name) for name in ("out", "checkpoint", "rta", "render"))
     changes = arguments.pop_overrides()
     episodes, seed = arguments.pop_count("episodes", 1000), arguments.pop_count("seed", 0, least=0)
     deterministic = arguments.pop_flag("deterministic")
     arguments.refuse_rest([*OPTIONS, "env.…"])
     if render not in (None, "gif"):
         raise ConfigError(f"render: found {render!r}; choose from gif")
-    if task and deterministic is False:
+    if elsewhere and deterministic is False:
         raise ConfigError("deterministic: expected true or nothing, found False; a policy from elsewhere acts by its mode")
-    deterministic = True if task else deterministic
+    deterministic = True if elsewhere else deterministic
     kinds = {None: ("stochastic", "deterministic"), True: ("deterministic",), False: ("stochastic",)}[deterministic]
-    subject = load_foreign(Path(run), task, activation or "tanh", actions) if task else load(run, checkpoint)
+    subject = load_foreign(elsewhere) if elsewhere else load(run, checkpoint)
     env = override(subject.env if rta is None else with_rta(subject.env, subject.name, rta), changes)
     request: dict[str, Any] = {
         "run": run,

@@ -11,17 +11,19 @@ import functools
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jaxsafe.cli import Arguments
 from jaxsafe.environment import Environment
+from jaxsafe.envs import make
 from jaxsafe.errors import ConfigError, missing, nearest
 from jaxsafe.rollout import Policy
-from jaxsafe.train.agent import Categorical
+from jaxsafe.train.agent import Categorical, Gaussian, Params
 
 Network = Callable[[Mapping[str, Array], Float[Array, " o"]], Float[Array, " a"]]
 
@@ -37,18 +39,61 @@ class ForeignAgent:
         """`network(weights, observation)` of one observation."""
         self.network = network
 
-    def policy(self, env: Environment, params: Mapping[str, Array], deterministic: Array | bool) -> Policy:
+    def inputs(self, env: Environment, observation: Float[Array, "batch o"]) -> Float[Array, "batch o"]:
+        """Return what the network sees: the observation as it is."""
+        return observation
+
+    def distribution(self, env: Environment, params: Params, inputs: Array) -> Categorical | Gaussian:
+        """Return what the network says of one observation or a batch; only its mode means something."""
+        out = jnp.vectorize(lambda one: self.network(params, one), signature="(o)->(a)")(inputs)
+        if env.num_action_points:
+            return Categorical(logits=out, points=env.num_action_points)
+        return Gaussian(mean=out, log_std=jnp.zeros(env.action_size))
+
+    def policy(self, env: Environment, params: Params, deterministic: Array | bool) -> Policy:
         """Return the action for each of a batch of observations."""
-
-        def act(key: Array, observation: Float[Array, "batch o"]) -> Array:
-            out = jax.vmap(lambda one: self.network(params, one))(observation)
-            return Categorical(logits=out, points=env.num_action_points).mode() if env.num_action_points else out
-
-        return act
+        return lambda key, observation: self.distribution(env, params, self.inputs(env, observation)).mode()
 
 
-def read_foreign(path: Path, env: Environment, activation: str = "tanh") -> tuple[ForeignAgent, dict[str, np.ndarray]]:
-    """The policy in a file, and its weights.
+class ForeignPolicy(NamedTuple):
+    """What `jaxsafe.train.policy.SavedPolicy` is for a policy of our own, as far as acting needs it."""
+
+    env: Environment
+    agent: ForeignAgent
+    params: Params
+
+
+class Source(NamedTuple):
+    """What a command says of a policy from elsewhere."""
+
+    path: Path
+    task: str
+    actions: Any
+    activation: str
+
+    def read(self) -> ForeignPolicy:
+        """Read it; raises a ConfigError if there is no such task, or as `read_foreign` does."""
+        return read_foreign(self.path, make(self.task, actions=self.actions), self.activation)
+
+
+def pop_source(arguments: Arguments, run: str) -> Source | None:
+    """Take `env`, `activation` and `actions` of a command: with `env`, `run` is a policy from elsewhere.
+
+    Raises:
+        ConfigError: the options do not fit each other.
+    """
+    task = arguments.pop_text("env")
+    if run.endswith(".onnx") and task is None:
+        raise ConfigError(f"env: missing; the task in which {run} shall act, for instance env=docking2d")
+    layers = task is not None and not run.endswith(".onnx")
+    arguments.refuse_beside([] if layers else ["activation"], "but for the layers in an .npz with env=TASK")
+    arguments.refuse_beside([] if task else ["actions"], "but for a policy from elsewhere, with env=TASK")
+    activation, actions = arguments.pop_text("activation"), arguments.pop_text("actions")
+    return None if task is None else Source(Path(run), task, actions, activation or "tanh")
+
+
+def read_foreign(path: Path, env: Environment, activation: str = "tanh") -> ForeignPolicy:
+    """The policy in a file, to act in an environment.
 
     Args:
         path: `.onnx`, or `.npz` with `kernel_0` (inputs, outputs), `bias_0`, `kernel_1`, ….
@@ -68,7 +113,7 @@ def read_foreign(path: Path, env: Environment, activation: str = "tanh") -> tupl
         raise ConfigError(f"{path}: does not take an observation of {env.observation_size} numbers: {reason}") from None
     if found != (wanted,):
         raise ConfigError(f"{path}: expected {wanted} outputs ({', '.join(env.action_names)}), found shape {found}")
-    return ForeignAgent(network), weights
+    return ForeignPolicy(env, ForeignAgent(network), weights)
 
 
 def _layers(path: Path, activation: str) -> tuple[Network, dict[str, np.ndarray]]:

@@ -9,9 +9,8 @@ import jax
 import numpy as np
 
 from jaxsafe.environment import Environment
-from jaxsafe.envs import make
 from jaxsafe.errors import ConfigError
-from jaxsafe.evaluate.foreign import ForeignAgent, read_foreign
+from jaxsafe.evaluate.foreign import ForeignAgent, Source
 from jaxsafe.train import directory
 from jaxsafe.train.agent import Agent, Params
 from jaxsafe.train.policy import PRETRAINED, find_policy, read_policy
@@ -32,18 +31,17 @@ class Subject(NamedTuple):
     place: Path  # where evaluations of them are written
 
 
-def load_foreign(path: Path, task: str, activation: str, actions: Any = None) -> Subject:
-    """A policy that was trained elsewhere, to act in a task with its own or other actions; see `foreign`.
+def load_foreign(source: Source) -> Subject:
+    """A policy that was trained elsewhere, to act in a task; see `foreign`.
 
     Raises:
         ConfigError: there is no such task, or the policy does not fit it.
     """
-    env, mapper = make(task, actions=actions), SeedMapper(1)
-    agent, weights = read_foreign(path, env, activation)
-    params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], weights))
-    name = Path(task).stem
-    about = {"env": name, "preset": path.name, "seeds": 1, "seed": 0, "steps": 0}
-    return Subject(name, env, agent, mapper, params, about, Path("evaluations") / path.stem)
+    policy, mapper = source.read(), SeedMapper(1)
+    params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], policy.params))
+    name = Path(source.task).stem
+    about = {"env": name, "preset": source.path.name, "seeds": 1, "seed": 0, "steps": 0}
+    return Subject(name, policy.env, policy.agent, mapper, params, about, Path("evaluations") / source.path.stem)
 
 
 def load(run: str, checkpoint: str | None) -> Subject:

@@ -10,10 +10,14 @@ from jaxsafe import cli
 from jaxsafe.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
+    from jaxsafe.evaluate.foreign import ForeignPolicy
     from jaxsafe.export.functions import Exported
+    from jaxsafe.train.policy import SavedPolicy
 
 FORMATS = ("onnx", "stablehlo", "vnnlib")
-INPUTS = ("observation", "network", "state")
+OPTIONS = (
+    "run", "seed", "env", "actions", "activation", "format", "inputs", "batch", "steps", "box.FIELD", "out",
+)  # fmt: skip
 BOX = {"position": (70.0, 106.0), "velocity": (-0.28, 0.28)}
 """Starts of the closed-loop docking property of the verification community, in m and m/s, over 40 s."""
 
@@ -26,31 +30,30 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.export import functions
     from jaxsafe.train.directory import versions
     from jaxsafe.train.files import write_bytes
-    from jaxsafe.train.policy import PRETRAINED, find_policy, read_policy
 
     arguments = cli.Arguments.parse(argv)
     run, form, out = (arguments.pop_text(name) for name in ("run", "format", "out"))
     if run is None:
         raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
     form = _one_of("format", form or "onnx", FORMATS)
-    single = run.endswith(".npz") or run.startswith(PRETRAINED)
+    saved, stem = _policy(arguments, run)
+    kinds = {"observation": lambda: functions.action(saved), "state": lambda: functions.control(saved)}
+    if isinstance(saved, functions.SavedPolicy):
+        kinds["network"] = lambda: functions.network(saved)
     boxes = [word for word in arguments.options if word.startswith("box.")]
-    arguments.refuse_beside(["seed"] if single else [], f"beside {run}, which is a single policy")
     arguments.refuse_beside(
         {"onnx": [], "stablehlo": ["batch"], "vnnlib": ["batch", "inputs"]}[form], f"with format={form}"
     )
     arguments.refuse_beside([] if form == "vnnlib" else ["steps", *boxes], "without format=vnnlib")
-    inputs = _one_of("inputs", arguments.pop_text("inputs") or "observation", INPUTS)
+    inputs = _one_of("inputs", arguments.pop_text("inputs") or "observation", [*kinds])
     batch, steps = arguments.pop_count("batch", 1), arguments.pop_count("steps", 40)
-    seed, box = arguments.pop_count("seed", 0, least=0), {word[4:]: arguments.pop(word) for word in boxes}
-    arguments.refuse_rest(["run", "format", "inputs", "batch", "steps", "seed", "box.FIELD", "out"])
-    path = find_policy(run) if single else Path(run) / "policy" / f"seed_{seed}.npz"
-    saved, stem = read_policy(path), path.stem if single else f"{Path(run).name}_{path.stem}"
+    box = {word[4:]: arguments.pop(word) for word in boxes}
+    arguments.refuse_rest(OPTIONS)
     about = {"policy": stem, "jaxsafe": versions()["jaxsafe"]}
     if form == "vnnlib":
         loops = functions.closed_loop(saved, steps, unrolled=True), functions.closed_loop(saved, steps)
         return _vnnlib(*loops, box, Path(out or f"{stem}_closed_loop.vnnlib"), about)
-    exported = {"network": functions.network, "observation": functions.action, "state": functions.control}[inputs](saved)
+    exported = kinds[inputs]()
     if form == "stablehlo":
         target = Path(out or f"{stem}.stablehlo")
         shape = jax.export.symbolic_shape(f"batch, {len(exported.inputs)}")
@@ -64,6 +67,21 @@ def main(argv: Sequence[str]) -> int:
         write_onnx(target, exported.function, (batch, len(exported.inputs)), {**about, **facts})
     print(f"{target}: {', '.join(exported.inputs)} -> {', '.join(exported.outputs)}")
     return 0
+
+
+def _policy(arguments: cli.Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy, str]:
+    """What `run` and the options beside it mean, and the first part of the names of files."""
+    from jaxsafe.evaluate.foreign import pop_source
+    from jaxsafe.train.policy import PRETRAINED, find_policy, read_policy
+
+    elsewhere = pop_source(arguments, run)
+    single = run.endswith(".npz") or run.startswith(PRETRAINED)
+    arguments.refuse_beside(["seed"] if elsewhere or single else [], f"beside {run}, which is a single policy")
+    seed = arguments.pop_count("seed", 0, least=0)
+    if elsewhere:
+        return elsewhere.read(), f"{Path(run).stem}_{Path(elsewhere.task).stem}"
+    path = find_policy(run) if single else Path(run) / "policy" / f"seed_{seed}.npz"
+    return read_policy(path), path.stem if single else f"{Path(run).name}_{path.stem}"
 
 
 def _one_of(name: str, value: str, known: Sequence[str]) -> str:
@@ -114,6 +132,8 @@ def usage() -> str:
         "usage: python -m jaxsafe.export run=RUN [key=value …]\n\n"
         "  run=RUN             a run directory, a policy file (.npz), or pretrained/TASK\n"
         "  seed=N              which policy of a run (default 0)\n"
+        "  run=FILE env=TASK   a policy from elsewhere: .onnx, or .npz with kernel_0, bias_0, … (activation=tanh);\n"
+        "                      actions=discrete if it gives logits\n"
         "  format=onnx         a graph of opset 17 with a fixed batch (default); needs jaxsafe[export]\n"
         "  format=stablehlo    a jax.export artefact, any batch\n"
         "  format=vnnlib       the closed loop over steps as ONNX, the property that no safety margin is negative from\n"

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.environment import Environment, reset_to, step
+from jaxsafe.evaluate.foreign import ForeignPolicy
 from jaxsafe.train.policy import SavedPolicy
 from jaxsafe.types import State, TimeStep
 
@@ -37,7 +38,7 @@ def network(saved: SavedPolicy) -> Exported:
     return Exported(function, tuple(f"feature_{i}" for i in range(size)), names)
 
 
-def action(saved: SavedPolicy) -> Exported:
+def action(saved: SavedPolicy | ForeignPolicy) -> Exported:
     """From the observation to the action that the environment takes: the mode, features included."""
 
     def function(observation: Array) -> Array:
@@ -47,7 +48,7 @@ def action(saved: SavedPolicy) -> Exported:
     return Exported(function, saved.env.observation_names, saved.env.action_names)
 
 
-def control(saved: SavedPolicy) -> Exported:
+def control(saved: SavedPolicy | ForeignPolicy) -> Exported:
     """From the state at which an episode may start to the control that acts first, in physical units."""
     act = action(saved).function
 
@@ -60,7 +61,7 @@ def control(saved: SavedPolicy) -> Exported:
     return Exported(jax.vmap(one), state_names(saved.env), saved.env.action_names)
 
 
-def closed_loop(saved: SavedPolicy, steps: int, unrolled: bool = False) -> Exported:
+def closed_loop(saved: SavedPolicy | ForeignPolicy, steps: int, unrolled: bool = False) -> Exported:
     """From the state at a start to every safety margin h at the start and after each of some steps: safe where all ≥ 0.
 
     `unrolled` without a loop, as an ONNX graph needs it; compiled by XLA that would take minutes.
