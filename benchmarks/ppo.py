@@ -4,7 +4,9 @@
 Brax and Stable-Baselines3 (64 × 1024, whose own loop it is) take the task through `jaxsafe.adapters`. Each measurement is a
 process of its own, on one pinned core and on all; peers run in environments that this script builds in `benchmarks/peers`,
 since their versions exclude each other. Compile time apart; the median of some repeats, in turns. Also ten seeds at once
-against one, and this PPO with the sort of `jax.random.permutation` for its shuffle. Writes `benchmarks/results/ppo.json`:
+against one, this PPO with the sort of `jax.random.permutation` for its shuffle, and PPO as it is mostly written in JAX
+(`usual_ppo.py`). `networks only` does nothing but take a batch through the networks, forwards and backwards, and step with
+Adam, on one core: the rest is what this PPO spends elsewhere. Writes `benchmarks/results/ppo.json`:
 
     python benchmarks/ppo.py [task=docking2d] [peers=rejax,brax,sb3] [repeats=3]
 """
@@ -19,12 +21,14 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from isolated import interpreter, probe
 
 OUT = Path(__file__).parent / "results" / "ppo.json"
 NUM_ENVS, NUM_STEPS, NUM_EPOCHS, NUM_MINIBATCHES, HIDDEN, UPDATES = 2048, 32, 4, 8, (64, 64), 8
 BATCH = NUM_ENVS * NUM_STEPS
+NETWORKS = "networks only"
 PEERS = {
     "rejax": ["rejax", "gymnax==0.0.9", "--pre", "tfp-nightly"],
     "brax": ["brax"],
@@ -46,7 +50,9 @@ def main() -> None:
     python = {name: interpreter(name, PEERS[name]) if name in peers else sys.executable for name in PROBES}
     cores = [1, usable_cores()]
     names = [name for name in PROBES if name in peers or name not in PEERS]
-    found: dict[tuple[str, int], list[float]] = {(name, count): [] for name in names for count in cores}
+    found: dict[tuple[str, int], list[float]] = {
+        (name, count): [] for name in names for count in cores if count == 1 or name != NETWORKS
+    }
     for _ in range(repeats):
         for name, count in found:
             found[name, count].append(probe(__file__, [f"probe={name}", f"task={task}"], count, python[name]))
@@ -55,7 +61,8 @@ def main() -> None:
     OUT.write_text(json.dumps({**about(), "task": task, "repeats": repeats, "runs": rows}, indent=1) + "\n")
     print(f"| {task}, thousand samples/s | 1 core | {cores[-1]} cores |\n|---|---|---|")
     for name in names:
-        print(f"| {name} | " + " | ".join(f"{statistics.median(found[name, n]) / 1e3:.3g}" for n in cores) + " |")
+        rates = [f"{statistics.median(found[name, n]) / 1e3:.3g}" if (name, n) in found else "–" for n in cores]
+        print(f"| {name} | " + " | ".join(rates) + " |")
 
 
 def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
@@ -65,18 +72,12 @@ def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
     claim_cores()
     import jax
 
-    from jaxsafe import cli
     from jaxsafe.train import ppo
-    from jaxsafe.train.config import resolve
     from jaxsafe.train.loop import programs
 
     if sort:
         ppo.shuffle = jax.random.permutation
-    settings = {
-        "num_envs": NUM_ENVS, "num_steps": NUM_STEPS, "num_epochs": NUM_EPOCHS, "num_minibatches": NUM_MINIBATCHES,
-    }  # fmt: skip
-    words = [f"env={task}", "preset=plain", f"agent.hidden={list(HIDDEN)}", f"steps={10 * UPDATES * BATCH}"]
-    config, env, _ = resolve(cli.Arguments.parse([*words, *(f"ppo.{key}={value}" for key, value in settings.items())]))
+    config, env = settings(task)
     mapper = SeedMapper(seeds, config.shares)
     shared = mapper.replicate((env, config.agent, config.ppo))
     fresh, advance = programs(mapper, UPDATES, config.num_updates)
@@ -86,6 +87,81 @@ def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
     start = time.perf_counter()
     jax.block_until_ready(advance(shared, state))
     return seeds * UPDATES * BATCH / (time.perf_counter() - start)
+
+
+def settings(task: str) -> tuple[Any, Any]:
+    """The configuration of our PPO, and the environment."""
+    from jaxsafe import cli
+    from jaxsafe.train.config import resolve
+
+    sizes = {"num_envs": NUM_ENVS, "num_steps": NUM_STEPS, "num_epochs": NUM_EPOCHS, "num_minibatches": NUM_MINIBATCHES}
+    words = [f"env={task}", "preset=plain", f"agent.hidden={list(HIDDEN)}", f"steps={10 * UPDATES * BATCH}"]
+    config, env, _ = resolve(cli.Arguments.parse([*words, *(f"ppo.{key}={value}" for key, value in sizes.items())]))
+    return config, env
+
+
+def networks_only(task: str) -> float:
+    """What the networks and Adam need of our updates: no environments, no advantages, no shuffle."""
+    from jaxsafe.train.seeds import claim_cores
+
+    claim_cores()
+    import jax
+    import jax.numpy as jnp
+
+    from jaxsafe.train import ppo
+
+    config, env = settings(task)
+    agent, hyper = config.agent, config.ppo
+    normal = lambda *shape: jax.random.normal(jax.random.key(len(shape)), (BATCH, *shape))  # noqa: E731
+    batch = ppo.Batch(normal(env.observation_size), {}, normal(env.action_size), normal(), normal(), normal())
+    chunks = jax.tree.map(lambda x: x.reshape(NUM_MINIBATCHES, -1, ppo.CHUNK, *x.shape[1:]), batch)
+
+    def forwards(params: Any, part: ppo.Batch) -> Any:
+        """The actor once, as in a step, and the critic twice, of a state and of the next."""
+        action = agent.distribution(env, params, part.inputs).mode()
+        return action.sum(), agent.value(params, part.inputs), agent.value(params, part.inputs + 1.0)
+
+    def minibatch(carry: Any, parts: ppo.Batch) -> tuple[Any, None]:
+        params, optimizer = carry
+        add = lambda total, part: (  # noqa: E731
+            jax.tree.map(jnp.add, total, jax.grad(ppo.loss)(params, env, agent, hyper, part)),
+            None,
+        )
+        gradient, _ = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), parts)
+        step, optimizer = ppo._optimizer(hyper).update(gradient, optimizer)
+        return (jax.tree.map(lambda p, s: p - 1e-4 * s, params, step), optimizer), None
+
+    def update(carry: Any, _: None) -> tuple[Any, Any]:
+        seen = jax.lax.map(lambda parts: jax.lax.map(lambda part: forwards(carry[0], part), parts), chunks)
+        carry, _ = jax.lax.scan(lambda carry, _: jax.lax.scan(minibatch, carry, chunks), carry, None, NUM_EPOCHS)
+        return carry, jax.tree.map(jnp.sum, seen)
+
+    params = agent.init(jax.random.key(0), env)
+    start = (params, ppo._optimizer(hyper).init(params))
+    return timed(jax.jit(lambda carry: jax.lax.scan(update, carry, None, UPDATES)), start)
+
+
+def usual_way(task: str) -> float:
+    """`usual_ppo.py`, one seed."""
+    import jax
+    import usual_ppo
+
+    import jaxsafe
+
+    env = jaxsafe.make(task)
+    update = lambda carry, _: (usual_ppo.update(env, NUM_STEPS, NUM_EPOCHS, NUM_MINIBATCHES, carry), None)  # noqa: E731
+    start = usual_ppo.init(env, HIDDEN, NUM_ENVS, jax.random.key(0))
+    return timed(jax.jit(lambda carry: jax.lax.scan(update, carry, None, UPDATES)), start)
+
+
+def timed(run: Callable, start: Any) -> float:
+    """Samples a second of some updates, called for the second time."""
+    import jax
+
+    jax.block_until_ready(run(start))
+    began = time.perf_counter()
+    jax.block_until_ready(run(start))
+    return UPDATES * BATCH / (time.perf_counter() - began)
 
 
 def rejax(task: str) -> float:
@@ -153,6 +229,8 @@ PROBES: dict[str, Callable[[str], float]] = {
     "jaxsafe": ours,
     "jaxsafe, ten seeds": partial(ours, seeds=10),
     "jaxsafe, sorting": partial(ours, sort=True),
+    NETWORKS: networks_only,
+    "usual way": usual_way,
     "rejax": rejax,
     "brax": brax,
     "sb3": sb3,
