@@ -3,9 +3,10 @@
 Random continuous actions, automatic reset, everything inside one compiled scan; compile time apart; the median of some
 repeats. Each row is a process of its own, pinned to one core; peers run in Python environments that this script builds in
 `benchmarks/peers`. `docking3d:usual_way` is the same task with what most JAX environments do: a key for every environment
-at every step, and a start drawn whether it is needed or not. Peers are other and mostly smaller tasks: gymnax's CartPole
-and Pendulum, Brax's inverted pendulum (spring), and CartPole of Gymnasium (NumPy) and EnvPool (one thread), which get the
-same actions at every step. Writes `benchmarks/results/environments.json` and prints the README's table:
+at every step, and a start drawn whether it is needed or not. Rows that end in `:one_action` draw actions once and take
+them at every step, so that the environment is alone in the loop. Peers are other and mostly smaller tasks: gymnax's
+CartPole and Pendulum, Brax's inverted pendulum (spring), and CartPole of Gymnasium (NumPy) and EnvPool (one thread), which
+get the same actions at every step. Writes `benchmarks/results/environments.json` and prints the README's table:
 
     python benchmarks/environments.py [lanes=1,1024,4096,16384] [names=docking3d,gymnax:Pendulum-v1,…] [repeats=5]
 """
@@ -41,9 +42,6 @@ NUM_STEPS = 1000
 SLOW_STEPS = 2_000_000
 """Steps of all environments together in one measurement of what is called from Python or by far slower than the tasks."""
 
-PEERS = {"gymnax": ["gymnax"], "brax": ["brax"], "envpool": ["envpool"]}
-"""What pip installs for each beside jaxsafe, which brings Gymnasium itself."""
-
 
 def main() -> None:
     """Run, write, print."""
@@ -55,13 +53,12 @@ def main() -> None:
         return
     from machine import about
 
-    libraries = {name.partition(":")[0] for name in names} & {*PEERS}
-    python = {library: interpreter(library, PEERS[library]) for library in libraries}
+    python = {library: interpreter(library) for library in {name.partition(":")[0] for name in names}}
     results = []
     for num in lanes:
         for name in names:
             words = [f"probe={name}", f"lanes={num}", f"repeats={repeats}"]
-            found = probe(__file__, words, 1, python.get(name.partition(":")[0], sys.executable))
+            found = probe(__file__, words, 1, python[name.partition(":")[0]])
             results.append({"task": name, "lanes": num, **found})
             print(f"{name} × {num:,}: {found['steps_per_s']:,.0f}", file=sys.stderr)
     content = {**about(), "pinned_to": 1, "released_steps_per_s": RELEASED, "runs": results}
@@ -69,18 +66,22 @@ def main() -> None:
     print(table(results, lanes))
 
 
-def task(name: str, num_envs: int, repeats: int) -> dict[str, Any]:
+def task(name: str, num_envs: int, repeats: int, one_action: bool = False) -> dict[str, Any]:
     """One of the five."""
-    return compiled(functools.partial(episode_steps, jaxsafe.make(name)), num_envs, repeats)
+    return compiled(functools.partial(episode_steps, jaxsafe.make(name), one_action=one_action), num_envs, repeats)
 
 
-def episode_steps(env: jaxsafe.Environment, key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
+def episode_steps(
+    env: jaxsafe.Environment, key: jax.Array, num_envs: int, num_steps: int, one_action: bool = False
+) -> jax.Array:
     """Steps with random actions; the sum of rewards, costs and of what a policy would see, so that none is left out."""
     state, timestep = reset_batch(env, key, num_envs, axis=-1)
+    draw = lambda key: jax.random.uniform(key, (env.action_size, num_envs), minval=-1.0)  # noqa: E731
+    first = draw(key)
 
     def one(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
         key_action, key_reset = jax.random.split(key)
-        action = jax.random.uniform(key_action, (env.action_size, num_envs), minval=-1.0)
+        action = first if one_action else draw(key_action)
         carry, timestep = step_or_reset_batch(env, carry[0], action, key_reset, axis=-1)
         return carry, jnp.sum(timestep.reward) + jnp.sum(timestep.cost) + jnp.sum(carry[1])
 
@@ -105,18 +106,22 @@ def usual_way(num_envs: int, repeats: int) -> dict[str, Any]:
     return compiled(run, num_envs, repeats)
 
 
-def gymnax(name: str, num_envs: int, repeats: int) -> dict[str, Any]:
+def gymnax(name: str, num_envs: int, repeats: int, one_action: bool = False) -> dict[str, Any]:
     """An environment of gymnax, which resets by itself."""
     env, params = importlib.import_module("gymnax").make(name)
     space = env.action_space(params)
 
+    def draw(key: jax.Array, num_envs: int) -> jax.Array:
+        if hasattr(space, "n"):
+            return jax.random.randint(key, (num_envs,), 0, space.n)
+        return jax.random.uniform(key, (num_envs, *space.shape), minval=space.low, maxval=space.high)
+
     def run(key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
+        first = draw(key, num_envs)
+
         def one(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
             key_action, key_step = jax.random.split(key)
-            if hasattr(space, "n"):
-                action = jax.random.randint(key_action, (num_envs,), 0, space.n)
-            else:
-                action = jax.random.uniform(key_action, (num_envs, *space.shape), minval=space.low, maxval=space.high)
+            action = first if one_action else draw(key_action, num_envs)
             keys = jax.random.split(key_step, num_envs)
             observation, state, reward, *_ = jax.vmap(env.step, in_axes=(0, 0, 0, None))(keys, state, action, params)
             return state, jnp.sum(reward) + jnp.sum(observation)
@@ -206,8 +211,10 @@ def table(results: list[dict[str, Any]], lanes: list[int]) -> str:
 
 RUNS: dict[str, Callable[[int, int], dict[str, Any]]] = {
     **{name: functools.partial(task, name) for name in TASKS},
+    "docking3d:one_action": functools.partial(task, "docking3d", one_action=True),
     "docking3d:usual_way": usual_way,
     **{f"gymnax:{name}": functools.partial(gymnax, name) for name in ("Pendulum-v1", "CartPole-v1")},
+    "gymnax:Pendulum-v1:one_action": functools.partial(gymnax, "Pendulum-v1", one_action=True),
     "brax:inverted_pendulum": brax,
     "gymnasium:CartPole-v1": gymnasium,
     "envpool:CartPole-v1": envpool,

@@ -12,27 +12,51 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
+CACHE = (
+    "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES",
+)  # fmt: skip
+"""Variables that say whether JAX keeps compiled programs, and from which time and size on."""
 
 
-def interpreter(name: str, packages: Sequence[str]) -> str:
-    """Python with a peer beside jaxsafe, in `benchmarks/peers`; built the first time."""
+PEERS = {
+    "gymnax": ["gymnax"],
+    "brax": ["brax"],
+    "envpool": ["envpool"],
+    "rejax": ["rejax", "gymnax==0.0.9", "--pre", "tfp-nightly"],
+    "sb3": ["stable-baselines3"],
+}
+"""What pip installs for each beside jaxsafe, which brings Gymnasium itself."""
+
+
+def interpreter(name: str) -> str:
+    """Python with a peer beside jaxsafe, in `benchmarks/peers`, built the first time; this Python for what is no peer."""
+    if name not in PEERS:
+        return sys.executable
     place = HERE / "peers" / name
     python = place / "bin" / "python"
     if not python.exists():
         try:
             subprocess.run([sys.executable, "-m", "venv", place], check=True)
-            subprocess.run([python, "-m", "pip", "install", "-q", "-e", HERE.parent, *packages], check=True)
+            subprocess.run([python, "-m", "pip", "install", "-q", "-e", HERE.parent, *PEERS[name]], check=True)
         except BaseException:
             shutil.rmtree(place, ignore_errors=True)  # the next run builds it again
             raise
     return str(python)
 
 
-def probe(script: str, words: Sequence[str], cores: int | None = None, python: str = sys.executable) -> Any:
-    """What a script prints last, as JSON, when it runs with these words pinned to some cores, or on all."""
+def probe(
+    script: str, words: Sequence[str], cores: int | None = None, python: str = sys.executable, cache: Path | None = None
+) -> Any:
+    """What a script prints last, as JSON, when it runs with these words pinned to some cores, or on all.
+
+    `cache` keeps what JAX compiles, however small; without it nothing is kept.
+    """
     usable = sorted(os.sched_getaffinity(0))[:cores]
-    command = [python, script, *words]
-    ran = subprocess.run(command, capture_output=True, text=True, preexec_fn=lambda: os.sched_setaffinity(0, usable))
+    command, environment = [python, script, *words], {key: value for key, value in os.environ.items() if key not in CACHE}
+    if cache:
+        environment |= dict(zip(CACHE, (str(cache), "0", "-1"), strict=True))
+    pin = lambda: os.sched_setaffinity(0, usable)  # noqa: E731
+    ran = subprocess.run(command, capture_output=True, text=True, preexec_fn=pin, env=environment)
     if ran.returncode:
         sys.exit(f"{' '.join(words)}: {ran.stderr[-2000:]}")
     return json.loads(ran.stdout.splitlines()[-1])

@@ -29,12 +29,7 @@ OUT = Path(__file__).parent / "results" / "ppo.json"
 NUM_ENVS, NUM_STEPS, NUM_EPOCHS, NUM_MINIBATCHES, HIDDEN, UPDATES = 2048, 32, 4, 8, (64, 64), 8
 BATCH = NUM_ENVS * NUM_STEPS
 NETWORKS = "networks only"
-PEERS = {
-    "rejax": ["rejax", "gymnax==0.0.9", "--pre", "tfp-nightly"],
-    "brax": ["brax"],
-    "sb3": ["stable-baselines3"],
-}
-"""What pip installs for each beside jaxsafe."""
+PEERS = ("rejax", "brax", "sb3")
 
 
 def main() -> None:
@@ -47,7 +42,7 @@ def main() -> None:
     from machine import about, usable_cores
 
     peers = [name for name in options.get("peers", ",".join(PEERS)).split(",") if name]
-    python = {name: interpreter(name, PEERS[name]) if name in peers else sys.executable for name in PROBES}
+    python = {name: interpreter(name) for name in PROBES if name in peers}
     cores = [1, usable_cores()]
     names = [name for name in PROBES if name in peers or name not in PEERS]
     found: dict[tuple[str, int], list[float]] = {
@@ -55,7 +50,9 @@ def main() -> None:
     }
     for _ in range(repeats):
         for name, count in found:
-            found[name, count].append(probe(__file__, [f"probe={name}", f"task={task}"], count, python[name]))
+            found[name, count].append(
+                probe(__file__, [f"probe={name}", f"task={task}"], count, python.get(name, sys.executable))
+            )
     rows = [{"peer": name, "cores": count, "samples_per_s": rates} for (name, count), rates in found.items()]
     OUT.parent.mkdir(exist_ok=True)
     OUT.write_text(json.dumps({**about(), "task": task, "repeats": repeats, "runs": rows}, indent=1) + "\n")
@@ -67,26 +64,33 @@ def main() -> None:
 
 def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
     """Our PPO as `jaxsafe.train` runs it, `seeds` of them; samples of all seeds together."""
-    from jaxsafe.train.seeds import SeedMapper, claim_cores
+    from jaxsafe.train.seeds import claim_cores
 
     claim_cores()
     import jax
 
     from jaxsafe.train import ppo
-    from jaxsafe.train.loop import programs
 
     if sort:
         ppo.shuffle = jax.random.permutation
-    config, env = settings(task)
-    mapper = SeedMapper(seeds, config.shares)
-    shared = mapper.replicate((env, config.agent, config.ppo))
-    fresh, advance = programs(mapper, UPDATES, config.num_updates)
-    state = fresh(shared, mapper.keys(0))
+    fresh, advance, keys, shared = our_programs(task, seeds, UPDATES)
+    state = fresh(shared, keys)
     advance = advance.lower(shared, state).compile()
     state, _ = jax.block_until_ready(advance(shared, state))
     start = time.perf_counter()
     jax.block_until_ready(advance(shared, state))
     return seeds * UPDATES * BATCH / (time.perf_counter() - start)
+
+
+def our_programs(task: str, seeds: int, updates: int) -> tuple[Any, Any, Any, Any]:
+    """The fresh state and some updates of our PPO, and what both take: keys, and what all seeds share."""
+    from jaxsafe.train.loop import programs
+    from jaxsafe.train.seeds import SeedMapper
+
+    config, env = settings(task)
+    mapper = SeedMapper(seeds, config.shares)
+    shared = mapper.replicate((env, config.agent, config.ppo))
+    return *programs(mapper, updates, config.num_updates), mapper.keys(0), shared
 
 
 def settings(task: str) -> tuple[Any, Any]:
@@ -167,23 +171,29 @@ def timed(run: Callable, start: Any) -> float:
 def rejax(task: str) -> float:
     """The PPO of rejax, without its evaluations."""
     import jax
+
+    train = rejax_trainer(task, UPDATES).lower(jax.random.PRNGKey(0)).compile()
+    jax.block_until_ready(train(jax.random.PRNGKey(0)))
+    start = time.perf_counter()
+    jax.block_until_ready(train(jax.random.PRNGKey(1)))
+    return UPDATES * BATCH / (time.perf_counter() - start)
+
+
+def rejax_trainer(task: str, updates: int) -> Any:
+    """Some updates from a key, to be compiled."""
+    import jax
     from rejax import PPO  # pyright: ignore[reportMissingImports]
 
     from jaxsafe.adapters.gymnax import GymnaxEnv
 
     env = GymnaxEnv(task, legacy=True)
     algorithm = PPO.create(
-        env=env, env_params=env.default_params, total_timesteps=UPDATES * BATCH, eval_freq=UPDATES * BATCH,
+        env=env, env_params=env.default_params, total_timesteps=updates * BATCH, eval_freq=updates * BATCH,
         skip_initial_evaluation=True, num_envs=NUM_ENVS, num_steps=NUM_STEPS,
         num_epochs=NUM_EPOCHS, num_minibatches=NUM_MINIBATCHES, learning_rate=3e-4,
         agent_kwargs={"hidden_layer_sizes": HIDDEN, "activation": "tanh"},
     )  # fmt: skip
-    algorithm = algorithm.replace(eval_callback=lambda *_: ())
-    train = jax.jit(algorithm.train).lower(jax.random.PRNGKey(0)).compile()
-    jax.block_until_ready(train(jax.random.PRNGKey(0)))
-    start = time.perf_counter()
-    jax.block_until_ready(train(jax.random.PRNGKey(1)))
-    return UPDATES * BATCH / (time.perf_counter() - start)
+    return jax.jit(algorithm.replace(eval_callback=lambda *_: ()).train)
 
 
 def brax(task: str) -> float:

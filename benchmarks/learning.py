@@ -1,0 +1,85 @@
+"""Does what makes this PPO fast change what it learns?
+
+Each variant trains ten seeds by the task's recipe in a process of its own: as it is; its shuffle replaced by the sort of
+`jax.random.permutation`; the gradient of a minibatch at once instead of in chunks; and every seed shared by two devices, on
+a CPU two cores. All draw the same starts and noise, but rounding or order differ, so that each ends elsewhere: what may not
+differ beyond noise is how good the policies are. Writes `benchmarks/results/learning.json` and prints a table:
+
+    python benchmarks/learning.py [tasks=docking2d,rejoin2d] [seeds=10] [seed=0]
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from isolated import probe
+
+OUT = Path(__file__).parent / "results" / "learning.json"
+VARIANTS = ("as it is", "sorting shuffle", "whole gradients", "two devices a seed")
+
+
+def main() -> None:
+    """Run, write, print."""
+    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
+    tasks = options.get("tasks", "docking2d,rejoin2d").split(",")
+    words = [f"{name}={options.get(name, default)}" for name, default in (("seeds", "10"), ("seed", "0"))]
+    if "probe" in options:
+        print(json.dumps(trained(options["probe"], [f"env={tasks[0]}", *words])))
+        return
+    from machine import about
+
+    rows = [
+        {"task": task, "variant": name, **probe(__file__, [f"probe={name}", f"tasks={task}", *words])}
+        for task in tasks
+        for name in VARIANTS
+    ]
+    OUT.write_text(json.dumps({**about(), "words": words, "runs": rows}, indent=1) + "\n")
+    print("| task | variant | 80 % in training | success, stochastic | deterministic | worst seed | length |")
+    print("|---|---|---|---|---|---|---|")
+    for row in rows:
+        sampled, modes = (row["evaluation"][kind] for kind in ("stochastic", "deterministic"))
+        cells = [_interval(one["success_rate"], 100.0) for one in (sampled, modes)]
+        worst = min(sampled["success_rate"]["per_seed"] + modes["success_rate"]["per_seed"])
+        length = _interval(sampled["episode_length"], 1.0)
+        print(
+            f"| {row['task']} | {row['variant']} | {row['steps_to_80']:,} | {' | '.join(cells)} | {worst:.1%} | {length} |"
+        )
+
+
+def trained(variant: str, words: list[str]) -> dict[str, Any]:
+    """Steps to 80 % success, and of the final evaluation the success and the length of episodes."""
+    from jaxsafe.train import __main__ as train
+    from jaxsafe.train import ppo
+    from jaxsafe.train.seeds import claim_cores
+
+    claim_cores()
+    import jax
+
+    if variant == "sorting shuffle":
+        ppo.shuffle = jax.random.permutation
+    if variant == "whole gradients":
+        ppo.CHUNK = 1 << 30
+    if variant == "two devices a seed":
+        words = [*words, "devices_per_seed=2"]
+    with tempfile.TemporaryDirectory() as place:
+        if train.main([*words, f"out={place}/run"]):
+            sys.exit("the training did not end")
+        results = json.loads((Path(place) / "run" / "results.json").read_text(encoding="utf-8"))
+    keep = ("success_rate", "episode_length")
+    return {
+        "steps_to_80": results["interaction_efficiency"]["timesteps"],
+        "evaluation": {kind: {name: found[name] for name in keep} for kind, found in results["evaluation"].items()},
+    }
+
+
+def _interval(found: dict[str, Any], factor: float) -> str:
+    low, high = (factor * value for value in found["ci95"])
+    return f"{factor * found['mean']:.2f} [{low:.2f}, {high:.2f}]"
+
+
+if __name__ == "__main__":
+    main()
