@@ -1,4 +1,9 @@
+import csv
+import importlib.util
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from jaxsafe.adapters.safety_gymnasium import SafetyEnv
 
@@ -32,3 +37,21 @@ def test_the_cost_of_a_lane_is_that_of_the_step_even_where_it_starts_anew() -> N
     assert info["final_observation"].shape == (8, 6)
     assert info["_final_observation"].all()
     assert (info["cost"] == 0.0).all()  # of the new start
+
+
+@pytest.mark.peer
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_omnisafe_learns_to_dock_within_the_budget(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    if importlib.util.find_spec("omnisafe") is None:  # importing it needs what the example puts in place first
+        pytest.skip("needs omnisafe")
+    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "examples"))
+    monkeypatch.chdir(tmp_path)
+    from omnisafe_docking2d import train  # pyright: ignore[reportMissingImports]
+
+    train()
+    [log] = tmp_path.glob("runs/*/*/progress.csv")
+    rows = list(csv.DictReader(log.open(encoding="utf-8")))
+    early, late = rows[3], rows[-1]
+    assert float(late["Metrics/EpRet"]) > float(early["Metrics/EpRet"]) + 3.0
+    assert float(late["Metrics/EpCost"]) <= 25.0
