@@ -15,7 +15,6 @@ import importlib
 import importlib.util
 import json
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -26,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium.vector import SyncVectorEnv
+from isolated import words
 from machine import about
 
 import jaxsafe
@@ -42,9 +42,9 @@ Step = Callable[[], Any]
 
 def main() -> None:
     """Run, write, print."""
-    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
-    task, repeats = options.get("task", "docking2d"), int(options.get("repeats", "5"))
-    numbers = [int(number) for number in options.get("envs", "1,64,1024,4096").split(",")]
+    options = words(task="docking2d", repeats="5", envs="1,64,1024,4096")
+    task, repeats = options["task"], int(options["repeats"])
+    numbers = [int(number) for number in options["envs"].split(",")]
     results = [{"envs": number, **measure(peers(task, number), number, repeats)} for number in numbers]
     OUT.parent.mkdir(exist_ok=True)
     OUT.write_text(json.dumps({**about(), "gymnasium": gym.__version__, "task": task, "runs": results}, indent=1) + "\n")

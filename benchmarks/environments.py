@@ -26,7 +26,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from isolated import interpreter, probe
+from isolated import interpreter, probe, several, words
 
 import jaxsafe
 from jaxsafe.envs import TASKS
@@ -45,9 +45,9 @@ SLOW_STEPS = 2_000_000
 
 def main() -> None:
     """Run, write, print."""
-    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
-    lanes = [int(number) for number in options.get("lanes", "1,1024,4096,16384").split(",")]
-    names, repeats = options.get("names", ",".join(RUNS)).split(","), int(options.get("repeats", "5"))
+    options = words(lanes="1,1024,4096,16384", names=",".join(RUNS), repeats="5")
+    lanes = [int(number) for number in options["lanes"].split(",")]
+    names, repeats = several("names", options["names"], RUNS), int(options["repeats"])
     if "probe" in options:
         print(json.dumps(RUNS[options["probe"]](lanes[0], repeats)))
         return
@@ -57,8 +57,8 @@ def main() -> None:
     results = []
     for num in lanes:
         for name in names:
-            words = [f"probe={name}", f"lanes={num}", f"repeats={repeats}"]
-            found = probe(__file__, words, 1, python[name.partition(":")[0]])
+            request = [f"probe={name}", f"lanes={num}", f"repeats={repeats}"]
+            found = probe(__file__, request, 1, python[name.partition(":")[0]])
             results.append({"task": name, "lanes": num, **found})
             print(f"{name} × {num:,}: {found['steps_per_s']:,.0f}", file=sys.stderr)
     content = {**about(), "pinned_to": 1, "released_steps_per_s": RELEASED, "runs": results}

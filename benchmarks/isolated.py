@@ -7,7 +7,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +28,27 @@ PEERS = {
 """What pip installs for each beside jaxsafe, which brings Gymnasium itself."""
 
 
+def words(**defaults: str) -> dict[str, str]:
+    """What the command says, `name=value`, over its defaults; a name that has none ends it with one line.
+
+    `probe` asks for a single measurement.
+    """
+    given = {name: value for name, _, value in (word.partition("=") for word in sys.argv[1:])}
+    for name in given:
+        if name not in {*defaults, "probe"}:
+            sys.exit(f"{name}: unknown option; choose from {', '.join(defaults)}")
+    return {**defaults, **given}
+
+
+def several(option: str, value: str, known: Iterable[str]) -> list[str]:
+    """The names in a list with commas; one that is not known ends the command with one line."""
+    names, allowed = [name for name in value.split(",") if name], list(known)
+    for name in names:
+        if name not in allowed:
+            sys.exit(f"{option}: found {name!r}; choose from {', '.join(allowed)}")
+    return names
+
+
 def interpreter(name: str) -> str:
     """Python with a peer beside jaxsafe, in `benchmarks/peers`, built the first time; this Python for what is no peer."""
     if name not in PEERS:
@@ -45,18 +66,18 @@ def interpreter(name: str) -> str:
 
 
 def probe(
-    script: str, words: Sequence[str], cores: int | None = None, python: str = sys.executable, cache: Path | None = None
+    script: str, request: Sequence[str], cores: int | None = None, python: str = sys.executable, cache: Path | None = None
 ) -> Any:
-    """What a script prints last, as JSON, when it runs with these words pinned to some cores, or on all.
+    """What a script prints last, as JSON, when it runs with such words pinned to some cores, or on all.
 
     `cache` keeps what JAX compiles, however small; without it nothing is kept.
     """
     usable = sorted(os.sched_getaffinity(0))[:cores]
-    command, environment = [python, script, *words], {key: value for key, value in os.environ.items() if key not in CACHE}
+    command, environment = [python, script, *request], {key: value for key, value in os.environ.items() if key not in CACHE}
     if cache:
         environment |= dict(zip(CACHE, (str(cache), "0", "-1"), strict=True))
     pin = lambda: os.sched_setaffinity(0, usable)  # noqa: E731
     ran = subprocess.run(command, capture_output=True, text=True, preexec_fn=pin, env=environment)
     if ran.returncode:
-        sys.exit(f"{' '.join(words)}: {ran.stderr[-2000:]}")
+        sys.exit(f"{' '.join(request)}: {ran.stderr[-2000:]}")
     return json.loads(ran.stdout.splitlines()[-1])

@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from isolated import probe
+from isolated import probe, words
 
 OUT = Path(__file__).parent / "results" / "learning.json"
 VARIANTS = ("as it is", "sorting shuffle", "whole gradients", "two devices a seed")
@@ -24,20 +24,20 @@ VARIANTS = ("as it is", "sorting shuffle", "whole gradients", "two devices a see
 
 def main() -> None:
     """Run, write, print."""
-    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
-    tasks = options.get("tasks", "docking2d,rejoin2d").split(",")
-    words = [f"{name}={options.get(name, default)}" for name, default in (("seeds", "10"), ("seed", "0"))]
+    options = words(tasks="docking2d,rejoin2d", seeds="10", seed="0")
+    tasks = options["tasks"].split(",")
+    seeds = [f"{name}={options[name]}" for name in ("seeds", "seed")]
     if "probe" in options:
-        print(json.dumps(trained(options["probe"], [f"env={tasks[0]}", *words])))
+        print(json.dumps(trained(options["probe"], [f"env={tasks[0]}", *seeds])))
         return
     from machine import about
 
     rows = [
-        {"task": task, "variant": name, **probe(__file__, [f"probe={name}", f"tasks={task}", *words])}
+        {"task": task, "variant": name, **probe(__file__, [f"probe={name}", f"tasks={task}", *seeds])}
         for task in tasks
         for name in VARIANTS
     ]
-    OUT.write_text(json.dumps({**about(), "words": words, "runs": rows}, indent=1) + "\n")
+    OUT.write_text(json.dumps({**about(), "words": seeds, "runs": rows}, indent=1) + "\n")
     print("| task | variant | 80 % in training | success, stochastic | deterministic | worst seed | length |")
     print("|---|---|---|---|---|---|---|")
     for row in rows:
@@ -50,7 +50,7 @@ def main() -> None:
         )
 
 
-def trained(variant: str, words: list[str]) -> dict[str, Any]:
+def trained(variant: str, asked: list[str]) -> dict[str, Any]:
     """Steps to 80 % success, and of the final evaluation the success and the length of episodes."""
     from jaxsafe.train import __main__ as train
     from jaxsafe.train import ppo
@@ -64,9 +64,9 @@ def trained(variant: str, words: list[str]) -> dict[str, Any]:
     if variant == "whole gradients":
         ppo.CHUNK = 1 << 30
     if variant == "two devices a seed":
-        words = [*words, "devices_per_seed=2"]
+        asked = [*asked, "devices_per_seed=2"]
     with tempfile.TemporaryDirectory() as place:
-        if train.main([*words, f"out={place}/run"]):
+        if train.main([*asked, f"out={place}/run"]):
             sys.exit("the training did not end")
         results = json.loads((Path(place) / "run" / "results.json").read_text(encoding="utf-8"))
     keep = ("success_rate", "episode_length")

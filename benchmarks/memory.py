@@ -11,7 +11,6 @@ Writes `benchmarks/results/memory.json` and prints the table of docs/scaling.md:
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 
 OUT = Path(__file__).parent / "results" / "memory.json"
@@ -21,16 +20,17 @@ NUM_STEPS = 32
 def main() -> None:
     """Run, write, print."""
     from isolated import probe as apart
+    from isolated import several, words
     from machine import about
 
     from jaxsafe.envs import TASKS
 
-    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
+    options = words(tasks=",".join(TASKS), num_envs="1024,4096,16384")
     if "probe" in options:
         print(json.dumps(probe(options["probe"], int(options["num_envs"]))))
         return
-    tasks = options.get("tasks", ",".join(TASKS)).split(",")
-    sizes = [int(size) for size in options.get("num_envs", "1024,4096,16384").split(",")]
+    tasks = several("tasks", options["tasks"], TASKS)
+    sizes = [int(size) for size in options["num_envs"].split(",")]
     rows = []
     for task in tasks:
         for size in sizes:

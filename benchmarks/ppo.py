@@ -23,7 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from isolated import interpreter, probe
+from isolated import interpreter, probe, several, words
 
 OUT = Path(__file__).parent / "results" / "ppo.json"
 NUM_ENVS, NUM_STEPS, NUM_EPOCHS, NUM_MINIBATCHES, HIDDEN, UPDATES = 2048, 32, 4, 8, (64, 64), 8
@@ -34,14 +34,14 @@ PEERS = ("rejax", "brax", "sb3")
 
 def main() -> None:
     """Run, write, print."""
-    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
-    task, repeats = options.get("task", "docking2d"), int(options.get("repeats", "3"))
+    options = words(task="docking2d", peers=",".join(PEERS), repeats="3")
+    task, repeats = options["task"], int(options["repeats"])
     if "probe" in options:
         print(json.dumps(PROBES[options["probe"]](task)))
         return
     from machine import about, usable_cores
 
-    peers = [name for name in options.get("peers", ",".join(PEERS)).split(",") if name]
+    peers = several("peers", options["peers"], PEERS)
     python = {name: interpreter(name) for name in PROBES if name in peers}
     cores = [1, usable_cores()]
     names = [name for name in PROBES if name in peers or name not in PEERS]

@@ -14,7 +14,6 @@ import functools
 import importlib
 import json
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +22,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from isolated import several, words
 from machine import about
 
 import jaxsafe
@@ -42,10 +42,9 @@ BATCH = 4096
 
 def main() -> None:
     """Run, write, print."""
-    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
-    repeats = int(options.get("repeats", "7"))
     parts = {"calls": calls, "qp": programs, "change": changes, "training": training}
-    chosen = options.get("parts", ",".join(parts)).split(",")
+    options = words(repeats="7", parts=",".join(parts))
+    repeats, chosen = int(options["repeats"]), several("parts", options["parts"], parts)
     known = json.loads(OUT.read_text()) if OUT.exists() else {}
     for name in chosen:
         rows = parts[name](repeats)

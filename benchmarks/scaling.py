@@ -27,7 +27,7 @@ import time
 from pathlib import Path
 
 import ppo
-from isolated import probe
+from isolated import probe, words
 
 OUT = Path(__file__).parent / "results" / "scaling.json"
 LANES, NUM_STEPS = 4096, 1000
@@ -39,8 +39,8 @@ DEVICES = 1000
 
 def main() -> None:
     """Run, write, print."""
-    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
-    task, repeats = options.get("task", "docking3d"), int(options.get("repeats", "3"))
+    options = words(task="docking3d", repeats="3")
+    task, repeats = options["task"], int(options["repeats"])
     if "probe" in options:
         print(PROBES[options["probe"]](task))
         return

@@ -25,7 +25,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from isolated import interpreter
+from isolated import interpreter, several, words
 from isolated import probe as apart
 
 OUT = Path(__file__).parent / "results" / "startup.json"
@@ -35,7 +35,7 @@ COLUMNS = ("import", "make", "trace", "compile", "training: trace", "compile")
 
 def main() -> None:
     """Run, write, print."""
-    options = {key: value for key, _, value in (word.partition("=") for word in sys.argv[1:])}
+    options = words(tasks="", rta="none,default", repeats="3")
     if "probe" in options:
         word = options["probe"]
         print(json.dumps(seconds_to(FIRST[word]) if word in FIRST else probe(*word.split(","))))
@@ -44,9 +44,9 @@ def main() -> None:
 
     from jaxsafe.envs import TASKS
 
-    tasks = options.get("tasks", ",".join(TASKS)).split(",")
-    chosen = [(task, rta) for rta in options.get("rta", "none,default").split(",") for task in tasks]
-    repeats = int(options.get("repeats", "3"))
+    tasks = several("tasks", options["tasks"] or ",".join(TASKS), TASKS)
+    chosen = [(task, rta) for rta in options["rta"].split(",") for task in tasks]
+    repeats = int(options["repeats"])
     rows = [measured(name, rta, repeats) for name, rta in chosen]
     rows.append(measured("Pendulum-v1", "gymnax", repeats, interpreter("gymnax")))
     first = [first_result(name, repeats) for name in FIRST]
