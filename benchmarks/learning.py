@@ -32,12 +32,13 @@ def main() -> None:
         return
     from machine import about
 
+    here = about()
     rows = [
         {"task": task, "variant": name, **probe(__file__, [f"probe={name}", f"tasks={task}", *seeds])}
         for task in tasks
         for name in VARIANTS
     ]
-    OUT.write_text(json.dumps({**about(), "words": seeds, "runs": rows}, indent=1) + "\n")
+    OUT.write_text(json.dumps({**here, "words": seeds, "runs": rows}, indent=1) + "\n")
     print("| task | variant | 80 % in training | success, stochastic | deterministic | worst seed | length |")
     print("|---|---|---|---|---|---|---|")
     for row in rows:

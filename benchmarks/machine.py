@@ -13,7 +13,7 @@ import jax
 
 
 def about() -> dict[str, Any]:
-    """Commit, versions, device and number of cores that may be used."""
+    """Commit, versions, device and number of cores that may be used; to be asked before what is measured begins."""
     return {
         "commit": _git("rev-parse", "HEAD"),
         "changed": bool(_git("status", "--porcelain", "--", "jaxsafe", "benchmarks/*.py", "configs")),

@@ -29,13 +29,14 @@ def main() -> None:
     if "probe" in options:
         print(json.dumps(probe(options["probe"], int(options["num_envs"]))))
         return
+    here = about()
     tasks = several("tasks", options["tasks"], TASKS)
     sizes = [int(size) for size in options["num_envs"].split(",")]
     rows = []
     for task in tasks:
         for size in sizes:
             rows.append({"task": task, "num_envs": size, **apart(__file__, [f"probe={task}", f"num_envs={size}"])})
-    OUT.write_text(json.dumps({**about(), "num_steps": NUM_STEPS, "runs": rows}, indent=1) + "\n")
+    OUT.write_text(json.dumps({**here, "num_steps": NUM_STEPS, "runs": rows}, indent=1) + "\n")
     print(
         "| predicted / measured | an environment's state | a seed without them |"
         + "".join(f" {n:,} × {NUM_STEPS} |" for n in sizes)

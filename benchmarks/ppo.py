@@ -41,7 +41,7 @@ def main() -> None:
         return
     from machine import about, usable_cores
 
-    peers = several("peers", options["peers"], PEERS)
+    here, peers = about(), several("peers", options["peers"], PEERS)
     python = {name: interpreter(name) for name in PROBES if name in peers}
     cores = [1, usable_cores()]
     names = [name for name in PROBES if name in peers or name not in PEERS]
@@ -55,7 +55,7 @@ def main() -> None:
             )
     rows = [{"peer": name, "cores": count, "samples_per_s": rates} for (name, count), rates in found.items()]
     OUT.parent.mkdir(exist_ok=True)
-    OUT.write_text(json.dumps({**about(), "task": task, "repeats": repeats, "runs": rows}, indent=1) + "\n")
+    OUT.write_text(json.dumps({**here, "task": task, "repeats": repeats, "runs": rows}, indent=1) + "\n")
     print(f"| {task}, thousand samples/s | 1 core | {cores[-1]} cores |\n|---|---|---|")
     for name in names:
         rates = [f"{statistics.median(found[name, n]) / 1e3:.3g}" if (name, n) in found else "–" for n in cores]

@@ -46,6 +46,7 @@ def main() -> None:
         return
     from machine import about, usable_cores
 
+    here = about()
     cores = 1 << (usable_cores().bit_length() - 1)
     if cores == 1:
         sys.exit("scaling.py: expected two cores or more, found one")
@@ -56,7 +57,7 @@ def main() -> None:
     rows = [{"what": name, "cores": count, "per_s": rates} for (name, count), rates in found.items()]
     rates = {key: statistics.median(values) for key, values in found.items()}
     projected = projection(rates, cores)
-    content = {**about(), "task": task, "repeats": repeats, "runs": rows, "projection": projected}
+    content = {**here, "task": task, "repeats": repeats, "runs": rows, "projection": projected}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
     print(f"| {task}, a second | 1 core | {cores} cores | ratio |\n|---|---|---|---|")
     for name in PROBES:

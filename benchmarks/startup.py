@@ -46,11 +46,11 @@ def main() -> None:
 
     tasks = several("tasks", options["tasks"] or ",".join(TASKS), TASKS)
     chosen = [(task, rta) for rta in options["rta"].split(",") for task in tasks]
-    repeats = int(options["repeats"])
+    here, repeats = about(), int(options["repeats"])
     rows = [measured(name, rta, repeats) for name, rta in chosen]
     rows.append(measured("Pendulum-v1", "gymnax", repeats, interpreter("gymnax")))
     first = [first_result(name, repeats) for name in FIRST]
-    content = {**about(), "unit": "s", "repeats": repeats, "columns": COLUMNS, "rows": rows, "first": first}
+    content = {**here, "unit": "s", "repeats": repeats, "columns": COLUMNS, "rows": rows, "first": first}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
     print("| s | " + " | ".join(COLUMNS) + " |\n|---|" + "---|" * len(COLUMNS))
     for row in rows:
