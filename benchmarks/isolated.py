@@ -76,8 +76,12 @@ def probe(
     command, environment = [python, script, *request], {key: value for key, value in os.environ.items() if key not in CACHE}
     if cache:
         environment |= dict(zip(CACHE, (str(cache), "0", "-1"), strict=True))
-    pin = lambda: os.sched_setaffinity(0, usable)  # noqa: E731
-    ran = subprocess.run(command, capture_output=True, text=True, preexec_fn=pin, env=environment)
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, usable)  # a child has that of the thread which starts it
+    try:
+        ran = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+    finally:
+        os.sched_setaffinity(0, before)
     if ran.returncode:
         sys.exit(f"{' '.join(request)}: {ran.stderr[-2000:]}")
     return json.loads(ran.stdout.splitlines()[-1])
