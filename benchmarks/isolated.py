@@ -72,12 +72,11 @@ def probe(
 
     `cache` keeps what JAX compiles, however small; without it nothing is kept.
     """
-    usable = sorted(os.sched_getaffinity(0))[:cores]
     command, environment = [python, script, *request], {key: value for key, value in os.environ.items() if key not in CACHE}
     if cache:
         environment |= dict(zip(CACHE, (str(cache), "0", "-1"), strict=True))
     before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, usable)  # a child has that of the thread which starts it
+    os.sched_setaffinity(0, sorted(before)[:cores])  # a child has that of the thread which starts it
     try:
         ran = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     finally:

@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from isolated import probe, words
+from isolated import probe, several, words
 
 OUT = Path(__file__).parent / "results" / "learning.json"
 VARIANTS = ("as it is", "sorting shuffle", "whole gradients", "two devices a seed")
@@ -25,14 +25,15 @@ VARIANTS = ("as it is", "sorting shuffle", "whole gradients", "two devices a see
 def main() -> None:
     """Run, write, print."""
     options = words(tasks="docking2d,rejoin2d", seeds="10", seed="0")
-    tasks = options["tasks"].split(",")
     seeds = [f"{name}={options[name]}" for name in ("seeds", "seed")]
     if "probe" in options:
-        print(json.dumps(trained(options["probe"], [f"env={tasks[0]}", *seeds])))
+        print(json.dumps(trained(options["probe"], [f"env={options['tasks']}", *seeds])))
         return
     from machine import about
 
-    here = about()
+    from jaxsafe.envs import TASKS
+
+    here, tasks = about(), several("tasks", options["tasks"], TASKS)
     rows = [
         {"task": task, "variant": name, **probe(__file__, [f"probe={name}", f"tasks={task}", *seeds])}
         for task in tasks

@@ -172,11 +172,7 @@ def rejax(task: str) -> float:
     """The PPO of rejax, without its evaluations."""
     import jax
 
-    train = rejax_trainer(task, UPDATES).lower(jax.random.PRNGKey(0)).compile()
-    jax.block_until_ready(train(jax.random.PRNGKey(0)))
-    start = time.perf_counter()
-    jax.block_until_ready(train(jax.random.PRNGKey(1)))
-    return UPDATES * BATCH / (time.perf_counter() - start)
+    return timed(rejax_trainer(task, UPDATES), jax.random.PRNGKey(0))
 
 
 def rejax_trainer(task: str, updates: int) -> Any:

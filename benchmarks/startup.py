@@ -64,10 +64,10 @@ def main() -> None:
 def first_result(name: str, repeats: int) -> dict[str, Any]:
     """Seconds to the first result with an empty cache, and with a full one."""
     found: dict[str, Any] = {"name": name, "cold": [], "warm": []}
+    python = interpreter(name.split()[0])
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as cache:
             for kind in ("cold", "warm"):
-                python = interpreter(name.split()[0])
                 found[kind].append(apart(__file__, [f"probe={name}"], None, python, Path(cache)))
     return found
 
