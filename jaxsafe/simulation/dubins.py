@@ -26,7 +26,7 @@ from jaxsafe.simulation.integrate import (
     time_to_limit,
 )
 from jaxsafe.simulation.platform import Platform
-from jaxsafe.simulation.trig import arctan, sin_cos, tan
+from jaxsafe.simulation.trig import arctan, sin_cos, sin_cos_acute
 from jaxsafe.types import Number, Positive, Record, Seconds
 
 GRAVITY = 32.17
@@ -112,7 +112,7 @@ class Dubins3DState(Record):
     @property
     def velocity(self) -> Float[Array, " 3"]:
         """Velocity v (cos ψ cos γ, sin ψ cos γ, −sin γ)."""
-        return self.speed[..., None] * jnp.stack(_forward(self.heading, self.flight_path_angle), axis=-1)
+        return self.speed[..., None] * jnp.stack(_forward(sin_cos(self.heading), sin_cos(self.flight_path_angle)), axis=-1)
 
     @property
     def orientation(self) -> Float[Array, "3 3"]:
@@ -172,9 +172,9 @@ class Dubins3D(Platform, type="dubins3d"):
         """Heading and way moved after a piece of the step, of which begin and length are given, from those before it."""
         (heading, *moved), (begin, length) = before, span
         nodes = [[ramp(*each, begin + node * length) for each in ramps] for node in NODES]
-        turns = [length * self.gravity / speed * tan(roll) for roll, _, speed in nodes]  # ψ̇ × length
+        turns = [self._turn(sin_cos_acute(roll), speed) * length for roll, _, speed in nodes]
         for (_, gamma, speed), weight, partial in zip(nodes, WEIGHTS, PARTIAL_WEIGHTS, strict=True):
-            forward = _forward(heading + _dot(partial, turns), gamma)
+            forward = _forward(sin_cos(heading + _dot(partial, turns)), sin_cos_acute(gamma))
             moved = [total + weight * length * speed * part for total, part in zip(moved, forward, strict=True)]
         return (heading + _dot(WEIGHTS, turns), *moved)
 
@@ -188,8 +188,12 @@ class Dubins3D(Platform, type="dubins3d"):
         """Eq. (9) within the limits; a commanded heading rate is that of the turn, the bank staying as it is."""
         names = ("acceleration", "flight_path_angle_rate", "roll_rate")
         acceleration, gamma, roll = (_number(controls, name, state.speed) for name in names)
-        turn = controls.get("heading_rate", self.gravity / state.speed * tan(state.roll))
+        turn = controls.get("heading_rate", self._turn(sin_cos(state.roll), state.speed))
         return Dubins3DState(state.velocity, turn, acceleration, gamma, roll)
+
+    def _turn(self, bank: tuple[Array, Array], speed: Array) -> Array:
+        """Heading rate ψ̇ = g/v tan φ from the sine and cosine of the bank φ, by one division."""
+        return self.gravity * bank[0] / (speed * bank[1])
 
     def _roll_rate(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Any:
         if "heading_rate" not in controls:
@@ -201,9 +205,9 @@ def _number(controls: Controls, name: str, like: Array) -> Array:
     return jnp.asarray(controls.get(name, 0.0), like.dtype)
 
 
-def _forward(heading: Array, gamma: Array) -> tuple[Array, Array, Array]:
-    """Direction of flight (cos ψ cos γ, sin ψ cos γ, −sin γ)."""
-    (y, x), (z, level) = sin_cos(heading), sin_cos(gamma)
+def _forward(heading: tuple[Array, Array], gamma: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+    """Direction of flight (cos ψ cos γ, sin ψ cos γ, −sin γ) from the sines and cosines of both angles."""
+    (y, x), (z, level) = heading, gamma
     return x * level, y * level, -z
 
 
