@@ -20,13 +20,11 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from jaxsafe.adapters import environment, observation_bounds
+from jaxsafe.adapters import environment
+from jaxsafe.adapters.conversion import facts, masked, spaces
 from jaxsafe.adapters.lanes import Episodes, Lanes
 from jaxsafe.environment import Environment, reset_to
 from jaxsafe.errors import ConfigError, nearest
-from jaxsafe.types import TimeStep
-
-Space = gym.spaces.Box | gym.spaces.MultiDiscrete
 
 
 class GymEnv(gym.Env[np.ndarray, np.ndarray]):
@@ -167,7 +165,7 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         episodes = self._lanes.now
         self._over = np.where(mask, False, self._over)
         self._film(mask, episodes)
-        return np.array(episodes.timestep.observation), _masked(facts(self.env, episodes.timestep), mask)
+        return np.array(episodes.timestep.observation), masked(facts(self.env, episodes.timestep), mask)
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
         """Advance every lane one time step of the task.
@@ -198,7 +196,7 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             episodes = self._lanes.now
             final = {"final_obs": np.array(taken.observation), "final_info": facts(self.env, taken)}
         self._film(restarted, episodes)
-        infos = _masked(facts(self.env, episodes.timestep), np.ones(self.num_envs, bool)) | _masked(final, restarted)
+        infos = masked(facts(self.env, episodes.timestep), np.ones(self.num_envs, bool)) | masked(final, restarted)
         rewards = taken.reward.astype(np.float64)
         flags = np.array(taken.terminated), np.array(taken.truncated)
         return np.array(episodes.timestep.observation), rewards, *flags, infos
@@ -253,45 +251,6 @@ class Frames:
 
         sim, margins = jax.tree.map(lambda *steps: np.stack(steps), *self._past)
         return Scene(self._env, sim, margins, self._env.agent).draw(len(self._past) - 1)
-
-
-def spaces(env: Environment) -> tuple[gym.spaces.Box, Space]:
-    """Of observations and of actions."""
-    dtype = jnp.result_type(float)
-    low, high = observation_bounds(env)
-    observation = gym.spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
-    if env.num_action_points:
-        return observation, gym.spaces.MultiDiscrete(list(env.num_action_points))
-    return observation, gym.spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
-
-
-def facts(env: Environment, timestep: TimeStep) -> dict[str, Any]:
-    """What `info` holds, of one step or of a batch on the host."""
-    info = timestep.info
-    outcomes = np.array(env.outcomes, object)
-    found = {
-        "cost": timestep.cost,
-        "outcome": outcomes[info.outcome],
-        "is_success": info.outcome == env.success,
-        **{name: getattr(info, name) for name in _FACTS},
-    }
-    return found if info.rta is None else {**found, "rta": vars(info.rta)}
-
-
-_FACTS = (
-    "margins", "severity", "reward_terms", "reward_totals", "status", "control_desired", "control_actual", "intervening",
-)  # fmt: skip
-
-
-def _masked(found: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """Gymnasium's form of a batch of infos: beside each entry, under `_` and its name, which lanes have it."""
-    mask = mask.copy()  # one for all, since it must not change
-    mask.setflags(write=False)
-    masked = {}
-    for name, value in found.items():
-        masked[name] = _masked(value, mask) if isinstance(value, Mapping) else np.asarray(value)
-        masked[f"_{name}"] = mask
-    return masked
 
 
 _ALONE = np.ones(1, bool)
