@@ -57,6 +57,27 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
     assert len(calls) == 3
 
 
+def test_a_report_in_parts_makes_the_page_of_one(calls: list[list[str]], capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["tasks=docking2d", "film=false", *REST]
+    assert command.main([*words, "kinds=[features,plain]"]) == 0
+    whole = Path("report/baselines.md").read_text()
+    for kind in ("plain", "features"):
+        assert command.main([*words, f"kinds={kind}", "out=parts"]) == 0
+    parts = Path("parts/baselines.md").read_text()
+    assert [line for line in whole.splitlines() if "|" in line] == [line for line in parts.splitlines() if "|" in line]
+    assert parts.count("- `python -m jaxsafe.report") == 2
+    assert sum(module == "jaxsafe.train" for module, *_ in calls) == 2
+
+    record = Path("parts/baselines/docking2d-features.json")
+    found = json.loads(record.read_text())
+    found["options"]["training"]["ppo"]["gamma"] = 0.5
+    record.write_text(json.dumps(found))
+    capsys.readouterr()
+    assert command.main([*words, "kinds=plain", "out=parts"]) == 0
+    assert f"{record}: was made with other options and is left out; report it again" in capsys.readouterr().out
+    assert "features |" not in Path("parts/baselines.md").read_text()
+
+
 def test_an_interrupted_report_goes_on(calls: list[list[str]], whole: Path) -> None:
     run = Path("runs/report/docking2d-features")
     assert train.main([*TINY, f"out={run}"]) == 0

@@ -18,8 +18,9 @@ SEEDS = 10
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     from jaxsafe.envs import TASKS
-    from jaxsafe.report.page import Report
+    from jaxsafe.report.page import DIRECTORY, Report
     from jaxsafe.report.plan import KINDS, plan
+    from jaxsafe.report.record import keep, kept
     from jaxsafe.report.run import evaluate, train
     from jaxsafe.train.config import resolve
 
@@ -28,18 +29,21 @@ def main(argv: Sequence[str]) -> int:
     tasks, kinds = (_names(name, arguments.pop(name), [*known]) for name, known in (("tasks", TASKS), ("kinds", KINDS)))
     film = arguments.pop_flag("film") is not False
     rest = [word for word in argv if word.partition("=")[0] in arguments.options]
-    items = plan(tasks, kinds, rest if "seeds" in arguments.options else [f"seeds={SEEDS}", *rest])
+    rest = rest if "seeds" in arguments.options else [f"seeds={SEEDS}", *rest]
+    items = plan(tasks, kinds, rest)
     episodes = [resolve(cli.Arguments.parse(item.words))[0].episodes for item in items]  # errors before anything is done
-    found = {}
+    command, commit = " ".join(["python -m jaxsafe.report", *argv]), _commit()
     try:
         for item, count in zip(items, episodes, strict=True):
-            found[item] = train(item, runs)
-            evaluate(item, found[item], count, film and item.kind == "features")
+            run = train(item, runs)
+            evaluate(item, run, count, film and item.kind == "features")
+            keep(item, run, out / DIRECTORY, command, commit)
     except KeyboardInterrupt:
         print(f"stopped; the same command goes on with what is in {runs}")
         return cli.INTERRUPTED
-    page = Report(found, " ".join(["python -m jaxsafe.report", *argv]), _commit()).write(out)
-    print(f"\n{page}")
+    records, old = kept(plan([*TASKS], [*KINDS], rest), out / DIRECTORY)
+    page = Report(records).write(out)
+    print("\n".join(["", *old, str(page)]))
     return 0
 
 
@@ -53,20 +57,25 @@ def _names(option: str, value: Any, known: Sequence[str]) -> list[str]:
 
 
 def _commit() -> str | None:
-    """Of the checkout that this runs in, if it does."""
+    """Of the checkout that this runs in, if it does, and whether the code or a recipe is not that commit's."""
     git = shutil.which("git")
     if git is None:
         return None
-    place = Path(__file__).resolve().parent
-    found = subprocess.run([git, "-C", str(place), "rev-parse", "HEAD"], capture_output=True, text=True, check=False)
-    return found.stdout.strip() or None
+    package = Path(__file__).resolve().parents[1]
+    code = [str(path) for path in (package, package.parent / "configs") if path.is_dir()]
+    commit, changes = (
+        subprocess.run([git, "-C", str(package), *words], capture_output=True, text=True, check=False).stdout.strip()
+        for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "--", *code])
+    )
+    return f"{commit[:12]} with changes" if commit and changes else commit[:12] or None
 
 
 def usage() -> str:
     """The help text."""
     return (
         "usage: python -m jaxsafe.report [key=value …]\n\n"
-        "  trains every task in every way with ten seeds, evaluates, and writes OUT/baselines.md; takes hours\n"
+        "  trains every task in every way with ten seeds, evaluates, and writes OUT/baselines.md; takes hours.\n"
+        "  May be done in parts: the page has also what was reported into OUT before, with the same options.\n\n"
         "  tasks=[docking2d,…]    some tasks only\n"
         "  kinds=[features,…]     some of features, plain, lanes, discrete, rta\n"
         "  runs=DIR               where the runs are (default runs/report); what is complete there is not done again\n"

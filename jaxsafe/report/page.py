@@ -2,57 +2,40 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxsafe.config import yaml
+from jaxsafe.envs import TASKS
 from jaxsafe.metrics import stratified_iqm
 from jaxsafe.plot.compare import compare_curves
 from jaxsafe.plot.style import save
-from jaxsafe.report.plan import KINDS, PAPER_STEPS, WITH_RTA, WITHOUT_RTA, Item
-from jaxsafe.report.run import FILM
-from jaxsafe.train.files import read_json, read_rows, write_csv, write_text
+from jaxsafe.report.plan import KINDS, PAPER_STEPS, WITH_RTA, WITHOUT_RTA
+from jaxsafe.report.record import Record
+from jaxsafe.train.files import write_text
 
-POINTS = 100
-"""Rows of each seed in the published curves."""
-
-CURVES = ("success_rate", "return", "length", "delta_v", "violating_steps", "cost", "episodes")
-
-Results = dict[str, Any]
+DIRECTORY = "baselines"
+"""Beside the page: records, curves, figures and films."""
 
 
 class Report:
-    """All items of a plan with their results, and the page that they make."""
+    """The records of all items, and the page that they make."""
 
-    def __init__(self, items: Mapping[Item, Path], command: str, commit: str | None) -> None:
-        """Read the results of every run."""
-        self.runs, self.command, self.commit = dict(items), command, commit
-        self.results: dict[Item, Results] = {item: read_json(run / "results.json") for item, run in items.items()}
-        self.others: dict[tuple[Item, str], Results] = {
-            (item, name): read_json(item.evaluation_directory(run, name) / "results.json")
-            for item, run in items.items()
-            for name in item.evaluations
-        }
-        self.rows = {item: read_rows(run / "progress.jsonl") for item, run in items.items()}
-        self.episodes = yaml.read(next(iter(items.values())) / "config.yaml")["training"]["episodes"]
-        self.kinds = list(dict.fromkeys(item.kind for item in items))
-        self.tasks = list(dict.fromkeys(item.task for item in items))
+    def __init__(self, records: Sequence[Record]) -> None:
+        """Of at least one record."""
+        self.records = sorted(records, key=lambda record: [*TASKS].index(record.item.task))
+        self.own = [(record.item, record.results) for record in self.records]
+        self.further = [(record, name, found) for record in self.records for name, found in record.evaluations.items()]
+        self.episodes = records[0].options["training"]["episodes"]
+        self.kinds = [kind for kind in KINDS if any(record.item.kind == kind for record in records)]
+        self.tasks = [task for task in TASKS if any(record.item.task == task for record in records)]
 
     def write(self, out: Path) -> Path:
-        """Write `baselines.md` and beside it the directory `baselines` with figures, films and curves."""
-        files = out / "baselines"
-        for item, run in self.runs.items():
-            write_csv(files / f"{item.name}.csv", _thinned(self.rows[item]))
-            for figure in ("trajectories", "speed_distance") if item.kind == "features" else ():
-                if (run / "figures" / f"{figure}.png").exists():
-                    shutil.copy(run / "figures" / f"{figure}.png", files / f"{item.task}_{figure}.png")
-            if (run / "film" / FILM).exists():
-                shutil.copy(run / "film" / FILM, files / f"{item.task}.gif")
+        """Write `baselines.md`, and the figures of training into the directory beside it where the records are."""
+        files = out / DIRECTORY
         for task in self.tasks:
-            rows = {item.kind: rows for item, rows in self.rows.items() if item.task == task}
-            save(compare_curves(rows, task), files / f"{task}_training.png")
+            curves = {record.item.kind: record.curves for record in self.records if record.item.task == task}
+            save(compare_curves(curves, task), files / f"{task}_training.png")
         page = out / "baselines.md"
         write_text(page, self.text(files))
         return page
@@ -66,15 +49,13 @@ class Report:
         return "\n\n".join(part for part in parts if part) + "\n"
 
     def _head(self) -> str:
-        one = next(iter(self.results.values()))
-        versions = ", ".join(f"{name} {version}" for name, version in one["versions"].items() if name != "device")
+        one = self.records[0].results
         return "\n".join([
             "# Baselines",
             "",
-            f"<!-- Written by `{self.command}`. -->",
-            f"Written by `{self.command}`: every number and picture below comes from that command"
-            + (f" on commit {self.commit[:12]}" if self.commit else "") + ".",
-            f"Versions: {versions}; {one['versions']['device']}, float32.",
+            "Every number and picture below comes from a command, and so does this page:",
+            "",
+            *self._origins(),
             "",
             "Each task is trained in these ways, by PPO:",
             "",
@@ -87,9 +68,21 @@ class Report:
             " In brackets: 95 % percentile-bootstrap intervals over seeds.",
         ])  # fmt: skip
 
+    def _origins(self) -> list[str]:
+        """A line for each command, commit and set of versions that some of the records come from."""
+        found: dict[tuple[str, str], list[str]] = {}
+        for record in self.records:
+            versions = record.results["versions"]
+            where = f" on commit {record.commit}" if record.commit else ""
+            others = ", ".join(f"{name} {version}" for name, version in versions.items() if name != "device")
+            found.setdefault((f"`{record.command}`{where}", f"{others}; {versions['device']}, float32"), []).append(
+                record.item.name
+            )
+        return [f"- {origin}: {', '.join(names)} ({versions})" for (origin, versions), names in found.items()]
+
     def _efficiency(self) -> str:
         rows = []
-        for item, found in self.results.items():
+        for item, found in self.own:
             steps, per_seed = (found["interaction_efficiency"][name] for name in ("timesteps", "per_seed"))
             paper = PAPER_STEPS[item.task]
             rows.append([
@@ -108,7 +101,7 @@ class Report:
 
     def _final(self) -> str:
         rows = []
-        for item, found in self.results.items():
+        for item, found in self.own:
             evaluation = found["evaluation"]
             each = [evaluation[kind]["success_rate"] for kind in ("stochastic", "deterministic")]
             failed = sum(min(pair) < 0.95 for pair in zip(*(one["per_seed"] for one in each), strict=True))
@@ -129,7 +122,7 @@ class Report:
         rows = [
             [item.task, item.kind, kind, _percent(one["episode_safety_violation_rate"]), _number(one["control_usage_l1"]),
              _number(one["control_usage"]), _number(one["episode_length"])]
-            for item, found in self.results.items() if item.task.startswith("docking")
+            for item, found in self.own if item.task.startswith("docking")
             for kind, one in found["evaluation"].items()
         ]  # fmt: skip
         return (
@@ -146,7 +139,7 @@ class Report:
 
     def _safety(self) -> str:
         rows = []
-        for item, found in self.results.items():
+        for item, found in self.own:
             cost = found["training_cost"]
             for kind, one in found["evaluation"].items():
                 rows.append([
@@ -166,11 +159,11 @@ class Report:
 
     def _rta(self) -> str:
         rows = []
-        for (item, name), found in self.others.items():
+        for record, name, found in self.further:
             if name not in (WITH_RTA, WITHOUT_RTA):
                 continue
             trained, flown = ("without", "with") if name == WITH_RTA else ("with", "without")
-            own = self.results[item]
+            item, own = record.item, record.results
             for label, results in ((trained, own), (flown, found)):
                 one = results["evaluation"]["stochastic"]
                 share = one["intervention_rate"]
@@ -202,11 +195,12 @@ class Report:
 
     def _starts(self) -> str:
         rows = [
-            [item.task, name, *(_percent(found["evaluation"][kind]["success_rate"]) for kind in found["evaluation"]),
+            [record.item.task, name,
+             *(_percent(found["evaluation"][kind]["success_rate"]) for kind in found["evaluation"]),
              *(_percent(found["evaluation"]["deterministic"][metric])
                for metric in ("safety_violation_rate", "episode_safety_violation_rate")),
              _number(found["evaluation"]["deterministic"]["episode_length"])]
-            for (item, name), found in self.others.items() if name not in (WITH_RTA, WITHOUT_RTA)
+            for record, name, found in self.further if name not in (WITH_RTA, WITHOUT_RTA)
         ]  # fmt: skip
         return (
             _section(
@@ -233,9 +227,7 @@ class Report:
         for kind in self.kinds:
             for way in ("stochastic", "deterministic"):
                 scores = [
-                    found["evaluation"][way]["success_rate"]["per_seed"]
-                    for item, found in self.results.items()
-                    if item.kind == kind
+                    found["evaluation"][way]["success_rate"]["per_seed"] for item, found in self.own if item.kind == kind
                 ]
                 both = stratified_iqm(scores)
                 low, high = both["ci95"]
@@ -265,10 +257,11 @@ class Report:
         lines = [
             "## To repeat and to reuse", "",
             "Curves of every seed, thinned to 100 rows each:"
-            " " + ", ".join(f"[{item.name}](baselines/{item.name}.csv)" for item in self.runs) + ".",
+            " " + ", ".join(f"[{item.name}](baselines/{item.name}.csv)" for item, _ in self.own) + "; beside each, as"
+            " JSON, every result of every seed.",
             "Hyperparameters stand in `configs/`. The commands behind the tables, also one by one:", "", "```",
         ]  # fmt: skip
-        for item in self.runs:
+        for item, _ in self.own:
             lines.append(f"python -m jaxsafe.train {' '.join(item.words)} out=runs/{item.name}")
             lines += [
                 f"python -m jaxsafe.evaluate run=runs/{item.name} {' '.join(options)}"
@@ -295,9 +288,3 @@ def _number(metric: Mapping[str, Any], digits: int = 2) -> str:
 def _rate(metric: Mapping[str, Any], episodes: int) -> str:
     """A share of episodes; a zero with the bound that it proves."""
     return _percent(metric) if metric["mean"] else f"0 of {episodes:,} (< {300 / episodes:.2g} %)"
-
-
-def _thinned(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    steps = sorted({row["step"] for row in rows})
-    kept = {steps[round(i * (len(steps) - 1) / max(POINTS - 1, 1))] for i in range(POINTS)} if steps else set()
-    return [{name: row[name] for name in ("seed", "step", *CURVES)} for row in rows if row["step"] in kept]

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from jaxsafe.cli import INTERRUPTED, Arguments
 from jaxsafe.config import describe, yaml
@@ -54,12 +55,18 @@ def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
         _call("jaxsafe.evaluate", [f"run={policy}", "episodes=10", "deterministic=true", "render=gif", f"out={film}"])
 
 
+def options_of(item: Item) -> dict[str, Any]:
+    """Every option of its training and of its environment as `config.yaml` has them, but for the place of the run."""
+    config, env, _ = resolve(Arguments.parse([*item.words]))
+    training = to_data(config)
+    return {"training": {name: training[name] for name in training if name != "out"}, "environment": describe(env)}
+
+
 def _refuse_other(item: Item, run: Path) -> None:
     """The numbers of an old run must not pass as those of a new recipe."""
-    config, env, _ = resolve(Arguments.parse([*item.words, f"out={run}"]))
-    wanted = {"training": to_data(config), "environment": describe(env)}
     content = yaml.read(run / "config.yaml")
-    if any(content[part] != value for part, value in wanted.items()):
+    content["training"].pop("out", None)
+    if any(content[part] != value for part, value in options_of(item).items()):
         raise ConfigError(f"runs: {run} was trained with other options; remove it, or give another directory")
 
 
