@@ -1,6 +1,7 @@
 """Settings for all tests: two devices, one thread each, and compiled programs kept between runs.
 
-Tests compile far more than they run: XLA's older emitter of kernels takes a third less time, for slower programs. Only some
+Tests compile far more than they run, so LLVM does little to the code, which takes a third less time (with nothing done at all
+a seed among many is no longer the seed alone, bit for bit). XLA's older emitter of kernels takes less time too; only some
 versions can choose it, and others stop at an unknown flag.
 """
 
@@ -14,7 +15,7 @@ import pytest
 from jaxsafe.train.seeds import claim_cores
 
 emitter = " --xla_cpu_use_fusion_emitters=false" * version("jaxlib").startswith("0.10.")
-os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count=2{emitter}")
+os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count=2 --xla_backend_optimization_level=1{emitter}")
 claim_cores()
 
 import jax  # noqa: E402
