@@ -1,8 +1,8 @@
 """Settings for all tests: two devices, one thread each, and compiled programs kept between runs.
 
-Tests compile far more than they run, so LLVM does little to the code, which takes a third less time (with nothing done at all
-a seed among many is no longer the seed alone, bit for bit). XLA's older emitter of kernels takes less time too; only some
-versions can choose it, and others stop at an unknown flag.
+Tests compile far more than they run, so LLVM optimises little, which takes a third less time (not at all: then a seed among
+many is no longer the seed alone, bit for bit). XLA's older emitter of kernels takes less time too; only some versions can
+choose it, and others stop at an unknown flag.
 """
 
 import os
