@@ -104,7 +104,7 @@ def run(
     usage: Callable[[], str],
     leave: Callable[[int], NoReturn] = sys.exit,
 ) -> None:
-    """Run a command and leave with its exit code, by `leave` after an error."""
+    """Run a command and leave with its exit code, by `leave` after an error or Ctrl-C."""
     argv = sys.argv[1:]
     if not argv or argv[0] in ("-h", "--help", "help"):
         print(usage(), file=sys.stdout if argv else sys.stderr)
@@ -120,11 +120,11 @@ def run(
         leave(2)
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+        leave(INTERRUPTED)
 
 
 def at_once(code: int) -> NoReturn:
-    """Leave without Python's shutdown: after a failed restore, orbax's threads would print tracebacks into it."""
+    """Leave without Python's shutdown: it would wait for threads that compile, and orbax's print tracebacks into it."""
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)

@@ -13,6 +13,7 @@ from jaxsafe.evaluate.episodes import longest, record_episodes, run_episodes
 from jaxsafe.metrics import METRICS, Episode, over_seeds, summarise
 from jaxsafe.rollout import Policy
 from jaxsafe.train.agent import Params
+from jaxsafe.train.ahead import Ahead
 from jaxsafe.train.seeds import SeedMapper
 from jaxsafe.types import Key, State, TimeStep
 
@@ -41,14 +42,20 @@ class Evaluator:
         self.mapper, self.env, self.agent = mapper, env, agent
         self._shared = mapper.replicate((env, agent))
         self._run = mapper.map(self._one_seed)
-        self._record = jax.jit(self._one_record, static_argnums=(2, 3))
+        self._recorders: dict[int, Callable[..., Any]] = {}
+
+    def prepare(self, params: Params) -> None:
+        """Compile while other work goes on; `params` are those of `run`, or as `SeedMapper.like` describes them."""
+        key, deterministic = jax.random.key(0), np.asarray(True)
+        self._run = Ahead(self._run, self._arguments(key, deterministic), params)
+        one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), params)
+        self._recorders[RECORDED] = Ahead(self._recorder(RECORDED), one, key, deterministic)
 
     def run(self, params: Params, num_episodes: int, seed: int, deterministic: bool) -> Episode:
         """Episodes of every seed's policy: each field [seeds, num_episodes], on the host."""
 
         def batch(key: Key) -> Episode:
-            shared = (*self._shared, *self.mapper.replicate((key, np.asarray(deterministic))))
-            return self.mapper.gather(self._run(shared, params))
+            return self.mapper.gather(self._run(self._arguments(key, np.asarray(deterministic)), params))
 
         return in_batches(batch, num_episodes, seed)
 
@@ -66,7 +73,7 @@ class Evaluator:
         steps = int(longest(self.env))
         for batch, key in enumerate(batch_keys(seed, -(-num_episodes // BATCH))):
             count = min(BATCH, num_episodes - batch * BATCH)
-            recorded = self._record(params, key, max(count, RECORDED), steps, np.asarray(deterministic))
+            recorded = self._recorder(max(count, RECORDED))(params, key, np.asarray(deterministic))
             for episode in range(count):
                 state, timestep = jax.tree.map(lambda x, i=episode: np.asarray(x)[:, i], recorded)
                 ended = np.flatnonzero(timestep.done)
@@ -76,8 +83,20 @@ class Evaluator:
         env, agent, key, deterministic = shared
         return run_episodes(env, agent.policy(env, params, deterministic), key, BATCH)
 
-    def _one_record(self, params: Params, key: Key, num_episodes: int, steps: int, deterministic: Any) -> Any:
-        return record_episodes(self.env, self.agent.policy(self.env, params, deterministic), key, num_episodes, steps)
+    def _arguments(self, key: Key, deterministic: Any) -> tuple:
+        return *self._shared, *self.mapper.replicate((key, deterministic))
+
+    def _recorder(self, num_episodes: int) -> Callable[..., Any]:
+        """Compiled once for each number of episodes."""
+        if num_episodes not in self._recorders:
+            steps = int(longest(self.env))
+
+            def record(params: Params, key: Key, deterministic: Any) -> Any:
+                policy = self.agent.policy(self.env, params, deterministic)
+                return record_episodes(self.env, policy, key, num_episodes, steps)
+
+            self._recorders[num_episodes] = jax.jit(record)
+        return self._recorders[num_episodes]
 
 
 def in_batches(run: Callable[[Key], Episode], num_episodes: int, seed: int) -> Episode:

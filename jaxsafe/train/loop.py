@@ -23,6 +23,7 @@ from jaxsafe.metrics import Episode
 from jaxsafe.rollout import choose
 from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.train import hosts, memory, ppo, window
+from jaxsafe.train.ahead import Ahead
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.files import append_rows, keep_rows, read_rows
@@ -61,12 +62,11 @@ class Training:
         self.shared = self.mapper.replicate((env, config.agent, config.ppo))
         intervals = (config.every(config.eval_every), config.every(config.checkpoint_every))
         self.chunk = max(1, min(config.num_updates // 50, 100_000 // config.ppo.batch_size, *intervals))
-        self.fresh, self.advance = programs(self.mapper, self.chunk, config.num_updates)
         self.evaluator = Evaluator(self.mapper, env, config.agent)
         self.checkpoints = Checkpoints(checkpoints or run, create=True)
         self.elapsed = self.compile_s = 0.0
         self.updates = 0
-        self._restore_or_init()
+        self._compile_and_begin()
         self._keep_copies()
         self.log = ProgressLog(run, self.step, self.updates * config.seeds, config.tensorboard)
         for name in ("eval.jsonl", "episodes.jsonl"):
@@ -85,11 +85,10 @@ class Training:
     def train(self) -> bool:
         """Train to the end; False if the user asked to stop before. Either way the state is in a checkpoint."""
         display = Display(self.config.num_updates * self.config.ppo.batch_size, self.step)
-        advance = self._compile()
         display.start()
         with _StopRequest() as stop:
             while self.updates < self.config.num_updates and not stop.requested:
-                before, (self.state, curves) = self.updates, advance(self.shared, self.state)
+                before, (self.state, curves) = self.updates, self.advance(self.shared, self.state)
                 self.updates = min(before + self.chunk, self.config.num_updates)
                 self._write_progress(curves, self.updates - before, display)
                 if self._due(before, self.config.eval_every):
@@ -114,16 +113,29 @@ class Training:
         self._record(self.config.episodes, final=True)
         return found
 
-    def _restore_or_init(self) -> None:
-        steps, content = self.checkpoints.steps, structure(self.env, self.config)
+    def _compile_and_begin(self) -> None:
+        """Have the state, fresh or restored, and the programs, compiled side by side."""
+        content = structure(self.env, self.config)
         each = memory.size(content) // self.config.seeds * (self.mapper.padded // self.mapper.mesh.shape["seeds"])
         memory.require(each, self.mapper.num_local_devices, MEMORY)
-        if not steps:
-            self.state = self.fresh(self.shared, self.mapper.keys(self.config.seed))
+        begin, keys = time.monotonic(), self.mapper.keys(self.config.seed)
+        fresh, advance = programs(self.mapper, self.chunk, self.config.num_updates)
+        like = self.mapper.like(jax.eval_shape(fresh, self.shared, keys), STATE)
+        self.advance = Ahead(advance, self.shared, like)  # the longest first
+        if self.checkpoints.steps:
+            self._restore(content)
+        else:
+            self.state = fresh(self.shared, keys)
             never = self.mapper.place(np.full(self.config.seeds, -1.0, np.float32))
             self.best = {"params": self.state.average, "success": never}
-            return
-        content, facts = self.checkpoints.restore(steps[-1], content)
+        self.evaluator.prepare(like.average)
+        compiled = self.advance.compiled()
+        self.compile_s += time.monotonic() - begin
+        has = memory.size(self.state) // self.mapper.mesh.size  # which is there already
+        memory.require(memory.footprint(compiled) - has, self.mapper.num_local_devices, MEMORY)
+
+    def _restore(self, content: Any) -> None:
+        content, facts = self.checkpoints.restore(self.checkpoints.steps[-1], content)
         self.state, self.best = self.mapper.place(content["state"], STATE), self.mapper.place(content["best"])
         self.updates, self.elapsed, self.compile_s = facts["updates"], facts["wall_s"], facts["compile_s"]
 
@@ -136,15 +148,6 @@ class Training:
             print(f"checkpoints after step {self.step:,} are missing: going on from there, the longer logs kept as *.bak")
             for log in self.run.glob("*.jsonl"):
                 shutil.copy(log, log.with_suffix(".jsonl.bak"))
-
-    def _compile(self) -> Any:
-        """Compile the chunk ahead of time, so that its cost is known."""
-        begin = time.monotonic()
-        compiled = self.advance.lower(self.shared, self.state).compile()
-        self.compile_s += time.monotonic() - begin
-        has = memory.size(self.state) // self.mapper.mesh.size  # which is there already
-        memory.require(memory.footprint(compiled) - has, self.mapper.num_local_devices, MEMORY)
-        return compiled
 
     def _due(self, before: int, every: int | None) -> bool:
         """Whether a chunk that began at update `before` passed a multiple of the interval or the end."""

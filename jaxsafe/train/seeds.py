@@ -98,6 +98,15 @@ class SeedMapper:
 
         return jax.tree.map(part, specs, tree)
 
+    def like(self, shapes: Any, specs: Any = SEEDS) -> Any:
+        """Shapes [padded] with how such arrays lie on the devices, to compile what `map` makes before there are any."""
+
+        def part(spec: PartitionSpec, part: Any) -> Any:
+            sharding = NamedSharding(self.mesh, spec)
+            return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), part)
+
+        return jax.tree.map(part, specs, shapes)
+
     def pad(self, values: Any) -> Any:
         """Repeat the last seed's entry up to `padded`."""
         return values[np.minimum(np.arange(self.padded), len(values) - 1)]

@@ -1,0 +1,33 @@
+"""Programs that are compiled side by side, on threads of their own, while other work goes on."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any
+
+import jax
+
+THREADS = 4
+"""How many programs are compiled at a time, as many as a training has: the compiler does little in parallel by itself."""
+
+
+class Ahead:
+    """A jitted function whose arguments always have the same shapes: traced at once, compiled before it is first called."""
+
+    def __init__(self, function: Any, *arguments: Any) -> None:
+        """Begin to compile `function`; `arguments` are as those of the calls, or their shapes, types and shardings."""
+        self._compiled = _threads().submit(function.lower(*arguments).compile)
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Call it, once it is compiled."""
+        return self.compiled()(*arguments)
+
+    def compiled(self) -> jax.stages.Compiled:
+        """Wait for the program."""
+        return self._compiled.result()
+
+
+@cache
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(THREADS, "compile")
