@@ -66,7 +66,7 @@ class Training:
         self.checkpoints = Checkpoints(checkpoints or run, create=True)
         self.elapsed = self.compile_s = 0.0
         self.updates = 0
-        self._compile_and_begin()
+        self._begin()
         self._keep_copies()
         self.log = ProgressLog(run, self.step, self.updates * config.seeds, config.tensorboard)
         for name in ("eval.jsonl", "episodes.jsonl"):
@@ -85,6 +85,7 @@ class Training:
     def train(self) -> bool:
         """Train to the end; False if the user asked to stop before. Either way the state is in a checkpoint."""
         display = Display(self.config.num_updates * self.config.ppo.batch_size, self.step)
+        self._await_compiled()
         display.start()
         with _StopRequest() as stop:
             while self.updates < self.config.num_updates and not stop.requested:
@@ -113,8 +114,8 @@ class Training:
         self._record(self.config.episodes, final=True)
         return found
 
-    def _compile_and_begin(self) -> None:
-        """Have the state, fresh or restored, and the programs, compiled side by side."""
+    def _begin(self) -> None:
+        """Have the state, fresh or restored, while all programs are compiled side by side."""
         content = structure(self.env, self.config)
         each = memory.size(content) // self.config.seeds * (self.mapper.padded // self.mapper.mesh.shape["seeds"])
         memory.require(each, self.mapper.num_local_devices, MEMORY)
@@ -129,10 +130,7 @@ class Training:
             never = self.mapper.place(np.full(self.config.seeds, -1.0, np.float32))
             self.best = {"params": self.state.average, "success": never}
         self.evaluator.prepare(like.average)
-        compiled = self.advance.compiled()
         self.compile_s += time.monotonic() - begin
-        has = memory.size(self.state) // self.mapper.mesh.size  # which is there already
-        memory.require(memory.footprint(compiled) - has, self.mapper.num_local_devices, MEMORY)
 
     def _restore(self, content: Any) -> None:
         content, facts = self.checkpoints.restore(self.checkpoints.steps[-1], content)
@@ -148,6 +146,13 @@ class Training:
             print(f"checkpoints after step {self.step:,} are missing: going on from there, the longer logs kept as *.bak")
             for log in self.run.glob("*.jsonl"):
                 shutil.copy(log, log.with_suffix(".jsonl.bak"))
+
+    def _await_compiled(self) -> None:
+        """Wait for the program of the updates, and see whether it fits."""
+        begin, compiled = time.monotonic(), self.advance.compiled()
+        self.compile_s += time.monotonic() - begin
+        has = memory.size(self.state) // self.mapper.mesh.size  # which is there already
+        memory.require(memory.footprint(compiled) - has, self.mapper.num_local_devices, MEMORY)
 
     def _due(self, before: int, every: int | None) -> bool:
         """Whether a chunk that began at update `before` passed a multiple of the interval or the end."""
