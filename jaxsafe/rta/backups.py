@@ -84,9 +84,13 @@ class MatchVelocity(BackupController, type="match_velocity"):
     In the plane it takes the heading and the speed that the lead will have after the step. In space it banks by
     tan φ = v ω/g for the turn ω = 0.25 e + ψ̇_lead of the present heading error e, and climbs or dives at the steepest angle
     while the error is large, abs(e) above 0.45 rad, less so down to 0.15 rad, then flies the lead's angle.
+
+    Rounding moves two aircraft of equal velocity, far from the origin by 0.01 ft a step. So where it is closer than
+    `clearance` it takes the lead's velocity plus w = 0.1 s⁻¹ (`clearance` − ‖r‖) r/‖r‖, to first order.
     """
 
     lead: PlatformName
+    clearance: Annotated[Length, Range(0.0)]
     turn: Literal["left", "right"]
     climb: Literal["up", "down"] | None = None  # in space
     dead_zone: Annotated[Radians, Range(0.0)] = 0.2
@@ -95,23 +99,33 @@ class MatchVelocity(BackupController, type="match_velocity"):
     def control(self, env: Any, sim: Sim, later: Others) -> Float[Array, " m"]:
         own, lead, ahead = sim.platforms[env.agent], sim.platforms[self.lead], later[self.lead]
         sign = 1.0 if self.turn == "left" else -1.0
+        away = self._away(own.position - lead.position)
+        level = jnp.sum(lead.velocity[:2] ** 2)
+        faster = jnp.sum(away * lead.velocity) / lead.speed
         goal = ahead.heading if self.climb is None else lead.heading
+        goal += (lead.velocity[0] * away[1] - lead.velocity[1] * away[0]) / level
         error = sign * wrap(sign * (goal - own.heading), -self.dead_zone, 2.0 * jnp.pi)
-        speed = jnp.clip(ahead.speed, *env.agent_platform.speed_limits)
+        speed = jnp.clip(ahead.speed + faster, *env.agent_platform.speed_limits)
         wanted = {"acceleration": (speed - own.speed) / env.dt}
         if self.climb is None:
             wanted["heading_rate"] = error / env.dt
         else:
-            wanted |= self._in_space(env, own, ahead, error, (ahead.heading - lead.heading) / env.dt)
+            steeper = (faster * lead.velocity[2] / lead.speed - away[2]) / jnp.sqrt(level)
+            turning = (ahead.heading - lead.heading) / env.dt
+            wanted |= self._in_space(env, own, error, turning, ahead.flight_path_angle + steeper)
         return jnp.stack([wanted[name] for name in env.action_names])
 
-    def _in_space(self, env: Any, own: Any, ahead: Any, error: Array, turning: Array) -> dict[str, Array]:
+    def _away(self, apart: Float[Array, " d"]) -> Float[Array, " d"]:
+        distance = safe_norm(apart)
+        return 0.1 * jnp.maximum(self.clearance - distance, 0.0) * apart / jnp.maximum(distance, 1.0)
+
+    def _in_space(self, env: Any, own: Any, error: Array, turning: Array, angle: Array) -> dict[str, Array]:
         plant = env.agent_platform
         bank = arctan(own.speed * (0.25 * error + turning) / plant.gravity)
         bank = jnp.clip(bank, plant.roll_limits[0], plant.roll_limits[1])
         lowest, highest = plant.flight_path_angle_limits
         steep = lowest if self.climb == "up" else highest  # ż = −v sin γ
-        level = jnp.clip(ahead.flight_path_angle, lowest, highest)
+        level = jnp.clip(angle, lowest, highest)
         share = jnp.clip((jnp.abs(error) - 0.15) / 0.3, 0.0, 1.0)
         gamma = level + share * (steep - level)
         return {

@@ -36,7 +36,7 @@ TURN: dict[str, Any] = {
 MATCH_2D: dict[str, Any] = {
     "constraints": ("collision",),
     "margin": 1.0,  # ft; for what prediction and plant may differ by in float32
-    "backups": tuple(MatchVelocity(name=turn, lead="lead", turn=turn) for turn in ("left", "right")),
+    "backups": tuple(MatchVelocity(name=turn, lead="lead", clearance=101.0, turn=turn) for turn in ("left", "right")),
     "horizon": 40,
     "terminal": VelocityMatched(of="wingman", to="lead", tolerance=1.0, clearance=101.0),
 }
@@ -45,7 +45,7 @@ MATCH_3D: dict[str, Any] = {
     "constraints": ("collision",),
     "margin": 2.0,
     "backups": tuple(
-        MatchVelocity(name=f"{turn}_{climb}", lead="lead", turn=turn, climb=climb)
+        MatchVelocity(name=f"{turn}_{climb}", lead="lead", clearance=102.0, turn=turn, climb=climb)
         for turn in ("left", "right")
         for climb in ("up", "down")
     ),
