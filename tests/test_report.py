@@ -102,7 +102,7 @@ def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:
         (["tasks=docking4d"], "tasks: found 'docking4d'; choose from rejoin2d"),
         (
             ["kinds=[features,plane]"],
-            "kinds: found 'plane'; choose from features, plain, lanes, discrete, rta. Did you mean 'plain'?",
+            "kinds: found 'plane'; choose from features, plain, lanes, discrete, rta, punished. Did you mean 'plain'?",
         ),
         (["tasks=[]"], "tasks: expected at least one of rejoin2d"),
         (["film=gif"], "film: expected true or false, found 'gif'"),
@@ -121,7 +121,7 @@ def test_every_command_of_the_plan_is_valid() -> None:
     from jaxsafe.envs import with_rta
 
     items = plan([*TASKS], [*KINDS], ["seeds=10"])
-    assert len({item.name for item in items}) == 25
+    assert len({item.name for item in items}) == 30
     for item in items:
         [(config, env, _)] = resolve_all(cli.Arguments.parse(item.words))
         assert config.seeds == 10

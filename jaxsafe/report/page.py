@@ -162,16 +162,17 @@ class Report:
         for record, name, found in self.further:
             if name not in (WITH_RTA, WITHOUT_RTA):
                 continue
-            trained, flown = ("without", "with") if name == WITH_RTA else ("with", "without")
+            flown = ("without", "with") if name == WITH_RTA else ("with", "without")
             item, own = record.item, record.results
-            for label, results in ((trained, own), (flown, found)):
+            trained = "with, punished" if item.kind == "punished" else flown[0]
+            for label, results in zip(flown, (own, found), strict=True):
                 one = results["evaluation"]["stochastic"]
                 share = one["intervention_rate"]
                 rows.append([
                     item.task, trained, label, _percent(one["success_rate"]),
                     _rate(one["safety_violation_rate"], self.episodes * results["seeds"]),
                     _percent(share) if share["mean"] is not None else "–",
-                    _number(own["training_cost"], 0) if label == trained else "",
+                    _number(own["training_cost"], 0) if results is own else "",
                 ])  # fmt: skip
         return (
             _section(

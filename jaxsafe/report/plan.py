@@ -32,6 +32,9 @@ KINDS: Mapping[str, Kind] = {
     "lanes": Kind(("preset=lanes",), "4,096 environments side by side, for accelerators"),
     "discrete": Kind(("actions=discrete",), "the recipe with the paper's discrete actions"),
     "rta": Kind(("rta=default",), "the recipe with run time assurance during training (`rta=default`)"),
+    "punished": Kind(
+        ("rta=default", "rta_training=punished"), "the same, and each intervention costs a little (`rta_training=punished`)"
+    ),
 }
 """By the name that the page uses."""
 
@@ -66,7 +69,7 @@ class Item(NamedTuple):
         """By name, what follows `python -m jaxsafe.evaluate run=…`."""
         if self.kind == "features":
             return {**STARTS[self.task], WITH_RTA: ["rta=default"]}
-        return {WITHOUT_RTA: ["rta=none"]} if self.kind == "rta" else {}
+        return {WITHOUT_RTA: ["rta=none"]} if self.kind in ("rta", "punished") else {}
 
     def evaluation_directory(self, run: Path, name: str) -> Path:
         """Where an evaluation of a run is written."""
