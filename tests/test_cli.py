@@ -48,8 +48,8 @@ def fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], t
         (["env=docking3d", "seed=-1"], "seed: expected a whole number in [0, 2"),
         (["env=docking3d", "seeds=2", "seeds=3"], "seeds: given twice"),
         (["env=docking3d", "seeds"], "argument 'seeds': expected key=value"),
-        (["env=docking3d", "preset=featurs"], "preset: unknown preset 'featurs'; choose from features, plain, lanes. "
-         "Did you mean 'features'?"),
+        (["env=docking3d", "preset=featurs"], "preset: unknown preset 'featurs'; choose from features, plain, lanes, quick."
+         " Did you mean 'features'?"),
         (["env=docking3d", "ppo.gama=0.9"], "ppo.gama: unknown field 'gama'"),
         (["env=docking3d", "ppo.gamma=1.5"], "ppo.gamma: expected a number in [0, 1], found 1.5"),
         (["env=docking3d", "ppo.gamma=high"], "ppo.gamma: expected a number in [0, 1], found 'high'"),

@@ -11,6 +11,7 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.report import __main__ as command
 from jaxsafe.report import run as running
+from jaxsafe.report.page import wall_to
 from jaxsafe.report.plan import KINDS, Item, plan
 from jaxsafe.train import __main__ as train
 from jaxsafe.train.config import resolve_all
@@ -102,7 +103,8 @@ def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:
         (["tasks=docking4d"], "tasks: found 'docking4d'; choose from rejoin2d"),
         (
             ["kinds=[features,plane]"],
-            "kinds: found 'plane'; choose from features, plain, lanes, discrete, rta, punished. Did you mean 'plain'?",
+            "kinds: found 'plane'; choose from features, plain, lanes, quick, discrete, rta, punished."
+            " Did you mean 'plain'?",
         ),
         (["tasks=[]"], "tasks: expected at least one of rejoin2d"),
         (["film=gif"], "film: expected true or false, found 'gif'"),
@@ -121,7 +123,7 @@ def test_every_command_of_the_plan_is_valid() -> None:
     from jaxsafe.envs import with_rta
 
     items = plan([*TASKS], [*KINDS], ["seeds=10"])
-    assert len({item.name for item in items}) == 30
+    assert len({item.name for item in items}) == 35
     for item in items:
         [(config, env, _)] = resolve_all(cli.Arguments.parse(item.words))
         assert config.seeds == 10
@@ -131,3 +133,16 @@ def test_every_command_of_the_plan_is_valid() -> None:
             changed = override(env if rta is None else with_rta(env, item.task, rta), arguments.pop_overrides())
             assert changed.observation_size == env.observation_size
             assert not arguments.options
+
+
+def test_the_wall_time_to_a_level_waits_for_every_seed() -> None:
+    rates = [(None, 1.0), (0.9, 0.9), (0.92, 0.98), (1.0, 1.0)]
+    curves = [
+        {"seed": seed, "step": 10 * index, "success_rate": pair[seed], "wall_s": index + seed / 10}
+        for seed in (0, 1)
+        for index, pair in enumerate(rates)
+    ]
+    assert wall_to(0.95, curves) == 2.1
+    assert wall_to(0.9, curves) == 1.1
+    assert wall_to(0.99, curves) == 3.1
+    assert wall_to(0.99, [row for row in curves if row["step"] < 30]) is None

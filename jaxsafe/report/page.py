@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ class Report:
         self.records = sorted(records, key=lambda record: [*TASKS].index(record.item.task))
         self.own = [(record.item, record.results) for record in self.records]
         self.further = [(record, name, found) for record in self.records for name, found in record.evaluations.items()]
-        self.episodes = records[0].options["training"]["episodes"]
+        self.episodes = {record.item.name: record.options["training"]["episodes"] for record in records}
         self.kinds = [kind for kind in KINDS if any(record.item.kind == kind for record in records)]
         self.tasks = [task for task in TASKS if any(record.item.task == task for record in records)]
 
@@ -43,8 +44,8 @@ class Report:
     def text(self, files: Path) -> str:
         """The page as Markdown; figures that are not in `files` are left out."""
         parts = [
-            self._head(), self._efficiency(), self._final(), self._docking(), self._safety(), self._rta(), self._starts(),
-            self._together(), self._pictures(files), self._settings(),
+            self._head(), self._efficiency(), self._quick(), self._final(), self._docking(), self._safety(), self._rta(),
+            self._starts(), self._together(), self._pictures(files), self._settings(),
         ]  # fmt: skip
         return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -62,8 +63,8 @@ class Report:
             *(f"- **{kind}**: {KINDS[kind].about}" for kind in self.kinds),
             "",
             f"Seeds {one['seed']} to {one['seed'] + one['seeds'] - 1} of every training; all recipes were found on other"
-            f" seeds (100 and above). Evaluations are of {self.episodes:,} episodes a seed from starts that no training"
-            " chose, the same for all policies, with sampled actions (stochastic) and with the policy's mode"
+            f" seeds (100 and above). Evaluations are of {max(self.episodes.values()):,} episodes a seed from starts that"
+            " no training chose, the same for all policies, with sampled actions (stochastic) and with the policy's mode"
             " (deterministic)."
             " In brackets: 95 % percentile-bootstrap intervals over seeds.",
         ])  # fmt: skip
@@ -97,6 +98,25 @@ class Report:
             " wall time is that of the whole command for all seeds: imports, compilation, training, evaluation.",
             ["task", "", "paper", "here", "paper / here", "seeds at 80 %", "steps", "wall [s]", "of it compiling [s]"],
             rows,
+        )
+
+    def _quick(self) -> str:
+        rows = []
+        for record in self.records:
+            if record.item.kind == "quick":
+                reached, found = wall_to(0.95, record.curves), record.results
+                times = f"{reached:.1f}" if reached is not None else "never", f"{found['wall_s']:.1f}"
+                rows.append([record.item.task, f"{found['steps']:,}", *times, f"{found['compile_s']:.1f}"])
+        return (
+            _section(
+                "Wall time",
+                "The short recipes (`preset=quick`), all seeds at once: seconds from the start of the command until 95 % of"
+                " the last 100 training episodes succeeded, on the average over seeds, and until its end.",
+                ["task", "steps", "to 95 % [s]", "whole command [s]", "of it compiling [s]"],
+                rows,
+            )
+            if rows
+            else ""
         )
 
     def _final(self) -> str:
@@ -140,10 +160,10 @@ class Report:
     def _safety(self) -> str:
         rows = []
         for item, found in self.own:
-            cost = found["training_cost"]
+            cost, episodes = found["training_cost"], self.episodes[item.name] * found["seeds"]
             for kind, one in found["evaluation"].items():
                 rows.append([
-                    item.task, item.kind, kind, _rate(one["safety_violation_rate"], self.episodes * found["seeds"]),
+                    item.task, item.kind, kind, _rate(one["safety_violation_rate"], episodes),
                     _percent(one["episode_safety_violation_rate"]),
                     *(f"{100 * one[f'episode_violation_severity_{name}']['mean']:.1f} %" for name in ("mean", "max")),
                     _number(cost, 0) if kind == "stochastic" else "",
@@ -170,7 +190,7 @@ class Report:
                 share = one["intervention_rate"]
                 rows.append([
                     item.task, trained, label, _percent(one["success_rate"]),
-                    _rate(one["safety_violation_rate"], self.episodes * results["seeds"]),
+                    _rate(one["safety_violation_rate"], self.episodes[item.name] * results["seeds"]),
                     _percent(share) if share["mean"] is not None else "–",
                     _number(own["training_cost"], 0) if results is own else "",
                 ])  # fmt: skip
@@ -274,6 +294,16 @@ class Report:
 def _section(title: str, text: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [f"## {title}", "", text, "", f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
     return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
+
+
+def wall_to(level: float, curves: Sequence[Mapping[str, Any]]) -> float | None:
+    """Seconds until the success rate in training, averaged over seeds that all have one, first is at a level."""
+    for _, group in groupby(sorted(curves, key=lambda row: row["step"]), key=lambda row: row["step"]):
+        rows = list(group)
+        rates = [row["success_rate"] for row in rows]
+        if None not in rates and sum(rates) >= level * len(rates):
+            return max(row["wall_s"] for row in rows)
+    return None
 
 
 def _percent(metric: Mapping[str, Any]) -> str:

@@ -30,6 +30,7 @@ KINDS: Mapping[str, Kind] = {
     "features": Kind((), "the recipe of the task: continuous actions, features computed from the observation by the agent"),
     "plain": Kind(("preset=plain",), "the paper's observation straight into the networks"),
     "lanes": Kind(("preset=lanes",), "4,096 environments side by side, for accelerators"),
+    "quick": Kind(("preset=quick",), "fewer epochs and steps, for a result soon; evaluated in 100 episodes a seed"),
     "discrete": Kind(("actions=discrete",), "the recipe with the paper's discrete actions"),
     "rta": Kind(("rta=default",), "the recipe with run time assurance during training (`rta=default`)"),
     "punished": Kind(

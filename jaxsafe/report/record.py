@@ -16,7 +16,7 @@ from jaxsafe.train.files import finite, read_json, read_rows, write_csv, write_j
 POINTS = 100
 """Rows of each seed in the published curves."""
 
-CURVES = ("success_rate", "return", "length", "delta_v", "violating_steps", "cost", "episodes")
+CURVES = ("wall_s", "success_rate", "return", "length", "delta_v", "violating_steps", "cost", "episodes")
 
 Results = dict[str, Any]
 
