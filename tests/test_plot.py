@@ -9,6 +9,7 @@ from matplotlib.image import imread
 from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.__main__ import main
+from jaxsafe.plot.compare import compare_curves
 from jaxsafe.plot.figures import draw_all, speed_distance, training_curves, trajectories
 
 
@@ -126,3 +127,13 @@ def test_several_runs_in_one_figure_with_a_table(
             main([f"run={runs}"])
     with pytest.raises(ConfigError, match="out: means nothing but for several runs"):
         main(["run=ppo", "out=x.png"])
+
+
+def test_comparison_is_logarithmic_only_where_runs_differ_much_in_length():
+    def rows(steps):
+        quantities = dict.fromkeys(("success_rate", "return", "length"), 0.5)
+        return [{"step": step, "wall_s": step / 1e4, "seed": 0, **quantities} for step in (1000, steps)]
+
+    for steps, scale in ((5_000, "linear"), (50_000, "log")):
+        figure = compare_curves({"one": rows(2_000), "other": rows(steps)}, "docking2d")
+        assert {panel.get_xscale() for panel in figure.axes} == {scale}

@@ -16,9 +16,13 @@ from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE
 LOOKS = tuple(product(("-", "--"), (BLUE, ORANGE, GREEN, "#CC79A7", GREY)))
 """Line style and colour of each run in turn."""
 
+FAR = 8.0
+
 
 def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, x: str = "steps") -> Figure:
     """A panel for each quantity, in it the mean and the 95 % interval over seeds of each run.
+
+    The horizontal axis is logarithmic where the longest run is more than `FAR` times as long as the shortest.
 
     Args:
         runs: rows of the progress log by the run's label.
@@ -29,6 +33,8 @@ def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, 
     curves = [curve for curve in CURVES if curve[0] in ALWAYS or any(row.get(curve[0]) for row in every)]
     figure, panels = panel_grid(len(curves), 3.6)
     column, label = AXES[x]
+    ends = [max(row[column] for row in rows) for rows in runs.values()]
+    logarithmic = max(ends) > FAR * min(ends)
     for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
         for (line, colour), (run, rows) in zip(cycle(LOOKS), runs.items(), strict=False):
             at, values = curve_table(rows, column, name)
@@ -38,7 +44,10 @@ def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, 
             if values.shape[1] > 1 and len(at):
                 panel.fill_between(at, *bootstrap_interval(values), color=colour, alpha=0.2, linewidth=0)
         panel.set(xlabel=label, ylabel=quantity)
-        panel.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
+        if logarithmic:
+            panel.set_xscale("log")
+        else:
+            panel.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
         panel.margins(x=0.0)
         if name == "success_rate":
             panel.set_ylim(-3, 103)
