@@ -11,7 +11,7 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.report import __main__ as command
 from jaxsafe.report import run as running
-from jaxsafe.report.page import wall_to
+from jaxsafe.report.page import samples_per_second, wall_to
 from jaxsafe.report.plan import KINDS, Item, plan
 from jaxsafe.train import __main__ as train
 from jaxsafe.train.config import resolve_all
@@ -146,3 +146,9 @@ def test_the_wall_time_to_a_level_waits_for_every_seed() -> None:
     assert wall_to(0.9, curves) == 1.1
     assert wall_to(0.99, curves) == 3.1
     assert wall_to(0.99, [row for row in curves if row["step"] < 30]) is None
+
+
+def test_samples_a_second_are_those_of_all_seeds_after_the_first_update():
+    curves = [{"seed": seed, "step": 100 * i, "wall_s": 20.0 + 2 * i} for seed in (3, 4) for i in (1, 2, 3)]
+    assert samples_per_second(curves) == 2 * 200 / 4
+    assert samples_per_second(curves[:1]) is None

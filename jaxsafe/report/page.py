@@ -44,7 +44,7 @@ class Report:
     def text(self, files: Path) -> str:
         """The page as Markdown; figures that are not in `files` are left out."""
         parts = [
-            self._head(), self._efficiency(), self._quick(), self._final(), self._docking(), self._safety(), self._rta(),
+            self._head(), self._efficiency(), self._wall(), self._final(), self._docking(), self._safety(), self._rta(),
             self._starts(), self._together(), self._pictures(files), self._settings(),
         ]  # fmt: skip
         return "\n\n".join(part for part in parts if part) + "\n"
@@ -100,19 +100,24 @@ class Report:
             rows,
         )
 
-    def _quick(self) -> str:
+    def _wall(self) -> str:
         rows = []
         for record in self.records:
-            if record.item.kind == "quick":
-                reached, found = wall_to(0.95, record.curves), record.results
-                times = f"{reached:.1f}" if reached is not None else "never", f"{found['wall_s']:.1f}"
-                rows.append([record.item.task, f"{found['steps']:,}", *times, f"{found['compile_s']:.1f}"])
+            if record.item.kind in ("quick", "lanes"):
+                reached, pace, found = wall_to(0.95, record.curves), samples_per_second(record.curves), record.results
+                rows.append([
+                    record.item.task, record.item.kind, f"{found['steps']:,}",
+                    f"{reached:.1f}" if reached is not None else "never", f"{found['wall_s']:.1f}",
+                    f"{found['compile_s']:.1f}", f"{pace:,.0f}" if pace is not None else "unknown",
+                ])  # fmt: skip
         return (
             _section(
                 "Wall time",
-                "The short recipes (`preset=quick`), all seeds at once: seconds from the start of the command until 95 % of"
-                " the last 100 training episodes succeeded, on the average over seeds, and until its end.",
-                ["task", "steps", "to 95 % [s]", "whole command [s]", "of it compiling [s]"],
+                "The shortest recipes and those with the most environments, all seeds at once: seconds from the start of"
+                " the command until 95 % of the last 100 training episodes succeeded, on the average over seeds, and until"
+                " its end; and environment steps a second of all seeds together from the first update to the last, with"
+                " their updates and the evaluations between them.",
+                ["task", "", "steps", "to 95 % [s]", "whole command [s]", "of it compiling [s]", "samples/s"],
                 rows,
             )
             if rows
@@ -304,6 +309,13 @@ def wall_to(level: float, curves: Sequence[Mapping[str, Any]]) -> float | None:
         if None not in rates and sum(rates) >= level * len(rates):
             return max(row["wall_s"] for row in rows)
     return None
+
+
+def samples_per_second(curves: Sequence[Mapping[str, Any]]) -> float | None:
+    """Environment steps of all seeds a second of wall time, from the first row to the last; None if there is one."""
+    first, last = ([pick(row[name] for row in curves) for name in ("step", "wall_s")] for pick in (min, max))
+    seeds = len({row["seed"] for row in curves})
+    return seeds * (last[0] - first[0]) / (last[1] - first[1]) if last[1] > first[1] else None
 
 
 def _percent(metric: Mapping[str, Any]) -> str:
