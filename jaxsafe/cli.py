@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -121,6 +123,16 @@ def run(
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         leave(INTERRUPTED)
+
+
+@contextmanager
+def without_collection() -> Iterator[None]:
+    """Hold garbage collection while programs are traced: none of that is garbage, and looking costs a tenth of the time."""
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.enable()
 
 
 def at_once(code: int) -> NoReturn:

@@ -221,6 +221,13 @@ def test_runs_without_a_name_take_the_next_free_one(tmp_path: Path, monkeypatch:
     assert (tmp_path / "runs" / "docking2d-2" / "results.json").exists()
 
 
+def test_evaluation_only_at_the_end_finds_what_evaluation_on_the_way_does(tmp_path: Path, whole: Path) -> None:
+    run = tmp_path / "run"
+    assert command.main([*(word for word in TINY if "eval_every" not in word), "eval_every=1000000", f"out={run}"]) == 0
+    for name in ("eval.jsonl", "episodes.jsonl"):
+        assert logs(run)[name] == [row for row in logs(whole)[name] if row["step"] == 1280]
+
+
 def test_a_policy_file_acts_like_the_trained_network(whole: Path) -> None:
     env, agent, params, about = read_policy(whole / "policy" / "seed_1.npz")
     trained = jax.tree.map(lambda x: x[1], final_state(whole)["state"].params)

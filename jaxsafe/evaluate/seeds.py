@@ -45,7 +45,12 @@ class Evaluator:
         self._recorders: dict[int, Callable[..., Any]] = {}
 
     def prepare(self, params: Params) -> None:
-        """Compile while other work goes on; `params` are those of `run`, or as `SeedMapper.like` describes them."""
+        """Compile while other work goes on; `params` are those of `run`, or as `SeedMapper.like` describes them.
+
+        The second call does nothing.
+        """
+        if isinstance(self._run, Ahead):
+            return
         key, deterministic = jax.random.key(0), np.asarray(True)
         self._run = Ahead(self._run, self._arguments(key, deterministic), params)
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), params)

@@ -60,7 +60,8 @@ def _train(run: Path, path: Path, began: float) -> bool:
             f"{name}: {config.seeds} seeds × {config.num_updates * config.ppo.batch_size:,} steps,"
             f" preset {config.preset}, in {run}"
         )
-        training = Training(config, env, own, began, run)
+        with cli.without_collection():
+            training = Training(config, env, own, began, run)
         if not training.train():
             print(f"stopped at step {training.step:,}; go on with: python -m jaxsafe.train resume={path}")
             return False

@@ -129,7 +129,8 @@ class Training:
             self.state = fresh(self.shared, keys)
             never = self.mapper.place(np.full(self.config.seeds, -1.0, np.float32))
             self.best = {"params": self.state.average, "success": never}
-        self.evaluator.prepare(like.average)
+        if self.config.every(self.config.eval_every) < self.config.num_updates:  # else it can wait for the cores
+            self.evaluator.prepare(like.average)
         self.compile_s += time.monotonic() - begin
 
     def _restore(self, content: Any) -> None:
@@ -174,6 +175,7 @@ class Training:
         self.best = _keep_best(self.best, {"params": self.state.average, "success": success})
 
     def _run_episodes(self, kind: str, num_episodes: int, final: bool) -> Episode:
+        self.evaluator.prepare(self.state.average)
         deterministic = kind == "deterministic"
         episodes = self.evaluator.run(self.state.average, num_episodes, EVALUATION_SEED, deterministic)
         rows = episode_rows(self.env, episodes, self.config.seed, step=self.step, kind=kind, final=final)
