@@ -135,17 +135,17 @@ def test_every_command_of_the_plan_is_valid() -> None:
             assert not arguments.options
 
 
-def test_the_wall_time_to_a_level_waits_for_every_seed() -> None:
-    rates = [(None, 1.0), (0.9, 0.9), (0.92, 0.98), (1.0, 1.0)]
+def test_the_wall_time_to_a_level_waits_for_twenty_episodes_of_every_seed() -> None:
+    rates = [(None, 1.0, 9), (1.0, 1.0, 19), (0.9, 0.9, 20), (0.92, 0.98, 30), (1.0, 1.0, 40)]
     curves = [
-        {"seed": seed, "step": 10 * index, "success_rate": pair[seed], "wall_s": index + seed / 10}
+        {"seed": seed, "step": 10 * index, "success_rate": row[seed], "episodes": row[2], "wall_s": index + seed / 10}
         for seed in (0, 1)
-        for index, pair in enumerate(rates)
+        for index, row in enumerate(rates)
     ]
-    assert wall_to(0.95, curves) == 2.1
-    assert wall_to(0.9, curves) == 1.1
-    assert wall_to(0.99, curves) == 3.1
-    assert wall_to(0.99, [row for row in curves if row["step"] < 30]) is None
+    assert wall_to(0.95, curves) == 3.1
+    assert wall_to(0.9, curves) == 2.1
+    assert wall_to(0.99, curves) == 4.1
+    assert wall_to(0.99, [row for row in curves if row["step"] < 40]) is None
 
 
 def test_samples_a_second_are_those_of_all_seeds_after_the_first_update():

@@ -52,6 +52,6 @@ def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, 
         if name == "success_rate":
             panel.set_ylim(-3, 103)
             panel.axhline(80.0, color="black", linestyle=":", linewidth=1.0)
-    panels[0].legend(loc="lower right", fontsize="small", frameon=False)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(runs), frameon=False)
     figure.suptitle(f"{title}: the last 100 training episodes, mean and 95 % interval over seeds", fontsize="medium")
     return figure

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from jaxsafe.envs import TASKS
-from jaxsafe.metrics import stratified_iqm
+from jaxsafe.metrics import interaction_efficiency, stratified_iqm
 from jaxsafe.plot.compare import compare_curves
+from jaxsafe.plot.figures import curve_table
 from jaxsafe.plot.style import save
 from jaxsafe.report.plan import KINDS, PAPER_STEPS, WITH_RTA, WITHOUT_RTA
 from jaxsafe.report.record import Record
@@ -67,6 +67,11 @@ class Report:
             " no training chose, the same for all policies, with sampled actions (stochastic) and with the policy's mode"
             " (deterministic)."
             " In brackets: 95 % percentile-bootstrap intervals over seeds.",
+            "",
+            "The paper's names (Section 5) of what the tables show: violating steps are its episode safety violation rate,"
+            " episodes with a violation its safety violation rate, severity its episode violation severity, Δv in the L2"
+            " norm its control usage, steps with an intervention its intervention rate. Every metric under its own name is"
+            " in the JSON beside each table's curves.",
         ])  # fmt: skip
 
     def _origins(self) -> list[str]:
@@ -130,15 +135,16 @@ class Report:
         for item, found in self.own:
             evaluation = found["evaluation"]
             each = [evaluation[kind]["success_rate"] for kind in ("stochastic", "deterministic")]
-            failed = sum(min(pair) < 0.95 for pair in zip(*(one["per_seed"] for one in each), strict=True))
+            pairs = enumerate(zip(*(one["per_seed"] for one in each), strict=True), start=found["seed"])
+            failed = [str(seed) for seed, pair in pairs if min(pair) < 0.95]
             rows.append([
                 item.task, item.kind, *(_percent(one) for one in each),
-                f"{100 * min(min(one['per_seed']) for one in each):.1f} %", str(failed) if failed else "none",
+                f"{100 * min(min(one['per_seed']) for one in each):.1f} %", ", ".join(failed) or "none",
                 *(_number(evaluation["deterministic"][name]) for name in ("average_return", "episode_length")),
             ])  # fmt: skip
         return _section(
             "After training",
-            "Success rate, the worst seed's, how many seeds failed (below 95 %, stochastic or deterministic), and the"
+            "Success rate, the worst seed's, which seeds failed (below 95 %, stochastic or deterministic), and the"
             " return and length [s] of deterministic episodes. Averages are over all seeds, those that failed included.",
             ["task", "", "success, stochastic", "success, deterministic", "worst seed", "failed seeds", "return", "length"],
             rows,
@@ -166,19 +172,20 @@ class Report:
     def _safety(self) -> str:
         rows = []
         for item, found in self.own:
-            cost, episodes = found["training_cost"], self.episodes[item.name] * found["seeds"]
+            cost, starts = found["training_cost"], self.episodes[item.name]
             for kind, one in found["evaluation"].items():
                 rows.append([
-                    item.task, item.kind, kind, _rate(one["safety_violation_rate"], episodes),
+                    item.task, item.kind, kind, _rate(one["safety_violation_rate"], starts, found["seeds"]),
                     _percent(one["episode_safety_violation_rate"]),
                     *(f"{100 * one[f'episode_violation_severity_{name}']['mean']:.1f} %" for name in ("mean", "max")),
                     _number(cost, 0) if kind == "stochastic" else "",
                 ])  # fmt: skip
         return _section(
             "Safety",
-            "Episodes with a violation (beside a zero its 95 % upper bound by the rule of three), violating steps,"
-            " severity: the excess as a share of the limit, mean over violating steps and maximum over episodes, averaged"
-            " over seeds; and how many steps of the whole training violated a constraint, per seed.",
+            "Episodes with a violation (beside a zero its 95 % upper bound by the rule of three; all seeds have the same"
+            " starts, so it counts them once), violating steps, severity: the excess as a share of the limit, mean over"
+            " violating steps and maximum over episodes, averaged over seeds, 0 for a seed without a violation; and how"
+            " many steps violated a constraint in the episodes that ended in training, per seed.",
             ["task", "", "", "episodes with a violation", "violating steps", "severity, mean", "maximum", "training cost"],
             rows,
         )
@@ -196,7 +203,7 @@ class Report:
                 share = one["intervention_rate"]
                 rows.append([
                     item.task, trained, label, _percent(one["success_rate"]),
-                    _rate(one["safety_violation_rate"], self.episodes[item.name] * results["seeds"]),
+                    _rate(one["safety_violation_rate"], self.episodes[item.name], results["seeds"]),
                     _percent(share) if share["mean"] is not None else "–",
                     _number(own["training_cost"], 0) if results is own else "",
                 ])  # fmt: skip
@@ -204,7 +211,7 @@ class Report:
             _section(
                 "Run time assurance",
                 "Policies trained without and with the filter, flown without and with it (stochastic). The training cost"
-                " counts the violating steps of the whole training, per seed.",
+                " counts the violating steps of the episodes that ended in training, per seed.",
                 [
                     "task",
                     "trained",
@@ -303,13 +310,11 @@ def _section(title: str, text: str, heads: Sequence[str], rows: Sequence[Sequenc
 
 
 def wall_to(level: float, curves: Sequence[Mapping[str, Any]]) -> float | None:
-    """Seconds until the success rate in training, averaged over seeds that all have one, first is at a level."""
-    for _, group in groupby(sorted(curves, key=lambda row: row["step"]), key=lambda row: row["step"]):
-        rows = list(group)
-        rates = [row["success_rate"] for row in rows]
-        if None not in rates and sum(rates) >= level * len(rates):
-            return max(row["wall_s"] for row in rows)
-    return None
+    """Seconds until the success rate in training reaches a level, by the definition of Table 2."""
+    steps, rates = curve_table(curves, "step", "success_rate")
+    _, episodes = curve_table(curves, "step", "episodes")
+    reached = interaction_efficiency(steps, rates, episodes, level)["timesteps"]
+    return None if reached is None else max(row["wall_s"] for row in curves if row["step"] == reached)
 
 
 def samples_per_second(curves: Sequence[Mapping[str, Any]]) -> float | None:
@@ -329,6 +334,6 @@ def _number(metric: Mapping[str, Any], digits: int = 2) -> str:
     return f"{metric['mean']:,.{digits}f} [{low:,.{digits}f}, {high:,.{digits}f}]"
 
 
-def _rate(metric: Mapping[str, Any], episodes: int) -> str:
-    """A share of episodes; a zero with the bound that it proves."""
-    return _percent(metric) if metric["mean"] else f"0 of {episodes:,} (< {300 / episodes:.2g} %)"
+def _rate(metric: Mapping[str, Any], starts: int, seeds: int) -> str:
+    """A share of episodes; a zero with the bound that it proves, of starts: all seeds have the same."""
+    return _percent(metric) if metric["mean"] else f"0 of {starts * seeds:,} (< {300 / starts:.2g} %)"
