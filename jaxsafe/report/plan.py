@@ -27,7 +27,11 @@ class Kind(NamedTuple):
 
 
 KINDS: Mapping[str, Kind] = {
-    "features": Kind((), "the recipe of the task: continuous actions, features computed from the observation by the agent"),
+    "features": Kind(
+        (),
+        "the recipe of the task: continuous actions, features computed from the observation by the agent; in rejoin the"
+        " critic also sees the totals of the reward terms so far, and training episodes end after 300 steps",
+    ),
     "plain": Kind(("preset=plain",), "the paper's observation straight into the networks"),
     "lanes": Kind(("preset=lanes",), "4,096 environments side by side, for accelerators"),
     "quick": Kind(("preset=quick",), "fewer epochs and steps, for a result soon; evaluated in 100 episodes a seed"),
