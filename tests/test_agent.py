@@ -1,3 +1,6 @@
+from collections.abc import Iterator
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -72,3 +75,29 @@ def test_the_critic_sees_the_totals_in_any_order_and_the_actor_does_not() -> Non
     shapes = jax.tree.map(jnp.shape, [normalise(agent).init(KEY, env) for agent in (blind, seeing)])
     assert shapes[0]["actor"] == shapes[1]["actor"]
     assert shapes[1]["critic"][0]["kernel"][0] == shapes[0]["critic"][0]["kernel"][0] + len(env.reward)
+
+
+def test_networks_of_many_seeds_are_orthogonalised_one_by_one_with_the_same_numbers() -> None:
+    """Many at once have hung: see `_orthogonal`."""
+    env, agent = jaxsafe.make("docking2d"), normalise(Agent(features="docking"))
+    init, keys = lambda key: agent.init(key, env), jax.random.split(jax.random.key(0), 3)
+    shapes = [
+        list(value.aval.shape)
+        for jaxpr in _inner(jax.make_jaxpr(jax.vmap(init))(keys).jaxpr)
+        for equation in jaxpr.eqns
+        if equation.primitive.name in ("geqrf", "qr", "householder_product")
+        for value in equation.outvars
+    ]
+    assert shapes
+    assert max(len(shape) for shape in shapes) == 2
+    many = jax.jit(jax.vmap(init))(keys)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a[1], b, atol=1e-6), many, init(keys[1]))
+
+
+def _inner(jaxpr: Any) -> Iterator[Any]:
+    yield jaxpr
+    for equation in jaxpr.eqns:
+        for value in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")):
+            inner = getattr(value, "jaxpr", value)
+            if hasattr(inner, "eqns"):
+                yield from _inner(inner)

@@ -165,8 +165,13 @@ def _layers(normals: Sequence[Array], last_gain: float) -> list[Params]:
     ]
 
 
+@jax.custom_batching.sequential_vmap
 def _orthogonal(normal: Float[Array, "m n"]) -> Float[Array, "m n"]:
-    """Orthonormal rows or columns, whichever are fewer, uniform over all such matrices: Q of QR, signs of diag R."""
+    """Orthonormal rows or columns, whichever are fewer, uniform over all such matrices: Q of QR, signs of diag R.
+
+    One at a time even under `vmap`: a QR of many on a CPU waits, in a thread of XLA's pool, for other threads of that pool,
+    so as many at once as there are cores wait forever (jaxlib 0.10).
+    """
     q, r = jnp.linalg.qr(normal if normal.shape[0] >= normal.shape[1] else normal.T)
     q = q * jnp.sign(jnp.diagonal(r))
     return q if q.shape == normal.shape else q.T
