@@ -17,6 +17,10 @@ LOOKS = tuple(product(("-", "--"), (BLUE, ORANGE, GREEN, "#CC79A7", GREY)))
 """Line style and colour of each run in turn."""
 
 FAR = 8.0
+"""Between lengths of runs that one linear axis cannot show together."""
+
+LEGEND = 7
+"""Names in a row of the legend, at most."""
 
 
 def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, x: str = "steps") -> Figure:
@@ -52,6 +56,7 @@ def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, 
         if name == "success_rate":
             panel.set_ylim(-3, 103)
             panel.axhline(80.0, color="black", linestyle=":", linewidth=1.0)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(runs), frameon=False)
+    columns = min(len(runs), LEGEND)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=columns, frameon=False)
     figure.suptitle(f"{title}: the last 100 training episodes, mean and 95 % interval over seeds", fontsize="medium")
     return figure
