@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal, TypeVar
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Int
 
 from jaxsafe.environment import Environment, reset, step
+from jaxsafe.renewal import choose, renew
 from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.types import Key, State, TimeStep
-
-Tree = TypeVar("Tree")
-
-FEW = 32
-"""Of a large batch, one lane in so many gets a new start at little cost."""
 
 Policy = Callable[[Key, Array], Array]
 """`policy(key, observation) -> action`, batched where the observations are."""
@@ -101,49 +97,15 @@ def step_or_reset_batch(
     timestep = cut_short(state, timestep, max_episode_steps)
     first = shard.first(action.shape[axis])
 
-    def draw(lanes: Array) -> tuple[State, Array]:
+    def draw(parameters: tuple[Environment, Key, Array], lanes: Array) -> tuple[State, Array]:
+        env, key, first = parameters
         fresh_state, fresh = _starts(env, key, first + lanes, axis)
         return fresh_state, fresh.observation
 
-    return renew(timestep.done, draw, (state, timestep.observation), axis), timestep
-
-
-def renew(where: Bool[Array, " n"], draw: Callable[[Array], Tree], old: Tree, axis: Literal[0, -1] = 0) -> Tree:
-    """The lanes of `old`, those where `where` holds replaced by `draw(lanes)`; lanes are the first axis, or the last.
-
-    Drawing a start costs many times a step. With few lanes most steps end no episode, with many most end a few: nothing is
-    drawn, or starts for one lane in `FEW`, or, if that is not enough, for all.
-    """
-    size = where.shape[0]
-    few, count = size // FEW, jnp.sum(where)
-
-    def none(old: Tree) -> Tree:
-        return old
-
-    def some(old: Tree) -> Tree:
-        lanes = jnp.nonzero(where, size=few, fill_value=size)[0]  # beyond the last lane: dropped
-        place = lanes if axis == 0 else (..., lanes)
-        return jax.tree.map(lambda x, new: x.at[place].set(new, mode="drop"), old, draw(lanes))
-
-    def every(old: Tree) -> Tree:
-        return choose(where, draw(jnp.arange(size)), old, axis)
-
-    if size < 8 * FEW:  # one more program, which takes as long to compile, does not pay
-        return jax.lax.cond(count > 0, every, none, old)
-    return jax.lax.switch(jnp.int32(count > 0) + (count > few), [none, some, every], old)
+    return renew(timestep.done, draw, (env, key, first), (state, timestep.observation), axis), timestep
 
 
 def cut_short(state: State, timestep: TimeStep, max_episode_steps: Array | float) -> TimeStep:
     """The time step, truncated if its episode is still running after `max_episode_steps`."""
     cut = ~timestep.done & (state.num_steps >= max_episode_steps)
     return timestep.replace(truncated=timestep.truncated | cut)
-
-
-def choose(where: Array, fresh: Tree, old: Tree, axis: Literal[0, -1] = 0) -> Tree:
-    """One of two trees lane by lane; `where` has the leading axes of all their leaves, or with `axis=-1` the last."""
-
-    def one(a: Array, b: Array) -> Array:
-        inner = a.ndim - where.ndim if axis == 0 else 0
-        return jnp.where(where.reshape(where.shape + (1,) * inner), a, b)
-
-    return jax.tree.map(one, fresh, old)

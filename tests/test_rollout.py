@@ -1,7 +1,5 @@
 """Episodes back to back: fresh starts, true last observations, and batches that are many single environments."""
 
-from typing import Literal
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -10,7 +8,7 @@ import pytest
 
 import jaxsafe
 from jaxsafe import Environment
-from jaxsafe.rollout import renew, reset_batch, step_or_reset, step_or_reset_batch
+from jaxsafe.rollout import reset_batch, step_or_reset, step_or_reset_batch
 from jaxsafe.simulation.cwh import cwh_flow
 from jaxsafe.types import State, TimeStep
 
@@ -145,25 +143,6 @@ def test_every_kind_of_end_is_followed_by_a_start(ends: str) -> None:
         assert int(after.num_steps) == expected
         assert bool(getattr(timestep, ends)) == (expected == 0)
         assert np.array_equal(observation, timestep.observation) == (expected != 0)
-
-
-@pytest.mark.parametrize("axis", [0, -1])
-@pytest.mark.parametrize("count", [0, 1, 16, 17, 512])
-def test_lanes_are_renewed_alike_however_many_they_are(count: int, axis: Literal[0, -1]) -> None:
-    def turned(x: jax.Array) -> jax.Array:
-        return jnp.moveaxis(x, 0, axis)
-
-    def draw(lanes: jax.Array) -> dict[str, jax.Array]:
-        return {"a": turned(1.0 + lanes[:, None] + jnp.zeros((len(lanes), 3))), "b": -lanes}
-
-    old = {"a": turned(jnp.zeros((512, 3))), "b": jnp.arange(512)}
-    where = jnp.zeros(512, bool).at[jax.random.permutation(jax.random.key(0), 512)[:count]].set(True)
-    found = jax.jit(renew, static_argnums=(1, 3))(where, draw, old, axis)
-    lanes = np.arange(512)
-    np.testing.assert_array_equal(
-        jnp.moveaxis(found["a"], axis, 0), np.where(where, 1.0 + lanes, 0.0)[:, None] * np.ones(3)
-    )
-    np.testing.assert_array_equal(found["b"], np.where(where, -lanes, lanes))
 
 
 def test_environments_may_be_the_last_axis(env: Environment) -> None:

@@ -14,7 +14,7 @@ from jaxtyping import Array
 from jaxsafe.adapters import environment
 from jaxsafe.environment import Environment, reset, step
 from jaxsafe.errors import ConfigError, missing
-from jaxsafe.rollout import choose
+from jaxsafe.renewal import choose
 from jaxsafe.types import Key, TimeStep
 
 try:

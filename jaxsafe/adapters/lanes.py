@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.rollout import cut_short, renew
+from jaxsafe.renewal import renew
+from jaxsafe.rollout import cut_short
 from jaxsafe.types import State, TimeStep
 
 
@@ -163,7 +164,12 @@ def pack(packing: Packing, tree: Any) -> Array:
 def restart(layout: Layout, env: Array, keys: Array, words: Array, mask: Array) -> tuple[Array, Array]:
     """The next keys and words, with a new episode where the mask says."""
     running = (keys, layout.episodes.unpack(words))
-    keys, episodes = renew(mask, lambda lanes: _start(layout.env.unpack(env), keys[lanes]), running)
+
+    def draw(parameters: tuple[Array, Array], lanes: Array) -> tuple[Array, Episodes]:
+        env, keys = parameters
+        return _start(layout.env.unpack(env), keys[lanes])
+
+    keys, episodes = renew(mask, draw, (env, keys), running)
     return keys, layout.episodes.pack(episodes)
 
 

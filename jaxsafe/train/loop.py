@@ -20,7 +20,7 @@ import numpy as np
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.seeds import KINDS, Evaluator, episode_rows
 from jaxsafe.metrics import Episode
-from jaxsafe.rollout import choose
+from jaxsafe.renewal import choose
 from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.train import hosts, memory, ppo, window
 from jaxsafe.train.ahead import Ahead

@@ -1,0 +1,56 @@
+"""New starts for some lanes of a batch: the same as a draw for every lane, however many there are."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsafe
+from jaxsafe.renewal import LARGE, LEAST, SHARE, renew
+from jaxsafe.rollout import reset_batch, step_or_reset_batch
+
+SIZES = (24, LARGE, 1000, 1031)  # few, many, no power of two, a prime
+
+
+@pytest.mark.parametrize("axis", [0, -1])
+@pytest.mark.parametrize("size", SIZES)
+def test_lanes_are_renewed_alike_however_many_they_are(size: int, axis: Literal[0, -1]) -> None:
+    def turned(x: jax.Array) -> jax.Array:
+        return jnp.moveaxis(x, 0, axis)
+
+    def draw(offset: jax.Array, lanes: jax.Array) -> dict[str, jax.Array]:
+        return {"a": turned(offset + lanes[:, None] + jnp.zeros((len(lanes), 3))), "b": -lanes}
+
+    old = {"a": turned(jnp.zeros((size, 3))), "b": jnp.arange(size)}
+    lanes, program = np.arange(size), jax.jit(renew, static_argnums=(1, 4))
+    order = np.random.default_rng(0).permutation(size)
+    chunk = max(LEAST, size // SHARE)
+    for chosen in (order[:0], order[:1], order[:chunk], order[: chunk + 1], lanes[-chunk:], lanes):
+        where = np.isin(lanes, chosen)
+        found = program(jnp.asarray(where), draw, jnp.ones(()), old, axis)
+        np.testing.assert_array_equal(
+            jnp.moveaxis(found["a"], axis, 0), np.where(where, 1.0 + lanes, 0.0)[:, None] * np.ones(3)
+        )
+        np.testing.assert_array_equal(found["b"], np.where(where, -lanes, lanes))
+
+
+@pytest.mark.parametrize("num_envs", [16, LARGE])
+def test_gradients_reach_the_starts_of_batches_of_any_size(num_envs: int) -> None:
+    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 1.0})
+    state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(0), num_envs)
+    state = state.replace(num_steps=jnp.arange(num_envs) % 2)
+
+    def total(least: jax.Array) -> tuple[jax.Array, jax.Array]:
+        wide = jaxsafe.override(env, {"deputy.start.position.distance": jnp.stack([least, jnp.float32(150.0)])})
+        (after, _), timestep = step_or_reset_batch(wide, state, jnp.zeros((num_envs, 2)), jax.random.key(1))
+        fresh = jnp.linalg.norm(after.sim.platforms["deputy"].position, axis=-1)[timestep.done]
+        return jnp.sum(fresh), fresh
+
+    for derivative in (jax.grad, jax.jacfwd):
+        slope, distances = derivative(total, has_aux=True)(jnp.float32(100.0))
+        assert len(distances) == num_envs // 2
+        np.testing.assert_allclose(slope, np.sum((150.0 - distances) / 50.0), rtol=1e-4)  # d = low + (high − low) u
