@@ -4,7 +4,8 @@ Random continuous actions, automatic reset, everything inside one compiled scan;
 repeats. Each row is a process of its own, pinned to one core; peers run in Python environments that this script builds in
 `benchmarks/peers`. `docking3d:usual_way` is the same task with what most JAX environments do: a key for every environment
 at every step, and a start drawn whether it is needed or not. Rows that end in `:one_action` draw actions once and take
-them at every step, so that the environment is alone in the loop. Peers are other and mostly smaller tasks: gymnax's
+them at every step, so that the environment is alone in the loop; `docking3d:no_reset` does so too and goes on where an
+episode ended. Peers are other and mostly smaller tasks: gymnax's
 CartPole and Pendulum, Brax's inverted pendulum (spring), and CartPole of Gymnasium (NumPy) and EnvPool (one thread), which
 get the same actions at every step. Writes `benchmarks/results/environments.json` and prints the README's table:
 
@@ -26,7 +27,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from isolated import interpreter, probe, several, words
+from isolated import interpreter, probe, several, versions, words
 
 import jaxsafe
 from jaxsafe.envs import TASKS
@@ -40,7 +41,7 @@ NUM_STEPS = 1000
 """Steps of each lane in one measurement, so that resets have their share; 200 times as many for one."""
 
 SLOW_STEPS = 2_000_000
-"""Steps of all environments together in one measurement of what is called from Python or by far slower than the tasks."""
+"""Steps of all environments together in one measurement of what is called from Python."""
 
 
 def main() -> None:
@@ -62,18 +63,19 @@ def main() -> None:
             found = probe(__file__, request, 1, python[name.partition(":")[0]])
             results.append({"task": name, "lanes": num, **found})
             print(f"{name} × {num:,}: {found['steps_per_s']:,.0f}", file=sys.stderr)
-    content = {**here, "pinned_to": 1, "released_steps_per_s": RELEASED, "runs": results}
+    content = {**here, "peers": versions(python), "pinned_to": 1, "released_steps_per_s": RELEASED, "runs": results}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
     print(table(results, lanes))
 
 
-def task(name: str, num_envs: int, repeats: int, one_action: bool = False) -> dict[str, Any]:
+def task(name: str, num_envs: int, repeats: int, one_action: bool = False, reset: bool = True) -> dict[str, Any]:
     """One of the five."""
-    return compiled(functools.partial(episode_steps, jaxsafe.make(name), one_action=one_action), num_envs, repeats)
+    run = functools.partial(episode_steps, jaxsafe.make(name), one_action=one_action, reset=reset)
+    return compiled(run, num_envs, repeats)
 
 
 def episode_steps(
-    env: jaxsafe.Environment, key: jax.Array, num_envs: int, num_steps: int, one_action: bool = False
+    env: jaxsafe.Environment, key: jax.Array, num_envs: int, num_steps: int, one_action: bool = False, reset: bool = True
 ) -> jax.Array:
     """Steps with random actions; the sum of rewards, costs and of what a policy would see, so that none is left out."""
     state, timestep = reset_batch(env, key, num_envs, axis=-1)
@@ -83,7 +85,11 @@ def episode_steps(
     def one(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
         key_action, key_reset = jax.random.split(key)
         action = first if one_action else draw(key_action)
-        carry, timestep = step_or_reset_batch(env, carry[0], action, key_reset, axis=-1)
+        if reset:
+            carry, timestep = step_or_reset_batch(env, carry[0], action, key_reset, axis=-1)
+        else:
+            state, timestep = jax.vmap(jaxsafe.step, in_axes=(None, -1, -1), out_axes=-1)(env, carry[0], action)
+            carry = (state, timestep.observation)
         return carry, jnp.sum(timestep.reward) + jnp.sum(timestep.cost) + jnp.sum(carry[1])
 
     return jnp.sum(jax.lax.scan(one, (state, timestep.observation), jax.random.split(key, num_steps))[1])
@@ -144,7 +150,7 @@ def brax(num_envs: int, repeats: int) -> dict[str, Any]:
 
         return jnp.sum(jax.lax.scan(one, env.reset(key), jax.random.split(key, num_steps))[1])
 
-    return compiled(run, num_envs, repeats, SLOW_STEPS // 10)
+    return compiled(run, num_envs, repeats, NUM_STEPS // 10)  # far slower than the tasks
 
 
 def gymnasium(num_envs: int, repeats: int) -> dict[str, Any]:
@@ -163,10 +169,9 @@ def envpool(num_envs: int, repeats: int) -> dict[str, Any]:
     return called(lambda: env.step(action), num_envs, repeats)
 
 
-def compiled(run: Callable, num_envs: int, repeats: int, most: int | None = None) -> dict[str, Any]:
-    """Compile once, then time; with `most`, that many steps of all environments together."""
-    num_steps = NUM_STEPS * (200 if num_envs == 1 else 1)
-    num_steps = num_steps if most is None else max(10, most // num_envs)
+def compiled(run: Callable, num_envs: int, repeats: int, num_steps: int = NUM_STEPS) -> dict[str, Any]:
+    """Compile once, then time; each lane makes so many steps, 200 times as many if it is the only one."""
+    num_steps *= 200 if num_envs == 1 else 1
     begin = time.perf_counter()
     program = jax.jit(run, static_argnums=(1, 2)).lower(jax.random.key(0), num_envs, num_steps).compile()
     compile_s = time.perf_counter() - begin
@@ -213,6 +218,7 @@ def table(results: list[dict[str, Any]], lanes: list[int]) -> str:
 RUNS: dict[str, Callable[[int, int], dict[str, Any]]] = {
     **{name: functools.partial(task, name) for name in TASKS},
     "docking3d:one_action": functools.partial(task, "docking3d", one_action=True),
+    "docking3d:no_reset": functools.partial(task, "docking3d", one_action=True, reset=False),
     "docking3d:usual_way": usual_way,
     **{f"gymnax:{name}": functools.partial(gymnax, name) for name in ("Pendulum-v1", "CartPole-v1")},
     "gymnax:Pendulum-v1:one_action": functools.partial(gymnax, "Pendulum-v1", one_action=True),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -63,6 +64,19 @@ def interpreter(name: str) -> str:
             shutil.rmtree(place, ignore_errors=True)  # the next run builds it again
             raise
     return str(python)
+
+
+def versions(names: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Of each peer's environment: what pip installed there for it, and what that computes with."""
+    ask = "import json, sys; from importlib.metadata import distributions as all; "
+    ask += "print(json.dumps({one.name.lower(): one.version for one in all() if one.name.lower() in sys.argv[1:]}))"
+    found = {}
+    for name in names:
+        wanted = [re.split("[=<>]", word)[0] for word in PEERS.get(name, []) if not word.startswith("-")]
+        if name in PEERS:
+            command = [interpreter(name), "-c", ask, *wanted, "jax", "jaxlib", "numpy", "gymnasium", "torch"]
+            found[name] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    return found
 
 
 def probe(

@@ -23,7 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from isolated import interpreter, probe, several, words
+from isolated import interpreter, probe, several, versions, words
 
 OUT = Path(__file__).parent / "results" / "ppo.json"
 NUM_ENVS, NUM_STEPS, NUM_EPOCHS, NUM_MINIBATCHES, HIDDEN, UPDATES = 2048, 32, 4, 8, (64, 64), 8
@@ -55,7 +55,9 @@ def main() -> None:
             )
     rows = [{"peer": name, "cores": count, "samples_per_s": rates} for (name, count), rates in found.items()]
     OUT.parent.mkdir(exist_ok=True)
-    OUT.write_text(json.dumps({**here, "task": task, "repeats": repeats, "runs": rows}, indent=1) + "\n")
+    OUT.write_text(
+        json.dumps({**here, "peers": versions(python), "task": task, "repeats": repeats, "runs": rows}, indent=1) + "\n"
+    )
     print(f"| {task}, thousand samples/s | 1 core | {cores[-1]} cores |\n|---|---|---|")
     for name in names:
         rates = [f"{statistics.median(found[name, n]) / 1e3:.3g}" if (name, n) in found else "–" for n in cores]

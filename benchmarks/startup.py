@@ -5,7 +5,8 @@ program is a step with automatic reset in 64 lanes, of the tasks and of gymnax's
 the task's recipe, its fresh state and its updates together.
 
 The second table is the time from the first import to the first result: a batched reset and step, docking3d beside
-Pendulum-v1 of gymnax, and an update of PPO on docking2d with the settings of `ppo.py`, beside rejax. Cold is with an empty
+Pendulum-v1 of gymnax, and an update of PPO on docking2d with the settings of `ppo.py`, beside rejax, whose task it is too,
+through `jaxsafe.adapters.gymnax`: so rejax also pays for importing and making ours. Cold is with an empty
 cache of compiled programs, warm with what the process before left there. Peers run in Python environments that this script
 builds in `benchmarks/peers`. Writes `benchmarks/results/startup.json` and prints the tables:
 
@@ -25,7 +26,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from isolated import interpreter, several, words
+from isolated import interpreter, several, versions, words
 from isolated import probe as apart
 
 OUT = Path(__file__).parent / "results" / "startup.json"
@@ -50,7 +51,15 @@ def main() -> None:
     rows = [measured(name, rta, repeats) for name, rta in chosen]
     rows.append(measured("Pendulum-v1", "gymnax", repeats, interpreter("gymnax")))
     first = [first_result(name, repeats) for name in FIRST]
-    content = {**here, "unit": "s", "repeats": repeats, "columns": COLUMNS, "rows": rows, "first": first}
+    content = {
+        **here,
+        "peers": versions(["gymnax", "rejax"]),
+        "unit": "s",
+        "repeats": repeats,
+        "columns": COLUMNS,
+        "rows": rows,
+        "first": first,
+    }
     OUT.write_text(json.dumps(content, indent=1) + "\n")
     print("| s | " + " | ".join(COLUMNS) + " |\n|---|" + "---|" * len(COLUMNS))
     for row in rows:
@@ -125,9 +134,6 @@ def _jaxsafe(task: str, rta: str, tick: Callable[[], None]) -> None:
 def _gymnax(name: str, tick: Callable[[], None]) -> None:
     import jax
 
-    from jaxsafe.train.seeds import claim_cores
-
-    claim_cores()
     gymnax = importlib.import_module("gymnax")
     tick()
     env, params = gymnax.make(name)
