@@ -46,30 +46,29 @@ def test_two_processes_train_what_one_trains(whole: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_two_processes_share_one_seed(tmp_path: Path) -> None:
-    one = ["seeds=1", "steps=320", "ppo.num_minibatches=1", "devices_per_seed=2"]  # of five updates, with TINY's batches
-    words = [word for word in TINY if not word.startswith(("seeds=", "steps="))]
-    processes = start(tmp_path, *words, *one, f"out={tmp_path / 'two'}")
+@pytest.mark.parametrize(("seeds", "devices"), [(1, (1, 1)), (2, (2, 2))])  # between processes; in each, which is faster
+def test_two_processes_whose_devices_share_seeds(seeds: int, devices: tuple[int, ...], tmp_path: Path) -> None:
+    shared = [f"seeds={seeds}", "steps=320", "ppo.num_minibatches=1", "devices_per_seed=2"]  # five updates of TINY's batches
+    words = [word for word in TINY if not word.startswith(("seeds=", "steps="))] + shared
+    processes = start(tmp_path, *words, f"out={tmp_path / 'two'}", devices=devices)
     assert [process.wait(300) for process in processes] == [0, 0], (tmp_path / "log0").read_text()
-    assert main([*words, *one, f"out={tmp_path / 'one'}"]) == 0
-    found, expected = (np.load(tmp_path / name / "policy" / "seed_0.npz") for name in ("two", "one"))
-    assert list(found) == list(expected)
-    for name in found:
-        if found[name].dtype.kind == "f":
-            np.testing.assert_allclose(found[name], expected[name], atol=1e-4)
+    assert main([*words, f"out={tmp_path / 'one'}"]) == 0
+    for seed in range(seeds):
+        found, expected = (np.load(tmp_path / name / "policy" / f"seed_{seed}.npz") for name in ("two", "one"))
+        assert list(found) == list(expected)
+        for name in found:
+            if found[name].dtype.kind == "f":
+                np.testing.assert_allclose(found[name], expected[name], atol=1e-4)
+
+
+def test_a_lost_process_ends_the_run(tmp_path: Path) -> None:
+    lose_one(tmp_path, tmp_path / "run")
 
 
 @pytest.mark.slow
-def test_a_lost_process_ends_the_run_and_another_number_goes_on(tmp_path: Path) -> None:
+def test_another_number_goes_on_after_a_process_is_lost(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    processes = start(tmp_path, *LONG, f"out={run}")
-    grows(run, processes[0])
-    processes[1].kill()
-    processes[1].wait()
-    assert processes[0].wait(60) == 2
-    told = (tmp_path / "log0").read_text().splitlines()[-1]
-    assert told.startswith("error: distributed: another process of this run has ended")
-    assert f"resume={run}" in told
+    lose_one(tmp_path, run)
     alone = subprocess.Popen([sys.executable, "-m", "jaxsafe.train", f"resume={run}"], stdout=subprocess.PIPE, text=True)
     grows(run, alone)
     alone.send_signal(signal.SIGINT)
@@ -78,6 +77,18 @@ def test_a_lost_process_ends_the_run_and_another_number_goes_on(tmp_path: Path) 
     grows(run, three[0])
     three[2].send_signal(signal.SIGTERM)  # one of them is asked to stop: all do
     assert [process.wait(60) for process in three] == [130] * 3
+
+
+def lose_one(place: Path, run: Path) -> None:
+    """Two processes train until the second is killed; the first ends with one line that says how to go on."""
+    processes = start(place, *LONG, f"out={run}")
+    grows(run, processes[0])
+    processes[1].kill()
+    processes[1].wait()
+    assert processes[0].wait(60) == 2
+    told = (place / "log0").read_text().splitlines()[-1]
+    assert told.startswith("error: distributed: another process of this run has ended")
+    assert f"resume={run}" in told
 
 
 def grows(run: Path, process: subprocess.Popen) -> None:

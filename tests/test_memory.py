@@ -1,3 +1,4 @@
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -7,6 +8,7 @@ import pytest
 from jaxsafe.errors import ConfigError
 from jaxsafe.train import hosts, memory
 from jaxsafe.train.__main__ import main
+from jaxsafe.tune.__main__ import main as tune
 
 
 def test_a_training_that_would_not_fit_is_refused_before_it_starts(tmp_path: Path) -> None:
@@ -17,6 +19,43 @@ def test_a_training_that_would_not_fit_is_refused_before_it_starts(tmp_path: Pat
         main(words)
     with pytest.raises(ConfigError, match=r"ppo.num_envs × ppo.num_steps: expected less than 2³¹, found 8,000,000,000"):
         main([*words[:-2], "ppo.num_envs=1000000000", "ppo.num_steps=8"])
+
+
+@pytest.mark.parametrize("command", [main, tune])
+def test_the_batch_of_an_update_is_counted(command: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available", lambda: 4 * 2**20)  # enough for the state, not for the update
+    sizes = ["ppo.num_envs=1024", "ppo.num_steps=32", "ppo.num_minibatches=8", "steps=65536", "agent.hidden=[8]"]
+    words = ["env=docking2d", "seeds=1", f"out={tmp_path / 'run'}", *sizes]
+    if command is tune:
+        words.append("sweep.ppo.gamma=[0.9,0.95]")
+    with pytest.raises(ConfigError, match=r"ppo.num_envs, .*: this training needs [\d.]+ GiB of memory, 0.0 GiB are free"):
+        command(words)
+
+
+def test_processes_of_one_machine_share_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available", lambda: 10 * memory.GIB)
+    monkeypatch.setattr(hosts, "beside", lambda: 4)
+    with pytest.raises(ConfigError, match=r"x: this training needs 16.0 GiB of memory, 10.0 GiB are free"):
+        memory.require(2 * memory.GIB, 2, "x")
+
+
+@pytest.mark.parametrize(("version", "path"), [(2, "/job/step"), (1, "/job/step"), (2, "/elsewhere")])
+def test_limits_of_control_groups_are_known(
+    version: int, path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    controllers = {2: "", 1: "memory"}[version]
+    _, limit, used, cache = memory.GROUPS[controllers]
+    for group, most, now in (("", "max", 900), ("job", "1000", 700), ("job/step", "2000", 600)):
+        place = tmp_path / group
+        place.mkdir(exist_ok=True)
+        (place / limit).write_text(f"{most}\n")
+        (place / used).write_text(f"{now}\n")
+        (place / "memory.stat").write_text(f"{cache} 50\nother 7\n")
+    monkeypatch.setitem(memory.GROUPS, controllers, (str(tmp_path), limit, used, cache))
+    lines = memory._lines
+    own = ["3:cpu:/x", f"{2 - version}:{controllers}:{path}"]
+    monkeypatch.setattr(memory, "_lines", lambda name: own if name == "/proc/self/cgroup" else lines(name))
+    assert memory._container() == (1000 - 700 + 50 if path == "/job/step" else None)
 
 
 def test_devices_of_one_machine_share_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,7 +6,9 @@ Each runs the same program on its own devices; process 0 writes the run director
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
+import platform
 import re
 import shutil
 import tempfile
@@ -78,6 +80,16 @@ def anyone(wants: bool) -> bool:
     from jax.experimental.multihost_utils import process_allgather
 
     return bool(np.any(process_allgather(np.asarray(wants))))
+
+
+def beside() -> int:
+    """How many processes of this run are on this machine, this one included."""
+    if jax.process_count() == 1:
+        return 1
+    from jax.experimental.multihost_utils import process_allgather
+
+    name = np.frombuffer(hashlib.sha256(platform.node().encode()).digest()[:8], np.int32)
+    return int(np.sum(np.all(process_allgather(name) == name, axis=-1)))
 
 
 def gather(x: Any) -> np.ndarray:

@@ -13,6 +13,12 @@ from jaxsafe.types import is_key
 
 GIB = 2**30
 
+GROUPS = {
+    "": ("/sys/fs/cgroup", "memory.max", "memory.current", "inactive_file"),
+    "memory": ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+}
+"""By controllers as in /proc/self/cgroup, version 2 and 1: where groups are, and what says limit, use and cache."""
+
 
 def size(shapes: Any) -> int:
     """Bytes of all arrays of a tree, or of their shapes."""
@@ -36,10 +42,10 @@ def require(needed: int, devices: int, what: str) -> None:
         what: the options that decide it.
 
     Raises:
-        ConfigError: the devices do not have as much left; on a CPU they share what the machine has.
+        ConfigError: the devices do not have as much left; CPU devices of all processes on a machine share what it has.
     """
     free = available()
-    total = needed * devices if jax.local_devices()[0].platform == "cpu" else needed
+    total = needed * devices * hosts.beside() if jax.local_devices()[0].platform == "cpu" else needed
     short = free is not None and total > free
     if hosts.anyone(short):
         found = f"{free / GIB:,.1f} GiB are free" if free is not None and short else "another process has less"
@@ -64,8 +70,26 @@ def _machine() -> int | None:
 
 
 def _container() -> int | None:
-    limit, used = ("".join(_lines(f"/sys/fs/cgroup/memory.{name}")) for name in ("max", "current"))
-    return int(limit) - int(used) if limit.strip().isdigit() and used.strip().isdigit() else None
+    """What the control groups of this process leave it, version 1 or 2: the least of its own and of those around it."""
+    known = []
+    for line in _lines("/proc/self/cgroup"):
+        _, controllers, path = line.split(":", 2)
+        if controllers not in GROUPS:
+            continue
+        root, limit, used, cache = GROUPS[controllers]
+        group = Path(path.lstrip("/"))
+        for inner in {group, *group.parents}:  # of a container, the file system may show only the root
+            known.append(_left(Path(root) / inner, limit, used, cache))
+    return min((free for free in known if free is not None), default=None)
+
+
+def _left(group: Path, limit: str, used: str, cache: str) -> int | None:
+    """The limit of a control group, less what is used and not a cache that can be dropped."""
+    most, now = ("".join(_lines(str(group / name))).strip() for name in (limit, used))
+    if not (most.isdigit() and now.isdigit()):
+        return None
+    dropped = [int(line.split()[1]) for line in _lines(str(group / "memory.stat")) if line.startswith(f"{cache} ")]
+    return int(most) - int(now) + sum(dropped)
 
 
 def _lines(path: str) -> list[str]:

@@ -13,7 +13,8 @@ import numpy as np
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.evaluate.seeds import BATCH, KINDS, in_batches, metrics_per_seed
 from jaxsafe.metrics import Episode, interaction_efficiency
-from jaxsafe.train.loop import EVALUATION_SEED, begin, chunk
+from jaxsafe.train import memory
+from jaxsafe.train.loop import EVALUATION_SEED, MEMORY, begin, chunk
 from jaxsafe.train.seeds import SeedMapper
 from jaxsafe.tune.settings import Setting, alike, lane
 from jaxsafe.types import Key
@@ -50,7 +51,7 @@ class Lanes:
         self.mapper = SeedMapper(self.at_once * self.seeds)
         self.length = -(-like.config.num_updates // CHUNKS)
         self._init = self.mapper.map(lambda _, one: begin(*one))
-        self._advance = self.mapper.map(self._one_chunk)
+        self._advance: Any = None  # compiled with the first lanes
         self._evaluate = self.mapper.map(_one_evaluation)
 
     def run(self, some: Sequence[Setting], tick: Callable[[int], object]) -> list[dict[str, Any]]:
@@ -58,8 +59,9 @@ class Lanes:
         places = self.mapper.pad(np.arange(self.at_once * self.seeds))
         trees = [lane(some[min(place // self.seeds, len(some) - 1)]) for place in places]
         lanes = self.mapper.place(jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees))
-        keys = jax.vmap(jax.random.key)(jnp.asarray(self.like.config.seed + places % self.seeds))
-        state = self._init((), (lanes, self.mapper.place(keys)))
+        keys = self.mapper.place(jax.vmap(jax.random.key)(jnp.asarray(self.like.config.seed + places % self.seeds)))
+        self._advance = self._advance or self._fitting(lanes, keys)
+        state = self._init((), (lanes, keys))
         curves = []
         for first in range(0, self.like.config.num_updates, self.length):
             count = min(self.length, self.like.config.num_updates - first)
@@ -71,6 +73,14 @@ class Lanes:
         split = lambda table: table.reshape(self.at_once, self.seeds, *table.shape[1:])[: len(some)]  # noqa: E731
         curve, sums = jax.tree.map(split, (curve, sums))
         return [self._result(setting, *jax.tree.map(lambda x, i=i: x[i], (curve, sums))) for i, setting in enumerate(some)]
+
+    def _fitting(self, lanes: Any, keys: jax.Array) -> jax.stages.Compiled:
+        """The program of some updates, refused before there is a state if either needs more memory than there is."""
+        like = self.mapper.like(jax.eval_shape(self._init, (), (lanes, keys)))
+        memory.require(memory.size(like) // self.mapper.mesh.size, self.mapper.num_local_devices, MEMORY)
+        compiled = self.mapper.map(self._one_chunk).lower((), (lanes, like)).compile()
+        memory.require(memory.footprint(compiled), self.mapper.num_local_devices, MEMORY)
+        return compiled
 
     def _one_chunk(self, _: tuple, one: tuple[Any, Any]) -> tuple[Any, dict[str, jax.Array]]:
         return chunk(*one, self.length, self.like.config.num_updates)
