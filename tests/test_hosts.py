@@ -48,7 +48,7 @@ def test_two_processes_train_what_one_trains(whole: Path, tmp_path: Path) -> Non
 @pytest.mark.slow
 @pytest.mark.parametrize(("seeds", "devices"), [(1, (1, 1)), (2, (2, 2))])  # between processes; in each, which is faster
 def test_two_processes_whose_devices_share_seeds(seeds: int, devices: tuple[int, ...], tmp_path: Path) -> None:
-    shared = [f"seeds={seeds}", "steps=320", "ppo.num_minibatches=1", "devices_per_seed=2"]  # five updates of TINY's batches
+    shared = [f"seeds={seeds}", "steps=320", "ppo.num_minibatches=1", "devices_per_seed=2"]  # five updates
     words = [word for word in TINY if not word.startswith(("seeds=", "steps="))] + shared
     processes = start(tmp_path, *words, f"out={tmp_path / 'two'}", devices=devices)
     assert [process.wait(300) for process in processes] == [0, 0], (tmp_path / "log0").read_text()
