@@ -228,14 +228,18 @@ class Report:
         )
 
     def _starts(self) -> str:
-        rows = [
-            [record.item.task, name,
-             *(_percent(found["evaluation"][kind]["success_rate"]) for kind in found["evaluation"]),
-             *(_percent(found["evaluation"]["deterministic"][metric])
-               for metric in ("safety_violation_rate", "episode_safety_violation_rate")),
-             _number(found["evaluation"]["deterministic"]["episode_length"])]
-            for record, name, found in self.further if name not in (WITH_RTA, WITHOUT_RTA)
-        ]  # fmt: skip
+        rows = []
+        for record, name, found in self.further:
+            if name in (WITH_RTA, WITHOUT_RTA):
+                continue
+            one = found["evaluation"]["deterministic"]
+            rows.append([
+                record.item.task, name,
+                *(_percent(found["evaluation"][kind]["success_rate"]) for kind in found["evaluation"]),
+                *(_percent(one[metric]) for metric in ("safety_violation_rate", "episode_safety_violation_rate")),
+                f"{100 * one['episode_violation_severity_max']['mean']:.1f} %",
+                _number(one["average_return"]), _number(one["control_usage_l1"]), _number(one["episode_length"], 1),
+            ])  # fmt: skip
         return (
             _section(
                 "Starts outside training",
@@ -248,7 +252,10 @@ class Report:
                     "deterministic",
                     "episodes with a violation",
                     "violating steps",
-                    "length",
+                    "severity, maximum",
+                    "return",
+                    "Δv, L1 [m/s]",
+                    "length [s]",
                 ],
                 rows,
             )
@@ -330,6 +337,8 @@ def _percent(metric: Mapping[str, Any]) -> str:
 
 
 def _number(metric: Mapping[str, Any], digits: int = 2) -> str:
+    if metric["mean"] is None:
+        return "–"
     low, high = metric["ci95"]
     return f"{metric['mean']:,.{digits}f} [{low:,.{digits}f}, {high:,.{digits}f}]"
 
