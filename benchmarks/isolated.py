@@ -71,11 +71,10 @@ def versions(names: Iterable[str]) -> dict[str, dict[str, str]]:
     ask = "import json, sys; from importlib.metadata import distributions as all; "
     ask += "print(json.dumps({one.name.lower(): one.version for one in all() if one.name.lower() in sys.argv[1:]}))"
     found = {}
-    for name in names:
-        wanted = [re.split("[=<>]", word)[0] for word in PEERS.get(name, []) if not word.startswith("-")]
-        if name in PEERS:
-            command = [interpreter(name), "-c", ask, *wanted, "jax", "jaxlib", "numpy", "gymnasium", "torch"]
-            found[name] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+    for name in sorted(set(names) & set(PEERS)):
+        wanted = [re.split("[=<>]", word)[0] for word in PEERS[name] if not word.startswith("-")]
+        command = [interpreter(name), "-c", ask, *wanted, "jax", "jaxlib", "numpy", "gymnasium", "torch"]
+        found[name] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
     return found
 
 

@@ -78,7 +78,7 @@ def _container() -> int | None:
             continue
         root, limit, used, cache = GROUPS[controllers]
         group = Path(path.lstrip("/"))
-        for inner in {group, *group.parents}:  # of a container, the file system may show only the root
+        for inner in (group, *group.parents):  # of a container, the file system may show only the root
             known.append(_left(Path(root) / inner, limit, used, cache))
     return min((free for free in known if free is not None), default=None)
 
