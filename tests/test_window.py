@@ -6,7 +6,7 @@ import pytest
 import jaxsafe
 from jaxsafe.metrics import Episode, begin
 from jaxsafe.rollout import reset_batch
-from jaxsafe.train.window import SIZE, empty_window, latest_cost, means, push
+from jaxsafe.train.window import SIZE, empty_window, latest_cost, means, push, total_cost
 
 ENV = jaxsafe.make("docking2d")
 
@@ -38,6 +38,21 @@ def test_the_cost_counts_the_violating_steps_of_all_finished_episodes() -> None:
     done = jnp.asarray(np.arange(300).reshape(150, 2) % 3 == 0)
     window = push(push(empty_window(episodes), episodes, done), episodes, done)
     assert int(window.cost) == 2 * sum(range(0, 300, 3))
+
+
+def test_the_cost_of_the_training_counts_every_violating_step_once() -> None:
+    rng = np.random.default_rng(2)
+    window, counted, before = empty_window(episodes_like(np.zeros(1, np.float32))), 0, np.zeros(3, int)
+    for _ in range(20):
+        violated, done = rng.random((5, 3)) < 0.5, rng.random((5, 3)) < 0.2
+        rows = []
+        for step in range(5):
+            rows.append(before + violated[step])
+            before = np.where(done[step], 0, rows[-1])
+        episodes = episodes_like(np.zeros((5, 3), np.float32)).replace(violating_steps=jnp.asarray(np.stack(rows)))
+        window = jax.jit(push)(window, episodes, jnp.asarray(done))
+        counted += violated.sum()
+        assert int(total_cost(window)) == counted
 
 
 def test_a_batch_with_more_episodes_than_the_window_leaves_its_last_ones() -> None:

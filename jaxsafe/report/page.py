@@ -185,7 +185,7 @@ class Report:
             "Episodes with a violation (beside a zero its 95 % upper bound by the rule of three; all seeds have the same"
             " starts, so it counts them once), violating steps, severity: the excess as a share of the limit, mean over"
             " violating steps and maximum over episodes, averaged over seeds, 0 for a seed without a violation; and how"
-            " many steps violated a constraint in the episodes that ended in training, per seed.",
+            " many steps of the training violated a constraint, per seed.",
             ["task", "", "", "episodes with a violation", "violating steps", "severity, mean", "maximum", "training cost"],
             rows,
         )
@@ -211,7 +211,7 @@ class Report:
             _section(
                 "Run time assurance",
                 "Policies trained without and with the filter, flown without and with it (stochastic). The training cost"
-                " counts the violating steps of the episodes that ended in training, per seed.",
+                " counts the violating steps of the whole training, per seed.",
                 [
                     "task",
                     "trained",

@@ -229,7 +229,7 @@ def chunk(
     def one(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
         going = state.num_updates < limit
         state = jax.lax.cond(going, lambda s: ppo.update(env, agent, hyper, limit, s, shard), lambda s: s, state)
-        counts = {"update": state.num_updates, "count": state.window.count, "cost": state.window.cost}
+        counts = {"update": state.num_updates, "count": state.window.count, "cost": window.total_cost(state.window)}
         if agent.cost_critic:
             counts["multiplier"] = state.multiplier
         return state, {**counts, **window.means(state.window, env.outcomes)}

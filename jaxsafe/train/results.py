@@ -43,7 +43,7 @@ def finish(training: Training, config: TrainConfig, env: Environment, name: str)
         "compile_s": round(training.compile_s, 2),
         "versions": versions(),
         "interaction_efficiency": _efficiency(training),
-        "training_cost": over_seeds(training.log.curve("cost")[1][-1].tolist()),  # violating steps of finished episodes
+        "training_cost": over_seeds(training.log.curve("cost")[1][-1].tolist()),  # violating steps
         "evaluation": evaluation(env, episodes),
     }
     write_json(training.run / "results.json", results)

@@ -14,21 +14,23 @@ SIZE = 100
 
 
 class Window(Record):
-    """A ring of the last `SIZE` finished episodes, and counts over all finished ones."""
+    """A ring of the last `SIZE` finished episodes, and counts over all."""
 
     episodes: Episode  # each field [SIZE]; slots never filled are zero
     count: Int[Array, ""]  # episodes
     cost: Int[Array, ""]  # steps with a violation
+    running_cost: Int[Array, ""]  # those of the episodes that still run
 
 
 def empty_window(like: Episode) -> Window:
     """A window in which no episode has finished yet; `like` gives dtypes."""
     episodes = jax.tree.map(lambda x: jnp.zeros(SIZE, x.dtype), like)
-    return Window(episodes, jnp.zeros((), jnp.int32), jnp.zeros((), jnp.int32))
+    none = jnp.zeros((), jnp.int32)
+    return Window(episodes, none, none, none)
 
 
 def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
-    """Add those of [num_steps, num_envs] episodes that are done, in order of time."""
+    """Add those of [num_steps, num_envs] episodes that are done, in order of time; those of the last step run on."""
     finished = done.ravel()
     order = jnp.cumsum(finished) - 1
     latest = finished & (order >= order[-1] + 1 - SIZE)
@@ -36,7 +38,13 @@ def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
     row = jnp.full(SIZE, -1).at[slot].set(jnp.arange(slot.size), mode="drop")  # one scatter, which is dear to compile
     ring = jax.tree.map(lambda old, new: jnp.where(row < 0, old, new.ravel()[row]), window.episodes, episodes)
     cost = jnp.sum(jnp.where(done, episodes.violating_steps, 0))
-    return Window(ring, window.count + order[-1] + 1, window.cost + cost)
+    running_cost = jnp.sum(jnp.where(done[-1], 0, episodes.violating_steps[-1]))
+    return Window(ring, window.count + order[-1] + 1, window.cost + cost, running_cost)
+
+
+def total_cost(window: Window) -> Array:
+    """Violating steps since the start of the training: those of finished episodes and of the episodes that still run."""
+    return window.cost + window.running_cost
 
 
 def latest_cost(window: Window, number: int = 25) -> Array:
