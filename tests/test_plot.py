@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from matplotlib.patches import Circle
 
+import jaxsafe
 from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.__main__ import main
@@ -74,6 +76,30 @@ def test_trajectories_have_a_panel_for_each_plane(dimension: int, panels: int) -
     axes = [panel for panel in figure.axes if panel.get_xlabel() == "x [m]"]
     assert len(axes) == panels
     np.testing.assert_allclose(axes[0].lines[0].get_xdata(), np.linspace(80.0, 0.0, 20))
+
+
+def test_paths_are_seen_from_the_lead_along_its_heading_with_the_region_that_it_carries() -> None:
+    env = jaxsafe.make("rejoin2d")
+    heading = np.linspace(0.0, 2.0, 30)  # the lead flies a turn, the wingman keeps 300 ft behind and 100 ft aside of it
+    lead = 1e4 * np.stack([np.sin(heading), 1.0 - np.cos(heading)], axis=1)
+    ahead, aside = np.stack([np.cos(heading), np.sin(heading)], 1), np.stack([-np.sin(heading), np.cos(heading)], 1)
+    rows = [
+        {
+            "platforms": {
+                "lead": {"position": list(p), "heading": h},
+                "wingman": {"position": list(p - 300 * a + 100 * b)},
+            },
+            "regions": {"rejoin_region": {"position": list(p - 250 * a + 433 * b)}},
+        }
+        for p, h, a, b in zip(lead, heading, ahead, aside, strict=True)
+    ]
+    panel = trajectories([(100, rows)], "title", "ft", env.regions).axes[0]
+    np.testing.assert_allclose(panel.lines[0].get_xydata(), np.tile([-300.0, 100.0], (30, 1)), atol=1e-6)
+    (region,) = panel.patches
+    assert isinstance(region, Circle)
+    np.testing.assert_allclose(region.center, [-250.0, 433.0], atol=1e-6)
+    assert region.radius == float(env.regions[0].radius)
+    assert panel.get_xlabel() == "x along the heading of the lead [ft]"
 
 
 def test_the_speed_limit_is_drawn_from_the_log() -> None:

@@ -151,12 +151,13 @@ def metrics_per_seed(env: Environment, episodes: Episode) -> dict[str, list[floa
 
 def _step_row(env: Environment, state: Any, timestep: Any, t: int) -> dict[str, Any]:
     info = timestep.info
-    platforms = {name: {field: value[t] for field, value in vars(one).items()} for name, one in state.sim.platforms.items()}
     assurance = {} if info.rta is None else {"intervening": info.intervening, **vars(info.rta)}
     pick = lambda tree: {name: _plain(value[t]) for name, value in tree.items()}  # noqa: E731
+    sim = state.sim
     return {
-        "t": _plain(state.sim.time[t]),
-        "platforms": {name: {field: _plain(value) for field, value in one.items()} for name, one in platforms.items()},
+        "t": _plain(sim.time[t]),
+        "platforms": {name: pick(vars(one)) for name, one in sim.platforms.items()},
+        "regions": {name: {"position": _plain(one.position[t])} for name, one in sim.regions.items()},
         "control_desired": dict(zip(env.action_names, _plain(info.control_desired[t]), strict=True)),
         "control_actual": dict(zip(env.action_names, _plain(info.control_actual[t]), strict=True)),
         "status": pick(info.status),

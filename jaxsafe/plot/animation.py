@@ -11,12 +11,22 @@ import jax
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from jaxsafe.environment import Environment
-from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, labelled, length_unit, margin_unit
+from jaxsafe.plot.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    centre_patch,
+    labelled,
+    length_unit,
+    margin_unit,
+    region_patch,
+)
 from jaxsafe.processors.constraint import Separation
 from jaxsafe.processors.status import Distance
 from jaxsafe.train.files import write_bytes
@@ -89,7 +99,7 @@ class Scene:
                 end = path[step] + 0.12 * reach * self._axes[name][step, plane]
                 axis.set_data(*np.stack([path[step], end], axis=1))
             for region, patch in artists["regions"].items():
-                _move(patch, (sim.regions[region].position - self.origin)[step][list(plane)])
+                centre_patch(patch, (sim.regions[region].position - self.origin)[step][list(plane)])
             panel.set(xlim=(-reach, reach), ylim=(-reach, reach))
         for line, (at, values) in self.lines:
             line.set_data(at[: step + 1], values[: step + 1])
@@ -115,7 +125,7 @@ class Scene:
             panel.yaxis.set_major_locator(MaxNLocator(4))
             artists: dict[str, dict[str, Any]] = {"platforms": {}, "regions": {}}
             for region in self.env.regions:
-                artists["regions"][region.name] = panel.add_patch(_patch(region, j == 2))
+                artists["regions"][region.name] = panel.add_patch(region_patch(region, j == 2))
             for radius in self._kept_away():
                 panel.add_patch(Circle((0.0, 0.0), radius, color=ORANGE, alpha=0.35, linewidth=0))
             for name in self.paths:
@@ -160,18 +170,3 @@ def _axis(platform: Any) -> np.ndarray:
         return np.asarray(jax.vmap(lambda one: one.orientation[:, 0])(platform))
     velocity = np.asarray(platform.velocity)
     return velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
-
-
-def _patch(region: Any, from_the_side: bool) -> Any:
-    style = {"color": GREEN, "alpha": 0.35, "linewidth": 0}
-    if from_the_side and hasattr(region, "height"):
-        size = (2.0 * float(region.radius), float(region.height))
-        return Rectangle((-size[0] / 2.0, -size[1] / 2.0), *size, **style)
-    return Circle((0.0, 0.0), float(getattr(region, "radius", 0.0)), **style)
-
-
-def _move(patch: Any, centre: np.ndarray) -> None:
-    if isinstance(patch, Circle):
-        patch.set_center((float(centre[0]), float(centre[1])))
-    else:
-        patch.set_xy((float(centre[0]) - patch.get_width() / 2.0, float(centre[1]) - patch.get_height() / 2.0))

@@ -15,12 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from jaxsafe.config import from_data, yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.interventions import interventions, most_altered
-from jaxsafe.plot.style import BLUE, GREY, ORANGE, length_unit, save
+from jaxsafe.plot.style import BLUE, GREY, ORANGE, centre_patch, length_unit, region_patch, save
 from jaxsafe.train.files import read_rows
 from jaxsafe.train.log import NEEDS
 
@@ -52,7 +53,7 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
     episodes = _episodes(run / "episodes.jsonl")
     if episodes:
         env = from_data(content["environment"], "environment")
-        figures["trajectories"] = trajectories(episodes, title, length_unit(env))
+        figures["trajectories"] = trajectories(episodes, title, length_unit(env), env.regions)
         if {"docking_distance", "speed", "velocity_limit"} <= episodes[0][1][0]["status"].keys():
             figures["speed_distance"] = speed_distance(episodes, title)
         if "rta" in episodes[-1][1][0]:
@@ -101,20 +102,33 @@ def panel_grid(count: int, width: float) -> tuple[Figure, np.ndarray]:
     return figure, panels
 
 
-def trajectories(episodes: Episodes, title: str, unit: str) -> Figure:
-    """Paths of the agent relative to the other platform, from purple early in training to green at its end."""
-    paths = [(step, _relative_path(rows)) for step, rows in episodes]
+def trajectories(episodes: Episodes, title: str, unit: str, regions: Sequence[Any] = ()) -> Figure:
+    """Paths of the agent relative to the other platform, from purple early in training to green at its end.
+
+    Where the other platform has a heading, x is along it: its own motion and turn do not show, and a region that it carries
+    rests.
+    """
+    paths = [(step, _relative_path(rows, _agent(rows))) for step, rows in episodes]
+    last = episodes[-1][1]
+    first = next(iter(last[0]["platforms"]))
     planes = [(0, 1)] if paths[0][1].shape[1] == 2 else [(0, 1), (0, 2)]
     figure = Figure(figsize=(5.4 * len(planes) + 0.8, 4.9), layout="constrained")
     panels = np.atleast_1d(figure.subplots(1, len(planes)))
     colours, colour = _colours(paths)
     for panel, (i, j) in zip(panels, planes, strict=True):
+        for region in regions:
+            if region.name in last[-1].get("regions", {}):  # logs of older versions have none
+                patch = panel.add_patch(region_patch(region, j == 2))
+                centre_patch(patch, _relative_path(last[-1:], region.name)[0, [i, j]])
+                patch.set_label(region.name)
         for step, path in paths:
             panel.plot(path[:, i], path[:, j], color=colour(step), linewidth=1.2)
             panel.plot(path[0, i], path[0, j], "o", color=colour(step), markersize=3)
-        panel.plot(0, 0, "*", color=ORANGE, markersize=12, label=next(iter(episodes[0][1][0]["platforms"])), zorder=3)
-        panel.set(xlabel=f"{'xyz'[i]} [{unit}]", ylabel=f"{'xyz'[j]} [{unit}]", aspect="equal")
+        panel.plot(0, 0, "*", color=ORANGE, markersize=12, label=first, zorder=3)
+        along = f" along the heading of the {first}" if "heading" in last[0]["platforms"][first] else ""
+        panel.set(xlabel=f"x{along} [{unit}]", ylabel=f"{'xyz'[j]} [{unit}]", aspect="equal")
         panel.set_adjustable("datalim")
+        panel.xaxis.set_major_locator(MaxNLocator(5))
     panels[0].legend(loc="best", fontsize="small", frameon=False)
     figure.colorbar(colours, ax=list(panels), label="environment steps of training")
     figure.suptitle(f"{title}: deterministic episodes of the first seed", fontsize="medium")
@@ -183,11 +197,23 @@ def _episodes(path: Path) -> Episodes:
     return [(step, rows) for (step, _, _), rows in grouped.items()]
 
 
-def _relative_path(rows: list[dict[str, Any]]) -> np.ndarray:
-    """Positions of the agent, the platform that was listed last, relative to the first, (steps, d)."""
-    first, *_, agent = rows[0]["platforms"]
-    positions = [np.array([row["platforms"][name]["position"] for row in rows], float) for name in (agent, first)]
-    return positions[0] - positions[1]  # a null, from a training that diverged, is nan here and leaves a gap
+def _agent(rows: list[dict[str, Any]]) -> str:
+    """The platform that was listed last."""
+    return list(rows[0]["platforms"])[-1]
+
+
+def _relative_path(rows: list[dict[str, Any]], of: str) -> np.ndarray:
+    """Positions of a platform or region relative to the first platform, turned by its heading if it has one, (steps, d)."""
+    first = next(iter(rows[0]["platforms"]))
+    everything = [{**row.get("regions", {}), **row["platforms"]} for row in rows]
+    path, origin = (np.array([one[name]["position"] for one in everything], float) for name in (of, first))
+    path = path - origin  # a null, from a training that diverged, is nan here and leaves a gap
+    if "heading" in rows[0]["platforms"][first]:
+        heading = np.array([row["platforms"][first]["heading"] for row in rows], float)
+        ahead, aside = np.cos(heading), np.sin(heading)
+        x, y = path[:, 0].copy(), path[:, 1].copy()
+        path[:, 0], path[:, 1] = ahead * x + aside * y, ahead * y - aside * x
+    return path
 
 
 def _colours(episodes: Sequence[tuple[int, Any]]) -> tuple[ScalarMappable, Any]:

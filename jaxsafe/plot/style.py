@@ -6,7 +6,9 @@ import io
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Rectangle
 
 from jaxsafe.processors.constraint import Separation, SpeedLimit
 from jaxsafe.train.files import write_bytes
@@ -35,6 +37,23 @@ def margin_unit(constraint: Any, length: str) -> str | None:
 def labelled(quantity: str, unit: str | None) -> str:
     """The label of an axis."""
     return f"{quantity} [{unit}]" if unit else quantity
+
+
+def region_patch(region: Any, from_the_side: bool) -> Any:
+    """The area of a region around the origin, seen from above or from the side, where one with a height is a rectangle."""
+    style = {"color": GREEN, "alpha": 0.35, "linewidth": 0}
+    if from_the_side and hasattr(region, "height"):
+        size = (2.0 * float(region.radius), float(region.height))
+        return Rectangle((-size[0] / 2.0, -size[1] / 2.0), *size, **style)
+    return Circle((0.0, 0.0), float(getattr(region, "radius", 0.0)), **style)
+
+
+def centre_patch(patch: Any, centre: np.ndarray) -> None:
+    """Move what `region_patch` made; centre [2]."""
+    if isinstance(patch, Circle):
+        patch.set_center((float(centre[0]), float(centre[1])))
+    else:
+        patch.set_xy((float(centre[0]) - patch.get_width() / 2.0, float(centre[1]) - patch.get_height() / 2.0))
 
 
 def save(figure: Figure, path: Path) -> Path:
