@@ -11,6 +11,8 @@ from typing import Any
 
 import jax
 
+from jaxsafe.origin import processor
+
 
 def about() -> dict[str, Any]:
     """Commit, versions, device and number of cores that may be used; to be asked before what is measured begins."""
@@ -21,7 +23,7 @@ def about() -> dict[str, Any]:
         "jax": jax.__version__,
         "jaxlib": version("jaxlib"),
         "device": jax.devices()[0].device_kind,
-        "processor": _processor(),
+        "processor": processor(),
         "cores": usable_cores(),
     }
 
@@ -34,11 +36,3 @@ def usable_cores() -> int:
 def _git(*words: str) -> str:
     command = ["git", "-C", str(Path(__file__).resolve().parent.parent), *words]
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor())

@@ -12,6 +12,7 @@ from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate.seeds import Evaluator, episode_rows
 from jaxsafe.evaluate.subject import Subject
+from jaxsafe.origin import versions
 from jaxsafe.train import directory
 from jaxsafe.train.files import append_rows, write_json
 from jaxsafe.train.results import evaluation
@@ -46,7 +47,7 @@ def evaluate(
     for kind, one in sums.items():
         rows = episode_rows(env, one, subject.facts["seed"], step=subject.facts["steps"], kind=kind, final=True)
         append_rows(path / "eval.jsonl", rows)
-    results = {**subject.facts, **request, "versions": directory.versions(), "evaluation": evaluation(env, sums)}
+    results = {**subject.facts, **request, "versions": versions(), "evaluation": evaluation(env, sums)}
     write_json(path / "results.json", results)
     for kind in kinds if render else ():
         _render(subject, evaluator, seed, kind, path)

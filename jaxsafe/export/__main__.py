@@ -28,7 +28,7 @@ def main(argv: Sequence[str]) -> int:
     import jax.numpy as jnp
 
     from jaxsafe.export import functions
-    from jaxsafe.train.directory import versions
+    from jaxsafe.origin import versions
     from jaxsafe.train.files import write_bytes
 
     arguments = cli.Arguments.parse(argv)

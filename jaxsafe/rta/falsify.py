@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxsafe import cli
+from jaxsafe import cli, origin
 
 OPTIONS = ("env", "rta", "steps", "lanes", "seed", "policies", "actions", "variant", "out")
 
@@ -67,13 +67,14 @@ def main(argv: Sequence[str]) -> int:
     env = make(task, changes, **options)
     if not env.constraints:
         raise ConfigError(f"env: {task} has no safety constraint")
+    facts: dict[str, Any] = {"command": " ".join(["python -m jaxsafe.rta.falsify", *argv]), "commit": origin.commit()}
+    facts |= {"versions": origin.versions(), "env": task, **options, "seed": seed}
     rows = []
     for name in policies if isinstance(policies, list) else [policies]:
         rows.append(attack(env, name, -(-steps // lanes), lanes, jax.random.key(seed)))
         print(report(rows[-1:]).splitlines()[1] if len(rows) > 1 else "\n".join(report(rows).splitlines()[:2]), flush=True)
         if out:  # after each, so that nothing is lost if the run is stopped
-            facts = {"env": task, **options, "seed": seed, "policies": rows}
-            write_text(Path(out), json.dumps(facts, indent=1) + "\n")
+            write_text(Path(out), json.dumps({**facts, "policies": rows}, indent=1, ensure_ascii=False) + "\n")
     if report(rows).splitlines()[-1].endswith("confidence"):
         print(report(rows).splitlines()[-1])
     if out:

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import platform
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
-
-import jax
 
 import jaxsafe.config
 from jaxsafe.component import normalise
@@ -17,6 +12,7 @@ from jaxsafe.config.convert import to_component, to_data
 from jaxsafe.environment import Environment
 from jaxsafe.envs import TASKS
 from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.origin import versions
 from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.files import write_text
 
@@ -94,17 +90,6 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
     config = normalise(to_component(content["training"], TrainConfig, f"{place}training"))
     env = jaxsafe.config.from_data(content["environment"], f"{place}environment")
     return config, env, str(content["env"])
-
-
-def versions() -> dict[str, Any]:
-    """What ran: package and library versions, Python, and the kind and number of devices."""
-    packages = ("jaxsafe", "jax", "jaxlib", "numpy", "optax", "orbax-checkpoint")
-    found = {name: importlib.metadata.version(name) for name in packages}
-    return {
-        **found,
-        "python": platform.python_version(),
-        "device": f"{len(jax.devices())} × {jax.devices()[0].device_kind}",
-    }
 
 
 def _next_free(parent: Path, name: str) -> Path:

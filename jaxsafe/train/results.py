@@ -9,8 +9,8 @@ from typing import Any
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.seeds import metrics_over_seeds
 from jaxsafe.metrics import Episode, interaction_efficiency, over_seeds
+from jaxsafe.origin import versions
 from jaxsafe.train.config import TrainConfig
-from jaxsafe.train.directory import versions
 from jaxsafe.train.files import read_json, write_json
 from jaxsafe.train.loop import Training
 from jaxsafe.train.policy import save_policy

@@ -12,6 +12,7 @@ import numpy as np
 from jaxsafe.cli import Arguments
 from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError
+from jaxsafe.origin import versions
 from jaxsafe.train import directory
 from jaxsafe.train.files import append_rows, keep_rows, write_csv, write_json, write_text
 
@@ -28,7 +29,7 @@ LONGEST = 36
 def create(out: str | None, request: Mapping[str, Any]) -> Path:
     """Make the directory of a sweep and write down what was asked for."""
     path = directory.make(out, Path("runs"), f"tune_{Path(str(request['env'])).stem}")
-    write_text(path / "sweep.yaml", yaml.write({"request": dict(request), "versions": directory.versions()}))
+    write_text(path / "sweep.yaml", yaml.write({"request": dict(request), "versions": versions()}))
     return path
 
 
