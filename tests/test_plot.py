@@ -11,7 +11,7 @@ import jaxsafe
 from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.__main__ import main
-from jaxsafe.plot.compare import compare_curves
+from jaxsafe.plot.compare import compare_curves, seed_curves
 from jaxsafe.plot.figures import draw_all, speed_distance, training_curves, trajectories
 
 
@@ -163,3 +163,14 @@ def test_comparison_is_logarithmic_only_where_runs_differ_much_in_length():
     for steps, scale in ((5_000, "linear"), (50_000, "log")):
         figure = compare_curves({"one": rows(2_000), "other": rows(steps)}, "docking2d")
         assert {panel.get_xscale() for panel in figure.axes} == {scale}
+
+
+def test_every_seed_has_its_line_and_those_that_failed_are_counted() -> None:
+    failing = [{**row, "success_rate": 0.3} if row["seed"] == 8 else {**row, "success_rate": 0.9} for row in rows(500)]
+    figure = seed_curves({"one": failing, "other": rows(500)}, "docking2d")
+    seeds = {row["seed"] for row in failing}
+    assert [len(panel.lines) for panel in figure.axes] == [len(seeds) + 1] * 2  # and the 80 % line
+    assert figure.axes[0].get_title() == f"one: 1 of {len(seeds)} seeds end below 80 %"
+    dashed = [line for line in figure.axes[0].lines if line.get_linestyle() == "--"]
+    assert len(dashed) == 1
+    np.testing.assert_allclose(dashed[0].get_ydata(), 30.0)

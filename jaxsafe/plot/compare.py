@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxsafe.metrics import bootstrap_interval
-from jaxsafe.plot.figures import ALWAYS, AXES, CURVES, curve_table, panel_grid
+from jaxsafe.plot.figures import ALWAYS, AXES, CURVES, curve_table, panel_grid, set_axes
 from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE
 
 LOOKS = tuple(product(("-", "--"), (BLUE, ORANGE, GREEN, "#CC79A7", GREY)))
@@ -47,16 +47,34 @@ def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, 
             panel.plot(at, values.mean(axis=1), color=colour, linestyle=line, linewidth=1.6, label=run)
             if values.shape[1] > 1 and len(at):
                 panel.fill_between(at, *bootstrap_interval(values), color=colour, alpha=0.2, linewidth=0)
-        panel.set(xlabel=label, ylabel=quantity)
+        set_axes(panel, label, quantity, name)
         if logarithmic:
             panel.set_xscale("log")
-        else:
-            panel.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
         panel.margins(x=0.0)
-        if name == "success_rate":
-            panel.set_ylim(-3, 103)
-            panel.axhline(80.0, color="black", linestyle=":", linewidth=1.0)
     columns = min(len(runs), LEGEND)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=columns, frameon=False)
     figure.suptitle(f"{title}: the last 100 training episodes, mean and 95 % interval over seeds", fontsize="medium")
+    return figure
+
+
+def seed_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> Figure:
+    """A panel for each run, in it the success rate in training of every seed; a seed that ends below 80 % is dashed.
+
+    Args:
+        runs: rows of the progress log by the run's label.
+        title: of the figure.
+    """
+    figure, panels = panel_grid(len(runs), 3.6)
+    name, quantity, factor = CURVES[0]
+    column, label = AXES["steps"]
+    for panel, (run, rows) in zip(panels, runs.items(), strict=False):
+        at, values = curve_table(rows, column, name)
+        low = ~(factor * values[-1] >= 80.0)
+        for seed in range(values.shape[1]):
+            colour, line = (ORANGE, "--") if low[seed] else (BLUE, "-")
+            panel.plot(at, factor * values[:, seed], line, color=colour, linewidth=1.0, alpha=0.7)
+        set_axes(panel, label, quantity, name)
+        panel.set_title(f"{run}: {int(low.sum())} of {len(low)} seeds end below 80 %", fontsize="medium")
+        panel.margins(x=0.0)
+    figure.suptitle(f"{title}: the last 100 training episodes of every seed", fontsize="medium")
     return figure

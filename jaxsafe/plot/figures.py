@@ -81,15 +81,20 @@ def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figur
     for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
         at, values = curve_table(rows, column, name)
         _curve(panel, at, factor * values)
-        panel.set(xlabel=label, ylabel=quantity)
-        panel.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
-        if name == "success_rate":
-            panel.set_ylim(-3, 103)
-            panel.axhline(80.0, color="black", linestyle=":", linewidth=1.0)
+        set_axes(panel, label, quantity, name)
     if panels[0].get_legend_handles_labels()[0]:
         panels[0].legend(loc="best", fontsize="small", frameon=False)
     figure.suptitle(f"{title}: the last 100 training episodes", fontsize="medium")
     return figure
+
+
+def set_axes(panel: Axes, label: str, quantity: str, name: str) -> None:
+    """The axes of a panel for a column of the progress log; a success rate has its whole range, and Table 2's level."""
+    panel.set(xlabel=label, ylabel=quantity)
+    panel.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
+    if name == "success_rate":
+        panel.set_ylim(-3, 103)
+        panel.axhline(80.0, color="black", linestyle=":", linewidth=1.0)
 
 
 def panel_grid(count: int, width: float) -> tuple[Figure, np.ndarray]:
