@@ -12,7 +12,7 @@ from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.report import __main__ as command
 from jaxsafe.report import run as running
 from jaxsafe.report.page import samples_per_second, wall_to
-from jaxsafe.report.plan import KINDS, Item, plan
+from jaxsafe.report.plan import KINDS, SHIPPED, Item, best_seed, plan
 from jaxsafe.train import __main__ as train
 from jaxsafe.train.config import resolve_all
 
@@ -29,22 +29,43 @@ def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[list[str]]:
         assert {"jaxsafe.train": train, "jaxsafe.evaluate": evaluate}[module].main(words) == 0
 
     monkeypatch.setattr(running, "_call", call)
-    monkeypatch.setattr(Item, "evaluations", property(lambda item: {"heavy": ["env.deputy.mass=24"]}))
+    few = {"heavy": ["env.deputy.mass=24"], SHIPPED: ["seed=1"]}
+    monkeypatch.setattr(Item, "evaluations", property(lambda item: few if item.kind == "features" else {}))
     monkeypatch.chdir(tmp_path)
     return made
 
 
 def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str]]) -> None:
-    words = ["tasks=docking2d", "kinds=features", *REST]
+    words = ["tasks=docking2d", "kinds=features", "policies=best", *REST]
     assert command.main(words) == 0
     page = Path("report/baselines.md").read_text()
     assert f"`python -m jaxsafe.report {' '.join(words)}`" in page
-    for section in ("Interaction efficiency", "After training", "Quality of docking", "Safety", "Starts outside training"):
+    for section in (
+        "Interaction efficiency",
+        "After training",
+        "Quality of docking",
+        "Safety",
+        "Starts outside training",
+        "The best policies",
+    ):
         assert f"## {section}" in page
     results = json.loads(Path("runs/report/docking2d-features/results.json").read_text())
     rate = results["evaluation"]["deterministic"]["episode_safety_violation_rate"]["mean"]
     assert f"| docking2d | features | deterministic | {100 * rate:.2f} [" in page
-    for file in ("docking2d_training.png", "docking2d_trajectories.png", "docking2d_speed_distance.png", "docking2d.gif"):
+    best = best_seed(results)
+    run = Path("runs/report/docking2d-features")
+    assert Path("best/docking2d.npz").read_bytes() == (run / "policy" / f"seed_{best}.npz").read_bytes()
+    shipped = json.loads((run / "evaluations" / SHIPPED / "results.json").read_text())["evaluation"]
+    rate = shipped["stochastic"]["success_rate"]
+    assert f"| docking2d | {best} | {100 * rate['mean']:.2f} % |" in page
+    assert len(rate["per_seed"]) == 1
+    for file in (
+        "docking2d_training.png",
+        "docking2d_seeds.png",
+        "docking2d_trajectories.png",
+        "docking2d_speed_distance.png",
+        "docking2d.gif",
+    ):
         assert Path("report/baselines", file).stat().st_size > 1000
         assert f"(baselines/{file})" in page
     with open("report/baselines/docking2d-features.csv") as file:
@@ -53,9 +74,9 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
         (64 * (i + 1), s) for i in range(20) for s in range(3)
     ]
     assert {"success_rate", "return", "cost"} <= rows[0].keys()
-    assert [module for module, *_ in calls] == ["jaxsafe.train", "jaxsafe.evaluate", "jaxsafe.evaluate"]
+    assert [module for module, *_ in calls] == ["jaxsafe.train", *3 * ["jaxsafe.evaluate"]]
     assert command.main(words) == 0  # all is there
-    assert len(calls) == 3
+    assert len(calls) == 4
 
 
 def test_a_report_in_parts_makes_the_page_of_one(calls: list[list[str]], capsys: pytest.CaptureFixture[str]) -> None:
@@ -87,7 +108,7 @@ def test_an_interrupted_report_goes_on(calls: list[list[str]], whole: Path) -> N
     (run / "evaluations" / "heavy" / "eval.jsonl").write_text("")  # of a kill
     assert command.main(["tasks=docking2d", "kinds=features", "film=false", *REST]) == 0
     assert calls[0] == ["jaxsafe.train", f"resume={run}"]
-    assert len(calls) == 2
+    assert len(calls) == 3
 
 
 def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:
@@ -130,6 +151,7 @@ def test_every_command_of_the_plan_is_valid() -> None:
         for words in item.evaluations.values():
             arguments = cli.Arguments.parse(words)
             rta = arguments.pop_text("rta")
+            arguments.pop("seed")
             changed = override(env if rta is None else with_rta(env, item.task, rta), arguments.pop_overrides())
             assert changed.observation_size == env.observation_size
             assert not arguments.options
@@ -152,3 +174,15 @@ def test_samples_a_second_are_those_of_all_seeds_after_the_first_update():
     curves = [{"seed": seed, "step": 100 * i, "wall_s": 20.0 + 2 * i} for seed in (3, 4) for i in (1, 2, 3)]
     assert samples_per_second(curves) == 2 * 200 / 4
     assert samples_per_second(curves[:1]) is None
+
+
+def test_the_best_policy_succeeds_most_then_violates_least_then_has_the_highest_return() -> None:
+    def results(success: list[float], violating: list[float | None], value: list[float | None]) -> dict:
+        names = ("success_rate", "episode_safety_violation_rate", "average_return")
+        columns = dict(zip(names, ({"per_seed": one} for one in (success, violating, value)), strict=True))
+        return {"seed": 5, "evaluation": {"deterministic": columns}}
+
+    assert best_seed(results([0.9, 1.0, 0.8], [0.0, 0.1, 0.0], [9.0, 1.0, 9.0])) == 6
+    assert best_seed(results([1.0, 1.0, 0.8], [0.2, 0.1, 0.0], [9.0, 1.0, 9.0])) == 6
+    assert best_seed(results([1.0, 1.0, 1.0], [0.1, 0.1, 0.1], [1.0, None, 2.0])) == 7
+    assert best_seed(results([0.0, 0.0], [None, None], [None, None])) == 5

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxsafe import cli
+from jaxsafe import cli, origin
 from jaxsafe.errors import ConfigError
 
 SEEDS = 10
@@ -19,25 +17,29 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     from jaxsafe.envs import TASKS
     from jaxsafe.report.page import DIRECTORY, Report
-    from jaxsafe.report.plan import KINDS, plan
+    from jaxsafe.report.plan import BEST, KINDS, plan
     from jaxsafe.report.record import keep, kept
     from jaxsafe.report.run import evaluate, train
     from jaxsafe.train.config import resolve
+    from jaxsafe.train.files import write_bytes
 
     arguments = cli.Arguments.parse(argv)
     out, runs = Path(arguments.pop_text("out") or "report"), Path(arguments.pop_text("runs") or "runs/report")
     tasks, kinds = (_names(name, arguments.pop(name), [*known]) for name, known in (("tasks", TASKS), ("kinds", KINDS)))
+    policies = arguments.pop_text("policies")
     film = arguments.pop_flag("film") is not False
     rest = [word for word in argv if word.partition("=")[0] in arguments.options]
     rest = rest if "seeds" in arguments.options else [f"seeds={SEEDS}", *rest]
     items = plan(tasks, kinds, rest)
     episodes = [resolve(cli.Arguments.parse(item.words))[0].episodes for item in items]  # errors before anything is done
-    command, commit = " ".join(["python -m jaxsafe.report", *argv]), _commit()
+    command, commit = " ".join(["python -m jaxsafe.report", *argv]), origin.commit()
     try:
         for item, count in zip(items, episodes, strict=True):
             run = train(item, runs)
             evaluate(item, run, count, film and item.kind == "features")
             keep(item, run, out / DIRECTORY, command, commit)
+            if policies and item.kind == "features":
+                write_bytes(Path(policies) / f"{item.task}.npz", (run / BEST).read_bytes())
     except KeyboardInterrupt:
         print(f"stopped; the same command goes on with what is in {runs}")
         return cli.INTERRUPTED
@@ -56,20 +58,6 @@ def _names(option: str, value: Any, known: Sequence[str]) -> list[str]:
     return [str(name) for name in names]
 
 
-def _commit() -> str | None:
-    """Of the checkout that this runs in, if it does, and whether the code or a recipe is not that commit's."""
-    git = shutil.which("git")
-    if git is None:
-        return None
-    package = Path(__file__).resolve().parents[1]
-    code = [str(path) for path in (package, package.parent / "configs") if path.is_dir()]
-    commit, changes = (
-        subprocess.run([git, "-C", str(package), *words], capture_output=True, text=True, check=False).stdout.strip()
-        for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "--", *code])
-    )
-    return f"{commit[:12]} with changes" if commit and changes else commit[:12] or None
-
-
 def usage() -> str:
     """The help text."""
     return (
@@ -80,6 +68,7 @@ def usage() -> str:
         "  kinds=[features,…]     some of features, plain, lanes, quick, discrete, rta, punished\n"
         "  runs=DIR               where the runs are (default runs/report); what is complete there is not done again\n"
         "  out=DIR                where to write the page (default report)\n"
+        "  policies=DIR           copy the best policy of each task there, as TASK.npz\n"
         "  film=false             no animations\n"
         "  seeds, steps, …        any option of jaxsafe.train, the same for all"
     )

@@ -8,10 +8,10 @@ from typing import Any
 
 from jaxsafe.envs import TASKS
 from jaxsafe.metrics import interaction_efficiency, stratified_iqm
-from jaxsafe.plot.compare import compare_curves
+from jaxsafe.plot.compare import compare_curves, seed_curves
 from jaxsafe.plot.figures import curve_table
 from jaxsafe.plot.style import save
-from jaxsafe.report.plan import KINDS, PAPER_STEPS, WITH_RTA, WITHOUT_RTA
+from jaxsafe.report.plan import KINDS, PAPER_STEPS, SHIPPED, WITH_RTA, WITHOUT_RTA, best_seed
 from jaxsafe.report.record import Record
 from jaxsafe.train.files import write_text
 
@@ -37,6 +37,7 @@ class Report:
         for task in self.tasks:
             curves = {record.item.kind: record.curves for record in self.records if record.item.task == task}
             save(compare_curves(curves, task), files / f"{task}_training.png")
+            save(seed_curves(curves, task), files / f"{task}_seeds.png")
         page = out / "baselines.md"
         write_text(page, self.text(files))
         return page
@@ -45,7 +46,7 @@ class Report:
         """The page as Markdown; figures that are not in `files` are left out."""
         parts = [
             self._head(), self._efficiency(), self._wall(), self._final(), self._docking(), self._safety(), self._rta(),
-            self._starts(), self._together(), self._pictures(files), self._settings(),
+            self._starts(), self._best(), self._together(), self._pictures(files), self._settings(),
         ]  # fmt: skip
         return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -78,12 +79,12 @@ class Report:
         """A line for each command, commit and set of versions that some of the records come from."""
         found: dict[tuple[str, str], list[str]] = {}
         for record in self.records:
-            versions = record.results["versions"]
+            versions = dict(record.results["versions"])
+            device, processor = versions.pop("device"), versions.pop("processor", None)
             where = f" on commit {record.commit}" if record.commit else ""
-            others = ", ".join(f"{name} {version}" for name, version in versions.items() if name != "device")
-            found.setdefault((f"`{record.command}`{where}", f"{others}; {versions['device']}, float32"), []).append(
-                record.item.name
-            )
+            made_by = ", ".join(f"{name} {version}" for name, version in versions.items())
+            made_by += f"; {device}{f' ({processor})' if processor else ''}, float32"
+            found.setdefault((f"`{record.command}`{where}", made_by), []).append(record.item.name)
         return [f"- {origin}: {', '.join(names)} ({versions})" for (origin, versions), names in found.items()]
 
     def _efficiency(self) -> str:
@@ -230,7 +231,7 @@ class Report:
     def _starts(self) -> str:
         rows = []
         for record, name, found in self.further:
-            if name in (WITH_RTA, WITHOUT_RTA):
+            if name in (WITH_RTA, WITHOUT_RTA, SHIPPED):
                 continue
             one = found["evaluation"]["deterministic"]
             rows.append([
@@ -263,6 +264,43 @@ class Report:
             else ""
         )
 
+    def _best(self) -> str:
+        rows = []
+        for record, name, found in self.further:
+            if name != SHIPPED:
+                continue
+            drawn, mode = found["evaluation"]["stochastic"], found["evaluation"]["deterministic"]
+            docks = record.item.task.startswith("docking")
+            rows.append([
+                record.item.task, str(best_seed(record.results)),
+                *(f"{100 * one['success_rate']['mean']:.2f} %" for one in (drawn, mode)),
+                f"{100 * mode['episode_safety_violation_rate']['mean']:.2f} %",
+                f"{mode['control_usage_l1']['mean']:.2f}" if docks else "–",
+                *(f"{mode[metric]['mean']:.1f}" for metric in ("average_return", "episode_length")),
+            ])  # fmt: skip
+        return (
+            _section(
+                "The best policies",
+                "One of each task's `features` policies: that whose deterministic episodes in the run's own evaluation"
+                " succeeded most often, then violated least, then had the highest return; here flown from other starts"
+                " (`seed=1`) than those it was chosen by. The package comes with those of its own report"
+                ' (`run=pretrained/TASK`, `jaxsafe.load_policy("TASK")`); the films below show them.',
+                [
+                    "task",
+                    "seed",
+                    "success, stochastic",
+                    "deterministic",
+                    "violating steps",
+                    "Δv, L1 [m/s]",
+                    "return",
+                    "length [s]",
+                ],
+                rows,
+            )
+            if rows
+            else ""
+        )
+
     def _together(self) -> str:
         rows = []
         for kind in self.kinds:
@@ -285,13 +323,17 @@ class Report:
         for task in self.tasks:
             lines += [f"### {task}", ""]
             for file, caption in (
-                (f"{task}_training.png", f"training of {task}"),
-                (f"{task}_trajectories.png", "paths of deterministic episodes, from early in training (purple) to its end"),
-                (f"{task}_speed_distance.png", "speed against distance of the same episodes, and the limit"),
-                (f"{task}.gif", f"a deterministic episode of {task}"),
+                (f"{task}_training.png", "Training in each way: mean and 95 % interval over seeds"),
+                (f"{task}_seeds.png", "Success in training of every seed, those that failed too"),
+                (
+                    f"{task}_trajectories.png",
+                    "Paths of deterministic episodes of the first seed (`features`), from early in training (purple) on",
+                ),
+                (f"{task}_speed_distance.png", "Speed against distance in the same episodes, and the limit"),
+                (f"{task}.gif", "A deterministic episode of the best policy"),
             ):
                 if (files / file).exists():
-                    lines += [f"![{caption}]({files.name}/{file})", ""]
+                    lines += [f"![{task}: {caption.replace('`', '')}]({files.name}/{file})", "", f"*{caption}.*", ""]
         return "\n".join(lines).rstrip()
 
     def _settings(self) -> str:
@@ -305,8 +347,8 @@ class Report:
         for item, _ in self.own:
             lines.append(f"python -m jaxsafe.train {' '.join(item.words)} out=runs/{item.name}")
             lines += [
-                f"python -m jaxsafe.evaluate run=runs/{item.name} {' '.join(options)}"
-                for options in item.evaluations.values()
+                f"python -m jaxsafe.evaluate run={item.subject(Path('runs', item.name), name)} {' '.join(options)}"
+                for name, options in item.evaluations.items()
             ]
         return "\n".join([*lines, "```"])
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jaxsafe.envs import TASKS
 from jaxsafe.errors import ConfigError, nearest
@@ -56,6 +57,12 @@ STARTS = {task: _REJOIN_STARTS if task.startswith("rejoin") else _DOCKING_STARTS
 
 WITH_RTA, WITHOUT_RTA = "filtered", "unfiltered"
 
+BEST = "best.npz"
+"""In a run of the `features` kind: its best policy, see `best_seed`."""
+
+SHIPPED = "shipped"
+"""The evaluation of the best policy alone, from other starts than those that it was chosen by."""
+
 
 class Item(NamedTuple):
     """One training of all seeds, and the evaluations of its policies beyond the run's own."""
@@ -73,12 +80,31 @@ class Item(NamedTuple):
     def evaluations(self) -> dict[str, list[str]]:
         """By name, what follows `python -m jaxsafe.evaluate run=…`."""
         if self.kind == "features":
-            return {**STARTS[self.task], WITH_RTA: ["rta=default"]}
+            return {**STARTS[self.task], WITH_RTA: ["rta=default"], SHIPPED: ["seed=1"]}
         return {WITHOUT_RTA: ["rta=none"]} if self.kind in ("rta", "punished") else {}
+
+    def subject(self, run: Path, name: str) -> Path:
+        """What an evaluation is of: every policy of a run, or the best one."""
+        return run / BEST if name == SHIPPED else run
 
     def evaluation_directory(self, run: Path, name: str) -> Path:
         """Where an evaluation of a run is written."""
         return run / "evaluations" / name.replace(" ", "_")
+
+
+def best_seed(results: Mapping[str, Any]) -> int:
+    """The seed whose deterministic episodes succeeded most often, then violated least, then had the highest return.
+
+    Args:
+        results: of a run, with its own evaluation after training.
+    """
+    found = results["evaluation"]["deterministic"]
+    columns = [found[name]["per_seed"] for name in ("success_rate", "episode_safety_violation_rate", "average_return")]
+    rank = [
+        (success, -(violating or 0.0), -math.inf if value is None else value)  # no steps, and not finite: null
+        for success, violating, value in zip(*columns, strict=True)
+    ]
+    return results["seed"] + rank.index(max(rank))
 
 
 def plan(tasks: Sequence[str], kinds: Sequence[str], words: Sequence[str]) -> list[Item]:

@@ -13,8 +13,9 @@ from jaxsafe.cli import INTERRUPTED, Arguments
 from jaxsafe.config import describe, yaml
 from jaxsafe.config.convert import to_data
 from jaxsafe.errors import ConfigError
-from jaxsafe.report.plan import Item
+from jaxsafe.report.plan import BEST, Item, best_seed
 from jaxsafe.train.config import resolve
+from jaxsafe.train.files import read_json, write_bytes
 
 FILM = "episode_deterministic.gif"
 
@@ -37,22 +38,24 @@ def train(item: Item, runs: Path) -> Path:
 
 
 def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
-    """Do those evaluations of a run that are still to do.
+    """Do those evaluations of a run that are still to do, and film its best policy.
 
     Raises:
         ConfigError: an evaluation failed.
         KeyboardInterrupt: the user stopped it.
     """
+    if item.kind == "features" and not (run / BEST).exists():
+        best = best_seed(read_json(run / "results.json"))
+        write_bytes(run / BEST, (run / "policy" / f"seed_{best}.npz").read_bytes())
     for name, options in item.evaluations.items():
         out = item.evaluation_directory(run, name)
         if not (out / "results.json").exists():
             shutil.rmtree(out, ignore_errors=True)  # of an evaluation that was interrupted
-            _call("jaxsafe.evaluate", [f"run={run}", f"episodes={episodes}", *options, f"out={out}"])
+            _call("jaxsafe.evaluate", [f"run={item.subject(run, name)}", f"episodes={episodes}", *options, f"out={out}"])
     film = run / "film"
     if render and not (film / FILM).exists():
         shutil.rmtree(film, ignore_errors=True)
-        policy = next(iter(sorted((run / "policy").iterdir())))
-        _call("jaxsafe.evaluate", [f"run={policy}", "episodes=10", "deterministic=true", "render=gif", f"out={film}"])
+        _call("jaxsafe.evaluate", [f"run={run / BEST}", "episodes=10", "deterministic=true", "render=gif", f"out={film}"])
 
 
 def options_of(item: Item) -> dict[str, Any]:
