@@ -22,7 +22,7 @@ from jaxsafe.train import __main__ as command
 from jaxsafe.train import directory
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import recipe
-from jaxsafe.train.loop import Training
+from jaxsafe.train.loop import Clock, Training
 from jaxsafe.train.policy import load_policy, read_policy
 from jaxsafe.train.restore import structure
 
@@ -191,6 +191,12 @@ def test_all_tasks_run_one_after_another_and_resume(
         patch.setattr(Training, "_write_progress", interrupt)
         assert command.main(["env=all", *words, *same, f"out={path}"]) == cli.INTERRUPTED
     assert f"go on with: python -m jaxsafe.train resume={path}" in capsys.readouterr().out
+    assert not list(path.rglob("results.json"))  # all are trained before the first is evaluated
+    with monkeypatch.context() as patch:
+        _crash_at(patch, Training, "evaluate_finally", call=2, after=False)
+        with pytest.raises(_CrashError):
+            command.main([f"resume={path}"])
+    capsys.readouterr()
     assert command.main([f"resume={path}"]) == 0
     said = capsys.readouterr().out
     assert f"{path / 'docking2d'} is complete" in said
@@ -198,6 +204,20 @@ def test_all_tasks_run_one_after_another_and_resume(
     assert [line[:2] for line in last] == [["docking2d", "1,280"], ["twin", "1,280"]]
     for name in ("docking2d", "twin"):
         assert logs(path / name) == logs(whole)
+
+
+def test_the_clocks_of_runs_that_take_turns_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = iter(range(0, 1000, 10))
+    monkeypatch.setattr(time, "monotonic", lambda: next(now))
+    one, other = Clock(spent=3.0), Clock()
+    with one:  # from 0 to 10
+        pass
+    with other:  # from 20
+        assert one.seconds == 13.0
+        assert other.seconds == 10.0  # at 30; to 40
+    with one:  # from 50 to 60
+        pass
+    assert (one.seconds, other.seconds) == (23.0, 20.0)
 
 
 def test_options_that_do_not_fit_all_tasks_are_told_with_the_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
+from itertools import zip_longest
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jaxsafe import cli
 from jaxsafe.train.seeds import claim_cores
+
+if TYPE_CHECKING:
+    from jaxsafe.train.loop import Training
 
 BEGAN = time.monotonic()
 
@@ -30,44 +36,70 @@ def main(argv: Sequence[str]) -> int:
     else:
         arguments.refuse_rest(["resume", "distributed"])
         path = Path(resume)
-    runs, began = directory.runs(path), BEGAN
-    for run in runs:
-        with hosts.loss_told(f"go on with: python -m jaxsafe.train distributed=true resume={path}"):
-            finished = _train(run, path, began)
-        if not finished:
-            return cli.INTERRUPTED
-        began = time.monotonic()
+    runs = directory.runs(path)
+    with hosts.loss_told(f"go on with: python -m jaxsafe.train distributed=true resume={path}"):
+        finished = _train([run for run in runs if not _complete(run)], path)
+    if not finished:
+        return cli.INTERRUPTED
     if len(runs) > 1 and hosts.leads():
         print(summary({run.name: run for run in runs}))
     return 0
 
 
-def _train(run: Path, path: Path, began: float) -> bool:
-    """Do what is left of a run, of those in `path`; False if the user asked to stop before its end."""
-    from jaxsafe.plot.figures import draw_all
-    from jaxsafe.train import directory, hosts
-    from jaxsafe.train.loop import Training
+def _complete(run: Path) -> bool:
+    """Whether all is there, with figures if only they are missing."""
+    if not (run / "results.json").exists():
+        return False
+    print(f"{run} is complete; nothing is left to do")
+    if not (run / "figures").exists():  # killed between the results and the figures
+        from jaxsafe.plot.figures import draw_all
+
+        draw_all(run)
+    return True
+
+
+def _train(runs: Sequence[Path], path: Path) -> bool:
+    """Train runs in `path` one after another, then evaluate them; False if the user asked to stop.
+
+    The programs of a run are compiled while the one before it trains: to compile alone leaves cores idle.
+    """
     from jaxsafe.train.results import finish, table
 
-    config, env, name = directory.read(run, "resume")
-    if (run / "results.json").exists():
-        print(f"{run} is complete; nothing is left to do")
-        if not (run / "figures").exists():  # killed between the results and the figures
-            draw_all(run)
-        return True
-    with hosts.own_files(run) as own:
-        print(
-            f"{name}: {config.seeds} seeds × {config.num_updates * config.ppo.batch_size:,} steps,"
-            f" preset {config.preset}, in {run}"
-        )
-        with cli.without_collection():
-            training = Training(config, env, own, began, run)
-        if not training.train():
-            print(f"stopped at step {training.step:,}; go on with: python -m jaxsafe.train resume={path}")
-            return False
-        print(table(finish(training, config, env, name), run / "results.json"))
-        print("figures: " + ", ".join(str(figure) for figure in draw_all(own)))
+    trained, upcoming = [], None
+    with ExitStack() as files:
+        for run, following in zip_longest(runs, runs[1:]):
+            training = upcoming or _open(run, files, BEGAN)
+            config = training.config
+            print(
+                f"{training.name}: {config.seeds} seeds × {config.num_updates * config.ppo.batch_size:,} steps,"
+                f" preset {config.preset}, in {run}"
+            )
+            training.prepare()
+            upcoming = following and _open(following, files, time.monotonic())
+            if upcoming:
+                upcoming.prepare()
+            if not training.train():
+                print(f"stopped at step {training.step:,}; go on with: python -m jaxsafe.train resume={path}")
+                return False
+            trained.append((run, training))
+        for _, training in trained:
+            training.prepare_evaluation()
+        from jaxsafe.plot.figures import draw_all  # only now: it takes a while
+
+        for run, training in trained:
+            print(table(finish(training), run / "results.json"))
+            print("figures: " + ", ".join(str(figure) for figure in draw_all(training.run)))
     return True
+
+
+def _open(run: Path, files: ExitStack, began: float) -> Training:
+    """What is left of a run; its logs are closed with `files`, and its clock has run since `began`."""
+    from jaxsafe.train import directory, hosts
+    from jaxsafe.train.loop import Clock, Training
+
+    own = files.enter_context(hosts.own_files(run))
+    config, env, name = directory.read(run, "resume")
+    return Training(config, env, name, own, Clock(time.monotonic() - began), run)
 
 
 def usage() -> str:

@@ -181,7 +181,7 @@ def usage() -> str:
     """Every option with its default and what it takes."""
     lines = ["usage: python -m jaxsafe.train env=TASK [key=value …]      or      resume=RUN", ""]
     lines += ["  distributed=true, beside either: this is one of several processes that srun or mpirun started"]
-    lines += ["  env=TASK, env=FILE.yaml, or env=all for the five tasks one after another"]
+    lines += ["  env=TASK, env=FILE.yaml, or env=all for the five tasks one after another, then evaluated"]
     lines += ["  env.PATH=VALUE changes it, for instance env.reward.delta_v.scale=-0.02", ""]
     for section, cls in (("", TrainConfig), ("agent.", Agent), ("ppo.", PPO)):
         for name, field in fields(cls).items():

@@ -17,6 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxsafe import cli
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.seeds import KINDS, Evaluator, episode_rows
 from jaxsafe.metrics import Episode
@@ -42,52 +43,77 @@ MEMORY = "ppo.num_envs, ppo.num_steps, seeds"
 """What decides how much of it a training needs."""
 
 
+class Clock:
+    """Seconds spent on a run, over all its sessions: those inside `with`. Runs of a command have one each."""
+
+    def __init__(self, spent: float = 0.0) -> None:
+        """Begin with what was spent already."""
+        self.spent = spent
+        self._since: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        """So far."""
+        return self.spent + (0.0 if self._since is None else time.monotonic() - self._since)
+
+    def __enter__(self) -> None:
+        self._since = time.monotonic()
+
+    def __exit__(self, *_: object) -> None:
+        self.spent, self._since = self.seconds, None
+
+
 class Training:
     """One run: all seeds of one configuration."""
 
     def __init__(
-        self, config: TrainConfig, env: Environment, run: Path, began: float, checkpoints: Path | None = None
+        self, config: TrainConfig, env: Environment, name: str, run: Path, clock: Clock, checkpoints: Path | None = None
     ) -> None:
-        """Prepare the compiled functions and the state, fresh or from the latest checkpoint of `checkpoints`.
+        """Say what to train, as yet without compiling anything.
 
         Args:
             config: of the run.
             env: of the run.
+            name: of the environment.
             run: the directory for logs and results.
-            began: `time.monotonic()` when the command began.
+            clock: with what was spent on the run before.
             checkpoints: the run directory that holds the checkpoints, if it is another.
         """
-        self.config, self.env, self.run, self.began = config, env, run, began
+        self.config, self.env, self.name, self.run, self.clock = config, env, name, run, clock
         self.mapper = SeedMapper(config.seeds, config.shares)
         self.shared = self.mapper.replicate((env, config.agent, config.ppo))
         intervals = (config.every(config.eval_every), config.every(config.checkpoint_every))
         self.chunk = max(1, min(config.num_updates // 50, 100_000 // config.ppo.batch_size, *intervals))
         self.evaluator = Evaluator(self.mapper, env, config.agent)
         self.checkpoints = Checkpoints(checkpoints or run, create=True)
-        self.elapsed = self.compile_s = 0.0
+        self.compile_s = 0.0
         self.updates = 0
-        self._begin()
+        self._prepared = False
+
+    def prepare(self) -> None:
+        """Have the state, fresh or from the latest checkpoint, and begin to compile; the second call does nothing."""
+        if self._prepared:
+            return
+        with self.clock, cli.without_collection():
+            self._begin()
         self._keep_copies()
-        self.log = ProgressLog(run, self.step, self.updates * config.seeds, config.tensorboard)
+        self.log = ProgressLog(self.run, self.step, self.updates * self.config.seeds, self.config.tensorboard)
         for name in ("eval.jsonl", "episodes.jsonl"):
-            keep_rows(run / name, lambda row: row["step"] <= self.step and not row["final"], ("step", "final"))
+            keep_rows(self.run / name, lambda row: row["step"] <= self.step and not row["final"], ("step", "final"))
+        self._prepared = True
 
     @property
     def step(self) -> int:
         """Environment steps that each seed has taken."""
         return self.updates * self.config.ppo.batch_size
 
-    @property
-    def wall_s(self) -> float:
-        """Seconds spent on this run so far, over all its sessions."""
-        return self.elapsed + time.monotonic() - self.began
-
     def train(self) -> bool:
         """Train to the end; False if the user asked to stop before. Either way the state is in a checkpoint."""
         display = Display(self.config.num_updates * self.config.ppo.batch_size, self.step)
-        self._await_compiled()
+        with self.clock:
+            self._await_compiled()
         display.start()
-        with _StopRequest() as stop:
+        with self.clock, _StopRequest() as stop:
             while self.updates < self.config.num_updates and not stop.requested:
                 before, (self.state, curves) = self.updates, self.advance(self.shared, self.state)
                 self.updates = min(before + self.chunk, self.config.num_updates)
@@ -105,6 +131,11 @@ class Training:
         """The networks of each seed, on the host."""
         stacked = self.mapper.gather(self.state.average)
         return [jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(self.config.seeds)]
+
+    def prepare_evaluation(self) -> None:
+        """Compile, while other work goes on, what `evaluate_finally` needs."""
+        with self.clock, cli.without_collection():
+            self.evaluator.prepare(self.state.average)
 
     def evaluate_finally(self) -> dict[str, Episode]:
         """The evaluation that stands in the results, by kind; its rows go to the logs."""
@@ -136,7 +167,8 @@ class Training:
     def _restore(self, content: Any) -> None:
         content, facts = self.checkpoints.restore(self.checkpoints.steps[-1], content)
         self.state, self.best = self.mapper.place(content["state"], STATE), self.mapper.place(content["best"])
-        self.updates, self.elapsed, self.compile_s = facts["updates"], facts["wall_s"], facts["compile_s"]
+        self.updates, self.compile_s = facts["updates"], facts["compile_s"]
+        self.clock.spent += facts["wall_s"]
 
     def _keep_copies(self) -> None:
         """If the logs are further on than a kill can explain, checkpoints are missing: copy the logs, then cut."""
@@ -162,7 +194,7 @@ class Training:
 
     def _write_progress(self, curves: dict[str, jax.Array], count: int, display: Display) -> None:
         host = {name: value[:, :count] for name, value in self.mapper.gather(curves).items()}
-        rows = progress_rows(self.env, host, self.config.seed, self.config.ppo.batch_size, self.wall_s)
+        rows = progress_rows(self.env, host, self.config.seed, self.config.ppo.batch_size, self.clock.seconds)
         self.log.write(rows)
         display.show(self.step, rows[-self.config.seeds :])
 
@@ -191,7 +223,7 @@ class Training:
             append_rows(self.run / "episodes.jsonl", ({**facts, "episode": number, **row} for row in rows))
 
     def _save(self) -> None:
-        facts = {"updates": self.updates, "wall_s": self.wall_s, "compile_s": self.compile_s}
+        facts = {"updates": self.updates, "wall_s": self.clock.seconds, "compile_s": self.compile_s}
         self.checkpoints.save(self.step, self.mapper.gather({"state": self.state, "best": self.best}), facts)
 
 

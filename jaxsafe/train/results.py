@@ -30,16 +30,18 @@ _ROWS = (
 )
 
 
-def finish(training: Training, config: TrainConfig, env: Environment, name: str) -> dict[str, Any]:
+def finish(training: Training) -> dict[str, Any]:
     """Evaluate, write policies and results, and return the results."""
-    episodes = training.evaluate_finally()
+    config, env, name = training.config, training.env, training.name
+    with training.clock:
+        episodes = training.evaluate_finally()
     for index, params in enumerate(training.params()):
         about = {"env": name, "preset": config.preset, "seed": config.seed + index, "step": training.step}
         save_policy(training.run / "policy" / f"seed_{config.seed + index}.npz", env, config.agent, params, about)
     results = {
         **facts(config, name),
         "steps": training.step,
-        "wall_s": round(training.wall_s, 2),
+        "wall_s": round(training.clock.seconds, 2),
         "compile_s": round(training.compile_s, 2),
         "versions": versions(),
         "interaction_efficiency": _efficiency(training),
