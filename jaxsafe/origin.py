@@ -36,12 +36,12 @@ def processor() -> str:
 
 
 def commit() -> str | None:
-    """Of the checkout that this runs in, if it does, and whether the code or a recipe is not that commit's."""
+    """Of the checkout that this runs in, if it does, and whether code or a recipe (not a policy) is not that commit's."""
     git = shutil.which("git")
     if git is None:
         return None
     package = Path(__file__).resolve().parent
-    code = [str(path) for path in (package, package.parent / "configs") if path.is_dir()]
+    code = [str(path) for path in (package, package.parent / "configs") if path.is_dir()] + [":(exclude)*.npz"]
     found, changes = (
         subprocess.run([git, "-C", str(package), *words], capture_output=True, text=True, check=False).stdout.strip()
         for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "--", *code])

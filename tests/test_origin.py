@@ -1,0 +1,41 @@
+"""What a result is said to be made by."""
+
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from jaxsafe import origin
+
+
+def test_a_commit_is_that_of_the_code_and_says_when_the_code_is_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(tmp_path), "-c", "user.name=test", "-c", "user.email=test@example.org", *words]
+        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
+
+    package = tmp_path / "package"
+    for file in (
+        package / "code.py",
+        package / "policies" / "one.npz",
+        tmp_path / "configs" / "task.yaml",
+        tmp_path / "page.md",
+    ):
+        file.parent.mkdir(exist_ok=True, parents=True)
+        file.write_text("first")
+    monkeypatch.setattr(origin, "__file__", str(package / "origin.py"))
+    assert origin.commit() is None
+    git("init", "-q")
+    git("add", "-A")
+    git("commit", "-qm", "all of it")
+    head = git("rev-parse", "HEAD")[:12]
+    assert origin.commit() == head
+    for result in (tmp_path / "page.md", package / "policies" / "one.npz", package / "policies" / "another.npz"):
+        result.write_text("another")
+    assert origin.commit() == head
+    for code in (package / "code.py", tmp_path / "configs" / "task.yaml", package / "new.py"):
+        code.write_text("another")
+        assert origin.commit() == f"{head} with changes"
+        git("stash", "-q", "-u")
+        assert origin.commit() == head
