@@ -70,10 +70,7 @@ def _train(runs: Sequence[Path], path: Path) -> bool:
         for run, following in zip_longest(runs, runs[1:]):
             training = upcoming or _open(run, files, BEGAN)
             config = training.config
-            print(
-                f"{training.name}: {config.seeds} seeds × {config.num_updates * config.ppo.batch_size:,} steps,"
-                f" preset {config.preset}, in {run}"
-            )
+            print(f"{training.name}: {config.seeds} seeds × {training.num_steps:,} steps, preset {config.preset}, in {run}")
             training.prepare()
             upcoming = following and _open(following, files, time.monotonic())
             if upcoming:

@@ -42,8 +42,10 @@ class Checkpoints:
         return sorted(self._manager.all_steps()) if hasattr(self, "_manager") else []
 
     def save(self, step: int, state: Any, facts: dict[str, Any]) -> None:
-        """Write one checkpoint: a pytree of arrays on the host, of keys their words, and some JSON."""
+        """Write one checkpoint, or write it anew: a pytree of arrays on the host, of keys their words, and some JSON."""
         ocp = self._ocp
+        if step in self.steps:
+            self._manager.delete(step)
         args = ocp.args.Composite(state=ocp.args.StandardSave(state), facts=ocp.args.JsonSave(facts))
         self._manager.save(step, args=args, force=True)
 

@@ -99,7 +99,7 @@ class Training:
         self._keep_copies()
         self.log = ProgressLog(self.run, self.step, self.updates * self.config.seeds, self.config.tensorboard)
         for name in ("eval.jsonl", "episodes.jsonl"):
-            keep_rows(self.run / name, lambda row: row["step"] <= self.step and not row["final"], ("step", "final"))
+            keep_rows(self.run / name, lambda row: row["step"] <= self.step and row["step"] < self.num_steps, ("step",))
         self._prepared = True
 
     @property
@@ -107,9 +107,14 @@ class Training:
         """Environment steps that each seed has taken."""
         return self.updates * self.config.ppo.batch_size
 
+    @property
+    def num_steps(self) -> int:
+        """Environment steps that each seed is to take."""
+        return self.config.num_updates * self.config.ppo.batch_size
+
     def train(self) -> bool:
         """Train to the end; False if the user asked to stop before. Either way the state is in a checkpoint."""
-        display = Display(self.config.num_updates * self.config.ppo.batch_size, self.step)
+        display = Display(self.num_steps, self.step)
         with self.clock:
             self._await_compiled()
         display.start()
@@ -118,7 +123,7 @@ class Training:
                 before, (self.state, curves) = self.updates, self.advance(self.shared, self.state)
                 self.updates = min(before + self.chunk, self.config.num_updates)
                 self._write_progress(curves, self.updates - before, display)
-                if self._due(before, self.config.eval_every):
+                if self.updates < self.config.num_updates and self._due(before, self.config.eval_every):
                     self._evaluate()
                 stop.requested = hosts.anyone(stop.requested)
                 if self._due(before, self.config.checkpoint_every) or stop.requested:
@@ -138,7 +143,9 @@ class Training:
             self.evaluator.prepare(self.state.average)
 
     def evaluate_finally(self) -> dict[str, Episode]:
-        """The evaluation that stands in the results, by kind; its rows go to the logs."""
+        """The last evaluation on the way, then that which stands in the results, by kind; the rows go to the logs."""
+        self._evaluate()
+        self._save()
         found = {}
         for kind in KINDS:
             found[kind] = self._run_episodes(kind, self.config.episodes, final=True)
