@@ -53,20 +53,32 @@ def test_the_log_probability_is_that_of_the_stored_action() -> None:
 
 
 def test_an_intervention_costs_what_its_term_says() -> None:
-    _, env = resolved("rta=default", "rta_training=punished", "env.reward.intervention.scale=-0.25")
+    _, env = resolved("rta=default", "env.reward.intervention.scale=-0.25")
     state, first = jaxsafe.reset_to(env, FAST)
     assert first.info.reward_terms["intervention"] == 0.0
     for push, cost in [(1.0, -0.25), (-1.0, 0.0)]:
         _, timestep = step(env, state, jnp.array([0.0, push]))
         assert timestep.info.intervening == (cost < 0.0)
         assert timestep.info.reward_terms["intervention"] == cost
-    again = resolve(Arguments.parse(["env=docking2d", "rta=default"]))[1]
-    assert [term.name for term in again.reward] == [term.name for term in env.reward][:-1]
+
+
+def test_interventions_are_punished_where_there_is_a_filter_and_nothing_else_is_asked() -> None:
+    for words, told, punished in [
+        (["rta=default"], "punished", True),
+        (["rta=default", "rta_training=punished"], "punished", True),
+        (["rta=default", "rta_training=unpunished"], "unpunished", False),
+        (["rta=default", "rta_training=corrected"], "corrected", False),
+        ([], None, False),
+    ]:
+        config, env = resolved(*words)
+        assert config.rta_training == told
+        assert ("intervention" in [term.name for term in env.reward]) == punished
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
+        (["rta_training=unpunished"], r"^rta_training: 'unpunished' needs run time assurance, for instance rta=default"),
         (["rta_training=punished"], r"^rta_training: 'punished' needs run time assurance, for instance rta=default"),
         (["rta=default", "rta_training=punishd"], r"^rta_training: .*Did you mean 'punished'"),
         (["rta=default", "rta_training=corrected", "actions=discrete"], r"^ppo\.learns_from: .*use actions=continuous"),
@@ -88,7 +100,7 @@ def test_corrected_is_a_setting_of_ppo() -> None:
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("rta") / "run"
-    assert train([*TINY, "seed=2", "rta=explicit_simplex", "rta_training=punished", f"out={out}"]) == 0
+    assert train([*TINY, "seed=2", "rta=explicit_simplex", f"out={out}"]) == 0
     return out
 
 

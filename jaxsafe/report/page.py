@@ -198,7 +198,7 @@ class Report:
                 continue
             flown = ("without", "with") if name == WITH_RTA else ("with", "without")
             item, own = record.item, record.results
-            trained = "with, punished" if item.kind == "punished" else flown[0]
+            trained = "with, unpunished" if item.kind == "unpunished" else flown[0]
             for label, results in zip(flown, (own, found), strict=True):
                 one = results["evaluation"]["stochastic"]
                 share = one["intervention_rate"]

@@ -37,9 +37,11 @@ KINDS: Mapping[str, Kind] = {
     "lanes": Kind(("preset=lanes",), "4,096 environments side by side, for accelerators"),
     "quick": Kind(("preset=quick",), "fewer epochs and steps, for a result soon; evaluated in 100 episodes a seed"),
     "discrete": Kind(("actions=discrete",), "the recipe with the paper's discrete actions"),
-    "rta": Kind(("rta=default",), "the recipe with run time assurance during training (`rta=default`)"),
-    "punished": Kind(
-        ("rta=default", "rta_training=punished"), "the same, and each intervention costs a little (`rta_training=punished`)"
+    "rta": Kind(
+        ("rta=default",), "the recipe with run time assurance during training, where each intervention costs a little"
+    ),
+    "unpunished": Kind(
+        ("rta=default", "rta_training=unpunished"), "the same, and interventions cost nothing (`rta_training=unpunished`)"
     ),
 }
 """By the name that the page uses."""
@@ -81,7 +83,7 @@ class Item(NamedTuple):
         """By name, what follows `python -m jaxsafe.evaluate run=…`."""
         if self.kind == "features":
             return {**STARTS[self.task], WITH_RTA: ["rta=default"], SHIPPED: ["seed=1"]}
-        return {WITHOUT_RTA: ["rta=none"]} if self.kind in ("rta", "punished") else {}
+        return {WITHOUT_RTA: ["rta=none"]} if self.kind in ("rta", "unpunished") else {}
 
     def subject(self, run: Path, name: str) -> Path:
         """What an evaluation is of: every policy of a run, or the best one."""

@@ -42,7 +42,7 @@ class TrainConfig(Component):
     actions: Literal["continuous", "discrete"] | None = None  # None: as the environment says
     variant: Literal["paper", "released"] | None = None  # None: paper
     rta: str | None = None  # None: as the environment says; default, or another preset of the task
-    rta_training: Literal["unpunished", "punished", "corrected"] = "unpunished"  # what PPO is told of interventions
+    rta_training: Literal["punished", "unpunished", "corrected"] | None = None  # None: punished, where there is a filter
     out: str | None = None  # None: a new directory in runs/
     eval_every: Count | None = None  # steps; None: a tenth of the run
     eval_episodes: Count = 100  # of each evaluation during training
@@ -103,13 +103,15 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
     for path, value in arguments.options.items():  # first, so that a misspelt option is told before a slow start
         config = set_path(config, path, value, to_value)
     env = make(task, actions=config.actions, variant=config.variant, rta=config.rta)
-    if config.rta_training == "punished" and not any(isinstance(term, Intervention) for term in env.reward):
+    told = config.rta_training or ("punished" if env.rta is not None else None)
+    if told == "punished" and not any(isinstance(term, Intervention) for term in env.reward):
         env = env.replace(reward=(*env.reward, normalise(Intervention(name="intervention"))))
     env = override(env, overrides)
     config = normalise(TrainConfig())
     for path, value in {**recipe(task, arguments.options.get("preset")), **arguments.options}.items():
         config = set_path(config, path, value, to_value)
-    if config.rta_training == "corrected":
+    config = config.replace(rta_training=told)
+    if told == "corrected":
         config = set_path(config, "ppo.learns_from", "actual", to_value)
     config = _with_algorithm(config)
     _check_rta(config, env)
@@ -151,7 +153,7 @@ def _with_algorithm(config: TrainConfig) -> TrainConfig:
 
 
 def _check_rta(config: TrainConfig, env: Environment) -> None:
-    if config.rta_training != "unpunished" and env.rta is None:
+    if config.rta_training is not None and env.rta is None:
         raise ConfigError(f"rta_training: {config.rta_training!r} needs run time assurance, for instance rta=default")
     if config.ppo.learns_from == "actual" and env.num_action_points:
         raise ConfigError("ppo.learns_from: the actual control is no choice of discrete actions; use actions=continuous")
