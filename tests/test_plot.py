@@ -170,7 +170,7 @@ def test_every_seed_has_its_line_and_those_that_failed_are_counted() -> None:
     figure = seed_curves({"one": failing, "other": rows(500)}, "docking2d")
     seeds = {row["seed"] for row in failing}
     assert [len(panel.lines) for panel in figure.axes] == [len(seeds) + 1] * 2  # and the 80 % line
-    assert figure.axes[0].get_title() == f"one: 1 of {len(seeds)} seeds end below 80 %"
+    assert figure.axes[0].get_title() == f"one: 1 of {len(seeds)} end below 80 %"
     dashed = [line for line in figure.axes[0].lines if line.get_linestyle() == "--"]
     assert len(dashed) == 1
     np.testing.assert_allclose(dashed[0].get_ydata(), 30.0)

@@ -74,7 +74,7 @@ def seed_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> 
             colour, line = (ORANGE, "--") if low[seed] else (BLUE, "-")
             panel.plot(at, factor * values[:, seed], line, color=colour, linewidth=1.0, alpha=0.7)
         set_axes(panel, label, quantity, name)
-        panel.set_title(f"{run}: {int(low.sum())} of {len(low)} seeds end below 80 %", fontsize="medium")
+        panel.set_title(f"{run}: {int(low.sum())} of {len(low)} end below 80 %", fontsize="medium")
         panel.margins(x=0.0)
     figure.suptitle(f"{title}: the last 100 training episodes of every seed", fontsize="medium")
     return figure
