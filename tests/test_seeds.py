@@ -1,3 +1,7 @@
+import os
+import subprocess
+import sys
+
 import jax
 import numpy as np
 import pytest
@@ -42,6 +46,27 @@ def three() -> TrainState:
 def test_a_seed_of_many_is_bit_for_bit_the_seed_alone(three: TrainState, seed: int) -> None:
     alone = seeds(seed, 1)
     jax.tree.map(lambda many, one: np.testing.assert_array_equal(many[seed], one[0]), three, alone)
+
+
+STARTS = """
+from jaxsafe.train.seeds import SeedMapper, claim_cores
+claim_cores()
+import jax, jaxsafe, numpy as np
+from jaxsafe.component import normalise
+from jaxsafe.train.agent import Agent
+from jaxsafe.train.loop import programs
+from jaxsafe.train.ppo import PPO
+shared = jaxsafe.make("docking2d_oriented"), normalise(Agent(features="approach")), normalise(PPO(num_envs=32))
+def starts(count):
+    mapper = SeedMapper(count)
+    return mapper.gather(programs(mapper, 1, 1)[0](mapper.replicate(shared), mapper.keys(0)))
+jax.tree.map(lambda many, one: np.testing.assert_array_equal(many[0], one[0]), starts(3), starts(1))
+"""
+
+
+def test_oriented_docking_starts_bit_for_bit_where_the_seed_alone_starts() -> None:
+    """Compiled as the command does, which the settings of the tests do not."""
+    subprocess.run([sys.executable, "-c", STARTS], check=True, env={**os.environ, "XLA_FLAGS": ""})
 
 
 @pytest.mark.parametrize(("updates", "share"), [(0, 2), (UPDATES, 2)])

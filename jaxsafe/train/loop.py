@@ -249,7 +249,7 @@ def programs(mapper: SeedMapper, length: int, limit: int) -> tuple[Any, Any]:
     def advance(shared: tuple, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         return chunk(shared, state, length, limit, mapper.shard)
 
-    fresh = mapper.map(partial(begin, shard=mapper.shard), returned=STATE)
+    fresh = mapper.map(partial(begin, shard=mapper.shard), returned=STATE, pairs=True)
     return fresh, mapper.map(advance, STATE, (STATE, SEEDS))
 
 

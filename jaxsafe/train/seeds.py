@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import zip_longest
 from typing import Any
 
@@ -67,19 +68,27 @@ class SeedMapper:
         self.one_by_one = groups[0][0].platform == "cpu"
         self.num_local_devices = sum(device.process_index == jax.process_index() for device in self.mesh.devices.flat)
 
-    def map(self, function: Callable[[Any, Any], Any], given: Any = SEEDS, returned: Any = SEEDS) -> Any:
+    def map(
+        self, function: Callable[[Any, Any], Any], given: Any = SEEDS, returned: Any = SEEDS, pairs: bool = False
+    ) -> Any:
         """`function(shared, one)` to a jittable `(shared, all)`, all with a leading axis of `padded` seeds.
 
         Args:
             function: of one seed.
             given: how the arrays of `all` lie on the devices, `SEEDS` or `LANES`, or a tree of both that stands for theirs.
             returned: the same of what the function returns.
+            pairs: take a device's only seed twice, for what is cheap and may be fused with its surroundings: the compiler
+                makes no loop for one seed, and there the starts of oriented docking differed in the last bit.
         """
 
         def shard(shared: Any, local: Any) -> Any:
             if not self.one_by_one:
                 return jax.vmap(function, in_axes=(None, 0))(shared, local)
-            return jax.lax.map(lambda one: _isolated(function)(shared, one), local)
+            each = partial(jax.lax.map, lambda one: _isolated(function)(shared, one))
+            if pairs and len(jax.tree.leaves(local)[0]) == 1:
+                pair = jax.tree.map(lambda x: jnp.repeat(x, 2, axis=0), local)
+                return jax.tree.map(lambda x: x[:1], each(pair))
+            return each(local)
 
         return jax.jit(
             jax.shard_map(shard, mesh=self.mesh, in_specs=(PartitionSpec(), given), out_specs=returned, check_vma=False)
