@@ -1,11 +1,11 @@
 """What does run time assurance cost, and how much does it change?
 
 Filter calls a second in a batch of 4096 states met on the way under random actions, float32, compiling apart, medians; the
-small quadratic program; how often and how much each docking filter alters random actions; and what a filter in the loop
-adds to the wall time of training, in turns with training without one. Where cbfpy or run-time-assurance are installed
+small quadratic program; how often and how much each docking filter alters random actions; what becomes of starts that are
+not certified; and what a filter in the loop adds to the wall time of training, in turns with training without one. Where cbfpy or run-time-assurance are installed
 their filters run in the same invocation. Writes `benchmarks/results/rta.json` and prints the tables:
 
-    python benchmarks/rta.py [parts=calls,qp,change,training] [repeats=7]
+    python benchmarks/rta.py [parts=calls,qp,change,starts,training] [repeats=7]
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ BATCH = 4096
 
 def main() -> None:
     """Run, write, print."""
-    parts = {"calls": calls, "qp": programs, "change": changes, "training": training}
+    parts = {"calls": calls, "qp": programs, "change": changes, "starts": starts, "training": training}
     options = words(repeats="7", parts=",".join(parts))
     repeats, chosen = int(options["repeats"]), several("parts", options["parts"], parts)
     known = json.loads(OUT.read_text()) if OUT.exists() else {}
@@ -204,6 +204,36 @@ def changes(repeats: int) -> list[dict[str, Any]]:
                 row = attack(jaxsafe.make(task, rta=preset), policy, 1000, 128, jax.random.key(0))
                 names = ("violating_steps", "intervention_rate", "mean_correction", "worst_margin")
                 rows.append({"task": task, "filter": preset, "actions": policy, **{name: row[name] for name in names}})
+    return rows
+
+
+def starts(repeats: int) -> list[dict[str, Any]]:
+    """What becomes of the starts of oriented docking that are not certified, in 400 steps."""
+    del repeats
+    env, size = jaxsafe.make("docking2d_oriented", rta="default"), 200_000
+    state, timestep = jax.jit(jax.vmap(jaxsafe.reset, in_axes=(None, 0)))(env, jax.random.split(jax.random.key(7), size))
+    lost = jax.tree.map(lambda leaf: leaf[~timestep.info.rta.certified], state)
+
+    @jax.jit
+    def margins(env: jaxsafe.Environment, lost: Any, action: jax.Array) -> jax.Array:
+        each = jax.vmap(jaxsafe.step, in_axes=(None, 0, None))
+        return jax.lax.scan(lambda state, _: each(env, state, action), lost, length=400)[1].info.margins["velocity_limit"]
+
+    rows = []
+    for name, value in (("coasting", 0.0), ("full thrust and turn", 1.0)):
+        h = np.asarray(margins(env, lost, jnp.full(env.action_size, value)))
+        steps = (h < 0.0).sum(axis=0)
+        rows.append(
+            {
+                "task": "docking2d_oriented",
+                "actions": name,
+                "starts": size,
+                "not_certified": h.shape[1],
+                "violating": int((steps > 0).sum()),
+                "longest": int(steps.max()),
+                "least_h": float(h.min()),
+            }
+        )
     return rows
 
 

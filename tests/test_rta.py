@@ -54,6 +54,20 @@ def test_no_adversary_breaks_the_filter(preset: str, task: str, policies: tuple[
         assert_unbroken(env, attack(env, policy, 150, 32, jax.random.key(1)))
 
 
+def test_an_oriented_spacecraft_across_its_velocity_turns_rather_than_pushes_it_away() -> None:
+    """A start with less than the margin, met in training: thrust that no longer holds the limit kept it above for 109 s."""
+    env = jaxsafe.make("docking2d_oriented", rta="default")
+    start = {"position": [7.8028517, -148.32379], "velocity": [-0.408887, 0.29509956], "attitude": 0.931799}
+    state, timestep = jaxsafe.reset_to(env, {"deputy": start | {"attitude_rate": 0.0}})
+    assert not timestep.info.rta.certified
+    margins = []
+    for _ in range(20):
+        state, timestep = step(env, state, jnp.ones(2))
+        margins.append(timestep.info.margins["velocity_limit"])
+    assert min(margins) > -0.003
+    assert min(margins[5:]) > 0.0
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("preset", "task"), LONG)
 def test_no_adversary_breaks_any_filter(preset: str, task: str) -> None:

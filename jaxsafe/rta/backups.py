@@ -36,12 +36,14 @@ class AlignAndBrake(BackupController, type="align_and_brake"):
 
     The attitude follows the rate sign(e) √(1.6 α abs(e)) for the error e between ±body axis and velocity, α the bound of
     the wheel. While abs(e) > `aligned` the thrust is the smallest that keeps the speed limit with twice the `margin`, which
-    holds the boundary while the craft turns; then it nulls the velocity along the body.
+    holds the boundary while the craft turns; then it nulls the velocity along the body. Where no thrust keeps the limit, it
+    brakes, but not while abs(e) > `steep`: thrust so far across the velocity turns it away as fast as the body follows.
     """
 
     constraint: ConstraintName
     margin: Annotated[Number, Unit("m/s"), Range(0.0)]
     aligned: Annotated[Radians, Positive] = jnp.pi / 30
+    steep: Annotated[Radians, Positive] = jnp.pi * 5 / 12
 
     def control(self, env: Any, sim: Sim, later: Others) -> Float[Array, " 2"]:
         state = sim.platforms[env.agent]
@@ -52,10 +54,11 @@ class AlignAndBrake(BackupController, type="align_and_brake"):
         turn = jnp.clip((rate - state.attitude_rate) / env.dt, low[1], high[1])
 
         ball = speed_ball(env, sim, jnp.stack([jnp.zeros_like(turn), turn]), self.constraint, 2.0 * self.margin, free=1)
-        hold, _ = project_box_ball(jnp.zeros(1, turn.dtype), low[:1], high[:1], *ball)
+        hold, feasible = project_box_ball(jnp.zeros(1, turn.dtype), low[:1], high[:1], *ball)
+        hold = jnp.where(feasible | (jnp.abs(error) <= self.steep), hold[0], 0.0)
         along = jnp.sum(state.velocity * direction(state.attitude))
         brake = -along * env.agent_platform.mass / env.dt
-        return jnp.stack([jnp.where(jnp.abs(error) <= self.aligned, brake, hold[0]), turn])
+        return jnp.stack([jnp.where(jnp.abs(error) <= self.aligned, brake, hold), turn])
 
 
 class Slow(TerminalSet, type="slow"):
