@@ -1,9 +1,10 @@
 """What does run time assurance cost, and how much does it change?
 
-Filter calls a second in a batch of 4096 states met on the way under random actions, float32, compiling apart, medians; the
-small quadratic program; how often and how much each docking filter alters random actions; what becomes of starts that are
-not certified; and what a filter in the loop adds to the wall time of training, in turns with training without one. Where cbfpy or run-time-assurance are installed
-their filters run in the same invocation. Writes `benchmarks/results/rta.json` and prints the tables:
+Filter calls a second in a batch of 4096 states met on the way under random actions, float32, compiling apart, medians;
+the small quadratic program; how often and how much each docking filter alters random actions; what becomes of starts
+that are not certified; and what a filter in the loop adds to the wall time of training, in turns with training without
+one. Where cbfpy or run-time-assurance are installed their filters run in the same invocation. Writes
+`benchmarks/results/rta.json` and prints the tables:
 
     python benchmarks/rta.py [parts=calls,qp,change,starts,training] [repeats=7]
 """

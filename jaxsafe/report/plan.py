@@ -33,7 +33,10 @@ KINDS: Mapping[str, Kind] = {
         "the recipe of the task: continuous actions, features computed from the observation by the agent; in rejoin the"
         " critic also sees the totals of the reward terms so far, and training episodes end after 300 steps",
     ),
-    "plain": Kind(("preset=plain",), "the paper's observation straight into the networks"),
+    "plain": Kind(
+        ("preset=plain",),
+        "the paper's observation straight into the networks; in rejoin3d training episodes end after 300 steps",
+    ),
     "lanes": Kind(("preset=lanes",), "4,096 environments side by side, for accelerators"),
     "quick": Kind(("preset=quick",), "fewer epochs and steps, for a result soon; evaluated in 100 episodes a seed"),
     "discrete": Kind(("actions=discrete",), "the recipe with the paper's discrete actions"),
