@@ -209,32 +209,36 @@ def changes(repeats: int) -> list[dict[str, Any]]:
 
 
 def starts(repeats: int) -> list[dict[str, Any]]:
-    """What becomes of the starts of oriented docking that are not certified, in 400 steps."""
+    """What becomes of the starts of oriented docking that are not certified, in 400 steps; and without the fastest ones."""
     del repeats
-    env, size = jaxsafe.make("docking2d_oriented", rta="default"), 200_000
-    state, timestep = jax.jit(jax.vmap(jaxsafe.reset, in_axes=(None, 0)))(env, jax.random.split(jax.random.key(7), size))
-    lost = jax.tree.map(lambda leaf: leaf[~timestep.info.rta.certified], state)
+    size, rows = 200_000, []
 
     @jax.jit
     def margins(env: jaxsafe.Environment, lost: Any, action: jax.Array) -> jax.Array:
         each = jax.vmap(jaxsafe.step, in_axes=(None, 0, None))
         return jax.lax.scan(lambda state, _: each(env, state, action), lost, length=400)[1].info.margins["velocity_limit"]
 
-    rows = []
-    for name, value in (("coasting", 0.0), ("full thrust and turn", 1.0)):
-        h = np.asarray(margins(env, lost, jnp.full(env.action_size, value)))
-        steps = (h < 0.0).sum(axis=0)
-        rows.append(
-            {
-                "task": "docking2d_oriented",
-                "actions": name,
-                "starts": size,
-                "not_certified": h.shape[1],
-                "violating": int((steps > 0).sum()),
-                "longest": int(steps.max()),
-                "least_h": float(h.min()),
-            }
-        )
+    for share in (1.0, 0.999):
+        env = jaxsafe.make("docking2d_oriented", {"deputy.start.velocity.share": [0.0, share]}, rta="default")
+        keys = jax.random.split(jax.random.key(7), size)
+        state, timestep = jax.jit(jax.vmap(jaxsafe.reset, in_axes=(None, 0)))(env, keys)
+        lost = jax.tree.map(lambda leaf, kept=timestep.info.rta.certified: leaf[~kept], state)
+        count = int((~timestep.info.rta.certified).sum())
+        for name, value in (("coasting", 0.0), ("full thrust and turn", 1.0)):
+            h = np.asarray(margins(env, lost, jnp.full(env.action_size, value))) if count else np.zeros((400, 0))
+            steps = (h < 0.0).sum(axis=0)
+            rows.append(
+                {
+                    "task": "docking2d_oriented",
+                    "share of the limit": share,
+                    "actions": name,
+                    "starts": size,
+                    "not_certified": count,
+                    "violating": int((steps > 0).sum()),
+                    "longest": int(steps.max(initial=0)),
+                    "least_h": float(h.min()) if count else None,
+                }
+            )
     return rows
 
 

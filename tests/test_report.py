@@ -3,9 +3,11 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 import pytest
 from tiny import TINY
 
+from jaxsafe import cli
 from jaxsafe.envs import TASKS
 from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import __main__ as evaluate
@@ -13,6 +15,7 @@ from jaxsafe.report import __main__ as command
 from jaxsafe.report import run as running
 from jaxsafe.report.page import samples_per_second, wall_to
 from jaxsafe.report.plan import KINDS, SHIPPED, Item, best_seed, plan
+from jaxsafe.rollout import reset_batch
 from jaxsafe.train import __main__ as train
 from jaxsafe.train.config import resolve_all
 
@@ -139,7 +142,6 @@ def test_bad_options_of_report_are_told(words: list[str], message: str) -> None:
 
 
 def test_every_command_of_the_plan_is_valid() -> None:
-    from jaxsafe import cli
     from jaxsafe.config import override
     from jaxsafe.envs import with_rta
 
@@ -186,3 +188,11 @@ def test_the_best_policy_succeeds_most_then_violates_least_then_has_the_highest_
     assert best_seed(results([1.0, 1.0, 0.8], [0.2, 0.1, 0.0], [9.0, 1.0, 9.0])) == 6
     assert best_seed(results([1.0, 1.0, 1.0], [0.1, 0.1, 0.1], [1.0, None, 2.0])) == 7
     assert best_seed(results([0.0, 0.0], [None, None], [None, None])) == 5
+
+
+def test_trainings_with_a_filter_start_where_it_promises_safety() -> None:
+    begin = jax.jit(reset_batch, static_argnums=2)
+    for item in plan(["docking2d_oriented"], ["rta", "unpunished"], ["seeds=2"]):
+        [(_, env, _)] = resolve_all(cli.Arguments.parse(item.words))
+        _, timestep = begin(env, jax.random.key(0), 20_000)
+        assert timestep.info.rta.certified.all()
