@@ -8,7 +8,8 @@ The second table is the time from the first import to the first result: a batche
 Pendulum-v1 of gymnax, and an update of PPO on docking2d with the settings of `ppo.py`, beside rejax, whose task it is too,
 through `jaxsafe.adapters.gymnax`: so rejax also pays for importing and making ours. Cold is with an empty
 cache of compiled programs, warm with what the process before left there. Peers run in Python environments that this script
-builds in `benchmarks/peers`. Writes `benchmarks/results/startup.json` and prints the tables:
+builds in `benchmarks/peers`. The third table is what that time goes into, as JAX's own events and profiler tell it. Writes
+`benchmarks/results/startup.json` and prints the tables:
 
     python benchmarks/startup.py [tasks=rejoin2d,…] [rta=none,default] [repeats=3]
 """
@@ -39,7 +40,9 @@ def main() -> None:
     options = words(tasks="", rta="none,default", repeats="3")
     if "probe" in options:
         word = options["probe"]
-        print(json.dumps(seconds_to(FIRST[word]) if word in FIRST else probe(*word.split(","))))
+        traced = word.removeprefix("profile ")
+        measure = seconds_to if traced == word else profile
+        print(json.dumps(measure(FIRST[traced]) if traced in FIRST else probe(*word.split(","))))
         return
     from machine import about
 
@@ -50,7 +53,8 @@ def main() -> None:
     here, repeats = about(), int(options["repeats"])
     rows = [measured(name, rta, repeats) for name, rta in chosen]
     rows.append(measured("Pendulum-v1", "gymnax", repeats, interpreter("gymnax")))
-    first = [first_result(name, repeats) for name in FIRST]
+    first = [first_result(name, name, repeats) for name in FIRST]
+    profiles = [first_result(name, f"profile {name}", repeats) for name in FIRST if name.startswith("jaxsafe")]
     content = {
         **here,
         "peers": versions(["gymnax", "rejax"]),
@@ -59,6 +63,7 @@ def main() -> None:
         "columns": COLUMNS,
         "rows": rows,
         "first": first,
+        "profiles": profiles,
     }
     OUT.write_text(json.dumps(content, indent=1) + "\n")
     print("| s | " + " | ".join(COLUMNS) + " |\n|---|" + "---|" * len(COLUMNS))
@@ -68,16 +73,20 @@ def main() -> None:
     print("\n| s to the first result | cold | warm |\n|---|---|---|")
     for row in first:
         print(f"| {row['name']} | " + " | ".join(f"{statistics.median(row[kind]):.2g}" for kind in ("cold", "warm")) + " |")
+    print("\n| s | " + " | ".join(PARTS) + " |\n|---|" + "---|" * len(PARTS))
+    for row, kind in ((row, kind) for row in profiles for kind in ("cold", "warm")):
+        middle = [statistics.median(one[part] for one in row[kind]) for part in PARTS]
+        print(f"| {row['name']}, {kind} | " + " | ".join(f"{value:.2g}" for value in middle) + " |")
 
 
-def first_result(name: str, repeats: int) -> dict[str, Any]:
-    """Seconds to the first result with an empty cache, and with a full one."""
+def first_result(name: str, word: str, repeats: int) -> dict[str, Any]:
+    """What a probe finds with an empty cache, and with a full one."""
     found: dict[str, Any] = {"name": name, "cold": [], "warm": []}
     python = interpreter(name.split()[0])
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as cache:
             for kind in ("cold", "warm"):
-                found[kind].append(apart(__file__, [f"probe={name}"], None, python, Path(cache)))
+                found[kind].append(apart(__file__, [f"probe={word}"], None, python, Path(cache)))
     return found
 
 
@@ -152,6 +161,64 @@ def seconds_to(result: Callable[[], Any]) -> float:
     start = time.perf_counter()
     result()
     return time.perf_counter() - start
+
+
+EVENTS = {
+    "trace": "/jax/core/compile/jaxpr_trace_duration",
+    "lower": "/jax/core/compile/jaxpr_to_mlir_module_duration",
+    "compile": "/jax/core/compile/backend_compile_duration",
+}
+"""What JAX reports of its stages, each inside or before the next; reading the cache counts as compiling."""
+
+REGIONS = {
+    "XLA's passes": ("HLO passes through layout assignment", "HLO passes after layout assignment"),
+    "emitters": ("FusionCompiler::Compile",),
+    "LLVM": ("TaskDispatcher::dispatch",),
+}
+"""What XLA's profiler calls the parts of compiling for a CPU."""
+
+PARTS = ("whole", "import of JAX", *EVENTS, "the rest", *REGIONS)
+"""The last ones are parts of `compile`, summed over the threads that do them side by side."""
+
+
+def profile(result: Callable[[], Any]) -> dict[str, float]:
+    """Seconds of each of `PARTS` until the result is there."""
+    start = time.perf_counter()
+    import jax
+
+    imported = time.perf_counter()
+    spans: list[tuple[str, float, float]] = []
+
+    def listen(event: str, duration: float, **_: Any) -> None:
+        spans.append((event, (now := time.perf_counter()) - duration, now))
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    options = jax.profiler.ProfileOptions()
+    options.python_tracer_level = 0
+    with tempfile.TemporaryDirectory() as place:
+        jax.profiler.start_trace(place, profiler_options=options)
+        began = time.perf_counter()
+        result()
+        ended = time.perf_counter()
+        jax.profiler.stop_trace()
+        [file] = Path(place).rglob("*.xplane.pb")
+        planes = jax.profiler.ProfileData.from_file(str(file)).planes
+        events = [(event.name, event.duration_ns) for plane in planes for line in plane.lines for event in line.events]
+    stages = [*EVENTS.values()]
+    spent = [_covered([span for span in spans if span[0] in stages[i:]]) for i in range(len(stages))]
+    found = {name: spent[i] - sum(spent[i + 1 : i + 2]) for i, name in enumerate(EVENTS)}
+    found |= {"import of JAX": imported - start, "the rest": ended - began - spent[0]}
+    found["whole"] = sum(found.values())
+    found |= {part: sum(ns for name, ns in events if name in regions) / 1e9 for part, regions in REGIONS.items()}
+    return {name: round(value, 3) for name, value in found.items()}
+
+
+def _covered(spans: list[tuple[str, float, float]]) -> float:
+    """Seconds in which at least one of the spans was under way."""
+    total, until = 0.0, 0.0
+    for _, begin, end in sorted(spans, key=lambda span: span[1]):
+        total, until = total + max(0.0, end - max(begin, until)), max(until, end)
+    return total
 
 
 def our_step() -> None:
