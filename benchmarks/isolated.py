@@ -20,13 +20,13 @@ CACHE = (
 
 
 PEERS = {
-    "gymnax": ["gymnax"],
+    "gymnax": ["gymnax", "six"],
     "brax": ["brax"],
     "envpool": ["envpool"],
-    "rejax": ["rejax", "gymnax==0.0.9", "--pre", "tfp-nightly"],
+    "rejax": ["rejax", "gymnax==0.0.9", "six", "--pre", "tfp-nightly"],
     "sb3": ["stable-baselines3"],
 }
-"""What pip installs for each beside jaxsafe, which brings Gymnasium itself."""
+"""What pip installs for each beside jaxsafe, which brings Gymnasium itself; gymnax imports six without asking for it."""
 
 
 def words(**defaults: str) -> dict[str, str]:
