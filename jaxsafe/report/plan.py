@@ -43,7 +43,7 @@ KINDS: Mapping[str, Kind] = {
     "rta": Kind(
         ("rta=default",),
         "the recipe with run time assurance during training, where each intervention costs a little; oriented docking"
-        " starts at up to 99.9 % of the speed limit, since faster starts cannot be certified",
+        " starts at up to 99 % of the speed limit, since some faster starts nothing can keep safe",
     ),
     "unpunished": Kind(
         ("rta=default", "rta_training=unpunished"), "the same, and interventions cost nothing (`rta_training=unpunished`)"
@@ -51,8 +51,8 @@ KINDS: Mapping[str, Kind] = {
 }
 """By the name that the page uses."""
 
-CERTIFIED_STARTS = {"docking2d_oriented": ("env.deputy.start.velocity.share=[0,0.999]",)}
-"""What leaves out a task's starts from which no filter promises anything, less than its margin below the limit."""
+CERTIFIED_STARTS = {"docking2d_oriented": ("env.deputy.start.velocity.share=[0,0.99]",)}
+"""What leaves out the starts of a task from which no filter can promise safety."""
 
 _DOCKING_STARTS = {
     "from 1 km": ["env.deputy.start.position.distance=[1000,1000]"],
