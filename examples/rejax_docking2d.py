@@ -2,7 +2,9 @@
 
     pip install 'jaxsafe[gymnax]' rejax && python examples/rejax_docking2d.py
 
-rejax 0.1.3 needs gymnax 0.0.9, and distrax a nightly TensorFlow Probability: pip install gymnax==0.0.9 six --pre tfp-nightly.
+rejax 0.1.3 needs gymnax 0.0.9, and distrax a nightly TensorFlow Probability:
+
+    pip install gymnax==0.0.9 six --pre tfp-nightly
 """
 
 import sys
