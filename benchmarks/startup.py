@@ -189,8 +189,8 @@ def profile(result: Callable[[], Any]) -> dict[str, float]:
     imported = time.perf_counter()
     spans: list[tuple[str, float, float]] = []
 
-    def listen(event: str, duration: float, **_: Any) -> None:
-        spans.append((event, (now := time.perf_counter()) - duration, now))
+    def listen(event: str, duration_secs: float, **_: Any) -> None:
+        spans.append((event, (now := time.perf_counter()) - duration_secs, now))
 
     jax.monitoring.register_event_duration_secs_listener(listen)
     options = jax.profiler.ProfileOptions()
