@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import io
 import logging
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +21,11 @@ from jaxsafe.types import is_key
 logging.getLogger("absl").setLevel(logging.ERROR)
 
 
-SETTLE_S = 0.5
-"""How long the threads of a failed read get to end, in silence."""
+QUIET_S = 0.5
+"""The threads of a failed read count as ended when none of them has complained for so long."""
+
+SETTLE_S = 10.0
+"""How long they get for that at most."""
 
 
 class Checkpoints:
@@ -62,14 +67,37 @@ class Checkpoints:
         ocp = self._ocp
         abstract = jax.tree.map(_empty, like)
         args = ocp.args.Composite(state=ocp.args.StandardRestore(abstract), facts=ocp.args.JsonRestore())
-        with contextlib.redirect_stderr(io.StringIO()):  # threads of a failed read complain one by one
+        reason = ""
+        with _silence() as complaints:
             try:
                 restored = self._manager.restore(step, args=args)
             except Exception as error:  # orbax and tensorstore raise whatever their layers raise
-                time.sleep(SETTLE_S)
                 reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
-                raise ConfigError(f"{self.directory / str(step)}: checkpoint cannot be read: {reason}") from None
+            if reason:  # outside the except clause: the error keeps the failed tasks, which complain when they go
+                _settle(complaints)
+        if reason:
+            raise ConfigError(f"{self.directory / str(step)}: checkpoint cannot be read: {reason}")
         return jax.tree.map(_as, restored["state"], like), restored["facts"]
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[io.StringIO]:
+    """Nothing on standard error: threads and tasks of a failed read complain one by one."""
+    logger = logging.getLogger("asyncio")
+    before, logger.disabled = logger.disabled, True
+    try:
+        with contextlib.redirect_stderr(io.StringIO()) as complaints:
+            yield complaints
+    finally:
+        logger.disabled = before
+
+
+def _settle(complaints: io.StringIO) -> None:
+    end, said = time.monotonic() + SETTLE_S, -1
+    while time.monotonic() < end and said != complaints.tell():
+        said = complaints.tell()
+        time.sleep(QUIET_S)
+    gc.collect()
 
 
 def _empty(shape: Any) -> np.ndarray:
