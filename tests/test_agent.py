@@ -63,6 +63,22 @@ def test_an_untrained_policy_is_centred_and_as_wide_as_configured(actions: str) 
     assert pushes.std() == pytest.approx(0.3, abs=0.02)
 
 
+def test_a_smaller_log_std_sharpens_the_choice_of_its_actuator_and_leaves_the_mode() -> None:
+    env = jaxsafe.make("docking2d", actions="discrete")
+    agent = normalise(Agent(prior_std=0.4))
+    params = agent.init(KEY, env)
+    params = {**params, "actor": jax.tree.map(lambda x: 20.0 * x, params["actor"])}
+    inputs = jax.random.normal(jax.random.key(1), (50, 6))
+    wide = agent.distribution(env, params, inputs)
+    narrow = agent.distribution(env, {**params, "log_std": params["log_std"] - jnp.array([0.0, 0.5])}, inputs)
+    np.testing.assert_array_equal(wide.mode(), narrow.mode())
+    assert isinstance(wide, Categorical)
+    assert isinstance(narrow, Categorical)
+    np.testing.assert_allclose(narrow.logits[:, :11], wide.logits[:, :11], rtol=1e-6)
+    np.testing.assert_allclose(narrow.logits[:, 11:], np.exp(1.0) * wide.logits[:, 11:], rtol=1e-5)
+    assert np.all(narrow.entropy() < wide.entropy())
+
+
 def test_the_critic_sees_the_totals_in_any_order_and_the_actor_does_not() -> None:
     env = jaxsafe.make("docking2d")
     blind, seeing = Agent(), Agent(critic_sees_totals=True)

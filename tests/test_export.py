@@ -48,7 +48,8 @@ def test_discrete_policies_choose_alike() -> None:
     policy = saved("docking2d")
     env = jaxsafe.make("docking2d", actions="discrete")
     params = policy.agent.init(jax.random.key(0), env)
-    policy = policy._replace(env=env, params=jax.tree.map(lambda x: 30.0 * x, params))
+    params = {**params, "actor": jax.tree.map(lambda x: 30.0 * x, params["actor"])}
+    policy = policy._replace(env=env, params=params)
     observations = np.random.default_rng(0).uniform(-1, 1, (500, 6)).astype(np.float32)
     expected = policy.agent.act(env, policy.params, jax.random.key(0), jnp.asarray(observations), True)
     found = run(to_onnx(functions.action(policy).function, observations.shape), observations)

@@ -138,8 +138,9 @@ def test_the_learning_rate_falls_as_it_is_told() -> None:
         np.testing.assert_allclose(rates, [1e-2, middle, 1e-4], rtol=1e-5)
 
 
-def test_the_noise_falls_besides_what_is_learnt() -> None:
-    env = probe(Constant(name="reward"))
+@pytest.mark.parametrize("discrete", [False, True], ids=["gaussian", "categorical"])
+def test_the_noise_falls_besides_what_is_learnt(discrete: bool) -> None:
+    env = probe(Constant(name="reward"), discrete=discrete)
     state = init(env, AGENT, SMALL, jax.random.key(0))
     kept = update(env, AGENT, SMALL, 10, state).params["log_std"]
     less = update(env, AGENT, SMALL.replace(noise_decay=jnp.array(2.0)), 10, state).params["log_std"]

@@ -32,7 +32,9 @@ class Agent(Component):
     features: Literal["none", "docking", "approach", "rejoin"] = "none"  # appended to the observation
     log_std: Annotated[Number, Unit("1", length=ANY)] = -0.7
     """Initial, of continuous actions in [−1, 1], one number or one for each; learnt, the same for all states."""
-    prior_std: Annotated[Dimensionless, Positive] = 0.3  # of discrete actions at the start, in units of half the range
+    prior_std: Annotated[Dimensionless, Positive] = 0.3
+    """Of discrete actions at the start, in units of half the range. Its logarithm is their first log_std, one for each
+    actuator, learnt as that of continuous actions: a smaller one sharpens the choice in all states."""
     critic_sees_totals: bool = False
     """Whether the critic, which only training needs, also sees what each reward term has summed to in the episode. What a
     term will still pay may depend on that, and the observation hides it."""
@@ -50,9 +52,8 @@ class Agent(Component):
             name: _layers([next(normals) for _ in pairwise(sizes)], last_gain=0.01 if name == "actor" else 1.0)
             for name, sizes in networks.items()
         }
-        if env.num_action_points:
-            return params
-        return {**params, "log_std": jnp.broadcast_to(jnp.asarray(self.log_std), env.action_size)}
+        log_std = jnp.log(self.prior_std) if env.num_action_points else jnp.asarray(self.log_std)
+        return {**params, "log_std": jnp.broadcast_to(log_std, env.action_size)}
 
     def inputs(self, env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
         """Return what the networks see of an observation."""
@@ -60,10 +61,12 @@ class Agent(Component):
 
     def distribution(self, env: Environment, params: Params, inputs: Float[Array, "*batch i"]) -> Gaussian | Categorical:
         """Return the policy, a distribution over actions."""
-        out = mlp(params["actor"], inputs)
-        if not env.num_action_points:
+        out, points = mlp(params["actor"], inputs), env.num_action_points
+        if not points:
             return Gaussian(mean=out, log_std=params["log_std"])
-        return Categorical(logits=out + _prior(env.num_action_points, self.prior_std), points=env.num_action_points)
+        sharpness = (self.prior_std * jnp.exp(-params["log_std"])) ** 2  # of each actuator, then of each of its logits
+        sharpness = jnp.sum(sharpness[:, None] * np.repeat(np.eye(len(points), dtype=np.float32), points, axis=1), axis=0)
+        return Categorical(logits=sharpness * (out + _prior(points, self.prior_std)), points=points)
 
     def critic_inputs(
         self, inputs: Float[Array, "*batch i"], reward_totals: Mapping[str, Float[Array, "*batch"]]

@@ -148,8 +148,7 @@ def update(
     gamma = discount(ppo, progress)
     batch = _to_batch(agent, ppo, gamma, state, transitions, shard)
     params, optimizer = learn(env, agent, ppo, learning_rate(ppo, progress), state, batch, key_learn, shard)
-    if "log_std" in params:
-        params = {**params, "log_std": params["log_std"] - ppo.noise_decay / total_updates}
+    params = {**params, "log_std": params["log_std"] - ppo.noise_decay / total_updates}
     episode, done = shard.join((transitions.episode, transitions.done), axis=1)
     window = push(state.window, episode, done)
     multiplier = dual_ascent(ppo, state.multiplier, window, done) if agent.cost_critic else ()
