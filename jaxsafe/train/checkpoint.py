@@ -67,7 +67,7 @@ class Checkpoints:
         ocp = self._ocp
         abstract = jax.tree.map(_empty, like)
         args = ocp.args.Composite(state=ocp.args.StandardRestore(abstract), facts=ocp.args.JsonRestore())
-        reason = ""
+        restored, reason = {}, ""
         with _silence() as complaints:
             try:
                 restored = self._manager.restore(step, args=args)
