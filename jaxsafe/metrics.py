@@ -34,6 +34,9 @@ METRICS = (
 )
 """The names that `summarise` returns."""
 
+ENOUGH_EPISODES = 20
+"""Training episodes that a seed must have finished before its success rate counts for interaction efficiency."""
+
 
 class Episode(Record):
     """Sums over one episode so far."""
@@ -107,7 +110,7 @@ def summarise(episodes: Episode, success: int, has_delta_v: bool = True, has_rta
 
 
 def interaction_efficiency(
-    steps: np.ndarray, success: np.ndarray, episodes: np.ndarray, threshold: float = 0.8, at_least: int = 20
+    steps: np.ndarray, success: np.ndarray, episodes: np.ndarray, threshold: float = 0.8, at_least: int = ENOUGH_EPISODES
 ) -> dict[str, Any]:
     """First environment step (per seed) at which success in training reaches a threshold, Table 2.
 

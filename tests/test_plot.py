@@ -24,6 +24,7 @@ def rows(num_updates: int = 50, num_seeds: int = 4) -> list[dict]:
             "seed": 7 + i,
             "step": 100 * (j + 1),
             "wall_s": 0.5 * j,
+            "episodes": 10 * j,
             **dict.fromkeys(names, None if j < 3 else float(curves[j, i])),
         }
         for j in range(num_updates)
@@ -70,12 +71,32 @@ def episode(step: int, dimension: int) -> tuple[int, list[dict]]:
     return step, [{"status": s, "platforms": p} for s, p in zip(status, platforms, strict=True)]
 
 
-@pytest.mark.parametrize(("dimension", "panels"), [(2, 1), (3, 2)])
-def test_trajectories_have_a_panel_for_each_plane(dimension: int, panels: int) -> None:
-    figure = trajectories([episode(100, dimension), episode(200, dimension)], "title", "m")
+@pytest.mark.parametrize(("dimension", "planes"), [(2, 1), (3, 2)])
+def test_trajectories_show_one_start_during_training_and_all_after_it_in_each_plane(dimension: int, planes: int) -> None:
+    other = episode(200, dimension)
+    for row in other[1]:
+        row["platforms"]["deputy"]["position"][0] *= -1.0
+    figure = trajectories([episode(0, dimension), episode(100, dimension), episode(200, dimension), other], "title", "m")
     axes = [panel for panel in figure.axes if panel.get_xlabel() == "x [m]"]
-    assert len(axes) == panels
-    np.testing.assert_allclose(axes[0].lines[0].get_xdata(), np.linspace(80.0, 0.0, 20))
+    assert [panel.get_title() for panel in axes[:2]] == ["one start, during training", "after training"]
+    assert len(axes) == 2 * planes
+    during, after = ([line for line in panel.lines if len(line.get_xdata()) > 1] for panel in axes[:2])
+    assert (len(during), len(after)) == (3, 2)
+    np.testing.assert_allclose(during[0].get_xdata(), np.linspace(80.0, 0.0, 20))
+    np.testing.assert_allclose(after[1].get_xdata(), np.linspace(-80.0, 0.0, 20))
+    assert len({line.get_color() for line in during}) == 3
+
+
+def test_early_policies_that_go_far_away_do_not_set_the_scale() -> None:
+    far = episode(0, 2)
+    for k, row in enumerate(far[1]):
+        row["platforms"]["deputy"]["position"] = [80.0 + 100.0 * k, 80.0]
+        row["status"] |= {"docking_distance": 113.0 + 100.0 * k, "speed": 5.0}
+    panel = trajectories([far, episode(100, 2)], "title", "m").axes[0]
+    assert panel.get_xlim() == panel.get_ylim() == pytest.approx((-128.0, 128.0))
+    panel = speed_distance([far, episode(100, 2)], "title").axes[0]
+    assert panel.get_xlim()[1] < 150.0
+    assert panel.get_ylim()[1] < 1.0
 
 
 def test_paths_are_seen_from_the_lead_along_its_heading_with_the_region_that_it_carries() -> None:
@@ -93,8 +114,10 @@ def test_paths_are_seen_from_the_lead_along_its_heading_with_the_region_that_it_
         }
         for p, h, a, b in zip(lead, heading, ahead, aside, strict=True)
     ]
-    panel = trajectories([(100, rows)], "title", "ft", env.regions).axes[0]
-    np.testing.assert_allclose(panel.lines[0].get_xydata(), np.tile([-300.0, 100.0], (30, 1)), atol=1e-6)
+    panel = trajectories([(100, rows)], "title", "ft", env.regions).axes[2]
+    assert panel.get_title() == "near the lead"
+    path = next(line for line in panel.lines if len(line.get_xdata()) > 1)
+    np.testing.assert_allclose(path.get_xydata(), np.tile([-300.0, 100.0], (30, 1)), atol=1e-6)
     (region,) = panel.patches
     assert isinstance(region, Circle)
     np.testing.assert_allclose(region.center, [-250.0, 433.0], atol=1e-6)
@@ -158,19 +181,30 @@ def test_several_runs_in_one_figure_with_a_table(
 def test_comparison_is_logarithmic_only_where_runs_differ_much_in_length():
     def rows(steps):
         quantities = dict.fromkeys(("success_rate", "return", "length"), 0.5)
-        return [{"step": step, "wall_s": step / 1e4, "seed": 0, **quantities} for step in (1000, steps)]
+        return [{"step": step, "wall_s": step / 1e4, "seed": 0, "episodes": 9, **quantities} for step in (1000, steps)]
 
     for steps, scale in ((5_000, "linear"), (50_000, "log")):
         figure = compare_curves({"one": rows(2_000), "other": rows(steps)}, "docking2d")
         assert {panel.get_xscale() for panel in figure.axes} == {scale}
 
 
-def test_every_seed_has_its_line_and_those_that_failed_are_counted() -> None:
+def test_curves_of_a_comparison_begin_when_every_seed_has_finished_enough_episodes() -> None:
+    panel = compare_curves({"one": rows()}, "docking2d", mark=("the paper's 80 %", 3000.0)).axes[0]
+    curve = next(line for line in panel.lines if line.get_label() == "one")
+    assert curve.get_xdata()[0] == 400  # the update after which there were 30 episodes, and a mean; 20 before had none
+    few = [{**row, "episodes": row["episodes"] // 50} for row in rows()]
+    curve = next(line for line in compare_curves({"one": few}, "docking2d").axes[0].lines if line.get_label() == "one")
+    assert 0 < len(curve.get_xdata()) < 10  # those with all 9 episodes that the run finished
+    (mark,) = [line for line in panel.lines if line.get_label() == "the paper's 80 %"]
+    assert mark.get_xydata().tolist() == [[3000.0, 80.0]]
+
+
+def test_every_seed_has_its_line_and_those_that_failed_are_named() -> None:
     failing = [{**row, "success_rate": 0.3} if row["seed"] == 8 else {**row, "success_rate": 0.9} for row in rows(500)]
-    figure = seed_curves({"one": failing, "other": rows(500)}, "docking2d")
+    figure = seed_curves({"one": failing, "other": rows(500)}, "docking2d", {"one": [8], "other": []})
     seeds = {row["seed"] for row in failing}
     assert [len(panel.lines) for panel in figure.axes] == [len(seeds) + 1] * 2  # and the 80 % line
-    assert figure.axes[0].get_title() == f"one: 1 of {len(seeds)} end below 80 %"
+    assert [panel.get_title() for panel in figure.axes] == ["one: failed seed 8", "other: failed none"]
     dashed = [line for line in figure.axes[0].lines if line.get_linestyle() == "--"]
     assert len(dashed) == 1
     np.testing.assert_allclose(dashed[0].get_ydata(), 30.0)

@@ -14,7 +14,7 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.report import __main__ as command
 from jaxsafe.report import run as running
-from jaxsafe.report.page import samples_per_second, wall_to
+from jaxsafe.report.page import failed_seeds, finished, samples_per_second, wall_to
 from jaxsafe.report.plan import KINDS, SHIPPED, Item, best_seed, plan
 from jaxsafe.rollout import reset_batch
 from jaxsafe.train import __main__ as train
@@ -199,3 +199,12 @@ def test_trainings_with_a_filter_start_where_it_promises_safety() -> None:
         fastest = override(env, {"deputy.start.velocity.share": [share[1], share[1]]})
         _, timestep = begin(fastest, jax.random.key(0), 20_000)
         assert timestep.info.rta.certified.all()
+
+
+def test_a_seed_failed_if_it_did_either_way_and_finished_episodes_are_those_by_the_step() -> None:
+    rates = {"stochastic": [0.95, 0.949, 1.0], "deterministic": [1.0, 1.0, 0.3]}
+    results = {"seed": 7, "evaluation": {way: {"success_rate": {"per_seed": rate}} for way, rate in rates.items()}}
+    assert failed_seeds(results) == [8, 9]
+    curves = [{"seed": seed, "step": 100 * i, "episodes": 10 * i + seed} for seed in (3, 4) for i in (1, 2, 3)]
+    assert finished(curves, 200) == 23.5
+    assert finished(curves, 250) == 23.5

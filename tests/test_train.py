@@ -94,7 +94,7 @@ def test_results_follow_the_schema(whole: Path) -> None:
 
 def test_logged_episodes_hold_states_controls_statuses_and_rewards(whole: Path) -> None:
     rows = logs(whole)["episodes.jsonl"]
-    assert {row["step"] for row in rows} == {320, 640, 960, 1280}
+    assert {row["step"] for row in rows} == {0, 64, 128, 256, 320, 640, 960, 1280}  # early learning, then each evaluation
     episode = [row for row in rows if row["step"] == 640]
     assert [row["t"] for row in episode] == list(range(len(episode)))
     assert [row["outcome"] for row in episode[:-1]] == ["running"] * (len(episode) - 1)

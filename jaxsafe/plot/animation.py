@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, NullFormatter
 from PIL import Image
 
 from jaxsafe.environment import Environment
@@ -37,6 +37,9 @@ FRAMES = 80
 
 PAUSE_MS, LAST_MS = 75, 1500
 """How long a frame stays, and the last one."""
+
+TICKS = 4
+"""Intervals between numbers at an axis of the map, at most."""
 
 
 def animate(env: Environment, episode: tuple[State, TimeStep], path: Path, title: str) -> Path:
@@ -82,7 +85,7 @@ class Scene:
         self.heading = self.figure.suptitle(title, fontsize="medium")
         self._draw_maps()
         self._draw_curves(self.paths[env.agent])
-        self.draw(max(range(len(self.sim.time)), key=self._reach))  # the widest numbers
+        self.draw(max(range(len(self.sim.time)), key=self._width))
         self.figure.set_layout_engine("none")  # or the panels would jump with the width of their numbers
 
     def draw(self, step: int) -> np.ndarray:
@@ -114,6 +117,11 @@ class Scene:
         near = max([1.5 * (centre + size) for centre, size in zip(centres, sizes, strict=True)], default=0.0)
         return max(near, 1.2 * max(np.abs(path[step]).max() for path in self.paths.values()), 1e-6)
 
+    def _width(self, step: int) -> int:
+        """Characters of the numbers at the axes of the map."""
+        ticks = MaxNLocator(TICKS).tick_values(-self._reach(step), self._reach(step))
+        return max(len(f"{tick:.10g}") for tick in ticks)
+
     def _draw_maps(self) -> None:
         unit = length_unit(self.env)
         seen_from = next((name for name in self.paths if name != self.env.agent), None)
@@ -121,13 +129,14 @@ class Scene:
         self.moving: list[dict[str, dict[str, Any]]] = []
         for panel, (i, j) in zip(self.maps, self.planes, strict=True):
             panel.set(xlabel=f"{'xyz'[i]} [{unit}]", ylabel=f"{'xyz'[j]} [{unit}]", aspect="equal")
-            panel.xaxis.set_major_locator(MaxNLocator(4))
-            panel.yaxis.set_major_locator(MaxNLocator(4))
+            panel.xaxis.set_major_locator(MaxNLocator(TICKS))
+            panel.yaxis.set_major_locator(MaxNLocator(TICKS))
             artists: dict[str, dict[str, Any]] = {"platforms": {}, "regions": {}}
             for region in self.env.regions:
                 artists["regions"][region.name] = panel.add_patch(region_patch(region, j == 2))
+                artists["regions"][region.name].set_label(region.name)
             for radius in self._kept_away():
-                panel.add_patch(Circle((0.0, 0.0), radius, color=ORANGE, alpha=0.35, linewidth=0))
+                panel.add_patch(Circle((0.0, 0.0), radius, color=ORANGE, alpha=0.35, linewidth=0, label="too near"))
             for name in self.paths:
                 colour = BLUE if name == self.env.agent else GREY
                 trail, axis = (panel.plot([], [], color=colour, linewidth=width)[0] for width in (1.2, 2.4))
@@ -148,6 +157,7 @@ class Scene:
         distance = np.linalg.norm(path, axis=1)
         above, below = self.curves
         above.set(yscale="log", ylabel=labelled("distance", unit))
+        above.yaxis.set_minor_formatter(NullFormatter())
         above.set(xlim=(0, time[-1] or 1.0), ylim=(0.7 * max(distance.min(), 1e-3), 1.4 * distance.max() + 1e-3))
         below.axhline(0.0, color="black", linewidth=0.8)
         below.set(xlabel="time [s]", xlim=(0, time[-1] or 1.0))

@@ -2,36 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import cycle, product
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxsafe.metrics import bootstrap_interval
+from jaxsafe.metrics import ENOUGH_EPISODES, bootstrap_interval
 from jaxsafe.plot.figures import ALWAYS, AXES, CURVES, curve_table, panel_grid, set_axes
 from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE
 
-LOOKS = tuple(product(("-", "--"), (BLUE, ORANGE, GREEN, "#CC79A7", GREY)))
+LOOKS = tuple(product(("-", "--"), (BLUE, ORANGE, GREEN, "#CC79A7", GREY, "#E69F00", "#56B4E9")))
 """Line style and colour of each run in turn."""
 
 FAR = 8.0
 """Between lengths of runs that one linear axis cannot show together."""
 
-LEGEND = 7
+LEGEND = 8
 """Names in a row of the legend, at most."""
 
 
-def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, x: str = "steps") -> Figure:
+def compare_curves(
+    runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, x: str = "steps", mark: tuple[str, float] | None = None
+) -> Figure:
     """A panel for each quantity, in it the mean and the 95 % interval over seeds of each run.
 
-    The horizontal axis is logarithmic where the longest run is more than `FAR` times as long as the shortest.
+    A curve begins when every seed has finished as many episodes as Table 2 needs, or all that it ever finished. The
+    horizontal axis is logarithmic where the longest run is more than `FAR` times as long as the shortest.
 
     Args:
         runs: rows of the progress log by the run's label.
         title: of the figure.
         x: `steps` or `wall`.
+        mark: a name and the place on the horizontal axis of the first panel where it stands.
     """
     every = [row for rows in runs.values() for row in rows]
     curves = [curve for curve in CURVES if curve[0] in ALWAYS or any(row.get(curve[0]) for row in every)]
@@ -42,7 +46,8 @@ def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, 
     for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
         for (line, colour), (run, rows) in zip(cycle(LOOKS), runs.items(), strict=False):
             at, values = curve_table(rows, column, name)
-            known = ~np.isnan(values).any(axis=1)
+            episodes = curve_table(rows, column, "episodes")[1]
+            known = ~np.isnan(values).any(axis=1) & (episodes >= np.minimum(ENOUGH_EPISODES, episodes[-1])).all(axis=1)
             at, values = at[known], factor * values[known]
             panel.plot(at, values.mean(axis=1), color=colour, linestyle=line, linewidth=1.6, label=run)
             if values.shape[1] > 1 and len(at):
@@ -51,30 +56,35 @@ def compare_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, 
         if logarithmic:
             panel.set_xscale("log")
         panel.margins(x=0.0)
+    if mark:
+        panels[0].plot(mark[1], 80.0, "k*", markersize=9, label=mark[0], clip_on=False, zorder=4)
     columns = min(len(runs), LEGEND)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=columns, frameon=False)
     figure.suptitle(f"{title}: the last 100 training episodes, mean and 95 % interval over seeds", fontsize="medium")
     return figure
 
 
-def seed_curves(runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str) -> Figure:
-    """A panel for each run, in it the success rate in training of every seed; a seed that ends below 80 % is dashed.
+def seed_curves(
+    runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, failed: Mapping[str, Collection[int]]
+) -> Figure:
+    """A panel for each run, in it the success rate in training of every seed, dashed if it failed.
 
     Args:
         runs: rows of the progress log by the run's label.
         title: of the figure.
+        failed: the seeds of each run that failed.
     """
     figure, panels = panel_grid(len(runs), 3.6)
     name, quantity, factor = CURVES[0]
     column, label = AXES["steps"]
     for panel, (run, rows) in zip(panels, runs.items(), strict=False):
         at, values = curve_table(rows, column, name)
-        low = ~(factor * values[-1] >= 80.0)
-        for seed in range(values.shape[1]):
-            colour, line = (ORANGE, "--") if low[seed] else (BLUE, "-")
-            panel.plot(at, factor * values[:, seed], line, color=colour, linewidth=1.0, alpha=0.7)
+        for seed, curve in zip(sorted({row["seed"] for row in rows}), values.T, strict=True):
+            colour, line, layer = (ORANGE, "--", 3) if seed in failed[run] else (BLUE, "-", 2)
+            panel.plot(at, factor * curve, line, color=colour, linewidth=1.0, alpha=0.7, zorder=layer)
         set_axes(panel, label, quantity, name)
-        panel.set_title(f"{run}: {int(low.sum())} of {len(low)} end below 80 %", fontsize="medium")
+        which = f"seed{'s' * (len(failed[run]) > 1)} {', '.join(map(str, sorted(failed[run])))}" if failed[run] else "none"
+        panel.set_title(f"{run}: failed {which}", fontsize="medium")
         panel.margins(x=0.0)
     figure.suptitle(f"{title}: the last 100 training episodes of every seed", fontsize="medium")
     return figure

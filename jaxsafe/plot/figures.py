@@ -13,9 +13,9 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import ListedColormap, PowerNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from jaxsafe.config import from_data, yaml
 from jaxsafe.errors import ConfigError
@@ -26,6 +26,7 @@ from jaxsafe.train.files import read_rows
 from jaxsafe.train.log import NEEDS
 
 LAST_COLOUR = 0.85  # the end of the colour map is too light on white
+NEAR = 3.0  # half the width of what is shown of the paths near the regions, in distances to their far ends
 CURVES = (
     ("success_rate", "success rate [%]", 100.0),
     ("return", "return", 1.0),
@@ -108,34 +109,49 @@ def panel_grid(count: int, width: float) -> tuple[Figure, np.ndarray]:
 
 
 def trajectories(episodes: Episodes, title: str, unit: str, regions: Sequence[Any] = ()) -> Figure:
-    """Paths of the agent relative to the other platform, from purple early in training to green at its end.
+    """Paths of the agent relative to the other platform: from one start in the course of training, and after it.
 
-    Where the other platform has a heading, x is along it: its own motion and turn do not show, and a region that it carries
-    rests.
+    A row for each plane; in a third column the paths after training near the regions. Where the other platform has a
+    heading, x is along it: its own motion and turn do not show, and a region that it carries rests.
     """
     paths = [(step, _relative_path(rows, _agent(rows))) for step, rows in episodes]
     last = episodes[-1][1]
     first = next(iter(last[0]["platforms"]))
-    planes = [(0, 1)] if paths[0][1].shape[1] == 2 else [(0, 1), (0, 2)]
-    figure = Figure(figsize=(5.4 * len(planes) + 0.8, 4.9), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, len(planes)))
+    start = paths[0][1][0]
+    after = [path for step, path in paths if step == paths[-1][0]]
+    regions = [region for region in regions if region.name in last[-1].get("regions", {})]  # older logs have none
+    places = [_relative_path(last[-1:], region.name)[0] for region in regions]
+    sizes = [np.abs(at).max() + float(getattr(one, "radius", 0.0)) for one, at in zip(regions, places, strict=True)]
     colours, colour = _colours(paths)
-    for panel, (i, j) in zip(panels, planes, strict=True):
-        for region in regions:
-            if region.name in last[-1].get("regions", {}):  # logs of older versions have none
+    groups = [
+        ("one start, during training", [(step, path) for step, path in paths if np.allclose(path[0], start)]),
+        ("after training", [(paths[-1][0], path) for path in after]),
+    ]
+    reach = [1.6 * np.abs(start).max(), 1.1 * max(np.nanmax(np.abs(path)) for path in after)]
+    if sizes:
+        groups, reach = [*groups, (f"near the {first}", groups[1][1])], [*reach, NEAR * max(sizes)]
+    planes = [(0, 1)] if len(start) == 2 else [(0, 1), (0, 2)]
+    figure = Figure(figsize=(3.7 * len(groups) + 1.2, 3.5 * len(planes) + 0.6), layout="constrained")
+    panels = figure.subplots(len(planes), len(groups), squeeze=False)
+    along = f" along the heading of the {first}" if "heading" in last[0]["platforms"][first] else ""
+    for (i, j), row in zip(planes, panels, strict=True):
+        for panel, (name, group), half in zip(row, groups, reach, strict=True):
+            for region, place in zip(regions, places, strict=True):
                 patch = panel.add_patch(region_patch(region, j == 2))
-                centre_patch(patch, _relative_path(last[-1:], region.name)[0, [i, j]])
+                centre_patch(patch, place[[i, j]])
                 patch.set_label(region.name)
-        for step, path in paths:
-            panel.plot(path[:, i], path[:, j], color=colour(step), linewidth=1.2)
-            panel.plot(path[0, i], path[0, j], "o", color=colour(step), markersize=3)
-        panel.plot(0, 0, "*", color=ORANGE, markersize=12, label=first, zorder=3)
-        along = f" along the heading of the {first}" if "heading" in last[0]["platforms"][first] else ""
-        panel.set(xlabel=f"x{along} [{unit}]", ylabel=f"{'xyz'[j]} [{unit}]", aspect="equal")
-        panel.set_adjustable("datalim")
-        panel.xaxis.set_major_locator(MaxNLocator(5))
-    panels[0].legend(loc="best", fontsize="small", frameon=False)
-    figure.colorbar(colours, ax=list(panels), label="environment steps of training")
+            panel.plot(0, 0, "*", color=ORANGE, markersize=7, label=first, zorder=1)
+            for step, path in group:
+                panel.plot(path[:, i], path[:, j], color=colour(step), linewidth=1.2)
+                panel.plot(path[0, i], path[0, j], "o", color=colour(step), markersize=3)
+            panel.set(xlabel=f"x{along} [{unit}]", ylabel=f"{'xyz'[j]} [{unit}]", aspect="equal")
+            panel.set(xlim=(-half, half), ylim=(-half, half))
+            panel.xaxis.set_major_locator(MaxNLocator(4))
+            panel.yaxis.set_major_locator(MaxNLocator(4))
+            if j == 1:
+                panel.set_title(name, fontsize="medium")
+    panels[0, -1].legend(loc="best", fontsize="small", frameon=False)
+    _colour_bar(figure, colours, list(panels.ravel()))
     figure.suptitle(f"{title}: deterministic episodes of the first seed", fontsize="medium")
     return figure
 
@@ -145,7 +161,7 @@ def speed_distance(episodes: Episodes, title: str) -> Figure:
     figure = Figure(figsize=(6.4, 4.4), layout="constrained")
     panel = figure.subplots()
     colours, colour = _colours(episodes)
-    limits = []
+    limits, starts, fastest = [], [], 0.0
     for step, rows in episodes:
         status = [row["status"] for row in rows]
         distance, speed, limit = (
@@ -153,13 +169,17 @@ def speed_distance(episodes: Episodes, title: str) -> Figure:
         )
         panel.plot(distance, speed, color=colour(step), linewidth=1.0)
         limits.append(np.stack([distance, limit]))
+        starts.append(distance[0])
+        if step == episodes[-1][0]:
+            fastest = max(fastest, np.nanmax(speed))
     line = np.concatenate(limits, axis=1)
+    line = line[:, (line[0] <= 1.2 * max(starts)).nonzero()[0]]  # an early policy may go far away
     line = line[:, np.argsort(line[0])]
     panel.plot(line[0], line[1], color="black", linestyle=":", linewidth=1.6, label="speed limit")
     panel.set(xlabel="distance to the chief [m]", ylabel="speed [m/s]")
-    panel.set(xlim=(0, None), ylim=(0, 1.5 * np.nanmax(line[1], initial=0.2)))
-    panel.legend(loc="upper left", frameon=False)
-    figure.colorbar(colours, ax=panel, label="environment steps of training")
+    panel.set(xlim=(0, 1.2 * max(starts)), ylim=(0, max(1.5 * np.nanmax(line[1], initial=0.2), 1.05 * fastest)))
+    panel.legend(loc="best", frameon=False)
+    _colour_bar(figure, colours, panel)
     figure.suptitle(f"{title}: deterministic episodes of the first seed", fontsize="medium")
     return figure
 
@@ -222,10 +242,16 @@ def _relative_path(rows: list[dict[str, Any]], of: str) -> np.ndarray:
 
 
 def _colours(episodes: Sequence[tuple[int, Any]]) -> tuple[ScalarMappable, Any]:
+    """The colour of each training step, from purple to green, mostly for the beginning, when most is learnt."""
     steps = [step for step, _ in episodes]
     shades = ListedColormap(colormaps["viridis"](np.linspace(0.0, LAST_COLOUR, 256)))
-    scale = Normalize(0, max(steps) or 1)
+    scale = PowerNorm(0.4, 0, max(steps) or 1)
     return ScalarMappable(scale, shades), lambda step: shades(scale(step))
+
+
+def _colour_bar(figure: Figure, colours: ScalarMappable, panels: Any) -> None:
+    bar = figure.colorbar(colours, ax=panels, label="environment steps of training")
+    bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda step, _: f"{step:,.0f}"))
 
 
 def _title(content: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:

@@ -59,8 +59,8 @@ _DOCKING_STARTS = {
     "from 10 km": ["env.deputy.start.position.distance=[10000,10000]", "env.terminal.timeout.limit=6000"],
 }
 _REJOIN_STARTS = {
-    "from 15 000 ft": ["env.wingman.start.position.distance=[15000,15000]"],
-    "from 30 000 ft": ["env.wingman.start.position.distance=[30000,30000]"],
+    "from 15,000 ft": ["env.wingman.start.position.distance=[15000,15000]"],
+    "from 30,000 ft": ["env.wingman.start.position.distance=[30000,30000]"],
 }
 STARTS = {task: _REJOIN_STARTS if task.startswith("rejoin") else _DOCKING_STARTS for task in TASKS}
 """Starts outside those of training, by task and name."""
@@ -99,7 +99,7 @@ class Item(NamedTuple):
 
     def evaluation_directory(self, run: Path, name: str) -> Path:
         """Where an evaluation of a run is written."""
-        return run / "evaluations" / name.replace(" ", "_")
+        return run / "evaluations" / name.replace(" ", "_").replace(",", "")
 
 
 def best_seed(results: Mapping[str, Any]) -> int:

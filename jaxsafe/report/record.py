@@ -5,16 +5,13 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxsafe.report.plan import Item
 from jaxsafe.report.run import FILM, options_of
 from jaxsafe.train.files import finite, read_json, read_rows, write_csv, write_json
-
-POINTS = 100
-"""Rows of each seed in the published curves."""
 
 CURVES = ("wall_s", "success_rate", "return", "length", "delta_v", "violating_steps", "cost", "episodes")
 
@@ -30,7 +27,7 @@ class Record(NamedTuple):
     options: dict[str, Any]  # every one
     results: Results
     evaluations: dict[str, Results]  # the further ones, by name
-    curves: list[dict[str, Any]]  # POINTS rows a seed
+    curves: list[dict[str, Any]]  # rows of the progress log
 
 
 def keep(item: Item, run: Path, files: Path, command: str, commit: str | None) -> None:
@@ -40,7 +37,8 @@ def keep(item: Item, run: Path, files: Path, command: str, commit: str | None) -
             _copy(run / "figures" / f"{figure}.png", files / f"{item.task}_{figure}.png")
     if (run / "film" / FILM).exists():
         _copy(run / "film" / FILM, files / f"{item.task}.gif")
-    write_csv(files / f"{item.name}.csv", _thinned(read_rows(run / "progress.jsonl")))
+    rows = read_rows(run / "progress.jsonl")
+    write_csv(files / f"{item.name}.csv", [{name: row[name] for name in ("seed", "step", *CURVES)} for row in rows])
     evaluations = {name: item.evaluation_directory(run, name) / "results.json" for name in item.evaluations}
     record = {
         "command": command,
@@ -80,9 +78,3 @@ def _numbers(row: Mapping[str, str]) -> dict[str, Any]:
     return {name: float(text) if text else None for name, text in row.items()} | {
         name: int(row[name]) for name in ("seed", "step")
     }
-
-
-def _thinned(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    steps = sorted({row["step"] for row in rows})
-    chosen = {steps[round(i * (len(steps) - 1) / max(POINTS - 1, 1))] for i in range(POINTS)} if steps else set()
-    return [{name: row[name] for name in ("seed", "step", *CURVES)} for row in rows if row["step"] in chosen]

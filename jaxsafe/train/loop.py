@@ -99,7 +99,7 @@ class Training:
         self._keep_copies()
         self.log = ProgressLog(self.run, self.step, self.updates * self.config.seeds, self.config.tensorboard)
         for name in ("eval.jsonl", "episodes.jsonl"):
-            keep_rows(self.run / name, lambda row: row["step"] <= self.step and row["step"] < self.num_steps, ("step",))
+            keep_rows(self.run / name, self._known, ("step",))
         self._prepared = True
 
     @property
@@ -119,12 +119,16 @@ class Training:
             self._await_compiled()
         display.start()
         with self.clock, _StopRequest() as stop:
+            if self.updates == 0 and self._learns_fast():
+                self._record(1, final=False)
             while self.updates < self.config.num_updates and not stop.requested:
                 before, (self.state, curves) = self.updates, self.advance(self.shared, self.state)
                 self.updates = min(before + self.chunk, self.config.num_updates)
                 self._write_progress(curves, self.updates - before, display)
                 if self.updates < self.config.num_updates and self._due(before, self.config.eval_every):
                     self._evaluate()
+                elif self._learns_fast():
+                    self._record(1, final=False)
                 stop.requested = hosts.anyone(stop.requested)
                 if self._due(before, self.config.checkpoint_every) or stop.requested:
                     self._save()
@@ -198,6 +202,15 @@ class Training:
         """Whether a chunk that began at update `before` passed a multiple of the interval or the end."""
         interval = self.config.every(every)
         return self.updates // interval > before // interval or self.updates == self.config.num_updates
+
+    def _learns_fast(self) -> bool:
+        """Whether to log an episode between evaluations, to see early learning: after 0, 1, 2, 4, … chunks."""
+        chunks, first = self.updates // self.chunk, self.config.every(self.config.eval_every)
+        return self.updates < first < self.config.num_updates and chunks & (chunks - 1) == 0
+
+    def _known(self, row: dict[str, Any]) -> bool:
+        """Whether a row of the evaluations is of before the state that training goes on from."""
+        return self.updates > 0 and row["step"] <= self.step and row["step"] < self.num_steps
 
     def _write_progress(self, curves: dict[str, jax.Array], count: int, display: Display) -> None:
         host = {name: value[:, :count] for name, value in self.mapper.gather(curves).items()}
