@@ -204,7 +204,7 @@ def test_every_seed_has_its_line_and_those_that_failed_are_named() -> None:
     figure = seed_curves({"one": failing, "other": rows(500)}, "docking2d", {"one": [8], "other": []})
     seeds = {row["seed"] for row in failing}
     assert [len(panel.lines) for panel in figure.axes] == [len(seeds) + 1] * 2  # and the 80 % line
-    assert [panel.get_title() for panel in figure.axes] == ["one: failed seed 8", "other: failed none"]
+    assert [panel.get_title() for panel in figure.axes] == ["one: seed 8 failed", "other: no seed failed"]
     dashed = [line for line in figure.axes[0].lines if line.get_linestyle() == "--"]
     assert len(dashed) == 1
     np.testing.assert_allclose(dashed[0].get_ydata(), 30.0)

@@ -58,8 +58,9 @@ def compare_curves(
         panel.margins(x=0.0)
     if mark:
         panels[0].plot(mark[1], 80.0, "k*", markersize=9, label=mark[0], clip_on=False, zorder=4)
-    columns = min(len(runs), LEGEND)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=columns, frameon=False)
+    shown, names = panels[0].get_legend_handles_labels()
+    columns = min(len(names), LEGEND)
+    figure.legend(shown, names, loc="outside lower center", ncols=columns, columnspacing=1.2, frameon=False)
     figure.suptitle(f"{title}: the last 100 training episodes, mean and 95 % interval over seeds", fontsize="medium")
     return figure
 
@@ -83,8 +84,10 @@ def seed_curves(
             colour, line, layer = (ORANGE, "--", 3) if seed in failed[run] else (BLUE, "-", 2)
             panel.plot(at, factor * curve, line, color=colour, linewidth=1.0, alpha=0.7, zorder=layer)
         set_axes(panel, label, quantity, name)
-        which = f"seed{'s' * (len(failed[run]) > 1)} {', '.join(map(str, sorted(failed[run])))}" if failed[run] else "none"
-        panel.set_title(f"{run}: failed {which}", fontsize="medium")
+        which = (
+            f"seed{'s' * (len(failed[run]) > 1)} {', '.join(map(str, sorted(failed[run])))}" if failed[run] else "no seed"
+        )
+        panel.set_title(f"{run}: {which} failed", fontsize="medium")
         panel.margins(x=0.0)
     figure.suptitle(f"{title}: the last 100 training episodes of every seed", fontsize="medium")
     return figure

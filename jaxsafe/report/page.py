@@ -102,7 +102,7 @@ class Report:
             rows.append([
                 item.task, item.kind, f"{paper:,}", f"{steps:,}" if steps else "never",
                 f"{paper / steps:.1f}" if steps else "–",
-                f"{finished(record.curves, steps):.0f}" if steps else "–",
+                f"{finished(record.curves, steps):,.0f}" if steps else "–",
                 f"{sum(one is not None for one in per_seed)} of {len(per_seed)}",
                 f"{found['steps']:,}", f"{found['wall_s']:.0f}", f"{found['compile_s']:.0f}",
             ])  # fmt: skip
