@@ -26,13 +26,20 @@ def versions() -> dict[str, Any]:
     }
 
 
-def processor() -> str:
-    """The model of this host's processor: results agree to the last bit only between processors of one kind."""
+def processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
+    """The model of this host's processor: results agree to the last bit only between processors of one kind.
+
+    With family and model, where they are known: a hypervisor may give many the same name.
+    """
     try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        lines = cpuinfo.read_text(encoding="utf-8").partition("\n\n")[0].splitlines()
     except OSError:
         lines = []
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.processor())
+    found = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    if "model name" not in found:
+        return platform.processor()
+    numbers = [f"{name.removeprefix('cpu ')} {found[name]}" for name in ("cpu family", "model") if name in found]
+    return ", ".join([found["model name"], *numbers])
 
 
 def commit() -> str | None:

@@ -1,5 +1,6 @@
 """What a result is said to be made by."""
 
+import platform
 import subprocess
 from pathlib import Path
 
@@ -39,3 +40,23 @@ def test_a_commit_is_that_of_the_code_and_says_when_the_code_is_another(
         assert origin.commit() == f"{head} with changes"
         git("stash", "-q", "-u")
         assert origin.commit() == head
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("processor\t: 0\ncpu family\t: 25\nmodel\t\t: 17\nmodel name\t: AMD EPYC\n\nmodel name: other\n",
+         "AMD EPYC, family 25, model 17"),
+        ("model name\t: Some: Core\n", "Some: Core"),
+        ("BogoMIPS\t: 50.00\n", "that of the platform"),
+        (None, "that of the platform"),
+    ],
+)  # fmt: skip
+def test_a_processor_is_named_with_what_tells_kinds_of_one_name_apart(
+    text: str | None, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(platform, "processor", lambda: "that of the platform")
+    file = tmp_path / "cpuinfo"
+    if text is not None:
+        file.write_text(text)
+    assert origin.processor(file) == name
