@@ -48,13 +48,17 @@ def test_discrete_policies_choose_alike() -> None:
     policy = saved("docking2d")
     env = jaxsafe.make("docking2d", actions="discrete")
     params = policy.agent.init(jax.random.key(0), env)
-    params = {**params, "actor": jax.tree.map(lambda x: 30.0 * x, params["actor"])}
+    params = {"actor": jax.tree.map(lambda x: 30.0 * x, params["actor"]), "log_std": jnp.array([-1.5, -2.0])}
     policy = policy._replace(env=env, params=params)
     observations = np.random.default_rng(0).uniform(-1, 1, (500, 6)).astype(np.float32)
     expected = policy.agent.act(env, policy.params, jax.random.key(0), jnp.asarray(observations), True)
     found = run(to_onnx(functions.action(policy).function, observations.shape), observations)
     assert np.mean(found == expected) > 0.999
     assert len(np.unique(found)) >= 3
+    network, inputs = functions.network(policy), policy.agent.inputs(env, jnp.asarray(observations))
+    distribution = policy.agent.distribution(env, params, inputs)
+    found = run(to_onnx(network.function, inputs.shape), np.asarray(inputs))
+    np.testing.assert_allclose(found, distribution.logits, rtol=1e-4, atol=1e-3)  # type: ignore[union-attr]
 
 
 def test_the_state_goes_in_and_the_control_comes_out() -> None:

@@ -19,6 +19,6 @@ def test_the_notebook_reads_the_log_of_a_run(whole: Path, tmp_path: Path, monkey
     monkeypatch.setenv("JAXSAFE_RUN", str(whole))
     outputs = [output for cell in execute(tmp_path).cells if cell.cell_type == "code" for output in cell.outputs]
     text = "".join(output.text for output in outputs if output.output_type == "stream" and output.name == "stdout")
-    assert "6 episodes, " in text
+    assert "10 episodes, " in text
     assert text.endswith("rows: consistent\n")
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 2

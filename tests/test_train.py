@@ -127,6 +127,8 @@ def _crash_at(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, call: int
 @pytest.mark.parametrize(
     ("name", "call", "after"),
     [
+        ("_record", 1, True),  # of the untrained policy
+        ("_record", 3, True),
         ("_write_progress", 3, True),  # before any checkpoint
         ("_write_progress", 7, True),  # rows that the checkpoint does not know
         ("_evaluate", 2, True),

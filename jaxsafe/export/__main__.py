@@ -139,7 +139,7 @@ def usage() -> str:
         "  format=vnnlib       the closed loop over steps as ONNX, the property that no safety margin is negative from\n"
         "                      any start in the box as VNN-LIB, and the worst start that a search finds\n"
         "  inputs=observation  from the paper's observation to the action, features included (default)\n"
-        "  inputs=network      from the features to the output of the network: matrix products and tanh only\n"
+        "  inputs=network      from the features to the output of the network: matrix products and tanh\n"
         "  inputs=state        from the state at a start to the control in physical units\n"
         "  batch=N             (default 1)\n"
         "  steps=N             of the closed loop (default 40)\n"

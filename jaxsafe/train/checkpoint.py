@@ -72,7 +72,8 @@ class Checkpoints:
             try:
                 restored = self._manager.restore(step, args=args)
             except Exception as error:  # orbax and tensorstore raise whatever their layers raise
-                reason = (str(error).splitlines() or [type(error).__name__])[0][:120]
+                lines = [line for line in str(error).splitlines() if line.strip()]
+                reason = (lines or [type(error).__name__])[0][:120]
             if reason:  # outside the except clause: the error keeps the failed tasks, which complain when they go
                 _settle(complaints)
         if reason:

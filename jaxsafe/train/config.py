@@ -48,7 +48,7 @@ class TrainConfig(Component):
     eval_episodes: Count = 100  # of each evaluation during training
     episodes: Count = 1000  # of the evaluation at the end
     checkpoint_every: Count | None = None  # steps; None: a tenth of the run
-    log_every: Count = 100  # every how many evaluation episodes one is logged step by step
+    log_every: Count = 100  # every how many evaluation episodes one is logged step by step; before the first, some too
     tensorboard: bool = False
     agent: Agent = Agent()
     ppo: PPO = PPO()

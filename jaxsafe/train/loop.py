@@ -117,20 +117,21 @@ class Training:
         display = Display(self.num_steps, self.step)
         with self.clock:
             self._await_compiled()
+            if self.updates == 0 and self._early_due():
+                self._record(1, final=False)
         display.start()
         with self.clock, _StopRequest() as stop:
-            if self.updates == 0 and self._learns_fast():
-                self._record(1, final=False)
-            while self.updates < self.config.num_updates and not stop.requested:
+            stopping = False  # as all hosts agree: a signal may come to one of them at any time
+            while self.updates < self.config.num_updates and not stopping:
                 before, (self.state, curves) = self.updates, self.advance(self.shared, self.state)
                 self.updates = min(before + self.chunk, self.config.num_updates)
                 self._write_progress(curves, self.updates - before, display)
                 if self.updates < self.config.num_updates and self._due(before, self.config.eval_every):
                     self._evaluate()
-                elif self._learns_fast():
+                elif self._early_due():
                     self._record(1, final=False)
-                stop.requested = hosts.anyone(stop.requested)
-                if self._due(before, self.config.checkpoint_every) or stop.requested:
+                stopping = hosts.anyone(stop.requested)
+                if self._due(before, self.config.checkpoint_every) or stopping:
                     self._save()
         display.close()
         self.log.close()
@@ -203,13 +204,13 @@ class Training:
         interval = self.config.every(every)
         return self.updates // interval > before // interval or self.updates == self.config.num_updates
 
-    def _learns_fast(self) -> bool:
-        """Whether to log an episode between evaluations, to see early learning: after 0, 1, 2, 4, … chunks."""
+    def _early_due(self) -> bool:
+        """Whether to log an episode to see early learning: after 0, 1, 2, 4, … chunks, if evaluations come later."""
         chunks, first = self.updates // self.chunk, self.config.every(self.config.eval_every)
         return self.updates < first < self.config.num_updates and chunks & (chunks - 1) == 0
 
     def _known(self, row: dict[str, Any]) -> bool:
-        """Whether a row of the evaluations is of before the state that training goes on from."""
+        """Whether training, as it goes on from here, will not write this row of the evaluations."""
         return self.updates > 0 and row["step"] <= self.step and row["step"] < self.num_steps
 
     def _write_progress(self, curves: dict[str, jax.Array], count: int, display: Display) -> None:

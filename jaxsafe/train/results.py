@@ -43,7 +43,7 @@ def finish(training: Training) -> dict[str, Any]:
         "steps": training.step,
         "wall_s": round(training.clock.seconds, 2),
         "compile_s": round(training.compile_s, 2),
-        "training_computation_time": training.log.rows[-1]["wall_s"],  # to the last update, compilation included
+        "training_computation_time": training.log.rows[-1]["wall_s"],  # [s] to the last update, and all before it
         "versions": versions(),
         "interaction_efficiency": _efficiency(training),
         "training_cost": over_seeds(training.log.curve("cost")[1][-1].tolist()),  # violating steps
