@@ -87,6 +87,38 @@ def test_trajectories_show_one_start_during_training_and_all_after_it_in_each_pl
     assert len({line.get_color() for line in during}) == 3
 
 
+def test_the_ends_of_the_paths_have_a_panel_where_a_region_is_small_beside_them() -> None:
+    env = jaxsafe.make("docking2d")
+    step, rows = episode(100, 2)
+    for row in rows:
+        row["regions"] = {"docking_region": {"position": [0.0, 0.0]}}
+    figure = trajectories([(step, rows)], "title", "m", env.regions)
+    assert [panel.get_title() for panel in figure.axes[:3]] == [
+        "one start, during training",
+        "after training",
+        "their ends",
+    ]
+    assert figure.axes[2].get_xlim() == pytest.approx((-1.5, 1.5))
+    unfinished = trajectories([(step, [{**row, "final": False} for row in rows])], "title", "m")
+    assert unfinished.axes[1].get_title() == "after 100 steps"
+
+
+def test_a_platform_alone_is_drawn_where_it_is_and_a_training_that_diverged_leaves_gaps() -> None:
+    alone = [{"platforms": {"deputy": {"position": [3.0 - k, 4.0]}}, "status": {}} for k in range(4)]
+    figure = trajectories([(0, alone)], "title", "m")
+    path = next(line for line in figure.axes[0].lines if len(line.get_xdata()) > 1)
+    np.testing.assert_allclose(path.get_xydata()[0], [3.0, 4.0])
+    assert figure.axes[0].get_xlim()[1] > 3.0
+    step, rows = episode(100, 2)
+    for row in rows[5:]:
+        row["platforms"]["deputy"]["position"] = [None, None]
+        row["status"] = dict.fromkeys(row["status"])
+    assert len(trajectories([(step, rows)], "title", "m").axes) == 3  # the colour bar too
+    assert speed_distance([(step, rows)], "title").axes[0].get_xlim()[1] > 113.0
+    rests = [{"platforms": {name: {"position": [0.0, 0.0]} for name in ("chief", "deputy")}}] * 3
+    assert trajectories([(0, rests)], "title", "m").axes[0].get_xlim() == (-1.0, 1.0)
+
+
 def test_early_policies_that_go_far_away_do_not_set_the_scale() -> None:
     far = episode(0, 2)
     for k, row in enumerate(far[1]):
@@ -114,8 +146,7 @@ def test_paths_are_seen_from_the_lead_along_its_heading_with_the_region_that_it_
         }
         for p, h, a, b in zip(lead, heading, ahead, aside, strict=True)
     ]
-    panel = trajectories([(100, rows)], "title", "ft", env.regions).axes[2]
-    assert panel.get_title() == "near the lead"
+    panel = trajectories([(100, rows)], "title", "ft", env.regions).axes[0]
     path = next(line for line in panel.lines if len(line.get_xdata()) > 1)
     np.testing.assert_allclose(path.get_xydata(), np.tile([-300.0, 100.0], (30, 1)), atol=1e-6)
     (region,) = panel.patches
@@ -183,16 +214,17 @@ def test_comparison_is_logarithmic_only_where_runs_differ_much_in_length():
         quantities = dict.fromkeys(("success_rate", "return", "length"), 0.5)
         return [{"step": step, "wall_s": step / 1e4, "seed": 0, "episodes": 9, **quantities} for step in (1000, steps)]
 
-    for steps, scale in ((5_000, "linear"), (50_000, "log")):
-        figure = compare_curves({"one": rows(2_000), "other": rows(steps)}, "docking2d")
+    for steps, mark, scale in ((5_000, None, "linear"), (50_000, None, "log"), (5_000, ("far", 50_000.0), "log")):
+        figure = compare_curves({"one": rows(2_000), "other": rows(steps)}, "docking2d", mark=mark)
         assert {panel.get_xscale() for panel in figure.axes} == {scale}
 
 
 def test_curves_of_a_comparison_begin_when_every_seed_has_finished_enough_episodes() -> None:
-    panel = compare_curves({"one": rows()}, "docking2d", mark=("the paper's 80 %", 3000.0)).axes[0]
+    known = [{**row, "success_rate": 0.5} for row in rows()]  # 10 more episodes after each update
+    panel = compare_curves({"one": known}, "docking2d", mark=("the paper's 80 %", 3000.0)).axes[0]
     curve = next(line for line in panel.lines if line.get_label() == "one")
-    assert curve.get_xdata()[0] == 400  # the update after which there were 30 episodes, and a mean; 20 before had none
-    few = [{**row, "episodes": row["episodes"] // 50} for row in rows()]
+    assert curve.get_xdata()[0] == 300
+    few = [{**row, "episodes": row["episodes"] // 50} for row in known]
     curve = next(line for line in compare_curves({"one": few}, "docking2d").axes[0].lines if line.get_label() == "one")
     assert 0 < len(curve.get_xdata()) < 10  # those with all 9 episodes that the run finished
     (mark,) = [line for line in panel.lines if line.get_label() == "the paper's 80 %"]

@@ -157,8 +157,9 @@ class Scene:
         distance = np.linalg.norm(path, axis=1)
         above, below = self.curves
         above.set(yscale="log", ylabel=labelled("distance", unit))
-        above.yaxis.set_minor_formatter(NullFormatter())
         above.set(xlim=(0, time[-1] or 1.0), ylim=(0.7 * max(distance.min(), 1e-3), 1.4 * distance.max() + 1e-3))
+        if np.ptp(np.log10(above.get_ylim())) > 1.0:  # a power of ten is among them, and others would crowd
+            above.yaxis.set_minor_formatter(NullFormatter())
         below.axhline(0.0, color="black", linewidth=0.8)
         below.set(xlabel="time [s]", xlim=(0, time[-1] or 1.0))
         self.lines = [(above.plot([], [], color=BLUE, linewidth=1.4)[0], (time, distance))]

@@ -22,6 +22,9 @@ FAR = 8.0
 LEGEND = 8
 """Names in a row of the legend, at most."""
 
+NAMED = 5
+"""Seeds in the title of a panel, at most."""
+
 
 def compare_curves(
     runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, x: str = "steps", mark: tuple[str, float] | None = None
@@ -41,7 +44,7 @@ def compare_curves(
     curves = [curve for curve in CURVES if curve[0] in ALWAYS or any(row.get(curve[0]) for row in every)]
     figure, panels = panel_grid(len(curves), 3.6)
     column, label = AXES[x]
-    ends = [max(row[column] for row in rows) for rows in runs.values()]
+    ends = [max(row[column] for row in rows) for rows in runs.values()] + ([mark[1]] if mark else [])
     logarithmic = max(ends) > FAR * min(ends)
     for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
         for (line, colour), (run, rows) in zip(cycle(LOOKS), runs.items(), strict=False):
@@ -84,9 +87,9 @@ def seed_curves(
             colour, line, layer = (ORANGE, "--", 3) if seed in failed[run] else (BLUE, "-", 2)
             panel.plot(at, factor * curve, line, color=colour, linewidth=1.0, alpha=0.7, zorder=layer)
         set_axes(panel, label, quantity, name)
-        which = (
-            f"seed{'s' * (len(failed[run]) > 1)} {', '.join(map(str, sorted(failed[run])))}" if failed[run] else "no seed"
-        )
+        count = len(failed[run])
+        named = f"seed{'s' * (count > 1)} {', '.join(map(str, sorted(failed[run])))}" if count else "no seed"
+        which = named if count <= NAMED else f"{count} of {values.shape[1]} seeds"
         panel.set_title(f"{run}: {which} failed", fontsize="medium")
         panel.margins(x=0.0)
     figure.suptitle(f"{title}: the last 100 training episodes of every seed", fontsize="medium")

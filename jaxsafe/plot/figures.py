@@ -26,7 +26,7 @@ from jaxsafe.train.files import read_rows
 from jaxsafe.train.log import NEEDS
 
 LAST_COLOUR = 0.85  # the end of the colour map is too light on white
-NEAR = 3.0  # half the width of what is shown of the paths near the regions, in distances to their far ends
+NEAR = 3.0  # half the width of what is shown near the smallest region, in distances to its far end
 CURVES = (
     ("success_rate", "success rate [%]", 100.0),
     ("return", "return", 1.0),
@@ -109,38 +109,44 @@ def panel_grid(count: int, width: float) -> tuple[Figure, np.ndarray]:
 
 
 def trajectories(episodes: Episodes, title: str, unit: str, regions: Sequence[Any] = ()) -> Figure:
-    """Paths of the agent relative to the other platform: from one start in the course of training, and after it.
+    """Paths of the agent relative to the other platform: from one start in the course of training, and the last ones.
 
-    A row for each plane; in a third column the paths after training near the regions. Where the other platform has a
-    heading, x is along it: its own motion and turn do not show, and a region that it carries rests.
+    A row for each plane; in a third column the last paths near the smallest region, if it is small beside them. Where the
+    other platform has a heading, x is along it: its own motion and turn do not show, and a region that it carries rests.
     """
     paths = [(step, _relative_path(rows, _agent(rows))) for step, rows in episodes]
     last = episodes[-1][1]
     first = next(iter(last[0]["platforms"]))
-    start = paths[0][1][0]
-    after = [path for step, path in paths if step == paths[-1][0]]
+    start, end = paths[0][1][0], paths[-1][0]
+    after = [path for step, path in paths if step == end]
+    during = [(step, path) for step, path in paths if np.allclose(path[0], start)]
     regions = [region for region in regions if region.name in last[-1].get("regions", {})]  # older logs have none
-    places = [_relative_path(last[-1:], region.name)[0] for region in regions]
+    places = [np.nan_to_num(_relative_path(last[-1:], region.name)[0]) for region in regions]
     sizes = [np.abs(at).max() + float(getattr(one, "radius", 0.0)) for one, at in zip(regions, places, strict=True)]
     colours, colour = _colours(paths)
     groups = [
-        ("one start, during training", [(step, path) for step, path in paths if np.allclose(path[0], start)]),
-        ("after training", [(paths[-1][0], path) for path in after]),
+        ("one start, during training", during),
+        ("after training" if last[0].get("final", True) else f"after {end:,} steps", [(end, path) for path in after]),
     ]
-    reach = [1.6 * np.abs(start).max(), 1.1 * max(np.nanmax(np.abs(path)) for path in after)]
-    if sizes:
-        groups, reach = [*groups, (f"near the {first}", groups[1][1])], [*reach, NEAR * max(sizes)]
+    reach = [
+        max(1.6 * np.abs(start).max(), _farthest([during[-1][1]])) or 1.0,  # an early policy may go far away
+        _farthest(after) or 1.0,
+    ]
+    if sizes and NEAR * min(sizes) < 0.5 * reach[1]:
+        groups, reach = [*groups, ("their ends", groups[1][1])], [*reach, NEAR * min(sizes)]
     planes = [(0, 1)] if len(start) == 2 else [(0, 1), (0, 2)]
     figure = Figure(figsize=(3.7 * len(groups) + 1.2, 3.5 * len(planes) + 0.6), layout="constrained")
     panels = figure.subplots(len(planes), len(groups), squeeze=False)
-    along = f" along the heading of the {first}" if "heading" in last[0]["platforms"][first] else ""
+    alone = len(last[0]["platforms"]) == 1
+    along = f" along the heading of the {first}" if not alone and "heading" in last[0]["platforms"][first] else ""
     for (i, j), row in zip(planes, panels, strict=True):
         for panel, (name, group), half in zip(row, groups, reach, strict=True):
             for region, place in zip(regions, places, strict=True):
                 patch = panel.add_patch(region_patch(region, j == 2))
                 centre_patch(patch, place[[i, j]])
                 patch.set_label(region.name)
-            panel.plot(0, 0, "*", color=ORANGE, markersize=7, label=first, zorder=1)
+            if not alone:
+                panel.plot(0, 0, "*", color=ORANGE, markersize=7, label=first, zorder=1)
             for step, path in group:
                 panel.plot(path[:, i], path[:, j], color=colour(step), linewidth=1.2)
                 panel.plot(path[0, i], path[0, j], "o", color=colour(step), markersize=3)
@@ -150,10 +156,16 @@ def trajectories(episodes: Episodes, title: str, unit: str, regions: Sequence[An
             panel.yaxis.set_major_locator(MaxNLocator(4))
             if j == 1:
                 panel.set_title(name, fontsize="medium")
-    panels[0, -1].legend(loc="best", fontsize="small", frameon=False)
+    if panels[0, -1].get_legend_handles_labels()[0]:
+        panels[0, -1].legend(loc="best", fontsize="small", frameon=False)
     _colour_bar(figure, colours, list(panels.ravel()))
     figure.suptitle(f"{title}: deterministic episodes of the first seed", fontsize="medium")
     return figure
+
+
+def _farthest(paths: Sequence[np.ndarray]) -> float:
+    """How far an axis must go to show all of them; 0 if they rest."""
+    return 1.1 * max(np.nanmax(np.abs(path)) for path in paths)
 
 
 def speed_distance(episodes: Episodes, title: str) -> Figure:
@@ -173,11 +185,12 @@ def speed_distance(episodes: Episodes, title: str) -> Figure:
         if step == episodes[-1][0]:
             fastest = max(fastest, np.nanmax(speed))
     line = np.concatenate(limits, axis=1)
-    line = line[:, (line[0] <= 1.2 * max(starts)).nonzero()[0]]  # an early policy may go far away
+    reach = 1.2 * max(starts) or 1.0
+    line = line[:, line[0] <= reach]  # an early policy may go far away
     line = line[:, np.argsort(line[0])]
     panel.plot(line[0], line[1], color="black", linestyle=":", linewidth=1.6, label="speed limit")
     panel.set(xlabel="distance to the chief [m]", ylabel="speed [m/s]")
-    panel.set(xlim=(0, 1.2 * max(starts)), ylim=(0, max(1.5 * np.nanmax(line[1], initial=0.2), 1.05 * fastest)))
+    panel.set(xlim=(0, reach), ylim=(0, max(1.5 * np.nanmax(line[1], initial=0.2), 1.05 * fastest)))
     panel.legend(loc="best", frameon=False)
     _colour_bar(figure, colours, panel)
     figure.suptitle(f"{title}: deterministic episodes of the first seed", fontsize="medium")
@@ -219,7 +232,8 @@ def _episodes(path: Path) -> Episodes:
     grouped: dict[tuple[int, bool, int], list[dict[str, Any]]] = {}
     for row in read_rows(path, ("step", "final", "episode", "platforms", "status")):
         grouped.setdefault((row["step"], row["final"], row["episode"]), []).append(row)
-    return [(step, rows) for (step, _, _), rows in grouped.items()]
+    ended = {step for step, final, _ in grouped if final}
+    return [(step, rows) for (step, final, _), rows in grouped.items() if final or step not in ended]
 
 
 def _agent(rows: list[dict[str, Any]]) -> str:
@@ -228,9 +242,14 @@ def _agent(rows: list[dict[str, Any]]) -> str:
 
 
 def _relative_path(rows: list[dict[str, Any]], of: str) -> np.ndarray:
-    """Positions of a platform or region relative to the first platform, turned by its heading if it has one, (steps, d)."""
+    """Positions of a platform or region relative to the first platform, turned by its heading if it has one, (steps, d).
+
+    As they are where there is one platform only.
+    """
     first = next(iter(rows[0]["platforms"]))
     everything = [{**row.get("regions", {}), **row["platforms"]} for row in rows]
+    if len(rows[0]["platforms"]) == 1:
+        return np.array([one[of]["position"] for one in everything], float)
     path, origin = (np.array([one[name]["position"] for one in everything], float) for name in (of, first))
     path = path - origin  # a null, from a training that diverged, is nan here and leaves a gap
     if "heading" in rows[0]["platforms"][first]:

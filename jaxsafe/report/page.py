@@ -312,7 +312,11 @@ class Report:
         for task in self.tasks:
             lines += [f"### {task}", ""]
             for file, caption in (
-                (f"{task}_training.png", "Training in each way: mean and 95 % interval over seeds"),
+                (
+                    f"{task}_training.png",
+                    f"Training in each way, once every seed has finished {ENOUGH_EPISODES} episodes: mean and 95 % interval"
+                    " over seeds",
+                ),
                 (f"{task}_seeds.png", "Success in training of every seed; dashed those that failed after it"),
                 (
                     f"{task}_trajectories.png",
@@ -366,17 +370,21 @@ def _section(title: str, text: str, heads: str, rows: Sequence[Sequence[str]]) -
 
 def wall_to(level: float, curves: Sequence[Mapping[str, Any]]) -> float | None:
     """Seconds until the success rate in training reaches a level, by the definition of Table 2."""
-    steps, rates = curve_table(curves, "step", "success_rate")
-    _, episodes = curve_table(curves, "step", "episodes")
+    steps, rates = curve_table(curves, "step", "success_rate", most=len(curves))
+    _, episodes = curve_table(curves, "step", "episodes", most=len(curves))
     reached = interaction_efficiency(steps, rates, episodes, level)["timesteps"]
     return None if reached is None else max(row["wall_s"] for row in curves if row["step"] == reached)
 
 
 def samples_per_second(curves: Sequence[Mapping[str, Any]]) -> float | None:
-    """Environment steps of all seeds a second of wall time, from the first row to the last; None if there is one."""
-    first, last = ([pick(row[name] for row in curves) for name in ("step", "wall_s")] for pick in (min, max))
+    """Environment steps of all seeds a second of wall time, between the first time on the clock and the last.
+
+    None if there is one. Updates that ran as one program have one time, its end.
+    """
+    times = [pick(row["wall_s"] for row in curves) for pick in (min, max)]
+    steps = [max(row["step"] for row in curves if row["wall_s"] == time) for time in times]
     seeds = len({row["seed"] for row in curves})
-    return seeds * (last[0] - first[0]) / (last[1] - first[1]) if last[1] > first[1] else None
+    return seeds * (steps[1] - steps[0]) / (times[1] - times[0]) if times[1] > times[0] else None
 
 
 def _percent(metric: Mapping[str, Any]) -> str:
