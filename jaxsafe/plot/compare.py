@@ -19,7 +19,7 @@ LOOKS = tuple(product(("-", "--"), (BLUE, ORANGE, GREEN, "#CC79A7", GREY, "#E69F
 FAR = 8.0
 """Between lengths of runs that one linear axis cannot show together."""
 
-LEGEND = 8
+LEGEND = 9
 """Names in a row of the legend, at most."""
 
 NAMED = 5

@@ -60,12 +60,14 @@ def _names(option: str, value: Any, known: Sequence[str]) -> list[str]:
 
 def usage() -> str:
     """The help text."""
+    from jaxsafe.report.plan import KINDS
+
     return (
         "usage: python -m jaxsafe.report [key=value …]\n\n"
         "  trains every task in every way with ten seeds, evaluates, and writes OUT/baselines.md; takes hours.\n"
         "  May be done in parts: the page has also what was reported into OUT before, with the same options.\n\n"
         "  tasks=[docking2d,…]    some tasks only\n"
-        "  kinds=[features,…]     some of features, plain, lanes, quick, discrete, rta, unpunished\n"
+        f"  kinds=[features,…]     some of {', '.join(KINDS)}\n"
         "  runs=DIR               where the runs are (default runs/report); what is complete there is not done again\n"
         "  out=DIR                where to write the page (default report)\n"
         "  policies=DIR           copy the best policy of each task there, as TASK.npz\n"

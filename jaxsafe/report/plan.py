@@ -39,7 +39,8 @@ KINDS: Mapping[str, Kind] = {
     ),
     "lanes": Kind(("preset=lanes",), "4,096 environments side by side, for accelerators"),
     "quick": Kind(("preset=quick",), "fewer epochs and steps, for a result soon; evaluated in 100 episodes a seed"),
-    "discrete": Kind(("actions=discrete",), "the recipe with the paper's discrete actions"),
+    "discrete": Kind(("actions=discrete",), "the recipe of `features` with the paper's discrete actions"),
+    "plain_discrete": Kind(("preset=plain", "actions=discrete"), "the recipe of `plain` with them"),
     "rta": Kind(
         ("rta=default",),
         "the recipe with run time assurance during training, where each intervention costs a little; oriented docking"
