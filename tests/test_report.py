@@ -146,7 +146,7 @@ def test_every_command_of_the_plan_is_valid() -> None:
     from jaxsafe.envs import with_rta
 
     items = plan([*TASKS], [*KINDS], ["seeds=10"])
-    assert len({item.name for item in items}) == 35
+    assert len({item.name for item in items}) == 40
     for item in items:
         [(config, env, _)] = resolve_all(cli.Arguments.parse(item.words))
         assert config.seeds == 10
