@@ -24,7 +24,7 @@ from typing import Any
 from isolated import CACHE, words
 
 from jaxsafe.envs import TASKS
-from jaxsafe.report.page import wall_to
+from jaxsafe.report.measures import wall_to
 from jaxsafe.train.files import read_json, read_rows
 
 OUT = Path(__file__).parent / "results" / "five_tasks.json"

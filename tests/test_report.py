@@ -14,7 +14,7 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.report import __main__ as command
 from jaxsafe.report import run as running
-from jaxsafe.report.page import failed_seeds, finished, samples_per_second, wall_to
+from jaxsafe.report.measures import failed_seeds, finished, samples_per_second, wall_to
 from jaxsafe.report.plan import KINDS, SHIPPED, Item, best_seed, plan
 from jaxsafe.rollout import reset_batch
 from jaxsafe.train import __main__ as train

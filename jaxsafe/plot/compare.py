@@ -46,11 +46,12 @@ def compare_curves(
     column, label = AXES[x]
     ends = [max(row[column] for row in rows) for rows in runs.values()] + ([mark[1]] if mark else [])
     logarithmic = max(ends) > FAR * min(ends)
+    counts = {run: curve_table(rows, column, "episodes")[1] for run, rows in runs.items()}
+    enough = {run: (count >= np.minimum(ENOUGH_EPISODES, count[-1])).all(axis=1) for run, count in counts.items()}
     for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
         for (line, colour), (run, rows) in zip(cycle(LOOKS), runs.items(), strict=False):
             at, values = curve_table(rows, column, name)
-            episodes = curve_table(rows, column, "episodes")[1]
-            known = ~np.isnan(values).any(axis=1) & (episodes >= np.minimum(ENOUGH_EPISODES, episodes[-1])).all(axis=1)
+            known = enough[run] & ~np.isnan(values).any(axis=1)
             at, values = at[known], factor * values[known]
             panel.plot(at, values.mean(axis=1), color=colour, linestyle=line, linewidth=1.6, label=run)
             if values.shape[1] > 1 and len(at):

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe.envs import TASKS
-from jaxsafe.metrics import ENOUGH_EPISODES, interaction_efficiency, stratified_iqm
+from jaxsafe.metrics import ENOUGH_EPISODES, stratified_iqm
 from jaxsafe.plot.compare import compare_curves, seed_curves
-from jaxsafe.plot.figures import curve_table
 from jaxsafe.plot.style import save
+from jaxsafe.report.measures import failed_seeds, finished, samples_per_second, wall_to
 from jaxsafe.report.plan import CERTIFIED_STARTS, KINDS, PAPER_STEPS, SHIPPED, WITH_RTA, WITHOUT_RTA, best_seed
 from jaxsafe.report.record import Record
 from jaxsafe.train.files import write_text
@@ -209,11 +209,11 @@ class Report:
             flown = ("without", "with") if name == WITH_RTA else ("with", "without")
             item, own = record.item, record.results
             trained = "with, unpunished" if item.kind == "unpunished" else flown[0]
+            narrowed = any(word in item.words for word in CERTIFIED_STARTS.get(item.task, ()))
+            starts = "narrowed" if narrowed else "the task's"
             for label, results in zip(flown, (own, found), strict=True):
                 one = results["evaluation"]["stochastic"]
                 share = one["intervention_rate"]
-                narrowed = any(word in item.words for word in CERTIFIED_STARTS.get(item.task, ()))
-                starts = "narrowed" if narrowed else "the task's"
                 rows.append([
                     item.task, trained, label, starts, _percent(one["success_rate"]),
                     _rate(one["safety_violation_rate"], self.episodes[item.name], results["seeds"]),
@@ -350,41 +350,9 @@ class Report:
         return "\n".join([*lines, "```"])
 
 
-def failed_seeds(results: Mapping[str, Any]) -> list[int]:
-    """The seeds of a run that succeed in less than 95 % of their episodes after training, stochastic or deterministic."""
-    each = [results["evaluation"][way]["success_rate"]["per_seed"] for way in ("stochastic", "deterministic")]
-    return [seed for seed, pair in enumerate(zip(*each, strict=True), start=results["seed"]) if min(pair) < 0.95]
-
-
-def finished(curves: Sequence[Mapping[str, Any]], step: int) -> float:
-    """Training episodes that a seed had finished by a step, on the average."""
-    latest = max(row["step"] for row in curves if row["step"] <= step)
-    counts = [row["episodes"] for row in curves if row["step"] == latest]
-    return sum(counts) / len(counts)
-
-
 def _section(title: str, text: str, heads: str, rows: Sequence[Sequence[str]]) -> str:
     lines = [f"## {title}", "", text, "", f"| {heads} |", "|" + "---|" * len(heads.split(" | "))]
     return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
-
-
-def wall_to(level: float, curves: Sequence[Mapping[str, Any]]) -> float | None:
-    """Seconds until the success rate in training reaches a level, by the definition of Table 2."""
-    steps, rates = curve_table(curves, "step", "success_rate", most=len(curves))
-    _, episodes = curve_table(curves, "step", "episodes", most=len(curves))
-    reached = interaction_efficiency(steps, rates, episodes, level)["timesteps"]
-    return None if reached is None else max(row["wall_s"] for row in curves if row["step"] == reached)
-
-
-def samples_per_second(curves: Sequence[Mapping[str, Any]]) -> float | None:
-    """Environment steps of all seeds a second of wall time, between the first time on the clock and the last.
-
-    None if there is one. Updates that ran as one program have one time, its end.
-    """
-    times = [pick(row["wall_s"] for row in curves) for pick in (min, max)]
-    steps = [max(row["step"] for row in curves if row["wall_s"] == time) for time in times]
-    seeds = len({row["seed"] for row in curves})
-    return seeds * (steps[1] - steps[0]) / (times[1] - times[0]) if times[1] > times[0] else None
 
 
 def _percent(metric: Mapping[str, Any]) -> str:

@@ -1,0 +1,41 @@
+"""What the page says of a run beyond the metrics of its episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from jaxsafe.metrics import interaction_efficiency
+from jaxsafe.plot.figures import curve_table
+
+
+def failed_seeds(results: Mapping[str, Any]) -> list[int]:
+    """The seeds of a run that succeed in less than 95 % of their episodes after training, stochastic or deterministic."""
+    each = [results["evaluation"][way]["success_rate"]["per_seed"] for way in ("stochastic", "deterministic")]
+    return [seed for seed, pair in enumerate(zip(*each, strict=True), start=results["seed"]) if min(pair) < 0.95]
+
+
+def finished(curves: Sequence[Mapping[str, Any]], step: int) -> float:
+    """Training episodes that a seed had finished by a step, on the average."""
+    latest = max(row["step"] for row in curves if row["step"] <= step)
+    counts = [row["episodes"] for row in curves if row["step"] == latest]
+    return sum(counts) / len(counts)
+
+
+def wall_to(level: float, curves: Sequence[Mapping[str, Any]]) -> float | None:
+    """Seconds until the success rate in training reaches a level, by the definition of Table 2."""
+    steps, rates = curve_table(curves, "step", "success_rate", most=len(curves))
+    _, episodes = curve_table(curves, "step", "episodes", most=len(curves))
+    reached = interaction_efficiency(steps, rates, episodes, level)["timesteps"]
+    return None if reached is None else max(row["wall_s"] for row in curves if row["step"] == reached)
+
+
+def samples_per_second(curves: Sequence[Mapping[str, Any]]) -> float | None:
+    """Environment steps of all seeds a second of wall time, between the first time on the clock and the last.
+
+    None if there is one. Updates that ran as one program have one time, its end.
+    """
+    times = [pick(row["wall_s"] for row in curves) for pick in (min, max)]
+    steps = [max(row["step"] for row in curves if row["wall_s"] == time) for time in times]
+    seeds = len({row["seed"] for row in curves})
+    return seeds * (steps[1] - steps[0]) / (times[1] - times[0]) if times[1] > times[0] else None
