@@ -24,6 +24,7 @@ import gymnasium as gym
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tables
 from gymnasium.vector import SyncVectorEnv
 from isolated import words
 from machine import about
@@ -47,8 +48,9 @@ def main() -> None:
     numbers = [int(number) for number in options["envs"].split(",")]
     results = [{"envs": number, **measure(peers(task, number), number, repeats)} for number in numbers]
     OUT.parent.mkdir(exist_ok=True)
-    OUT.write_text(json.dumps({**about(), "gymnasium": gym.__version__, "task": task, "runs": results}, indent=1) + "\n")
-    print(table(results))
+    content = {**about(), "gymnasium": gym.__version__, "task": task, "runs": results}
+    OUT.write_text(json.dumps(content, indent=1) + "\n")
+    print(tables.adapters(content))
 
 
 def peers(task: str, number: int) -> dict[str, Step]:
@@ -182,17 +184,6 @@ def measure(found: dict[str, Step], number: int, repeats: int) -> dict[str, Any]
         "fastest": {name: round(max(values), 1) for name, values in rates.items()},
         "first_step_s": {name: round(value, 2) for name, value in first.items()},
     }
-
-
-def table(results: list[dict[str, Any]]) -> str:
-    """Markdown: thousand steps a second."""
-    names = dict.fromkeys(name for run in results for name in run["steps_per_s"])
-    lines = ["| thousand steps/s | " + " | ".join(f"{run['envs']:,}" for run in results) + " |"]
-    lines.append("|---|" + "---|" * len(results))
-    for name in names:
-        cells = [f"{run['steps_per_s'][name] / 1e3:.3g}" if name in run["steps_per_s"] else "–" for run in results]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
 
 
 if __name__ == "__main__":

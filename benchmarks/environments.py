@@ -52,6 +52,7 @@ def main() -> None:
     if "probe" in options:
         print(json.dumps(RUNS[options["probe"]](lanes[0], repeats)))
         return
+    import tables
     from machine import about
 
     here = about()
@@ -65,7 +66,7 @@ def main() -> None:
             print(f"{name} × {num:,}: {found['steps_per_s']:,.0f}", file=sys.stderr)
     content = {**here, "peers": versions(python), "pinned_to": 1, "released_steps_per_s": RELEASED, "runs": results}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
-    print(table(results, lanes))
+    print(tables.environments(content))
 
 
 def task(name: str, num_envs: int, repeats: int, one_action: bool = False, reset: bool = True) -> dict[str, Any]:
@@ -204,15 +205,6 @@ def rates(steps: int, seconds: list[float], compile_s: float) -> dict[str, Any]:
         "fastest": found[-1],
         "compile_s": round(compile_s, 2),
     }
-
-
-def table(results: list[dict[str, Any]], lanes: list[int]) -> str:
-    """Markdown: million steps a second."""
-    lines = ["| million steps/s | " + " | ".join(f"{num:,}" for num in lanes) + " |", "|---|" + "---|" * len(lanes)]
-    for name in dict.fromkeys(run["task"] for run in results):
-        cells = [f"{run['steps_per_s'] / 1e6:.3g}" for run in results if run["task"] == name]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
 
 
 RUNS: dict[str, Callable[[int, int], dict[str, Any]]] = {

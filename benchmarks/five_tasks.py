@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import os
-import statistics
 import subprocess
 import sys
 import tempfile
@@ -36,6 +35,7 @@ POLL = 0.1
 def main() -> None:
     """Run, write, print."""
     options = words(seeds="10", seed="0", preset="quick", repeats="3")
+    import tables
     from machine import about
 
     here = about()
@@ -44,15 +44,9 @@ def main() -> None:
     for _ in range(int(options["repeats"])):
         runs.append({"one command": together(asked), "five commands": apart(asked)})
         print(json.dumps(runs[-1]), file=sys.stderr)
-    OUT.write_text(json.dumps({**here, "words": asked, "level": LEVEL, "unit": "s", "runs": runs}, indent=1) + "\n")
-    print("| | all learnt after [s] | whole command [s] | success, stochastic | failed seeds |\n|---|---|---|---|---|")
-    for way in runs[0]:
-        learnt, whole = ([run[way][name] for run in runs] for name in ("learnt", "whole"))
-        success, failed = (runs[0][way][name] for name in ("success", "failed"))
-        print(
-            f"| {way} | {middle(learnt)} | {middle(whole)} | {', '.join(f'{value:.1%}' for value in success.values())}"
-            f" | {sum(map(len, failed.values()))} |"
-        )
+    content = {**here, "words": asked, "level": LEVEL, "unit": "s", "runs": runs}
+    OUT.write_text(json.dumps(content, indent=1) + "\n")
+    print(tables.five_tasks(content))
 
 
 def together(asked: Sequence[str]) -> dict[str, Any]:
@@ -115,14 +109,6 @@ def all_known(values: Sequence[float | None]) -> list[float]:
     """The values, or nothing if one of them was never reached."""
     known = [value for value in values if value is not None]
     return known if len(known) == len(values) else []
-
-
-def middle(values: Sequence[float | None]) -> str:
-    """The median of several measurements and their range, or `never`."""
-    known = all_known(values)
-    if not known:
-        return "never"
-    return f"{statistics.median(known):.0f} ({min(known):.0f} to {max(known):.0f})"
 
 
 if __name__ == "__main__":

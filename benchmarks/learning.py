@@ -29,6 +29,7 @@ def main() -> None:
     if "probe" in options:
         print(json.dumps(trained(options["probe"], [f"env={options['tasks']}", *seeds])))
         return
+    import tables
     from machine import about
 
     from jaxsafe.envs import TASKS
@@ -39,17 +40,9 @@ def main() -> None:
         for task in tasks
         for name in VARIANTS
     ]
-    OUT.write_text(json.dumps({**here, "words": seeds, "runs": rows}, indent=1) + "\n")
-    print("| task | variant | 80 % in training | success, stochastic | deterministic | worst seed | length |")
-    print("|---|---|---|---|---|---|---|")
-    for row in rows:
-        sampled, modes = (row["evaluation"][kind] for kind in ("stochastic", "deterministic"))
-        cells = [_interval(one["success_rate"], 100.0) for one in (sampled, modes)]
-        worst = min(sampled["success_rate"]["per_seed"] + modes["success_rate"]["per_seed"])
-        length = _interval(sampled["episode_length"], 1.0)
-        print(
-            f"| {row['task']} | {row['variant']} | {row['steps_to_80']:,} | {' | '.join(cells)} | {worst:.1%} | {length} |"
-        )
+    content = {**here, "words": seeds, "runs": rows}
+    OUT.write_text(json.dumps(content, indent=1) + "\n")
+    print(tables.learning(content))
 
 
 def trained(variant: str, asked: list[str]) -> dict[str, Any]:
@@ -76,11 +69,6 @@ def trained(variant: str, asked: list[str]) -> dict[str, Any]:
         "steps_to_80": results["interaction_efficiency"]["timesteps"],
         "evaluation": {kind: {name: found[name] for name in keep} for kind, found in results["evaluation"].items()},
     }
-
-
-def _interval(found: dict[str, Any], factor: float) -> str:
-    low, high = (factor * value for value in found["ci95"])
-    return f"{factor * found['mean']:.2f} [{low:.2f}, {high:.2f}]"
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ def main() -> None:
     from isolated import probe as apart
     from isolated import several, words
     from machine import about
+    from tables import memory
 
     from jaxsafe.envs import TASKS
 
@@ -36,16 +37,9 @@ def main() -> None:
     for task in tasks:
         for size in sizes:
             rows.append({"task": task, "num_envs": size, **apart(__file__, [f"probe={task}", f"num_envs={size}"])})
-    OUT.write_text(json.dumps({**here, "num_steps": NUM_STEPS, "runs": rows}, indent=1) + "\n")
-    print(
-        "| predicted / measured | an environment's state | a seed without them |"
-        + "".join(f" {n:,} × {NUM_STEPS} |" for n in sizes)
-    )
-    print("|---|---|---|" + "---|" * len(sizes))
-    for task in tasks:
-        mine = [row for row in rows if row["task"] == task]
-        cells = [f"{row['predicted'] / 2**20:.0f} / {row['measured'] / 2**20:.0f} MiB" for row in mine]
-        print(f"| {task} | {mine[0]['lane']:,} B | {mine[0]['seed'] / 1024:.0f} KiB | " + " | ".join(cells) + " |")
+    content = {**here, "num_steps": NUM_STEPS, "runs": rows}
+    OUT.write_text(json.dumps(content, indent=1) + "\n")
+    print(memory(content))
 
 
 def probe(task: str, num_envs: int) -> dict[str, int]:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 import os
-import statistics
 import sys
 import time
 from collections.abc import Callable
@@ -39,6 +38,7 @@ def main() -> None:
     if "probe" in options:
         print(json.dumps(PROBES[options["probe"]](task)))
         return
+    import tables
     from machine import about, usable_cores
 
     here, peers = about(), several("peers", options["peers"], PEERS)
@@ -55,13 +55,9 @@ def main() -> None:
             )
     rows = [{"peer": name, "cores": count, "samples_per_s": rates} for (name, count), rates in found.items()]
     OUT.parent.mkdir(exist_ok=True)
-    OUT.write_text(
-        json.dumps({**here, "peers": versions(python), "task": task, "repeats": repeats, "runs": rows}, indent=1) + "\n"
-    )
-    print(f"| {task}, thousand samples/s | 1 core | {cores[-1]} cores |\n|---|---|---|")
-    for name in names:
-        rates = [f"{statistics.median(found[name, n]) / 1e3:.3g}" if (name, n) in found else "–" for n in cores]
-        print(f"| {name} | " + " | ".join(rates) + " |")
+    content = {**here, "peers": versions(python), "task": task, "repeats": repeats, "runs": rows}
+    OUT.write_text(json.dumps(content, indent=1) + "\n")
+    print(tables.ppo(content))
 
 
 def ours(task: str, seeds: int = 1, sort: bool = False) -> float:

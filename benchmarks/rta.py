@@ -25,6 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from isolated import several, words
 from machine import about
+from tables import markdown
 
 import jaxsafe
 from jaxsafe.component import normalise
@@ -50,16 +51,9 @@ def main() -> None:
     for name in chosen:
         rows = parts[name](repeats)
         known[name] = {**about(), "rows": rows}
-        print(f"\n{name}\n" + table(rows))
+        print(f"\n{name}\n" + markdown(list(rows[0]), ([_short(value) for value in row.values()] for row in rows)))
         OUT.parent.mkdir(exist_ok=True)
         OUT.write_text(json.dumps(known, indent=1) + "\n")
-
-
-def table(rows: list[dict[str, Any]]) -> str:
-    """Markdown, a column for each key."""
-    names = list(rows[0])
-    lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
-    return "\n".join(lines + ["| " + " | ".join(_short(row[name]) for name in names) + " |" for row in rows])
 
 
 def timed(run: Callable[[], Any], repeats: int) -> tuple[float, float]:

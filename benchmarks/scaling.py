@@ -44,6 +44,7 @@ def main() -> None:
     if "probe" in options:
         print(PROBES[options["probe"]](task))
         return
+    import tables
     from machine import about, usable_cores
 
     here = about()
@@ -59,13 +60,7 @@ def main() -> None:
     projected = projection(rates, cores)
     content = {**here, "task": task, "repeats": repeats, "runs": rows, "projection": projected}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
-    print(f"| {task}, a second | 1 core | {cores} cores | ratio |\n|---|---|---|---|")
-    for name in PROBES:
-        one, all_ = rates[name, 1], rates[name, cores]
-        print(f"| {name} | {one / 1e3:,.3g} k | {all_ / 1e3:,.3g} k | {all_ / one:.2f} |")
-    print(f"\n| {DEVICES:,} devices | seeds | million samples/s | of a perfect split |\n|---|---|---|---|")
-    for row in projected:
-        print(f"| {row['shared']} a seed | {row['seeds']:,} | {row['samples_per_s'] / 1e6:.3g} | {row['efficiency']:.0%} |")
+    print(f"{tables.scaling(content)}\n\n{tables.projection(content)}")
 
 
 def projection(rates: dict[tuple[str, int], float], cores: int) -> list[dict[str, float]]:

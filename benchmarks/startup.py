@@ -45,6 +45,7 @@ def main() -> None:
         print(json.dumps(measure(FIRST[traced]) if traced in FIRST else probe(*word.split(","))))
         return
     from machine import about
+    from tables import startup_first, startup_parts, startup_profile
 
     from jaxsafe.envs import TASKS
 
@@ -66,17 +67,7 @@ def main() -> None:
         "profiles": profiles,
     }
     OUT.write_text(json.dumps(content, indent=1) + "\n")
-    print("| s | " + " | ".join(COLUMNS) + " |\n|---|" + "---|" * len(COLUMNS))
-    for row in rows:
-        label = row["name"] if row["rta"] == "none" else f"{row['name']}, {row['rta']}"
-        print(f"| {label} | " + " | ".join(f"{value:.2g}" for value in row["seconds"]) + " |")
-    print("\n| s to the first result | cold | warm |\n|---|---|---|")
-    for row in first:
-        print(f"| {row['name']} | " + " | ".join(f"{statistics.median(row[kind]):.2g}" for kind in ("cold", "warm")) + " |")
-    print("\n| s | " + " | ".join(PARTS) + " |\n|---|" + "---|" * len(PARTS))
-    for row, kind in ((row, kind) for row in profiles for kind in ("cold", "warm")):
-        middle = [statistics.median(one[part] for one in row[kind]) for part in PARTS]
-        print(f"| {row['name']}, {kind} | " + " | ".join(f"{value:.2g}" for value in middle) + " |")
+    print("\n\n".join(make(content) for make in (startup_parts, startup_first, startup_profile)))
 
 
 def first_result(name: str, word: str, repeats: int) -> dict[str, Any]:

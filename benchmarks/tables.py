@@ -1,0 +1,502 @@
+"""The tables of the pages, from the results of the benchmarks and of the report, so that they cannot drift.
+
+Run `python benchmarks/tables.py` after a benchmark or a report: each table replaces the one in its page that has the same
+first row. `tests/test_benchmarks.py` compares the committed pages with it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import statistics
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxsafe.envs import TASKS
+from jaxsafe.report.plan import KINDS, PAPER_STEPS, WITHOUT_RTA
+from jaxsafe.train.files import write_text
+
+ROOT = Path(__file__).parent.parent
+RESULTS, BASELINES = ROOT / "benchmarks" / "results", ROOT / "docs" / "baselines"
+
+Found = Mapping[str, Any]
+"""The content of a file of results."""
+
+PENDULUM = "gymnax:Pendulum-v1"
+ENVIRONMENTS = {
+    **{task: task for task in TASKS},
+    "docking3d:one_action": "docking3d, one action",
+    "docking3d:no_reset": "docking3d, one action, no reset",
+    "docking3d:usual_way": "docking3d, the usual way",
+    PENDULUM: "gymnax Pendulum-v1",
+    "gymnax:CartPole-v1": "gymnax CartPole-v1",
+    f"{PENDULUM}:one_action": "gymnax Pendulum-v1, one action",
+    "brax:inverted_pendulum": "Brax inverted pendulum, spring",
+    "gymnasium:CartPole-v1": "Gymnasium CartPole-v1, NumPy",
+    "envpool:CartPole-v1": "EnvPool CartPole-v1, one thread",
+}
+README_ENVIRONMENTS = (*TASKS, "docking3d:usual_way", PENDULUM, "gymnasium:CartPole-v1")
+
+PPO = {
+    "jaxsafe": "jaxsafe, one seed",
+    "jaxsafe, ten seeds": "jaxsafe, ten seeds",
+    "jaxsafe, sorting": "jaxsafe, shuffled by sorting",
+    "networks only": "its networks and Adam alone",
+    "usual way": "[PPO written the usual way](../benchmarks/usual_ppo.py), as in PureJaxRL",
+    "rejax": "rejax",
+    "brax": "Brax",
+    "sb3": "Stable-Baselines3",
+}
+VARIANTS = {
+    "sorting shuffle": "shuffled by sorting",
+    "whole gradients": "gradients of whole minibatches",
+    "two devices a seed": "two devices share each seed",
+}
+ADAPTERS = {
+    "pure functions, called from Python": "pure functions, called from Python",
+    "GymVectorEnv": "`GymVectorEnv`",
+    "SafetyEnv": "`SafetyEnv`, a batch",
+    "SB3VecEnv": "`SB3VecEnv`",
+    "GymnaxEnv": "`GymnaxEnv`, mapped",
+    "BraxEnv": "`BraxEnv` in `wrap`",
+    "GymEnv": "`GymEnv`",
+    "SyncVectorEnv of GymEnv": "`SyncVectorEnv` of `GymEnv`",
+    "Gymnasium CartPole, NumPy": "Gymnasium CartPole, NumPy",
+    "EnvPool CartPole": "EnvPool CartPole",
+}
+DOCKING_FIRST = sorted(TASKS, key=lambda task: task.startswith("rejoin"))
+"""As docs/rta.md has the tasks."""
+
+PARTS = ("whole", "import of JAX", "trace", "lower", "compile", "the rest", "XLA's passes", "emitters", "LLVM")
+FILTERS = {
+    "cbfpy, batched": "cbfpy 0.1.0, `vmap`",
+    "run-time-assurance, one at a time": "run-time-assurance 1.18.6, one call at a time",
+}
+
+
+def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table; empty cells are as short as they can be."""
+    lines = [[*heads], *rows]
+    text = ["|" + "|".join(f" {cell} " if cell else " " for cell in line) + "|" for line in lines]
+    return "\n".join([text[0], "|" + "---|" * len(heads), *text[1:]])
+
+
+def environments(found: Found, names: Iterable[str] = tuple(ENVIRONMENTS)) -> str:
+    """Million steps a second, medians."""
+    rates = _steps(found)
+    lanes = sorted({number for _, number in rates})
+    heads = ["million steps/s at … environments", *(f"{number:,}" for number in lanes)]
+    shown = [name for name in names if (name, lanes[0]) in rates]
+    return markdown(
+        heads, ([ENVIRONMENTS[name], *(_three(rates[name, number] / 1e6) for number in lanes)] for name in shown)
+    )
+
+
+def readme_environments(found: Found) -> str:
+    """The same, of fewer environments."""
+    return environments(found, README_ENVIRONMENTS)
+
+
+def ppo(found: Found) -> str:
+    """Thousand samples a second, medians."""
+    rates = _samples(found)
+    cores = sorted({count for _, count in rates})
+    heads = ["thousand samples/s", *(f"{count} core{'s' * (count > 1)}" for count in cores)]
+    shown = [name for name in PPO if (name, 1) in rates]
+    return markdown(
+        heads,
+        ([PPO[name], *(f"{rates[name, n] / 1e3:.0f}" if (name, n) in rates else "–" for n in cores)] for name in shown),
+    )
+
+
+def startup_parts(found: Found) -> str:
+    """Seconds of each part, without a cache."""
+    rows = []
+    for row in found["rows"]:
+        name = f"gymnax {row['name']}" if row["rta"] == "gymnax" else row["name"]
+        cells = [f"{value:.2g}" for value in row["seconds"]]
+        filtered = f", `rta={row['rta']}`" if row["rta"] not in ("none", "gymnax") else ""
+        rows.append([name + filtered, *cells, *["–"] * (len(found["columns"]) - len(cells))])
+    return markdown(["s", *found["columns"]], rows)
+
+
+def startup_first(found: Found) -> str:
+    """Seconds to the first result, medians."""
+    return markdown(
+        ["s", "cold", "warm"],
+        (
+            [row["name"].replace(" ", ", "), *(f"{statistics.median(row[kind]):.2g}" for kind in ("cold", "warm"))]
+            for row in found["first"]
+        ),
+    )
+
+
+def startup_profile(found: Found) -> str:
+    """What that time goes into, medians."""
+    rows = []
+    for row in found["profiles"]:
+        for kind in ("cold", "warm"):
+            middle = [statistics.median(one[part] for one in row[kind]) for part in PARTS]
+            cells = [f"{value:.2g}" if value else "–" for value in middle]
+            rows.append([f"{row['name'].removeprefix('jaxsafe ')}, {kind}", *cells])
+    return markdown(["s", *(part.replace("compile", "compile, or read") for part in PARTS)], rows)
+
+
+def five_tasks(found: Found) -> str:
+    """Seconds, medians."""
+    labels = {"one command": "one command, `env=all`", "five commands": "five commands"}
+    rows = []
+    for way, label in labels.items():
+        each = [[run[way][name] for run in found["runs"]] for name in ("learnt", "whole")]
+        rows.append([label, *("never" if None in values else f"{statistics.median(values):.0f}" for values in each)])
+    return markdown(["s", "all learnt after", "whole, with evaluations and figures"], rows)
+
+
+def learning(found: Found) -> str:
+    """Means and 95 % intervals."""
+    rows = []
+    for row in found["runs"]:
+        sampled, modes = (row["evaluation"][kind] for kind in ("stochastic", "deterministic"))
+        worst = min(sampled["success_rate"]["per_seed"] + modes["success_rate"]["per_seed"])
+        first = row["variant"] not in VARIANTS
+        rows.append([
+            f"{row['task']}, as it is" if first else VARIANTS[row["variant"]],
+            f"{row['steps_to_80']:,}{' steps' * first}",
+            _interval(sampled["success_rate"], 100.0, 2),
+            f"{100 * modes['success_rate']['mean']:.2f}",
+            f"{worst:.1%}".replace("%", " %"),
+            _interval(modes["episode_length"], 1.0, 1),
+        ])  # fmt: skip
+    return markdown(
+        ["", "80 % in training after", "success, stochastic [%]", "deterministic", "worst seed", "length [s]"], rows
+    )
+
+
+def scaling(found: Found) -> str:
+    """Medians on one core and on all."""
+    rates = _rates(found)
+    cores = max(count for _, count in rates)
+    rows = []
+    for name in dict.fromkeys(name for name, _ in rates):
+        one, all_ = rates[name, 1], rates[name, cores]
+        cells = [f"{rate / 1e6:.1f} million" if "environment" in name else f"{rate / 1e3:,.0f},000" for rate in (one, all_)]
+        rows.append([_scaled(name), *cells, f"{all_ / one:.2f}"])
+    return markdown([f"{found['task']}, a second", "1 core", f"{cores} cores", "ratio"], rows)
+
+
+def projection(found: Found) -> str:
+    """What a thousand devices would do."""
+    return markdown(
+        ["1,000 devices", "seeds", "million samples/s", "of a perfect split"],
+        (
+            [f"{row['shared']} a seed", f"{row['seeds']:,}", f"{row['samples_per_s'] / 1e6:.3g}",
+             f"{100 * row['efficiency']:.0f} %"]
+            for row in found["projection"]
+        ),
+    )  # fmt: skip
+
+
+def memory(found: Found) -> str:
+    """MiB, but for the first two columns."""
+    sizes = sorted({row["num_envs"] for row in found["runs"]})
+    rows = []
+    for task in dict.fromkeys(row["task"] for row in found["runs"]):
+        mine = [row for row in found["runs"] if row["task"] == task]
+        cells = [f"{row['predicted'] / 2**20:.0f} / {row['measured'] / 2**20:.0f}" for row in mine]
+        rows.append([task, f"{mine[0]['lane']:,} B", f"{mine[0]['seed'] / 1024:.0f} KiB", *cells])
+    heads = ["predicted / measured", "an environment's state", "a seed without them"]
+    return markdown([*heads, *(f"{size:,} × {found['num_steps']}" for size in sizes)], rows)
+
+
+def adapters(found: Found) -> str:
+    """Thousand steps a second, medians."""
+    runs = found["runs"]
+    rows = []
+    for name, label in ADAPTERS.items():
+        rates = [run["steps_per_s"].get(name) for run in runs]
+        if any(rates):
+            rows.append([label, *("–" if rate is None else _three(rate / 1e3) for rate in rates)])
+    return markdown(["environments", *(f"{run['envs']:,}" for run in runs)], rows)
+
+
+def filter_calls(found: Found) -> str:
+    """Calls a second."""
+    rates = {(row["filter"], row["task"]): row["calls_per_s"] for row in found["calls"]["rows"]}
+    order = [
+        "discrete_asif",
+        "explicit_simplex",
+        "implicit_simplex",
+        "implicit_asif",
+        "explicit_asif",
+        "released",
+        *FILTERS,
+    ]
+    rows = []
+    for name in order:
+        cells = [_scale(rates[name, task]) if (name, task) in rates else "" for task in TASKS]
+        if any(cells):
+            rows.append([FILTERS.get(name, f"`{name}`"), *cells])
+    return markdown(["filter", *TASKS], rows)
+
+
+def filter_changes(found: Found) -> str:
+    """Of random actions, a row for each filter and kind of actions."""
+    rows = found["change"]["rows"]
+    tasks = [*dict.fromkeys(row["task"] for row in rows)]
+    cells: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        cells.setdefault((row["filter"], row["actions"]), []).extend([
+            f"{row['violating_steps']:,}", f"{row['intervention_rate']:.1%}", f"{row['mean_correction']:.3f}",
+        ])  # fmt: skip
+    heads = [head for task in tasks for head in (f"{task}: violating", "altered", "‖Δu‖")]
+    return markdown(
+        ["filter", "actions", *heads],
+        (
+            ["" if actions == "bang_bang" else f"`{name}`", actions.replace("_", "-"), *shown]
+            for (name, actions), shown in cells.items()
+        ),
+    )
+
+
+def programs(found: Found) -> str:
+    """Of the quadratic program."""
+    rows = found["qp"]["rows"]
+    return markdown(
+        ["variables", *(str(row["variables"]) for row in rows)],
+        [
+            ["solutions/s", *(_scale(row["solutions_per_s"]) for row in rows)],
+            ["error, 99 of 100", *(f"{row['error_99_percent']:.0e}".replace("e-0", "e-") for row in rows)],
+        ],
+    )
+
+
+def filter_cost(found: Found) -> str:
+    """Of an update of PPO, beside one without a filter."""
+    filters: dict[str, list[tuple[str, float]]] = {}
+    for row in found["training"]["rows"]:
+        filters.setdefault(row["task"], []).append((row["filter"], row["ratio"]))
+    names = [", ".join(f"`{name}`" for name, _ in each) for each in filters.values()]
+    ratios = [", ".join(f"{ratio:.2f}" for _, ratio in each) for each in filters.values()]
+    return markdown(["", *filters], [["filter", *names], ["wall time, without a filter = 1", *ratios]])
+
+
+def adversaries(_: Found) -> str:
+    """What each found against each task's filter."""
+    rows = []
+    for task in DOCKING_FIRST:
+        found = json.loads((RESULTS / "falsify" / f"{task}.json").read_text(encoding="utf-8"))
+        for row in found["policies"]:
+            rows.append([
+                task, row["policy"],
+                *(f"{row[name]:,}" for name in ("steps", "violating_steps", "violating_steps_inside")),
+                f"{row['worst_margin_inside']:.2g}", f"{row['intervention_rate']:.1%}", f"{row['mean_correction']:.3g}",
+            ])  # fmt: skip
+    heads = "task | policy | steps | violating, at samples | inside | least h inside | altered | mean ‖Δu‖"
+    return markdown(heads.split(" | "), rows)
+
+
+def filtered_training(_: Found) -> str:
+    """Policies trained without and with a filter, by their modes, of the records of the report."""
+    labels = {"features": "no filter", "rta": "`rta=default`", "unpunished": "and `rta_training=unpunished`"}
+    rows = []
+    for task in DOCKING_FIRST:
+        for kind, label in labels.items():
+            record = _record(task, kind)
+            own = record["results"]
+            mode = own["evaluation"]["deterministic"]
+            rows.append([
+                task if kind == "features" else "", label,
+                f"{own['interaction_efficiency']['timesteps']:,}", f"{own['training_cost']['mean']:,.0f}",
+                f"{100 * mode['success_rate']['mean']:.4g}%", _share(mode["episode_safety_violation_rate"]),
+                f"{mode['episode_length']['mean']:.0f}",
+            ])  # fmt: skip
+            if kind == "features":
+                rows[-1] += ["–"] * 3
+                continue
+            alone = record["evaluations"][WITHOUT_RTA]["evaluation"]["deterministic"]
+            rows[-1] += [
+                _share(mode["intervention_rate"]),
+                f"{100 * alone['success_rate']['mean']:.4g}%", _share(alone["episode_safety_violation_rate"]),
+            ]  # fmt: skip
+    heads = "task | option | 80 % in training after | violations in training | success | violating steps | length [steps]"
+    return markdown(f"{heads} | steps altered | alone: success | alone: violating steps".split(" | "), rows)
+
+
+def readme_results(_: Found) -> str:
+    """The recipes of the tasks, of the records of the report."""
+    rows = []
+    for task in TASKS:
+        own = _record(task, "features")["results"]
+        each = [own["evaluation"][way]["success_rate"] for way in ("stochastic", "deterministic")]
+        rows.append([
+            task, f"{PAPER_STEPS[task]:,}", f"{own['interaction_efficiency']['timesteps']:,}", f"{own['steps']:,}",
+            *(f"{100 * one['mean']:.2f} %" for one in each), f"{100 * min(min(one['per_seed']) for one in each):.1f} %",
+        ])  # fmt: skip
+    heads = "task | 80 % in training, paper | here | trained for | success, stochastic | deterministic | worst seed"
+    return markdown(heads.split(" | "), rows)
+
+
+def goals(_: Found) -> str:
+    """Ratios that were aimed for before any of it was written, and those of four files of results; bold: not reached."""
+    names = ("environments", "ppo", "scaling", "startup")
+    found = {name: json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")) for name in names}
+    steps, samples, scaled = _steps(found["environments"]), _samples(found["ppo"]), _rates(found["scaling"])
+    many = sorted({lanes for _, lanes in steps})[1:]
+    slow, fast = sorted(found["environments"]["released_steps_per_s"])
+    first = {
+        row["name"]: {kind: statistics.median(row[kind]) for kind in ("cold", "warm")} for row in found["startup"]["first"]
+    }
+
+    def pendulum(names: Iterable[str], goal: float, way: str = "") -> str:
+        return _reached([steps[name + way, lanes] / steps[PENDULUM + way, lanes] for name in names for lanes in many], goal)
+
+    def released(names: Iterable[str], goal: float) -> str:
+        rates = [steps[name, lanes] for name in names for lanes in many]
+        return f"{_reached([rate / fast for rate in rates], goal)}; {_reached([rate / slow for rate in rates], goal)}"
+
+    def started(what: str, peer: str, kind: str, goal: float) -> str:
+        return _reached([first[f"jaxsafe {what}"][kind] / first[f"{peer} {what}"][kind]], goal, most=True)
+
+    one, ten = ({n: samples[name, n] for n in (1, 2)} for name in ("jaxsafe", "jaxsafe, ten seeds"))
+    environment = next(name for name, _ in scaled if "environment" in name)
+    cores = scaled[environment, 2] / scaled[environment, 1]
+    outside = 1 - one[1] / samples["networks only", 1]
+    rows = [
+        ("docking3d / Pendulum-v1, environment steps, one core, 1,024 to 16,384", "≥ 3", "≥ 5", pendulum(["docking3d"], 3)),
+        ("the same, one action", "≥ 6", "≥ 10", pendulum(["docking3d"], 6, ":one_action")),
+        ("every task / Pendulum-v1", "≥ 0.5", "≥ 1", pendulum(TASKS, 0.5)),
+        (
+            "docking3d / released code, its faster figure; its slower",
+            "≥ 10,000",
+            "≥ 30,000",
+            released(["docking3d"], 10_000),
+        ),
+        ("every task / released code, the same", "≥ 2,000", "≥ 5,000", released(TASKS, 2_000)),
+        ("environment steps, two cores / one", "≥ 1.6", "≥ 1.9", _reached([cores], 1.6)),
+        ("PPO samples, jaxsafe / rejax, two cores", "≥ 1.5", "≥ 2.5", _reached([one[2] / samples["rejax", 2]], 1.5)),
+        ("PPO, two cores / one, one seed", "≥ 1.3", "≥ 1.8", _reached([one[2] / one[1]], 1.3)),
+        ("ten seeds on two cores / one on one, time", "≤ 6.5", "≤ 5.3", _reached([10 * one[1] / ten[2]], 6.5, most=True)),
+        ("PPO outside networks and Adam, share of time", "≤ 0.15", "≤ 0.08", _reached([outside], 0.15, most=True)),
+        ("import and first step / gymnax, compiled before", "≤ 0.6", "≤ 0.4", started("step", "gymnax", "warm", 0.6)),
+        ("import and first update / rejax, compiled before", "≤ 0.4", "≤ 0.25", started("update", "rejax", "warm", 0.4)),
+        ("the same, nothing compiled before", "≤ 0.8", "≤ 0.55", started("update", "rejax", "cold", 0.8)),
+    ]
+    return markdown(["ratio", "goal", "more", "reached"], rows)
+
+
+TABLES: Sequence[tuple[str, Callable[[Found], str], str]] = (
+    ("environments", environments, "docs/performance.md"),
+    ("environments", readme_environments, "README.md"),
+    ("ppo", ppo, "docs/performance.md"),
+    ("startup", startup_parts, "docs/performance.md"),
+    ("startup", startup_first, "docs/performance.md"),
+    ("startup", startup_profile, "docs/performance.md"),
+    ("five_tasks", five_tasks, "docs/performance.md"),
+    ("learning", learning, "docs/performance.md"),
+    ("", goals, "docs/performance.md"),
+    ("scaling", scaling, "docs/scaling.md"),
+    ("scaling", projection, "docs/scaling.md"),
+    ("memory", memory, "docs/scaling.md"),
+    ("adapters", adapters, "docs/adapters/gymnasium.md"),
+    ("rta", filter_calls, "docs/rta.md"),
+    ("rta", filter_changes, "docs/rta.md"),
+    ("rta", programs, "docs/rta.md"),
+    ("rta", filter_cost, "docs/rta.md"),
+    ("", adversaries, "docs/rta.md"),
+    ("", filtered_training, "docs/rta.md"),
+    ("", readme_results, "README.md"),
+)
+"""File of results, what makes a table of it, and the page where it stands."""
+
+
+def pages() -> dict[Path, str]:
+    """Each page with its tables as they should be.
+
+    Raises:
+        ValueError: a page does not have exactly one table with the first row of one of these.
+    """
+    text: dict[Path, str] = {}
+    for file, make, name in TABLES:
+        page = ROOT / name
+        found = json.loads((RESULTS / f"{file}.json").read_text(encoding="utf-8")) if file else {}
+        table = make(found)
+        head = table.partition("\n")[0]
+        before = text.get(page) or page.read_text(encoding="utf-8")
+        text[page], count = re.subn(
+            rf"^{re.escape(head)}\n(?:\|.*\n)+", lambda _, new=table: f"{new}\n", before, flags=re.M
+        )
+        if count != 1:
+            raise ValueError(f"{name}: found {count} tables that begin with {head}; expected one")
+    return text
+
+
+def main() -> None:
+    """Write the pages that changed, and name them."""
+    try:
+        for page, text in pages().items():
+            if text != page.read_text(encoding="utf-8"):
+                write_text(page, text)
+                print(page.relative_to(ROOT))
+    except ValueError as error:
+        sys.exit(str(error))
+
+
+def _record(task: str, kind: str) -> Found:
+    assert kind in KINDS
+    return json.loads((BASELINES / f"{task}-{kind}.json").read_text(encoding="utf-8"))
+
+
+def _steps(found: Found) -> dict[tuple[str, int], float]:
+    return {(run["task"], run["lanes"]): run["steps_per_s"] for run in found["runs"]}
+
+
+def _samples(found: Found) -> dict[tuple[str, int], float]:
+    return {(run["peer"], run["cores"]): statistics.median(run["samples_per_s"]) for run in found["runs"]}
+
+
+def _rates(found: Found) -> dict[tuple[str, int], float]:
+    return {(run["what"], run["cores"]): statistics.median(run["per_s"]) for run in found["runs"]}
+
+
+def _scaled(name: str) -> str:
+    """What the page calls a row of `scaling.py`."""
+    return name if "environment" in name else f"PPO {name}{'' if 'each' in name else ' that both share'}"
+
+
+def _reached(values: Sequence[float], goal: float, most: bool = False) -> str:
+    """The range of some ratios, bold where it misses the goal, the least or the most that they may be."""
+
+    def shown(value: float) -> str:
+        digits = 0 if value >= 100 else 2 if value < 2 else 1
+        while (round(value, digits) > goal, round(value, digits) < goal) != (value > goal, value < goal):
+            digits += 1  # else it would look as if it were on the other side
+        text = f"{value:,.{digits}f}"
+        return f"**{text}**" if (value > goal if most else value < goal) else text
+
+    return " to ".join(shown(value) for value in sorted({min(values), max(values)}))
+
+
+def _interval(metric: Found, factor: float, digits: int) -> str:
+    mean, low, high = (f"{factor * value:.{digits}f}" for value in (metric["mean"], *metric["ci95"]))
+    return f"{mean} [{low}, {high}]"
+
+
+def _share(metric: Found) -> str:
+    return f"{100 * metric['mean']:.3g}%" if metric["mean"] else "0"
+
+
+def _three(value: float) -> str:
+    """Three digits, without an exponent."""
+    return f"{value:.3g}" if value < 1000 else f"{float(f'{value:.3g}'):,.0f}"
+
+
+def _scale(rate: float) -> str:
+    """Of calls a second: in millions or thousands, to two digits or three."""
+    scaled, unit = (rate / 1e6, "M") if rate >= 1e6 else (rate / 1e3, "k")
+    return f"{scaled:.2g} {unit}" if unit == "M" else f"{scaled:.3g} {unit}"
+
+
+if __name__ == "__main__":
+    main()

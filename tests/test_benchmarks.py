@@ -1,0 +1,55 @@
+"""The tables in the pages are those of the results in the repository."""
+
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+
+
+@pytest.fixture
+def tables(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    import tables  # pyright: ignore[reportMissingImports]
+
+    return tables
+
+
+def test_the_tables_of_the_pages_are_current(tables: ModuleType) -> None:
+    stale = [str(page) for page, text in tables.pages().items() if text != page.read_text(encoding="utf-8")]
+    assert stale == [], "run benchmarks/tables.py"
+
+
+def test_another_result_makes_another_table(tables: ModuleType) -> None:
+    rows = [{"task": "docking2d", "num_envs": 64, "lane": 200, "seed": 2048, "predicted": 2**20, "measured": 3 * 2**20}]
+    assert tables.memory({"num_steps": 32, "runs": rows}).splitlines() == [
+        "| predicted / measured | an environment's state | a seed without them | 64 × 32 |",
+        "|---|---|---|---|",
+        "| docking2d | 200 B | 2 KiB | 1 / 3 |",
+    ]
+
+
+def test_a_page_without_the_table_is_named(tables: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "TABLES", [("memory", lambda _: "| a | b |\n|---|---|", "docs/scaling.md")])
+    with pytest.raises(ValueError, match=r"docs/scaling.md: found 0 tables that begin with \| a \| b \|; expected one"):
+        tables.pages()
+
+
+@pytest.mark.parametrize(
+    ("values", "goal", "most", "text"),
+    [
+        ([3.0, 5.0], 4.0, False, "**3.0** to 5.0"),
+        ([3.0, 5.0], 2.0, False, "3.0 to 5.0"),
+        ([0.5], 0.4, True, "**0.50**"),
+        ([0.3], 0.4, True, "0.30"),
+        ([12345.0], 20_000, False, "**12,345**"),
+    ],
+)
+def test_a_missed_goal_is_bold(tables: ModuleType, values: list[float], goal: float, most: bool, text: str) -> None:
+    assert tables._reached(values, goal, most) == text
+
+
+def test_a_rounded_value_never_looks_as_if_it_reached_the_goal(tables: ModuleType) -> None:
+    assert tables._reached([1.596], 1.6) == "**1.596**"
+    assert tables._reached([2.96], 3.0) == "**2.96**"
