@@ -206,7 +206,7 @@ def memory(found: Found) -> str:
         mine = [row for row in found["runs"] if row["task"] == task]
         cells = [f"{row['predicted'] / 2**20:.0f} / {row['measured'] / 2**20:.0f}" for row in mine]
         rows.append([task, f"{mine[0]['lane']:,} B", f"{mine[0]['seed'] / 1024:.0f} KiB", *cells])
-    heads = ["predicted / measured", "an environment's state", "a seed without them"]
+    heads = ["predicted / measured", "an environment", "a seed without them"]
     return markdown([*heads, *(f"{size:,} × {found['num_steps']}" for size in sizes)], rows)
 
 

@@ -24,7 +24,7 @@ def test_the_tables_of_the_pages_are_current(tables: ModuleType) -> None:
 def test_another_result_makes_another_table(tables: ModuleType) -> None:
     rows = [{"task": "docking2d", "num_envs": 64, "lane": 200, "seed": 2048, "predicted": 2**20, "measured": 3 * 2**20}]
     assert tables.memory({"num_steps": 32, "runs": rows}).splitlines() == [
-        "| predicted / measured | an environment's state | a seed without them | 64 × 32 |",
+        "| predicted / measured | an environment | a seed without them | 64 × 32 |",
         "|---|---|---|---|",
         "| docking2d | 200 B | 2 KiB | 1 / 3 |",
     ]
