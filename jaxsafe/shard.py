@@ -32,12 +32,12 @@ class Shard:
         """Where this device's part begins, if it has this size."""
         return 0 if self.count == 1 else jax.lax.axis_index(self.axis) * size
 
-    def own(self, x: Array, axis: int = 0) -> Array:
-        """This device's part of what all of them have whole."""
+    def own(self, x: Array) -> Array:
+        """This device's part, along the first axis, of what all of them have whole."""
         if self.count == 1:
             return x
-        size = x.shape[axis] // self.count
-        return jax.lax.dynamic_slice_in_dim(x, self.first(size), size, axis)
+        size = x.shape[0] // self.count
+        return jax.lax.dynamic_slice_in_dim(x, self.first(size), size)
 
     def draw(self, draw: Callable[..., Array], key: Key, shape: tuple[int, ...], *options: Any) -> Array:
         """This device's part, of this shape, of one draw for the batch: `draw(key, shape, *options)`."""

@@ -13,13 +13,14 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from orbax.checkpoint import CheckpointManager
 from tiny import TINY
 
 from jaxsafe import cli
 from jaxsafe.envs import TASKS
 from jaxsafe.errors import ConfigError
 from jaxsafe.train import __main__ as command
-from jaxsafe.train import directory
+from jaxsafe.train import directory, hosts
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import recipe
 from jaxsafe.train.loop import Clock, Training
@@ -149,21 +150,64 @@ def test_a_crashed_run_resumes_to_the_same_end(
     assert_same_end(run, whole)
 
 
+@pytest.mark.parametrize("when", ["before", "after"])
+def test_a_kill_while_the_last_checkpoint_is_written_anew_loses_nothing(
+    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    run = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        _crash_at(patch, CheckpointManager, "save", call=5, after=when == "after")
+        with pytest.raises(_CrashError):
+            command.main([*TINY, f"out={run}"])
+    assert (run / "checkpoints" / "1280.before").exists()
+    assert (run / "checkpoints" / "1280").exists() == (when == "after")
+    with monkeypatch.context() as patch:
+        patch.setattr(Training, "train", lambda self: self.step == 1280 or pytest.fail(f"went back to {self.step}"))
+        assert command.main([f"resume={run}"]) == 0
+    assert sorted(path.name for path in (run / "checkpoints").iterdir()) == ["1280", "320", "640", "960"]
+    assert_same_end(run, whole)
+
+
+def test_a_run_has_one_command_at_work_on_it(tmp_path: Path, whole: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    (run / "results.json").unlink()
+    with (
+        hosts.own_files(run),
+        pytest.raises(ConfigError, match=f"^{run}: another command is at work on this run; wait for its end, or stop it$"),
+    ):
+        command.main([f"resume={run}"])
+    assert command.main([f"resume={run}"]) == 0
+
+
+def test_a_refused_training_leaves_its_directory_free(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise ConfigError("ppo.num_envs: this training needs 9 GiB")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("jaxsafe.train.memory.require", refused)
+        with pytest.raises(ConfigError, match="needs 9 GiB"):
+            command.main([*TINY, f"out={tmp_path / 'run'}"])
+    assert not (tmp_path / "run").exists()
+    assert command.main([*TINY, f"out={tmp_path / 'run'}"]) == 0
+
+
+@pytest.mark.parametrize("step", [448, 1280])  # the second with nothing left to train
 def test_ctrl_c_stops_after_a_chunk_with_a_checkpoint_and_resumes(
-    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], step: int
 ) -> None:
     run = tmp_path / "run"
     original = Training._write_progress
 
     def interrupt(self: Training, *args: Any) -> None:
         original(self, *args)
-        if self.step == 448:
+        if self.step == step:
             os.kill(os.getpid(), signal.SIGINT)
 
     with monkeypatch.context() as patch:
         patch.setattr(Training, "_write_progress", interrupt)
         assert command.main([*TINY, f"out={run}"]) == cli.INTERRUPTED
-    assert f"stopped at step 448; go on with: python -m jaxsafe.train resume={run}" in capsys.readouterr().out
+    assert f"stopped at step {step:,}; go on with: python -m jaxsafe.train resume={run}" in capsys.readouterr().out
     assert command.main([f"resume={run}"]) == 0
     assert_same_end(run, whole)
 
@@ -283,7 +327,7 @@ def test_twenty_kills_at_random_moments_change_nothing(tmp_path: Path) -> None:
             process.send_signal(rng.choice([signal.SIGKILL, signal.SIGKILL, signal.SIGINT]))
             process.wait()
             kills += 1
-        if (run / "figures" / "speed_distance.png").exists():
+        if (run / "figures").exists():
             assert_same_end(run, whole)
             ended += 1
 
@@ -372,6 +416,10 @@ def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(tmp_path: Path) -> 
         (["cost_limit=5"], "cost_limit: plain PPO has none; add algorithm=ppo_lagrangian"),
         (["algorithm=ppo_lagrangian", "cost_limit=0"], "cost_limit: expected a number > 0"),
         (["algorithm=trpo"], "algorithm: found .trpo.; choose from ppo, ppo_lagrangian"),
+        (["agent.cost_critic=true"], "agent.cost_critic: follows from the algorithm; give algorithm=ppo_lagrangian"),
+        (["algorithm=ppo_lagrangian", "cost_limit=1", "ppo.cost_limit=2"], "ppo.cost_limit: follows from the algorithm"),
+        (["ppo.multiplier_rate=0.1"], "ppo.multiplier_rate: plain PPO has none; add algorithm=ppo_lagrangian"),
+        (["algorithm=ppo_lagrangian", "cost_limit=1", "ppo.gamma=1"], "ppo.gamma: expected less than 1 with algorithm=ppo"),
     ],
 )
 def test_a_cost_limit_needs_the_algorithm_for_it(words: list[str], message: str) -> None:

@@ -59,7 +59,12 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
             figures["speed_distance"] = speed_distance(episodes, title)
         if "rta" in episodes[-1][1][0]:
             figures["interventions"] = interventions(most_altered(episodes), env, title)
-    return [save(figure, run / "figures" / f"{name}.png") for name, figure in figures.items()]
+    place = run / "figures"
+    new = place if place.exists() else place.with_name("figures.part")  # for the first time all or none
+    paths = [save(figure, new / f"{name}.png") for name, figure in figures.items()]
+    if new != place:
+        new.rename(place)
+    return [place / path.name for path in paths]
 
 
 def progress(run: Path) -> list[dict[str, Any]]:

@@ -22,6 +22,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     claim_cores()
     cli.enable_compilation_cache()
+    from jaxsafe.errors import ConfigError
     from jaxsafe.train import directory, hosts
     from jaxsafe.train.config import resolve_all
     from jaxsafe.train.results import summary
@@ -37,8 +38,16 @@ def main(argv: Sequence[str]) -> int:
         arguments.refuse_rest(["resume", "distributed"])
         path = Path(resume)
     runs = directory.runs(path)
-    with hosts.loss_told(f"go on with: python -m jaxsafe.train distributed=true resume={path}"):
-        finished = _train([run for run in runs if not _complete(run)], path)
+    try:
+        with hosts.loss_told(f"go on with: python -m jaxsafe.train distributed=true resume={path}"):
+            finished = _train([run for run in runs if not _complete(run)], path)
+    except ConfigError:
+        if resume is None and hosts.leads():
+            directory.discard_unused(path)
+        raise
+    except KeyboardInterrupt:
+        print(f"go on with: python -m jaxsafe.train resume={path}")
+        raise
     if not finished:
         return cli.INTERRUPTED
     if len(runs) > 1 and hosts.leads():
@@ -48,10 +57,12 @@ def main(argv: Sequence[str]) -> int:
 
 def _complete(run: Path) -> bool:
     """Whether all is there, with figures if only they are missing."""
+    from jaxsafe.train import hosts
+
     if not (run / "results.json").exists():
         return False
     print(f"{run} is complete; nothing is left to do")
-    if not (run / "figures").exists():  # killed between the results and the figures
+    if not (run / "figures").exists() and hosts.leads():  # killed between the results and the figures
         from jaxsafe.plot.figures import draw_all
 
         draw_all(run)

@@ -1,4 +1,7 @@
-"""Checkpoints with orbax: a step directory appears whole or not at all, so a kill leaves the one before."""
+"""Checkpoints with orbax: a step directory appears whole or not at all, so a kill leaves the one before.
+
+That one also if it is of the same step: it is moved aside, and goes only when the new one is there.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import contextlib
 import gc
 import io
 import logging
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.train import hosts
 from jaxsafe.types import is_key
 
 logging.getLogger("absl").setLevel(logging.ERROR)
@@ -26,6 +31,9 @@ QUIET_S = 0.5
 
 SETTLE_S = 10.0
 """How long they get for that at most."""
+
+ASIDE = ".before"
+"""Ends the name of a checkpoint while the one that takes its place is written."""
 
 
 class Checkpoints:
@@ -38,6 +46,8 @@ class Checkpoints:
         self._ocp = ocp
         self.directory = (run / "checkpoints").absolute()
         options = ocp.CheckpointManagerOptions(create=create, enable_async_checkpointing=False, read_only=not create)
+        if create:
+            self._recover()
         if create or self.directory.is_dir():
             self._manager = ocp.CheckpointManager(self.directory, options=options)
 
@@ -49,10 +59,25 @@ class Checkpoints:
     def save(self, step: int, state: Any, facts: dict[str, Any]) -> None:
         """Write one checkpoint, or write it anew: a pytree of arrays on the host, of keys their words, and some JSON."""
         ocp = self._ocp
+        place, before = self.directory / str(step), self.directory / f"{step}{ASIDE}"
         if step in self.steps:
-            self._manager.delete(step)
+            if hosts.leads():
+                place.rename(before)
+            hosts.meet("moved aside")
+            self._manager.reload()
         args = ocp.args.Composite(state=ocp.args.StandardSave(state), facts=ocp.args.JsonSave(facts))
         self._manager.save(step, args=args, force=True)
+        if hosts.leads():
+            shutil.rmtree(before, ignore_errors=True)
+
+    def _recover(self) -> None:
+        """Take a checkpoint back whose successor of the same step was never written."""
+        for before in self.directory.glob(f"*{ASIDE}") if hosts.leads() else ():
+            if before.with_suffix("").exists():
+                shutil.rmtree(before)
+            else:
+                before.rename(before.with_suffix(""))
+        hosts.meet("taken back")
 
     def restore(self, step: int, like: Any) -> tuple[Any, dict[str, Any]]:
         """Read one checkpoint, as arrays on the host, into the structure and shapes of `like`.

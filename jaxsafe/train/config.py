@@ -113,7 +113,7 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
     config = config.replace(rta_training=told)
     if told == "corrected":
         config = set_path(config, "ppo.learns_from", "actual", to_value)
-    config = _with_algorithm(config)
+    config = _with_algorithm(config, arguments.options)
     _check_rta(config, env)
     if config.ppo.batch_size % config.ppo.num_minibatches:
         raise ConfigError(
@@ -141,13 +141,21 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
     return config, env, Path(task).stem
 
 
-def _with_algorithm(config: TrainConfig) -> TrainConfig:
+def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfig:
+    for path, instead in (("agent.cost_critic", "algorithm=ppo_lagrangian"), ("ppo.cost_limit", "cost_limit=N")):
+        if path in given:
+            raise ConfigError(f"{path}: follows from the algorithm; give {instead}")
     if config.algorithm == "ppo":
+        for path in ("ppo.multiplier", "ppo.multiplier_rate"):
+            if path in given:
+                raise ConfigError(f"{path}: plain PPO has none; add algorithm=ppo_lagrangian")
         if config.cost_limit is not None:
             raise ConfigError("cost_limit: plain PPO has none; add algorithm=ppo_lagrangian")
         return config
     if config.cost_limit is None:
         raise ConfigError("cost_limit: missing; the violating steps that an episode may have, for instance cost_limit=5")
+    if float(config.ppo.gamma) >= 1.0:
+        raise ConfigError(f"ppo.gamma: expected less than 1 with algorithm=ppo_lagrangian, found {float(config.ppo.gamma)}")
     agent, ppo = config.agent.replace(cost_critic=True), config.ppo.replace(cost_limit=config.cost_limit)
     return config.replace(agent=agent, ppo=ppo)
 

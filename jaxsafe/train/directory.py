@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -62,8 +64,8 @@ def make(out: str | None, parent: Path, name: str) -> Path:
     Raises:
         ConfigError: `out` already holds something, or cannot be written.
     """
-    path = Path(out) if out else _next_free(parent, name)
     try:
+        path = Path(out) if out else _next_free(parent, name)
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
             advice = f"continue it with resume={path}" if (path / "config.yaml").exists() else "choose an empty one"
             raise ConfigError(f"out: {path} already holds something and is never overwritten; {advice}")
@@ -92,6 +94,19 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
     return config, env, str(content["env"])
 
 
+def discard_unused(path: Path) -> None:
+    """Remove what `create_all` made, if nothing has come to it: a training that was refused is no run."""
+    if all(found.is_dir() or found.name == "config.yaml" for found in path.rglob("*")):
+        shutil.rmtree(path, ignore_errors=True)
+
+
 def _next_free(parent: Path, name: str) -> Path:
-    names = [parent / name, *(parent / f"{name}-{number}" for number in range(2, 10_000))]
-    return next(path for path in names if not path.exists())
+    """Made here, so that no other process takes it too."""
+    parent.mkdir(parents=True, exist_ok=True)
+    number = 1
+    while True:
+        path = parent / (name if number == 1 else f"{name}-{number}")
+        with contextlib.suppress(FileExistsError):
+            path.mkdir()
+            return path
+        number += 1

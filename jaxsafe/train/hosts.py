@@ -22,6 +22,11 @@ import numpy as np
 from jaxsafe.errors import ConfigError
 from jaxsafe.types import is_key
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None
+
 LONGEST = 4096
 """Of what process 0 tells the others, in bytes."""
 
@@ -105,17 +110,37 @@ def gather(x: Any) -> np.ndarray:
 
 @contextlib.contextmanager
 def own_files(run: Path) -> Iterator[Path]:
-    """The run directory; in the other processes a copy of its logs, which nobody will read, and nothing is printed."""
-    if leads():
-        _meet("copied")
-        yield run
-        return
+    """The run directory, which process 0 alone writes; the others have a copy of its logs to go on from, and print nothing.
+
+    Raises:
+        ConfigError: in every process, if another command writes this run already.
+    """
+    with contextlib.ExitStack() as held:
+        from_leader(lambda: held.enter_context(_locked(run)))
+        if leads():
+            meet("copied")
+            yield run
+            return
     with tempfile.TemporaryDirectory() as place, open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
         for file in run.iterdir():
             if file.is_file():
                 shutil.copy(file, place)
-        _meet("copied")
+        meet("copied")
         yield Path(place)
+
+
+@contextlib.contextmanager
+def _locked(run: Path) -> Iterator[str]:
+    """Hold the run, where the system has locks; this one goes with the process. Gives an empty text."""
+    with contextlib.ExitStack() as files:
+        try:
+            if fcntl:
+                fcntl.flock(files.enter_context(open(run / "config.yaml", "rb+")), fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(f"{run}: another command is at work on this run; wait for its end, or stop it") from None
+        except OSError:  # a file system without locks, or no such run, which is told elsewhere
+            pass
+        yield ""
 
 
 @contextlib.contextmanager
@@ -130,7 +155,8 @@ def loss_told(advice: str) -> Iterator[None]:
         raise ConfigError(f"distributed: another process of this run has ended ({reason}); {advice}") from None
 
 
-def _meet(name: str) -> None:
+def meet(name: str) -> None:
+    """Wait until all processes are here."""
     if jax.process_count() > 1:
         from jax.experimental.multihost_utils import sync_global_devices
 

@@ -34,7 +34,7 @@ class ProgressLog:
             write_csv(self._csv, self.rows)
         else:
             self._csv.unlink(missing_ok=True)
-        self._board = tensorboard_writer()(str(run / "tensorboard"), purge_step=resume_step) if tensorboard else None
+        self._board = tensorboard_writer()(str(run / "tensorboard"), purge_step=resume_step + 1) if tensorboard else None
 
     def write(self, rows: list[dict[str, Any]]) -> None:
         """Add rows to all logs."""

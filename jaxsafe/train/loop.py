@@ -1,7 +1,8 @@
 """The host's side of training: compiled chunks of updates, and between them logs, evaluations and checkpoints.
 
 All that decides the numbers is a function of the configuration and of the state in the checkpoint, and chunks begin at the
-same updates however often a run is interrupted: a resumed run ends bit for bit where the uninterrupted one ends.
+same updates however often a run is interrupted: a resumed run ends bit for bit where the uninterrupted one ends, if as many
+devices share a seed.
 """
 
 from __future__ import annotations
@@ -113,7 +114,7 @@ class Training:
         return self.config.num_updates * self.config.ppo.batch_size
 
     def train(self) -> bool:
-        """Train to the end; False if the user asked to stop before. Either way the state is in a checkpoint."""
+        """Train to the end; False if the user asked to stop meanwhile. Either way the state is in a checkpoint."""
         display = Display(self.num_steps, self.step)
         with self.clock:
             self._await_compiled()
@@ -133,9 +134,10 @@ class Training:
                 stopping = hosts.anyone(stop.requested)
                 if self._due(before, self.config.checkpoint_every) or stopping:
                     self._save()
+            stopping = stopping or hosts.anyone(stop.requested)  # it may have come with the last of them
         display.close()
         self.log.close()
-        return self.updates == self.config.num_updates
+        return not stopping
 
     def params(self) -> list[Any]:
         """The networks of each seed, on the host."""
@@ -160,7 +162,7 @@ class Training:
     def _begin(self) -> None:
         """Have the state, fresh or restored, while all programs are compiled side by side."""
         content = structure(self.env, self.config)
-        each = memory.size(content) // self.config.seeds * (self.mapper.padded // self.mapper.mesh.shape["seeds"])
+        each = memory.size(content) // self.config.seeds * self.mapper.padded // self.mapper.mesh.size
         memory.require(each, self.mapper.num_local_devices, MEMORY)
         begin, keys = time.monotonic(), self.mapper.keys(self.config.seed)
         fresh, advance = programs(self.mapper, self.chunk, self.config.num_updates)
