@@ -1,5 +1,10 @@
 import csv
 import json
+import os
+import signal
+import subprocess
+import sys
+import threading
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -63,6 +68,7 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
     rate = shipped["stochastic"]["success_rate"]
     assert f"| docking2d | {best} | {100 * rate['mean']:.2f} % |" in page
     assert len(rate["per_seed"]) == 1
+    assert f"python -m jaxsafe.evaluate run=runs/docking2d-features/policy/seed_{best}.npz episodes=6 seed=1\n" in page
     for file in (
         "docking2d_training.png",
         "docking2d_seeds.png",
@@ -113,6 +119,23 @@ def test_an_interrupted_report_goes_on(calls: list[list[str]], whole: Path) -> N
     assert command.main(["tasks=docking2d", "kinds=features", "film=false", *REST]) == 0
     assert calls[0] == ["jaxsafe.train", f"resume={run}"]
     assert len(calls) == 3
+
+
+def test_ctrl_c_gives_the_training_time_to_save(tmp_path: Path) -> None:
+    saving = f"import time, pathlib; time.sleep(1.0); pathlib.Path({str(tmp_path / 'saved')!r}).touch()"
+    process = subprocess.Popen([sys.executable, "-c", saving])
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        running._wait(process)
+    assert process.returncode == 0
+    assert (tmp_path / "saved").exists()
+
+
+def test_a_termination_of_the_report_is_passed_on() -> None:
+    process = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGTERM)).start()
+    assert running._wait(process) == -signal.SIGTERM
+    assert signal.getsignal(signal.SIGTERM) is not process.terminate
 
 
 def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:

@@ -341,12 +341,13 @@ class Report:
             " JSON, every result of every seed.",
             "Hyperparameters stand in `configs/`. The commands behind the tables, also one by one:", "", "```",
         ]  # fmt: skip
-        for item, _ in self.own:
-            lines.append(f"python -m jaxsafe.train {' '.join(item.words)} out=runs/{item.name}")
-            lines += [
-                f"python -m jaxsafe.evaluate run={item.subject(Path('runs', item.name), name)} {' '.join(options)}"
-                for name, options in item.evaluations.items()
-            ]
+        for item, found in self.own:
+            run = Path("runs", item.name)
+            lines.append(f"python -m jaxsafe.train {' '.join(item.words)} out={run}")
+            count = self.episodes[item.name]
+            for name, options in item.evaluations.items():
+                subject = run / "policy" / f"seed_{best_seed(found)}.npz" if name == SHIPPED else run
+                lines.append(f"python -m jaxsafe.evaluate run={subject} episodes={count} {' '.join(options)}")
         return "\n".join([*lines, "```"])
 
 

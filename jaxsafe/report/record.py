@@ -59,7 +59,7 @@ def kept(items: Iterable[Item], files: Path) -> tuple[list[Record], list[str]]:
         if not path.exists():
             continue
         found = read_json(path)
-        if found["words"] != list(item.words) or found["options"] != json.loads(json.dumps(finite(options_of(item)))):
+        if found["options"] != json.loads(json.dumps(finite(options_of(item)))):
             old.append(f"{path}: was made with other options and is left out; report it again")
             continue
         with open(path.with_suffix(".csv"), encoding="utf-8", newline="") as file:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -75,8 +76,21 @@ def _refuse_other(item: Item, run: Path) -> None:
 
 def _call(module: str, words: Sequence[str]) -> None:
     print(f"\n$ python -m {module} {' '.join(words)}", flush=True)
-    code = subprocess.run([sys.executable, "-m", module, *words], check=False).returncode
-    if code == INTERRUPTED:
+    code = _wait(subprocess.Popen([sys.executable, "-m", module, *words]))
+    if code in (INTERRUPTED, -signal.SIGTERM):
         raise KeyboardInterrupt
     if code:
         raise ConfigError(f"python -m {module} {' '.join(words)}: ended with code {code}")
+
+
+def _wait(process: subprocess.Popen) -> int:
+    """Its exit code. A termination is passed on; after Ctrl-C, which it gets too, it has the time to save what it has."""
+    previous = signal.signal(signal.SIGTERM, lambda *_: process.terminate())
+    try:
+        try:
+            return process.wait()
+        except KeyboardInterrupt:
+            process.wait()
+            raise
+    finally:
+        signal.signal(signal.SIGTERM, previous)
