@@ -37,6 +37,9 @@ METRICS = (
 ENOUGH_EPISODES = 20
 """Training episodes that a seed must have finished before its success rate counts for interaction efficiency."""
 
+ROUNDING = 1e-6
+"""Of success rates and their averages: what is so close below a threshold has reached it."""
+
 
 class Episode(Record):
     """Sums over one episode so far."""
@@ -129,7 +132,8 @@ def interaction_efficiency(
         return int(steps[np.argmax(reached)]) if reached.any() else None
 
     enough = episodes >= at_least
-    rate = np.where(enough, np.nan_to_num(success), 0.0)
+    rate = np.where(enough, np.nan_to_num(np.asarray(success, float)), 0.0)
+    threshold -= ROUNDING
     together = enough.all(axis=1) & (rate.mean(axis=1) >= threshold)
     return {
         "timesteps": first(together),

@@ -186,6 +186,12 @@ def test_interaction_efficiency_is_the_first_step_at_which_the_average_over_seed
 
 def test_a_rate_of_exactly_four_fifths_counts() -> None:
     assert efficiency([[0.79], [0.8]], [[100], [100]]) == {"timesteps": 200, "per_seed": [200]}
+    rates = [0.97, 0.61, 0.74, 0.85, 0.64, 0.8, 0.85, 0.9, 0.97, 0.67]
+    assert np.mean([rates], axis=1)[0] < 0.8  # as floats
+    assert efficiency([rates], [[100] * 10])["timesteps"] == 100
+    single = np.full((1, 1), 80 * np.float32(0.01) - np.float32(6e-8), np.float32)  # as a sum of hundredths may end
+    assert efficiency(single, [[100]]) == {"timesteps": 100, "per_seed": [100]}
+    assert efficiency([[0.79999]], [[100]])["timesteps"] is None
 
 
 def test_a_rate_counts_only_from_twenty_finished_episodes_on() -> None:
