@@ -1,5 +1,6 @@
 import csv
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,12 @@ import pytest
 from tiny import TINY
 
 from jaxsafe import cli
+from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.train.config import recipe
 from jaxsafe.tune import __main__ as command
+from jaxsafe.tune.lanes import Lanes
+from jaxsafe.tune.results import _key
 from jaxsafe.tune.settings import Span, alike, pop_sweep, settings
 
 BASE = [word for word in TINY if not word.startswith("ppo.num_steps")]
@@ -84,6 +88,7 @@ def test_settings_that_differ_in_sizes_are_compiled_apart() -> None:
         (["sweep.agent.hidden=[[8]]"], "sweep.agent.hidden: agent.hidden is given as well; leave one out"),
         (["sweep.ppo.clip=[0.1]", "rank=speed"], "rank: unknown order 'speed'; choose from steps, success, deterministic"),
         (["sweep.ppo.clip=[0.1]", "samples=0"], "samples: expected a whole number ≥ 1, found 0"),
+        (["sweep.env=[docking2d,docking3d]"], "sweep.env: must be the same in all settings; give env=… instead"),
         (["resume=nowhere"], "resume: no sweep in 'nowhere'"),
     ],
 )
@@ -105,6 +110,7 @@ def test_a_setting_learns_what_the_same_training_learns(swept: Path, whole: Path
             row["curve"]["success_rate"][seed], [each["success_rate"] or 0.0 for each in own], atol=1e-4
         )
         assert row["training_return"][seed] == pytest.approx(own[-1]["return"], rel=1e-4)
+    assert row["interaction_efficiency"] == json.loads((whole / "results.json").read_text())["interaction_efficiency"]
     evaluation = json.loads((whole / "results.json").read_text())["evaluation"]
     for kind, metrics in evaluation.items():
         for name, metric in metrics.items():
@@ -123,6 +129,33 @@ def test_the_table_ranks_every_setting(swept: Path) -> None:
     assert (swept / "curves.png").stat().st_size > 10_000
     ranked = json.loads((swept / "results.json").read_text())["settings"]
     assert [str(row["setting"]) for row in ranked] == [row["setting"] for row in rows]
+
+
+@pytest.mark.parametrize(("rank", "order"), [("steps", [2, 0, 1]), ("success", [1, 0, 2]), ("deterministic", [0, 2, 1])])
+def test_each_rank_has_its_best_first(rank: str, order: list[int]) -> None:
+    def row(steps: int | None, success: float, deterministic: float) -> dict[str, Any]:
+        found = {"stochastic": {"success_rate": [success]}, "deterministic": {"success_rate": [deterministic]}}
+        curve = {"success_rate": [[0.5]]}
+        return {"interaction_efficiency": {"timesteps": steps}, "evaluation": found, "curve": curve}
+
+    rows = [row(200, 0.8, 1.0), row(None, 0.9, 0.7), row(100, 0.7, 0.9)]
+    assert sorted(range(3), key=lambda index: _key(rows[index], rank)) == order
+
+
+def test_a_group_of_one_trains_once() -> None:
+    arguments = options("sweep.agent.hidden=[[8],[8,8]]")
+    found = settings(arguments, pop_sweep(arguments), None, 0)
+    assert Lanes(found[0], 1).at_once == 1
+
+
+def test_a_sweep_does_not_go_on_by_another_recipe(swept: Path, tmp_path: Path) -> None:
+    path = tmp_path / "older"
+    shutil.copytree(swept, path)
+    content = yaml.read(path / "sweep.yaml")
+    content["first"]["training"]["ppo"]["clip"] = 0.37
+    (path / "sweep.yaml").write_text(yaml.write(content))
+    with pytest.raises(ConfigError, match=f"resume: the recipe or the environment of {path} has changed"):
+        command.main([f"resume={path}"])
 
 
 def test_a_killed_sweep_goes_on_and_ends_the_same(swept: Path, tmp_path: Path) -> None:

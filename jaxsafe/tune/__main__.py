@@ -38,7 +38,10 @@ def main(argv: Sequence[str]) -> int:
     arguments.options.setdefault("episodes", EPISODES)
     sweep = pop_sweep(arguments)
     found = settings(arguments, sweep, samples, draw)
-    path = path or results.create(out, request)
+    if path is None:
+        path = results.create(out, request, found[0])
+    else:
+        results.refuse_other(path, found[0])
     rows = results.read(path)
     left = [i for i in range(len(found)) if i not in rows]
     print(

@@ -47,7 +47,7 @@ class Lanes:
         """Prepare for `count` settings such as `like`: on a CPU a few at a time that keep all cores busy, else all."""
         self.like, self.seeds, devices = like, like.config.seeds, jax.devices()
         on_cpu = devices[0].platform == "cpu"
-        self.at_once = math.lcm(self.seeds, len(devices)) // self.seeds if on_cpu else count
+        self.at_once = min(count, math.lcm(self.seeds, len(devices)) // self.seeds) if on_cpu else count
         self.mapper = SeedMapper(self.at_once * self.seeds)
         self.length = -(-like.config.num_updates // CHUNKS)
         self._init = self.mapper.map(lambda _, one: begin(*one))

@@ -10,11 +10,13 @@ from typing import Any
 import numpy as np
 
 from jaxsafe.cli import Arguments
-from jaxsafe.config import yaml
+from jaxsafe.config import describe, yaml
+from jaxsafe.config.convert import to_data
 from jaxsafe.errors import ConfigError
 from jaxsafe.origin import versions
 from jaxsafe.train import directory
 from jaxsafe.train.files import append_rows, keep_rows, write_csv, write_json, write_text
+from jaxsafe.tune.settings import Setting
 
 Rows = dict[int, dict[str, Any]]
 """The results of settings, by their place in the sweep."""
@@ -26,10 +28,10 @@ LONGEST = 36
 """Letters of a legend's entry."""
 
 
-def create(out: str | None, request: Mapping[str, Any]) -> Path:
-    """Make the directory of a sweep and write down what was asked for."""
+def create(out: str | None, request: Mapping[str, Any], first: Setting) -> Path:
+    """Make the directory of a sweep and write down what was asked for, and what its first setting is in full."""
     path = directory.make(out, Path("runs"), f"tune_{Path(str(request['env'])).stem}")
-    write_text(path / "sweep.yaml", yaml.write({"request": dict(request), "versions": versions()}))
+    write_text(path / "sweep.yaml", yaml.write({"request": dict(request), "first": _whole(first), "versions": versions()}))
     return path
 
 
@@ -42,6 +44,16 @@ def read_request(path: Path) -> Arguments:
     if not (path / "sweep.yaml").is_file():
         raise ConfigError(f"resume: no sweep in {str(path)!r} (a directory with sweep.yaml)")
     return Arguments(dict(yaml.read(path / "sweep.yaml")["request"]))
+
+
+def refuse_other(path: Path, first: Setting) -> None:
+    """Results by another recipe, or of another environment, must not stand in one table with these.
+
+    Raises:
+        ConfigError: what the sweep was begun with has changed.
+    """
+    if yaml.read(path / "sweep.yaml").get("first") != yaml.parse(yaml.write(_whole(first)), "first"):
+        raise ConfigError(f"resume: the recipe or the environment of {path} has changed since it was begun; begin it anew")
 
 
 def read(path: Path) -> Rows:
@@ -74,6 +86,10 @@ def line(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
     facts = _flat(row, swept)
     values = ", ".join(f"{name} {facts[name]}" for name in swept)
     return f"setting {index}: {values}: 80 % after {_cell(facts['80 % after'])}, then {facts['stochastic']:.1%}"
+
+
+def _whole(setting: Setting) -> dict[str, Any]:
+    return {"training": to_data(setting.config), "environment": describe(setting.env)}
 
 
 def _key(row: dict[str, Any], rank: str) -> tuple[float, float, float]:

@@ -18,7 +18,7 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.train.config import TrainConfig, resolve
 
 PREFIX = "sweep."
-COMMON = ("seeds", "seed", "episodes", "out", "preset")
+COMMON = ("env", "seeds", "seed", "episodes", "out", "preset")
 """Options that all settings of a sweep share."""
 
 _RANGE = re.compile(r"(log|uniform)\(\s*([^,\s]+)\s*,\s*([^,\s]+)\s*\)")
