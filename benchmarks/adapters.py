@@ -46,9 +46,10 @@ def main() -> None:
     options = words(task="docking2d", repeats="5", envs="1,64,1024,4096")
     task, repeats = options["task"], int(options["repeats"])
     numbers = [int(number) for number in options["envs"].split(",")]
+    here = about()
     results = [{"envs": number, **measure(peers(task, number), number, repeats)} for number in numbers]
     OUT.parent.mkdir(exist_ok=True)
-    content = {**about(), "gymnasium": gym.__version__, "task": task, "runs": results}
+    content = {**here, "gymnasium": gym.__version__, "task": task, "runs": results}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
     print(tables.adapters(content))
 

@@ -49,8 +49,9 @@ def main() -> None:
     repeats, chosen = int(options["repeats"]), several("parts", options["parts"], parts)
     known = json.loads(OUT.read_text()) if OUT.exists() else {}
     for name in chosen:
+        here = about()
         rows = parts[name](repeats)
-        known[name] = {**about(), "rows": rows}
+        known[name] = {**here, "rows": rows}
         print(f"\n{name}\n" + markdown(list(rows[0]), ([_short(value) for value in row.values()] for row in rows)))
         OUT.parent.mkdir(exist_ok=True)
         OUT.write_text(json.dumps(known, indent=1) + "\n")
