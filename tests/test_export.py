@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 from typing import Any
 
@@ -101,6 +102,15 @@ def test_a_search_finds_the_least_margin() -> None:
     worst = search(functions.Exported(bowl, ("a", "b"), ("h",)), [(-1, 1), (-1, 1)], jax.random.key(0), starts=50)
     assert worst.margin == pytest.approx(-0.01, abs=1e-4)
     np.testing.assert_allclose(worst.start, [0.31, -0.7], atol=0.02)
+
+
+def test_the_page_tells_what_the_search_finds(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    page = (Path(__file__).parent.parent / "docs" / "export.md").read_text(encoding="utf-8")
+    assert main(["run=pretrained/docking2d", "format=vnnlib", f"out={tmp_path / 'x.vnnlib'}"]) == 0
+    told = re.compile(r"least margin (\S+) from .*(: no counterexample among .*)")
+    (said, rest), (found, end) = (told.search(text).groups() for text in (page, capsys.readouterr().out))  # type: ignore[union-attr]
+    assert float(found) == pytest.approx(float(said), abs=2e-4)  # on another processor
+    assert end == rest
 
 
 def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: Any) -> None:
