@@ -1,6 +1,7 @@
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -92,7 +93,27 @@ def test_recorded_episodes_are_those_that_were_evaluated() -> None:
         last = int(np.flatnonzero(timesteps.done[:, i])[0])
         assert last == int(episodes.length[i])
         assert float(timesteps.reward[1 : last + 1, i].sum()) == pytest.approx(float(episodes.episode_return[i]), rel=1e-5)
-    np.testing.assert_allclose(states.sim.time[:, 0], np.arange(32))
+    np.testing.assert_allclose(states.sim.time[:32, 0], np.arange(32))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "steps"),
+    [
+        ({"dt": 0.3, "terminal.timeout.limit": 9.0}, 31),  # 9 / 0.3 is less than 30 in single precision
+        ({"terminal.timeout.limit": 9.0, "randomize": {"dt": [0.5, 1.5]}}, 19),
+        ({"terminal.timeout.limit": 9.0, "randomize": {"terminal.timeout.limit": [5.0, 20.0]}}, 21),
+    ],
+)
+def test_no_episode_is_cut_before_its_timeout(overrides: dict[str, Any], steps: int) -> None:
+    env = jaxsafe.make("docking2d", overrides)
+    episodes = run_episodes(env, zero, jax.random.key(0), 64)
+    assert {env.outcomes[outcome] for outcome in np.asarray(episodes.outcome)} == {"timeout"}
+    assert int(episodes.length.max()) <= steps <= int(longest(env))
+
+
+def test_a_change_of_the_observation_is_refused(whole: Path) -> None:
+    with pytest.raises(ConfigError, match="env: the change gives observation_names"):
+        main([f"run={whole}", "env.observation=[velocity,position,speed,velocity_limit]"])
 
 
 def test_every_episode_is_counted_once_however_short() -> None:

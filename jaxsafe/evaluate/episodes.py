@@ -65,7 +65,16 @@ def record_episodes(
     return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
 
 
+SPARE = 2
+"""One more than fit into the limit, and one for the rounding of their quotient."""
+
+
 def longest(env: Environment) -> Array:
-    """The largest number of steps that an episode can take, from its timeouts; `LONGEST` without one."""
-    limits = [condition.limit / env.dt for condition in env.terminal if isinstance(condition, Timeout)]
-    return jnp.asarray(LONGEST) if not limits else jnp.floor(jnp.min(jnp.stack(limits))).astype(jnp.int32) + 1
+    """At least as many steps as an episode can take, from its timeouts; `LONGEST` without one."""
+    drawn = {path: (jnp.min(span), jnp.max(span)) for path, span in env.randomize.items()}
+    dt = drawn["dt"][0] if "dt" in drawn else env.dt
+    limits = [
+        drawn.get(f"terminal.{condition.name}.limit", (None, condition.limit))[1] / dt
+        for condition in env.terminal if isinstance(condition, Timeout)
+    ]  # fmt: skip
+    return jnp.asarray(LONGEST) if not limits else jnp.floor(jnp.min(jnp.stack(limits))).astype(jnp.int32) + SPARE

@@ -34,7 +34,7 @@ def evaluate(
     Raises:
         ConfigError: `out` holds something, or the policies do not fit the environment.
     """
-    for what in ("observation_size", "action_names", "num_action_points"):
+    for what in ("observation_names", "action_names", "num_action_points"):
         found, needed = getattr(env, what), getattr(subject.env, what)
         if found != needed:
             raise ConfigError(f"env: the change gives {what} {found}, the policies of {request['run']} have {needed}")
