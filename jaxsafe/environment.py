@@ -84,11 +84,6 @@ class Environment(Component):
         return self.outcomes.index("success") if "success" in self.outcomes else -1
 
     @property
-    def can_truncate(self) -> bool:
-        """Whether any end is a truncation."""
-        return "truncated" in self._ends.values()
-
-    @property
     def action_names(self) -> tuple[str, ...]:
         """The actuators, in the order of the action."""
         return self.agent_platform.controller.names
@@ -137,7 +132,7 @@ def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:
         The state and the first time step: reward and cost as of no step taken, `terminated` and `truncated` False.
     """
     parameters = _draw_parameters(env, key)
-    env = _with_parameters(env, parameters)
+    env = drawn(env, parameters)
     sim = _blank(env)
     for platform, key_i in zip(env.platforms, jax.random.split(key, len(env.platforms)), strict=True):
         with part("platforms", platform.name):
@@ -159,7 +154,7 @@ def reset_to(
         ConfigError: a platform, field or parameter is unknown, or a random one is missing or has another shape.
     """
     parameters = _chosen_parameters(env, parameters or {})
-    env = _with_parameters(env, parameters)
+    env = drawn(env, parameters)
     known = {platform.name: platform for platform in env.platforms}
     for name in start:
         if name not in known:
@@ -183,7 +178,7 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
     Raises:
         ConfigError: the action has another shape, or is not whole numbers where actions are discrete.
     """
-    env = _with_parameters(env, state.parameters)
+    env = drawn(env, state.parameters)
     action = _checked(env, action)
     controls = env.agent_platform.controller.control(action, state.sim)
     desired = jnp.stack([controls[name] for name in env.action_names])
@@ -223,7 +218,8 @@ def _chosen_parameters(env: Environment, parameters: Mapping[str, Any]) -> Param
     return {path: placed(f"parameter {path}", parameters[path], env.dt) for path in env.randomize}
 
 
-def _with_parameters(env: Environment, parameters: Parameters) -> Environment:
+def drawn(env: Environment, parameters: Parameters) -> Environment:
+    """The environment with what an episode has drawn of it, `state.parameters`."""
     for path, value in parameters.items():
         env = set_path(env, path, value)
     return env

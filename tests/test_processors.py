@@ -553,12 +553,10 @@ def test_a_timeout_ends_the_episode_on_the_step_after_the_limit(env: Environment
 
 def test_a_timeout_may_be_declared_a_truncation() -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 1, "terminal.timeout.ends": "truncated"})
-    assert env.can_truncate
     timesteps = run(env, start(env, (100.0, 0.0), (0.0, 0.0)), (0.0, 0.0), 2)
     assert [bool(timestep.truncated) for timestep in timesteps] == [False, True]
     assert not any(timestep.terminated for timestep in timesteps)
     assert timesteps[1].done
-    assert not jaxsafe.make("docking2d").can_truncate
 
 
 def test_time_counts_steps_times_their_length() -> None:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.environment import Environment, step
+from jaxsafe.environment import Environment, drawn, step
 from jaxsafe.paths import set_path
 from jaxsafe.rollout import reset_batch
 from jaxsafe.rta.adversaries import ADVERSARIES
@@ -74,7 +74,7 @@ def attack(env: Environment, name: str, num_steps: int, num_lanes: int, key: Key
         "uncertified_steps": int(total["uncertified"]),
         "infeasible_steps": int(total["infeasible"]),
         "unsafe_starts": float(total["unsafe_starts"] / episodes),
-        "violation_bound": 3.0 / steps,
+        "violation_bound": None if total["violating"] or total["violating_inside"] else 3.0 / steps,
     }
 
 
@@ -86,7 +86,7 @@ def _follow(env: Environment, name: str, num_steps: int, num_lanes: int, key: Ke
         state, counts = carry
         key_act, key_reset = jax.random.split(key)
         keys = jax.random.split(key_act, num_lanes)
-        controls = jax.vmap(lambda state, key: ADVERSARIES[name](env, state.sim, key))(state, keys)
+        controls = jax.vmap(lambda state, key: ADVERSARIES[name](drawn(env, state.parameters), state.sim, key))(state, keys)
         after, done, facts = _step(env, state, controls)
         fresh, first = reset_batch(env, key_reset, num_lanes)
         facts["unsafe_starts"] = done & _unsafe(first)
@@ -142,8 +142,10 @@ def _step(env: Environment, state: State, controls: Float[Array, "n m"]) -> tupl
     """One step of all lanes: the states after it, which episodes ended, and what happened."""
     after, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, state, controls)
     info, zero = timestep.info, jnp.zeros_like(timestep.reward)
-    lowest = jax.vmap(lambda state: smallest_margin(env, state.sim))(after)
-    inside = jax.vmap(functools.partial(_inside, env))(state.sim, info.control_actual)
+    lowest = jax.vmap(lambda state: smallest_margin(drawn(env, state.parameters), state.sim))(after)
+    inside = jax.vmap(lambda state, control: _inside(drawn(env, state.parameters), state.sim, control))(
+        state, info.control_actual
+    )
     facts = {
         "steps": zero + 1.0,
         "violating": lowest < 0.0,

@@ -28,13 +28,18 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
         f" {row['mean_correction']:>8.3g}"
         for row in rows
     ]
-    clean = [row for row in rows if not row["violating_steps"]]
+    clean = [row for row in rows if not violated(row)]
     if clean:
         steps = sum(row["steps"] for row in clean)
         lines.append(
             f"{len(clean)} of {len(rows)} without a violation: below {3.0 / steps:.1g} a step with 95 % confidence"
         )
     return "\n".join(lines)
+
+
+def violated(row: dict[str, Any]) -> bool:
+    """Whether a constraint was, at a sample or inside a step."""
+    return bool(row["violating_steps"] or row["violating_steps_inside"])
 
 
 def main(argv: Sequence[str]) -> int:
@@ -79,7 +84,7 @@ def main(argv: Sequence[str]) -> int:
         print(report(rows).splitlines()[-1])
     if out:
         print(f"written to {out}")
-    return int(any(row["violating_steps"] for row in rows))
+    return int(any(map(violated, rows)))
 
 
 def usage() -> str:
