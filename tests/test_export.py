@@ -1,4 +1,5 @@
 import re
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 import jaxsafe
 from jaxsafe.errors import ConfigError
+from jaxsafe.evaluate.foreign import ACTIVATIONS
 from jaxsafe.export import functions
 from jaxsafe.export.__main__ import main
 from jaxsafe.export.onnx import to_onnx
@@ -87,6 +89,12 @@ def test_the_closed_loop_is_the_environments_own() -> None:
     np.testing.assert_allclose(expected[:, 0], limit - speed, atol=1e-6)
 
 
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_every_activation_of_a_policy_from_elsewhere_can_be_exported(name: str) -> None:
+    values = np.linspace(-4.0, 4.0, 60, dtype=np.float32).reshape(6, 10)
+    np.testing.assert_allclose(run(to_onnx(ACTIVATIONS[name], (6, 10)), values), ACTIVATIONS[name](values), atol=1e-6)
+
+
 def test_a_property_names_its_box_and_what_must_not_happen(tmp_path: Path) -> None:
     exported = functions.Exported(lambda x: x, ("a", "b"), ("h_0", "h_1"))
     text = write_vnnlib(tmp_path / "x.vnnlib", exported, [(0.5, 1.5), (-2.0, 3.0)]).read_text()
@@ -111,6 +119,14 @@ def test_the_page_tells_what_the_search_finds(tmp_path: Path, capsys: pytest.Cap
     (said, rest), (found, end) = (told.search(text).groups() for text in (page, capsys.readouterr().out))  # type: ignore[union-attr]
     assert float(found) == pytest.approx(float(said), abs=2e-4)  # on another processor
     assert end == rest
+
+
+def test_a_run_without_such_a_policy_says_so(whole: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="seed: found 7; choose from 0, 1, 2"):
+        main([f"run={whole}", "seed=7"])
+    shutil.copy(whole / "config.yaml", tmp_path)
+    with pytest.raises(ConfigError, match=f"^run: {tmp_path} has no policies yet; finish it with: .* resume={tmp_path}$"):
+        main([f"run={tmp_path}"])
 
 
 def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: Any) -> None:
@@ -144,6 +160,11 @@ def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFi
         ),
         (["run=pretrained/docking2d", "format=vnnlib", "batch=2"], "batch: means nothing with format=vnnlib"),
         (["run=pretrained/docking2d", "format=stablehlo", "batch=2"], "batch: means nothing with format=stablehlo"),
+        (["run=pretrained/docking2d", "format=vnnlib", "out=loop.onnx"], "out: expected NAME.vnnlib"),
+        (["run=pretrained/docking2d", "format=vnnlib", "box.position=[a,b]"], r"box.position: expected \[low, high\]"),
+        (["run=pretrained/docking2d", "format=vnnlib", "box.position=[1,.inf]"], r"box.position: expected \[low, high\]"),
+        (["run=nowhere"], "run: no run in 'nowhere'"),
+        (["run=pretrained/docking2d", "env=docking2d"], "env: pretrained/docking2d holds its own environment"),
         (["run=pretrained/docking2d", "box.position=[1,2]"], "box.position: means nothing without format=vnnlib"),
     ],
 )

@@ -23,6 +23,7 @@ from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.evaluate.graph import Network, read_graph
 from jaxsafe.rollout import Policy
 from jaxsafe.train.agent import Categorical, Gaussian, Params
+from jaxsafe.train.policy import PRETRAINED
 
 ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
 """Between the layers of an .npz."""
@@ -82,6 +83,10 @@ def pop_source(arguments: Arguments, run: str) -> Source | None:
     task = arguments.pop_text("env")
     if run.endswith(".onnx") and task is None:
         raise ConfigError(f"env: missing; the task in which {run} shall act, for instance env=docking2d")
+    if task is not None and (run.startswith(PRETRAINED) or Path(run).is_dir()):
+        raise ConfigError(
+            f"env: {run} holds its own environment; leave env={task} out, or change numbers by env.PATH=VALUE"
+        )
     layers = task is not None and not run.endswith(".onnx")
     arguments.refuse_beside([] if layers else ["activation"], "but for the layers in an .npz with env=TASK")
     arguments.refuse_beside([] if task else ["actions"], "but for a policy from elsewhere, with env=TASK")
@@ -119,7 +124,7 @@ def _layers(path: Path, activation: str) -> tuple[Network, dict[str, np.ndarray]
     try:
         with np.load(path, allow_pickle=False) as file:
             weights = {name: np.asarray(file[name], np.float32) for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise ConfigError(
             f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not an .npz of numbers'}"
         ) from None

@@ -13,7 +13,7 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate.foreign import ForeignAgent, Source
 from jaxsafe.train import directory
 from jaxsafe.train.agent import Agent, Params
-from jaxsafe.train.policy import PRETRAINED, find_policy, read_policy
+from jaxsafe.train.policy import find_policy, is_single, read_policy
 from jaxsafe.train.restore import load_params
 from jaxsafe.train.results import facts
 from jaxsafe.train.seeds import SeedMapper
@@ -50,7 +50,7 @@ def load(run: str, checkpoint: str | None) -> Subject:
     Raises:
         ConfigError: there is no such run, policy or checkpoint.
     """
-    if run.endswith(".npz") or (run.startswith(PRETRAINED) and not Path(run).exists()):
+    if is_single(run):
         if checkpoint is not None:
             raise ConfigError(f"checkpoint: {run} is a single policy; leave checkpoint={checkpoint} out")
         return _of_file(find_policy(run))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 from jaxsafe import cli
 from jaxsafe.errors import ConfigError, nearest
@@ -51,8 +52,15 @@ def main(argv: Sequence[str]) -> int:
     arguments.refuse_rest(OPTIONS)
     about = {"policy": stem, "jaxsafe": versions()["jaxsafe"]}
     if form == "vnnlib":
+        target = Path(out or f"{stem}_closed_loop.vnnlib")
+        if target.suffix != ".vnnlib" or target.with_suffix(".onnx").resolve() == Path(run).resolve():
+            raise ConfigError(
+                f"out: expected NAME.vnnlib, for which NAME.onnx is written too and is not {run}, found {target}"
+            )
+        if not saved.env.constraints:
+            raise ConfigError("format: vnnlib asks whether a safety constraint holds, and this environment has none")
         loops = functions.closed_loop(saved, steps, unrolled=True), functions.closed_loop(saved, steps)
-        return _vnnlib(*loops, box, Path(out or f"{stem}_closed_loop.vnnlib"), about)
+        return _vnnlib(*loops, box, target, about)
     exported = kinds[inputs]()
     if form == "stablehlo":
         target = Path(out or f"{stem}.stablehlo")
@@ -72,14 +80,22 @@ def main(argv: Sequence[str]) -> int:
 def _policy(arguments: cli.Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy, str]:
     """What `run` and the options beside it mean, and the first part of the names of files."""
     from jaxsafe.evaluate.foreign import pop_source
-    from jaxsafe.train.policy import PRETRAINED, find_policy, read_policy
+    from jaxsafe.train import directory
+    from jaxsafe.train.policy import find_policy, is_single, read_policy
 
     elsewhere = pop_source(arguments, run)
-    single = run.endswith(".npz") or run.startswith(PRETRAINED)
+    single = is_single(run)
     arguments.refuse_beside(["seed"] if elsewhere or single else [], f"beside {run}, which is a single policy")
     seed = arguments.pop_count("seed", 0, least=0)
     if elsewhere:
         return elsewhere.read(), f"{Path(run).stem}_{Path(elsewhere.task).stem}"
+    if not single:
+        directory.read(Path(run), "run")  # imports what a user's environment is made of
+        known = {int(file.stem.removeprefix("seed_")) for file in (Path(run) / "policy").glob("seed_*.npz")}
+        if not known:
+            raise ConfigError(f"run: {run} has no policies yet; finish it with: python -m jaxsafe.train resume={run}")
+        if seed not in known:
+            raise ConfigError(f"seed: found {seed}; choose from {', '.join(map(str, sorted(known)))}")
     path = find_policy(run) if single else Path(run) / "policy" / f"seed_{seed}.npz"
     return read_policy(path), path.stem if single else f"{Path(run).name}_{path.stem}"
 
@@ -116,7 +132,7 @@ def _box(names: Sequence[str], given: dict[str, object]) -> list[tuple[float, fl
         keys = [name, ".".join(parts[:2]), parts[1]]
         key = next((key for key in keys if key in bounds), None)
         interval = bounds.get(key) if key else None
-        if not (isinstance(interval, (list, tuple)) and len(interval) == 2 and interval[0] <= interval[1]):
+        if not _is_interval(interval):
             raise ConfigError(f"box.{parts[1]}: expected [low, high] for {name}, found {interval!r}")
         used.add(key)
         box.append((float(interval[0]), float(interval[1])))
@@ -124,6 +140,11 @@ def _box(names: Sequence[str], given: dict[str, object]) -> list[tuple[float, fl
         if key not in used:
             raise ConfigError(f"box.{key}: the state has no such field; it has {', '.join(names)}")
     return box
+
+
+def _is_interval(value: Any) -> TypeGuard[Sequence[float]]:
+    numbers = isinstance(value, (list, tuple)) and len(value) == 2 and all(isinstance(one, (int, float)) for one in value)
+    return numbers and -math.inf < value[0] <= value[1] < math.inf
 
 
 def usage() -> str:

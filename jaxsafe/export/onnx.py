@@ -31,7 +31,7 @@ _SAME = {
     "exp": "Exp", "log": "Log", "sqrt": "Sqrt", "tanh": "Tanh", "abs": "Abs", "sin": "Sin", "cos": "Cos", "atan": "Atan",
     "sign": "Sign", "floor": "Floor", "round": "Round", "lt": "Less", "gt": "Greater", "le": "LessOrEqual",
     "ge": "GreaterOrEqual", "eq": "Equal", "and": "And", "or": "Or", "not": "Not", "copy": "Identity",
-    "stop_gradient": "Identity",
+    "stop_gradient": "Identity", "logistic": "Sigmoid", "pow": "Pow",
 }  # fmt: skip
 _INSIDE = {"jit": "jaxpr", "pjit": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
 _TYPES = {"float32": TensorProto.FLOAT, "int32": TensorProto.INT32, "bool": TensorProto.BOOL}

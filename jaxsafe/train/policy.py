@@ -92,6 +92,11 @@ def load_policy(policy: str | os.PathLike, deterministic: bool = True) -> Policy
     return jax.jit(act)  # or each call would work out the inputs anew
 
 
+def is_single(run: str) -> bool:
+    """Whether a command's `run` is one policy, in a file or of the package, and not a directory with those of all seeds."""
+    return run.endswith(".npz") or (run.startswith(PRETRAINED) and not Path(run).exists())
+
+
 def find_policy(policy: str | os.PathLike) -> Path:
     """The file of a policy, given by a path, by the name of a task, or by `pretrained/` and that name.
 
