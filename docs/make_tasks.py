@@ -71,7 +71,7 @@ SECTIONS = (
 def page(task: str) -> str:
     """The Markdown page of a task."""
     env = jaxsafe.make(task)
-    length = length_unit(env)
+    length = length_unit(env) or ""
     paths = f"A path is what `jaxsafe.make({task!r}, {{path: value}})` takes, followed by a dot and the number's name."
     blocks = [
         f"<!-- Written by docs/make_tasks.py. -->\n# {task}",

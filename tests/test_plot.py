@@ -1,4 +1,5 @@
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.__main__ import main
 from jaxsafe.plot.compare import compare_curves, seed_curves
-from jaxsafe.plot.figures import draw_all, speed_distance, training_curves, trajectories
+from jaxsafe.plot.figures import _episodes, draw_all, speed_distance, training_curves, trajectories
+from jaxsafe.plot.style import save
 
 
 def rows(num_updates: int = 50, num_seeds: int = 4) -> list[dict]:
@@ -174,6 +176,31 @@ def test_figures_come_from_the_log_files_alone(whole: Path, tmp_path: Path) -> N
     image = imread(run / "figures" / "training_wall.png")
     assert image.shape[0] > 300
     assert image[..., :3].std() > 0.05  # not blank
+
+
+def test_the_agent_is_drawn_whatever_it_and_the_others_are_called(whole: Path, tmp_path: Path) -> None:
+    """Logs have the platforms in the order of the alphabet."""
+    for name in ("config.yaml", "progress.jsonl", "episodes.jsonl"):
+        text = (whole / name).read_text()
+        (tmp_path / name).write_text(re.sub(r"\bchief\b", "target", re.sub(r"\bdeputy\b", "chaser", text)))
+    rows = [json.loads(line) for line in (tmp_path / "episodes.jsonl").read_text().splitlines()]
+    assert [*rows[0]["platforms"]] == ["target", "chaser"]  # chief, deputy
+    swapped = [{**row, "platforms": {name: row["platforms"][name] for name in ("chaser", "target")}} for row in rows]
+    (tmp_path / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in swapped))
+    episodes = _episodes(tmp_path / "episodes.jsonl", ["target", "chaser"])
+    figure = trajectories(episodes, "title", "m")
+    expected = swapped[-1]["platforms"]["chaser"]["position"]
+    ends = [line.get_xydata()[-1] for line in figure.axes[1].lines]
+    assert min(np.abs(end - np.array(expected)).max() for end in ends) < 1e-3
+    assert draw_all(tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["png", "pdf", "svg"])
+def test_a_figure_is_of_the_kind_that_its_name_says(kind: str, tmp_path: Path) -> None:
+    path = save(training_curves(rows(2), "steps", "title"), tmp_path / f"x.{kind}")
+    assert path.read_bytes()[:5] in {"png": [b"\x89PNG\r"], "pdf": [b"%PDF-"], "svg": [b"<?xml"]}[kind]
+    with pytest.raises(ConfigError, match=r"out: cannot draw x\.docx; choose from "):
+        save(training_curves(rows(2), "steps", "title"), tmp_path / "x.docx")
 
 
 def test_a_run_without_rows_is_told_in_one_line(whole: Path, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ class Scene:
     def __init__(self, env: Environment, sim: Sim, margins: Mapping[str, Any], title: str) -> None:
         """Draw what does not move; every field [steps]."""
         self.env, self.sim, self.margins, self.title = env, sim, margins, title
-        others = [name for name in sim.platforms if name != env.agent]
+        others = [platform.name for platform in env.platforms if platform.name != env.agent]
         origin = sim.platforms[others[0] if others else env.agent].position
         self.origin = origin if others else np.zeros_like(origin)
         self.paths = {name: one.position - self.origin for name, one in sim.platforms.items()}
@@ -124,11 +125,11 @@ class Scene:
 
     def _draw_maps(self) -> None:
         unit = length_unit(self.env)
-        seen_from = next((name for name in self.paths if name != self.env.agent), None)
+        seen_from = next((platform.name for platform in self.env.platforms if platform.name != self.env.agent), None)
         self._axes = {name: _axis(one) for name, one in self.sim.platforms.items()}
         self.moving: list[dict[str, dict[str, Any]]] = []
         for panel, (i, j) in zip(self.maps, self.planes, strict=True):
-            panel.set(xlabel=f"{'xyz'[i]} [{unit}]", ylabel=f"{'xyz'[j]} [{unit}]", aspect="equal")
+            panel.set(xlabel=labelled("xyz"[i], unit), ylabel=labelled("xyz"[j], unit), aspect="equal")
             panel.xaxis.set_major_locator(MaxNLocator(TICKS))
             panel.yaxis.set_major_locator(MaxNLocator(TICKS))
             artists: dict[str, dict[str, Any]] = {"platforms": {}, "regions": {}}
@@ -163,13 +164,14 @@ class Scene:
         below.axhline(0.0, color="black", linewidth=0.8)
         below.set(xlabel="time [s]", xlim=(0, time[-1] or 1.0))
         self.lines = [(above.plot([], [], color=BLUE, linewidth=1.4)[0], (time, distance))]
-        for colour, (name, margin) in zip((GREEN, ORANGE, GREY), self.margins.items(), strict=False):
+        for colour, (name, margin) in zip(cycle((GREEN, ORANGE, GREY, BLUE)), self.margins.items(), strict=False):
             line = below.plot([], [], color=colour, linewidth=1.4, label=name)[0]
             self.lines.append((line, (time, margin)))
         if self.margins:
-            below.set_ylabel(labelled("margin h", margin_unit(self.env.constraints[0], unit)))
+            kinds = {margin_unit(constraint, unit) for constraint in self.env.constraints}
+            below.set_ylabel(labelled("margin h", kinds.pop() if len(kinds) == 1 else None))
             values = np.concatenate([*self.margins.values()])
-            low, high = min(values.min(), 0.0), max(values.max(), 0.0)
+            low, high = np.nanmin(values, initial=0.0), np.nanmax(values, initial=0.0)
             below.set_ylim(low - 0.08 * (high - low) - 1e-3, high + 0.08 * (high - low) + 1e-3)
             below.axhspan(below.get_ylim()[0], 0.0, color=ORANGE, alpha=0.15, linewidth=0)
             below.legend(loc="best", fontsize="x-small", frameon=False)

@@ -21,7 +21,7 @@ from jaxsafe.config import from_data, yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.interventions import interventions, most_altered
-from jaxsafe.plot.style import BLUE, GREY, ORANGE, centre_patch, length_unit, region_patch, save
+from jaxsafe.plot.style import BLUE, GREY, ORANGE, centre_patch, labelled, length_unit, region_patch, save
 from jaxsafe.train.files import read_rows
 from jaxsafe.train.log import NEEDS
 
@@ -51,9 +51,10 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
     content = yaml.read(run / "config.yaml")
     title = _title(content, rows)
     figures = {f"training_{x}": training_curves(rows, x, title)}
-    episodes = _episodes(run / "episodes.jsonl")
+    env = from_data(content["environment"], "environment")
+    others = [platform.name for platform in env.platforms if platform.name != env.agent]
+    episodes = _episodes(run / "episodes.jsonl", [*others[:1], env.agent])
     if episodes:
-        env = from_data(content["environment"], "environment")
         figures["trajectories"] = trajectories(episodes, title, length_unit(env), env.regions)
         if {"docking_distance", "speed", "velocity_limit"} <= episodes[0][1][0]["status"].keys():
             figures["speed_distance"] = speed_distance(episodes, title)
@@ -113,7 +114,7 @@ def panel_grid(count: int, width: float) -> tuple[Figure, np.ndarray]:
     return figure, panels
 
 
-def trajectories(episodes: Episodes, title: str, unit: str, regions: Sequence[Any] = ()) -> Figure:
+def trajectories(episodes: Episodes, title: str, unit: str | None, regions: Sequence[Any] = ()) -> Figure:
     """Paths of the agent relative to the other platform: from one start in the course of training, and the last ones.
 
     A row for each plane; in a third column the last paths near the smallest region, if it is small beside them. Where the
@@ -155,7 +156,7 @@ def trajectories(episodes: Episodes, title: str, unit: str, regions: Sequence[An
             for step, path in group:
                 panel.plot(path[:, i], path[:, j], color=colour(step), linewidth=1.2)
                 panel.plot(path[0, i], path[0, j], "o", color=colour(step), markersize=3)
-            panel.set(xlabel=f"x{along} [{unit}]", ylabel=f"{'xyz'[j]} [{unit}]", aspect="equal")
+            panel.set(xlabel=labelled(f"x{along}", unit), ylabel=labelled("xyz"[j], unit), aspect="equal")
             panel.set(xlim=(-half, half), ylim=(-half, half))
             panel.xaxis.set_major_locator(MaxNLocator(4))
             panel.yaxis.set_major_locator(MaxNLocator(4))
@@ -232,10 +233,11 @@ def curve_table(
     return at, values
 
 
-def _episodes(path: Path) -> Episodes:
-    """Logged episodes in order, each with the training step of its policy; those of the end only once."""
+def _episodes(path: Path, names: Sequence[str]) -> Episodes:
+    """Logged episodes of these platforms, each with the training step of its policy; those of the end only once."""
     grouped: dict[tuple[int, bool, int], list[dict[str, Any]]] = {}
     for row in read_rows(path, ("step", "final", "episode", "platforms", "status")):
+        row["platforms"] = {name: row["platforms"][name] for name in names}
         grouped.setdefault((row["step"], row["final"], row["episode"]), []).append(row)
     ended = {step for step, final, _ in grouped if final}
     return [(step, rows) for (step, final, _), rows in grouped.items() if final or step not in ended]

@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxsafe.plot.style import BLUE, GREY, ORANGE, control_unit, labelled, length_unit, margin_unit
+from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, control_unit, labelled, length_unit, margin_unit
 
-GREEN, SHADE = "#009E73", "#F0E442"  # of the same palette
+SHADE = "#F0E442"  # of the same palette
 Rows = list[dict[str, Any]]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+from jaxsafe.errors import ConfigError
 from jaxsafe.processors.constraint import Separation, SpeedLimit
 from jaxsafe.train.files import write_bytes
 from jaxsafe.types import units
@@ -17,19 +18,21 @@ from jaxsafe.types import units
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8A8A8A"  # Okabe-Ito, safe for colour-blind readers
 
 
-def length_unit(env: Any) -> str:
-    """The unit of positions: m or ft."""
-    return units(type(env.agent_platform.rest()))["position"]
+def length_unit(env: Any) -> str | None:
+    """The unit of positions: m or ft; None if the platform does not say."""
+    return units(type(env.agent_platform.rest())).get("position")
 
 
-def control_unit(name: str, length: str) -> str | None:
+def control_unit(name: str, length: str | None) -> str | None:
     """The unit of a control by the words in its name, given that of lengths; None if it is not known."""
     known = {"thrust": "N", "rate": "rad/s", "attitude_acceleration": "rad/s²", "acceleration": f"{length}/s²"}
     return next((unit for word, unit in known.items() if word in name), None)
 
 
-def margin_unit(constraint: Any, length: str) -> str | None:
+def margin_unit(constraint: Any, length: str | None) -> str | None:
     """The unit of a constraint's h, given that of positions; None if it is not known."""
+    if length is None:
+        return None
     known = {SpeedLimit: f"{length}/s", Separation: length}
     return next((unit for kind, unit in known.items() if isinstance(constraint, kind)), None)
 
@@ -57,10 +60,17 @@ def centre_patch(patch: Any, centre: np.ndarray) -> None:
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as a PNG file and return its path."""
+    """Write a figure as a file of the kind that its name says, PNG if none, and return its path.
+
+    Raises:
+        ConfigError: there is no such kind.
+    """
+    kind, known = path.suffix[1:] or "png", figure.canvas.get_supported_filetypes()
+    if kind not in known:
+        raise ConfigError(f"out: cannot draw {path.name}; choose from .{', .'.join(sorted(known))}")
     for panel in figure.axes:
         panel.spines[["top", "right"]].set_visible(False)
     buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=150, format="png")
+    figure.savefig(buffer, dpi=150, format=kind)
     write_bytes(path, buffer.getvalue())
     return path
