@@ -48,6 +48,9 @@ def commit() -> str | None:
     if git is None:
         return None
     package = Path(__file__).resolve().parent
+    ours = [git, "-C", str(package), "ls-files", "--error-unmatch", "origin.py"]
+    if subprocess.run(ours, capture_output=True, check=False).returncode:
+        return None  # installed somewhere inside another repository
     code = [str(path) for path in (package, package.parent / "configs") if path.is_dir()] + [":(exclude)*.npz"]
     found, changes = (
         subprocess.run([git, "-C", str(package), *words], capture_output=True, text=True, check=False).stdout.strip()

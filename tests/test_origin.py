@@ -18,6 +18,7 @@ def test_a_commit_is_that_of_the_code_and_says_when_the_code_is_another(
 
     package = tmp_path / "package"
     for file in (
+        package / "origin.py",
         package / "code.py",
         package / "policies" / "one.npz",
         tmp_path / "configs" / "task.yaml",
@@ -40,6 +41,18 @@ def test_a_commit_is_that_of_the_code_and_says_when_the_code_is_another(
         assert origin.commit() == f"{head} with changes"
         git("stash", "-q", "-u")
         assert origin.commit() == head
+
+
+def test_a_package_inside_another_repository_has_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / ".venv" / "package"
+    package.mkdir(parents=True)
+    (package / "origin.py").write_text("installed")
+    (tmp_path / "mine.py").write_text("mine")
+    mine = ["git", "-C", str(tmp_path), "-c", "user.name=test", "-c", "user.email=test@example.org"]
+    for words in (["init", "-q"], ["add", "mine.py"], ["commit", "-qm", "mine"]):
+        subprocess.run([*mine, *words], check=True)
+    monkeypatch.setattr(origin, "__file__", str(package / "origin.py"))
+    assert origin.commit() is None
 
 
 @pytest.mark.parametrize(
