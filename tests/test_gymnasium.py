@@ -190,6 +190,11 @@ def test_an_episode_can_be_watched() -> None:
         batch.step(np.zeros((2, 2), np.float32))
     assert np.array_equal(batch.render()[0].shape, first.shape)
     assert len(batch.unwrapped._frames[0]._past) == 1
+    batch = GymVectorEnv("docking2d", 1, autoreset_mode="SameStep", render_mode="rgb_array", max_episode_steps=3)
+    batch.reset(seed=0)
+    for _ in range(4):  # the third ends the episode and shows the start of the next
+        batch.step(np.zeros((1, 2), np.float32))
+    assert len(batch._frames[0]._past) == 2
 
 
 @pytest.mark.parametrize(

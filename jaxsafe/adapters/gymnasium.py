@@ -184,8 +184,9 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if action.shape != self.action_space.shape:
             raise ConfigError(f"actions: expected shape {self.action_space.shape}, found {action.shape}")
         self._lanes.step(action)
-        restarted, final = over, {}
+        restarted, final = np.zeros_like(over), {}
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and over.any():
+            restarted = over
             self._lanes.restart(over)  # instead of the step
         episodes = self._lanes.now
         taken = episodes.timestep

@@ -82,7 +82,7 @@ class GymnaxEnv:
         following, observation = restarted(params.env, state, timestep, key)
         info = {
             "cost": timestep.cost,
-            "is_success": timestep.info.outcome == self.env.success,
+            "is_success": timestep.info.outcome == params.env.success,
             "terminated": timestep.terminated,
             "truncated": timestep.truncated,
             "final_observation": timestep.observation,
