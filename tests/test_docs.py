@@ -144,6 +144,14 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_pa
     assert process.stdout.split(f"{MARK}\n")[:-1] == expected
 
 
+def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:
+    blocks = [text for kind, text in BLOCK.findall((ROOT / "README.md").read_text(encoding="utf-8")) if kind == "python"]
+    (tmp_path / "program.py").write_text("\n".join(blocks), encoding="utf-8")
+    process = run(["program.py"], tmp_path)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.count("\n") >= len(blocks)
+
+
 @pytest.mark.slow
 def test_terminal_sets_hold_where_the_page_says_so(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "rta.md").read_text(encoding="utf-8")

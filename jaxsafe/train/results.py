@@ -18,7 +18,7 @@ from jaxsafe.train.policy import save_policy
 _ROWS = (
     ("success_rate", "success rate", "%"),
     ("average_return", "average return", ""),
-    ("episode_length", "episode length [s]", ""),
+    ("episode_length", "episode length [steps]", ""),
     ("control_usage", "control usage Δv [m/s]", ""),
     ("control_usage_l1", "control usage Δv, L1 [m/s]", ""),
     ("safety_violation_rate", "episodes with a violation", "%"),
