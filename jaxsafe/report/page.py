@@ -333,8 +333,8 @@ class Report:
     def _settings(self) -> str:
         lines = [
             "## To repeat and to reuse", "",
-            "Curves of every seed, a row for each update (100 rows a seed in records of before this was so), averages over"
-            " the last 100 finished episodes: `step`, environment steps of the seed; `wall_s`, seconds of the run;"
+            "Curves of every seed, a row for each update, averages over the last 100 finished episodes: `step`, environment"
+            " steps of the seed; `wall_s`, seconds of the run;"
             " `success_rate`; `return`; `length` [s]; `delta_v` [m/s], L2; `violating_steps`, a share; `cost`, violating"
             " steps of the whole training so far; `episodes` finished so far:"
             " " + ", ".join(f"[{item.name}](baselines/{item.name}.csv)" for item, _ in self.own) + "; beside each, as"
