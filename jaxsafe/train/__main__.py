@@ -40,11 +40,12 @@ def main(argv: Sequence[str]) -> int:
     runs = directory.runs(path)
     try:
         with hosts.loss_told(f"go on with: python -m jaxsafe.train distributed=true resume={path}"):
-            finished = _train([run for run in runs if not _complete(run)], path)
-    except ConfigError:
-        if resume is None and hosts.leads():
-            directory.discard_unused(path)
-        raise
+            try:
+                finished = _train([run for run in runs if not _complete(run)], path)
+            except ConfigError:  # refused, and not by the loss of another process
+                if resume is None and hosts.leads():
+                    directory.discard_unused(path)
+                raise
     except KeyboardInterrupt:
         print(f"go on with: python -m jaxsafe.train resume={path}")
         raise
