@@ -166,14 +166,11 @@ REGIONS = {
     "emitters": ("FusionCompiler::Compile",),
     "LLVM": ("TaskDispatcher::dispatch",),
 }
-"""What XLA's profiler calls the parts of compiling for a CPU."""
-
-PARTS = ("whole", "import of JAX", *EVENTS, "the rest", *REGIONS)
-"""The last ones are parts of `compile`, summed over the threads that do them side by side."""
+"""What XLA's profiler calls the parts of compiling for a CPU, summed over the threads that do them side by side."""
 
 
 def profile(result: Callable[[], Any]) -> dict[str, float]:
-    """Seconds of each of `PARTS` until the result is there."""
+    """Seconds of each of `tables.PARTS` until the result is there."""
     start = time.perf_counter()
     import jax
 

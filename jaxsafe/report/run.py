@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe.cli import INTERRUPTED, Arguments
-from jaxsafe.config import describe, yaml
-from jaxsafe.config.convert import to_data
+from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.report.plan import BEST, Item, best_seed
 from jaxsafe.train.config import resolve
+from jaxsafe.train.directory import described
 from jaxsafe.train.files import read_json, write_bytes
 
 FILM = "episode_deterministic.gif"
@@ -62,8 +62,9 @@ def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
 def options_of(item: Item) -> dict[str, Any]:
     """Every option of its training and of its environment as `config.yaml` has them, but for the place of the run."""
     config, env, _ = resolve(Arguments.parse([*item.words]))
-    training = to_data(config)
-    return {"training": {name: training[name] for name in training if name != "out"}, "environment": describe(env)}
+    found = described(config, env)
+    found["training"].pop("out")
+    return found
 
 
 def _refuse_other(item: Item, run: Path) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import jaxsafe.config
 from jaxsafe.component import normalise
@@ -26,17 +27,17 @@ def create(config: TrainConfig, env: Environment, name: str) -> Path:
         ConfigError: `out` already holds something, or cannot be written.
     """
     path = make(config.out, Path("runs"), name)
-    content = {
-        "env": name,
-        "training": to_data(config),
-        "environment": jaxsafe.config.describe(env),
-        "versions": versions(),
-    }
+    content = {"env": name, **described(config, env), "versions": versions()}
     try:
         write_text(path / "config.yaml", yaml.write(content))
     except OSError as error:
         raise ConfigError(f"out: cannot write {error.filename}: {error.strerror}") from None
     return path
+
+
+def described(config: TrainConfig, env: Environment) -> dict[str, Any]:
+    """All that decides a training, as data."""
+    return {"training": to_data(config), "environment": jaxsafe.config.describe(env)}
 
 
 def create_all(resolved: Sequence[tuple[TrainConfig, Environment, str]]) -> Path:

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxsafe.cli import Arguments
-from jaxsafe.config import describe, yaml
-from jaxsafe.config.convert import to_data
+from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.origin import versions
 from jaxsafe.train import directory
@@ -31,7 +30,8 @@ LONGEST = 36
 def create(out: str | None, request: Mapping[str, Any], first: Setting) -> Path:
     """Make the directory of a sweep and write down what was asked for, and what its first setting is in full."""
     path = directory.make(out, Path("runs"), f"tune_{Path(str(request['env'])).stem}")
-    write_text(path / "sweep.yaml", yaml.write({"request": dict(request), "first": _whole(first), "versions": versions()}))
+    whole = directory.described(first.config, first.env)
+    write_text(path / "sweep.yaml", yaml.write({"request": dict(request), "first": whole, "versions": versions()}))
     return path
 
 
@@ -52,7 +52,8 @@ def refuse_other(path: Path, first: Setting) -> None:
     Raises:
         ConfigError: what the sweep was begun with has changed.
     """
-    if yaml.read(path / "sweep.yaml").get("first") != yaml.parse(yaml.write(_whole(first)), "first"):
+    now = yaml.write(directory.described(first.config, first.env))
+    if yaml.read(path / "sweep.yaml").get("first") != yaml.parse(now, "first"):
         raise ConfigError(f"resume: the recipe or the environment of {path} has changed since it was begun; begin it anew")
 
 
@@ -86,10 +87,6 @@ def line(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
     facts = _flat(row, swept)
     values = ", ".join(f"{name} {facts[name]}" for name in swept)
     return f"setting {index}: {values}: 80 % after {_cell(facts['80 % after'])}, then {facts['stochastic']:.1%}"
-
-
-def _whole(setting: Setting) -> dict[str, Any]:
-    return {"training": to_data(setting.config), "environment": describe(setting.env)}
 
 
 def _key(row: dict[str, Any], rank: str) -> tuple[float, float, float]:
