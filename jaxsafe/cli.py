@@ -17,10 +17,13 @@ from jaxsafe.errors import ConfigError, nearest
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells expect."""
 
+PATHS = ("out", "run", "runs", "resume", "policies")
+"""Options that are paths: `out=2024.10` is a name, not a number."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """A command line `key=value …` as typed, values read as YAML scalars."""
+    """A command line `key=value …` as typed, values read as YAML scalars but for paths."""
 
     options: dict[str, Any]
 
@@ -38,7 +41,8 @@ class Arguments:
                 raise ConfigError(f"argument {word!r}: expected key=value, for instance seeds=10")
             if key in options:
                 raise ConfigError(f"{key}: given twice")
-            options[key] = yaml.parse(text, key)
+            value = yaml.parse(text, key)
+            options[key] = text if key in PATHS and type(value) in (int, float) else value
         return cls(options)
 
     def pop(self, key: str, default: Any = None) -> Any:

@@ -33,6 +33,13 @@ def fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], t
     return run
 
 
+def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
+    arguments = cli.Arguments.parse(["out=2024.10", "run=007", "env.timeout=10.0"])
+    assert (arguments.pop_text("out"), arguments.pop_text("run")) == ("2024.10", "007")
+    assert arguments.pop_overrides() == {"timeout": 10.0}
+    assert cli.Arguments.parse(["run=[a, b]"]).pop("run") == ["a", "b"]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
