@@ -39,7 +39,7 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
 
 def violated(row: dict[str, Any]) -> bool:
     """Whether a constraint was, at a sample or inside a step."""
-    return bool(row["violating_steps"] or row["violating_steps_inside"])
+    return row["violation_bound"] is None
 
 
 def main(argv: Sequence[str]) -> int:
