@@ -19,12 +19,16 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.report import __main__ as command
 from jaxsafe.report import run as running
-from jaxsafe.report.measures import failed_seeds, finished, samples_per_second, wall_to
+from jaxsafe.report.measures import failed_seeds, finished, samples_per_second, steps_to, wall_to
+from jaxsafe.report.page import DIRECTORY, Report
 from jaxsafe.report.plan import KINDS, SHIPPED, Item, best_seed, plan
+from jaxsafe.report.record import kept
 from jaxsafe.rollout import reset_batch
 from jaxsafe.train import __main__ as train
+from jaxsafe.train import directory
 from jaxsafe.train.config import resolve_all
 
+PAGE = Path(__file__).parent.parent / "docs" / "baselines.md"
 REST = [word for word in TINY if not word.startswith("env=")]
 
 
@@ -110,6 +114,23 @@ def test_a_report_in_parts_makes_the_page_of_one(calls: list[list[str]], capsys:
     assert "features |" not in Path("parts/baselines.md").read_text()
 
 
+def test_a_record_is_of_the_commit_that_trained_it(calls: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["tasks=docking2d", "kinds=plain", *REST]
+    for now, trained in (("first", "first"), ("second", "first")):
+        monkeypatch.setattr(directory, "commit", lambda now=now: now)
+        assert command.main(words) == 0
+        assert f"`python -m jaxsafe.report {' '.join(words)}` on commit {trained}: docking2d-plain" in (
+            Path("report/baselines.md").read_text()
+        )
+    assert len(calls) == 1
+
+
+def test_the_page_of_the_project_is_that_of_its_records_and_of_todays_recipes() -> None:
+    records, old = kept(plan([*TASKS], [*KINDS], [f"seeds={command.SEEDS}"]), PAGE.parent / DIRECTORY)
+    assert len(records) == len(TASKS) * len(KINDS), old
+    assert Report(records).text(PAGE.parent / DIRECTORY) == PAGE.read_text(encoding="utf-8")
+
+
 def test_an_interrupted_report_goes_on(calls: list[list[str]], whole: Path) -> None:
     run = Path("runs/report/docking2d-features")
     assert train.main([*TINY, f"out={run}"]) == 0
@@ -193,6 +214,9 @@ def test_the_wall_time_to_a_level_waits_for_twenty_episodes_of_every_seed() -> N
     assert wall_to(0.9, curves) == 2.1
     assert wall_to(0.99, curves) == 4.1
     assert wall_to(0.99, [row for row in curves if row["step"] < 40]) is None
+    assert steps_to(0.9, curves) == 20
+    assert steps_to(0.9, curves, at_least=25) == 30
+    assert steps_to(0.9, curves, at_least=100) is None
 
 
 def test_samples_a_second_are_those_of_all_seeds_after_the_first_update():

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxsafe import cli, origin
+from jaxsafe import cli
 from jaxsafe.errors import ConfigError
 
 SEEDS = 10
@@ -32,12 +32,12 @@ def main(argv: Sequence[str]) -> int:
     rest = rest if "seeds" in arguments.options else [f"seeds={SEEDS}", *rest]
     items = plan(tasks, kinds, rest)
     episodes = [resolve(cli.Arguments.parse(item.words))[0].episodes for item in items]  # errors before anything is done
-    command, commit = " ".join(["python -m jaxsafe.report", *argv]), origin.commit()
+    command = " ".join(["python -m jaxsafe.report", *argv])
     try:
         for item, count in zip(items, episodes, strict=True):
             run = train(item, runs)
             evaluate(item, run, count, film and item.kind == "features")
-            keep(item, run, out / DIRECTORY, command, commit)
+            keep(item, run, out / DIRECTORY, command)
             if policies and item.kind == "features":
                 write_bytes(Path(policies) / f"{item.task}.npz", (run / BEST).read_bytes())
     except KeyboardInterrupt:

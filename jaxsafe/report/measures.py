@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jaxsafe.metrics import interaction_efficiency
+from jaxsafe.metrics import ENOUGH_EPISODES, interaction_efficiency
 from jaxsafe.plot.figures import curve_table
 
 
@@ -22,11 +22,22 @@ def finished(curves: Sequence[Mapping[str, Any]], step: int) -> float:
     return sum(counts) / len(counts)
 
 
-def wall_to(level: float, curves: Sequence[Mapping[str, Any]]) -> float | None:
-    """Seconds until the success rate in training reaches a level, by the definition of Table 2."""
+def steps_to(level: float, curves: Sequence[Mapping[str, Any]], at_least: int = ENOUGH_EPISODES) -> int | None:
+    """Environment steps per seed until the success rate in training reaches a level, by the definition of Table 2.
+
+    Args:
+        level: the success rate, on the average over seeds.
+        curves: rows of the progress log.
+        at_least: episodes that every seed must have finished.
+    """
     steps, rates = curve_table(curves, "step", "success_rate", most=len(curves))
     _, episodes = curve_table(curves, "step", "episodes", most=len(curves))
-    reached = interaction_efficiency(steps, rates, episodes, level)["timesteps"]
+    return interaction_efficiency(steps, rates, episodes, level, at_least)["timesteps"]
+
+
+def wall_to(level: float, curves: Sequence[Mapping[str, Any]]) -> float | None:
+    """Seconds until the success rate in training reaches a level, by the definition of Table 2."""
+    reached = steps_to(level, curves)
     return None if reached is None else max(row["wall_s"] for row in curves if row["step"] == reached)
 
 

@@ -9,8 +9,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jaxsafe.config import yaml
 from jaxsafe.report.plan import Item
-from jaxsafe.report.run import FILM, options_of
+from jaxsafe.report.run import FILM_FILE, options_of
 from jaxsafe.train.files import finite, read_json, read_rows, write_csv, write_json
 
 CURVES = ("wall_s", "success_rate", "return", "length", "delta_v", "violating_steps", "cost", "episodes")
@@ -23,26 +24,26 @@ class Record(NamedTuple):
 
     item: Item
     command: str  # of the report that carried it out
-    commit: str | None  # of the checkout it ran in
+    commit: str | None  # of the checkout that it was trained in
     options: dict[str, Any]  # every one
     results: Results
     evaluations: dict[str, Results]  # the further ones, by name
     curves: list[dict[str, Any]]  # rows of the progress log
 
 
-def keep(item: Item, run: Path, files: Path, command: str, commit: str | None) -> None:
+def keep(item: Item, run: Path, files: Path, command: str) -> None:
     """Write what the page needs of a run, its pictures too, into the directory beside the page."""
     for figure in ("trajectories", "speed_distance") if item.kind == "features" else ():
         if (run / "figures" / f"{figure}.png").exists():
             _copy(run / "figures" / f"{figure}.png", files / f"{item.task}_{figure}.png")
-    if (run / "film" / FILM).exists():
-        _copy(run / "film" / FILM, files / f"{item.task}.gif")
+    if (run / "film" / FILM_FILE).exists():
+        _copy(run / "film" / FILM_FILE, files / f"{item.task}.gif")
     rows = read_rows(run / "progress.jsonl")
     write_csv(files / f"{item.name}.csv", [{name: row[name] for name in ("seed", "step", *CURVES)} for row in rows])
     evaluations = {name: item.evaluation_directory(run, name) / "results.json" for name in item.evaluations}
     record = {
         "command": command,
-        "commit": commit,
+        "commit": yaml.read(run / "config.yaml").get("commit"),
         "words": item.words,
         "options": options_of(item),
         "results": read_json(run / "results.json"),

@@ -13,12 +13,12 @@ from typing import Any
 from jaxsafe.cli import INTERRUPTED, Arguments
 from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError
-from jaxsafe.report.plan import BEST, Item, best_seed
+from jaxsafe.report.plan import BEST, FILM, Item, best_seed
 from jaxsafe.train.config import resolve
 from jaxsafe.train.directory import described
 from jaxsafe.train.files import read_json, write_bytes
 
-FILM = "episode_deterministic.gif"
+FILM_FILE = "episode_deterministic.gif"
 
 
 def train(item: Item, runs: Path) -> Path:
@@ -54,9 +54,9 @@ def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
             shutil.rmtree(out, ignore_errors=True)  # of an evaluation that was interrupted
             _call("jaxsafe.evaluate", [f"run={item.subject(run, name)}", f"episodes={episodes}", *options, f"out={out}"])
     film = run / "film"
-    if render and not (film / FILM).exists():
+    if render and not (film / FILM_FILE).exists():
         shutil.rmtree(film, ignore_errors=True)
-        _call("jaxsafe.evaluate", [f"run={run / BEST}", "episodes=10", "deterministic=true", "render=gif", f"out={film}"])
+        _call("jaxsafe.evaluate", [f"run={run / BEST}", *FILM, f"out={film}"])
 
 
 def options_of(item: Item) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from jaxsafe.config.convert import to_component, to_data
 from jaxsafe.environment import Environment
 from jaxsafe.envs import TASKS
 from jaxsafe.errors import ConfigError, nearest
-from jaxsafe.origin import versions
+from jaxsafe.origin import commit, versions
 from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.files import write_text
 
@@ -27,7 +27,7 @@ def create(config: TrainConfig, env: Environment, name: str) -> Path:
         ConfigError: `out` already holds something, or cannot be written.
     """
     path = make(config.out, Path("runs"), name)
-    content = {"env": name, **described(config, env), "versions": versions()}
+    content = {"env": name, **described(config, env), "commit": commit(), "versions": versions()}
     try:
         write_text(path / "config.yaml", yaml.write(content))
     except OSError as error:
