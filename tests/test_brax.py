@@ -77,6 +77,7 @@ def test_mistakes_are_named(brax: Any) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["ppo", "sac", "apg"])
 def test_braxs_own_trainers_run(algorithm: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("brax")
     monkeypatch.syspath_prepend("examples")
     import brax_docking2d
 

@@ -49,6 +49,7 @@ def test_the_library_accepts_single_environments() -> None:
 
 @pytest.mark.slow
 def test_its_ppo_learns_docking(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("stable_baselines3")
     monkeypatch.syspath_prepend("examples")
     import stable_baselines3_docking2d as example
 
