@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from jaxsafe.adapters import observation_bounds
+from jaxsafe.adapters import action_bounds, observation_bounds
 from jaxsafe.envs import make
 from jaxsafe.errors import missing
 
@@ -45,3 +45,14 @@ def test_observations_are_bounded_where_they_are_clipped() -> None:
     at = env.observation_names.index("speed")
     assert (low[at], high[at]) == (-1.0, 2.0)
     assert set(low[:at]) == {-float("inf")}
+
+
+THRUST_X = "deputy.controller.actuators.thrust_x"
+PHYSICAL = {f"{THRUST_X}.rescale": False, f"{THRUST_X}.low": -3.0, f"{THRUST_X}.high": 0.5}
+
+
+def test_actions_are_bounded_by_the_actuators_that_do_not_rescale() -> None:
+    assert action_bounds(make("docking2d")) == ([-1.0, -1.0], [1.0, 1.0])
+    assert action_bounds(make("docking2d", PHYSICAL)) == ([-3.0, -1.0], [0.5, 1.0])
+    drawn = make("docking2d", PHYSICAL, randomize={f"{THRUST_X}.low": [-4.0, -2.0], f"{THRUST_X}.high": [0.25, 2.0]})
+    assert action_bounds(drawn) == ([-4.0, -1.0], [2.0, 1.0])

@@ -70,6 +70,9 @@ def test_a_return_has_a_gradient(brax: Any) -> None:
 def test_mistakes_are_named(brax: Any) -> None:
     with pytest.raises(ConfigError, match="actions: Brax's agents need continuous actions"):
         brax.BraxEnv("docking2d", actions="discrete")
+    physical = {"wingman.controller.actuators.acceleration.rescale": False}
+    with pytest.raises(ConfigError, match=r"actuator acceleration: Brax's agents act in \[-1, 1\], found \[-96.5, 96.5\]"):
+        brax.BraxEnv("rejoin2d", physical)
     with pytest.raises(ConfigError, match="randomization_fn: give BraxEnv randomize="):
         brax.wrap(brax.BraxEnv("docking2d"), randomization_fn=lambda: None)
 

@@ -16,6 +16,7 @@ import jaxsafe
 from jaxsafe import ConfigError
 from jaxsafe.adapters.gymnasium import GymEnv, GymVectorEnv
 from jaxsafe.adapters.registration import IDS
+from jaxsafe.adapters.safety_gymnasium import SafetyEnv
 from jaxsafe.envs import TASKS
 
 SOON = {"terminal.distance.limit": 130.0}
@@ -170,6 +171,18 @@ def test_every_option_of_make_is_understood() -> None:
     env.reset(seed=1), same_env.reset(seed=1)
     for _ in range(3):
         assert env.step(np.array([0, 10]))[1] == same_env.step([0, 10])[1]
+
+
+def test_the_whole_action_space_and_no_more_reaches_the_actuators() -> None:
+    physical = {f"deputy.controller.actuators.thrust_x.{name}": value for name, value in
+                {"rescale": False, "low": -3.0, "high": 0.5}.items()}  # fmt: skip
+    env, batch = GymEnv("docking2d", physical), GymVectorEnv("docking2d", 2, physical)
+    assert np.array_equal(batch.action_space.low, [[-3.0, -1.0]] * 2)
+    assert batch.single_action_space == env.action_space == SafetyEnv("docking2d", overrides=physical).action_space
+    env.reset(seed=0)
+    for bound in (env.action_space.low, env.action_space.high):
+        assert np.array_equal(env.step(bound)[-1]["control_actual"], bound)
+    assert np.array_equal(env.step(2.0 * bound)[-1]["control_actual"], bound)
 
 
 def test_an_episode_can_be_watched() -> None:

@@ -77,6 +77,15 @@ def test_spaces_are_those_of_gymnax(make: Any) -> None:
     assert env.action_space(env.default_params).sample(jax.random.key(0)).shape == (2,)
 
 
+def test_the_action_space_is_the_actuators(make: Any) -> None:
+    thrust = "deputy.controller.actuators.thrust_x"
+    env = make("docking2d", {f"{thrust}.rescale": False, f"{thrust}.low": -3.0, f"{thrust}.high": 0.5})
+    space = env.action_space(env.default_params)
+    assert (space.low.tolist(), space.high.tolist()) == ([-3.0, -1.0], [0.5, 1.0])
+    wide = env.default_params.replace(env=jaxsafe.override(env.env, {f"{thrust}.high": 2.0}))
+    assert env.action_space(wide).high.tolist() == [2.0, 1.0]
+
+
 @pytest.mark.slow
 def test_rejax_trains_unmodified(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("rejax")

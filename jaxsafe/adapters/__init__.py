@@ -8,10 +8,13 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
+import jax.numpy as jnp
+
 from jaxsafe.config import override
-from jaxsafe.environment import Environment
+from jaxsafe.environment import Environment, drawn
 from jaxsafe.envs import make
 from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.simulation.controllers import Actuator, AgentController
 
 
 def environment(
@@ -40,3 +43,28 @@ def observation_bounds(env: Environment) -> tuple[list[float], list[float]]:
         size = sum(name == item.name or name.startswith(f"{item.name}.") for name in env.observation_names)
         bounds += size * [(-math.inf, math.inf) if item.clip is None else (float(item.clip[0]), float(item.clip[1]))]
     return [low for low, _ in bounds], [high for _, high in bounds]
+
+
+def action_bounds(env: Environment) -> tuple[list[Any], list[Any]]:
+    """Return the least and the greatest value of each element of a continuous action.
+
+    They are −1 and 1 where the actuator rescales, else the actuator's own limits. Where episodes draw a limit, it is the
+    widest that they can draw.
+    """
+    if not acts_in_physical_units(env):
+        return [-1.0] * env.action_size, [1.0] * env.action_size
+    ends = [drawn(env, {path: interval[i] for path, interval in env.randomize.items()}) for i in (0, 1)]
+    pairs = list(zip(*map(_actuators, ends), strict=True))
+    low = [-1.0 if a.rescale else jnp.minimum(a.low, b.low) for a, b in pairs]
+    high = [1.0 if a.rescale else jnp.maximum(a.high, b.high) for a, b in pairs]
+    return low, high
+
+
+def acts_in_physical_units(env: Environment) -> bool:
+    """Return whether some actuator takes its element of a continuous action as it is."""
+    return not all(actuator.rescale for actuator in _actuators(env))
+
+
+def _actuators(env: Environment) -> tuple[Actuator, ...]:
+    controller = env.agent_platform.controller
+    return controller.actuators if isinstance(controller, AgentController) else ()

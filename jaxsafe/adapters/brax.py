@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxsafe.adapters import environment
+from jaxsafe.adapters import action_bounds, environment
 from jaxsafe.environment import Environment, reset, step
 from jaxsafe.errors import ConfigError, missing
 from jaxsafe.renewal import choose
@@ -39,11 +39,16 @@ class BraxEnv(Env):
         """Make the environment; `options` are `variant`, `randomize`, `rta` of `jaxsafe.make`.
 
         Raises:
-            ConfigError: as `jaxsafe.make`; or actions are discrete, which Brax's agents do not know.
+            ConfigError: as `jaxsafe.make`; or actions are discrete, or are not in [−1, 1]: Brax's agents know no others.
         """
         self.env = environment(task, overrides, options)
         if self.env.num_action_points:
             raise ConfigError("actions: Brax's agents need continuous actions")
+        for name, low, high in zip(self.env.action_names, *action_bounds(self.env), strict=True):
+            if (low, high) != (-1.0, 1.0):
+                raise ConfigError(
+                    f"actuator {name}: Brax's agents act in [-1, 1], found [{low:g}, {high:g}]; leave rescale on"
+                )
 
     def reset(self, rng: Key) -> State:
         """A random start."""

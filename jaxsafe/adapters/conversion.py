@@ -9,7 +9,7 @@ import gymnasium as gym
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.adapters import observation_bounds
+from jaxsafe.adapters import action_bounds, observation_bounds
 from jaxsafe.environment import Environment
 from jaxsafe.types import TimeStep
 
@@ -27,7 +27,8 @@ def spaces(env: Environment) -> tuple[gym.spaces.Box, Space]:
     observation = gym.spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
     if env.num_action_points:
         return observation, gym.spaces.MultiDiscrete(list(env.num_action_points))
-    return observation, gym.spaces.Box(-1.0, 1.0, (env.action_size,), np.float32)
+    low, high = action_bounds(env)
+    return observation, gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
 
 
 def facts(env: Environment, timestep: TimeStep) -> dict[str, Any]:

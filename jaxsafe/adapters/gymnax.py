@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxsafe.adapters import environment, observation_bounds
+from jaxsafe.adapters import action_bounds, acts_in_physical_units, environment, observation_bounds
 from jaxsafe.environment import Environment, reset, step
 from jaxsafe.errors import missing
 from jaxsafe.rollout import cut_short, restarted
@@ -96,10 +96,17 @@ class GymnaxEnv:
         return math.prod(self.env.num_action_points) if self.env.num_action_points else self.env.action_size
 
     def action_space(self, params: GymnaxParams | None = None) -> Any:
-        """`Box` in [−1, 1], or `Discrete` over all combinations."""
+        """Return `Box`, [−1, 1] or the limits of actuators that do not rescale, or `Discrete` over all combinations.
+
+        The limits are those of `params`.
+        """
         if self.env.num_action_points:
             return spaces.Discrete(self.num_actions)
-        return spaces.Box(-1.0, 1.0, (self.env.action_size,), dtype=jnp.float32)
+        if not acts_in_physical_units(self.env):
+            return spaces.Box(-1.0, 1.0, (self.env.action_size,), dtype=jnp.float32)
+        low, high = action_bounds((params or self.default_params).env)
+        arrays = [jnp.stack(jnp.broadcast_arrays(*bounds), axis=-1).astype(jnp.float32) for bounds in (low, high)]
+        return spaces.Box(*arrays, (self.env.action_size,), dtype=jnp.float32)
 
     def observation_space(self, params: GymnaxParams | None = None) -> Any:
         """`Box` with the bounds of what is clipped."""
