@@ -6,6 +6,7 @@ import dataclasses
 import gc
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any, NoReturn
 
 from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.streams import lasting_streams
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells expect."""
@@ -42,7 +44,8 @@ class Arguments:
             if key in options:
                 raise ConfigError(f"{key}: given twice")
             value = yaml.parse(text, key)
-            options[key] = text if key in PATHS and type(value) in (int, float) else value
+            value = text if key in PATHS and type(value) in (int, float) else value
+            options[key] = _from_home(value, key) if key in (*PATHS, "env") else value
         return cls(options)
 
     def pop(self, key: str, default: Any = None) -> Any:
@@ -105,28 +108,61 @@ class Arguments:
             raise ConfigError(f"{key}: unknown option; choose from {nearest(key, known)}")
 
 
+def _from_home(path: Any, key: str) -> Any:
+    """Return a path, or each of a list, with the home directory for its `~`, which a shell leaves alone in `out=~/x`."""
+    if isinstance(path, list):
+        return [_from_home(one, key) for one in path]
+    if not isinstance(path, str) or not path.startswith("~"):
+        return path
+    expanded = os.path.expanduser(path)
+    if expanded == path:
+        raise ConfigError(f"{key}: no home directory for {path!r}; write ./{path} for a name that begins with ~")
+    return expanded
+
+
 def run(
     main: Callable[[Sequence[str]], int | None],
     usage: Callable[[], str],
     leave: Callable[[int], NoReturn] = sys.exit,
 ) -> None:
-    """Run a command and leave with its exit code, by `leave` after an error or Ctrl-C."""
+    """Run a command and leave with its exit code, by `leave` after an error or Ctrl-C.
+
+    Output that nobody reads any more is no error. Output that could not be written is one, told when the work is done.
+    """
     argv = sys.argv[1:]
-    if not argv or argv[0] in ("-h", "--help", "help"):
-        print(usage(), file=sys.stdout if argv else sys.stderr)
-        sys.exit(0 if argv else 2)
+    with lasting_streams() as stdout:
+        if not argv or argv[0] in ("-h", "--help", "help"):
+            print(usage(), file=sys.stdout if argv else sys.stderr)
+            code, leave = (0 if argv else 2), sys.exit
+        else:
+            code, finished = _run(main, argv)
+            leave = sys.exit if finished else leave
+        sys.stdout.flush()
+        if stdout.error and not isinstance(stdout.error, BrokenPipeError):
+            print(f"error: standard output: {stdout.error.strerror}", file=sys.stderr)
+            code = code or 2
+        leave(code)
+
+
+def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tuple[int, bool]:
+    """Return the exit code of a command, and whether it came to its end."""
     try:
-        sys.exit(main(argv) or 0)
+        return main(argv) or 0, True
     except ConfigError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        leave(2)
+        return 2, False
     except OSError as error:
         place = error.filename or "file"
         print(f"error: {place}: {error.strerror or error}", file=sys.stderr)
-        leave(2)
+        return 2, False
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
-        leave(INTERRUPTED)
+        return INTERRUPTED, False
+
+
+def in_main_thread() -> bool:
+    """Return whether this is the main thread, the only one that may say what a signal does."""
+    return threading.current_thread() is threading.main_thread()
 
 
 @contextmanager
@@ -151,11 +187,11 @@ def enable_compilation_cache() -> None:
     import jax
 
     if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
         try:
+            base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
             (base / "jaxsafe").mkdir(parents=True, exist_ok=True)
-        except OSError:
-            return  # a home that cannot be written costs time, nothing else
+        except (OSError, RuntimeError):
+            return  # a home that cannot be written, or none at all, costs time and nothing else
         jax.config.update("jax_compilation_cache_dir", str(base / "jaxsafe"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

@@ -10,9 +10,13 @@ from jaxsafe import cli
 from jaxsafe.config import __main__ as config
 from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import __main__ as evaluate
+from jaxsafe.evaluate.seeds import Evaluator
 from jaxsafe.plot import __main__ as plot
 from jaxsafe.train import __main__ as train
+from jaxsafe.train.loop import Training
 from jaxsafe.train.policy import read_policy
+from jaxsafe.tune import __main__ as tune
+from jaxsafe.tune import lanes
 
 
 @pytest.fixture
@@ -100,6 +104,22 @@ def test_a_directory_that_holds_something_is_never_overwritten(fails: Callable[.
     assert (tmp_path / "run" / "config.yaml").read_text() == "precious"
 
 
+def test_what_fails_before_anything_comes_of_it_leaves_no_directory(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("a compiler that fails")
+
+    monkeypatch.setattr(Training, "prepare", fail)
+    monkeypatch.setattr(Evaluator, "run", fail)
+    monkeypatch.setattr(lanes, "train_all", fail)
+    commands = (train, ["env=docking2d"]), (evaluate, ["run=pretrained/docking2d"])
+    for command, words in (*commands, (tune, ["env=docking2d", "sweep.ppo.gamma=[0.9,0.95]"])):
+        with pytest.raises(RuntimeError, match="a compiler that fails"):
+            command.main([*words, f"out={tmp_path / 'made'}"])
+        assert not (tmp_path / "made").exists()
+
+
 def test_an_unwritable_output_is_told_in_one_line(fails: Callable[..., str], tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     assert "out: cannot write" in fails(train, "env=docking3d", "out=file/run")
@@ -159,6 +179,16 @@ def test_policy_files_cannot_run_code_and_broken_ones_are_told_in_one_line(tmp_p
         read_policy(tmp_path / "other.npz")
     with pytest.raises(ConfigError, match="cannot be read: No such file"):
         read_policy(tmp_path / "none.npz")
+
+
+def test_a_path_may_begin_with_the_home_directory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    arguments = cli.Arguments.parse(["out=~/x", "run=[~/a,b/~,./~]", "env=~/mine.yaml", "rta=~x"])
+    assert arguments.options == {
+        "out": "/home/me/x", "run": ["/home/me/a", "b/~", "./~"], "env": "/home/me/mine.yaml", "rta": "~x",
+    }  # fmt: skip
+    with pytest.raises(ConfigError, match=r"^resume: no home directory for '~nobody-of-that-name/x'; write \./~nobody"):
+        cli.Arguments.parse(["resume=~nobody-of-that-name/x"])
 
 
 @pytest.mark.parametrize("module", ["train", "evaluate", "plot", "config"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import codecs
+import sys
 from collections.abc import Sequence
 
 from jaxsafe import cli
@@ -10,7 +12,7 @@ from jaxsafe.errors import ConfigError
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
-    from jaxsafe.config import dump
+    from jaxsafe.config import describe, yaml
     from jaxsafe.envs import make
 
     task, *words = argv
@@ -20,7 +22,9 @@ def main(argv: Sequence[str]) -> int:
     changes = arguments.pop_overrides()
     options = {name: arguments.pop_text(name) for name in ("actions", "variant", "rta")}
     arguments.refuse_rest([*options, "env.…"])
-    print(dump(make(task, changes, **options)), end="")  # type: ignore[arg-type]
+    env = make(task, changes, **options)  # type: ignore[arg-type]
+    utf8 = codecs.lookup(sys.stdout.encoding).name == "utf-8"  # as whoever reads the file takes it to be
+    print(yaml.write(describe(env), ascii_only=not utf8), end="")
     return 0
 
 

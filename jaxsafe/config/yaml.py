@@ -88,6 +88,7 @@ def read(path: str | os.PathLike) -> Any:
     return parse(text, str(path))
 
 
-def write(value: Any) -> str:
-    """Plain data as YAML: mappings in block style, lists of scalars on one line."""
-    return yaml.dump(value, Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=100, allow_unicode=True)
+def write(value: Any, ascii_only: bool = False) -> str:
+    """Plain data as YAML: mappings in block style, lists of scalars on one line, other letters as escapes if asked for."""
+    options = {"sort_keys": False, "default_flow_style": None, "width": 100, "allow_unicode": not ascii_only}
+    return yaml.dump(value, Dumper=_Dumper, **options)

@@ -42,8 +42,12 @@ def evaluate(
     path = directory.make(
         out, subject.place, f"{request['checkpoint']}-{episodes}-seed{seed}" + "-changed" * bool(request["changes"])
     )
-    evaluator = Evaluator(subject.mapper, env, subject.agent)
-    sums = {kind: evaluator.run(subject.params, episodes, seed, kind == "deterministic") for kind in kinds}
+    try:
+        evaluator = Evaluator(subject.mapper, env, subject.agent)
+        sums = {kind: evaluator.run(subject.params, episodes, seed, kind == "deterministic") for kind in kinds}
+    except Exception:
+        directory.discard_unused(path)
+        raise
     for kind, one in sums.items():
         rows = episode_rows(env, one, subject.facts["seed"], step=subject.facts["steps"], kind=kind, final=True)
         append_rows(path / "eval.jsonl", rows)

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxsafe.cli import INTERRUPTED, Arguments
+from jaxsafe.cli import INTERRUPTED, Arguments, in_main_thread
 from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.report.plan import BEST, FILM, Item, best_seed
@@ -86,6 +86,8 @@ def _call(module: str, words: Sequence[str]) -> None:
 
 def _wait(process: subprocess.Popen) -> int:
     """Its exit code. A termination is passed on; after Ctrl-C, which it gets too, it has the time to save what it has."""
+    if not in_main_thread():
+        return process.wait()
     previous = signal.signal(signal.SIGTERM, lambda *_: process.terminate())
     try:
         try:

@@ -22,6 +22,8 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     claim_cores()
     cli.enable_compilation_cache()
+    import jax
+
     from jaxsafe.errors import ConfigError
     from jaxsafe.train import directory, hosts
     from jaxsafe.train.config import resolve_all
@@ -42,8 +44,9 @@ def main(argv: Sequence[str]) -> int:
         with hosts.loss_told(f"go on with: python -m jaxsafe.train distributed=true resume={path}"):
             try:
                 finished = _train([run for run in runs if not _complete(run)], path)
-            except ConfigError:  # refused, and not by the loss of another process
-                if resume is None and hosts.leads():
+            except Exception as error:
+                alone = jax.process_count() == 1  # else it may be the loss of another process, after which the run goes on
+                if resume is None and hosts.leads() and (alone or isinstance(error, ConfigError)):
                     directory.discard_unused(path)
                 raise
     except KeyboardInterrupt:

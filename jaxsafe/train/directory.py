@@ -96,8 +96,8 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
 
 
 def discard_unused(path: Path) -> None:
-    """Remove what `create_all` made, if nothing has come to it: a training that was refused is no run."""
-    if all(found.is_dir() or found.name == "config.yaml" for found in path.rglob("*")):
+    """Remove a directory to which nothing has come since it was made: what failed before it began is no run."""
+    if all(found.is_dir() or found.name in ("config.yaml", "sweep.yaml") for found in path.rglob("*")):
         shutil.rmtree(path, ignore_errors=True)
 
 

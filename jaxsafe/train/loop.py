@@ -300,11 +300,15 @@ def _keep_best(best: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
 
 
 class _StopRequest:
-    """Turns the first Ctrl-C or termination into a flag, so that the run stops between chunks; the second acts as usual."""
+    """Turns the first Ctrl-C or termination into a flag, so that the run stops between chunks; the second acts as usual.
+
+    Signals come to the main thread: a training in another one leaves them alone.
+    """
 
     def __enter__(self) -> _StopRequest:
         self.requested = False
-        self._previous = {number: signal.signal(number, self._set) for number in (signal.SIGINT, signal.SIGTERM)}
+        numbers = (signal.SIGINT, signal.SIGTERM) if cli.in_main_thread() else ()
+        self._previous = {number: signal.signal(number, self._set) for number in numbers}
         return self
 
     def __exit__(self, *_: object) -> None:

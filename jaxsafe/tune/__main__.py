@@ -20,6 +20,7 @@ def main(argv: Sequence[str]) -> int:
     from tqdm import tqdm
 
     from jaxsafe.errors import ConfigError, nearest
+    from jaxsafe.train import directory
     from jaxsafe.tune import results
     from jaxsafe.tune.lanes import train_all
     from jaxsafe.tune.settings import alike, pop_sweep, settings
@@ -55,6 +56,10 @@ def main(argv: Sequence[str]) -> int:
                 results.add(path, done)
                 rows |= done
                 tqdm.write("\n".join(results.line(i, row, list(sweep)) for i, row in done.items()))
+    except Exception:
+        if resume is None:
+            directory.discard_unused(path)
+        raise
     except KeyboardInterrupt:
         print(f"stopped with {len(rows)} of {len(found)} settings; go on with: python -m jaxsafe.tune resume={path}")
         return cli.INTERRUPTED
