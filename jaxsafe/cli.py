@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from jaxsafe.config import yaml
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.errors import ConfigError, nearest, show
 from jaxsafe.streams import lasting_streams
 
 INTERRUPTED = 130
@@ -40,7 +40,7 @@ class Arguments:
         for word in argv:
             key, equals, text = word.partition("=")
             if not equals or not key:
-                raise ConfigError(f"argument {word!r}: expected key=value, for instance seeds=10")
+                raise ConfigError(f"argument {show(word)}: expected key=value, for instance seeds=10")
             if key in options:
                 raise ConfigError(f"{key}: given twice")
             value = yaml.parse(text, key)
@@ -62,7 +62,7 @@ class Arguments:
             return None
         value = self.options.pop(key)
         if value is None or isinstance(value, (list, dict, bool)):
-            raise ConfigError(f"{key}: expected a name or a path, found {value!r}")
+            raise ConfigError(f"{key}: expected a name or a path, found {show(value)}")
         return str(value)
 
     def pop_count(self, key: str, default: int, least: int = 1) -> int:
@@ -75,7 +75,7 @@ class Arguments:
         if isinstance(value, float) and value.is_integer():
             value = int(value)
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
-            raise ConfigError(f"{key}: expected a whole number ≥ {least}, found {value!r}")
+            raise ConfigError(f"{key}: expected a whole number ≥ {least}, found {show(value)}")
         return value
 
     def pop_flag(self, key: str) -> bool | None:
@@ -88,7 +88,7 @@ class Arguments:
             return None
         value = self.options.pop(key)
         if not isinstance(value, bool):
-            raise ConfigError(f"{key}: expected true or false, found {value!r}")
+            raise ConfigError(f"{key}: expected true or false, found {show(value)}")
         return value
 
     def pop_overrides(self) -> dict[str, Any]:

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.component import Component, Unit
-from jaxsafe.errors import ConfigError, nearest, part
+from jaxsafe.errors import ConfigError, nearest, part, show
 from jaxsafe.paths import set_path
 from jaxsafe.processors.constraint import Constraint
 from jaxsafe.processors.observation import Observation
@@ -158,7 +158,7 @@ def reset_to(
     known = {platform.name: platform for platform in env.platforms}
     for name in start:
         if name not in known:
-            raise ConfigError(f"reset_to: unknown platform {name!r}; choose from {nearest(name, known)}")
+            raise ConfigError(f"reset_to: unknown platform {show(name)}; choose from {nearest(name, known)}")
     platforms = {name: platform.place(start.get(name, {})) for name, platform in known.items()}
     return _begin(env, _blank(env).replace(platforms=platforms), parameters)
 
@@ -211,7 +211,7 @@ def _chosen_parameters(env: Environment, parameters: Mapping[str, Any]) -> Param
     for path in parameters:
         if path not in env.randomize:
             known = nearest(path, env.randomize) or "none"
-            raise ConfigError(f"reset_to: parameter {path!r} is not random; choose from {known}")
+            raise ConfigError(f"reset_to: parameter {show(path)} is not random; choose from {known}")
     for path in env.randomize:
         if path not in parameters:
             raise ConfigError(f"reset_to: parameter {path!r} is missing: it is random at reset, so give it")

@@ -11,10 +11,41 @@ class ConfigError(ValueError):
     """A value from outside is wrong: a misspelt name, a wrong type, a number out of range, a broken file."""
 
 
+def show(value: object, most: int = 60) -> str:
+    """Return what `repr` does, cut to `most` letters. Nothing beyond those is looked at: a value may be very large."""
+    text = ""
+    for piece in _pieces(value, most):
+        text += piece
+        if len(text) > most:
+            return text[: most - 3] + "..."
+    return text
+
+
+def _pieces(value: object, most: int) -> Iterator[str]:
+    """Yield the text of a value bit by bit, each bit at least one letter."""
+    if type(value) in (list, tuple, dict):
+        opening, closing = {list: "[]", tuple: "()", dict: "{}"}[type(value)]
+        yield opening
+        for index, item in enumerate(value):  # type: ignore[arg-type]
+            if index:
+                yield ", "
+            yield from _pieces(item, most)
+            if isinstance(value, dict):
+                yield ": "
+                yield from _pieces(value[item], most)
+        yield "," + closing if isinstance(value, tuple) and len(value) == 1 else closing
+    elif isinstance(value, str):
+        yield repr(value[: most + 1])
+    elif isinstance(value, int) and value.bit_length() > 10_000:  # Python refuses to write more than 4300 digits
+        yield "a number of thousands of digits"
+    else:
+        yield repr(value)
+
+
 def nearest(found: object, allowed: Iterable[object]) -> str:
     """The allowed names as a list in words, with the nearest match to what was found: `a, b, c. Did you mean 'b'?`."""
     names = [str(name) for name in allowed]
-    close = difflib.get_close_matches(str(found), names, n=1, cutoff=0.5)
+    close = difflib.get_close_matches(found if isinstance(found, str) else show(found), names, n=1, cutoff=0.5)
     return ", ".join(names) + (f". Did you mean {close[0]!r}?" if close else "")
 
 

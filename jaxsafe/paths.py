@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from jaxsafe.component import Component, Field, fields
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.errors import ConfigError, nearest, show
 
 Convert = Callable[[Any, Field, str], Any]
 """`convert(value, field, place)`: the value that the field takes, or a ConfigError that names the place."""
@@ -45,7 +45,7 @@ def _set(component: Any, path: list[str], value: Any, convert: Convert, place: s
     if head not in table and head in names:
         return component.replace(**{component.shorthand: _set_item(parts, path, value, convert, place)})
     if head not in table:
-        raise ConfigError(f"{join(place, head)}: unknown field {head!r}; choose from {nearest(head, [*table, *names])}")
+        raise ConfigError(f"{join(place, head)}: unknown field {show(head)}; choose from {nearest(head, [*table, *names])}")
     here, inner = join(place, head), getattr(component, head)
     if not rest:
         picked = _pick(inner, value, here) if _are_names(inner, value) else convert(value, table[head], here)
@@ -56,7 +56,7 @@ def _set(component: Any, path: list[str], value: Any, convert: Convert, place: s
         return component.replace(**{head: _set_item(inner, rest, value, convert, here)})
     if isinstance(inner, Mapping) and len(rest) == 1:
         if rest[0] not in inner:
-            raise ConfigError(f"{here}: unknown name {rest[0]!r}; choose from {nearest(rest[0], inner)}")
+            raise ConfigError(f"{here}: unknown name {show(rest[0])}; choose from {nearest(rest[0], inner)}")
         return component.replace(**{head: convert({**inner, rest[0]: value}, table[head], here)})
     raise ConfigError(f"{join(here, rest[0])}: {here} has no fields" + (" because it is not set" if inner is None else ""))
 
@@ -81,5 +81,5 @@ def _pick(items: tuple, names: Sequence[str], place: str) -> tuple:
 def _index(items: tuple, name: str, place: str) -> int:
     names = [getattr(item, "name", str(index)) for index, item in enumerate(items)]
     if name not in names:
-        raise ConfigError(f"{join(place, name)}: unknown name {name!r}; choose from {nearest(name, names)}")
+        raise ConfigError(f"{join(place, name)}: unknown name {show(name)}; choose from {nearest(name, names)}")
     return names.index(name)

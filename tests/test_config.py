@@ -19,6 +19,7 @@ from jaxsafe.config import build, dump, load
 from jaxsafe.config.convert import to_component
 from jaxsafe.config.imports import import_modules, modules
 from jaxsafe.config.yaml import parse, write
+from jaxsafe.errors import show
 from jaxsafe.processors.reward import Failure
 from jaxsafe.processors.status import Status
 from jaxsafe.simulation.cwh import Spacecraft
@@ -833,3 +834,67 @@ def test_a_status_of_the_wrong_kind_is_refused(task: str, path: str, status: str
     else:
         message = fault(lambda: jaxsafe.override(env, {path: status}))
         assert message == f"{path}: expected a status that is {wanted}, found {status!r}, which is not"
+
+
+LAUGHS = "\n".join([f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 13)])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("!!bool x", r"line 1: not valid YAML: found 'x' after the tag !!bool$"),
+        ("!!bool yes", r"found 'yes' after the tag !!bool$"),
+        ("!!bool [1]", r"found a collection after the tag !!bool$"),
+        ("!!float ''", r"found '' after the tag !!float$"),
+        ("!!float 1:30", r"found '1:30' after the tag !!float$"),
+        ("!!int x", r"found 'x' after the tag !!int$"),
+        ("!!null x", r"found 'x' after the tag !!null$"),
+        ("!!map x", r"expected a mapping after the tag !!map$"),
+        ("!!seq x", r"expected a sequence node, but found scalar$"),
+        ("!!str [x]", r"expected a scalar node, but found sequence$"),
+        *((f"!!{tag} x", rf"could not determine a constructor for the tag '.*{tag}'$") for tag in
+          ("timestamp", "binary", "set", "omap", "pairs", "merge", "value", "python/none")),
+        ("!mine x", r"could not determine a constructor for the tag '!mine'$"),
+        ("&a [*a]", r"an alias stands inside what it is the alias of$"),
+        ("&a {b: {c: *a}}", r"an alias stands inside what it is the alias of$"),
+        (f"{{a0: &a0 [1, 1],\n{LAUGHS}".replace("\n", " ").replace("] a", "], a") + "}",
+         r"its aliases stand for more than 1,000,000 values$"),
+        ('"\\ud800"', r"found a control character in '\\ud800'$"),
+        ('"a\\0b"', r"found a control character in 'a\\x00b'$"),
+        ('"\\UFFFFFFFF"', r"Python int too large"),
+        ("9" * 5000, r"not valid YAML: Exceeds the limit"),
+        ("x" * (2**20 + 1), r"^key: expected at most 1,048,576 letters$"),
+    ],
+)  # fmt: skip
+def test_yaml_that_is_hard_to_read_is_refused(text: str, message: str) -> None:
+    assert re.search(message, fault(lambda: parse(text, "key")))
+
+
+def test_tags_of_the_core_schema_and_aliases_are_read() -> None:
+    text = "[!!str 12, !!int '12', !!float 12, !!bool 'true', !!null '', !!map {a: !!seq [1]}, ! 12]"
+    assert parse(text, "key") == ["12", 12, 12.0, True, None, {"a": [1]}, 12]
+    assert parse("[&a [1, 2], *a, {<<: *a}]", "key") == [[1, 2], [1, 2], {"<<": [1, 2]}]
+
+
+def test_a_value_is_shown_by_its_first_letters_however_large_it_is() -> None:
+    huge: Any = [1]
+    for _ in range(60):
+        huge = [huge] * 9
+    for path in (
+        "agent",
+        "dt",
+        "platforms",
+        "status.speed.of",
+        "randomize",
+        "reward.failure.values",
+        "regions",
+        "status.delta_v.norm",
+    ):
+        message = fault(lambda path=path: jaxsafe.make("docking2d", {path: huge}))
+        assert "[[[" in message
+    cyclic: list[Any] = []
+    cyclic.append(cyclic)
+    assert show(cyclic) == "[" * 57 + "..."
+    assert show(10**5000) == "a number of thousands of digits"
+    for value in ([], (), {}, (1,), (1, [2.5, "x"]), {"a": {"b": None}}, "it's", 10**50, -1.5, True, {1}, "x" * 55):
+        assert show(value) == repr(value)

@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jaxsafe.component import ANY, Component, Refers, fields
 from jaxsafe.config.convert import expects, to_value
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.errors import ConfigError, nearest, show
 from jaxsafe.paths import join, set_path
 from jaxsafe.processors.observation import Observe, ObserveAngle
 from jaxsafe.rta.prediction import judge
@@ -117,15 +117,15 @@ def _problems(component: Component, place: str) -> Iterator[tuple[str, str]]:
 def _reference(place: str, name: str, known: Iterable[str], which: str = "") -> None:
     known = list(known)
     if name not in known:
-        raise ConfigError(f"{place}: nothing{which} is called {name!r}; choose from {nearest(name, known) or 'none'}")
+        raise ConfigError(f"{place}: nothing{which} is called {show(name)}; choose from {nearest(name, known) or 'none'}")
 
 
 def _once(place: str, names: Sequence[str]) -> None:
     for name in names:
         if names.count(name) > 1:
-            raise ConfigError(f"{place}: the name {name!r} stands twice")
+            raise ConfigError(f"{place}: the name {show(name)} stands twice")
         if not name or "." in name:
-            raise ConfigError(f"{place}: expected a name without dots, found {name!r}")
+            raise ConfigError(f"{place}: expected a name without dots, found {show(name)}")
 
 
 def _check_space(env: Environment) -> None:

@@ -14,7 +14,7 @@ from jax.core import Tracer
 
 from jaxsafe.component import ANY, Component, Field, Kind, choices, fields, normalise, unwrap_optional
 from jaxsafe.component import field as field_of
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.errors import ConfigError, nearest, show
 from jaxsafe.paths import join
 
 
@@ -33,7 +33,7 @@ def to_component(data: Any, base: type[Kind], place: str) -> Kind:
     label = f"{place} ({cls.type_name})" if cls.type_name else place or "environment"
     for name in entries:
         if name not in table:
-            raise ConfigError(f"{label}: unknown field {name!r}; choose from {nearest(name, table)}")
+            raise ConfigError(f"{label}: unknown field {show(name)}; choose from {nearest(name, table)}")
     for name, field in table.items():
         if field.required and name not in entries:
             raise ConfigError(f"{label}: field {name!r} is missing; it takes {expects(field)}")
@@ -84,7 +84,7 @@ def _choose(entries: dict, base: type[Kind], place: str) -> tuple[type[Kind], di
         raise ConfigError(f"{place}: field 'type' is missing; choose from {nearest('', sorted(options))}")
     kind = entries.pop("type")
     if not isinstance(kind, str) or kind not in options:
-        raise ConfigError(f"{place}: unknown type {kind!r}; choose from {nearest(kind, sorted(options))}")
+        raise ConfigError(f"{place}: unknown type {show(kind)}; choose from {nearest(kind, sorted(options))}")
     return options[kind], entries
 
 
@@ -108,7 +108,7 @@ def _structure(value: Any, hint: Any, field: Field, place: str) -> Any:
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
         raise ConfigError(f"{place}: expected {expects(field)}, found {_show(value)}")
     if field.range and isinstance(value, int) and value not in field.range:
-        raise ConfigError(f"{place}: expected {expects(field)}, found {value}")
+        raise ConfigError(f"{place}: expected {expects(field)}, found {show(value)}")
     return value
 
 
@@ -134,7 +134,7 @@ def _number(value: Any, field: Field, place: str) -> jax.Array:
     length = field.unit.length if field.unit else None
     wrong = ConfigError(f"{place}: expected {expects(field)}, found {_show(value)}")
     items = value if isinstance(value, (list, tuple)) else [value]
-    if any(item is None or isinstance(item, (bool, str, Mapping)) for item in items):
+    if any(item is None or isinstance(item, (bool, str, Mapping, list, tuple)) for item in items):
         raise wrong
     try:
         array = value if isinstance(value, jax.Array) else np.asarray(value, float)
@@ -180,5 +180,4 @@ def _shortest(array: np.ndarray) -> Any:
 def _show(value: Any) -> str:
     if isinstance(value, Tracer):
         return f"an array of shape {value.shape}"
-    text = repr(to_data(value) if isinstance(value, (np.ndarray, jax.Array)) else value)
-    return text if len(text) <= 60 else text[:57] + "..."
+    return show(to_data(value) if isinstance(value, (np.ndarray, jax.Array)) else value)

@@ -8,7 +8,7 @@ import sys
 from typing import Any
 
 from jaxsafe.component import Component, fields
-from jaxsafe.errors import ConfigError
+from jaxsafe.errors import ConfigError, show
 from jaxsafe.paths import join
 
 
@@ -31,7 +31,7 @@ def import_modules(names: Any, place: str) -> None:
     """
     here = join(place, "imports")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ConfigError(f"{here}: expected a list of modules, found {names!r}")
+        raise ConfigError(f"{here}: expected a list of modules, found {show(names)}")
     if os.getcwd() not in sys.path and "" not in sys.path:
         sys.path.append(os.getcwd())
     for name in names:
@@ -41,4 +41,4 @@ def import_modules(names: Any, place: str) -> None:
             raise
         except (Exception, SystemExit) as error:
             reason = next(iter(str(error).splitlines()), "")[:200]
-            raise ConfigError(f"{here}: cannot import {name!r}: {type(error).__name__}: {reason}") from error
+            raise ConfigError(f"{here}: cannot import {show(name)}: {type(error).__name__}: {reason}") from error

@@ -8,7 +8,7 @@ from typing import Any
 from jaxsafe.config.check import check
 from jaxsafe.config.convert import to_value
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError
+from jaxsafe.errors import ConfigError, show
 from jaxsafe.paths import set_path
 
 
@@ -26,6 +26,6 @@ def override(env: Environment, changes: Mapping[str, Any]) -> Environment:
     changed = env
     for path, value in changes.items():
         if not isinstance(path, str):
-            raise ConfigError(f"override: expected dotted paths such as 'deputy.mass', found {path!r}")
+            raise ConfigError(f"override: expected dotted paths such as 'deputy.mass', found {show(path)}")
         changed = set_path(changed, path, value, to_value)
     return check(changed, before=env)

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from jaxsafe.config import build, load, override
 from jaxsafe.environment import Environment
 from jaxsafe.envs import _docking, docking2d, docking2d_oriented, docking3d, rejoin2d, rejoin3d
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.errors import ConfigError, nearest, show
 from jaxsafe.paths import set_path
 from jaxsafe.rta.filter import RTA
 from jaxsafe.rta.presets import PRESETS
@@ -65,7 +65,7 @@ def make(
         ConfigError: one line that names the place, what was found and what is allowed.
     """
     if not isinstance(task, (str, os.PathLike)):
-        raise ConfigError(f"env: expected the name of a task or a .yaml file, found {task!r}")
+        raise ConfigError(f"env: expected the name of a task or a .yaml file, found {show(task)}")
     for option, kinds, value in (
         ("overrides", Mapping, overrides),
         ("randomize", Mapping, randomize),
@@ -73,7 +73,7 @@ def make(
     ):
         if value is not None and not isinstance(value, kinds):
             raise ConfigError(
-                f"{option}: expected {'paths with values' if kinds is Mapping else 'a name'}, found {value!r}"
+                f"{option}: expected {'paths with values' if kinds is Mapping else 'a name'}, found {show(value)}"
             )
     name = os.fspath(task)
     if name in TASKS:
@@ -81,7 +81,7 @@ def make(
     elif name.endswith((".yaml", ".yml")):
         env = load(name)
     else:
-        raise ConfigError(f"env: unknown task {name!r} and not a .yaml file; choose from {nearest(name, TASKS)}")
+        raise ConfigError(f"env: unknown task {show(name)} and not a .yaml file; choose from {nearest(name, TASKS)}")
     if variant is not None:
         env = _with_variant(env, name, variant)
     if actions is not None:
@@ -93,7 +93,7 @@ def make(
 
 def _with_variant(env: Environment, task: str, variant: str) -> Environment:
     if variant not in VARIANTS:
-        raise ConfigError(f"variant: unknown variant {variant!r}; choose from {nearest(variant, VARIANTS)}")
+        raise ConfigError(f"variant: unknown variant {show(variant)}; choose from {nearest(variant, VARIANTS)}")
     if task not in TASKS:
         raise ConfigError(f"variant: {task} says itself what it is; a variant is for {', '.join(TASKS)}")
     return override(env, VARIANTS[variant].get(task, {}))
@@ -113,12 +113,12 @@ def _filter(task: str, rta: str | RTA) -> RTA | None:
         return rta
     presets = {"none": lambda: None, **PRESETS.get(task, {})}
     if not isinstance(rta, str) or rta not in presets:
-        raise ConfigError(f"rta: {task} has no preset {rta!r}; choose from {nearest(rta, presets)}")
+        raise ConfigError(f"rta: {task} has no preset {show(rta)}; choose from {nearest(rta, presets)}")
     return presets[rta]()
 
 
 def _with_actions(env: Environment, actions: str) -> Environment:
     if actions not in _ACTIONS:
-        raise ConfigError(f"actions: unknown kind {actions!r}; choose from {nearest(actions, _ACTIONS)}")
+        raise ConfigError(f"actions: unknown kind {show(actions)}; choose from {nearest(actions, _ACTIONS)}")
     actuators = getattr(env.agent_platform.controller, "actuators", ())
     return set_path(env, f"{env.agent}.controller", _ACTIONS[actions](actuators=actuators))

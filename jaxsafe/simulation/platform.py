@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from jaxsafe.component import Component, Range
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.errors import ConfigError, nearest, show
 from jaxsafe.simulation.controllers import Controller, Controls, Uncontrolled
 from jaxsafe.simulation.initializers import Initializer
 from jaxsafe.types import Key, Record, Seconds, Sim
@@ -83,11 +83,13 @@ class Platform(Component):
         """
         values = vars(values) if isinstance(values, Record) else values
         if not isinstance(values, Mapping):
-            raise ConfigError(f"reset_to: {self.name}: expected fields by name, found {values!r}")
+            raise ConfigError(f"reset_to: {self.name}: expected fields by name, found {show(values)}")
         rest = self.rest()
         for name in values:
             if name not in vars(rest):
-                raise ConfigError(f"reset_to: {self.name} has no field {name!r}; choose from {nearest(name, vars(rest))}")
+                raise ConfigError(
+                    f"reset_to: {self.name} has no field {show(name)}; choose from {nearest(name, vars(rest))}"
+                )
         for name in self.random_fields:
             if name not in values:
                 raise ConfigError(f"reset_to: {self.name}.{name} is missing: it is random at reset, so give it")
@@ -104,9 +106,9 @@ def placed(name: str, value: Any, like: Array) -> Array:
     try:
         array = jnp.asarray(value, like.dtype)
     except (TypeError, ValueError):
-        raise ConfigError(f"reset_to: {name}: expected numbers, found {value!r}") from None
+        raise ConfigError(f"reset_to: {name}: expected numbers, found {show(value)}") from None
     if value is None or array.shape != like.shape:
         raise ConfigError(f"reset_to: {name}: expected shape {like.shape}, found {array.shape}")
     if not isinstance(array, Tracer) and not np.isfinite(np.asarray(array)).all():
-        raise ConfigError(f"reset_to: {name}: expected finite numbers, found {value!r}")
+        raise ConfigError(f"reset_to: {name}: expected finite numbers, found {show(value)}")
     return array

@@ -15,7 +15,7 @@ from jaxsafe.config import override, yaml
 from jaxsafe.config.convert import expects, to_value
 from jaxsafe.environment import Environment
 from jaxsafe.envs import TASKS, make
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.errors import ConfigError, nearest, show
 from jaxsafe.paths import set_path
 from jaxsafe.processors.reward import Intervention
 from jaxsafe.train.agent import Agent
@@ -177,7 +177,7 @@ def recipe(task: str, preset: str | None) -> dict[str, Any]:
     known = yaml.read(file) if file.is_file() else {"plain": {}}
     name = preset if preset is not None else ("features" if "features" in known else "plain")
     if name not in known:
-        raise ConfigError(f"preset: unknown preset {name!r}; choose from {nearest(name, known)}")
+        raise ConfigError(f"preset: unknown preset {show(name)}; choose from {nearest(name, known)}")
     return {"preset": name, **_flatten(known[name] or {})}
 
 

@@ -19,7 +19,7 @@ def main(argv: Sequence[str]) -> int:
     cli.enable_compilation_cache()
     from tqdm import tqdm
 
-    from jaxsafe.errors import ConfigError, nearest
+    from jaxsafe.errors import ConfigError, nearest, show
     from jaxsafe.train import directory
     from jaxsafe.tune import results
     from jaxsafe.tune.lanes import train_all
@@ -33,7 +33,7 @@ def main(argv: Sequence[str]) -> int:
     request, out = dict(arguments.options), arguments.pop_text("out")
     rank = arguments.pop("rank", RANKS[0])
     if rank not in RANKS:
-        raise ConfigError(f"rank: unknown order {rank!r}; choose from {nearest(rank, RANKS)}")
+        raise ConfigError(f"rank: unknown order {show(rank)}; choose from {nearest(rank, RANKS)}")
     samples = arguments.pop_count("samples", 0) if "samples" in arguments.options else None
     draw = arguments.pop_count("draw", 0, least=0)
     arguments.options.setdefault("episodes", EPISODES)

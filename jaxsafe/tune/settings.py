@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxsafe.cli import Arguments
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError
+from jaxsafe.errors import ConfigError, show
 from jaxsafe.train.config import TrainConfig, resolve
 
 PREFIX = "sweep."
@@ -112,13 +112,13 @@ def _choices(key: str, value: Any) -> list[Any] | Span:
         return value
     match = _RANGE.fullmatch(value) if isinstance(value, str) else None
     if match is None:
-        raise ConfigError(f"{key}: expected a list [a,b,…], uniform(low,high) or log(low,high), found {value!r}")
+        raise ConfigError(f"{key}: expected a list [a,b,…], uniform(low,high) or log(low,high), found {show(value)}")
     try:
         low, high = float(match[2]), float(match[3])
     except ValueError:
-        raise ConfigError(f"{key}: expected two numbers in the brackets, found {value!r}") from None
+        raise ConfigError(f"{key}: expected two numbers in the brackets, found {show(value)}") from None
     if not low < high or (match[1] == "log" and low <= 0.0) or not math.isfinite(high - low):
-        raise ConfigError(f"{key}: expected low < high, for log above 0, found {value!r}")
+        raise ConfigError(f"{key}: expected low < high, for log above 0, found {show(value)}")
     return Span(low, high, match[1] == "log")
 
 
