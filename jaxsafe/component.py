@@ -147,6 +147,8 @@ def normalise(value: Any) -> Any:
     """Make every number in a component a strongly typed array, so that Python floats and arrays compile alike.
 
     Intervals and vectors written as tuples become arrays; the dtype is the default float (float32, or float64 in x64).
+    Mappings are sorted by name, as every JAX transformation leaves them: what a component computes from one must not
+    depend on the order in which a user wrote it, or it would be another number under jit.
     """
     if isinstance(value, Component):
         table = fields(type(value)).items()
@@ -158,7 +160,7 @@ def normalise(value: Any) -> Any:
         )
     if isinstance(value, tuple):
         return tuple(map(normalise, value))
-    return {key: _leaf(item) for key, item in value.items()} if isinstance(value, dict) else value
+    return {key: _leaf(value[key]) for key in sorted(value)} if isinstance(value, dict) else value
 
 
 def _leaf(value: Any) -> Any:

@@ -203,8 +203,9 @@ def _draw_parameters(env: Environment, key: Key) -> Parameters:
     """Numbers for one episode, from a key of their own so that platforms start alike with and without them."""
     if not env.randomize:
         return {}
-    drawn = uniform(jax.random.fold_in(key, len(env.platforms)), *env.randomize.values())
-    return dict(zip(env.randomize, drawn, strict=True))
+    paths = sorted(env.randomize)  # which number a path gets must not depend on the order in which they were written
+    drawn = uniform(jax.random.fold_in(key, len(env.platforms)), *(env.randomize[path] for path in paths))
+    return dict(zip(paths, drawn, strict=True))
 
 
 def _chosen_parameters(env: Environment, parameters: Mapping[str, Any]) -> Parameters:

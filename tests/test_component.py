@@ -13,6 +13,7 @@ import pytest
 from jaxsafe.component import ANY, Component, Range, Unit, choices, fields, normalise
 from jaxsafe.config.convert import expects, to_value
 from jaxsafe.errors import ConfigError
+from jaxsafe.processors.reward import Failure
 from jaxsafe.types import Length, Positive, StatusName
 
 Size = Annotated[Any, Unit("m"), Positive]
@@ -317,3 +318,8 @@ def test_a_type_name_is_not_inherited(kind: type[Component]) -> None:
 
     assert Below.type_name is None
     assert choices(kind) == {"taken": Below.__mro__[1]}
+
+
+def test_mappings_are_sorted_by_name_when_a_component_is_built() -> None:
+    failure = Failure(name="failure", values={"timeout": -1.0, "crash": -2.0, "distance": -3.0})
+    assert list(normalise(failure).values) == ["crash", "distance", "timeout"]

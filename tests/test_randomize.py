@@ -283,3 +283,32 @@ def test_leads_turn_differently() -> None:
     assert turned.min() < -0.005
     assert turned.max() > 0.005
     assert len(np.unique(turned)) > 28
+
+
+def test_equal_environments_start_alike_whatever_order_their_numbers_were_written_in() -> None:
+    intervals = {"deputy.mean_motion": [0.001, 0.002], "deputy.mass": [10, 14], "dt": [0.5, 2.0]}
+    backwards = dict(reversed(intervals.items()))
+    first, second = (jaxsafe.make("docking2d", randomize=one) for one in (intervals, backwards))
+    assert first == second
+    assert dump(first) == dump(second)
+    bare = first.replace(randomize=dict(reversed(first.randomize.items())))  # as no check has seen it
+    expected = reset(first, keys()[0])[0].parameters
+    for env in (first, second, bare):
+        chex.assert_trees_all_equal(jaxsafe.reset(env, keys()[0])[0].parameters, expected)
+        chex.assert_trees_all_equal(reset(env, keys()[0])[0].parameters, expected)
+
+
+def test_a_number_of_the_filter_may_be_random() -> None:
+    env = jaxsafe.make("docking2d", rta="default", randomize={"rta.margin": [2e-4, 1e-3], "deputy.mass": [10, 14]})
+    margins = np.asarray(reset_many(env, keys())[0].parameters["rta.margin"])
+    assert len(np.unique(margins)) == 64
+    assert margins.min() >= 2e-4
+    assert margins.max() <= 1e-3
+    assert load(dump(env)) == env
+    with pytest.raises(ConfigError, match=r"^randomize: rta\.margin: rta has no fields because it is not set$"):
+        jaxsafe.make("docking2d", randomize={"rta.margin": [2e-4, 1e-3]})
+
+
+def test_two_paths_of_one_number_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"^randomize: platforms\.deputy\.mass and deputy\.mass are the same number"):
+        jaxsafe.make("docking2d", randomize={"deputy.mass": [1, 2], "platforms.deputy.mass": [3, 4]})

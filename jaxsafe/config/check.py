@@ -191,6 +191,7 @@ def _check_randomized(env: Environment) -> None:
             raise ConfigError(f"{place}: expected the path of one number, found that of {expects(field)}")
         return to_value(value, field, place)
 
+    leaves: dict[int, str] = {}
     for path, interval in env.randomize.items():
         if path.split(".")[0] == "randomize":
             raise ConfigError(f"randomize.{path}: expected the path of a number outside `randomize`")
@@ -207,6 +208,11 @@ def _check_randomized(env: Environment) -> None:
                 _check_problems(changed)
             except ConfigError as error:
                 raise ConfigError(f"randomize: {error}") from None
+        mark = object()
+        index = next(i for i, leaf in enumerate(jax.tree.leaves(set_path(env, path, mark))) if leaf is mark)
+        if index in leaves:
+            raise ConfigError(f"randomize: {path} and {leaves[index]} are the same number; leave one out")
+        leaves[index] = path
 
 
 def _shapes(env: Environment) -> tuple[Any, tuple]:
@@ -289,7 +295,13 @@ def _check_suited(env: Environment) -> None:
 
 def _faults(env: Environment, key: jax.Array) -> Mapping[str, jax.Array]:
     assert env.rta is not None
-    return env.rta.unsuited(env, reset(env.replace(rta=None), key)[0].sim)
+    start, _ = reset(env.replace(rta=None, randomize=_without_filter(env.randomize)), key)
+    return env.rta.unsuited(env, start.sim)
+
+
+def _without_filter(paths: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is random outside the filter."""
+    return {path: interval for path, interval in paths.items() if not path.startswith("rta.")}
 
 
 _faults_of_starts = jax.jit(jax.vmap(_faults, in_axes=(None, 0)))

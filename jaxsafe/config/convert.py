@@ -126,7 +126,8 @@ def _mapping(value: Any, item: Any, field: Field, place: str) -> dict[str, Any]:
     if not isinstance(value, Mapping):
         raise ConfigError(f"{place}: expected a mapping of names to values, found {_show(value)}")
     entry = field_of("", item)
-    return {str(key): to_value(content, entry, join(place, str(key))) for key, content in value.items()}
+    found = {str(key): to_value(content, entry, join(place, str(key))) for key, content in value.items()}
+    return {key: found[key] for key in sorted(found)}  # see `normalise`
 
 
 def _number(value: Any, field: Field, place: str) -> jax.Array:
