@@ -898,3 +898,27 @@ def test_a_value_is_shown_by_its_first_letters_however_large_it_is() -> None:
     assert show(10**5000) == "a number of thousands of digits"
     for value in ([], (), {}, (1,), (1, [2.5, "x"]), {"a": {"b": None}}, "it's", 10**50, -1.5, True, {1}, "x" * 55):
         assert show(value) == repr(value)
+
+
+@pytest.mark.parametrize(
+    ("task", "region", "fitting"),
+    [
+        ("docking3d", {"type": "circle", "radius": 1}, "3 dimensions; choose from cylinder, sphere$"),
+        ("rejoin3d", {"type": "circle", "radius": 1}, "3 dimensions; choose from cylinder, sphere$"),
+        ("docking2d", {"type": "cylinder", "radius": 1, "height": 1}, "2 dimensions; choose from circle, sphere$"),
+        ("docking2d", {"type": "sphere", "radius": 1}, None),
+        ("docking3d", {"type": "cylinder", "radius": 1, "height": 1}, None),
+    ],
+)
+def test_a_region_is_refused_in_a_space_where_its_name_says_something_else(
+    task: str, region: dict[str, Any], fitting: str | None
+) -> None:
+    env = jaxsafe.make(task)
+    regions = [{"name": env.regions[0].name, "on": env.regions[0].on, **region}]
+    if fitting is None:
+        jaxsafe.override(env, {"regions": regions})
+    else:
+        message = fault(lambda: jaxsafe.override(env, {"regions": regions}))
+        assert re.search(
+            rf"^regions\.{env.regions[0].name}: a {region['type']} is no part of a space of {fitting}", message
+        )

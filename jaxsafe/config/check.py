@@ -12,13 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxsafe.component import ANY, Component, Refers, fields
+from jaxsafe.component import ANY, Component, Refers, choices, fields
 from jaxsafe.config.convert import expects, to_value
 from jaxsafe.environment import Environment, reset, step
 from jaxsafe.errors import ConfigError, nearest, show
 from jaxsafe.paths import join, set_path
 from jaxsafe.processors.observation import Observe, ObserveAngle
 from jaxsafe.rta.prediction import judge
+from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.types import Sim
 
@@ -144,6 +145,13 @@ def _check_space(env: Environment) -> None:
                     f" choose from {nearest(item.what, known[platform])}"
                 )
     for region in env.regions:
+        space = env.agent_platform.dimension
+        if space in (2, 3) and space not in region.dimensions:
+            fitting = [name for name, kind in choices(Region).items() if space in kind.dimensions]
+            raise ConfigError(
+                f"regions.{region.name}: a {region.type_name} is no part of a space of {space} dimensions;"
+                f" choose from {nearest('', sorted(fitting))}"
+            )
         for status in env.status:
             if getattr(status, "region", None) == region.name and getattr(status, "of", None) == region.on:
                 raise ConfigError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -107,6 +107,8 @@ class Displacement(Offset, type="displacement"):
 class Region(Component):
     """A part of space attached to a platform; a pure function of the platforms, recomputed at every step."""
 
+    dimensions: ClassVar[tuple[int, ...]] = (2, 3)
+    """The dimensions of space in which it means what its name says."""
     name: str
     on: PlatformName
     offset: Offset | None = None  # None: centred on the platform
@@ -139,10 +141,13 @@ class Sphere(Region, type="sphere"):
 class Circle(Sphere, type="circle"):
     """All points of the plane within `radius` of the centre: ‖r − c‖ ≤ ρ, Eqs. (7), (13)."""
 
+    dimensions: ClassVar[tuple[int, ...]] = (2,)
+
 
 class Cylinder(Region, type="cylinder"):
     """All points within `radius` of the centre in x and y, and within half the `height` in z, Eq. (10)."""
 
+    dimensions: ClassVar[tuple[int, ...]] = (3,)
     radius: Annotated[Length, Range(0.0)]
     height: Annotated[Length, Range(0.0)]
 
