@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsafe.config import override
 from jaxsafe.environment import Environment, drawn
@@ -34,6 +35,17 @@ def environment(
     if options:
         raise ConfigError(f"{next(iter(options))}: the environment is made already; give it to jaxsafe.make instead")
     return override(task, overrides) if overrides else task
+
+
+def checked_count(name: str, count: Any) -> int:
+    """Return a number of environments or of steps.
+
+    Raises:
+        ConfigError: it is no whole number, or below 1.
+    """
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+        raise ConfigError(f"{name}: expected a whole number ≥ 1, found {count!r}")
+    return int(count)
 
 
 def observation_bounds(env: Environment) -> tuple[list[float], list[float]]:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxsafe.adapters import action_bounds, environment
+from jaxsafe.adapters import action_bounds, checked_count, environment
 from jaxsafe.environment import Environment, reset, step
 from jaxsafe.errors import ConfigError, missing
 from jaxsafe.renewal import choose
@@ -87,6 +87,29 @@ class BraxEnv(Env):
         return {"cost": timestep.cost, "success": _number(timestep.info.outcome == self.env.success), **terms}
 
 
+class Repeat(Wrapper):
+    """Takes each action for several steps of the task, at most until the episode ends.
+
+    Rewards and metrics are summed over the steps taken. Brax's own repetition goes on after the end and adds to the
+    rewards what is paid there, and it has the metrics of the last step only.
+    """
+
+    def __init__(self, env: Env, action_repeat: int) -> None:
+        super().__init__(env)
+        self.action_repeat = action_repeat
+
+    def step(self, state: State, action: Array) -> State:
+        def again(taken: State, _: None) -> tuple[State, None]:
+            following = self.env.step(taken, action)
+            summed = following.replace(
+                reward=taken.reward + following.reward,
+                metrics=jax.tree.map(jnp.add, taken.metrics, following.metrics),
+            )
+            return choose(taken.done.astype(bool), taken, summed), None
+
+        return jax.lax.scan(again, self.env.step(state, action), length=self.action_repeat - 1)[0]
+
+
 class FreshStarts(Wrapper):
     """Starts each episode anew. Brax's own AutoResetWrapper begins every episode of a lane where its first began."""
 
@@ -115,11 +138,13 @@ def wrap(env: Env, episode_length: int = 1000, action_repeat: int = 1, randomiza
     """What to give Brax's trainers as `wrap_env_fn`: many episodes side by side, each with a fresh start.
 
     Raises:
-        ConfigError: with a `randomization_fn`, which is for Brax's own physics.
+        ConfigError: with a `randomization_fn`, which is for Brax's own physics, or an `action_repeat` below 1.
     """
     if randomization_fn is not None:
         raise ConfigError("randomization_fn: give BraxEnv randomize={path: [low, high]} instead")
-    return FreshStarts(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
+    checked_count("action_repeat", action_repeat)
+    episodes = EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat=1)
+    return FreshStarts(Repeat(episodes, action_repeat) if action_repeat > 1 else episodes)
 
 
 def mend_brax() -> None:

@@ -20,7 +20,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from jaxsafe.adapters import environment
+from jaxsafe.adapters import checked_count, environment
 from jaxsafe.adapters.conversion import facts, masked, spaces
 from jaxsafe.adapters.lanes import Episodes, Lanes
 from jaxsafe.environment import Environment, reset_to
@@ -139,7 +139,7 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ConfigError: as `jaxsafe.make`.
         """
         self.env = environment(task, overrides, options)
-        self.num_envs = _checked_count("num_envs", num_envs)
+        self.num_envs = checked_count("num_envs", num_envs)
         self.render_mode = _checked_render_mode(render_mode)
         self.autoreset_mode = _checked_mode(autoreset_mode)
         self.metadata = {**GymEnv.metadata, "autoreset_mode": self.autoreset_mode}
@@ -301,11 +301,5 @@ def _checked_render_mode(render_mode: str | None) -> str | None:
     return render_mode
 
 
-def _checked_count(name: str, count: Any) -> int:
-    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-        raise ConfigError(f"{name}: expected a whole number ≥ 1, found {count!r}")
-    return int(count)
-
-
 def _checked_limit(max_episode_steps: int | None) -> float:
-    return np.inf if max_episode_steps is None else float(_checked_count("max_episode_steps", max_episode_steps))
+    return np.inf if max_episode_steps is None else float(checked_count("max_episode_steps", max_episode_steps))
