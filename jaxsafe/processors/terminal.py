@@ -7,6 +7,7 @@ from typing import Literal
 from jaxtyping import Array, Bool
 
 from jaxsafe.component import Component
+from jaxsafe.simulation.clock import later, reached
 from jaxsafe.types import FlagName, Length, Seconds, Sim, StatusName
 
 Ends = Literal["terminated", "truncated"]
@@ -84,7 +85,7 @@ class Held(Terminal, type="held"):
 
     def reached(self, sim: Sim) -> Bool[Array, ""]:
         time = sim.status[self.time]
-        return time >= self.duration if self.inclusive else time > self.duration
+        return reached(time, self.duration) if self.inclusive else later(time, self.duration)
 
 
 class Holds(Terminal, type="holds"):
@@ -102,4 +103,4 @@ class Timeout(Terminal, type="timeout"):
     limit: Seconds
 
     def reached(self, sim: Sim) -> Bool[Array, ""]:
-        return sim.time > self.limit
+        return later(sim.time, self.limit)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsafe.component import Component, Unit
+from jaxsafe.simulation.clock import reached
 from jaxsafe.simulation.controllers import Bound, Controller, Controls
 from jaxsafe.simulation.trig import sin_cos
 from jaxsafe.types import Number, Radians, Seconds, Sim
@@ -61,7 +62,7 @@ class Schedule(Command, type="schedule"):
 
     def value(self, sim: Sim) -> Float[Array, ""]:
         steps = jnp.diff(self.values, prepend=0.0)
-        return jnp.sum(jnp.where(sim.time >= self.times, steps, 0.0))
+        return jnp.sum(jnp.where(reached(sim.time, self.times), steps, 0.0))
 
 
 class Sinusoid(Command, type="sinusoid"):
