@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxsafe.component import Component, Unit
 from jaxsafe.errors import ConfigError, nearest, part, show
@@ -31,6 +31,12 @@ from jaxsafe.simulation.platform import Platform, placed
 from jaxsafe.types import Info, Key, Memory, Number, ParameterPath, PlatformName, RTAInfo, Seconds, Sim, State, TimeStep
 
 Parameters = Mapping[str, Float[Array, ""]]
+
+SUCCESS = "success"
+"""The outcome that success rates count."""
+
+DIVERGED = "diverged"
+"""The outcome of an episode whose state is not finite. It comes last in `Environment.outcomes`."""
 
 
 class Environment(Component):
@@ -74,14 +80,14 @@ class Environment(Component):
 
     @property
     def outcomes(self) -> tuple[str, ...]:
-        """What `info.outcome` indexes: `running`, the terminal conditions, the reward bounds, in their listed order."""
+        """What `info.outcome` indexes: `running`, terminal conditions and reward bounds in their order, and `diverged`."""
         bounds = [term.bound.outcome for term in self.reward if term.bound]
-        return ("running", *(condition.name for condition in self.terminal), *bounds)
+        return ("running", *(condition.name for condition in self.terminal), *bounds, DIVERGED)
 
     @property
     def success(self) -> int:
         """The index of the outcome `success`; −1, which nothing ends with, where the task has none."""
-        return self.outcomes.index("success") if "success" in self.outcomes else -1
+        return self.outcomes.index(SUCCESS) if SUCCESS in self.outcomes else -1
 
     @property
     def action_names(self) -> tuple[str, ...]:
@@ -118,7 +124,7 @@ class Environment(Component):
     @property
     def _ends(self) -> dict[str, str]:
         bounds = {term.bound.outcome: term.bound.ends for term in self.reward if term.bound}
-        return {condition.name: condition.ends for condition in self.terminal} | bounds
+        return {condition.name: condition.ends for condition in self.terminal} | bounds | {DIVERGED: "terminated"}
 
 
 def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:
@@ -283,14 +289,25 @@ def _statuses(env: Environment, sim: Sim, memory: Mapping[str, Any] | None) -> t
 
 
 def _terminal(env: Environment, sim: Sim) -> Sim:
-    """The first condition that holds ends the episode; those that stand apart end it beside the others."""
-    ended, over = {}, jnp.zeros((), bool)
+    """The first condition that holds ends the episode; those that stand apart end it beside the others.
+
+    A state that is not finite ends it before all of them: no comparison with such numbers means anything.
+    """
+    diverged = _diverged(sim)
+    ended, over = {DIVERGED: diverged}, diverged
     for condition in env.terminal:
         with part("terminal", condition.name):
             reached = condition.reached(sim)
-            ended[condition.name] = reached if condition.apart else reached & ~over
+            ended[condition.name] = reached & ~(diverged if condition.apart else over)
             over = over if condition.apart else over | reached
     return sim.replace(ended={**sim.ended, **ended})
+
+
+def _diverged(sim: Sim) -> Bool[Array, ""]:
+    """Whether a number of a platform is not finite, or a status is not a number."""
+    numbers = [leaf for leaf in jax.tree.leaves(sim.platforms) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    statuses = [leaf for leaf in sim.status.values() if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return _any(jnp.any(~jnp.isfinite(number)) for number in numbers) | _any(jnp.isnan(status) for status in statuses)
 
 
 def _rewards(env: Environment, sim: Sim, state: State) -> tuple[Sim, dict, dict, dict]:
@@ -338,12 +355,14 @@ def _info(
     for constraint in env.constraints:
         with part("constraints", constraint.name):
             margins[constraint.name] = margin = constraint.margin(sim)
-            severity[constraint.name] = jnp.maximum(-margin, 0.0) / constraint.limit(sim)
+            excess = jnp.maximum(-margin, 0.0) / constraint.limit(sim)
+            known = jnp.where(jnp.isfinite(excess), excess, 1.0)  # a margin that is not a number lacks the whole limit
+            severity[constraint.name] = jnp.where(margin >= 0.0, 0.0, known)
     return Info(outcome, sim.status, terms, totals, desired, actual, sim.intervening, margins, severity, assurance)
 
 
 def _time_step(env: Environment, sim: Sim, observation: Array, reward: Array, info: Info) -> TimeStep:
-    violated = _any(margin < 0.0 for margin in info.margins.values())
+    violated = sim.ended[DIVERGED] | _any(~(margin >= 0.0) for margin in info.margins.values())
     kinds = ("terminated", "truncated")
     terminated, truncated = (_any(sim.ended[name] for name, how in env._ends.items() if how == kind) for kind in kinds)
     return TimeStep(observation, reward, violated.astype(observation.dtype), terminated, truncated, info)

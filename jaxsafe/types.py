@@ -131,7 +131,7 @@ class Info(Record):
     control_actual: Float[Array, " actuators"]  # what the plant received, after run time assurance
     intervening: Bool[Array, ""]  # whether run time assurance changed the control
     margins: Mapping[str, Float[Array, ""]]  # signed h(x) of every safety constraint, safe where ≥ 0
-    severity: Mapping[str, Float[Array, ""]]  # max(0, −h) as a share of the constraint's limit at this step
+    severity: Mapping[str, Float[Array, ""]]  # max(0, −h) as a share of the constraint's limit; 1 where h is not a number
     rta: RTAInfo | None  # None without run time assurance
 
 
@@ -140,7 +140,7 @@ class TimeStep(Record):
 
     observation: Float[Array, " observation"]
     reward: Float[Array, ""]
-    cost: Float[Array, ""]  # 1 on a step that violates a safety constraint, else 0
+    cost: Float[Array, ""]  # 1 on a step that violates a safety constraint or ends with `diverged`, else 0
     terminated: Bool[Array, ""]  # the task ended: no value beyond this state
     truncated: Bool[Array, ""]  # cut short: the value of `observation` still counts
     info: Info

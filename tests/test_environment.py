@@ -8,13 +8,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array, Float
 
 import jaxsafe
 from jaxsafe import ConfigError, Environment
-from jaxsafe.types import State, TimeStep
+from jaxsafe.processors.status import Status
+from jaxsafe.types import Sim, State, StatusName, TimeStep
 
 START = {"deputy": {"position": [100.0, 50.0], "velocity": [0.1, -0.2]}}
-OUTCOMES = ("running", "success", "crash", "distance", "timeout", "velocity")
+OUTCOMES = ("running", "success", "crash", "distance", "timeout", "velocity", "diverged")
 
 reset = jax.jit(jaxsafe.reset)
 step = jax.jit(jaxsafe.step)
@@ -194,7 +196,7 @@ def test_a_variant_orders_its_actions_and_outcomes(task: str, variant: Any, acti
     env = jaxsafe.make(task, variant=variant)
     assert env.action_names == tuple(actions.split())
     assert env.observation_size == size
-    assert env.outcomes == ("running", *outcomes.split())
+    assert env.outcomes == ("running", *outcomes.split(), "diverged")
     points = 11 if "docking" in task else 5
     assert jaxsafe.make(task, variant=variant, actions="discrete").num_action_points == (points,) * env.action_size
 
@@ -227,7 +229,7 @@ def test_the_first_condition_that_holds_hides_those_after_it() -> None:
     assert ends(env, [5.0, 0.0])[:2] == (["distance"], "distance")
     names = ["timeout", "distance", "success", "crash"]
     swapped = jaxsafe.make("docking2d", numbers | {"terminal": names})
-    assert swapped.outcomes == ("running", *names, "velocity")
+    assert swapped.outcomes == ("running", *names, "velocity", "diverged")
     assert ends(swapped, [0.3, 0.0])[:2] == (["timeout"], "timeout")
 
 
@@ -267,7 +269,7 @@ def test_a_released_docking_that_crashes_too_late_is_a_timeout() -> None:
 def test_any_reward_term_may_carry_a_bound(how: str) -> None:
     bound = {"below": -0.05, "outcome": "thirst", "ends": how}
     env = jaxsafe.make("docking2d", {"reward.delta_v.bound": bound, "reward.delta_v.scale": -0.3})
-    assert env.outcomes == (*OUTCOMES, "thirst")
+    assert env.outcomes == (*OUTCOMES[:-1], "thirst", "diverged")
     state, _ = jaxsafe.reset_to(env, START)
     over, kind = [], []
     for _ in range(4):  # each pays 0.3 √2/12 = 0.0354
@@ -293,3 +295,21 @@ def test_reset_to_takes_arrays_inside_a_compiled_function() -> None:
     position, velocity = jnp.array([100.0, 0.0]), jnp.array([0.0, 0.1])
     state = jax.jit(lambda env: jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})[0])(env)
     assert (state.sim.platforms["deputy"].position == position).all()
+
+
+class Broken(Status, type="broken_for_this_test"):
+    """A number that does not exist near the chief."""
+
+    distance: StatusName
+
+    def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
+        return jnp.log(sim.status[self.distance] - 50.0)
+
+
+def test_a_status_that_is_not_a_number_ends_the_episode() -> None:
+    plain = jaxsafe.make("docking2d")
+    status = (*plain.status, Broken(name="broken", distance="docking_distance"))
+    env = jaxsafe.override(plain, {"status": status})
+    for distance, expected in ((100.0, ([], "running", 0.0)), (10.0, (["diverged"], "diverged", 1.0))):
+        ended, outcome, timestep = ends(env, [distance, 0.0])
+        assert (ended, outcome, float(timestep.cost)) == expected

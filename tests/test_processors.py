@@ -33,7 +33,7 @@ from jaxsafe.simulation.oriented import OrientedState
 from jaxsafe.types import Sim, State, TimeStep
 
 N = 0.001027
-OUTCOMES = ("success", "crash", "distance", "timeout", "velocity")
+OUTCOMES = ("success", "crash", "distance", "timeout", "velocity", "diverged")
 SPEEDS = {"speed": "speed", "velocity_limit": "velocity_limit"}
 REST = jnp.zeros(2)
 

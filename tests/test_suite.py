@@ -11,7 +11,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import jaxsafe
-from jaxsafe import Environment
+from jaxsafe import Environment, metrics
 from jaxsafe.config import dump, load
 from jaxsafe.envs import TASKS
 from jaxsafe.types import State, TimeStep
@@ -423,7 +423,7 @@ def test_at_most_one_outcome_ends_an_episode(env: Environment, task: str) -> Non
     if task in REJOIN:
         together = jaxsafe.override(together, {"terminal.crash.limit": 1000.0})
     state, _ = jaxsafe.reset_to(together, inside(env, task), dict.fromkeys(env.randomize, 12.0))
-    names = env.outcomes[1:-1] if "velocity" in env.outcomes else env.outcomes[1:]
+    names = [name for name in env.outcomes[1:] if name not in ("velocity", "diverged")]
     for expected in [name for name in names if name not in ("crash", "keep_out") or task in REJOIN]:
         stepped, timestep = step(together, state, action(env, 0.0))
         assert [name for name, ended in stepped.sim.ended.items() if ended] == [expected]
@@ -646,3 +646,42 @@ def test_derivatives_are_finite_at_the_edges(task: str) -> None:
     assert len(found) > 30
     assert any(leaf.any() for leaf in found)
     chex.assert_tree_all_finite(found)
+
+
+# States that are not finite
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf], ids=str)
+def test_an_episode_whose_state_is_not_finite_ends_as_a_violation_and_a_failure(
+    env: Environment, task: str, value: float
+) -> None:
+    state, first = reset(env, jax.random.key(0))
+    for place, leaf in enumerate(jax.tree.leaves(state.sim.platforms[env.agent])):
+        broken = jax.tree.leaves(state.sim.platforms[env.agent])
+        broken[place] = jnp.full_like(leaf, value)
+        own = jax.tree.unflatten(jax.tree.structure(state.sim.platforms[env.agent]), broken)
+        platforms = {**state.sim.platforms, env.agent: own}
+        begun = state.replace(sim=state.sim.replace(platforms=platforms))
+        after, timestep = step(env, begun, action(env, 0.0))
+        numbers = [leaf for leaf in jax.tree.leaves(after.sim.platforms) if leaf.dtype == jnp.float32]
+        if all(np.isfinite(leaf).all() for leaf in numbers):
+            continue  # a field that the step computes anew
+        assert env.outcomes[int(timestep.info.outcome)] == "diverged"
+        assert [name for name, ended in after.sim.ended.items() if ended] == ["diverged"]
+        assert timestep.terminated
+        assert timestep.cost == 1.0
+        assert all(0.0 <= float(severity) <= 1.0 for severity in timestep.info.severity.values())
+        assert timestep.info.outcome != env.success
+        sums = metrics.accumulate(metrics.begin(first), timestep)
+        found = metrics.summarise(jax.tree.map(lambda leaf: leaf[None], sums), env.success)
+        assert found["success_rate"] == 0.0
+        assert found["safety_violation_rate"] == found["episode_safety_violation_rate"] == 1.0
+
+
+def test_an_action_that_is_not_a_number_ends_the_episode(env: Environment) -> None:
+    if env.num_action_points:
+        return
+    state, _ = reset(env, jax.random.key(0))
+    _, timestep = step(env, state, action(env, np.nan))
+    assert env.outcomes[int(timestep.info.outcome)] == "diverged"
+    assert (timestep.cost, bool(timestep.terminated)) == (1.0, True)
