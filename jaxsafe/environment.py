@@ -127,6 +127,19 @@ class Environment(Component):
         return {condition.name: condition.ends for condition in self.terminal} | bounds | {DIVERGED: "terminated"}
 
 
+def require_success(env: Environment) -> None:
+    """Refuse an environment in which nothing would count as a success.
+
+    Raises:
+        ConfigError: no outcome is called `success`.
+    """
+    if env.success < 0:
+        found = ", ".join(env.outcomes[1:-1])
+        raise ConfigError(
+            f"terminal: no outcome is called {SUCCESS!r}, so nothing would count as one; call the goal so, among {found}"
+        )
+
+
 def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:
     """Draw a random start of an episode.
 

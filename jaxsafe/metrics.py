@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxsafe.environment import Environment
 from jaxsafe.types import Record, TimeStep
 
 METRICS = (
@@ -33,6 +34,15 @@ METRICS = (
     "intervention_rate",
 )
 """The names that `summarise` returns."""
+
+SAFETY_METRICS = (
+    "safety_violation_rate",
+    "episode_safety_violation_rate",
+    "episode_cost",
+    "episode_violation_severity_mean",
+    "episode_violation_severity_max",
+)
+"""The metrics that only an environment with safety constraints has."""
 
 ENOUGH_EPISODES = 20
 """Training episodes that a seed must have finished before its success rate counts for interaction efficiency."""
@@ -81,35 +91,63 @@ def accumulate(episode: Episode, timestep: TimeStep) -> Episode:
     )
 
 
-def summarise(episodes: Episode, success: int, has_delta_v: bool = True, has_rta: bool = False) -> dict[str, float | None]:
-    """The metrics over a set of finished episodes.
+def measures(env: Environment) -> dict[str, bool]:
+    """Return what an environment measures, as `summarise` asks for it."""
+    statuses = {status.name for status in env.status}
+    return {
+        "has_delta_v": "delta_v" in statuses,
+        "has_delta_v_l1": "delta_v_l1" in statuses,
+        "has_constraints": bool(env.constraints),
+        "has_rta": env.rta is not None,
+    }
+
+
+def summarise(
+    episodes: Episode,
+    success: int,
+    has_delta_v: bool = True,
+    has_rta: bool = False,
+    has_delta_v_l1: bool | None = None,
+    has_constraints: bool = True,
+) -> dict[str, float | None]:
+    """The metrics over a set of finished episodes. What the environment does not measure is None, never 0.
 
     Args:
         episodes: sums of the episodes, each field of shape (episodes,).
-        success: index of the outcome that counts as success.
-        has_delta_v: whether control usage means anything in this task; if not it is None.
-        has_rta: whether there was run time assurance; if not its share of steps is None.
+        success: index of the outcome that counts as success; below 0 there is none.
+        has_delta_v: whether the environment has the status `delta_v`, from which control usage comes.
+        has_rta: whether there was run time assurance, whose interventions are counted.
+        has_delta_v_l1: whether the environment has the status `delta_v_l1`; None is as `has_delta_v`.
+        has_constraints: whether the environment has safety constraints, whose violations are counted.
 
     Returns:
         Every name of `METRICS`: rates as fractions in [0, 1], Δv in m/s, length in steps, severity as a share of the limit
-        (mean over violating steps, 0 if there is none).
+        (mean over violating steps, 0 if there is none). A figure that is not finite is None too.
     """
     mean = {name: float(np.mean(value)) for name, value in vars(episodes).items() if name != "reward_totals"}
     violating, steps = mean["violating_steps"], mean["length"]
-    return {
+    found = {
         "average_return": mean["episode_return"],
         "episode_length": steps,
         "success_rate": float(np.mean(np.asarray(episodes.outcome) == success)),
-        "control_usage": mean["delta_v"] if has_delta_v else None,
-        "control_usage_l1": mean["delta_v_l1"] if has_delta_v else None,
+        "control_usage": mean["delta_v"],
+        "control_usage_l1": mean["delta_v_l1"],
         "safety_violation_rate": float(np.mean(np.asarray(episodes.violating_steps) > 0)),
         "episode_safety_violation_rate": violating / max(steps, 1e-9),
         "episode_cost": violating,
         "episode_violation_severity_mean": mean["severity_sum"] / violating if violating else 0.0,
         "episode_violation_severity_max": float(np.max(episodes.severity_max)),
         "mean_reward": mean["episode_return"] / max(steps, 1e-9),
-        "intervention_rate": mean["interventions"] / max(steps, 1e-9) if has_rta else None,
+        "intervention_rate": mean["interventions"] / max(steps, 1e-9),
     }
+    measured = {
+        "success_rate": success >= 0,
+        "control_usage": has_delta_v,
+        "control_usage_l1": has_delta_v if has_delta_v_l1 is None else has_delta_v_l1,
+        "intervention_rate": has_rta,
+        **dict.fromkeys(SAFETY_METRICS, has_constraints),
+    }
+    return {name: value if measured.get(name, True) and np.isfinite(value) else None for name, value in found.items()}
 
 
 def interaction_efficiency(

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float
 
 import jaxsafe
 from jaxsafe import ConfigError, Environment
+from jaxsafe.environment import require_success
 from jaxsafe.processors.status import Status
 from jaxsafe.types import Sim, State, StatusName, TimeStep
 
@@ -313,3 +314,13 @@ def test_a_status_that_is_not_a_number_ends_the_episode() -> None:
     for distance, expected in ((100.0, ([], "running", 0.0)), (10.0, (["diverged"], "diverged", 1.0))):
         ended, outcome, timestep = ends(env, [distance, 0.0])
         assert (ended, outcome, float(timestep.cost)) == expected
+
+
+def test_success_is_an_outcome_that_training_and_evaluation_ask_for() -> None:
+    plain = jaxsafe.make("docking2d")
+    require_success(plain)
+    goal = plain.terminal[0].replace(name="docked")
+    terms = tuple(term for term in plain.reward if term.name != "success")
+    env = jaxsafe.override(plain, {"terminal": (goal, *plain.terminal[1:]), "reward": terms})
+    with pytest.raises(ConfigError, match=r"no outcome is called 'success'.*docked, crash, distance, timeout, velocity"):
+        require_success(env)

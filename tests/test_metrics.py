@@ -1,5 +1,6 @@
 """The metrics of Section 5, over streams of time steps written by hand."""
 
+from pathlib import Path
 from typing import Any
 
 import chex
@@ -19,6 +20,7 @@ from jaxsafe.metrics import (
     begin,
     bootstrap_interval,
     interaction_efficiency,
+    measures,
     over_seeds,
     stratified_iqm,
     summarise,
@@ -147,6 +149,31 @@ def test_control_usage_is_none_where_there_is_no_delta_v(episodes: Episode) -> N
     assert found["intervention_rate"] is None
     assert found["control_usage"] is None
     assert found["control_usage_l1"] is None
+
+
+def test_what_an_environment_does_not_measure_is_none(episodes: Episode) -> None:
+    found = summarise(episodes, -1, has_delta_v=True, has_delta_v_l1=False, has_constraints=False)
+    known = {"average_return", "episode_length", "control_usage", "mean_reward"}
+    assert {name for name, value in found.items() if value is not None} == known
+    assert summarise(episodes, SUCCESS, has_delta_v=False, has_delta_v_l1=True)["control_usage_l1"] is not None
+
+
+def test_an_environment_says_what_it_measures() -> None:
+    assert measures(jaxsafe.make("docking2d", rta="default")) == {
+        "has_delta_v": True, "has_delta_v_l1": True, "has_constraints": True, "has_rta": True,
+    }  # fmt: skip
+    custom = jaxsafe.make(str(Path(__file__).parent.parent / "configs" / "custom_env.yaml"))
+    assert measures(custom) | {"has_rta": False} == {
+        "has_delta_v": True, "has_delta_v_l1": False, "has_constraints": True, "has_rta": False,
+    }  # fmt: skip
+    assert not measures(jaxsafe.make("rejoin2d"))["has_delta_v"]
+
+
+def test_a_figure_that_is_not_finite_is_none(episodes: Episode) -> None:
+    broken = episodes.replace(episode_return=episodes.episode_return.at[1].set(jnp.nan))
+    found = summarise(broken, SUCCESS)
+    assert found["average_return"] is found["mean_reward"] is None
+    assert found["success_rate"] == pytest.approx(2.0 / 3)
 
 
 def test_the_metrics_of_a_real_episode_agree_with_its_steps() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 
-from jaxsafe.environment import Environment
+from jaxsafe.environment import Environment, require_success
 from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate.seeds import Evaluator, episode_rows
 from jaxsafe.evaluate.subject import Subject
@@ -34,6 +34,7 @@ def evaluate(
     Raises:
         ConfigError: `out` holds something, or the policies do not fit the environment.
     """
+    require_success(env)
     for what in ("observation_names", "action_names", "num_action_points"):
         found, needed = getattr(env, what), getattr(subject.env, what)
         if found != needed:

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.episodes import longest, record_episodes, run_episodes
-from jaxsafe.metrics import METRICS, Episode, over_seeds, summarise
+from jaxsafe.metrics import METRICS, Episode, measures, over_seeds, summarise
 from jaxsafe.rollout import Policy
 from jaxsafe.train.agent import Params
 from jaxsafe.train.ahead import Ahead
@@ -119,8 +119,17 @@ def batch_keys(seed: int, batches: int) -> Iterator[Key]:
 def episode_rows(env: Environment, episodes: Episode, first_seed: int, **common: Any) -> list[dict[str, Any]]:
     """A row for each episode of each seed, for `eval.jsonl`."""
     success = env.success
-    names = ("episode_return", "length", "delta_v", "delta_v_l1", "violating_steps", "severity_max", "interventions")
+    measured = measures(env)
+    needs = {
+        "delta_v": "has_delta_v",
+        "delta_v_l1": "has_delta_v_l1",
+        "violating_steps": "has_constraints",
+        "severity_max": "has_constraints",
+        "interventions": "has_rta",
+    }
+    names = ("episode_return", "length", *needs)
     columns = {name: np.asarray(getattr(episodes, name)).tolist() for name in names}
+    unmeasured = {name for name, what in needs.items() if not measured[what]}
     outcomes = np.asarray(episodes.outcome)
     return [
         {
@@ -129,7 +138,10 @@ def episode_rows(env: Environment, episodes: Episode, first_seed: int, **common:
             "episode": index,
             "outcome": env.outcomes[outcomes[seed, index]],
             "success": bool(outcomes[seed, index] == success),
-            **{name.removeprefix("episode_"): _short(column[seed][index]) for name, column in columns.items()},
+            **{
+                name.removeprefix("episode_"): None if name in unmeasured else _short(column[seed][index])
+                for name, column in columns.items()
+            },
         }
         for seed in range(outcomes.shape[0])
         for index in range(outcomes.shape[1])
@@ -143,9 +155,9 @@ def metrics_over_seeds(env: Environment, episodes: Episode) -> dict[str, Any]:
 
 def metrics_per_seed(env: Environment, episodes: Episode) -> dict[str, list[float | None]]:
     """Every metric of Section 5 for each seed, from sums [seeds, episodes]."""
-    has_delta_v, has_rta = any(status.name == "delta_v" for status in env.status), env.rta is not None
+    measured = measures(env)
     seeds = range(np.asarray(episodes.outcome).shape[0])
-    each = [summarise(jax.tree.map(lambda x, i=i: x[i], episodes), env.success, has_delta_v, has_rta) for i in seeds]
+    each = [summarise(jax.tree.map(lambda x, i=i: x[i], episodes), env.success, **measured) for i in seeds]
     return {name: [one[name] for one in each] for name in METRICS}
 
 

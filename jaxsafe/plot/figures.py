@@ -32,7 +32,7 @@ CURVES = (
     ("return", "return", 1.0),
     ("length", "episode length [steps]", 1.0),
     ("delta_v", "Δv per episode [m/s]", 1.0),
-    ("violating_steps", "violating steps of an episode [%]", 100.0),
+    ("violating_share", "violating share of an episode's steps [%]", 100.0),
     ("episode_cost", "violating steps per episode", 1.0),
 )
 ALWAYS = ("success_rate", "return", "length")

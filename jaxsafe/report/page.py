@@ -80,7 +80,7 @@ class Report:
             "The paper's names (Section 5) of what the tables show: violating steps are its episode safety violation rate,"
             " episodes with a violation its safety violation rate, severity its episode violation severity, Δv in the L2"
             " norm its control usage, steps with an intervention its intervention rate. In the tables all steps of all"
-            " episodes count alike; in the curves of training violating steps are the average of the episodes' shares."
+            " episodes count alike; in the curves of training every episode counts alike (`violating_share`)."
             " Every metric under its own name is in the JSON beside each table's curves.",
         ])  # fmt: skip
 
@@ -341,8 +341,8 @@ class Report:
             "## To repeat and to reuse", "",
             "Curves of every seed, a row for each update, averages over the last 100 finished episodes: `step`, environment"
             " steps of the seed; `wall_s`, seconds of the run;"
-            " `success_rate`; `return`; `length` [s]; `delta_v` [m/s], L2; `violating_steps`, a share; `cost`, violating"
-            " steps of the whole training so far; `episodes` finished so far:"
+            " `success_rate`; `return`; `length` [s]; `delta_v` [m/s], L2; `violating_share` of an episode's steps; `cost`,"
+            " violating steps of the whole training so far; `episodes` finished so far:"
             " " + ", ".join(f"[{item.name}](baselines/{item.name}.csv)" for item, _ in self.own) + "; beside each, as"
             " JSON, every result of every seed.",
             "Hyperparameters stand in `configs/`. The commands behind the tables, also one by one:", "", "```",

@@ -14,7 +14,7 @@ from jaxsafe.report.plan import Item
 from jaxsafe.report.run import FILM_FILE, options_of
 from jaxsafe.train.files import finite, read_json, read_rows, write_csv, write_json
 
-CURVES = ("wall_s", "success_rate", "return", "length", "delta_v", "violating_steps", "cost", "episodes")
+CURVES = ("wall_s", "success_rate", "return", "length", "delta_v", "violating_share", "cost", "episodes")
 
 Results = dict[str, Any]
 
@@ -39,7 +39,7 @@ def keep(item: Item, run: Path, files: Path, command: str) -> None:
     if (run / "film" / FILM_FILE).exists():
         _copy(run / "film" / FILM_FILE, files / f"{item.task}.gif")
     rows = read_rows(run / "progress.jsonl")
-    write_csv(files / f"{item.name}.csv", [{name: row[name] for name in ("seed", "step", *CURVES)} for row in rows])
+    write_csv(files / f"{item.name}.csv", [{name: row.get(name) for name in ("seed", "step", *CURVES)} for row in rows])
     evaluations = {name: item.evaluation_directory(run, name) / "results.json" for name in item.evaluations}
     record = {
         "command": command,

@@ -13,7 +13,7 @@ from jaxsafe.cli import Arguments
 from jaxsafe.component import Component, Range, fields, normalise
 from jaxsafe.config import override, yaml
 from jaxsafe.config.convert import expects, to_value
-from jaxsafe.environment import Environment
+from jaxsafe.environment import Environment, require_success
 from jaxsafe.envs import TASKS, make
 from jaxsafe.errors import ConfigError, nearest, show
 from jaxsafe.paths import set_path
@@ -107,6 +107,7 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
     if told == "punished" and not any(isinstance(term, Intervention) for term in env.reward):
         env = env.replace(reward=(*env.reward, normalise(Intervention(name="intervention"))))
     env = override(env, overrides)
+    require_success(env)
     config = normalise(TrainConfig())
     for path, value in {**recipe(task, arguments.options.get("preset")), **arguments.options}.items():
         config = set_path(config, path, value, to_value)

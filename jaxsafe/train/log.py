@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError
+from jaxsafe.metrics import measures
 from jaxsafe.train.files import append_csv, append_rows, keep_rows, write_csv
 
 NEEDS = ("seed", "step", "wall_s", "episodes", "cost", "success_rate", "return", "length")
@@ -76,15 +77,15 @@ def progress_rows(env: Environment, curves: dict[str, np.ndarray], seed: int, ba
 
 
 def columns(env: Environment) -> list[str]:
-    """The measured columns of the progress log, averages over the window, in order."""
+    """The measured columns of the progress log, averages over the window, in order; none for what is not measured."""
+    measured = measures(env)
     first = [
         "success_rate",
         "return",
         "length",
-        "delta_v",
-        "violating_steps",
-        "episode_cost",
-        *(["interventions"] if env.rta else []),
+        *(["delta_v"] if measured["has_delta_v"] else []),
+        *(["violating_share", "episode_cost"] if measured["has_constraints"] else []),
+        *(["intervention_share"] if measured["has_rta"] else []),
     ]
     return [*first, *(f"outcome/{name}" for name in env.outcomes[1:]), *(f"reward/{term.name}" for term in env.reward)]
 

@@ -55,7 +55,11 @@ def latest_cost(window: Window, number: int = 25) -> Array:
 
 
 def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:
-    """Averages over the episodes in the window, by column name of the progress log; 0 while it is empty."""
+    """Averages over the episodes in the window, by column name of the progress log; 0 while it is empty.
+
+    A share is an average of shares: every episode counts alike, however long it is. The rates of `metrics.summarise` are
+    other numbers under other names: there every step counts alike.
+    """
     filled = jnp.arange(SIZE) < window.count
     weight = filled / jnp.maximum(jnp.minimum(window.count, SIZE), 1)
     episodes = window.episodes
@@ -65,9 +69,9 @@ def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:
         "return": jnp.sum(weight * episodes.episode_return),
         "length": jnp.sum(weight * episodes.length),
         "delta_v": jnp.sum(weight * episodes.delta_v),
-        "violating_steps": jnp.sum(weight * episodes.violating_steps / jnp.maximum(episodes.length, 1)),
+        "violating_share": jnp.sum(weight * episodes.violating_steps / jnp.maximum(episodes.length, 1)),
         "episode_cost": jnp.sum(weight * episodes.violating_steps),
-        "interventions": jnp.sum(weight * episodes.interventions / jnp.maximum(episodes.length, 1)),
+        "intervention_share": jnp.sum(weight * episodes.interventions / jnp.maximum(episodes.length, 1)),
         **{f"outcome/{name}": value for name, value in share.items()},
         **{f"reward/{name}": jnp.sum(weight * total) for name, total in episodes.reward_totals.items()},
     }
