@@ -8,7 +8,7 @@ from typing import Any
 project, author = "jaxsafe", "The jaxsafe authors"
 copyright = "The jaxsafe authors, MIT licence"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
-exclude_patterns = ["_site"]
+exclude_patterns = ["_site", "jupyter_execute"]  # what a build makes
 nb_execution_mode = "off"  # pages show what is committed; a test runs the notebook
 myst_heading_anchors = 3
 myst_links_external_new_tab = True
@@ -21,7 +21,7 @@ autodoc_default_options = {"members": True, "member-order": "bysource", "no-valu
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 autodoc_preserve_defaults = True
-autodoc_mock_imports = ["brax", "gymnax", "stable_baselines3"]
+autodoc_mock_imports = ["brax", "gymnax", "onnx", "stable_baselines3"]
 add_module_names = False
 
 
