@@ -1,6 +1,6 @@
 """Brax's own PPO, SAC or APG learns docking2d.
 
-    pip install 'jaxsafe[brax]' && python examples/brax_docking2d.py [ppo | sac | apg]
+    pip install '.[brax]' && python examples/brax_docking2d.py [ppo | sac | apg]
 
 APG differentiates the reward through the spacecraft's dynamics. Brax's settings are a start, not tuned.
 """

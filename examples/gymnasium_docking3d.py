@@ -1,6 +1,6 @@
 """The policy of the package docks in a batch of Gymnasium's environments, with run time assurance or without.
 
-pip install jaxsafe && python examples/gymnasium_docking3d.py [none | default]
+pip install . && python examples/gymnasium_docking3d.py [none | default]
 """
 
 import sys

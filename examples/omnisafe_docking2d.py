@@ -2,7 +2,7 @@
 
 OmniSafe 0.5 asks for Safety-Gymnasium, which is tied to Gymnasium 0.28.1, and for pandas 2.0.3; neither is needed here:
 
-    pip install 'jaxsafe' torch tensorboard wandb moviepy typer seaborn pandas gdown rich xmltodict
+    pip install . torch tensorboard wandb moviepy typer seaborn pandas gdown rich xmltodict
     pip install --no-deps omnisafe
     python examples/omnisafe_docking2d.py
 """

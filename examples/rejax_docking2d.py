@@ -1,6 +1,6 @@
 """rejax's PPO, unmodified, learns docking2d: four seeds in one program.
 
-    pip install 'jaxsafe[gymnax]' rejax && python examples/rejax_docking2d.py
+    pip install '.[gymnax]' rejax && python examples/rejax_docking2d.py
 
 rejax 0.1.3 needs gymnax 0.0.9, and distrax a nightly TensorFlow Probability:
 

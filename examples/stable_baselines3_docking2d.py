@@ -1,6 +1,6 @@
 """Stable-Baselines3's PPO learns docking2d on the compiled batch of environments, on the paper's observation.
 
-    pip install 'jaxsafe[sb3]' && python examples/stable_baselines3_docking2d.py [steps] [seed]
+    pip install '.[sb3]' && python examples/stable_baselines3_docking2d.py [steps] [seed]
 
 Some minutes on two cores; torch needs no GPU.
 """

@@ -59,6 +59,11 @@ def part(*path: str) -> Iterator[None]:
         raise
 
 
+def install(extra: str) -> str:
+    """Say how to install an extra. jaxsafe is on no package index, so that only a clone of it has them."""
+    return f"in a clone of jaxsafe: pip install '.[{extra}]'"
+
+
 class MissingError(ConfigError, ImportError):
     """A package of an extra is not installed."""
 
@@ -67,4 +72,4 @@ def missing(error: ImportError, package: str, extra: str) -> ImportError:
     """What to raise where a package of an extra fails to import; if it is installed but broken, its own error."""
     if (error.name or "").partition(".")[0] != package:
         return error
-    return MissingError(f"{package} is not installed; pip install 'jaxsafe[{extra}]'")
+    return MissingError(f"{package} is not installed; {install(extra)}")

@@ -155,10 +155,20 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_pa
 
 def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:
     blocks = [text for kind, text in BLOCK.findall((ROOT / "README.md").read_text(encoding="utf-8")) if kind == "python"]
-    (tmp_path / "program.py").write_text("\n".join(blocks), encoding="utf-8")
+    shown = "assert safe.info.intervening.mean() > 0.9 and safe.cost.sum() == 0"  # what the filter is there for
+    (tmp_path / "program.py").write_text("\n".join([*blocks, shown]), encoding="utf-8")
     process = run(["program.py"], tmp_path)
     assert process.returncode == 0, process.stderr
     assert process.stdout.count("\n") >= len(blocks)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_commands_are_those_of_any_shell(page: Path) -> None:
+    """In zsh a word with brackets must be quoted, and a comment behind a command is part of it."""
+    commands = [line for line in page.read_text(encoding="utf-8").splitlines() if "python -m jaxsafe" in line]
+    words = [word for line in commands for word in line.split()]
+    assert [word for word in words if re.match(r"[\w.]+=.*[\[*?]", word)] == []
+    assert [line for line in commands if line.startswith("python") and " # " in line] == []
 
 
 @pytest.mark.slow

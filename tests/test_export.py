@@ -1,5 +1,6 @@
 import re
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,9 @@ def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFi
     observations = np.random.default_rng(0).uniform(-1, 1, (7, 6)).astype(np.float32)
     expected = jaxsafe.load_policy("docking2d")(jax.random.key(0), observations)
     np.testing.assert_allclose(loaded.call(observations), expected, atol=1e-6)
+    monkeypatch.setitem(sys.modules, "flatbuffers", None)
+    with pytest.raises(ConfigError, match=r"^flatbuffers is not installed; .* pip install '.\[export\]'$"):
+        main(["run=pretrained/docking2d", "format=stablehlo", "out=other"])
 
 
 @pytest.mark.parametrize(

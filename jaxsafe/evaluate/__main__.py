@@ -67,7 +67,7 @@ def usage() -> str:
         "  rta=none|default|…     run time assurance (default as in training)\n"
         "  deterministic=true|false   one kind only (default both)\n"
         "  render=gif             draw the first episode of the first seed as an animation\n"
-        "  env.PATH=VALUE         change the environment, for instance env.deputy.start.position.distance=[1000,1000]\n"
+        "  env.PATH=VALUE         change the environment, for instance 'env.deputy.start.position.distance=[1000,1000]'\n"
         "  out=DIR                where to write (default: a new directory in RUN/evaluations, or in evaluations/)"
     )
 

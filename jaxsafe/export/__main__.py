@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from jaxsafe import cli
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.errors import ConfigError, missing, nearest
 
 if TYPE_CHECKING:
     from jaxsafe.evaluate.foreign import ForeignPolicy
@@ -63,6 +63,10 @@ def main(argv: Sequence[str]) -> int:
         return _vnnlib(*loops, box, target, about)
     exported = kinds[inputs]()
     if form == "stablehlo":
+        try:
+            import flatbuffers  # noqa: F401  jax.export needs it and does not ask for it
+        except ImportError as error:
+            raise missing(error, "flatbuffers", "export") from None
         target = Path(out or f"{stem}.stablehlo")
         shape = jax.export.symbolic_shape(f"batch, {len(exported.inputs)}")
         made = jax.export.export(jax.jit(exported.function))(jax.ShapeDtypeStruct(shape, jnp.float32))
@@ -155,7 +159,7 @@ def usage() -> str:
         "  seed=N              which policy of a run (default 0)\n"
         "  run=FILE env=TASK   a policy from elsewhere: .onnx, or .npz with kernel_0, bias_0, … (activation=tanh);\n"
         "                      actions=discrete if it gives logits\n"
-        "  format=onnx         a graph of opset 17 with a fixed batch (default); needs jaxsafe[export]\n"
+        "  format=onnx         a graph of opset 17 with a fixed batch (default); needs the extra `export`\n"
         "  format=stablehlo    a jax.export artefact, any batch\n"
         "  format=vnnlib       the closed loop over steps as ONNX, the property that no safety margin is negative from\n"
         "                      any start in the box as VNN-LIB, and the worst start that a search finds\n"

@@ -60,7 +60,7 @@ def usage() -> str:
     """The help text."""
     return (
         "usage: python -m jaxsafe.plot run=RUN [x=steps|wall]\n"
-        "       python -m jaxsafe.plot run=[RUN,RUN,…] [x=steps|wall] [out=comparison.png]\n\n"
+        "       python -m jaxsafe.plot 'run=[RUN,RUN,…]' [x=steps|wall] [out=comparison.png]\n\n"
         "  draws into RUN/figures from RUN's log files; or the curves of several runs of one task, with a table of results"
     )
 

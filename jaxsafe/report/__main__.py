@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -32,7 +33,7 @@ def main(argv: Sequence[str]) -> int:
     rest = rest if "seeds" in arguments.options else [f"seeds={SEEDS}", *rest]
     items = plan(tasks, kinds, rest)
     episodes = [resolve(cli.Arguments.parse(item.words))[0].episodes for item in items]  # errors before anything is done
-    command = " ".join(["python -m jaxsafe.report", *argv])
+    command = f"python -m jaxsafe.report {shlex.join(argv)}".rstrip()
     try:
         for item, count in zip(items, episodes, strict=True):
             run = train(item, runs)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -349,13 +350,13 @@ class Report:
         ]  # fmt: skip
         for item, found in self.own:
             run = Path("runs", item.name)
-            lines.append(f"python -m jaxsafe.train {' '.join(item.words)} out={run}")
+            lines.append(f"python -m jaxsafe.train {shlex.join(item.words)} out={run}")
             count = self.episodes[item.name]
             for name, options in item.evaluations.items():
                 subject = run / "policy" / f"seed_{best_seed(found)}.npz" if name == SHIPPED else run
-                lines.append(f"python -m jaxsafe.evaluate run={subject} episodes={count} {' '.join(options)}")
+                lines.append(f"python -m jaxsafe.evaluate run={subject} episodes={count} {shlex.join(options)}")
                 if name == SHIPPED:
-                    lines.append(f"python -m jaxsafe.evaluate run={subject} {' '.join(FILM)}")
+                    lines.append(f"python -m jaxsafe.evaluate run={subject} {shlex.join(FILM)}")
         return "\n".join([*lines, "```"])
 
 

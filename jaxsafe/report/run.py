@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import signal
 import subprocess
@@ -76,12 +77,12 @@ def _refuse_other(item: Item, run: Path) -> None:
 
 
 def _call(module: str, words: Sequence[str]) -> None:
-    print(f"\n$ python -m {module} {' '.join(words)}", flush=True)
+    print(f"\n$ python -m {module} {shlex.join(words)}", flush=True)
     code = _wait(subprocess.Popen([sys.executable, "-m", module, *words]))
     if code in (INTERRUPTED, -signal.SIGTERM):
         raise KeyboardInterrupt
     if code:
-        raise ConfigError(f"python -m {module} {' '.join(words)}: ended with code {code}")
+        raise ConfigError(f"python -m {module} {shlex.join(words)}: ended with code {code}")
 
 
 def _wait(process: subprocess.Popen) -> int:

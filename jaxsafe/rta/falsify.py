@@ -7,6 +7,7 @@ defeat the filter. Violations are counted at the samples and inside the steps, s
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -72,7 +73,7 @@ def main(argv: Sequence[str]) -> int:
     env = make(task, changes, **options)
     if not env.constraints:
         raise ConfigError(f"env: {task} has no safety constraint")
-    facts: dict[str, Any] = {"command": " ".join(["python -m jaxsafe.rta.falsify", *argv]), "commit": origin.commit()}
+    facts: dict[str, Any] = {"command": f"python -m jaxsafe.rta.falsify {shlex.join(argv)}", "commit": origin.commit()}
     facts |= {"versions": origin.versions(), "env": task, **options, "seed": seed}
     rows = []
     for name in policies if isinstance(policies, list) else [policies]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError
+from jaxsafe.errors import ConfigError, install
 from jaxsafe.metrics import measures
 from jaxsafe.train.files import append_csv, append_rows, keep_rows, write_csv
 
@@ -146,5 +146,8 @@ def tensorboard_writer() -> Any:
     try:
         from tensorboardX import SummaryWriter
     except ImportError:
-        raise ConfigError("tensorboard: needs the extra, pip install 'jaxsafe[tensorboard]'") from None
+        raise ConfigError(f"tensorboard: tensorboardX is not installed; {install('tensorboard')}") from None
+    except Exception as error:  # an old one beside a new protobuf
+        reason = next(iter(str(error).splitlines()), "")
+        raise ConfigError(f"tensorboard: tensorboardX cannot be imported: {type(error).__name__}: {reason}") from None
     return SummaryWriter

@@ -1,4 +1,4 @@
-"""`python -m jaxsafe.tune env=docking2d seeds=4 sweep.ppo.gamma=[0.95,0.97]`: train every setting, rank them in a table."""
+"""`python -m jaxsafe.tune env=docking2d seeds=4 'sweep.ppo.gamma=[0.95,0.97]'`: train every setting and rank them."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def main(argv: Sequence[str]) -> int:
 def usage() -> str:
     """The help text."""
     return (
-        "usage: python -m jaxsafe.tune env=TASK sweep.OPTION=[a,b,…] [key=value …]      or      resume=DIR\n\n"
+        "usage: python -m jaxsafe.tune env=TASK 'sweep.OPTION=[a,b,…]' [key=value …]      or      resume=DIR\n\n"
         "  sweep.OPTION=[a,b]     values of an option of jaxsafe.train, or of env.PATH; several make a grid\n"
         "  sweep.OPTION='log(1e-4,1e-2)' or 'uniform(0.9,1)'   an interval to draw from, with samples=N\n"
         "  samples=N              draw N settings instead of trying all combinations; draw=SEED chooses others\n"
