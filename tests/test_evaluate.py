@@ -10,8 +10,12 @@ from PIL import Image
 
 import jaxsafe
 from jaxsafe.errors import ConfigError
+from jaxsafe.evaluate import episodes as episodes_module
+from jaxsafe.evaluate import seeds as seeds_module
 from jaxsafe.evaluate.__main__ import main
-from jaxsafe.evaluate.episodes import longest, record_episodes, run_episodes
+from jaxsafe.evaluate.episodes import run_episodes
+from jaxsafe.evaluate.seeds import Evaluator, batch_keys
+from jaxsafe.train.seeds import SeedMapper
 
 
 def zero(key: jax.Array, observation: jax.Array) -> jax.Array:
@@ -84,16 +88,53 @@ def test_a_corrupt_checkpoint_is_told_in_one_line(whole: Path, tmp_path: Path, d
     assert "\n" not in str(error.value)
 
 
-def test_recorded_episodes_are_those_that_were_evaluated() -> None:
-    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 30.0})
-    key = jax.random.key(5)
-    episodes = run_episodes(env, zero, key, 6)
-    states, timesteps = record_episodes(env, zero, key, 2, int(longest(env)))
-    for i in range(2):
-        last = int(np.flatnonzero(timesteps.done[:, i])[0])
+@jax.tree_util.register_static
+class Idle:
+    """Never pushes."""
+
+    def policy(self, env: Any, params: Any, deterministic: Any) -> Any:
+        return zero
+
+
+@pytest.mark.parametrize(("timeout", "piece"), [(30.0, 256), (30.0, 7), (1e10, 7)])
+def test_recorded_episodes_are_those_that_were_evaluated(
+    timeout: float, piece: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(seeds_module, "PIECE", piece)
+    ends = {"terminal.timeout.limit": timeout, "terminal.distance.limit": 150.2 if timeout > 30.0 else 40e3}
+    env = jaxsafe.make("docking2d", {**ends, "deputy.start.position.distance": [150.0, 150.0]})
+    monkeypatch.setattr(episodes_module, "MAX_STEPS", 40)
+    episodes = run_episodes(env, zero, next(batch_keys(3, 1)), 10)
+    for i, (states, timesteps) in enumerate(Evaluator(SeedMapper(1), env, Idle()).episodes({}, 3, 3)):
+        last = len(timesteps.reward) - 1
         assert last == int(episodes.length[i])
-        assert float(timesteps.reward[1 : last + 1, i].sum()) == pytest.approx(float(episodes.episode_return[i]), rel=1e-5)
-    np.testing.assert_allclose(states.sim.time[:32, 0], np.arange(32))
+        assert int(timesteps.info.outcome[last]) == int(episodes.outcome[i])
+        assert float(timesteps.reward[1:].sum()) == pytest.approx(float(episodes.episode_return[i]), rel=1e-5)
+        np.testing.assert_allclose(states.sim.time, np.arange(last + 1))
+
+
+def test_a_timeout_that_means_none_leaves_episodes_as_they_are() -> None:
+    ends = {"deputy.start.position.distance": [150.0, 150.0], "terminal.distance.limit": 150.2}
+    run = jax.jit(lambda env: run_episodes(env, zero, jax.random.key(1), 8))
+    usual = run(jaxsafe.make("docking2d", {**ends, "terminal.timeout.limit": 50_000.0}))
+    assert (np.asarray(usual.length) < 50_000).all()
+    for timeout in (1e6, 1e7, 2.0**31, 1e10, 1e38):
+        late = run(jaxsafe.make("docking2d", {**ends, "terminal.timeout.limit": timeout}))
+        np.testing.assert_array_equal(late.length, usual.length)
+        np.testing.assert_array_equal(late.outcome, usual.outcome)
+
+
+def test_an_episode_that_does_not_end_is_given_up_and_that_is_told(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(episodes_module, "MAX_STEPS", 45)
+    words = [f"run={whole / 'policy' / 'seed_0.npz'}", "episodes=2", "env.terminal.timeout.limit=1e10"]
+    assert main([*words, f"out={tmp_path / 'x'}"]) == 0
+    told = "episodes still running after 45 steps, given up and counted as failures: 2 stochastic, 2 deterministic"
+    assert told in capsys.readouterr().out
+    results = json.loads((tmp_path / "x" / "results.json").read_text())
+    assert results["given_up"] == {"after_steps": 45, "stochastic": 2, "deterministic": 2}
+    assert json.loads((tmp_path / "x" / "eval.jsonl").read_text().splitlines()[0])["outcome"] == "running"
 
 
 @pytest.mark.parametrize(
@@ -108,7 +149,7 @@ def test_no_episode_is_cut_before_its_timeout(overrides: dict[str, Any], steps: 
     env = jaxsafe.make("docking2d", overrides)
     episodes = run_episodes(env, zero, jax.random.key(0), 64)
     assert {env.outcomes[outcome] for outcome in np.asarray(episodes.outcome)} == {"timeout"}
-    assert int(episodes.length.max()) <= steps <= int(longest(env))
+    assert int(episodes.length.max()) <= steps
 
 
 def test_a_change_of_the_observation_is_refused(whole: Path) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Int
 
 from jaxsafe.environment import Environment, step
 from jaxsafe.metrics import Episode, accumulate, begin
@@ -12,12 +14,15 @@ from jaxsafe.processors.terminal import Timeout
 from jaxsafe.rollout import Policy, reset_batch
 from jaxsafe.types import Key, State, TimeStep
 
-LONGEST = 10_000
-"""Steps after which an episode without a timeout is given up; its outcome is then `running`."""
+MAX_STEPS_WITHOUT_TIMEOUT = 10_000
+"""In an environment without a timeout, an episode that takes longer is given up; its outcome is then `running`."""
+
+MAX_STEPS = 1_000_000
+"""An episode that takes longer is given up whatever the timeout, which may be so late that it means none."""
 
 
 def run_episodes(env: Environment, policy: Policy, key: Key, num_episodes: int) -> Episode:
-    """Run one episode in each of `num_episodes` environments until all have ended.
+    """Run one episode in each of `num_episodes` environments until all have ended or are given up after `max_steps`.
 
     Starts depend on the key only, so that policies are compared from the same starts.
 
@@ -27,7 +32,7 @@ def run_episodes(env: Environment, policy: Policy, key: Key, num_episodes: int) 
     key_start, key_act = jax.random.split(key)
     state, timestep = reset_batch(env, key_start, num_episodes)
     episode = begin(timestep)
-    limit = longest(env)
+    limit = max_steps(env)
 
     def going(carry: tuple[Array, State, Array, Episode]) -> Array:
         return (carry[0] < limit) & jnp.any(carry[3].outcome == 0)
@@ -44,16 +49,31 @@ def run_episodes(env: Environment, policy: Policy, key: Key, num_episodes: int) 
     return jax.lax.while_loop(going, advance, start)[3]
 
 
-def record_episodes(
-    env: Environment, policy: Policy, key: Key, num_episodes: int, num_steps: int
-) -> tuple[State, TimeStep]:
-    """Every state and time step of the episodes that `run_episodes` runs with the same key, from the start on.
+class Position(NamedTuple):
+    """How far a recording of several episodes has come: what its next steps begin with."""
+
+    num_steps: Int[Array, ""]
+    state: State
+    observation: Array
+
+
+def begin_recording(env: Environment, key: Key, num_episodes: int) -> tuple[Position, tuple[State, TimeStep]]:
+    """Start the episodes that `run_episodes` runs with the same key; states and time steps are [num_episodes]."""
+    key_start, _ = jax.random.split(key)
+    state, timestep = reset_batch(env, key_start, num_episodes)
+    return Position(jnp.zeros((), jnp.int32), state, timestep.observation), (state, timestep)
+
+
+def record_steps(
+    env: Environment, policy: Policy, key: Key, position: Position, num_steps: int
+) -> tuple[Position, tuple[State, TimeStep]]:
+    """Go on with episodes that `begin_recording` began with this key.
 
     Returns:
-        States and time steps, [num_steps + 1, num_episodes]; what follows the end of an episode means nothing.
+        Where they are then, and the states and time steps on the way, [num_steps, num_episodes]; what follows the end of
+        an episode means nothing.
     """
-    key_start, key_act = jax.random.split(key)
-    first = reset_batch(env, key_start, num_episodes)
+    _, key_act = jax.random.split(key)
 
     def advance(carry: tuple[State, Array], t: Array) -> tuple[tuple[State, Array], tuple[State, TimeStep]]:
         state, observation = carry
@@ -61,20 +81,15 @@ def record_episodes(
         state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, state, action)
         return (state, timestep.observation), (state, timestep)
 
-    _, rest = jax.lax.scan(advance, (first[0], first[1].observation), jnp.arange(num_steps))
-    return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), first, rest)
+    times = position.num_steps + jnp.arange(num_steps, dtype=jnp.int32)
+    (state, observation), recorded = jax.lax.scan(advance, (position.state, position.observation), times)
+    return Position(position.num_steps + num_steps, state, observation), recorded
 
 
-SPARE = 2
-"""One more than fit into the limit, and one for the rounding of their quotient."""
+def max_steps(env: Environment) -> int:
+    """Return the number of steps after which an episode that has not ended is given up.
 
-
-def longest(env: Environment) -> Array:
-    """At least as many steps as an episode can take, from its timeouts; `LONGEST` without one."""
-    drawn = {path: (jnp.min(span), jnp.max(span)) for path, span in env.randomize.items()}
-    dt = drawn["dt"][0] if "dt" in drawn else env.dt
-    limits = [
-        drawn.get(f"terminal.{condition.name}.limit", (None, condition.limit))[1] / dt
-        for condition in env.terminal if isinstance(condition, Timeout)
-    ]  # fmt: skip
-    return jnp.asarray(LONGEST) if not limits else jnp.floor(jnp.min(jnp.stack(limits))).astype(jnp.int32) + SPARE
+    It does not follow from the numbers of a timeout: those end episodes themselves, and may be any.
+    """
+    ends = any(isinstance(condition, Timeout) for condition in env.terminal)
+    return MAX_STEPS if ends else MAX_STEPS_WITHOUT_TIMEOUT

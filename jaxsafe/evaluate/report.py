@@ -10,7 +10,7 @@ import jax
 
 from jaxsafe.environment import Environment, require_success
 from jaxsafe.errors import ConfigError
-from jaxsafe.evaluate.seeds import Evaluator, episode_rows
+from jaxsafe.evaluate.seeds import Evaluator, episode_rows, given_up
 from jaxsafe.evaluate.subject import Subject
 from jaxsafe.origin import versions
 from jaxsafe.train import directory
@@ -53,6 +53,7 @@ def evaluate(
         rows = episode_rows(env, one, subject.facts["seed"], step=subject.facts["steps"], kind=kind, final=True)
         append_rows(path / "eval.jsonl", rows)
     results = {**subject.facts, **request, "versions": versions(), "evaluation": evaluation(env, sums)}
+    results |= given_up(env, sums)
     write_json(path / "results.json", results)
     for kind in kinds if render else ():
         _render(subject, evaluator, seed, kind, path)

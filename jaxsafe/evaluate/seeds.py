@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import numpy as np
 
 from jaxsafe.environment import Environment
-from jaxsafe.evaluate.episodes import longest, record_episodes, run_episodes
+from jaxsafe.evaluate.episodes import begin_recording, max_steps, record_steps, run_episodes
 from jaxsafe.metrics import METRICS, Episode, measures, over_seeds, summarise
 from jaxsafe.rollout import Policy
 from jaxsafe.train.agent import Params
@@ -23,7 +23,22 @@ BATCH = 100
 RECORDED = 10
 """Episodes recorded at a time, at least: one compiled program serves the evaluations during and after training."""
 
+PIECE = 256
+"""Steps recorded at a time: what a recording holds follows from how long its episodes are, not from any limit."""
+
+MAX_RECORDED_STEPS = 25_000
+"""A recording ends here, if its episode has not ended before: beyond it, logs and figures would take GiB.
+
+Every task at a tenth of its time step is still recorded whole."""
+
 KINDS = ("stochastic", "deterministic")
+
+
+class Recorder(NamedTuple):
+    """Two compiled functions that record some episodes of one policy."""
+
+    begin: Callable[..., Any]  # of a key: the position and the starts
+    go_on: Callable[..., Any]  # of parameters, key, `deterministic` and a position: the next, and `PIECE` steps
 
 
 class Acting(Protocol):
@@ -42,7 +57,7 @@ class Evaluator:
         self.mapper, self.env, self.agent = mapper, env, agent
         self._shared = mapper.replicate((env, agent))
         self._run = mapper.map(self._one_seed)
-        self._recorders: dict[int, Callable[..., Any]] = {}
+        self._recorders: dict[int, Recorder] = {}
 
     def prepare(self, params: Params) -> None:
         """Compile while other work goes on; `params` are those of `run`, or as `SeedMapper.like` describes them.
@@ -54,7 +69,9 @@ class Evaluator:
         key, deterministic = jax.random.key(0), np.asarray(True)
         self._run = Ahead(self._run, self._arguments(key, deterministic), params)
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), params)
-        self._recorders[RECORDED] = Ahead(self._recorder(RECORDED), one, key, deterministic)
+        begin, go_on = self._recorder(RECORDED)
+        position, _ = jax.eval_shape(begin, key)
+        self._recorders[RECORDED] = Recorder(Ahead(begin, key), Ahead(go_on, one, key, deterministic, position))
 
     def run(self, params: Params, num_episodes: int, seed: int, deterministic: bool) -> Episode:
         """Episodes of every seed's policy: each field [seeds, num_episodes], on the host."""
@@ -66,23 +83,40 @@ class Evaluator:
 
     def record(
         self, params: Params, num_episodes: int, seed: int, deterministic: bool = True
-    ) -> Iterator[list[dict[str, Any]]]:
+    ) -> Iterator[Iterator[dict[str, Any]]]:
         """Every step of the first episodes that `run` runs with one seed's parameters, as rows for a log."""
         for state, timestep in self.episodes(params, num_episodes, seed, deterministic):
-            yield [_step_row(self.env, state, timestep, t) for t in range(len(timestep.reward))]
+            yield (_step_row(self.env, state, timestep, t) for t in range(len(timestep.reward)))
 
     def episodes(
         self, params: Params, num_episodes: int, seed: int, deterministic: bool = True
     ) -> Iterator[tuple[State, TimeStep]]:
-        """States and time steps, [steps + 1], of each of the episodes that `record` describes."""
-        steps = int(longest(self.env))
+        """States and time steps, [steps + 1], of each of the episodes that `record` describes.
+
+        At most `MAX_RECORDED_STEPS` steps of each.
+        """
         for batch, key in enumerate(batch_keys(seed, -(-num_episodes // BATCH))):
-            count = min(BATCH, num_episodes - batch * BATCH)
-            recorded = self._recorder(max(count, RECORDED))(params, key, np.asarray(deterministic))
-            for episode in range(count):
-                state, timestep = jax.tree.map(lambda x, i=episode: np.asarray(x)[:, i], recorded)
-                ended = np.flatnonzero(timestep.done)
-                yield jax.tree.map(lambda x, n=(ended[0] if ended.size else steps): x[: n + 1], (state, timestep))
+            yield from self._episodes(params, key, np.asarray(deterministic), min(BATCH, num_episodes - batch * BATCH))
+
+    def _episodes(self, params: Params, key: Key, deterministic: Any, count: int) -> Iterator[tuple[State, TimeStep]]:
+        """The first `count` episodes of a batch; of each only what it lasts is kept."""
+        begin, go_on = self._recorder(max(count, RECORDED))
+        position, first = begin(key)
+        pieces = [[jax.tree.map(lambda x, i=i: np.asarray(x)[i : i + 1], first)] for i in range(count)]
+        left = [*range(count)]
+        limit = min(max_steps(self.env), MAX_RECORDED_STEPS)
+        for before in range(0, limit, PIECE):
+            position, recorded = go_on(params, key, deterministic, position)
+            recorded = jax.tree.map(np.asarray, recorded)
+            ended = {i: np.flatnonzero(recorded[1].done[:, i]) for i in left}
+            for i in left:
+                size = min(ended[i][0] + 1 if ended[i].size else PIECE, limit - before)
+                pieces[i].append(jax.tree.map(lambda x, i=i, n=size: x[:n, i].copy(), recorded))
+            left = [i for i in left if not ended[i].size]
+            if not left:
+                break
+        for parts in pieces:
+            yield jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
     def _one_seed(self, shared: tuple, params: Params) -> Episode:
         env, agent, key, deterministic = shared
@@ -91,16 +125,18 @@ class Evaluator:
     def _arguments(self, key: Key, deterministic: Any) -> tuple:
         return *self._shared, *self.mapper.replicate((key, deterministic))
 
-    def _recorder(self, num_episodes: int) -> Callable[..., Any]:
+    def _recorder(self, num_episodes: int) -> Recorder:
         """Compiled once for each number of episodes."""
         if num_episodes not in self._recorders:
-            steps = int(longest(self.env))
 
-            def record(params: Params, key: Key, deterministic: Any) -> Any:
+            def begin(key: Key) -> Any:
+                return begin_recording(self.env, key, num_episodes)
+
+            def go_on(params: Params, key: Key, deterministic: Any, position: Any) -> Any:
                 policy = self.agent.policy(self.env, params, deterministic)
-                return record_episodes(self.env, policy, key, num_episodes, steps)
+                return record_steps(self.env, policy, key, position, PIECE)
 
-            self._recorders[num_episodes] = jax.jit(record)
+            self._recorders[num_episodes] = Recorder(jax.jit(begin), jax.jit(go_on))
         return self._recorders[num_episodes]
 
 
@@ -146,6 +182,15 @@ def episode_rows(env: Environment, episodes: Episode, first_seed: int, **common:
         for seed in range(outcomes.shape[0])
         for index in range(outcomes.shape[1])
     ]
+
+
+def given_up(env: Environment, kinds: Mapping[str, Episode]) -> dict[str, Any]:
+    """Return how many episodes of each kind had not ended when they were given up, and after how many steps.
+
+    They count as failures. Empty if all have ended.
+    """
+    counts = {kind: int(np.sum(np.asarray(episodes.outcome) == 0)) for kind, episodes in kinds.items()}
+    return {"given_up": {"after_steps": max_steps(env), **counts}} if any(counts.values()) else {}
 
 
 def metrics_over_seeds(env: Environment, episodes: Episode) -> dict[str, Any]:

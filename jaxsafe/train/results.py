@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe.environment import Environment
-from jaxsafe.evaluate.seeds import metrics_over_seeds
+from jaxsafe.evaluate.seeds import given_up, metrics_over_seeds
 from jaxsafe.metrics import Episode, interaction_efficiency, over_seeds
 from jaxsafe.origin import versions
 from jaxsafe.train.config import TrainConfig
@@ -48,6 +48,7 @@ def finish(training: Training) -> dict[str, Any]:
         "interaction_efficiency": _efficiency(training),
         "training_cost": over_seeds(training.log.curve("cost")[1][-1].tolist()),  # violating steps
         "evaluation": evaluation(env, episodes),
+        **given_up(env, episodes),
     }
     write_json(training.run / "results.json", results)
     return results
@@ -76,6 +77,10 @@ def table(results: dict[str, Any], path: Path) -> str:
             lines.append(f"{label:28}" + "".join(f"{_cell(one[name], unit):>26}" for one in found.values()))
     worst = {kind: min(one["success_rate"]["per_seed"]) for kind, one in found.items()}
     lines.append(f"{'worst seed, success rate':28}" + "".join(f"{value:>26.1%}" for value in worst.values()))
+    if "given_up" in results:
+        counts, limit = results["given_up"], results["given_up"]["after_steps"]
+        told = ", ".join(f"{counts[kind]:,} {kind}" for kind in found)
+        lines.append(f"episodes still running after {limit:,} steps, given up and counted as failures: {told}")
     if "interaction_efficiency" in results:
         steps = results["interaction_efficiency"]["timesteps"]
         lines += ["", f"80 % training success after {steps:,} steps" if steps else "80 % training success not reached"]

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.evaluate.episodes import run_episodes
-from jaxsafe.evaluate.seeds import BATCH, KINDS, in_batches, metrics_per_seed
+from jaxsafe.evaluate.seeds import BATCH, KINDS, given_up, in_batches, metrics_per_seed
 from jaxsafe.metrics import Episode, interaction_efficiency
 from jaxsafe.train import memory
 from jaxsafe.train.loop import EVALUATION_SEED, MEMORY, begin, chunk
@@ -105,6 +105,7 @@ class Lanes:
             "training_success": success[-1].tolist(),
             "training_return": last.tolist(),
             "evaluation": {kind: metrics_per_seed(setting.env, episodes) for kind, episodes in sums.items()},
+            **given_up(setting.env, sums),
             "curve": {"steps": steps.tolist(), "success_rate": np.round(success.T, 4).tolist()},
         }
 

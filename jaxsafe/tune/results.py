@@ -79,6 +79,7 @@ def finish(path: Path, rows: Rows, swept: Sequence[str], rank: str) -> str:
     lines = _table(flat[:SHOWN])
     if len(flat) > SHOWN:
         lines.append(f"… and {len(flat) - SHOWN} more")
+    lines += [f"setting {index}: {_given_up(rows[index])}" for index in order if "given_up" in rows[index]]
     return "\n".join([*lines, f"results in {path / 'results.csv'}, figure {figure}"])
 
 
@@ -87,6 +88,13 @@ def line(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
     facts = _flat(row, swept)
     values = ", ".join(f"{name} {facts[name]}" for name in swept)
     return f"setting {index}: {values}: 80 % after {_cell(facts['80 % after'])}, then {facts['stochastic']:.1%}"
+
+
+def _given_up(row: dict[str, Any]) -> str:
+    """Say how many evaluation episodes of a setting had not ended."""
+    counts = dict(row["given_up"])
+    steps = counts.pop("after_steps")
+    return f"{sum(counts.values()):,} episodes still running after {steps:,} steps, given up and counted as failures"
 
 
 def _key(row: dict[str, Any], rank: str) -> tuple[float, float, float]:
