@@ -112,7 +112,7 @@ def test_a_run_reports_how_often_it_was_corrected(run: Path, capsys: pytest.Capt
     assert results(run)["intervention_rate"]["mean"] > 0.0
     assert results(run)["episode_safety_violation_rate"]["mean"] == 0.0
     rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
-    assert any(row["interventions"] for row in rows)
+    assert any(row["intervention_share"] for row in rows)
     assert any(row["reward/intervention"] for row in rows)
     logged = [json.loads(line) for file in run.rglob("*.jsonl") for line in file.read_text().splitlines()]
     steps = [row["rta"] for row in logged if "rta" in row]

@@ -14,7 +14,7 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.train.config import recipe
 from jaxsafe.tune import __main__ as command
 from jaxsafe.tune.lanes import Lanes
-from jaxsafe.tune.results import _key
+from jaxsafe.tune.results import _flat, _key
 from jaxsafe.tune.settings import Span, alike, pop_sweep, settings
 
 BASE = [word for word in TINY if not word.startswith("ppo.num_steps")]
@@ -140,6 +140,14 @@ def test_each_rank_has_its_best_first(rank: str, order: list[int]) -> None:
 
     rows = [row(200, 0.8, 1.0), row(None, 0.9, 0.7), row(100, 0.7, 0.9)]
     assert sorted(range(3), key=lambda index: _key(rows[index], rank)) == order
+
+
+def test_the_table_leaves_out_violations_that_were_not_counted(swept: Path) -> None:
+    row = results(swept)[0]
+    assert "violating" in _flat(row, ())
+    unmeasured = {"episode_safety_violation_rate": [None] * 3}
+    evaluation = {kind: metrics | unmeasured for kind, metrics in row["evaluation"].items()}
+    assert "violating" not in _flat(row | {"evaluation": evaluation}, ())
 
 
 def test_a_group_of_one_trains_once() -> None:

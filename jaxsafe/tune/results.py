@@ -120,8 +120,13 @@ def _flat(row: dict[str, Any], swept: Sequence[str]) -> dict[str, Any]:
         "worst": round(min(row["evaluation"]["stochastic"]["success_rate"]), 4),
         "deterministic": round(_mean(row, "deterministic", "success_rate"), 4),
         "length": round(_mean(row, "deterministic", "episode_length"), 1),
-        "violating": round(_mean(row, "deterministic", "episode_safety_violation_rate"), 5),
+        **({"violating": round(_mean(row, "deterministic", "episode_safety_violation_rate"), 5)} if _measured(row) else {}),
     }
+
+
+def _measured(row: dict[str, Any]) -> bool:
+    """Return whether the environment has safety constraints whose violations were counted."""
+    return None not in row["evaluation"]["deterministic"]["episode_safety_violation_rate"]
 
 
 def _mean(row: dict[str, Any], kind: str, metric: str) -> float:
