@@ -1,7 +1,8 @@
 """Standard output and standard error of a command. Whatever happens to them, the work goes on.
 
-Text that an encoding lacks is replaced, a stream that is closed leads nowhere, and so does one that can take no more: the
-reader of a pipe has gone, or the disk is full.
+Letters that an encoding lacks are replaced, control characters, which may come with a stranger's file and would act on the
+terminal, are spelt out. A stream that is closed leads nowhere, and so does one that can take no more: the reader of a pipe
+has gone, or the disk is full.
 """
 
 from __future__ import annotations
@@ -12,18 +13,30 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+CONTROLS = {code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0))}
+"""How control characters are spelt out."""
+
+ALLOWED = {ord(letter): letter for letter in "\n\t"}
+"""Control characters that are part of a text."""
+
+
+def printable(text: str) -> str:
+    """Return a text with its control characters spelt out, and what is no Unicode replaced."""
+    return text.translate(CONTROLS | ALLOWED).encode(errors="replace").decode()
+
 
 class LastingStream:
     """A text stream that never raises an OSError: after the first one it discards what is written, and keeps the error."""
 
-    def __init__(self, stream: Any) -> None:
-        """Wrap a stream."""
+    def __init__(self, stream: Any, allowed: str = "") -> None:
+        """Wrap a stream, to which these control characters may be written too."""
         self._stream = stream
+        self._controls = CONTROLS | ALLOWED | {ord(letter): letter for letter in allowed}
         self.error: OSError | None = None
 
     def write(self, text: str) -> int:
         """Write text."""
-        self._attempt(self._stream.write, text)
+        self._attempt(self._stream.write, text.translate(self._controls))
         return len(text)
 
     def flush(self) -> None:
@@ -50,7 +63,7 @@ def lasting_streams() -> Iterator[LastingStream]:
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass  # a file that gets the number of a closed stream would receive what libraries print there
     os.close(number)
-    sys.stdout, sys.stderr = (_lasting(stream) for stream in before)
+    sys.stdout, sys.stderr = _lasting(before[0]), _lasting(before[1], allowed="\r")  # with which a bar is drawn anew
     try:
         yield sys.stdout
     finally:
@@ -59,9 +72,9 @@ def lasting_streams() -> Iterator[LastingStream]:
         sys.stdout, sys.stderr = before
 
 
-def _lasting(stream: Any) -> Any:
+def _lasting(stream: Any, allowed: str = "") -> Any:
     if stream is None:  # it was closed when Python started
         stream = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     if hasattr(stream, "reconfigure"):
         stream.reconfigure(errors="replace")
-    return LastingStream(stream)
+    return LastingStream(stream, allowed)

@@ -7,15 +7,17 @@ import pytest
 from PIL import Image
 
 import jaxsafe
-from jaxsafe.evaluate.episodes import record_episodes
+from jaxsafe.evaluate.episodes import begin_recording, record_steps
 from jaxsafe.plot.animation import Scene, animate
 
 
 def recorded(env: jaxsafe.Environment, steps: int) -> Any:
     """An episode of random actions."""
     policy = lambda key, o: jax.random.uniform(key, (*o.shape[:-1], env.action_size), minval=-1.0)  # noqa: E731
-    episode = jax.jit(record_episodes, static_argnums=(1, 3, 4))(env, policy, jax.random.key(0), 1, steps)
-    return jax.tree.map(lambda x: np.asarray(x)[:, 0], episode)
+    key = jax.random.key(0)
+    position, start = jax.jit(begin_recording, static_argnums=2)(env, key, 1)
+    _, later = jax.jit(record_steps, static_argnums=(1, 4))(env, policy, key, position, steps)
+    return jax.tree.map(lambda x, y: np.concatenate([np.asarray(x), np.asarray(y)[:, 0]]), start, later)
 
 
 @pytest.mark.parametrize(("task", "maps"), [("docking2d_oriented", 1), ("rejoin3d", 2)])
@@ -34,6 +36,19 @@ def test_a_scene_shows_the_agent_where_it_is(task: str, maps: int) -> None:
     expected = sim.platforms[env.agent].position[12] - sim.platforms[other].position[12]
     np.testing.assert_allclose(shown, expected[:2], rtol=1e-5)
     assert all(abs(expected[i]) < scene.maps[0].get_xlim()[1] for i in (0, 1))
+
+
+def test_names_and_titles_are_drawn_letter_by_letter() -> None:
+    env = jaxsafe.make("docking2d")
+    regions = tuple(region.replace(name="$\\frac{$") for region in env.regions)
+    status = tuple(one.replace(region="$\\frac{$") if hasattr(one, "region") else one for one in env.status)
+    constraints = tuple(one.replace(name="_$\\frac{$") for one in env.constraints)
+    env = jaxsafe.config.build(env.replace(regions=regions, status=status, constraints=constraints))
+    states, timesteps = recorded(env, 2)
+    scene = Scene(env, states.sim, timesteps.info.margins, "$\\frac{$")
+    scene.draw(2)
+    legend = scene.curves[1].get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == ["\u200b_\\$\\frac{\\$"]
 
 
 def test_an_animation_repeats_and_rests_at_the_end(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from matplotlib.image import imread
 from matplotlib.patches import Circle
 
 import jaxsafe
+from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.__main__ import main
@@ -193,6 +195,49 @@ def test_the_agent_is_drawn_whatever_it_and_the_others_are_called(whole: Path, t
     ends = [line.get_xydata()[-1] for line in figure.axes[1].lines]
     assert min(np.abs(end - np.array(expected)).max() for end in ends) < 1e-3
     assert draw_all(tmp_path)
+
+
+FORMULA = "$\\frac{$"
+NASTY = [FORMULA, "_old", "$x$", r"\$a$", "a\x1b]0;b\x07c", "\udcff"]
+
+
+@pytest.mark.parametrize("name", NASTY)
+def test_names_are_drawn_letter_by_letter(name: str) -> None:
+    figure = compare_curves({name: rows(), f"{name}2": rows()}, name, mark=(name, 1000.0))
+    figure.draw_without_rendering()
+    shown = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert len(shown) == 3
+    drawn = figure.axes[0].text(0.0, 0.0, shown[0])
+    assert drawn._preprocess_math(shown[0])[1] is False  # pyright: ignore[reportAttributeAccessIssue]
+    seen = drawn._preprocess_math(shown[0])[0]  # pyright: ignore[reportAttributeAccessIssue]
+    assert seen.removeprefix("\u200b") == name.replace("\x1b", r"\x1b").replace("\x07", r"\x07").replace("\udcff", "?")
+
+
+@pytest.mark.parametrize("nasty", [FORMULA, "_$x"])
+def test_a_run_whose_every_name_is_a_formula_is_drawn(
+    whole: Path, tmp_path: Path, nasty: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Names of the environment, of its platforms and regions, and of the run."""
+
+    def renamed(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {renamed(key): renamed(one) for key, one in value.items()}
+        if isinstance(value, list):
+            return [renamed(one) for one in value]
+        return f"{value}{nasty}" if value in ("docking2d", "chief", "deputy", "docking_region") else value
+
+    monkeypatch.chdir(tmp_path)
+    run = tmp_path / nasty
+    shutil.copytree(whole, run, ignore=shutil.ignore_patterns("figures"))
+    content = yaml.parse((whole / "config.yaml").read_text().replace("features: docking2d", "features: x"), "x")
+    (run / "config.yaml").write_text(yaml.write(renamed(content)))
+    for log in ("episodes.jsonl", "progress.jsonl"):
+        lines = (whole / log).read_text().splitlines()
+        (run / log).write_text("".join(json.dumps(renamed(json.loads(line))) + "\n" for line in lines))
+    shutil.copytree(run, tmp_path / "other")
+    assert main([f"run={nasty}"]) == 0
+    assert "trajectories.png" in capsys.readouterr().out
+    assert main([f"run=['{nasty}',other]"]) == 0
 
 
 @pytest.mark.parametrize("kind", ["png", "pdf", "svg"])

@@ -1,4 +1,5 @@
 import errno
+import io
 import os
 import subprocess
 import sys
@@ -59,6 +60,14 @@ def test_a_reader_that_goes_away_and_a_full_disk_end_no_command_in_a_traceback(
 ) -> None:
     ran = shell(command, tmp_path)
     assert (ran.returncode, ran.stderr[: len(told)], ran.stderr.count("\n")) == (code, told, int(bool(told)))
+
+
+def test_control_characters_of_a_stranger_do_not_reach_the_terminal() -> None:
+    kept = io.StringIO()
+    LastingStream(kept).write("a\x1b]0;title\x07b\rc\x9b2Jd\te\n")
+    assert kept.getvalue() == r"a\x1b]0;title\x07b\x0dc\x9b2Jd" + "\te\n"
+    LastingStream(kept, allowed="\r").write("\r10 %")
+    assert kept.getvalue().endswith("\r10 %")
 
 
 def test_a_stream_that_failed_leads_nowhere_and_says_why() -> None:

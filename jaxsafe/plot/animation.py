@@ -26,6 +26,7 @@ from jaxsafe.plot.style import (
     labelled,
     length_unit,
     margin_unit,
+    plain,
     region_patch,
 )
 from jaxsafe.processors.constraint import Separation
@@ -71,7 +72,7 @@ class Scene:
 
     def __init__(self, env: Environment, sim: Sim, margins: Mapping[str, Any], title: str) -> None:
         """Draw what does not move; every field [steps]."""
-        self.env, self.sim, self.margins, self.title = env, sim, margins, title
+        self.env, self.sim, self.margins, self.title = env, sim, margins, plain(title)
         others = [platform.name for platform in env.platforms if platform.name != env.agent]
         origin = sim.platforms[others[0] if others else env.agent].position
         self.origin = origin if others else np.zeros_like(origin)
@@ -83,7 +84,7 @@ class Scene:
         left, right = parts
         self.maps = np.atleast_1d(left.subplots(1, len(self.planes)))
         self.curves = right.subplots(2, 1, sharex=True)
-        self.heading = self.figure.suptitle(title, fontsize="medium")
+        self.heading = self.figure.suptitle(self.title, fontsize="medium")
         self._draw_maps()
         self._draw_curves(self.paths[env.agent])
         self.draw(max(range(len(self.sim.time)), key=self._width))
@@ -93,7 +94,7 @@ class Scene:
         """The picture of a step, red, green and blue in 8 bits: (height, width, 3)."""
         sim = self.sim
         ended = [name for name, flag in sim.ended.items() if flag[step]]
-        self.heading.set_text(f"{self.title}: {sim.time[step]:.0f} s, {ended[0] if ended else 'running'}")
+        self.heading.set_text(f"{self.title}: {sim.time[step]:.0f} s, {plain(ended[0]) if ended else 'running'}")
         reach = self._reach(step)
         for panel, plane, artists in zip(self.maps, self.planes, self.moving, strict=True):
             for name, (trail, dot, axis) in artists["platforms"].items():
@@ -135,18 +136,18 @@ class Scene:
             artists: dict[str, dict[str, Any]] = {"platforms": {}, "regions": {}}
             for region in self.env.regions:
                 artists["regions"][region.name] = panel.add_patch(region_patch(region, j == 2))
-                artists["regions"][region.name].set_label(region.name)
+                artists["regions"][region.name].set_label(plain(region.name))
             for radius in self._kept_away():
                 panel.add_patch(Circle((0.0, 0.0), radius, color=ORANGE, alpha=0.35, linewidth=0, label="too near"))
             for name in self.paths:
                 colour = BLUE if name == self.env.agent else GREY
                 trail, axis = (panel.plot([], [], color=colour, linewidth=width)[0] for width in (1.2, 2.4))
-                dot = panel.plot([], [], "o", color=colour, markersize=6, label=name)[0]
+                dot = panel.plot([], [], "o", color=colour, markersize=6, label=plain(name))[0]
                 artists["platforms"][name] = (trail, dot, axis)
             self.moving.append(artists)
         self.maps[0].legend(loc="upper left", fontsize="x-small", frameon=False)
         if seen_from:
-            self.maps[0].set_title(f"seen from the {seen_from}", fontsize="small")
+            self.maps[0].set_title(plain(f"seen from the {seen_from}"), fontsize="small")
 
     def _kept_away(self) -> list[float]:
         """Radii within which the agent must not come near the platform that it is seen from."""
@@ -165,7 +166,7 @@ class Scene:
         below.set(xlabel="time [s]", xlim=(0, time[-1] or 1.0))
         self.lines = [(above.plot([], [], color=BLUE, linewidth=1.4)[0], (time, distance))]
         for colour, (name, margin) in zip(cycle((GREEN, ORANGE, GREY, BLUE)), self.margins.items(), strict=False):
-            line = below.plot([], [], color=colour, linewidth=1.4, label=name)[0]
+            line = below.plot([], [], color=colour, linewidth=1.4, label=plain(name))[0]
             self.lines.append((line, (time, margin)))
         if self.margins:
             kinds = {margin_unit(constraint, unit) for constraint in self.env.constraints}

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from jaxsafe.metrics import ENOUGH_EPISODES, bootstrap_interval
 from jaxsafe.plot.figures import ALWAYS, AXES, CURVES, curve_table, panel_grid, set_axes
-from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE
+from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, plain
 
 LOOKS = tuple(product(("-", "--"), (BLUE, ORANGE, GREEN, "#CC79A7", GREY, "#E69F00", "#56B4E9")))
 """Line style and colour of each run in turn."""
@@ -53,7 +53,7 @@ def compare_curves(
             at, values = curve_table(rows, column, name)
             known = enough[run] & ~np.isnan(values).any(axis=1)
             at, values = at[known], factor * values[known]
-            panel.plot(at, values.mean(axis=1), color=colour, linestyle=line, linewidth=1.6, label=run)
+            panel.plot(at, values.mean(axis=1), color=colour, linestyle=line, linewidth=1.6, label=plain(run))
             if values.shape[1] > 1 and len(at):
                 panel.fill_between(at, *bootstrap_interval(values), color=colour, alpha=0.2, linewidth=0)
         set_axes(panel, label, quantity, name)
@@ -61,11 +61,11 @@ def compare_curves(
             panel.set_xscale("log")
         panel.margins(x=0.0)
     if mark:
-        panels[0].plot(mark[1], 80.0, "k*", markersize=9, label=mark[0], clip_on=False, zorder=4)
+        panels[0].plot(mark[1], 80.0, "k*", markersize=9, label=plain(mark[0]), clip_on=False, zorder=4)
     shown, names = panels[0].get_legend_handles_labels()
     columns = min(len(names), LEGEND)
     figure.legend(shown, names, loc="outside lower center", ncols=columns, columnspacing=1.2, frameon=False)
-    figure.suptitle(f"{title}: the last 100 training episodes, mean and 95 % interval over seeds", fontsize="medium")
+    figure.suptitle(f"{plain(title)}: the last 100 training episodes, mean and 95 % interval over seeds", fontsize="medium")
     return figure
 
 
@@ -91,7 +91,7 @@ def seed_curves(
         count = len(failed[run])
         named = f"seed{'s' * (count > 1)} {', '.join(map(str, sorted(failed[run])))}" if count else "no seed"
         which = named if count <= NAMED else f"{count} of {values.shape[1]} seeds"
-        panel.set_title(f"{run}: {which} failed", fontsize="medium")
+        panel.set_title(f"{plain(run)}: {which} failed", fontsize="medium")
         panel.margins(x=0.0)
-    figure.suptitle(f"{title}: the last 100 training episodes of every seed", fontsize="medium")
+    figure.suptitle(f"{plain(title)}: the last 100 training episodes of every seed", fontsize="medium")
     return figure

@@ -21,7 +21,7 @@ from jaxsafe.config import from_data, yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.interventions import interventions, most_altered
-from jaxsafe.plot.style import BLUE, GREY, ORANGE, centre_patch, labelled, length_unit, region_patch, save
+from jaxsafe.plot.style import BLUE, GREY, ORANGE, centre_patch, labelled, length_unit, plain, region_patch, save
 from jaxsafe.train.files import read_rows
 from jaxsafe.train.log import NEEDS
 
@@ -91,7 +91,7 @@ def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figur
         set_axes(panel, label, quantity, name)
     if panels[0].get_legend_handles_labels()[0]:
         panels[0].legend(loc="best", fontsize="small", frameon=False)
-    figure.suptitle(f"{title}: the last 100 training episodes", fontsize="medium")
+    figure.suptitle(f"{plain(title)}: the last 100 training episodes", fontsize="medium")
     return figure
 
 
@@ -150,13 +150,13 @@ def trajectories(episodes: Episodes, title: str, unit: str | None, regions: Sequ
             for region, place in zip(regions, places, strict=True):
                 patch = panel.add_patch(region_patch(region, j == 2))
                 centre_patch(patch, place[[i, j]])
-                patch.set_label(region.name)
+                patch.set_label(plain(region.name))
             if not alone:
-                panel.plot(0, 0, "*", color=ORANGE, markersize=7, label=first, zorder=1)
+                panel.plot(0, 0, "*", color=ORANGE, markersize=7, label=plain(first), zorder=1)
             for step, path in group:
                 panel.plot(path[:, i], path[:, j], color=colour(step), linewidth=1.2)
                 panel.plot(path[0, i], path[0, j], "o", color=colour(step), markersize=3)
-            panel.set(xlabel=labelled(f"x{along}", unit), ylabel=labelled("xyz"[j], unit), aspect="equal")
+            panel.set(xlabel=labelled(plain(f"x{along}"), unit), ylabel=labelled("xyz"[j], unit), aspect="equal")
             panel.set(xlim=(-half, half), ylim=(-half, half))
             panel.xaxis.set_major_locator(MaxNLocator(4))
             panel.yaxis.set_major_locator(MaxNLocator(4))
@@ -165,7 +165,7 @@ def trajectories(episodes: Episodes, title: str, unit: str | None, regions: Sequ
     if panels[0, -1].get_legend_handles_labels()[0]:
         panels[0, -1].legend(loc="best", fontsize="small", frameon=False)
     _colour_bar(figure, colours, list(panels.ravel()))
-    figure.suptitle(f"{title}: deterministic episodes of the first seed", fontsize="medium")
+    figure.suptitle(f"{plain(title)}: deterministic episodes of the first seed", fontsize="medium")
     return figure
 
 
@@ -199,7 +199,7 @@ def speed_distance(episodes: Episodes, title: str) -> Figure:
     panel.set(xlim=(0, reach), ylim=(0, max(1.5 * np.nanmax(line[1], initial=0.2), 1.05 * fastest)))
     panel.legend(loc="best", frameon=False)
     _colour_bar(figure, colours, panel)
-    figure.suptitle(f"{title}: deterministic episodes of the first seed", fontsize="medium")
+    figure.suptitle(f"{plain(title)}: deterministic episodes of the first seed", fontsize="medium")
     return figure
 
 

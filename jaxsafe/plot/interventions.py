@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, control_unit, labelled, length_unit, margin_unit
+from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, control_unit, labelled, length_unit, margin_unit, plain
 
 SHADE = "#F0E442"  # of the same palette
 Rows = list[dict[str, Any]]
@@ -64,7 +64,8 @@ def interventions(rows: Rows, env: Any, title: str) -> Figure:
     figure.align_ylabels(list(panels))
     share = altered.mean() if len(altered) else 0.0
     figure.suptitle(
-        f"{title}\naltered on {100.0 * share:.0f} % of the steps, ended with {rows[-1]['outcome']}", fontsize="medium"
+        f"{plain(title)}\naltered on {100.0 * share:.0f} % of the steps, ended with {plain(rows[-1]['outcome'])}",
+        fontsize="medium",
     )
     return figure
 
@@ -83,7 +84,8 @@ def _control(panel: Axes, times: np.ndarray, rows: Rows, actuator: Any) -> None:
 
 def _name(panel: Axes, quantity: str, unit: str | None) -> None:
     """Label the y axis in short lines, as the panels are low."""
-    panel.set_ylabel(textwrap.fill(labelled(quantity, unit).replace("_", " "), 14), fontsize="small")
+    lines = textwrap.wrap(labelled(quantity, unit).replace("_", " "), 14)
+    panel.set_ylabel("\n".join(map(plain, lines)), fontsize="small")
 
 
 def _shade(panel: Axes, times: np.ndarray, altered: np.ndarray, label: str | None) -> None:

@@ -25,7 +25,7 @@ from jaxsafe import cli
 from jaxsafe.environment import Environment, reset_to
 from jaxsafe.envs import TASKS, make
 from jaxsafe.errors import ConfigError
-from jaxsafe.plot.style import GREY, ORANGE, labelled, length_unit, margin_unit, save
+from jaxsafe.plot.style import GREY, ORANGE, labelled, length_unit, margin_unit, plain, save
 from jaxsafe.rta.filter import CertifiedRTA
 from jaxsafe.rta.prediction import constraint
 from jaxsafe.simulation.cwh import Spacecraft
@@ -144,14 +144,14 @@ def draw(env: Environment, title: str, x: Ends | None = None, y: Ends | None = N
             if values.min() < level < values.max():
                 panel.contour(across, up, values, levels=[level], colors=look["color"], linewidths=look["linewidth"])
         panel.locator_params(nbins=5)
-        panel.set(title=each, xlabel=plane.x_label, aspect="equal" if plane.spatial else "auto")
+        panel.set(title=plain(each), xlabel=plain(plane.x_label), aspect="equal" if plane.spatial else "auto")
         if plane.spatial:
             panel.plot(0, 0, ">", color="black", markersize=7)
-    panels[0].set_ylabel(plane.y_label)
+    panels[0].set_ylabel(plain(plane.y_label))
     figure.colorbar(ScalarMappable(scale, SHADES), ax=list(panels), label=labelled("H", _unit(env)), extend="max")
     figure.legend(handles=_entries(surveys), loc="outside lower center", ncols=3, frameon=False)
     notes = [plane.note, "" if env.rta.enforce else "certificates not enforced"]
-    figure.suptitle("; ".join([title, *(note for note in notes if note)]))
+    figure.suptitle(plain("; ".join([title, *(note for note in notes if note)])))
     return figure
 
 

@@ -12,9 +12,11 @@ from matplotlib.patches import Circle, Rectangle
 
 from jaxsafe.errors import ConfigError
 from jaxsafe.processors.constraint import Separation, SpeedLimit
+from jaxsafe.streams import printable
 from jaxsafe.train.files import write_bytes
 from jaxsafe.types import units
 
+ZERO_WIDTH_SPACE = "\u200b"
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8A8A8A"  # Okabe-Ito, safe for colour-blind readers
 
 
@@ -35,6 +37,15 @@ def margin_unit(constraint: Any, length: str | None) -> str | None:
         return None
     known = {SpeedLimit: f"{length}/s", Separation: length}
     return next((unit for kind, unit in known.items() if isinstance(constraint, kind)), None)
+
+
+def plain(text: object) -> str:
+    """Return a text of the user as a figure shows it letter by letter, for titles and labels.
+
+    Matplotlib reads `$…$` as a formula, and leaves out of legends what begins with `_`.
+    """
+    shown = printable(str(text)).replace("$", r"\$")
+    return f"{ZERO_WIDTH_SPACE}{shown}" if shown.startswith("_") else shown
 
 
 def labelled(quantity: str, unit: str | None) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from jaxsafe.plot.style import GREY, save
+from jaxsafe.plot.style import GREY, plain, save
 
 NAMED = 8
 """Settings that get a colour and a name, the best ones."""
@@ -25,7 +25,12 @@ def sweep_curves(path: Path, curves: Sequence[tuple[str, dict[str, Any]]]) -> Pa
         named = place < NAMED
         colour = colormaps["viridis"](0.85 * place / max(min(len(curves), NAMED) - 1, 1)) if named else GREY
         panel.plot(
-            steps, success, color=colour, linewidth=1.6 if named else 0.6, label=label if named else None, zorder=-place
+            steps,
+            success,
+            color=colour,
+            linewidth=1.6 if named else 0.6,
+            label=plain(label) if named else None,
+            zorder=-place,
         )
     panel.axhline(80.0, color="black", linestyle=":", linewidth=1.0)
     panel.set(xlabel="environment steps per seed", ylabel="success rate [%], last 100 episodes", ylim=(-3, 103))
