@@ -19,7 +19,7 @@ from jaxsafe.export.__main__ import main
 from jaxsafe.export.onnx import to_onnx
 from jaxsafe.export.vnnlib import search, write_vnnlib
 from jaxsafe.rollout import reset_batch
-from jaxsafe.train.policy import SavedPolicy, find_policy, read_policy
+from jaxsafe.train.policy import SavedPolicy, find_policy, read_policy, save_policy
 
 
 def saved(task: str) -> SavedPolicy:
@@ -113,6 +113,48 @@ def test_a_search_finds_the_least_margin() -> None:
     np.testing.assert_allclose(worst.start, [0.31, -0.7], atol=0.02)
 
 
+@pytest.mark.parametrize("where", ["everywhere", "in a corner", "inside"])
+def test_a_margin_that_is_not_a_number_is_a_counterexample(where: str) -> None:
+    def margins(x: jax.Array) -> jax.Array:
+        wrong = {"everywhere": x[:, 0] > -9.0, "in a corner": x[:, 0] + x[:, 1] > 1.99, "inside": jnp.abs(x[:, 0]) < 0.1}
+        return jnp.stack([jnp.where(wrong[where], jnp.nan, 1.0), jnp.ones(len(x))], axis=-1)
+
+    worst = search(functions.Exported(margins, ("a", "b"), ("h_0", "h_1")), [(-1, 1), (-1, 1)], jax.random.key(0))
+    assert worst.margin == -np.inf
+    assert np.isnan(margins(jnp.asarray(worst.start)[None])).any()
+
+
+def test_a_slope_that_is_not_a_number_is_no_counterexample() -> None:
+    cone = lambda x: 0.5 + jnp.linalg.norm(jnp.maximum(x, 0.0), axis=-1, keepdims=True)  # noqa: E731
+    worst = search(functions.Exported(cone, ("a", "b"), ("h",)), [(-1, 1), (-1, 1)], jax.random.key(0), starts=50)
+    assert worst.margin == 0.5
+    assert np.isfinite(worst.start).all()
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_policy_that_diverged_is_not_exported(value: float, tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    policy = saved("docking2d")
+    layers = [jax.tree.map(np.array, layer) for layer in policy.params["actor"]]
+    layers[0]["kernel"][0, 0] = value
+    save_policy(Path("own.npz"), policy.env, policy.agent, {**policy.params, "actor": layers}, {})
+    for words in (["format=onnx"], ["format=stablehlo"], ["format=vnnlib"]):
+        with pytest.raises(ConfigError, match=r"^own\.npz: actor/0/kernel: not all parameters are finite numbers"):
+            main(["run=own.npz", *words])
+    np.savez("theirs.npz", kernel_0=np.full((6, 2), np.nan), bias_0=np.zeros(2))
+    with pytest.raises(ConfigError, match=r"^theirs\.npz: kernel_0: not all parameters are finite numbers"):
+        main(["run=theirs.npz", "env=docking2d", "format=vnnlib"])
+    assert not [path for path in tmp_path.iterdir() if path.suffix != ".npz"]
+
+
+def test_a_loop_that_ends_in_no_number_is_violated(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    layers = {"kernel_0": np.full((6, 2), 3e38), "kernel_1": np.array([[1.0, 1.0], [-1.0, -1.0]])}
+    np.savez(tmp_path / "x.npz", **layers, bias_0=np.zeros(2), bias_1=np.zeros(2))  # infinity less infinity
+    words = [f"run={tmp_path / 'x.npz'}", "env=docking2d", "format=vnnlib", "steps=1", f"out={tmp_path / 'x.vnnlib'}"]
+    assert main([*words, "activation=relu"]) == 0
+    assert re.search("least margin not a number from .*: violated$", capsys.readouterr().out.strip())
+
+
 def test_the_page_tells_what_the_search_finds(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     page = (Path(__file__).parent.parent / "docs" / "export.md").read_text(encoding="utf-8")
     assert main(["run=pretrained/docking2d", "format=vnnlib", f"out={tmp_path / 'x.vnnlib'}"]) == 0
@@ -167,6 +209,10 @@ def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFi
         (["run=pretrained/docking2d", "format=vnnlib", "out=loop.onnx"], "out: expected NAME.vnnlib"),
         (["run=pretrained/docking2d", "format=vnnlib", "box.position=[a,b]"], r"box.position: expected \[low, high\]"),
         (["run=pretrained/docking2d", "format=vnnlib", "box.position=[1,.inf]"], r"box.position: expected \[low, high\]"),
+        (
+            ["run=pretrained/docking2d", "format=vnnlib", "box.position=[0,1e30]"],
+            r"each within ±1e\+18, found",
+        ),
         (["run=nowhere"], "run: no run in 'nowhere'"),
         (["run=pretrained/docking2d", "env=docking2d"], "env: pretrained/docking2d holds its own environment"),
         (["run=pretrained/docking2d", "box.position=[1,2]"], "box.position: means nothing without format=vnnlib"),
@@ -175,6 +221,12 @@ def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFi
 def test_mistakes_are_named(words: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         main(words)
+
+
+def test_finite_numbers_are_told_apart() -> None:
+    values = np.array([[0.0, -3e38, np.inf, -np.inf, np.nan]], np.float32)
+    model = to_onnx(lambda x: jnp.where(jnp.isfinite(x), 1.0, 0.0), values.shape)
+    np.testing.assert_array_equal(run(model, values), np.isfinite(values))
 
 
 def test_what_has_no_counterpart_is_named() -> None:

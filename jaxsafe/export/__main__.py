@@ -22,6 +22,9 @@ OPTIONS = (
 BOX = {"position": (70.0, 106.0), "velocity": (-0.28, 0.28)}
 """Starts of the closed-loop docking property of the verification community, in m and m/s, over 40 s."""
 
+MAX_BOUND = 1e18
+"""Of a box: squares of larger numbers are infinite in single precision, and so is every margin."""
+
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
@@ -38,6 +41,7 @@ def main(argv: Sequence[str]) -> int:
         raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
     form = _one_of("format", form or "onnx", FORMATS)
     saved, stem = _policy(arguments, run)
+    _require_finite(run, saved)
     kinds = {"observation": lambda: functions.action(saved), "state": lambda: functions.control(saved)}
     if isinstance(saved, functions.SavedPolicy):
         kinds["network"] = lambda: functions.network(saved)
@@ -104,6 +108,20 @@ def _policy(arguments: cli.Arguments, run: str) -> tuple[SavedPolicy | ForeignPo
     return read_policy(path), path.stem if single else f"{Path(run).name}_{path.stem}"
 
 
+def _require_finite(run: str, saved: SavedPolicy | ForeignPolicy) -> None:
+    """Refuse what a training that diverged left; in a network from elsewhere an infinite constant may be a bound."""
+    import jax
+    import numpy as np
+
+    from jaxsafe.train.policy import SavedPolicy
+
+    wrong = (lambda x: ~np.isfinite(x)) if isinstance(saved, SavedPolicy) else np.isnan
+    for path, leaf in jax.tree.leaves_with_path(saved.params):
+        if wrong(np.asarray(leaf, np.float64)).any():
+            name = jax.tree_util.keystr(path, simple=True, separator="/")
+            raise ConfigError(f"{run}: {name}: not all parameters are finite numbers, so there is no policy to export")
+
+
 def _one_of(name: str, value: str, known: Sequence[str]) -> str:
     if value not in known:
         raise ConfigError(f"{name}: found {value!r}; choose from {nearest(value, known)}")
@@ -122,8 +140,9 @@ def _vnnlib(unrolled: Exported, looped: Exported, given: dict[str, object], path
     print(f"{graph}\n{write_vnnlib(path, unrolled, box)}", flush=True)
     worst = search(looped, box, jax.random.key(0))
     start = ", ".join(f"{name} {value:.4g}" for name, value in zip(looped.inputs, worst.start, strict=True))
-    found = "violated" if worst.margin < 0.0 else f"no counterexample among {worst.tried:,} starts, which proves nothing"
-    print(f"least margin {worst.margin:.4g} from {start}: {found}")
+    found = f"no counterexample among {worst.tried:,} starts, which proves nothing" if worst.margin >= 0.0 else "violated"
+    margin = "not a number" if worst.margin == -math.inf else f"{worst.margin:.4g}"
+    print(f"least margin {margin} from {start}: {found}")
     return 0
 
 
@@ -137,7 +156,9 @@ def _box(names: Sequence[str], given: dict[str, object]) -> list[tuple[float, fl
         key = next((key for key in keys if key in bounds), None)
         interval = bounds.get(key) if key else None
         if not _is_interval(interval):
-            raise ConfigError(f"box.{parts[1]}: expected [low, high] for {name}, found {interval!r}")
+            raise ConfigError(
+                f"box.{parts[1]}: expected [low, high] for {name}, each within ±{MAX_BOUND:.0e}, found {interval!r}"
+            )
         used.add(key)
         box.append((float(interval[0]), float(interval[1])))
     for key in given:
@@ -148,7 +169,7 @@ def _box(names: Sequence[str], given: dict[str, object]) -> list[tuple[float, fl
 
 def _is_interval(value: Any) -> TypeGuard[Sequence[float]]:
     numbers = isinstance(value, (list, tuple)) and len(value) == 2 and all(isinstance(one, (int, float)) for one in value)
-    return numbers and -math.inf < value[0] <= value[1] < math.inf
+    return numbers and -MAX_BOUND <= value[0] <= value[1] <= MAX_BOUND
 
 
 def usage() -> str:

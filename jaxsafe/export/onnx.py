@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
+from jax.interpreters import partial_eval
 
 from jaxsafe.errors import ConfigError, missing
 from jaxsafe.train.files import write_bytes
@@ -54,8 +55,9 @@ def write_onnx(path: Path, function: Callable[[Any], Any], shape: Sequence[int],
 def to_onnx(function: Callable[[Any], Any], shape: Sequence[int]) -> Any:
     """The model of `write_onnx`."""
     closed = jax.make_jaxpr(function)(jnp.zeros(shape, jnp.float32))
+    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True], instantiate=True)  # what nothing needs may be anything
     graph = _Graph()
-    [output] = graph.inline(closed.jaxpr, closed.consts, ["input"])
+    [output] = graph.inline(jaxpr, closed.consts, ["input"])
     graph.node("Identity", [output], "output")
     graph.prune("output")
     [result] = closed.out_avals
@@ -157,6 +159,9 @@ class _Graph:
 
     def _ne(self, inputs: list[str], *_: Any) -> str:
         return self.node("Not", [self.node("Equal", inputs)])
+
+    def _is_finite(self, inputs: list[str], *_: Any) -> str:
+        return self.node("Less", [self.node("Abs", inputs), self.constant(np.float32(np.inf))])
 
     def _square(self, inputs: list[str], *_: Any) -> str:
         return self.node("Mul", [inputs[0], inputs[0]])

@@ -24,7 +24,7 @@ Box = Sequence[tuple[float, float]]
 class Worst(NamedTuple):
     """The start with the least margin that a search found."""
 
-    margin: float
+    margin: float  # −∞ if some margin on the way is not a number, which is not safe either
     start: np.ndarray
     tried: int
 
@@ -48,20 +48,22 @@ def write_vnnlib(path: Path, exported: Exported, box: Box) -> Path:
 def search(exported: Exported, box: Box, key: Key, starts: int = 10_000, best: int = 64, rounds: int = 100) -> Worst:
     """Look for a start in the box with a negative margin: corners, random starts, then descent from the worst of them.
 
-    It may miss one: a search that finds nothing is no proof.
+    It may miss one: a search that finds nothing is no proof. A margin that is not a number is no safe one.
     """
     low, high = (jnp.array([bounds[i] for bounds in box]) for i in (0, 1))
     corners = np.stack(np.meshgrid(*([0.0, 1.0] for _ in box), indexing="ij"), axis=-1).reshape(-1, len(box))[:4096]
     shares = jnp.concatenate([jnp.asarray(corners, jnp.float32), jax.random.uniform(key, (starts, len(box)))])
 
     def least(share: jax.Array) -> jax.Array:
-        return jnp.min(exported.function(low + share * (high - low)), axis=-1)
+        margins = exported.function(low + share * (high - low))
+        return jnp.min(jnp.where(jnp.isnan(margins), -jnp.inf, margins), axis=-1)
 
     @jax.jit
     def descend(share: jax.Array) -> tuple[jax.Array, jax.Array]:
         def one(i: int, carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
             share, worst, at = carry
             gradient = jax.grad(lambda s: jnp.sum(least(s)))(share)
+            gradient = jnp.where(jnp.isfinite(gradient), gradient, 0.0)  # from where there is no slope, stay
             length = jnp.linalg.norm(gradient, axis=-1, keepdims=True)
             moved = jnp.clip(share - 0.1 * 0.95**i * gradient / jnp.maximum(length, 1e-12), 0.0, 1.0)
             found = least(moved)
