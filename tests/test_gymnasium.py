@@ -130,7 +130,54 @@ def test_seeds_are_chains_of_keys() -> None:
     np.testing.assert_allclose(jaxsafe.make("docking2d").reset(now)[1].observation, first, rtol=1e-6)
     other = gym.make("jaxsafe/Docking2D-v0")
     assert not np.array_equal(other.reset()[0], gym.make("jaxsafe/Docking2D-v0").reset()[0])
-    other.reset(seed=2**40)
+
+
+BIG = [0, 1, 2**32 - 1, 2**32, 2**32 + 1, 2**40, 2**64, 2**64 + 2**32, 2**70, 2**96, 2**128 - 1]
+
+
+def test_every_seed_has_a_start_of_its_own_however_big_it_is() -> None:
+    env = GymEnv("docking2d")
+    starts = [env.reset(seed=seed)[0] for seed in BIG]
+    assert len({start.tobytes() for start in starts}) == len(BIG)
+    np.testing.assert_allclose(GymVectorEnv("docking2d", len(BIG)).reset(seed=BIG)[0], starts, rtol=1e-6)
+    np.testing.assert_allclose(GymVectorEnv("docking2d", 3).reset(seed=2**32 - 1)[0], starts[2:5], rtol=1e-6)
+    drawn = GymEnv("docking2d")
+    first, _ = drawn.reset()
+    assert np.array_equal(env.reset(seed=drawn.np_random_seed)[0], first)
+
+
+@pytest.mark.parametrize("build", [lambda: gym.make("jaxsafe/Docking2D-v0"), lambda: GymVectorEnv("docking2d", 2)])
+def test_a_generator_of_ones_own_decides_the_starts(build: Any) -> None:
+    env, starts = build(), []
+    for seed in (3, 4, 3):  # at first, and in the middle of a chain
+        env.np_random = np.random.default_rng(seed)
+        starts.append(np.stack([env.reset()[0] for _ in range(2)]))
+    assert np.array_equal(starts[0], starts[2])
+    assert len(np.unique(np.concatenate(starts[:2]).reshape(-1, 6), axis=0)) == np.concatenate(starts[:2]).size // 6
+    with pytest.raises(ConfigError, match=r"np_random: expected a numpy.random.Generator, found 3"):
+        env.np_random = 3
+
+
+def test_a_generator_of_ones_own_waits_for_the_lanes_that_go_on() -> None:
+    env, other = GymVectorEnv("docking2d", 2), GymVectorEnv("docking2d", 2)
+    first, _ = env.reset(seed=0)
+    env.np_random = np.random.default_rng(3)
+    only, _ = env.reset(options={"reset_mask": np.array([True, False])})
+    assert np.array_equal(only[1], first[1])
+    other.np_random = np.random.default_rng(3)
+    expected, _ = other.reset()
+    assert np.array_equal(only[0], expected[0])
+
+
+def test_lanes_start_as_single_environments_with_other_kinds_of_keys() -> None:
+    with jax.default_prng_impl("rbg"):
+        env, single = GymVectorEnv("docking2d", 3), GymEnv("docking2d")
+        single.reset(seed=1)
+        expected = [single.reset(seed=1)[0], *(single.reset()[0] for _ in range(2))]
+        starts = [env.reset(seed=0)[0]]
+    mask = {"reset_mask": np.array([False, True, False])}
+    starts += [env.reset(options=mask)[0] for _ in range(2)]
+    np.testing.assert_allclose([start[1] for start in starts], expected, rtol=1e-6, atol=1e-6)
 
 
 def test_lanes_are_seeded_one_by_one() -> None:
@@ -222,6 +269,10 @@ def test_an_episode_can_be_watched() -> None:
         (lambda: GymVectorEnv("docking2d", 2, autoreset_mode="Same"), "autoreset_mode: unknown mode 'Same'"),
         (lambda: GymEnv("docking2d").reset(options={"from": 3}), "reset: options: unknown 'from'; choose from start"),
         (lambda: GymVectorEnv("docking2d", 2).reset(seed=[1, 2, 3]), "seed: expected 2 seeds, found 3"),
+        (lambda: GymVectorEnv("docking2d", 2).reset(seed=[1, -1]), "seed: expected a whole number ≥ 0, found -1"),
+        (lambda: GymVectorEnv("docking2d", 2).reset(seed=1.5), "seed: expected a whole number ≥ 0, or one for each lane"),
+        (lambda: GymEnv("docking2d").reset(seed=True), "seed: expected a whole number ≥ 0, found True"),
+        (lambda: GymEnv("docking2d").reset(seed=10**5000), "seed: expected at most 128 bits, found 16610"),
         (lambda: GymVectorEnv("docking2d", 2).reset(options={"reset_mask": [True, False]}), "reset_mask: expected a bool"),
     ],
 )

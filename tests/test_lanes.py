@@ -32,7 +32,7 @@ def test_environments_of_one_structure_share_a_layout() -> None:
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
 def test_lanes_do_what_the_pure_functions_do(actions: str) -> None:
     env = jaxsafe.make("docking2d", actions=actions)
-    lanes, seeds = Lanes(env, 3, np.inf), np.array([4, 5, 6], np.uint32)
+    lanes, seeds = Lanes(env, 3, np.inf), [4, 5, 6]
     lanes.seed(np.ones(3, bool), seeds)
     lanes.restart(np.ones(3, bool))
     action = np.array([[0, 10], [3, 3], [7, 1]], np.int32) if actions == "discrete" else np.eye(3, 2, dtype=np.float32)

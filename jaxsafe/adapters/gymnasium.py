@@ -9,7 +9,7 @@ Observations, rewards and infos are NumPy arrays and Python numbers.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -27,7 +27,44 @@ from jaxsafe.environment import Environment, reset_to
 from jaxsafe.errors import ConfigError, nearest
 
 
-class GymEnv(gym.Env[np.ndarray, np.ndarray]):
+class _Chains:
+    """The chains of keys that episodes start from, one for each lane."""
+
+    _lanes: Lanes
+    _unseeded: np.ndarray
+    """Where no chain has begun, or `np_random` is a new generator and the next chain begins from it; [num_envs]."""
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """Return the generator of Gymnasium's; episodes start from it where no seed is given, if it was set."""
+        return super().np_random  # type: ignore[misc]
+
+    @np_random.setter
+    def np_random(self, value: np.random.Generator) -> None:
+        if not isinstance(value, np.random.Generator):
+            raise ConfigError(f"np_random: expected a numpy.random.Generator, found {value!r}")
+        self._np_random = value
+        self._np_random_seed = -1  # Gymnasium's sign of a generator whose seed is unknown
+        self._unseeded[:] = True
+
+    def _begin_chains(self, mask: np.ndarray, seeds: Sequence[int | None]) -> None:
+        """Begin a chain in each lane of the mask that is asked to, or has none."""
+        begin = mask & (self._unseeded | [seed is not None for seed in seeds])
+        if not begin.any():
+            return
+        own = [0] * len(seeds)
+        if any(seed is None for seed in seeds):
+            known: Any = self.np_random_seed  # type: ignore[attr-defined]
+            own = (
+                self.np_random.integers(2**32, size=len(seeds)).tolist()
+                if known == -1
+                else range(known, known + len(seeds))
+            )
+        self._lanes.seed(begin, [one if seed is None else seed for seed, one in zip(seeds, own, strict=True)])
+        self._unseeded &= ~begin
+
+
+class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
     """One environment.
 
     `reset(seed=s)` starts a chain of keys from `jax.random.key(s)`, and each reset takes the next: equal seeds give equal
@@ -65,14 +102,14 @@ class GymEnv(gym.Env[np.ndarray, np.ndarray]):
         self.render_mode = _checked_render_mode(render_mode)
         self.observation_space, self.action_space = spaces(self.env)
         self._lanes = Lanes(self.env, 1, _checked_limit(max_episode_steps))
+        self._unseeded = np.ones(1, bool)
         self._frames = Frames(self.env) if render_mode else None
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Start an episode: see the class."""
         super().reset(seed=seed)
         chosen = _checked_options(options, ("start", "parameters"))
-        if seed is not None or not self._lanes.running:
-            self._lanes.seed(_ALONE, _seeds([self.np_random_seed]))
+        self._begin_chains(_ALONE, [_checked_seed(seed)])
         if chosen:
             placed = reset_to(self.env, chosen.get("start", {}), chosen.get("parameters"))
             self._lanes.place(jax.tree.map(lambda x: x[None], Episodes(*placed)))
@@ -113,7 +150,7 @@ class GymEnv(gym.Env[np.ndarray, np.ndarray]):
         return timestep.observation.copy(), float(timestep.reward), *flags, info
 
 
-class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Many environments, stepped by one compiled program.
 
     Each lane does what a `GymEnv` of its own would do with the same seed; `reset(seed=s)` seeds lane i with s + i. What
@@ -147,6 +184,7 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._lanes = Lanes(self.env, self.num_envs, _checked_limit(max_episode_steps))
+        self._unseeded = np.ones(self.num_envs, bool)
         self._over = np.zeros(self.num_envs, bool)
         self._frames = [Frames(self.env) for _ in range(self.num_envs)] if render_mode else []
 
@@ -157,10 +195,7 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         mask = _checked_mask(_checked_options(options, ("reset_mask",)).get("reset_mask"), self.num_envs)
         if not self._lanes.running and not mask.all():
             raise ResetNeeded("reset: the first reset takes no reset_mask")
-        asked = self._seeds(seed)
-        seeded = mask & np.array([one is not None or not self._lanes.running for one, _ in asked])
-        if seeded.any():
-            self._lanes.seed(seeded, _seeds([entropy if one is None else one for one, entropy in asked]))
+        self._begin_chains(mask, self._seeds(seed))
         self._lanes.restart(mask)
         episodes = self._lanes.now
         self._over = np.where(mask, False, self._over)
@@ -211,17 +246,18 @@ class GymVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise ResetNeeded("render: call reset first")
         return tuple(frames.draw() for frames in self._frames)
 
-    def _seeds(self, seed: int | list[int | None] | None) -> list[tuple[int | None, int]]:
-        """For each lane the seed that was asked for, and one to begin with if none was."""
+    def _seeds(self, seed: int | Iterable[int | None] | None) -> list[int | None]:
+        """Return the seed that each lane is asked for."""
         if seed is None or isinstance(seed, int | np.integer):
             super().reset(seed=seed)  # sets np_random
-            base = [None if seed is None else int(seed) + lane for lane in range(self.num_envs)]
-        else:
-            base = [None if one is None else int(one) for one in seed]
-        if len(base) != self.num_envs:
-            raise ConfigError(f"reset: seed: expected {self.num_envs} seeds, found {len(base)}")
-        entropy: Any = self.np_random_seed
-        return [(one, entropy + lane) for lane, one in enumerate(base)]
+            first = _checked_seed(seed)
+            return [None if first is None else first + lane for lane in range(self.num_envs)]
+        if not isinstance(seed, Iterable):
+            raise ConfigError(f"reset: seed: expected a whole number ≥ 0, or one for each lane, found {seed!r}")
+        seeds = [_checked_seed(one) for one in seed]
+        if len(seeds) != self.num_envs:
+            raise ConfigError(f"reset: seed: expected {self.num_envs} seeds, found {len(seeds)}")
+        return seeds
 
     def _film(self, restarted: np.ndarray, episodes: Episodes) -> None:
         """Remember what pictures show."""
@@ -258,8 +294,19 @@ _ALONE = np.ones(1, bool)
 """The mask of the only lane."""
 
 
-def _seeds(seeds: list[Any]) -> np.ndarray:
-    return np.array([seed % 2**32 for seed in seeds], np.uint32)
+MAX_SEED_BITS = 128
+"""As many as Gymnasium's own seeds have, which are drawn where none is given."""
+
+
+def _checked_seed(seed: Any) -> int | None:
+    if seed is None:
+        return None
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or seed < 0:
+        raise ConfigError(f"reset: seed: expected a whole number ≥ 0, found {seed!r}")
+    bits = int(seed).bit_length()
+    if bits > MAX_SEED_BITS:
+        raise ConfigError(f"reset: seed: expected at most {MAX_SEED_BITS} bits, found {bits}")
+    return int(seed)
 
 
 def _checked_action(env: Environment, action: Any) -> np.ndarray:

@@ -7,6 +7,7 @@ hundred. So each is packed into one array of words, bit by bit, and unpacked ins
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -111,10 +112,11 @@ def _unsigned(dtype: Any) -> np.dtype:
 
 
 class Layout(NamedTuple):
-    """How an environment and its episodes are packed."""
+    """How an environment and its episodes are packed, and the kind of their keys."""
 
     env: Packing
     episodes: Packing
+    key_impl: str  # as `jax.random.key(seed, impl=…)` takes it
 
 
 class Lanes:
@@ -122,8 +124,10 @@ class Lanes:
 
     def __init__(self, env: Environment, num_envs: int, max_episode_steps: float) -> None:
         """Pack the environment; no episode runs yet."""
-        keys = np.zeros((num_envs, 2), np.uint32)
-        self._layout = Layout(packing(env), packing(jax.eval_shape(_start, env, keys)[1], lanes=1))
+        impl: Any = jax.config.jax_default_prng_impl  # pyright: ignore[reportAttributeAccessIssue]
+        keys = np.zeros((num_envs, *_key_shape(impl)), np.uint32)
+        episodes = jax.eval_shape(functools.partial(_start, impl), env, keys)[1]
+        self._layout = Layout(packing(env), packing(episodes, lanes=1), impl)
         self._env = np.asarray(self._layout.env.pack(env))
         self._limit = np.float32(max_episode_steps)
         self._keys: Any = keys  # raw, of the chains that starts come from
@@ -135,9 +139,15 @@ class Lanes:
         """The `Episodes`, of NumPy arrays that must not be written to."""
         return self._layout.episodes.receive(self._words)
 
-    def seed(self, mask: np.ndarray, seeds: np.ndarray) -> None:
-        """Begin new chains of keys where the mask says, each at `jax.random.key(seed)`; both [num_envs]."""
-        self._keys = np.where(mask[:, None], _raw_keys(seeds), self._keys)
+    def seed(self, mask: np.ndarray, seeds: Sequence[int]) -> None:
+        """Begin new chains of keys where the mask says, [num_envs], each at `jax.random.key(seed)`.
+
+        A seed of more than 32 bits begins at the key of its lowest 32, folded with the others.
+        """
+        size = max(1, *(-(-seed.bit_length() // 32) for seed in seeds))
+        words = [[seed >> 32 * i & 0xFFFFFFFF for i in range(size)] for seed in seeds]
+        keys = _raw_keys(self._layout.key_impl, np.array(words, np.uint32))
+        self._keys = np.where(mask[:, None], keys, self._keys)
 
     def restart(self, mask: np.ndarray) -> None:
         """Start an episode where the mask says, [num_envs]; the first time, everywhere."""
@@ -167,7 +177,7 @@ def restart(layout: Layout, env: Array, keys: Array, words: Array, mask: Array) 
 
     def draw(parameters: tuple[Array, Array], lanes: Array) -> tuple[Array, Episodes]:
         env, keys = parameters
-        return _start(layout.env.unpack(env), keys[lanes])
+        return _start(layout.key_impl, layout.env.unpack(env), keys[lanes])
 
     keys, episodes = renew(mask, draw, (env, keys), running)
     return keys, layout.episodes.pack(episodes)
@@ -181,16 +191,31 @@ def advance(layout: Layout, env: Array, words: Array, action: Array, limit: floa
     return layout.episodes.pack(Episodes(state, cut_short(state, timestep, limit)))
 
 
-@jax.jit
-def _raw_keys(seeds: Array) -> Array:
-    return jax.vmap(lambda seed: jax.random.key_data(jax.random.key(seed)))(seeds)
+@functools.partial(jax.jit, static_argnums=0)
+def _raw_keys(impl: str, seeds: Array) -> Array:
+    """Return the key of each seed, given as words of 32 bits, the lowest first, [num_envs, words]."""
+
+    def raw_key(words: Array) -> Array:
+        key = jax.random.key(words[0], impl=impl)
+        for i in range(1, words.size):
+            folded, _ = jax.random.split(jax.random.fold_in(key, words[i]))  # `unsafe_rbg` folds in any order alike
+            key = jnp.where(jnp.any(words[i:] > 0), folded, key)
+        return jax.random.key_data(key)
+
+    return jax.lax.map(raw_key, seeds)
 
 
-def _start(env: Environment, keys: Array) -> tuple[Array, Episodes]:
+def _key_shape(impl: str) -> tuple[int, ...]:
+    return jax.eval_shape(lambda: jax.random.key_data(jax.random.key(0, impl=impl))).shape
+
+
+def _start(impl: str, env: Environment, keys: Array) -> tuple[Array, Episodes]:
     """The keys that follow, and an episode in each lane."""
 
     def start(key: Array) -> tuple[Array, Episodes]:
-        following, now = jax.random.split(jax.random.wrap_key_data(key))
+        following, now = jax.random.split(jax.random.wrap_key_data(key, impl=impl))
         return jax.random.key_data(following), Episodes(*reset(env, now))
 
-    return jax.vmap(start)(keys)
+    # What other kinds of keys draw under vmap depends on the first lane's key: a lane would start where it started before.
+    over_lanes = jax.vmap(start) if impl == "threefry2x32" else functools.partial(jax.lax.map, start)
+    return over_lanes(keys)
