@@ -37,13 +37,20 @@ class Unit:
 
 @dataclasses.dataclass(frozen=True)
 class Range:
-    """The closed or half-open interval in which a number must lie, with or without 0."""
+    """The closed or half-open interval in which a number must lie, with or without 0, and how small or large it may be.
+
+    The interval says what has a meaning. `smallest` and `largest` say which magnitudes, 0 apart, single precision can
+    compute with. A number must be finite unless it is a limit that may be `infinite`, where it then means none.
+    """
 
     low: float = -float("inf")
     high: float = float("inf")
     open_low: bool = False
     open_high: bool = False
     nonzero: bool = False
+    smallest: float = 0.0
+    largest: float = float("inf")
+    infinite: bool = False
 
     def __contains__(self, value: float) -> bool:
         above = value > self.low if self.open_low else value >= self.low
@@ -53,9 +60,23 @@ class Range:
     def __str__(self) -> str:
         if self.nonzero:
             return "other than 0"
+        if self.high == -self.low == float("inf"):
+            return ""
         if self.high == float("inf"):
             return f"{'>' if self.open_low else '≥'} {self.low:g}"
         return f"in {'(' if self.open_low else '['}{self.low:g}, {self.high:g}{')' if self.open_high else ']'}"
+
+    def carries(self, value: float) -> bool:
+        """Whether single precision can compute with a number of this magnitude."""
+        return value == 0 or self.smallest <= abs(value) <= self.largest
+
+    @property
+    def magnitudes(self) -> str:
+        """Return in words what `carries` allows."""
+        if self.largest == float("inf"):
+            return f"of a magnitude from {self.smallest:g} on" if self.smallest else "that is finite"
+        most = f"{self.largest:,}" if isinstance(self.largest, int) else f"{self.largest:g}"
+        return f"of a magnitude from {self.smallest:g} to {most}" if self.smallest else f"of a magnitude up to {most}"
 
 
 @dataclasses.dataclass(frozen=True)

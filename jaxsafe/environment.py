@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.component import Component, Unit
+from jaxsafe.component import Component, Range, Unit
 from jaxsafe.errors import ConfigError, nearest, part, show
 from jaxsafe.paths import set_path
 from jaxsafe.processors.constraint import Constraint
@@ -28,7 +28,7 @@ from jaxsafe.rta.prediction import advance
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.initializers import uniform
 from jaxsafe.simulation.platform import Platform, placed
-from jaxsafe.types import Info, Key, Memory, Number, ParameterPath, PlatformName, RTAInfo, Seconds, Sim, State, TimeStep
+from jaxsafe.types import Info, Key, Memory, Number, ParameterPath, PlatformName, RTAInfo, Sim, State, TimeStep
 
 Parameters = Mapping[str, Float[Array, ""]]
 
@@ -48,7 +48,7 @@ class Environment(Component):
     shorthand: ClassVar[str | None] = "platforms"
 
     agent: PlatformName
-    dt: Seconds = 1.0
+    dt: Annotated[Number, Unit("s"), Range(0.0, open_low=True, smallest=1e-6, largest=1e5)] = 1.0
     platforms: tuple[Platform, ...]
     regions: tuple[Region, ...] = ()
     status: tuple[Status, ...] = ()
@@ -172,6 +172,9 @@ def reset_to(
     Raises:
         ConfigError: a platform, field or parameter is unknown, or a random one is missing or has another shape.
     """
+    for what, value in (("platforms", start), ("parameters", {} if parameters is None else parameters)):
+        if not isinstance(value, Mapping):
+            raise ConfigError(f"reset_to: expected {what} by name, found {show(value)}")
     parameters = _chosen_parameters(env, parameters or {})
     env = drawn(env, parameters)
     known = {platform.name: platform for platform in env.platforms}

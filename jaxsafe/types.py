@@ -22,15 +22,32 @@ Key = Array
 Number = Any
 """An array; until the environment is built a float, or a tuple of floats."""
 Positive = Range(0.0, open_low=True)
+
+FAR = 1e12
+"""The largest distance [m or ft]: the squares of distances that sum up over many steps are finite in single precision."""
+
+Reach = Range(0.0, largest=FAR)
+"""A distance, which may be 0."""
+
+Extent = Range(0.0, open_low=True, smallest=1e-6, largest=FAR)
+"""A distance that something is divided by."""
+
+Place = Range(largest=FAR)
+"""A coordinate, or another number of a start, on either side of 0."""
+
+Control = Range(largest=1e9)
+"""A control in physical units."""
 Dimensionless = Annotated[Number, Unit("1")]
 Length = Annotated[Number, Unit("m or ft")]
 """In the unit of the platforms: metres for spacecraft, feet for aircraft."""
 MetresPerSecond = Annotated[Number, Unit("m/s")]
 PerSecond = Annotated[Number, Unit("1/s")]
 Radians = Annotated[Number, Unit("rad")]
+Turn = Range(largest=1e4)
+"""An angle [rad]: sines of larger ones lose digits in single precision."""
 RadiansPerSecond = Annotated[Number, Unit("rad/s")]
 Newtons = Annotated[Number, Unit("N")]
-Kilograms = Annotated[Number, Unit("kg"), Positive]
+Kilograms = Annotated[Number, Unit("kg"), Range(0.0, open_low=True, smallest=1e-6, largest=FAR)]
 Seconds = Annotated[Number, Unit("s"), Positive]
 
 PlatformName = Annotated[str, Refers("platforms")]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsafe.component import ANY, Component, Range, Unit, choices, fields, normalise
+from jaxsafe.component import ANY, Component, Range, Unit, choices, field, fields, normalise
 from jaxsafe.config.convert import expects, to_value
 from jaxsafe.errors import ConfigError
 from jaxsafe.processors.reward import Failure
@@ -323,3 +323,44 @@ def test_a_type_name_is_not_inherited(kind: type[Component]) -> None:
 def test_mappings_are_sorted_by_name_when_a_component_is_built() -> None:
     failure = Failure(name="failure", values={"timeout": -1.0, "crash": -2.0, "distance": -3.0})
     assert list(normalise(failure).values) == ["crash", "distance", "timeout"]
+
+
+def test_a_range_says_which_magnitudes_single_precision_can_compute_with() -> None:
+    mass = Range(0.0, open_low=True, smallest=1e-3, largest=1e6)
+    assert [mass.carries(value) for value in (0.0, 1e-4, 1e-3, -1e6, 2e6)] == [True, False, True, True, False]
+    assert mass.magnitudes == "of a magnitude from 0.001 to 1e+06"
+    assert Range(largest=10_000).magnitudes == "of a magnitude up to 10,000"
+    assert Range(smallest=0.5).magnitudes == "of a magnitude from 0.5 on"
+    assert Range().magnitudes == "that is finite"
+    assert str(Range(largest=5.0)) == ""
+
+
+@pytest.mark.parametrize(
+    ("annotation", "value", "message"),
+    [
+        (Annotated[Any, Unit("m")], float("inf"), "^x: expected a number in m that is finite, found inf$"),
+        (Annotated[Any, Unit("m")], 1e39, "^x: expected a number in m that is finite, found 1e[+]39$"),
+        (Annotated[Any, Unit("m", length=0)], [1.0, -1e39], "that is finite"),
+        (Annotated[Any, Unit("m"), Range(largest=5.0)], -6, "^x: expected a number in m of a magnitude up to 5, found -6$"),
+        (Annotated[Any, Unit("m"), Range(0.0, smallest=2.0)], 1, "in m ≥ 0 of a magnitude from 2 on, found 1$"),
+        (Annotated[Any, Unit("m"), Range(infinite=True)], 1e39, "that is finite, found 1e[+]39$"),
+        (
+            Annotated[Any, Unit("m", length=2), Range(infinite=True)],
+            [np.inf, np.inf],
+            "low < high where a bound is infinite",
+        ),
+        (Annotated[int, Range(1, largest=9)], 10, "^x: expected a whole number ≥ 1 of a magnitude up to 9, found 10$"),
+        (Annotated[int, Range(1, largest=9)], 1e300, "found 1e[+]300$"),
+        (Annotated[int, Range(1, largest=9)], 10**4000, "found a number of thousands of digits$"),
+    ],
+)
+def test_a_number_that_single_precision_cannot_hold_is_refused(annotation: Any, value: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        to_value(value, field("x", annotation), "x")
+
+
+def test_a_limit_may_be_infinite_where_its_range_says_so() -> None:
+    clip = field("x", Annotated[Any, Unit("1", length=2), Range(largest=9.0, infinite=True)])
+    assert to_value([-np.inf, 1], clip, "x").tolist() == [-np.inf, 1.0]
+    with pytest.raises(ConfigError, match="of a magnitude up to 9"):
+        to_value([-np.inf, 10], clip, "x")

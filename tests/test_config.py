@@ -922,3 +922,52 @@ def test_a_region_is_refused_in_a_space_where_its_name_says_something_else(
         assert re.search(
             rf"^regions\.{env.regions[0].name}: a {region['type']} is no part of a space of {fitting}", message
         )
+
+
+@pytest.mark.parametrize(
+    ("task", "path", "value", "message"),
+    [
+        *(("docking2d", path, value, "of a magnitude|that is finite") for path, value in [
+            ("dt", 1e30), ("dt", 1e-30), ("dt", float("inf")), ("deputy.mass", 1e-30), ("deputy.mass", 1e39),
+            ("deputy.mean_motion", float("inf")), ("deputy.start.position.distance", [0, 1e38]),
+            ("deputy.start.position.direction.azimuth", [0, float("inf")]), ("deputy.start.velocity.share", [0, 1e38]),
+            ("deputy.controller.actuators.thrust_x.low", -float("inf")), ("regions.docking_region.radius", 1e38),
+            ("deputy.controller.actuators.thrust_x.points", 1e30), ("terminal.distance.limit", 1e39),
+            ("terminal.timeout.limit", float("inf")), ("reward.delta_v.scale", float("inf")),
+            ("reward.success.value", -1e39), ("reward.success.time_scale", 1e-38), ("observation.position.scale", 1e-38),
+            ("reward.velocity_constraint.offset", float("inf")), ("reward.velocity_constraint.bound.below", -float("inf")),
+            ("reward.failure.values.crash", -float("inf")), ("reward.distance_change.half_distance", 1e-38),
+            ("status.velocity_limit.slope", 1e38),
+        ]),
+        ("docking2d", "terminal.distance.limit", -1, r"expected a number in m or ft > 0, found -1"),
+        ("docking2d", "terminal.distance.limit", 0, r"expected a number in m or ft > 0, found 0"),
+        ("docking2d", "observation.position.clip", [float("inf")] * 2, "low < high where a bound is infinite"),
+        ("rejoin3d", "lead.gravity", 0, r"lead\.gravity: expected a number in ft/s² > 0, found 0"),
+        ("rejoin3d", "wingman.roll_limits", [-1.5707, 1.5707], "of a magnitude up to 1.57"),
+        ("rejoin3d", "wingman.speed_limits", [1e-30, 400], "of a magnitude from 0.001 to 1e[+]09"),
+        ("rejoin2d", "lead.start.position.low", [1e38, 1e38], "of a magnitude up to 1e[+]12"),
+        ("rejoin2d", "regions.rejoin_region.offset.angle", float("inf"), "of a magnitude up to 10000"),
+        ("docking2d_oriented", "deputy.attitude_rate_limits", [1e38, 1e38], "of a magnitude up to 1e[+]06"),
+    ],
+)  # fmt: skip
+def test_a_number_from_which_no_finite_state_follows_is_refused(task: str, path: str, value: Any, message: str) -> None:
+    found = fault(lambda: jaxsafe.make(task, {path: value}))
+    assert path in found
+    assert re.search(message, found)
+
+
+def test_a_speed_limit_of_nothing_is_refused() -> None:
+    changes = {"status.velocity_limit.floor": 0, "status.velocity_limit.slope": 0}
+    assert fault(lambda: jaxsafe.make("docking2d", changes)).startswith("status.velocity_limit: expected a limit above 0")
+    jaxsafe.make("docking2d", {"status.velocity_limit.floor": 0})
+
+
+def test_limits_may_be_infinite_and_read_back(env: Environment) -> None:
+    changes = {"terminal.distance.limit": float("inf"), "observation.position.clip": [-float("inf"), 1.0]}
+    changed = jaxsafe.override(env, changes)
+    assert load(dump(changed)) == changed
+
+
+def test_the_horizon_of_a_filter_has_an_end() -> None:
+    message = fault(lambda: jaxsafe.make("docking2d", {"rta.horizon": 1e30}, rta="implicit_asif"))
+    assert message == "rta.horizon: expected a whole number ≥ 0 of a magnitude up to 10,000, found 1e+30"

@@ -324,3 +324,21 @@ def test_success_is_an_outcome_that_training_and_evaluation_ask_for() -> None:
     env = jaxsafe.override(plain, {"terminal": (goal, *plain.terminal[1:]), "reward": terms})
     with pytest.raises(ConfigError, match=r"no outcome is called 'success'.*docked, crash, distance, timeout, velocity"):
         require_success(env)
+
+
+@pytest.mark.parametrize(
+    ("start", "parameters", "message"),
+    [
+        (None, None, "expected platforms by name, found None"),
+        ([], None, r"expected platforms by name, found \[\]"),
+        ("deputy", None, "expected platforms by name, found 'deputy'"),
+        ({"deputy": None}, None, "deputy: expected fields by name, found None"),
+        (START, [1], r"expected parameters by name, found \[1\]"),
+        ({"deputy": {**START["deputy"], "velocity": [0.0, 1e39]}}, None, r"velocity: expected finite numbers, found \[0"),
+    ],
+)
+def test_reset_to_refuses_what_is_no_mapping_of_numbers(
+    env: Environment, start: Any, parameters: Any, message: str
+) -> None:
+    with pytest.raises(ConfigError, match=f"^reset_to: .*{message}"):
+        jaxsafe.reset_to(env, start, parameters)

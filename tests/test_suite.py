@@ -1,5 +1,6 @@
 """The laws that every task keeps, with continuous and with discrete actions, and one environment composed in YAML."""
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import jaxsafe
-from jaxsafe import Environment, metrics
+from jaxsafe import ConfigError, Environment, metrics
+from jaxsafe.component import Component, fields
 from jaxsafe.config import dump, load
 from jaxsafe.envs import TASKS
 from jaxsafe.types import State, TimeStep
@@ -685,3 +687,46 @@ def test_an_action_that_is_not_a_number_ends_the_episode(env: Environment) -> No
     _, timestep = step(env, state, action(env, np.nan))
     assert env.outcomes[int(timestep.info.outcome)] == "diverged"
     assert (timestep.cost, bool(timestep.terminated)) == (1.0, True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["docking3d", "docking2d_oriented", "rejoin2d", "rejoin3d"])
+def test_a_number_at_either_end_of_what_is_allowed_gives_finite_states(task: str) -> None:
+    @jax.jit
+    def finite(env: Environment, keys: jax.Array) -> jax.Array:
+        state, timestep = jax.vmap(jaxsafe.reset, in_axes=(None, 0))(env, keys)
+        seen = [state, timestep]
+        for index in range(3):
+            action = jnp.full((len(keys), env.action_size), (-1.0) ** index)
+            state, timestep = jax.vmap(jaxsafe.step, in_axes=(None, 0, 0))(env, state, action)
+            seen += [state, timestep]
+        floats = [leaf for leaf in jax.tree.leaves(seen) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+        return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in floats]))
+
+    env, keys = jaxsafe.make(task), jax.random.split(jax.random.key(0), 4)
+    accepted = 0
+    for path, shape in paths_of_numbers(env):
+        for size in (1e12, 1e9, 1e5, 1e3, 1e-3, 1e-6, 0.0):
+            for value in (size, -size):
+                try:
+                    changed = jaxsafe.override(env, {path: np.full(shape, value)})
+                except ConfigError:
+                    continue
+                accepted += 1
+                assert finite(changed, keys), (path, value)
+    assert accepted > 200
+
+
+def paths_of_numbers(component: Component, place: str = "") -> Iterator[tuple[str, tuple[int, ...]]]:
+    """The dotted path and the shape of every number of an environment."""
+    for name, field in fields(type(component)).items():
+        value, here = getattr(component, name), f"{place}{name}"
+        if field.unit:
+            yield from [] if value is None else [(here, value.shape)]
+        elif isinstance(value, Component):
+            yield from paths_of_numbers(value, f"{here}.")
+        elif isinstance(value, tuple):
+            for part in value:
+                yield from paths_of_numbers(part, f"{here}.{part.name}.") if isinstance(part, Component) else ()
+        elif isinstance(value, Mapping):
+            yield from ((f"{here}.{key}", ()) for key in value)

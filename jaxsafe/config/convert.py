@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxsafe.component import ANY, Component, Field, Kind, choices, fields, normalise, unwrap_optional
+from jaxsafe.component import ANY, Component, Field, Kind, Range, choices, fields, normalise, unwrap_optional
 from jaxsafe.component import field as field_of
 from jaxsafe.errors import ConfigError, nearest, show
 from jaxsafe.paths import join
@@ -68,7 +68,7 @@ def expects(field: Field) -> str:
             field.unit.length
         ]
         unit = "" if field.unit.symbol in ("1", "physical", "as observed") else f" in {field.unit.symbol}"
-        return f"{shape}{unit}" + (f" {field.range}" if field.range else "")
+        return f"{shape}{unit} {field.range or ''}".rstrip()
     core = _bare(field.hint)
     if typing.get_origin(core) is Literal:
         return "one of " + ", ".join(map(str, typing.get_args(core)))
@@ -103,12 +103,15 @@ def _structure(value: Any, hint: Any, field: Field, place: str) -> Any:
         if value not in arguments:
             raise ConfigError(f"{place}: found {_show(value)}; choose from {nearest(value, arguments)}")
         return value
+    given = value
     if hint is int and isinstance(value, float) and value.is_integer():
         value = int(value)
     if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
         raise ConfigError(f"{place}: expected {expects(field)}, found {_show(value)}")
     if field.range and isinstance(value, int) and value not in field.range:
         raise ConfigError(f"{place}: expected {expects(field)}, found {show(value)}")
+    if field.range and isinstance(value, int) and not field.range.carries(value):
+        raise ConfigError(f"{place}: expected {expects(field)} {field.range.magnitudes}, found {show(given)}")
     return value
 
 
@@ -147,11 +150,16 @@ def _number(value: Any, field: Field, place: str) -> jax.Array:
     if not isinstance(array, Tracer):
         with np.errstate(over="ignore"):  # beyond the largest float32 is infinite
             numbers = np.asarray(array, jnp.result_type(float))
-        allowed = field.range is None or all(number in field.range for number in np.atleast_1d(numbers))
-        if np.isnan(numbers).any() or not allowed or (field.range and np.isinf(numbers).any()):
+        limits = field.range or Range()
+        if np.isnan(numbers).any() or not all(number in limits for number in np.atleast_1d(numbers)):
             raise wrong
+        finite = np.isfinite(numbers) | (limits.infinite & np.isinf(np.asarray(array, float)))
+        if not finite.all() or not all(limits.carries(number) for number in numbers[np.isfinite(numbers)].tolist()):
+            raise ConfigError(f"{place}: expected {expects(field)} {limits.magnitudes}, found {_show(value)}")
         if length == 2 and numbers[0] > numbers[1]:
             raise ConfigError(f"{place}: expected low ≤ high, found {_show(value)}")
+        if length == 2 and np.isinf(numbers[0]) and numbers[0] == numbers[1]:
+            raise ConfigError(f"{place}: expected low < high where a bound is infinite, found {_show(value)}")
         array = numbers
     return jnp.asarray(array, jnp.result_type(float))
 

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 from jaxtyping import Array, Float
 
 from jaxsafe.component import Component
-from jaxsafe.types import Length, Positive, Sim, StatusName
+from jaxsafe.types import Extent, Length, Sim, StatusName
 
 
 class Constraint(Component):
@@ -44,7 +44,7 @@ class Separation(Constraint, type="separation"):
 
     between: ClassVar[bool] = True
     distance: StatusName
-    minimum: Annotated[Length, Positive]
+    minimum: Annotated[Length, Extent]
 
     def margin(self, sim: Sim) -> Float[Array, ""]:
         return sim.status[self.distance] - self.minimum

@@ -12,8 +12,8 @@ from jaxsafe.processors.processor import Processor
 from jaxsafe.simulation.geometry import direction, mag_norm, to_body
 from jaxsafe.types import AnyStatusName, Number, PlatformName, RegionName, Sim
 
-Scale = Annotated[Number, Unit("as observed", length=ANY), Range(nonzero=True)]
-Limit = Annotated[Number, Unit("1", length=2)]
+Scale = Annotated[Number, Unit("as observed", length=ANY), Range(nonzero=True, smallest=1e-12)]
+Limit = Annotated[Number, Unit("1", length=2), Range(infinite=True)]
 
 
 class Observation(Processor):

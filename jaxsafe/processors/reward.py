@@ -8,29 +8,29 @@ from typing import Annotated, Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.component import Component, Unit
+from jaxsafe.component import Component, Range, Unit
 from jaxsafe.processors.processor import Processor
 from jaxsafe.processors.terminal import Ends
 from jaxsafe.types import (
-    Dimensionless,
+    Extent,
     FlagName,
     Length,
     Number,
     OutcomeName,
-    Positive,
     Record,
-    Seconds,
     Sim,
     StatusName,
 )
 
-PerMetrePerSecond = Annotated[Number, Unit("s/m")]
+Pay = Annotated[Number, Unit("1"), Range(largest=1e12)]
+"""A part of a reward: the squares of its sums over episodes are finite in single precision."""
+PerMetrePerSecond = Annotated[Number, Unit("s/m"), Range(largest=1e12)]
 
 
 class Bound(Component):
     """Ends the episode with `outcome` once the term's sum over the episode is below `below`."""
 
-    below: Dimensionless
+    below: Pay
     outcome: str
     ends: Ends = "terminated"
 
@@ -52,8 +52,8 @@ class DistanceChange(Reward, type="distance_change"):
     """Change of an exponential potential of a distance: scale·(e^(−a d_t) − e^(−a d_(t−1))), a = ln 2 / half_distance."""
 
     distance: StatusName
-    half_distance: Annotated[Length, Positive]
-    scale: Dimensionless = 2.0
+    half_distance: Annotated[Length, Extent]
+    scale: Pay = 2.0
 
     def init(self, sim: Sim) -> Potential:
         current = self._potential(sim)
@@ -86,7 +86,7 @@ class WhileIn(Reward, type="while_in"):
     """
 
     status: FlagName
-    value: Dimensionless = 0.1
+    value: Pay = 0.1
     both_samples: bool = False
 
     def init(self, sim: Sim) -> Stay:
@@ -116,7 +116,7 @@ class FirstTime(Reward, type="first_time"):
     """
 
     status: FlagName
-    value: Dimensionless = 0.25
+    value: Pay = 0.25
     count_start: bool = True
 
     def init(self, sim: Sim) -> Arrival:
@@ -136,7 +136,7 @@ class VelocityConstraint(Reward, type="velocity_constraint"):
 
     speed: StatusName
     velocity_limit: StatusName
-    offset: Dimensionless = -0.01
+    offset: Pay = -0.01
     scale: PerMetrePerSecond = -0.01
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
@@ -157,7 +157,7 @@ class DeltaVCost(Reward, type="delta_v"):
 class Intervention(Reward, type="intervention"):
     """A constant on every step on which run time assurance changed the control: what a policy pays for leaning on it."""
 
-    scale: Dimensionless = -0.01
+    scale: Pay = -0.01
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
         return jnp.where(sim.intervening, self.scale, 0.0)
@@ -167,8 +167,8 @@ class Success(Reward, type="success"):
     """value − t/t_max when the episode ends with `outcome`: sooner is better."""
 
     outcome: OutcomeName
-    time_scale: Seconds
-    value: Dimensionless = 2.0
+    time_scale: Annotated[Number, Unit("s"), Range(0.0, open_low=True, smallest=1e-6)]
+    value: Pay = 2.0
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
         return jnp.where(sim.ended[self.outcome], self.value - sim.time / self.time_scale, 0.0)
@@ -177,7 +177,7 @@ class Success(Reward, type="success"):
 class Failure(Reward, type="failure"):
     """A constant for each way to fail, by outcome name."""
 
-    values: Mapping[OutcomeName, Dimensionless]
+    values: Mapping[OutcomeName, Pay]
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
         return jnp.sum(jnp.stack([jnp.where(sim.ended[outcome], value, 0.0) for outcome, value in self.values.items()]))

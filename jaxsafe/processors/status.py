@@ -17,6 +17,7 @@ from jaxsafe.types import (
     Number,
     PerSecond,
     PlatformName,
+    Reach,
     Record,
     RegionName,
     Sim,
@@ -118,9 +119,14 @@ class VelocityLimit(Status, type="velocity_limit"):
     """Distance-dependent speed limit ν₀ + ν₁‖r‖, Eqs. (14), (17); it grows from a distance `constant_to` on."""
 
     distance: StatusName
-    floor: Annotated[MetresPerSecond, Range(0.0)]
-    slope: Annotated[PerSecond, Range(0.0)]
-    constant_to: Annotated[Length, Range(0.0)] = 0.0
+    floor: Annotated[MetresPerSecond, Range(0.0, largest=1e9)]
+    slope: Annotated[PerSecond, Range(0.0, largest=1e3)]
+    constant_to: Annotated[Length, Reach] = 0.0
+
+    def problem(self) -> str | None:
+        if self.floor == 0.0 and (self.slope == 0.0 or self.constant_to > 0.0):
+            return "expected a limit above 0 away from the centre: a floor, or a slope that begins there"
+        return None
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
         return self.floor + self.slope * jnp.maximum(sim.status[self.distance] - self.constant_to, 0.0)

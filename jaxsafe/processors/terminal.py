@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from jaxtyping import Array, Bool
 
-from jaxsafe.component import Component
+from jaxsafe.component import Component, Range
 from jaxsafe.simulation.clock import later, reached
-from jaxsafe.types import FlagName, Length, Seconds, Sim, StatusName
+from jaxsafe.types import FlagName, Length, Reach, Seconds, Sim, StatusName
 
 Ends = Literal["terminated", "truncated"]
 
@@ -56,7 +56,7 @@ class TooFar(Terminal, type="too_far"):
     """A distance above a limit; `inclusive`: at it already."""
 
     distance: StatusName
-    limit: Length
+    limit: Annotated[Length, Range(0.0, open_low=True, infinite=True)]
     inclusive: bool = False
 
     def reached(self, sim: Sim) -> Bool[Array, ""]:
@@ -68,7 +68,7 @@ class TooClose(Terminal, type="too_close"):
     """A distance below a limit; `inclusive`: at it already."""
 
     distance: StatusName
-    limit: Length
+    limit: Annotated[Length, Reach]
     inclusive: bool = True
 
     def reached(self, sim: Sim) -> Bool[Array, ""]:

@@ -97,7 +97,7 @@ class CertifiedRTA(RTA):
     constraints: tuple[ConstraintName, ...]
     margin: Margin = 0.0
     backups: tuple[BackupController, ...]
-    horizon: Annotated[int, Range(0)] = 0
+    horizon: Annotated[int, Range(0, largest=10_000)] = 0
     terminal: TerminalSet | None = None
     release: Margin = 0.0
     enforce: bool = True

@@ -9,11 +9,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.component import Range
+from jaxsafe.component import Range, Unit
 from jaxsafe.rta.filter import RTA, CertifiedRTA, RTAMemory, admissible
 from jaxsafe.rta.prediction import advance, undirected
 from jaxsafe.simulation.geometry import direction, safe_norm, to_body
-from jaxsafe.types import Length, PlatformName, Positive, RadiansPerSecond, RTAInfo, Seconds, Sim
+from jaxsafe.types import Length, Number, PlatformName, Positive, RadiansPerSecond, RTAInfo, Sim
 
 
 class Simplex(CertifiedRTA, type="simplex"):
@@ -55,9 +55,9 @@ class CollisionSimplex(RTA, type="collision_simplex"):
     """
 
     other: PlatformName
-    window: Seconds = 11.0
-    points: Annotated[int, Range(2)] = 111
-    turn_rate: Annotated[RadiansPerSecond, Positive] = math.radians(6.0)
+    window: Annotated[Number, Unit("s"), Range(0.0, open_low=True, largest=1e4)] = 11.0
+    points: Annotated[int, Range(2, largest=10_000)] = 111
+    turn_rate: Annotated[RadiansPerSecond, Range(0.0, open_low=True, largest=1e3)] = math.radians(6.0)
     engage: Annotated[Length, Positive] = 200.0
     release: Annotated[Length, Positive] = 250.0
 

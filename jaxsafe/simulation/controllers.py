@@ -13,9 +13,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.component import Component, Range, Unit
-from jaxsafe.types import Number, Sim
+from jaxsafe.types import Control, Number, Sim
 
-Bound = Annotated[Number, Unit("physical")]
+Bound = Annotated[Number, Unit("physical"), Control]
 Controls = Mapping[str, Float[Array, ""]]
 
 
@@ -30,7 +30,7 @@ class Actuator(Component):
     name: str
     low: Bound
     high: Bound
-    points: Annotated[int, Range(2)] = 11
+    points: Annotated[int, Range(2, largest=2**16)] = 11
     rescale: bool = True
     zero_centred: bool = False
 

@@ -10,7 +10,7 @@ from typing import Annotated
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.component import Unit
+from jaxsafe.component import Range, Unit
 from jaxsafe.simulation.controllers import Controls
 from jaxsafe.simulation.integrate import sine_ratios
 from jaxsafe.simulation.platform import Platform
@@ -21,6 +21,8 @@ MEAN_MOTION = 0.001027
 
 MASS = 12.0
 """Mass m of the deputy [kg], Table 4."""
+
+MeanMotion = Annotated[RadiansPerSecond, Range(largest=10.0)]
 
 
 class SpacecraftState(Record):
@@ -59,7 +61,7 @@ class Spacecraft(Anchor, type="spacecraft"):
     """A point mass with one thruster pair per axis: `thrust_x`, `thrust_y` and, in space, `thrust_z` [N]."""
 
     mass: Kilograms = MASS
-    mean_motion: RadiansPerSecond = MEAN_MOTION
+    mean_motion: MeanMotion = MEAN_MOTION
 
     @property
     def inputs(self) -> tuple[str, ...]:

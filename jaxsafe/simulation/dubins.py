@@ -27,7 +27,7 @@ from jaxsafe.simulation.integrate import (
 )
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.simulation.trig import arctan, sin_cos, sin_cos_acute
-from jaxsafe.types import Number, Positive, Record, Seconds
+from jaxsafe.types import Number, Record, Seconds
 
 GRAVITY = 32.17
 """Acceleration of gravity g [ft/s²]."""
@@ -35,8 +35,10 @@ GRAVITY = 32.17
 SPEEDS = (200.0, 400.0)
 """Slowest and fastest flight [ft/s], Table 3."""
 
-SpeedLimits = Annotated[Number, Unit("ft/s", length=2), Positive]
-AngleLimits = Annotated[Number, Unit("rad", length=2), Range(-jnp.pi / 2, jnp.pi / 2, open_low=True, open_high=True)]
+SpeedLimits = Annotated[Number, Unit("ft/s", length=2), Range(0.0, open_low=True, smallest=1e-3, largest=1e9)]
+AngleLimits = Annotated[
+    Number, Unit("rad", length=2), Range(-jnp.pi / 2, jnp.pi / 2, open_low=True, open_high=True, largest=1.57)
+]
 
 Ramps = Sequence[tuple[Any, Any, Any]]
 """Value, rate and limits of what changes linearly over a step."""
@@ -132,7 +134,7 @@ class Dubins3D(Platform, type="dubins3d"):
     speed_limits: SpeedLimits = SPEEDS
     flight_path_angle_limits: AngleLimits = (-jnp.pi / 9, jnp.pi / 9)
     roll_limits: AngleLimits = (-jnp.pi / 3, jnp.pi / 3)
-    gravity: Annotated[Number, Unit("ft/s²"), Range(0.0)] = GRAVITY
+    gravity: Annotated[Number, Unit("ft/s²"), Range(0.0, open_low=True, smallest=1e-6, largest=1e6)] = GRAVITY
 
     @property
     def inputs(self) -> tuple[str, ...]:

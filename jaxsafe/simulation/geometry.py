@@ -9,9 +9,9 @@ from typing import Annotated, Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.component import Component, Range, Unit
+from jaxsafe.component import Component, Unit
 from jaxsafe.simulation.trig import sin_cos
-from jaxsafe.types import Length, Number, PlatformName, Radians, RegionState
+from jaxsafe.types import Length, Number, Place, PlatformName, Radians, Reach, RegionState, Turn
 
 
 def safe_norm(vector: Float[Array, " d"]) -> Float[Array, ""]:
@@ -87,8 +87,8 @@ class Offset(Component):
 class Aspect(Offset, type="aspect"):
     """ρ (cos(ψ + π + θ), sin(ψ + π + θ)), Eq. (6): behind the platform, θ from its tail, turning with it."""
 
-    distance: Annotated[Length, Range(0.0)]
-    angle: Radians
+    distance: Annotated[Length, Reach]
+    angle: Annotated[Radians, Turn]
 
     def vector(self, platform: Any) -> Float[Array, " d"]:
         planar = self.distance * direction(platform.heading + jnp.pi + self.angle)
@@ -98,7 +98,7 @@ class Aspect(Offset, type="aspect"):
 class Displacement(Offset, type="displacement"):
     """A constant vector along the axes of the global frame."""
 
-    by: Annotated[Number, Unit("m or ft", length=0)]
+    by: Annotated[Number, Unit("m or ft", length=0), Place]
 
     def vector(self, platform: Any) -> Float[Array, " d"]:
         return self.by
@@ -132,7 +132,7 @@ class Region(Component):
 class Sphere(Region, type="sphere"):
     """All points within `radius` of the centre: ‖r − c‖ ≤ ρ, Eqs. (7), (13)."""
 
-    radius: Annotated[Length, Range(0.0)]
+    radius: Annotated[Length, Reach]
 
     def contains(self, offset: Float[Array, " d"]) -> Bool[Array, ""]:
         return safe_norm(offset) <= self.radius
@@ -148,8 +148,8 @@ class Cylinder(Region, type="cylinder"):
     """All points within `radius` of the centre in x and y, and within half the `height` in z, Eq. (10)."""
 
     dimensions: ClassVar[tuple[int, ...]] = (3,)
-    radius: Annotated[Length, Range(0.0)]
-    height: Annotated[Length, Range(0.0)]
+    radius: Annotated[Length, Reach]
+    height: Annotated[Length, Reach]
 
     def contains(self, offset: Float[Array, " 3"]) -> Bool[Array, ""]:
         x, y, z = offset

@@ -16,14 +16,14 @@ from jaxtyping import Array, Float
 
 from jaxsafe.component import ANY, Component, Range, Unit
 from jaxsafe.simulation.geometry import direction, safe_norm
-from jaxsafe.types import Key, MetresPerSecond, Number, PerSecond, PlatformName, Sim
+from jaxsafe.types import Key, MetresPerSecond, Number, PerSecond, Place, PlatformName, Reach, Sim, Turn
 
 TWO_PI = 2.0 * jnp.pi
 
-Interval = Annotated[Number, Unit("m or ft", length=2)]
-Distances = Annotated[Number, Unit("m or ft", length=2), Range(0.0)]
-Angles = Annotated[Number, Unit("rad", length=2)]
-Shares = Annotated[Number, Unit("1", length=2), Range(0.0)]
+Interval = Annotated[Number, Unit("m or ft", length=2), Place]
+Distances = Annotated[Number, Unit("m or ft", length=2), Reach]
+Angles = Annotated[Number, Unit("rad", length=2), Turn]
+Shares = Annotated[Number, Unit("1", length=2), Range(0.0, largest=1e3)]
 
 
 class Initializer(Component):
@@ -51,7 +51,7 @@ class Direction(Component):
 class Fixed(Initializer, type="fixed"):
     """The same start in every episode."""
 
-    value: Annotated[Number, Unit("physical", length=ANY)]
+    value: Annotated[Number, Unit("physical", length=ANY), Place]
 
     def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Array:
         return self.value
@@ -60,8 +60,8 @@ class Fixed(Initializer, type="fixed"):
 class Uniform(Initializer, type="uniform"):
     """Uniform between bounds, independently in each component: the paper's generic initializer."""
 
-    low: Annotated[Number, Unit("physical", length=ANY)]
-    high: Annotated[Number, Unit("physical", length=ANY)]
+    low: Annotated[Number, Unit("physical", length=ANY), Place]
+    high: Annotated[Number, Unit("physical", length=ANY), Place]
 
     def problem(self) -> str | None:
         if self.low.shape != self.high.shape or not np.all(np.asarray(self.low) <= np.asarray(self.high)):
@@ -101,8 +101,8 @@ class BelowSpeedLimit(Initializer, type="below_speed_limit"):
     """A velocity in a random direction with a speed uniform in shares × (ν₀ + ν₁‖r‖), Eq. (14), r drawn before."""
 
     about: PlatformName
-    floor: Annotated[MetresPerSecond, Range(0.0)]
-    slope: Annotated[PerSecond, Range(0.0)]
+    floor: Annotated[MetresPerSecond, Range(0.0, largest=1e9)]
+    slope: Annotated[PerSecond, Range(0.0, largest=1e3)]
     share: Shares = (0.0, 1.0)
     direction: Direction = Direction()
 

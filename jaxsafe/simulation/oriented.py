@@ -9,12 +9,12 @@ from jaxtyping import Array, Float
 
 from jaxsafe.component import Range, Unit
 from jaxsafe.simulation.controllers import Controls
-from jaxsafe.simulation.cwh import MASS, MEAN_MOTION, cwh_acceleration, cwh_flow
+from jaxsafe.simulation.cwh import MASS, MEAN_MOTION, MeanMotion, cwh_acceleration, cwh_flow
 from jaxsafe.simulation.geometry import direction, rotation
 from jaxsafe.simulation.integrate import NODES, WEIGHTS, ramp, time_to_limit
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.simulation.trig import wrap
-from jaxsafe.types import Kilograms, Number, RadiansPerSecond, Record, Seconds
+from jaxsafe.types import Kilograms, Number, Record, Seconds
 
 RATE_LIMIT = jnp.pi / 90.0
 """Fastest turn [rad/s], Table 4: 2°/s."""
@@ -48,8 +48,11 @@ class OrientedSpacecraft(Platform, type="oriented_spacecraft"):
 
     dimension: Annotated[int, Range(2, 2)] = 2
     mass: Kilograms = MASS
-    mean_motion: RadiansPerSecond = MEAN_MOTION
-    attitude_rate_limits: Annotated[Number, Unit("rad/s", length=2)] = (-RATE_LIMIT, RATE_LIMIT)
+    mean_motion: MeanMotion = MEAN_MOTION
+    attitude_rate_limits: Annotated[Number, Unit("rad/s", length=2), Range(largest=1e6, infinite=True)] = (
+        -RATE_LIMIT,
+        RATE_LIMIT,
+    )
 
     @property
     def inputs(self) -> tuple[str, ...]:

@@ -104,8 +104,9 @@ def placed(name: str, value: Any, like: Array) -> Array:
         ConfigError: it has another shape or is not finite numbers.
     """
     try:
-        array = jnp.asarray(value, like.dtype)
-    except (TypeError, ValueError):
+        with np.errstate(over="ignore"):  # beyond the largest float32 is infinite, and refused below
+            array = jnp.asarray(value, like.dtype)
+    except (TypeError, ValueError, OverflowError):
         raise ConfigError(f"reset_to: {name}: expected numbers, found {show(value)}") from None
     if value is None or array.shape != like.shape:
         raise ConfigError(f"reset_to: {name}: expected shape {like.shape}, found {array.shape}")

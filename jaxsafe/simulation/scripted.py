@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.component import Component, Unit
+from jaxsafe.component import Component, Range, Unit
 from jaxsafe.simulation.clock import reached
 from jaxsafe.simulation.controllers import Bound, Controller, Controls
 from jaxsafe.simulation.trig import sin_cos
-from jaxsafe.types import Number, Radians, Seconds, Sim
+from jaxsafe.types import Control, Number, Radians, Sim, Turn
 
 
 class Command(Component):
@@ -51,7 +51,7 @@ class Schedule(Command, type="schedule"):
     """Piecewise constant: `values[k]` from `times[k]` until the next time, 0 before the first."""
 
     times: Annotated[Number, Unit("s", length=0)]
-    values: Annotated[Number, Unit("physical", length=0)]
+    values: Annotated[Number, Unit("physical", length=0), Control]
 
     def problem(self) -> str | None:
         if self.times.shape != self.values.shape or not self.times.size:
@@ -69,8 +69,8 @@ class Sinusoid(Command, type="sinusoid"):
     """Weaving: amplitude · sin(2π t/period + phase)."""
 
     amplitude: Bound
-    period: Seconds
-    phase: Radians = 0.0
+    period: Annotated[Number, Unit("s"), Range(0.0, open_low=True, smallest=1e-6)]
+    phase: Annotated[Radians, Turn] = 0.0
 
     def value(self, sim: Sim) -> Float[Array, ""]:
         return self.amplitude * sin_cos(2.0 * jnp.pi * sim.time / self.period + self.phase)[0]
