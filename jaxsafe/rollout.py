@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from jaxsafe.environment import Environment, reset, step
+from jaxsafe.errors import ConfigError, show
 from jaxsafe.renewal import choose, renew
 from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.types import Key, State, TimeStep
@@ -33,7 +35,13 @@ def rollout(env: Environment, policy: Policy, key: Key, num_steps: int, num_envs
 
     Returns:
         The time steps, stacked [num_steps] or [num_steps, num_envs].
+
+    Raises:
+        ConfigError: `num_steps` or `num_envs` is no number of steps or environments.
     """
+    _require_count("num_steps", num_steps, least=0)
+    if num_envs is not None:
+        _require_count("num_envs", num_envs, least=1)
     key_start, key_run = jax.random.split(key)
     carry = reset(env, key_start) if num_envs is None else reset_batch(env, key_start, num_envs, axis=-1)
 
@@ -47,6 +55,16 @@ def rollout(env: Environment, policy: Policy, key: Key, num_steps: int, num_envs
 
     _, timesteps = jax.lax.scan(one_step, (carry[0], carry[1].observation), jax.random.split(key_run, num_steps))
     return timesteps if num_envs is None else jax.tree.map(lambda x: jnp.moveaxis(x, -1, 1), timesteps)
+
+
+def _require_count(name: str, value: Any, least: int) -> None:
+    """Refuse what is no whole number, or too small; XLA would say so in many lines, or run no environment at all."""
+    try:
+        enough = operator.index(value) >= least
+    except TypeError:
+        enough = False
+    if not enough:
+        raise ConfigError(f"rollout: {name}: expected a whole number ≥ {least}, found {show(value)}")
 
 
 def step_or_reset(env: Environment, state: State, action: Array, key: Key) -> tuple[tuple[State, Array], TimeStep]:

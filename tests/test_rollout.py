@@ -1,5 +1,7 @@
 """Episodes back to back: fresh starts, true last observations, and batches that are many single environments."""
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -7,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsafe
-from jaxsafe import Environment
+from jaxsafe import ConfigError, Environment
 from jaxsafe.rollout import reset_batch, step_or_reset, step_or_reset_batch
 from jaxsafe.simulation.cwh import cwh_flow
 from jaxsafe.types import State, TimeStep
@@ -207,3 +209,18 @@ def test_discrete_actions_roll_out_with_a_new_key_at_every_step() -> None:
     assert set(np.round(fifths).ravel()) == set(range(-5, 6))
     assert len(np.unique(np.round(fifths).reshape(NUM_STEPS, -1), axis=0)) == NUM_STEPS
     assert timesteps.terminated.sum() == 3 * (NUM_STEPS // LENGTH)
+
+
+@pytest.mark.parametrize(
+    ("counts", "message"),
+    [
+        ({"num_steps": -1}, "num_steps: expected a whole number ≥ 0, found -1"),
+        ({"num_steps": 2.5}, "num_steps: expected a whole number ≥ 0, found 2.5"),
+        ({"num_steps": None}, "num_steps: expected a whole number ≥ 0, found None"),
+        ({"num_steps": 3, "num_envs": -3}, "num_envs: expected a whole number ≥ 1, found -3"),
+        ({"num_steps": 3, "num_envs": 0}, "num_envs: expected a whole number ≥ 1, found 0"),
+    ],
+)
+def test_a_rollout_of_no_number_of_steps_or_environments_is_refused(counts: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"^rollout: {message}$"):
+        jaxsafe.rollout(jaxsafe.make("docking2d"), lambda key, observation: jnp.zeros(2), jax.random.key(0), **counts)
