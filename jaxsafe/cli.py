@@ -19,8 +19,14 @@ from jaxsafe.streams import lasting_streams
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells expect."""
 
-PATHS = ("out", "run", "runs", "resume", "policies")
-"""Options that are paths: `out=2024.10` is a name, not a number."""
+PATHS = ("env", "out", "run", "runs", "resume", "policies")
+"""Options that are paths, and taken as typed: `out=2024.10` is no number, and `out="my run #3"` has no comment."""
+
+MAX_COUNT = 2**31 - 1
+"""The largest whole number, unless an option says otherwise: the programs count in 32 bits."""
+
+MAX_SEED = 2**32 - 1
+"""The largest seed: keys of random numbers are made of its lowest 32 bits."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,9 +49,7 @@ class Arguments:
                 raise ConfigError(f"argument {show(word)}: expected key=value, for instance seeds=10")
             if key in options:
                 raise ConfigError(f"{key}: given twice")
-            value = yaml.parse(text, key)
-            value = text if key in PATHS and type(value) in (int, float) else value
-            options[key] = _from_home(value, key) if key in (*PATHS, "env") else value
+            options[key] = _path(text, key) if key in PATHS else yaml.parse(text, key)
         return cls(options)
 
     def pop(self, key: str, default: Any = None) -> Any:
@@ -65,18 +69,27 @@ class Arguments:
             raise ConfigError(f"{key}: expected a name or a path, found {show(value)}")
         return str(value)
 
-    def pop_count(self, key: str, default: int, least: int = 1) -> int:
+    def pop_count(self, key: str, default: int, least: int = 1, most: int = MAX_COUNT) -> int:
         """Take out a whole number.
 
         Raises:
-            ConfigError: it is something else, or too small.
+            ConfigError: it is something else, too small or too large.
         """
-        value = self.options.pop(key, default)
-        if isinstance(value, float) and value.is_integer():
-            value = int(value)
+        given = self.options.pop(key, default)
+        value = int(given) if isinstance(given, float) and given.is_integer() else given
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
-            raise ConfigError(f"{key}: expected a whole number ≥ {least}, found {show(value)}")
+            raise ConfigError(f"{key}: expected a whole number ≥ {least}, found {show(given)}")
+        if value > most:
+            raise ConfigError(f"{key}: expected a whole number from {least} to {most:,}, found {show(given)}")
         return value
+
+    def pop_seed(self, key: str = "seed") -> int:
+        """Take out the seed of random numbers, 0 if it was not given.
+
+        Raises:
+            ConfigError: it is not one, or so large that it would give the numbers of a smaller one.
+        """
+        return self.pop_count(key, 0, least=0, most=MAX_SEED)
 
     def pop_flag(self, key: str) -> bool | None:
         """Take out true or false; None if it was not given.
@@ -106,6 +119,11 @@ class Arguments:
         """Raise a ConfigError for an option that nobody took."""
         for key in self.options:
             raise ConfigError(f"{key}: unknown option; choose from {nearest(key, known)}")
+
+
+def _path(text: str, key: str) -> Any:
+    """Return a path as typed, or a list of them in brackets; None where there is none."""
+    return _from_home(yaml.parse(text, key, as_text=True) if text.startswith("[") else text or None, key)
 
 
 def _from_home(path: Any, key: str) -> Any:

@@ -12,6 +12,7 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.evaluate.seeds import Evaluator
 from jaxsafe.plot import __main__ as plot
+from jaxsafe.rta import falsify
 from jaxsafe.train import __main__ as train
 from jaxsafe.train.loop import Training
 from jaxsafe.train.policy import read_policy
@@ -206,3 +207,50 @@ def test_import_draws_in_only_what_the_core_needs() -> None:
     code = f"import sys, jaxsafe; print([name for name in {heavy} if name in sys.modules])"
     found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert found.stdout.strip() == "[]"
+
+
+def test_paths_are_taken_as_typed() -> None:
+    words = ["out=my run #3", "run=a: b", "resume='x'", "runs=true", "policies=007", "env=my # task.yaml"]
+    arguments = cli.Arguments.parse(words)
+    assert [arguments.pop_text(word.partition("=")[0]) for word in words] == [word.partition("=")[2] for word in words]
+    assert cli.Arguments.parse(["run=[2024.10, 007, true]"]).pop("run") == ["2024.10", "007", "true"]
+    assert cli.Arguments.parse(["out="]).pop("out", "") is None
+
+
+HUGE = "9" * 4000
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "message"),
+    [
+        (evaluate, ["run=pretrained/docking2d", "seed=1e38"], "seed: expected a whole number from 0 to 4,294,967,295"),
+        (evaluate, ["run=pretrained/docking2d", "seed=4294967296"], "4,294,967,295, found 4294967296"),
+        (evaluate, ["run=pretrained/docking2d", f"episodes={HUGE}"], "episodes: expected a whole number from 1 to"),
+        (falsify, ["env=docking2d", "seed=4294967296"], "seed: expected a whole number from 0 to 4,294,967,295"),
+        (falsify, ["env=docking2d", "steps=1e300"], "steps: expected a whole number from 1 to 2,147,483,647, found 1e+300"),
+        (tune, ["env=docking2d", "sweep.ppo.gamma=uniform(0.9,1)", "samples=1e38"], "samples: expected a whole"),
+        (tune, ["env=docking2d", "sweep.ppo.gamma=[0.9]", "draw=1e38"], "draw: expected a whole number from 0 to"),
+        (tune, ["env=docking2d", *(f"sweep.ppo.{name}=[{', '.join(map(str, range(1, 102)))}]" for name in
+          ("num_envs", "num_steps"))], "sweep: expected at most 10,000 settings, found 10,201; samples=N draws some"),
+        (train, ["env=docking2d", "steps=1e300"], "steps: expected a whole number ≥ 1 of a magnitude up to 1,000,000,000"),
+        (train, ["env=docking2d", "steps=1e15", "ppo.num_envs=1", "ppo.num_steps=2"], "expected less than 2³¹ updates"),
+        (train, ["env=docking2d", f"eval_every={HUGE}"], "eval_every: expected a whole number ≥ 1 of a magnitude up to"),
+        (train, ["env=docking2d", f"checkpoint_every={HUGE}"], "found a number of thousands of digits"),
+        (train, ["env=docking2d", "eval_episodes=1e12"], "eval_episodes: expected a whole number ≥ 1 of a magnitude up to"),
+        (train, ["env=docking2d", "seeds=1e9"], "seeds: expected a whole number ≥ 1 of a magnitude up to 100,000"),
+        (train, ["env=docking2d", "ppo.num_epochs=1e300"], "ppo.num_epochs: expected a whole number ≥ 1 of a magnitude"),
+        (train, ["env=docking2d", f"agent.hidden=[{HUGE}]"], "agent.hidden.[0]: expected a list ≥ 1 of a magnitude up to"),
+        (train, ["env=docking2d", f"agent.hidden=[{', '.join('1' * 65)}]"], "expected at most 64 layers, found 65"),
+        (train, ["env=docking2d", "agent.log_std=.inf"], "agent.log_std: expected a number or a list of numbers of"),
+        (train, ["env=docking2d", "ppo.horizon_growth=1e-30"], "expected at least 1 − ppo.gamma = 0.04"),
+        (train, ["env=docking2d", "agent={}"], "agent: name one of its options, for instance agent.hidden=…"),
+        (train, ["env=docking2d", "ppo={gamma: 0.9}"], "ppo: name one of its options, for instance ppo.gamma=…"),
+        (train, ["env=docking2d", "seeds=!!bool x"], "seeds, line 1: not valid YAML: found 'x' after the tag !!bool"),
+        (train, ["env=docking2d", "env.dt=1e30"], "dt: expected a number in s > 0 of a magnitude from 1e-06 to 100000"),
+    ],
+)  # fmt: skip
+def test_numbers_that_no_program_can_count_to_are_told_at_once(
+    fails: Callable[..., str], module: object, words: list[str], message: str
+) -> None:
+    assert message in fails(module, *words)
+    assert list(Path.cwd().rglob("*")) == []

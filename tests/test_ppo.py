@@ -230,3 +230,9 @@ def test_the_kept_networks_are_those_of_training_or_their_average() -> None:
     expected = jax.tree.map(lambda a, b, c: 0.25 * a + 0.25 * b + 0.5 * c, start, few[1].params, few[2].params)
     for found, wanted in zip(jax.tree.leaves(few[2].average), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(found, wanted, atol=1e-5)
+
+
+def test_the_numbers_of_devices_that_may_share_a_seed_are_the_common_divisors_and_found_quickly() -> None:
+    assert PPO(num_envs=24, num_steps=64, num_minibatches=2).shares == [1, 2, 3, 4, 6, 8, 12, 24]
+    assert PPO(num_envs=9, num_steps=1, num_minibatches=1).shares == [1, 3, 9]
+    assert PPO(num_envs=2**30 - 1, num_steps=1, num_minibatches=1).shares[:4] == [1, 3, 7, 9]

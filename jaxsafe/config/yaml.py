@@ -126,8 +126,14 @@ _Loader.add_constructor("tag:yaml.org,2002:map", _Loader.construct_yaml_map)
 _Loader.yaml_constructors[None] = _Loader.construct_undefined  # every other tag
 
 
-def parse(text: str, place: str) -> Any:
-    """Read one YAML document from a string.
+class _TextLoader(_Loader):
+    """Reads every scalar as text."""
+
+    yaml_implicit_resolvers: dict = {}  # noqa: RUF012, typed so by the base
+
+
+def parse(text: str, place: str, as_text: bool = False) -> Any:
+    """Read one YAML document from a string, its scalars `as_text` if they are names whatever they look like.
 
     Raises:
         ConfigError: the text is not YAML or too long; the message begins with `place` and gives the line.
@@ -135,7 +141,7 @@ def parse(text: str, place: str) -> Any:
     if len(text) > MAX_LETTERS:
         raise ConfigError(f"{place}: expected at most {MAX_LETTERS:,} letters")
     try:
-        return yaml.load(text, _Loader)
+        return yaml.load(text, _TextLoader if as_text else _Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f", line {mark.line + 1}" if mark else ""

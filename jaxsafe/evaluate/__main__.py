@@ -31,7 +31,7 @@ def main(argv: Sequence[str]) -> int:
     arguments.refuse_beside(["checkpoint"] if elsewhere else [], "for a policy from elsewhere, which env= says it is")
     out, checkpoint, rta, render = (arguments.pop_text(name) for name in ("out", "checkpoint", "rta", "render"))
     changes = arguments.pop_overrides()
-    episodes, seed = arguments.pop_count("episodes", 1000), arguments.pop_count("seed", 0, least=0)
+    episodes, seed = arguments.pop_count("episodes", 1000), arguments.pop_seed()
     deterministic = arguments.pop_flag("deterministic")
     arguments.refuse_rest([*OPTIONS, "env.…"])
     if render not in (None, "gif"):

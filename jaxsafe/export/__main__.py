@@ -94,7 +94,7 @@ def _policy(arguments: cli.Arguments, run: str) -> tuple[SavedPolicy | ForeignPo
     elsewhere = pop_source(arguments, run)
     single = is_single(run)
     arguments.refuse_beside(["seed"] if elsewhere or single else [], f"beside {run}, which is a single policy")
-    seed = arguments.pop_count("seed", 0, least=0)
+    seed = arguments.pop_seed()
     if elsewhere:
         return elsewhere.read(), f"{Path(run).stem}_{Path(elsewhere.task).stem}"
     if not single:

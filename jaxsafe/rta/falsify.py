@@ -61,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
     changes = arguments.pop_overrides()
     steps, lanes = arguments.pop_count("steps", 100_000), arguments.pop_count("lanes", 256)
     known = (*ADVERSARIES, SEARCH)
-    seed, policies = arguments.pop_count("seed", 0, least=0), arguments.pop("policies", list(known))
+    seed, policies = arguments.pop_seed(), arguments.pop("policies", list(known))
     arguments.refuse_rest([*OPTIONS, "env.…"])
     if task is None:
         raise ConfigError("env: missing; for instance env=docking3d")

@@ -20,7 +20,7 @@ from jaxsafe.environment import Environment
 from jaxsafe.rollout import Policy
 from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.train.features import FEATURES
-from jaxsafe.types import Dimensionless, Key, Number, Positive
+from jaxsafe.types import Dimensionless, Key, Number
 
 Params = dict[str, Any]
 
@@ -28,11 +28,11 @@ Params = dict[str, Any]
 class Agent(Component):
     """Actor and critic of the same shape, with nothing shared, for a given environment's spaces."""
 
-    hidden: Annotated[tuple[int, ...], Range(1)] = (64, 64)
+    hidden: Annotated[tuple[int, ...], Range(1, largest=2**16)] = (64, 64)
     features: Literal["none", "docking", "approach", "rejoin"] = "none"  # appended to the observation
-    log_std: Annotated[Number, Unit("1", length=ANY)] = -0.7
+    log_std: Annotated[Number, Unit("1", length=ANY), Range(largest=20.0)] = -0.7
     """Initial, of continuous actions in [−1, 1], one number or one for each; learnt, the same for all states."""
-    prior_std: Annotated[Dimensionless, Positive] = 0.3
+    prior_std: Annotated[Dimensionless, Range(0.0, open_low=True, smallest=1e-6, largest=1e6)] = 0.3
     """Of discrete actions at the start, in units of half the range. Its logarithm is their first log_std, one for each
     actuator, learnt as that of continuous actions: a smaller one sharpens the choice in all states."""
     critic_sees_totals: bool = False

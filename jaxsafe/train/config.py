@@ -20,10 +20,16 @@ from jaxsafe.paths import set_path
 from jaxsafe.processors.reward import Intervention
 from jaxsafe.train.agent import Agent
 from jaxsafe.train.log import tensorboard_writer
-from jaxsafe.train.ppo import PPO
+from jaxsafe.train.ppo import MAX_COUNT, PPO
 from jaxsafe.types import Dimensionless, Positive
 
-Count = Annotated[int, Range(1)]
+Count = Annotated[int, Range(1, largest=MAX_COUNT)]
+Steps = Annotated[int, Range(1, largest=10**15)]
+"""A number of environment steps, or an interval that users raise to mean never; double precision counts as far."""
+
+MAX_SEEDS = 100_000
+MAX_LAYERS = 64
+"""Of a network. Each is compiled by itself."""
 
 WORTHWHILE = 128
 """Samples of a minibatch for each device that shares a seed, at least: fewer take less time than to exchange gradients."""
@@ -35,20 +41,20 @@ class TrainConfig(Component):
     preset: str = "features"
     algorithm: Literal["ppo", "ppo_lagrangian"] = "ppo"
     cost_limit: Annotated[Dimensionless, Positive] | None = None  # of ppo_lagrangian: violating steps per episode
-    seeds: Count = 1
+    seeds: Annotated[int, Range(1, largest=MAX_SEEDS)] = 1
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0  # the first; seeds=10 is seed … seed + 9
     devices_per_seed: Count | None = None  # that share its environments; None: as many as there are, while each has work
-    steps: Count = 500_000
+    steps: Steps = 500_000
     actions: Literal["continuous", "discrete"] | None = None  # None: as the environment says
     variant: Literal["paper", "released"] | None = None  # None: paper
     rta: str | None = None  # None: as the environment says; default, or another preset of the task
     rta_training: Literal["punished", "unpunished", "corrected"] | None = None  # None: punished, where there is a filter
     out: str | None = None  # None: a new directory in runs/
-    eval_every: Count | None = None  # steps; None: a tenth of the run
+    eval_every: Steps | None = None  # steps; None: a tenth of the run
     eval_episodes: Count = 100  # of each evaluation during training
     episodes: Count = 1000  # of the evaluation at the end
-    checkpoint_every: Count | None = None  # steps; None: a tenth of the run
-    log_every: Count = 100  # every how many evaluation episodes one is logged step by step; before the first, some too
+    checkpoint_every: Steps | None = None  # steps; None: a tenth of the run
+    log_every: Steps = 100  # every how many evaluation episodes one is logged step by step; before the first, some too
     tensorboard: bool = False
     agent: Agent = Agent()
     ppo: PPO = PPO()
@@ -99,6 +105,9 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
     task, overrides = arguments.pop_text("env"), arguments.pop_overrides()
     if task is None:
         raise ConfigError("env: missing; for instance env=docking3d")
+    for name, example in (("agent", "hidden"), ("ppo", "gamma")):
+        if name in arguments.options:
+            raise ConfigError(f"{name}: name one of its options, for instance {name}.{example}=…")
     config = TrainConfig()
     for path, value in arguments.options.items():  # first, so that a misspelt option is told before a slow start
         config = set_path(config, path, value, to_value)
@@ -128,6 +137,17 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
         )
     if config.ppo.batch_size >= 2**31:
         raise ConfigError(f"ppo.num_envs × ppo.num_steps: expected less than 2³¹, found {config.ppo.batch_size:,}")
+    if config.num_updates >= 2**31:
+        raise ConfigError(
+            f"steps: expected less than 2³¹ updates of {config.ppo.batch_size:,}, found {config.steps:,} steps"
+        )
+    if len(config.agent.hidden) > MAX_LAYERS:
+        raise ConfigError(f"agent.hidden: expected at most {MAX_LAYERS} layers, found {len(config.agent.hidden)}")
+    if float(config.ppo.horizon_growth) < 1.0 - float(config.ppo.gamma):
+        raise ConfigError(
+            f"ppo.horizon_growth: expected at least 1 − ppo.gamma = {1.0 - float(config.ppo.gamma):.3g}, or the discount"
+            f" factor falls below 0; found {float(config.ppo.horizon_growth):g}"
+        )
     if config.ppo.learning_rate_decay == "exponential" and not config.ppo.final_learning_rate > 0.0:
         raise ConfigError("ppo.final_learning_rate: expected a number > 0 for an exponential decay, found 0")
     if config.seed + config.seeds > 2**31:

@@ -32,6 +32,9 @@ from jaxsafe.types import Dimensionless, Key, Positive, Record, State, TimeStep
 
 Share = Range(0.0, 1.0)
 
+MAX_COUNT = 2**31 - 1
+"""The largest number of environments, steps or minibatches: programs count in 32 bits."""
+
 CHUNK = 512
 """Samples that a CPU takes through the networks at once: so many activations stay in a core's cache."""
 
@@ -39,11 +42,11 @@ CHUNK = 512
 class PPO(Component):
     """Hyperparameters; names as in the literature."""
 
-    num_envs: Annotated[int, Range(1)] = 16  # episodes run side by side
-    num_steps: Annotated[int, Range(1)] = 128  # steps of each between updates
+    num_envs: Annotated[int, Range(1, largest=MAX_COUNT)] = 16  # episodes run side by side
+    num_steps: Annotated[int, Range(1, largest=MAX_COUNT)] = 128  # steps of each between updates
     max_episode_steps: Annotated[Dimensionless, Range(1.0)] = 1e6  # episodes of training are truncated after as many
-    num_epochs: Annotated[int, Range(1)] = 10
-    num_minibatches: Annotated[int, Range(1)] = 2
+    num_epochs: Annotated[int, Range(1, largest=10_000)] = 10
+    num_minibatches: Annotated[int, Range(1, largest=MAX_COUNT)] = 2
     learning_rate: Annotated[Dimensionless, Positive] = 3e-3
     final_learning_rate: Annotated[Dimensionless, Range(0.0)] = 3e-4  # reached at the end
     learning_rate_decay: Literal["linear", "exponential"] = "linear"  # on the way there
@@ -51,7 +54,9 @@ class PPO(Component):
     horizon_growth: Annotated[Dimensionless, Positive] = 1.0  # factor on 1/(1 − γ), reached exponentially at the end
     gae_lambda: Annotated[Dimensionless, Share] = 1.0
     clip: Annotated[Dimensionless, Positive] = 0.2
-    noise_decay: Annotated[Dimensionless, Range(0.0)] = 0.0  # how far log_std falls by the end, besides what is learnt
+    noise_decay: Annotated[Dimensionless, Range(0.0, largest=20.0)] = (
+        0.0  # how far log_std falls by the end, besides what is learnt
+    )
     value_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.5
     entropy_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.0
     max_grad_norm: Annotated[Dimensionless, Positive] = 0.5
@@ -70,7 +75,8 @@ class PPO(Component):
     def shares(self) -> list[int]:
         """Numbers of devices that can share a seed: each has as many environments, and samples of a minibatch."""
         most = math.gcd(self.num_envs, self.batch_size // self.num_minibatches)
-        return [count for count in range(1, most + 1) if most % count == 0]
+        small = [count for count in range(1, math.isqrt(most) + 1) if most % count == 0]
+        return sorted({*small, *(most // count for count in small)})
 
 
 class TrainState(Record):

@@ -23,7 +23,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.train import directory
     from jaxsafe.tune import results
     from jaxsafe.tune.lanes import train_all
-    from jaxsafe.tune.settings import alike, pop_sweep, settings
+    from jaxsafe.tune.settings import MAX_SETTINGS, alike, pop_sweep, settings
 
     arguments, path = cli.Arguments.parse(argv), None
     resume = arguments.pop_text("resume")
@@ -34,8 +34,8 @@ def main(argv: Sequence[str]) -> int:
     rank = arguments.pop("rank", RANKS[0])
     if rank not in RANKS:
         raise ConfigError(f"rank: unknown order {show(rank)}; choose from {nearest(rank, RANKS)}")
-    samples = arguments.pop_count("samples", 0) if "samples" in arguments.options else None
-    draw = arguments.pop_count("draw", 0, least=0)
+    samples = arguments.pop_count("samples", 1, most=MAX_SETTINGS) if "samples" in arguments.options else None
+    draw = arguments.pop_seed("draw")
     arguments.options.setdefault("episodes", EPISODES)
     sweep = pop_sweep(arguments)
     found = settings(arguments, sweep, samples, draw)

@@ -21,6 +21,12 @@ PREFIX = "sweep."
 COMMON = ("env", "seeds", "seed", "episodes", "out", "preset")
 """Options that all settings of a sweep share."""
 
+MAX_SETTINGS = 10_000
+"""The largest sweep. Each setting is a training, and checking as many takes half a minute before the first begins."""
+
+MANY_SETTINGS = 500
+"""From so many on the user is told that they are being checked."""
+
 _RANGE = re.compile(r"(log|uniform)\(\s*([^,\s]+)\s*,\s*([^,\s]+)\s*\)")
 
 
@@ -80,10 +86,15 @@ def settings(arguments: Arguments, sweep: Mapping[str, list[Any] | Span], sample
         for name, values in sweep.items():
             if isinstance(values, Span):
                 raise ConfigError(f"{PREFIX}{name}: a range needs samples=N, the number of settings to draw")
+        count = math.prod(map(len, sweep.values()))
+        if count > MAX_SETTINGS:
+            raise ConfigError(f"sweep: expected at most {MAX_SETTINGS:,} settings, found {count:,}; samples=N draws some")
         points = list(itertools.product(*sweep.values()))
     else:
         generator = np.random.default_rng(draw)
         points = [[_draw(values, generator) for values in sweep.values()] for _ in range(samples)]
+    if len(points) >= MANY_SETTINGS:
+        print(f"checking {len(points):,} settings", flush=True)
     found = []
     for point in points:
         changes = dict(zip(sweep, point, strict=True))
