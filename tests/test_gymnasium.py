@@ -1,4 +1,6 @@
+import copy
 import importlib
+import pickle
 import subprocess
 import sys
 from typing import Any
@@ -14,6 +16,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import jaxsafe
 from jaxsafe import ConfigError
+from jaxsafe.adapters import lanes
 from jaxsafe.adapters.gymnasium import GymEnv, GymVectorEnv
 from jaxsafe.adapters.registration import IDS
 from jaxsafe.adapters.safety_gymnasium import SafetyEnv
@@ -189,6 +192,32 @@ def test_lanes_are_seeded_one_by_one() -> None:
     assert not np.array_equal(again[0], observation[0])
     unseeded = [gym.make_vec("jaxsafe/Docking2D-v0", num_envs=2).reset()[0] for _ in range(2)]
     assert not np.array_equal(*unseeded)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: gym.make("jaxsafe/Docking2D-v0", rta="explicit_simplex"),
+        lambda: GymVectorEnv("docking2d", 2, autoreset_mode="SameStep", max_episode_steps=2),
+        lambda: SafetyEnv("docking2d", 2, max_episode_steps=2),
+    ],
+)
+def test_a_copy_goes_on_alike_and_compiles_nothing(build: Any, copied: Any) -> None:
+    def fly(env: Any) -> np.ndarray:
+        observations = [env.reset(seed=seed)[0] for seed in (0, 1)]
+        observations += [env.step(np.zeros(env.action_space.shape, np.float32))[0] for _ in range(3)]
+        return np.stack([*observations, env.reset()[0], env.reset()[0]])
+
+    def programs() -> list[int]:
+        return [program._cache_size() for program in (lanes.advance, lanes.restart, lanes._raw_keys)]
+
+    env = build()
+    expected, before = fly(env), programs()
+    other = copied(env)
+    assert np.array_equal(other.reset()[0], env.reset()[0])
+    assert np.array_equal(fly(other), expected)
+    assert programs() == before
 
 
 def test_info_says_what_happened() -> None:

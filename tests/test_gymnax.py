@@ -38,6 +38,21 @@ def test_a_step_is_ours_and_resets_by_itself(make: Any) -> None:
     assert int(state.num_steps) == 0
 
 
+def test_instances_share_compiled_programs(make: Any) -> None:
+    from jaxsafe.adapters import gymnax
+
+    sizes = []
+    for mass in (12.0, 12.0, 13.0):
+        env = make("docking2d", {"deputy.mass": mass})
+        _, state = env.reset(jax.random.key(0))
+        found = env.step(jax.random.key(1), state, jnp.ones(2))
+        assert len(found) == 6
+        sizes.append((gymnax._reset._cache_size(), gymnax._step._cache_size()))
+    assert sizes[0] == sizes[1] == sizes[2]
+    expected = jaxsafe.step(env.env, state, jnp.ones(2))[1].observation
+    np.testing.assert_allclose(found[5]["final_observation"], expected, rtol=1e-5)
+
+
 def test_older_libraries_get_five_values(make: Any) -> None:
     env = make("docking2d", legacy=True)
     _, state = env.reset(jax.random.key(0))

@@ -7,7 +7,6 @@ env = GymnaxEnv("docking2d", legacy=True)     # gymnax 0.0.9, rejax, PureJaxRL: 
 
 from __future__ import annotations
 
-import functools
 import math
 import os
 from collections.abc import Mapping
@@ -64,31 +63,18 @@ class GymnaxEnv:
         """The environment as it was made."""
         return GymnaxParams(self.env)
 
-    @functools.partial(jax.jit, static_argnames="self")
     def reset(self, key: Key, params: GymnaxParams | None = None) -> tuple[Array, State]:
         """A random start: observation and state."""
-        state, timestep = reset((params or self.default_params).env, key)
-        return timestep.observation, state
+        return _reset(key, params or self.default_params)
 
-    @functools.partial(jax.jit, static_argnames="self")
     def step(self, key: Key, state: State, action: Array, params: GymnaxParams | None = None) -> tuple:
         """One step, and a fresh start where it ends the episode: (observation, state, reward, terminated, truncated, info).
 
         With `legacy`, (observation, state, reward, done, info).
         """
-        params = params or self.default_params
-        state, timestep = step(params.env, state, self._action(action))
-        timestep = cut_short(state, timestep, params.max_steps_in_episode)
-        following, observation = restarted(params.env, state, timestep, key)
-        info = {
-            "cost": timestep.cost,
-            "is_success": timestep.info.outcome == params.env.success,
-            "terminated": timestep.terminated,
-            "truncated": timestep.truncated,
-            "final_observation": timestep.observation,
-        }
-        ends = (timestep.done,) if self.legacy else (timestep.terminated, timestep.truncated)
-        return observation, following, timestep.reward, *ends, info
+        *taken, info = _step(key, state, action, params or self.default_params)
+        ends = (info["terminated"], info["truncated"])
+        return *taken, *((ends[0] | ends[1],) if self.legacy else ends), info
 
     @property
     def num_actions(self) -> int:
@@ -113,6 +99,26 @@ class GymnaxEnv:
         low, high = observation_bounds(self.env)
         return spaces.Box(jnp.array(low), jnp.array(high), (len(low),), dtype=jnp.result_type(float))
 
-    def _action(self, action: Array) -> Array:
-        points = self.env.num_action_points
-        return jnp.stack(jnp.unravel_index(action, points)).astype(jnp.int32) if points else action
+
+@jax.jit
+def _reset(key: Key, params: GymnaxParams) -> tuple[Array, State]:
+    """Compiled once for all environments of one structure, as is `_step`."""
+    state, timestep = reset(params.env, key)
+    return timestep.observation, state
+
+
+@jax.jit
+def _step(key: Key, state: State, action: Array, params: GymnaxParams) -> tuple[Array, State, Array, dict[str, Array]]:
+    points = params.env.num_action_points
+    chosen = jnp.stack(jnp.unravel_index(action, points)).astype(jnp.int32) if points else action
+    state, timestep = step(params.env, state, chosen)
+    timestep = cut_short(state, timestep, params.max_steps_in_episode)
+    following, observation = restarted(params.env, state, timestep, key)
+    info = {
+        "cost": timestep.cost,
+        "is_success": timestep.info.outcome == params.env.success,
+        "terminated": timestep.terminated,
+        "truncated": timestep.truncated,
+        "final_observation": timestep.observation,
+    }
+    return observation, following, timestep.reward, info

@@ -29,7 +29,11 @@ class Episodes(NamedTuple):
 
 
 class Packing:
-    """How the leaves of a pytree lie in one array, [words] or with lanes [words, num_envs]: type by type."""
+    """How the leaves of a pytree lie in one array, [words] or with lanes [words, num_envs]: type by type.
+
+    Compiled programs belong to one object, so a process has only one for each structure, see `packing`. Copies and what is
+    read from a pickle are that object too.
+    """
 
     def __init__(self, structure: Any, shapes: tuple[tuple[tuple[int, ...], np.dtype], ...]) -> None:
         """Lay out leaves of these shapes, without the axis of lanes, and types."""
@@ -45,6 +49,9 @@ class Packing:
                     end += size
             self._blocks.append((dtype, start, end, parts))
         self._size = end
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _packing, (self._structure, self._shapes)
 
     def empty(self, lanes: int) -> np.ndarray:
         """Words of no meaning."""
@@ -103,7 +110,9 @@ def packing(example: Any, lanes: int = 0) -> Packing:
     return _packing(structure, tuple((leaf.shape[lanes:], np.dtype(leaf.dtype)) for leaf in leaves))
 
 
-_packing = functools.cache(Packing)
+@functools.cache
+def _packing(structure: Any, shapes: tuple[tuple[tuple[int, ...], np.dtype], ...]) -> Packing:
+    return Packing(structure, shapes)
 
 
 def _unsigned(dtype: Any) -> np.dtype:
