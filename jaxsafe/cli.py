@@ -7,13 +7,14 @@ import gc
 import os
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
 from jaxsafe.config import yaml
-from jaxsafe.errors import ConfigError, nearest, show
+from jaxsafe.errors import ConfigError, ConfigWarning, nearest, show
 from jaxsafe.streams import lasting_streams
 
 INTERRUPTED = 130
@@ -165,7 +166,8 @@ def run(
 def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tuple[int, bool]:
     """Return the exit code of a command, and whether it came to its end."""
     try:
-        return main(argv) or 0, True
+        with _warnings_in_one_line():
+            return main(argv) or 0, True
     except ConfigError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2, False
@@ -176,6 +178,22 @@ def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tu
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED, False
+
+
+@contextmanager
+def _warnings_in_one_line() -> Iterator[None]:
+    """Print what this package warns of as the commands print errors; other warnings stay as they are."""
+    with warnings.catch_warnings():
+        show_other = warnings.showwarning
+
+        def show_warning(message: Any, category: type[Warning], *rest: Any, **options: Any) -> None:
+            if issubclass(category, ConfigWarning):
+                print(f"warning: {message}", file=sys.stderr)
+            else:
+                show_other(message, category, *rest, **options)
+
+        warnings.showwarning = show_warning
+        yield
 
 
 def in_main_thread() -> bool:

@@ -11,6 +11,10 @@ class ConfigError(ValueError):
     """A value from outside is wrong: a misspelt name, a wrong type, a number out of range, a broken file."""
 
 
+class ConfigWarning(UserWarning):
+    """What a user asked for is possible and probably not all that was meant."""
+
+
 def show(value: object, most: int = 60) -> str:
     """Return what `repr` does, cut to `most` letters. Nothing beyond those is looked at: a value may be very large."""
     text = ""

@@ -3,6 +3,7 @@
 import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +20,7 @@ from jaxsafe.config import build, dump, load
 from jaxsafe.config.convert import to_component
 from jaxsafe.config.imports import import_modules, modules
 from jaxsafe.config.yaml import parse, write
-from jaxsafe.errors import show
+from jaxsafe.errors import ConfigWarning, show
 from jaxsafe.processors.reward import Failure
 from jaxsafe.processors.status import Status
 from jaxsafe.simulation.cwh import Spacecraft
@@ -971,3 +972,63 @@ def test_limits_may_be_infinite_and_read_back(env: Environment) -> None:
 def test_the_horizon_of_a_filter_has_an_end() -> None:
     message = fault(lambda: jaxsafe.make("docking2d", {"rta.horizon": 1e30}, rta="implicit_asif"))
     assert message == "rta.horizon: expected a whole number ≥ 0 of a magnitude up to 10,000, found 1e+30"
+
+
+# Numbers that belong together
+
+SLOPES = "status.velocity_limit.slope and deputy.start.velocity.slope, which were twice it, keep their values"
+
+
+@pytest.mark.parametrize(
+    ("task", "changes", "message"),
+    [
+        ("docking2d", {"deputy.mean_motion": 0.002}, f"deputy.mean_motion changes alone: {SLOPES}"),
+        ("docking2d_oriented", {"platforms.deputy.mean_motion": 0.002}, f"deputy.mean_motion changes alone: {SLOPES}"),
+        ("docking3d", {"randomize": {"deputy.mean_motion": [1e-3, 2e-3]}}, f"deputy.mean_motion is random alone: {SLOPES}"),
+        ("docking3d", {"randomize": {"platforms.deputy.mean_motion": [0, 1e-3]}}, "deputy.mean_motion is random alone"),
+        ("docking2d", {"terminal.timeout.limit": 6000},
+         "terminal.timeout.limit changes alone: reward.success.time_scale, which was equal to it, keeps its value"),
+        ("docking2d", {"reward.success.time_scale": 6000}, "reward.success.time_scale changes alone: terminal.timeout"),
+        ("rejoin2d", {"terminal.crash.limit": 200}, "terminal.crash.limit changes alone: constraints.collision.minimum"),
+        ("rejoin3d", {"constraints.collision.minimum": 200}, "constraints.collision.minimum changes alone"),
+        ("docking2d", {"status.velocity_limit.floor": 0.1}, "status.velocity_limit.floor changes alone: deputy.start.velo"),
+    ],
+)  # fmt: skip
+def test_a_number_that_is_changed_without_those_that_follow_from_it_is_told(
+    task: str, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.warns(ConfigWarning) as caught:
+        jaxsafe.make(task, changes)
+    assert len(caught) == 1
+    assert str(caught[0].message).startswith(message)
+    assert "\n" not in str(caught[0].message)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"terminal.timeout.limit": 6000, "reward.success.time_scale": 6000},
+        {"terminal.timeout.limit": 6000, "reward.success.time_scale": 7000},
+        {"terminal.timeout.limit": 2000},
+        {"deputy.mean_motion": 0.1, "status.velocity_limit.slope": 0.2, "deputy.start.velocity.slope": 0.2},
+        {"deputy.mass": 10, "randomize": {"deputy.mass": [10, 14]}},
+        {"reward": ["velocity_constraint", "failure"]},
+    ],
+)
+def test_numbers_that_are_changed_together_or_belong_to_no_other_are_not_told(changes: dict[str, Any]) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jaxsafe.make("docking2d", changes)
+        jaxsafe.make("docking2d", variant="released")
+
+
+def test_traced_numbers_are_not_told(env: Environment) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jax.eval_shape(lambda limit: jaxsafe.override(env, {"terminal.timeout.limit": limit}), 3.0)
+
+
+def test_a_file_whose_tied_number_is_random_is_told(env: Environment) -> None:
+    text = dump(env).replace("randomize: {}", "randomize: {deputy.mean_motion: [0.001, 0.002]}")
+    with pytest.warns(ConfigWarning, match=f"^deputy.mean_motion is random alone: {SLOPES}"):
+        load(text)

@@ -114,6 +114,27 @@ def test_a_report_in_parts_makes_the_page_of_one(calls: list[list[str]], capsys:
     assert "features |" not in Path("parts/baselines.md").read_text()
 
 
+def test_an_evaluation_with_other_options_than_today_s_is_left_out_and_made_anew(
+    calls: list[list[str]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["tasks=docking2d", "kinds=features", "film=false", *REST]
+    assert command.main(words) == 0
+    assert "| docking2d | heavy |" in Path("report/baselines.md").read_text()
+    heavier = {"heavy": ["env.deputy.mass=30"], SHIPPED: ["seed=1"]}
+    monkeypatch.setattr(Item, "evaluations", property(lambda item: heavier if item.kind == "features" else {}))
+    records, old = kept(plan(["docking2d"], ["features"], REST), Path("report/baselines"))
+    assert list(records[0].evaluations) == [SHIPPED]
+    assert old == [
+        "report/baselines/docking2d-features.json: its evaluation 'heavy' was made with other options and is left out;"
+        " report it again"
+    ]
+    assert command.main(words) == 0
+    assert calls[-1][:2] == ["jaxsafe.evaluate", "run=runs/report/docking2d-features"]
+    assert "env.deputy.mass=30" in calls[-1]
+    assert len(calls) == 4
+    assert "| docking2d | heavy |" in Path("report/baselines.md").read_text()
+
+
 def test_a_record_is_of_the_commit_that_trained_it(calls: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["tasks=docking2d", "kinds=plain", *REST]
     for now, trained in (("first", "first"), ("second", "first")):

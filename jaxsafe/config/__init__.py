@@ -10,6 +10,7 @@ from jaxsafe.config.check import check
 from jaxsafe.config.convert import to_component, to_data
 from jaxsafe.config.imports import import_modules, modules
 from jaxsafe.config.override import override
+from jaxsafe.config.tied import warn_of_ties
 from jaxsafe.environment import Environment
 
 __all__ = ["build", "describe", "dump", "from_data", "load", "override"]
@@ -32,7 +33,9 @@ def load(source: str | os.PathLike) -> Environment:
 
     text = isinstance(source, str) and "\n" in source
     data = yaml.parse(str(source), "environment") if text else yaml.read(source)
-    return from_data(data, "")
+    env = from_data(data, "")
+    warn_of_ties(env.replace(randomize={}), env)
+    return env
 
 
 def dump(env: Environment) -> str:

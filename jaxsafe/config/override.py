@@ -7,6 +7,7 @@ from typing import Any
 
 from jaxsafe.config.check import check
 from jaxsafe.config.convert import to_value
+from jaxsafe.config.tied import warn_of_ties
 from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError, show
 from jaxsafe.paths import set_path
@@ -28,4 +29,6 @@ def override(env: Environment, changes: Mapping[str, Any]) -> Environment:
         if not isinstance(path, str):
             raise ConfigError(f"override: expected dotted paths such as 'deputy.mass', found {show(path)}")
         changed = set_path(changed, path, value, to_value)
-    return check(changed, before=env)
+    checked = check(changed, before=env)
+    warn_of_ties(env, checked)
+    return checked

@@ -259,7 +259,8 @@ class Report:
                 "Starts outside training",
                 "The same policies (`features`) from farther away than they ever started. From 10 km the way at the speed"
                 " limit takes 2,257 s, more than the 2,000 s that docking2d and docking3d have, so there the timeout"
-                " of all is 6,000 s. All columns but the first success rate are of deterministic episodes.",
+                " of all is 6,000 s, and so is the time that the success reward is scaled by. All columns but the first"
+                " success rate are of deterministic episodes.",
                 "task | start | success, stochastic | success, deterministic | episodes with a violation | violating steps"
                 " | severity, maximum | return | Δv, L1 [m/s] | length [s]",
                 rows,

@@ -61,7 +61,11 @@ CERTIFIED_STARTS = {"docking2d_oriented": ("env.deputy.start.velocity.share=[0,0
 
 _DOCKING_STARTS = {
     "from 1 km": ["env.deputy.start.position.distance=[1000,1000]"],
-    "from 10 km": ["env.deputy.start.position.distance=[10000,10000]", "env.terminal.timeout.limit=6000"],
+    "from 10 km": [
+        "env.deputy.start.position.distance=[10000,10000]",
+        "env.terminal.timeout.limit=6000",
+        "env.reward.success.time_scale=6000",
+    ],
 }
 _REJOIN_STARTS = {
     "from 15,000 ft": ["env.wingman.start.position.distance=[15000,15000]"],

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from jaxsafe.config import yaml
 from jaxsafe.report.plan import Item
-from jaxsafe.report.run import FILM_FILE, options_of
+from jaxsafe.report.run import FILM_FILE, answers, options_of
 from jaxsafe.train.files import finite, read_json, read_rows, write_csv, write_json
 
 CURVES = ("wall_s", "success_rate", "return", "length", "delta_v", "violating_share", "cost", "episodes")
@@ -65,8 +65,14 @@ def kept(items: Iterable[Item], files: Path) -> tuple[list[Record], list[str]]:
             continue
         with open(path.with_suffix(".csv"), encoding="utf-8", newline="") as file:
             curves = [_numbers(row) for row in csv.DictReader(file)]
-        values = {name: found[name] for name in ("command", "commit", "options", "results", "evaluations")}
-        records.append(Record(item=item, curves=curves, **values))
+        values = {name: found[name] for name in ("command", "commit", "options", "results")}
+        evaluations = found["evaluations"]
+        current = {name: one for name, one in evaluations.items() if answers(item.evaluations.get(name, []), one)}
+        old += [
+            f"{path}: its evaluation {name!r} was made with other options and is left out; report it again"
+            for name in evaluations.keys() - current.keys()
+        ]
+        records.append(Record(item=item, curves=curves, evaluations=current, **values))
     return records, old
 
 

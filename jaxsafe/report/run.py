@@ -7,7 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -51,13 +51,22 @@ def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
         write_bytes(run / BEST, (run / "policy" / f"seed_{best}.npz").read_bytes())
     for name, options in item.evaluations.items():
         out = item.evaluation_directory(run, name)
-        if not (out / "results.json").exists():
-            shutil.rmtree(out, ignore_errors=True)  # of an evaluation that was interrupted
+        if not (out / "results.json").exists() or not answers(options, read_json(out / "results.json")):
+            shutil.rmtree(out, ignore_errors=True)  # of an evaluation that was interrupted, or of other options
             _call("jaxsafe.evaluate", [f"run={item.subject(run, name)}", f"episodes={episodes}", *options, f"out={out}"])
     film = run / "film"
     if render and not (film / FILM_FILE).exists():
         shutil.rmtree(film, ignore_errors=True)
         _call("jaxsafe.evaluate", [f"run={run / BEST}", *FILM, f"out={film}"])
+
+
+def answers(options: Sequence[str], results: Mapping[str, Any]) -> bool:
+    """Whether the results of an evaluation are those of these options, which follow `python -m jaxsafe.evaluate run=…`."""
+    arguments = Arguments.parse(options)
+    filters = {"rta": arguments.pop_text("rta")} if "rta" in arguments.options else {}
+    return results["changes"] == {**filters, **arguments.pop_overrides()} and (
+        results["evaluation_seed"] == arguments.pop_seed()
+    )
 
 
 def options_of(item: Item) -> dict[str, Any]:

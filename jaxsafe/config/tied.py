@@ -1,0 +1,93 @@
+"""Numbers that the tasks derive from one another, but that stand in an environment as two: changing one alone is told."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax.core import Tracer
+
+from jaxsafe.environment import Environment
+from jaxsafe.errors import ConfigWarning
+from jaxsafe.processors.constraint import Separation
+from jaxsafe.processors.reward import Success
+from jaxsafe.processors.status import VelocityLimit
+from jaxsafe.processors.terminal import Timeout, TooClose
+from jaxsafe.simulation.initializers import BelowSpeedLimit
+
+_OFTEN = {1.0: "equal to", 2.0: "twice"}
+
+
+class Tie(NamedTuple):
+    """Two numbers by their paths; the second is `factor` times the first where they belong together."""
+
+    paths: tuple[str, str]
+    numbers: tuple[Any, Any]
+    factor: float = 1.0
+
+    @property
+    def traced(self) -> bool:
+        """Whether nothing can be said about the numbers."""
+        return any(isinstance(number, Tracer) for number in self.numbers)
+
+    @property
+    def holds(self) -> bool:
+        """Whether the numbers belong together as they are."""
+        first, second = map(np.asarray, self.numbers)
+        return bool(abs(self.factor * first - second) <= 1e-6 * abs(second))
+
+
+def warn_of_ties(before: Environment, after: Environment) -> None:
+    """Warn in one line for each number that was tied to others, and was changed or made random without them.
+
+    Args:
+        before: the environment as it was.
+        after: the environment with what a user changed. Numbers that are traced are not judged.
+    """
+    held = {tie.paths: tie for tie in _ties(before) if not tie.traced and tie.holds}
+    newly_random = {path.removeprefix("platforms.") for path in after.randomize if path not in before.randomize}
+    alone: dict[tuple[str, str, float], list[str]] = {}
+    for tie in _ties(after):
+        if tie.paths not in held or tie.traced:
+            continue
+        random = [path in newly_random for path in tie.paths]
+        changed = [not np.array_equal(*pair) for pair in zip(tie.numbers, held[tie.paths].numbers, strict=True)]
+        if not any(random) and (tie.holds or all(changed)):
+            continue
+        index = random.index(True) if any(random) else changed.index(True)
+        factor = tie.factor if index == 0 else 1.0 / tie.factor
+        verb = "is random" if any(random) else "changes"
+        alone.setdefault((tie.paths[index], verb, factor), []).append(tie.paths[1 - index])
+    for (path, verb, factor), others in alone.items():
+        was = f"{'was' if len(others) == 1 else 'were'} {_OFTEN.get(factor, f'{factor:g} times')} it"
+        kept = "keeps its value" if len(others) == 1 else "keep their values"
+        warnings.warn(f"{path} {verb} alone: {' and '.join(others)}, which {was}, {kept}", ConfigWarning, stacklevel=3)
+
+
+def _ties(env: Environment) -> Iterator[Tie]:
+    """Yield the numbers of an environment that may be tied; the tasks write them so."""
+    limits = [one for one in env.status if isinstance(one, VelocityLimit)]
+    for timeout in (one for one in env.terminal if isinstance(one, Timeout)):
+        for reward in (one for one in env.reward if isinstance(one, Success)):
+            paths = f"terminal.{timeout.name}.limit", f"reward.{reward.name}.time_scale"
+            yield Tie(paths, (timeout.limit, reward.time_scale))
+    for crash in (one for one in env.terminal if isinstance(one, TooClose)):
+        for constraint in (one for one in env.constraints if isinstance(one, Separation)):
+            if constraint.distance == crash.distance:
+                paths = f"terminal.{crash.name}.limit", f"constraints.{constraint.name}.minimum"
+                yield Tie(paths, (crash.limit, constraint.minimum))
+    for platform in env.platforms:
+        starts = [one for one in platform.start if isinstance(one, BelowSpeedLimit)]
+        sloped = {f"status.{one.name}": one for one in limits} | {
+            f"{platform.name}.start.{one.name}": one for one in starts
+        }
+        for place, one in sloped.items():
+            if hasattr(platform, "mean_motion"):
+                yield Tie((f"{platform.name}.mean_motion", f"{place}.slope"), (platform.mean_motion, one.slope), 2.0)
+        for limit in limits:
+            for start in starts:
+                for name in ("floor", "slope"):
+                    paths = f"status.{limit.name}.{name}", f"{platform.name}.start.{start.name}.{name}"
+                    yield Tie(paths, (getattr(limit, name), getattr(start, name)))
