@@ -14,7 +14,7 @@ from jaxsafe.simulation.trig import sin_cos
 from jaxsafe.types import Length, Number, Place, PlatformName, Radians, Reach, RegionState, Turn
 
 
-def safe_norm(vector: Float[Array, " d"]) -> Float[Array, ""]:
+def safe_norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
     """Euclidean norm ‖v‖ whose gradient at v = 0 is 0 instead of NaN.
 
     Double where: the root must not see 0 in either branch, because `where` multiplies the untaken branch's infinite

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError
-from jaxsafe.simulation.geometry import rotation
+from jaxsafe.simulation.geometry import rotation, safe_norm
 from jaxsafe.types import Number
+
+SMALLEST_LIMIT = 1e-6
+"""A speed limit is never smaller in the features. No environment observes less, but other code may ask a policy about an
+observation of zeros, which would be divided by zero."""
 
 Features = Callable[[Environment, Float[Array, "*batch o"]], Float[Array, "*batch i"]]
 
@@ -26,7 +31,7 @@ def docking(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Ar
     The target is 0.005 wide in units of p, which a plain perceptron resolves late or never.
     """
     position = _vector(env, observation, "position", "docking")
-    distance = jnp.linalg.norm(position, axis=-1, keepdims=True)
+    distance = _norm(position)
     return jnp.concatenate([observation, position / (distance + 0.01), jnp.log(distance + 0.005)], axis=-1)
 
 
@@ -37,9 +42,10 @@ def approach(env: Environment, observation: Float[Array, "*batch o"]) -> Float[A
     v/limit across p, and ‖v‖/limit, which is 1 at the limit.
     """
     position = _vector(env, observation, "position", "approach")
-    relative_to_limit = 1.0 / _elements(env, observation, "velocity_limit", "approach")
+    limit = jnp.maximum(_elements(env, observation, "velocity_limit", "approach"), SMALLEST_LIMIT)
+    relative_to_limit = 1.0 / limit
     velocity = _scale(env, "velocity") * _vector(env, observation, "velocity", "approach") * relative_to_limit
-    direction = position / (jnp.linalg.norm(position, axis=-1, keepdims=True) + 1e-3)
+    direction = position / (_norm(position) + 1e-3)
     along = jnp.sum(direction * velocity, axis=-1, keepdims=True)
     speed = _elements(env, observation, "speed", "approach") * relative_to_limit
     return jnp.concatenate([docking(env, observation), velocity, along, velocity - along * direction, speed], axis=-1)
@@ -62,7 +68,7 @@ def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Arr
         _magnitude_and_direction(env, observation, f"{name}_velocity") for name in ("lead", "wingman")
     )
     way, relative = far * towards, speed * along - own_speed * own
-    course = relative / (jnp.linalg.norm(relative, axis=-1, keepdims=True) + 0.01)
+    course = relative / (_norm(relative) + 0.01)
     closing = jnp.sum(bearing * course, axis=-1, keepdims=True)
     across = bearing - closing * course
     approaching = jnp.maximum(-closing, 0.0)
@@ -79,6 +85,11 @@ def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Arr
 
 FEATURES: Mapping[str, Features] = {each.__name__: each for each in (none, docking, approach, rejoin)}
 """By name, as in `agent.features`."""
+
+
+@jax.jit  # one program, and so the same roundings, whether what surrounds it is compiled or not
+def _norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch 1"]:
+    return safe_norm(vector)[..., None]
 
 
 def _magnitude_and_direction(

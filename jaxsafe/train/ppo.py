@@ -39,6 +39,11 @@ CHUNK = 512
 """Samples that a CPU takes through the networks at once: so many activations stay in a core's cache."""
 
 
+MAX_LOG_RATIO = 20.0
+"""The ratio of new to old probabilities is taken as at most e²⁰. Where a ratio overflows, the loss or its gradient is not a
+number. This bound also leaves room for the squares in the norm of the gradient."""
+
+
 class PPO(Component):
     """Hyperparameters; names as in the literature."""
 
@@ -290,7 +295,9 @@ def learn(
 def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch) -> Array:
     """Clipped surrogate + value error − entropy bonus, averaged over the batch."""
     policy = agent.distribution(env, params, batch.inputs)
-    ratio = jnp.exp(policy.log_prob(batch.action) - batch.log_prob)
+    log_ratio = policy.log_prob(batch.action) - batch.log_prob
+    bounded = jax.lax.stop_gradient(jnp.minimum(log_ratio, MAX_LOG_RATIO))
+    ratio = jnp.exp(bounded + (log_ratio - jax.lax.stop_gradient(log_ratio)))  # the second term, 0, has the derivative
     clipped = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
     seen = agent.critic_inputs(batch.inputs, batch.totals)
