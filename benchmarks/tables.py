@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe.envs import TASKS
+from jaxsafe.metrics import with_interval
 from jaxsafe.report.plan import PAPER_STEPS, WITHOUT_RTA
 from jaxsafe.train.files import write_text
 
@@ -487,8 +488,8 @@ def _until(steps: int | None) -> str:
 
 
 def _interval(metric: Found, factor: float, digits: int) -> str:
-    mean, low, high = (f"{factor * value:.{digits}f}" for value in (metric["mean"], *metric["ci95"]))
-    return f"{mean} [{low}, {high}]"
+    interval = metric["ci95"] and [factor * bound for bound in metric["ci95"]]
+    return with_interval(factor * metric["mean"], interval, f".{digits}f")
 
 
 def _share(metric: Found) -> str:

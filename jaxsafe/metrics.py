@@ -47,6 +47,9 @@ SAFETY_METRICS = (
 ENOUGH_EPISODES = 20
 """Training episodes that a seed must have finished before its success rate counts for interaction efficiency."""
 
+ENOUGH_SEEDS = 3
+"""Below this an interval over seeds would say nothing: resampling one seed has no spread, and two give their own values."""
+
 ROUNDING = 1e-6
 """Of success rates and their averages: what is so close below a threshold has reached it."""
 
@@ -180,7 +183,10 @@ def interaction_efficiency(
 
 
 def over_seeds(per_seed: list[float | None]) -> dict[str, Any]:
-    """Mean, 95 % percentile-bootstrap interval over seeds, interquartile mean, and the values themselves."""
+    """Mean, 95 % percentile-bootstrap interval over seeds, interquartile mean, and the values themselves.
+
+    The interval of fewer than `ENOUGH_SEEDS` is None.
+    """
     if any(value is None for value in per_seed):
         return {"mean": None, "ci95": None, "iqm": None, "per_seed": per_seed}
     from scipy.stats import trim_mean
@@ -188,7 +194,7 @@ def over_seeds(per_seed: list[float | None]) -> dict[str, Any]:
     values = np.asarray(per_seed, float)
     return {
         "mean": float(values.mean()),
-        "ci95": [float(bound) for bound in bootstrap_interval(values[None])[:, 0]],
+        "ci95": bootstrap_interval(values[None])[:, 0].tolist() if len(values) >= ENOUGH_SEEDS else None,
         "iqm": float(trim_mean(values, 0.25)),
         "per_seed": [float(value) for value in values],
     }
@@ -198,6 +204,7 @@ def stratified_iqm(scores: Sequence[Sequence[float]], resamples: int = 2000) -> 
     """Interquartile mean over all runs of all tasks, with its 95 % stratified-bootstrap interval.
 
     The mean of the middle half of all scores, where each task's runs are resampled among themselves (Agarwal et al. 2021).
+    The interval is None where a task has fewer than `ENOUGH_SEEDS` runs.
 
     Args:
         scores: a sequence of scores, one for each run, for each task.
@@ -210,8 +217,16 @@ def stratified_iqm(scores: Sequence[Sequence[float]], resamples: int = 2000) -> 
     spread = trim_mean(np.concatenate(drawn, axis=1), 0.25, axis=1)
     return {
         "iqm": float(trim_mean(np.concatenate(tasks), 0.25)),
-        "ci95": [float(bound) for bound in np.percentile(spread, [2.5, 97.5])],
+        "ci95": np.percentile(spread, [2.5, 97.5]).tolist() if min(map(len, tasks)) >= ENOUGH_SEEDS else None,
     }
+
+
+def with_interval(value: float, interval: Sequence[float] | None, form: str) -> str:
+    """Return a number, and the interval that it lies in if there is one, as text: `0.5 [0.4, 0.6]`."""
+    if interval is None:
+        return format(value, form)
+    low, high = interval
+    return f"{value:{form}} [{low:{form}}, {high:{form}}]"
 
 
 def bootstrap_interval(values: np.ndarray, resamples: int = 2000) -> np.ndarray:

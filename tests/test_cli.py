@@ -193,6 +193,12 @@ def test_a_path_may_begin_with_the_home_directory(monkeypatch: pytest.MonkeyPatc
         cli.Arguments.parse(["resume=~nobody-of-that-name/x"])
 
 
+def test_columns_of_a_table_never_touch() -> None:
+    lines = cli.columns([["", "a"], ["x", "123,456,789,012.00 [1, 2] %"], ["a long name", "-"]])
+    assert [line.split("  ")[-1] for line in lines] == [" a", "123,456,789,012.00 [1, 2] %", "-"]
+    assert len({len(line) for line in lines}) == 1
+
+
 @pytest.mark.parametrize("module", ["train", "evaluate", "plot", "config"])
 def test_help_names_the_options(module: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     command = {"train": train, "evaluate": evaluate, "plot": plot, "config": config}[module]

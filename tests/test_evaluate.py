@@ -33,11 +33,16 @@ def test_the_runs_own_results_come_out_again(whole: Path, tmp_path: Path, capsys
     assert len(rows) == 2 * 3 * 6
 
 
-def test_a_policy_file_gives_the_results_of_its_seed(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_policy_file_gives_the_results_of_its_seed_and_a_film(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.chdir(tmp_path)
     file = whole / "policy" / "seed_2.npz"
     assert main([f"run={file}", "episodes=6", "deterministic=true", "render=gif"]) == 0
     place = tmp_path / "evaluations" / "seed_2" / "last-6-seed0"
+    told = capsys.readouterr().out
+    assert "docking2d, preset features, ppo, rta none, 1 seed, 1,280 steps each" in told
+    assert f"films: {(place / 'episode_deterministic.gif').relative_to(tmp_path)}" in told
     found = json.loads((place / "results.json").read_text())
     own = json.loads((whole / "results.json").read_text())["evaluation"]["deterministic"]
     assert found["seed"] == 2
@@ -62,6 +67,7 @@ def test_evaluations_get_directories_of_their_own(whole: Path, tmp_path: Path) -
     assert (run / "results.json").read_bytes() == before
     results = json.loads((run / "evaluations" / "640-2-seed3-changed" / "results.json").read_text())
     assert results["changes"] == {"deputy.mass": 24}
+    assert (results["algorithm"], results["rta"]) == ("ppo", "none")
     assert results["steps"] == 640
     with pytest.raises(ConfigError, match="never overwritten"):
         main([f"run={run}", "episodes=2", f"out={run / 'evaluations' / 'best-2-seed0'}"])

@@ -24,6 +24,7 @@ from jaxsafe.metrics import (
     over_seeds,
     stratified_iqm,
     summarise,
+    with_interval,
 )
 from jaxsafe.types import Info, TimeStep
 
@@ -267,7 +268,7 @@ def test_the_bootstrap_interval_is_row_by_row() -> None:
 
 
 @settings(deadline=None, max_examples=20)
-@given(st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=10))
+@given(st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=10))
 def test_the_interval_lies_within_the_values(values: list[float]) -> None:
     found = over_seeds(values)
     low, high = found["ci95"]
@@ -275,8 +276,13 @@ def test_the_interval_lies_within_the_values(values: list[float]) -> None:
     assert min(values) - slack <= low <= high <= max(values) + slack
 
 
-def test_one_seed_has_an_interval_of_no_width() -> None:
-    assert over_seeds([0.7]) == {"mean": 0.7, "ci95": [0.7, 0.7], "iqm": 0.7, "per_seed": [0.7]}
+def test_one_seed_or_two_have_no_interval() -> None:
+    assert over_seeds([0.7]) == {"mean": 0.7, "ci95": None, "iqm": 0.7, "per_seed": [0.7]}
+    assert over_seeds([0.5, 0.75])["ci95"] is None
+    assert over_seeds([0.5, 0.75, 1.0])["ci95"] == [0.5, 1.0]
+    assert stratified_iqm([[0.5] * 10, [0.7, 0.8]])["ci95"] is None
+    assert with_interval(0.7, None, ".1f") == "0.7"
+    assert with_interval(1234.5, [1000.0, 2000.0], ",.0f") == "1,234 [1,000, 2,000]"
 
 
 def test_a_metric_without_a_meaning_stays_none() -> None:

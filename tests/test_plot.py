@@ -6,17 +6,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_hex
 from matplotlib.image import imread
 from matplotlib.patches import Circle
 
 import jaxsafe
 from jaxsafe.config import yaml
+from jaxsafe.envs import TASKS
 from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.__main__ import main
 from jaxsafe.plot.compare import compare_curves, seed_curves
 from jaxsafe.plot.figures import _episodes, draw_all, speed_distance, training_curves, trajectories
-from jaxsafe.plot.style import save
+from jaxsafe.plot.style import GREEN, ORANGE, kept_out, save
 
 
 def rows(num_updates: int = 50, num_seeds: int = 4) -> list[dict]:
@@ -213,6 +215,29 @@ def test_names_are_drawn_letter_by_letter(name: str) -> None:
     assert seen.removeprefix("\u200b") == name.replace("\x1b", r"\x1b").replace("\x07", r"\x07").replace("\udcff", "?")
 
 
+def test_an_interval_is_drawn_and_named_only_where_there_are_seeds_enough() -> None:
+    for count, interval in ((2, False), (3, True)):
+        panel = training_curves(rows(num_seeds=count), "steps", "title").axes[0]
+        assert ("95 % interval" in panel.get_legend_handles_labels()[1]) == bool(panel.collections) == interval
+        figure = compare_curves({"one": rows(num_seeds=count)}, "docking2d")
+        title = figure.get_suptitle()
+        assert title == f"docking2d: the last 100 training episodes, mean{' and 95 % interval' * interval} over seeds"
+        assert bool(figure.axes[0].collections) == interval
+
+
+def test_what_to_stay_out_of_is_not_drawn_like_the_goal() -> None:
+    assert kept_out(jaxsafe.make(Path(__file__).parent.parent / "configs" / "custom_env.yaml")) == {"keep_out"}
+    for task in TASKS:
+        assert kept_out(jaxsafe.make(task)) == set()
+    step, rows = episode(100, 2)
+    for row in rows:
+        row["regions"] = {"docking_region": {"position": [0.0, 0.0]}}
+    env = jaxsafe.make("docking2d")
+    for forbidden, colour in (((), GREEN), (("docking_region",), ORANGE)):
+        panel = trajectories([(step, rows)], "title", "m", env.regions, forbidden).axes[0]
+        assert to_hex(panel.patches[0].get_facecolor()).upper() == colour
+
+
 @pytest.mark.parametrize("nasty", [FORMULA, "_$x"])
 def test_a_run_whose_every_name_is_a_formula_is_drawn(
     whole: Path, tmp_path: Path, nasty: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -266,7 +291,8 @@ def test_several_runs_in_one_figure_with_a_table(
     assert main(["run=[ppo,limited]", "x=wall", "out=both.png"]) == 0
     heads, first, second, written = capsys.readouterr().out.splitlines()
     assert "cost/episode" in heads
-    assert (first.split()[0], second.split()[0], written) == ("ppo", "limited", "both.png")
+    assert (first.split()[:3], second.split()[:3]) == (["ppo", "ppo", "none"], ["limited", "ppo", "none"])
+    assert written == "both.png"
     assert imread("both.png").shape[2] == 4
     (tmp_path / "limited" / "results.json").unlink()
     for runs, message in (

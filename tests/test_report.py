@@ -1,6 +1,7 @@
 import csv
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -52,7 +53,7 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
     words = ["tasks=docking2d", "kinds=features", "policies=best", *REST]
     assert command.main(words) == 0
     page = Path("report/baselines.md").read_text()
-    assert f"`python -m jaxsafe.report {' '.join(words)}`" in page
+    assert f"`python -m jaxsafe.report {shlex.join(words)}`" in page
     for section in (
         "Interaction efficiency",
         "After training",
@@ -140,7 +141,7 @@ def test_a_record_is_of_the_commit_that_trained_it(calls: list[list[str]], monke
     for now, trained in (("first", "first"), ("second", "first")):
         monkeypatch.setattr(directory, "commit", lambda now=now: now)
         assert command.main(words) == 0
-        assert f"`python -m jaxsafe.report {' '.join(words)}` on commit {trained}: docking2d-plain" in (
+        assert f"`python -m jaxsafe.report {shlex.join(words)}` on commit {trained}: docking2d-plain" in (
             Path("report/baselines.md").read_text()
         )
     assert len(calls) == 1

@@ -81,6 +81,7 @@ def test_progress_has_a_row_for_every_update_of_every_seed(whole: Path) -> None:
 
 def test_results_follow_the_schema(whole: Path) -> None:
     results = json.loads((whole / "results.json").read_text())
+    assert (results["algorithm"], results["rta"]) == ("ppo", "none")
     assert {"env", "preset", "seeds", "steps", "wall_s", "compile_s", "versions", "interaction_efficiency"} < set(results)
     assert results["compile_s"] < results["training_computation_time"] < results["wall_s"]
     assert set(results["interaction_efficiency"]) == {"timesteps", "per_seed"}

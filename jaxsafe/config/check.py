@@ -44,13 +44,13 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
     _reference("agent", env.agent, names["platforms"])
     for section in _SECTIONS:
         for index, part in enumerate(getattr(env, section)):
-            for place, refers, name in _references(part, f"{section}.{part.name}"):
+            for place, refers, name in references(part, f"{section}.{part.name}"):
                 # Later ones are not there yet when a start is drawn, or a status evaluated.
                 early = section == "status" or place.startswith(f"platforms.{part.name}.start")
                 ordered = refers.section == section and early
                 known = names[refers.section][: index if ordered else None]
                 _reference(place, name, known, " listed before it" if ordered else "")
-    for place, refers, name in _references(env.rta, "rta") if env.rta else ():
+    for place, refers, name in references(env.rta, "rta") if env.rta else ():
         _reference(place, name, names[refers.section])
     _check_problems(env)
     for platform in env.platforms:
@@ -66,7 +66,8 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
     return env
 
 
-def _references(component: Component, place: str) -> Iterator[tuple[str, Refers, str]]:
+def references(component: Component, place: str) -> Iterator[tuple[str, Refers, str]]:
+    """Yield each name of another part that a component has: the place of the name, what it refers to, and the name."""
     for name, field in fields(type(component)).items():
         value, here = getattr(component, name), join(place, name)
         for refers, one in [(field.refers, value)] if field.refers else _listed(field.hint, value):
@@ -76,7 +77,7 @@ def _references(component: Component, place: str) -> Iterator[tuple[str, Refers,
             yield from ((here, refers, key) for refers in _key_refers(field.hint) for key in value)
         for inner in value if isinstance(value, tuple) else (value,):
             if isinstance(inner, Component):
-                yield from _references(inner, join(here, getattr(inner, "name", "")))
+                yield from references(inner, join(here, getattr(inner, "name", "")))
 
 
 def _listed(hint: Any, value: Any) -> list[tuple[Refers, Any]]:
@@ -252,7 +253,7 @@ def _check_kinds(env: Environment) -> None:
         return
     for section in _SECTIONS:
         for part in getattr(env, section):
-            for place, refers, name in _references(part, f"{section}.{part.name}"):
+            for place, refers, name in references(part, f"{section}.{part.name}"):
                 if refers.section == "status" and refers.boolean not in (None, found[name].dtype == bool):
                     wanted = "true or false" if refers.boolean else "a number"
                     raise ConfigError(f"{place}: expected a status that is {wanted}, found {name!r}, which is not")

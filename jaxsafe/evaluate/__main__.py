@@ -19,7 +19,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.envs import with_rta
     from jaxsafe.errors import ConfigError
     from jaxsafe.evaluate.foreign import pop_source
-    from jaxsafe.evaluate.report import evaluate
+    from jaxsafe.evaluate.report import evaluate, film
     from jaxsafe.evaluate.subject import load, load_foreign
     from jaxsafe.train.results import table
 
@@ -51,6 +51,8 @@ def main(argv: Sequence[str]) -> int:
     }
     path, results = evaluate(subject, env, kinds, request, out, render is not None)
     print(table(results, path))
+    if render:
+        print("films: " + ", ".join(str(film(path.parent, kind)) for kind in kinds))
     return 0
 
 

@@ -15,6 +15,7 @@ from jaxsafe.evaluate.subject import Subject
 from jaxsafe.origin import versions
 from jaxsafe.train import directory
 from jaxsafe.train.files import append_rows, write_json
+from jaxsafe.train.log import filter_name
 from jaxsafe.train.results import evaluation
 
 
@@ -52,7 +53,13 @@ def evaluate(
     for kind, one in sums.items():
         rows = episode_rows(env, one, subject.facts["seed"], step=subject.facts["steps"], kind=kind, final=True)
         append_rows(path / "eval.jsonl", rows)
-    results = {**subject.facts, **request, "versions": versions(), "evaluation": evaluation(env, sums)}
+    results = {
+        **subject.facts,
+        **request,
+        "rta": filter_name(env),
+        "versions": versions(),
+        "evaluation": evaluation(env, sums),
+    }
     results |= given_up(env, sums)
     write_json(path / "results.json", results)
     for kind in kinds if render else ():
@@ -65,4 +72,9 @@ def _render(subject: Subject, evaluator: Evaluator, seed: int, kind: str, path: 
 
     first = jax.tree.map(lambda x: x[0], subject.mapper.gather(subject.params))
     [episode] = evaluator.episodes(first, 1, seed, kind == "deterministic")
-    animate(evaluator.env, episode, path / f"episode_{kind}.gif", f"{subject.name}, {kind}")
+    animate(evaluator.env, episode, film(path, kind), f"{subject.name}, {kind}")
+
+
+def film(path: Path, kind: str) -> Path:
+    """Return the place of the animation of an episode in the directory of an evaluation."""
+    return path / f"episode_{kind}.gif"

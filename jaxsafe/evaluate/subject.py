@@ -27,7 +27,7 @@ class Subject(NamedTuple):
     agent: Agent | ForeignAgent
     mapper: SeedMapper
     params: Params  # [mapper.padded], placed
-    facts: dict[str, Any]  # env, preset, seeds, seed (the first) and steps, for the results
+    facts: dict[str, Any]  # env, preset, algorithm, seeds, seed (the first), steps: for the results
     place: Path  # where evaluations of them are written
 
 
@@ -40,7 +40,7 @@ def load_foreign(source: Source) -> Subject:
     policy, mapper = source.read(), SeedMapper(1)
     params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], policy.params))
     name = Path(source.task).stem
-    about = {"env": name, "preset": source.path.name, "seeds": 1, "seed": 0, "steps": 0}
+    about = {"env": name, "preset": source.path.name, "algorithm": "unknown", "seeds": 1, "seed": 0, "steps": 0}
     return Subject(name, policy.env, policy.agent, mapper, params, about, Path("evaluations") / source.path.stem)
 
 
@@ -57,13 +57,14 @@ def load(run: str, checkpoint: str | None) -> Subject:
     config, env, name = directory.read(Path(run), "run")
     mapper = SeedMapper(config.seeds)
     params, step = load_params(mapper, Path(run), config, env, checkpoint or "last")
-    found = {**facts(config, name), "steps": step}
+    found = {**facts(config, env, name), "steps": step}
     return Subject(name, env, config.agent, mapper, params, found, Path(run) / "evaluations")
 
 
 def _of_file(path: Path) -> Subject:
     saved, mapper = read_policy(path), SeedMapper(1)
     params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], saved.params))
-    about = {"env": path.stem, "preset": "unknown", "seed": 0, "step": 0} | saved.about
-    found = {"env": about["env"], "preset": about["preset"], "seeds": 1, "seed": about["seed"], "steps": about["step"]}
+    about = {"env": path.stem, "preset": "unknown", "algorithm": "unknown", "seed": 0, "step": 0} | saved.about
+    found = {**{name: about[name] for name in ("env", "preset", "algorithm")}, "seeds": 1}
+    found |= {"seed": about["seed"], "steps": about["step"]}
     return Subject(str(about["env"]), saved.env, saved.agent, mapper, params, found, Path("evaluations") / path.stem)

@@ -23,6 +23,7 @@ from jaxsafe.plot.style import (
     GREY,
     ORANGE,
     centre_patch,
+    kept_out,
     labelled,
     length_unit,
     margin_unit,
@@ -125,7 +126,7 @@ class Scene:
         return max(len(f"{tick:.10g}") for tick in ticks)
 
     def _draw_maps(self) -> None:
-        unit = length_unit(self.env)
+        unit, forbidden = length_unit(self.env), kept_out(self.env)
         seen_from = next((platform.name for platform in self.env.platforms if platform.name != self.env.agent), None)
         self._axes = {name: _axis(one) for name, one in self.sim.platforms.items()}
         self.moving: list[dict[str, dict[str, Any]]] = []
@@ -135,7 +136,7 @@ class Scene:
             panel.yaxis.set_major_locator(MaxNLocator(TICKS))
             artists: dict[str, dict[str, Any]] = {"platforms": {}, "regions": {}}
             for region in self.env.regions:
-                artists["regions"][region.name] = panel.add_patch(region_patch(region, j == 2))
+                artists["regions"][region.name] = panel.add_patch(region_patch(region, j == 2, region.name in forbidden))
                 artists["regions"][region.name].set_label(plain(region.name))
             for radius in self._kept_away():
                 panel.add_patch(Circle((0.0, 0.0), radius, color=ORANGE, alpha=0.35, linewidth=0, label="too near"))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from jaxsafe.metrics import ENOUGH_EPISODES, bootstrap_interval
+from jaxsafe.metrics import ENOUGH_EPISODES, ENOUGH_SEEDS, bootstrap_interval
 from jaxsafe.plot.figures import ALWAYS, AXES, CURVES, curve_table, panel_grid, set_axes
 from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, plain
 
@@ -29,7 +29,7 @@ NAMED = 5
 def compare_curves(
     runs: Mapping[str, Sequence[Mapping[str, Any]]], title: str, x: str = "steps", mark: tuple[str, float] | None = None
 ) -> Figure:
-    """A panel for each quantity, in it the mean and the 95 % interval over seeds of each run.
+    """A panel for each quantity, in it the mean over seeds of each run, and its 95 % interval where there are enough.
 
     A curve begins when every seed has finished as many episodes as Table 2 needs, or all that it ever finished. The
     horizontal axis is logarithmic where the longest run is more than `FAR` times as long as the shortest.
@@ -48,13 +48,15 @@ def compare_curves(
     logarithmic = max(ends) > FAR * min(ends)
     counts = {run: curve_table(rows, column, "episodes")[1] for run, rows in runs.items()}
     enough = {run: (count >= np.minimum(ENOUGH_EPISODES, count[-1])).all(axis=1) for run, count in counts.items()}
+    intervals = ""
     for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
         for (line, colour), (run, rows) in zip(cycle(LOOKS), runs.items(), strict=False):
             at, values = curve_table(rows, column, name)
             known = enough[run] & ~np.isnan(values).any(axis=1)
             at, values = at[known], factor * values[known]
             panel.plot(at, values.mean(axis=1), color=colour, linestyle=line, linewidth=1.6, label=plain(run))
-            if values.shape[1] > 1 and len(at):
+            if values.shape[1] >= ENOUGH_SEEDS and len(at):
+                intervals = " and 95 % interval"
                 panel.fill_between(at, *bootstrap_interval(values), color=colour, alpha=0.2, linewidth=0)
         set_axes(panel, label, quantity, name)
         if logarithmic:
@@ -65,7 +67,7 @@ def compare_curves(
     shown, names = panels[0].get_legend_handles_labels()
     columns = min(len(names), LEGEND)
     figure.legend(shown, names, loc="outside lower center", ncols=columns, columnspacing=1.2, frameon=False)
-    figure.suptitle(f"{plain(title)}: the last 100 training episodes, mean and 95 % interval over seeds", fontsize="medium")
+    figure.suptitle(f"{plain(title)}: the last 100 training episodes, mean{intervals} over seeds", fontsize="medium")
     return figure
 
 

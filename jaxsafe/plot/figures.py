@@ -5,7 +5,7 @@ Of a run with run time assurance also what it altered, see `interventions`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,11 +19,11 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from jaxsafe.config import from_data, yaml
 from jaxsafe.errors import ConfigError
-from jaxsafe.metrics import bootstrap_interval
+from jaxsafe.metrics import ENOUGH_SEEDS, bootstrap_interval
 from jaxsafe.plot.interventions import interventions, most_altered
-from jaxsafe.plot.style import BLUE, GREY, ORANGE, centre_patch, labelled, length_unit, plain, region_patch, save
+from jaxsafe.plot.style import BLUE, GREY, ORANGE, centre_patch, kept_out, labelled, length_unit, plain, region_patch, save
 from jaxsafe.train.files import read_rows
-from jaxsafe.train.log import NEEDS
+from jaxsafe.train.log import NEEDS, filter_name, headline
 
 LAST_COLOUR = 0.85  # the end of the colour map is too light on white
 NEAR = 3.0  # half the width of what is shown near the smallest region, in distances to its far end
@@ -32,7 +32,7 @@ CURVES = (
     ("return", "return", 1.0),
     ("length", "episode length [steps]", 1.0),
     ("delta_v", "Δv per episode [m/s]", 1.0),
-    ("violating_share", "violating share of an episode's steps [%]", 100.0),
+    ("violating_share", "violating share\nof an episode's steps [%]", 100.0),
     ("episode_cost", "violating steps per episode", 1.0),
 )
 ALWAYS = ("success_rate", "return", "length")
@@ -49,13 +49,14 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
     """
     rows = progress(run)
     content = yaml.read(run / "config.yaml")
-    title = _title(content, rows)
-    figures = {f"training_{x}": training_curves(rows, x, title)}
     env = from_data(content["environment"], "environment")
+    facts = {"algorithm": "ppo", **content["training"], "env": content["env"], "rta": filter_name(env)}
+    title = headline({**facts, "seeds": len({row["seed"] for row in rows})})
+    figures = {f"training_{x}": training_curves(rows, x, title)}
     others = [platform.name for platform in env.platforms if platform.name != env.agent]
     episodes = _episodes(run / "episodes.jsonl", [*others[:1], env.agent])
     if episodes:
-        figures["trajectories"] = trajectories(episodes, title, length_unit(env), env.regions)
+        figures["trajectories"] = trajectories(episodes, title, length_unit(env), env.regions, kept_out(env))
         if {"docking_distance", "speed", "velocity_limit"} <= episodes[0][1][0]["status"].keys():
             figures["speed_distance"] = speed_distance(episodes, title)
         if "rta" in episodes[-1][1][0]:
@@ -81,7 +82,7 @@ def progress(run: Path) -> list[dict[str, Any]]:
 
 
 def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figure:
-    """A panel for each quantity: every seed thin, their mean, and the 95 % interval of the mean."""
+    """A panel for each quantity: every seed thin, their mean, and its 95 % interval where there are enough of them."""
     column, label = AXES[x]
     curves = [curve for curve in CURVES if curve[0] in ALWAYS or any(row.get(curve[0]) for row in rows)]
     figure, panels = panel_grid(len(curves), 4.2)
@@ -91,7 +92,7 @@ def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figur
         set_axes(panel, label, quantity, name)
     if panels[0].get_legend_handles_labels()[0]:
         panels[0].legend(loc="best", fontsize="small", frameon=False)
-    figure.suptitle(f"{plain(title)}: the last 100 training episodes", fontsize="medium")
+    figure.suptitle(f"{plain(title)}\nthe last 100 training episodes", fontsize="medium")
     return figure
 
 
@@ -114,7 +115,9 @@ def panel_grid(count: int, width: float) -> tuple[Figure, np.ndarray]:
     return figure, panels
 
 
-def trajectories(episodes: Episodes, title: str, unit: str | None, regions: Sequence[Any] = ()) -> Figure:
+def trajectories(
+    episodes: Episodes, title: str, unit: str | None, regions: Sequence[Any] = (), forbidden: Collection[str] = ()
+) -> Figure:
     """Paths of the agent relative to the other platform: from one start in the course of training, and the last ones.
 
     A row for each plane; in a third column the last paths near the smallest region, if it is small beside them. Where the
@@ -148,7 +151,7 @@ def trajectories(episodes: Episodes, title: str, unit: str | None, regions: Sequ
     for (i, j), row in zip(planes, panels, strict=True):
         for panel, (name, group), half in zip(row, groups, reach, strict=True):
             for region, place in zip(regions, places, strict=True):
-                patch = panel.add_patch(region_patch(region, j == 2))
+                patch = panel.add_patch(region_patch(region, j == 2, region.name in forbidden))
                 centre_patch(patch, place[[i, j]])
                 patch.set_label(plain(region.name))
             if not alone:
@@ -165,7 +168,7 @@ def trajectories(episodes: Episodes, title: str, unit: str | None, regions: Sequ
     if panels[0, -1].get_legend_handles_labels()[0]:
         panels[0, -1].legend(loc="best", fontsize="small", frameon=False)
     _colour_bar(figure, colours, list(panels.ravel()))
-    figure.suptitle(f"{plain(title)}: deterministic episodes of the first seed", fontsize="medium")
+    figure.suptitle(f"{plain(title)}\ndeterministic episodes of the first seed", fontsize="medium")
     return figure
 
 
@@ -199,7 +202,7 @@ def speed_distance(episodes: Episodes, title: str) -> Figure:
     panel.set(xlim=(0, reach), ylim=(0, max(1.5 * np.nanmax(line[1], initial=0.2), 1.05 * fastest)))
     panel.legend(loc="best", frameon=False)
     _colour_bar(figure, colours, panel)
-    figure.suptitle(f"{plain(title)}: deterministic episodes of the first seed", fontsize="medium")
+    figure.suptitle(f"{plain(title)}\ndeterministic episodes of the first seed", fontsize="medium")
     return figure
 
 
@@ -212,7 +215,7 @@ def _curve(panel: Axes, at: np.ndarray, values: np.ndarray) -> None:
     panel.plot(at, values, color=GREY, linewidth=0.6, alpha=0.6)
     panel.plot([], [], color=GREY, linewidth=0.6, label="each seed")
     panel.plot(at, values.mean(axis=1), color=BLUE, linewidth=1.8, label="mean")
-    if values.shape[1] > 1:
+    if values.shape[1] >= ENOUGH_SEEDS:
         panel.fill_between(at, *bootstrap_interval(values), color=BLUE, alpha=0.25, linewidth=0, label="95 % interval")
     panel.margins(x=0.0)
 
@@ -278,8 +281,3 @@ def _colours(episodes: Sequence[tuple[int, Any]]) -> tuple[ScalarMappable, Any]:
 def _colour_bar(figure: Figure, colours: ScalarMappable, panels: Any) -> None:
     bar = figure.colorbar(colours, ax=panels, label="environment steps of training")
     bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda step, _: f"{step:,.0f}"))
-
-
-def _title(content: dict[str, Any], rows: Sequence[dict[str, Any]]) -> str:
-    count = len({row["seed"] for row in rows})
-    return f"{content['env']}, preset {content['training']['preset']}, {count} seed{'s' * (count != 1)}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
+from jaxsafe.config.check import references
+from jaxsafe.environment import SUCCESS
 from jaxsafe.errors import ConfigError
 from jaxsafe.processors.constraint import Separation, SpeedLimit
 from jaxsafe.streams import printable
@@ -53,9 +56,28 @@ def labelled(quantity: str, unit: str | None) -> str:
     return f"{quantity} [{unit}]" if unit else quantity
 
 
-def region_patch(region: Any, from_the_side: bool) -> Any:
+def kept_out(env: Any) -> set[str]:
+    """Return the names of the regions to stay out of: a constraint or a failure watches them, and no success does."""
+    status = {part.name: part for part in env.status}
+
+    def watched(parts: Iterable[Any]) -> set[str]:
+        found = set()
+        for part in parts:
+            for _, refers, name in references(part, ""):
+                if refers.section == "regions":
+                    found.add(name)
+                elif refers.section == "status":
+                    found |= watched([status[name]])  # which refers to those before it only
+        return found
+
+    goals = [part for part in env.terminal if part.name == SUCCESS]
+    failures = [part for part in env.terminal if part.name != SUCCESS]
+    return watched([*env.constraints, *failures]) - watched(goals)
+
+
+def region_patch(region: Any, from_the_side: bool, forbidden: bool = False) -> Any:
     """The area of a region around the origin, seen from above or from the side, where one with a height is a rectangle."""
-    style = {"color": GREEN, "alpha": 0.35, "linewidth": 0}
+    style = {"color": ORANGE if forbidden else GREEN, "alpha": 0.35, "linewidth": 0}
     if from_the_side and hasattr(region, "height"):
         size = (2.0 * float(region.radius), float(region.height))
         return Rectangle((-size[0] / 2.0, -size[1] / 2.0), *size, **style)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe.envs import TASKS
-from jaxsafe.metrics import ENOUGH_EPISODES, stratified_iqm
+from jaxsafe.metrics import ENOUGH_EPISODES, stratified_iqm, with_interval
 from jaxsafe.plot.compare import compare_curves, seed_curves
 from jaxsafe.plot.style import save
 from jaxsafe.report.measures import failed_seeds, finished, samples_per_second, steps_to, wall_to
@@ -306,8 +306,7 @@ class Report:
                     found["evaluation"][way]["success_rate"]["per_seed"] for item, found in self.own if item.kind == kind
                 ]
                 both = stratified_iqm(scores)
-                low, high = both["ci95"]
-                rows.append([kind, way, f"{100 * both['iqm']:.2f} [{100 * low:.2f}, {100 * high:.2f}] %"])
+                rows.append([kind, way, _percent({"mean": both["iqm"], "ci95": both["ci95"]})])
         return _section(
             "All tasks together",
             "Interquartile mean of the success rates of all seeds of all tasks; 95 % intervals of a stratified bootstrap.",
@@ -367,15 +366,14 @@ def _section(title: str, text: str, heads: str, rows: Sequence[Sequence[str]]) -
 
 
 def _percent(metric: Mapping[str, Any]) -> str:
-    low, high = metric["ci95"]
-    return f"{100 * metric['mean']:.2f} [{100 * low:.2f}, {100 * high:.2f}] %"
+    interval = metric["ci95"] and [100.0 * bound for bound in metric["ci95"]]
+    return f"{with_interval(100.0 * metric['mean'], interval, '.2f')} %"
 
 
 def _number(metric: Mapping[str, Any], digits: int = 2) -> str:
     if metric["mean"] is None:
         return "–"
-    low, high = metric["ci95"]
-    return f"{metric['mean']:,.{digits}f} [{low:,.{digits}f}, {high:,.{digits}f}]"
+    return with_interval(metric["mean"], metric["ci95"], f",.{digits}f")
 
 
 def _rate(metric: Mapping[str, Any], starts: int, seeds: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,18 @@ from jaxsafe.train.files import append_csv, append_rows, keep_rows, write_csv
 
 NEEDS = ("seed", "step", "wall_s", "episodes", "cost", "success_rate", "return", "length")
 """Columns that every row of the progress log has."""
+
+
+def filter_name(env: Environment) -> str:
+    """Return the kind of the run time assurance that acts in an environment."""
+    return "none" if env.rta is None else env.rta.type_name or type(env.rta).__name__
+
+
+def headline(facts: Mapping[str, Any]) -> str:
+    """Say in short what a run is, for the title of a table or a figure."""
+    count = facts["seeds"]
+    what = f"{facts['env']}, preset {facts['preset']}, {facts['algorithm']}, rta {facts['rta']}"
+    return f"{what}, {count} seed{'s' * (count != 1)}"
 
 
 class ProgressLog:

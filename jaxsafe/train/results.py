@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxsafe import cli
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.seeds import given_up, metrics_over_seeds
-from jaxsafe.metrics import Episode, interaction_efficiency, over_seeds
+from jaxsafe.metrics import ENOUGH_SEEDS, Episode, interaction_efficiency, over_seeds, with_interval
 from jaxsafe.origin import versions
 from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.files import read_json, write_json
+from jaxsafe.train.log import filter_name, headline
 from jaxsafe.train.loop import Training
 from jaxsafe.train.policy import save_policy
 
@@ -36,10 +38,11 @@ def finish(training: Training) -> dict[str, Any]:
     with training.clock:
         episodes = training.evaluate_finally()
     for index, params in enumerate(training.params()):
-        about = {"env": name, "preset": config.preset, "seed": config.seed + index, "step": training.step}
+        about = {"env": name, "preset": config.preset, "algorithm": config.algorithm}
+        about |= {"seed": config.seed + index, "step": training.step}
         save_policy(training.run / "policy" / f"seed_{config.seed + index}.npz", env, config.agent, params, about)
     results = {
-        **facts(config, name),
+        **facts(config, env, name),
         "steps": training.step,
         "wall_s": round(training.clock.seconds, 2),
         "compile_s": round(training.compile_s, 2),
@@ -54,9 +57,10 @@ def finish(training: Training) -> dict[str, Any]:
     return results
 
 
-def facts(config: TrainConfig, name: str) -> dict[str, Any]:
+def facts(config: TrainConfig, env: Environment, name: str) -> dict[str, Any]:
     """What every result says about the run that it belongs to."""
-    return {"env": name, "preset": config.preset, "seeds": config.seeds, "seed": config.seed}
+    how = {"env": name, "preset": config.preset, "algorithm": config.algorithm, "rta": filter_name(env)}
+    return {**how, "seeds": config.seeds, "seed": config.seed}
 
 
 def evaluation(env: Environment, episodes: dict[str, Episode]) -> dict[str, Any]:
@@ -67,16 +71,13 @@ def evaluation(env: Environment, episodes: dict[str, Episode]) -> dict[str, Any]
 def table(results: dict[str, Any], path: Path) -> str:
     """The results as text: a column for each kind, mean and 95 % interval over seeds."""
     found = results["evaluation"]
-    count = results["seeds"]
-    lines = [
-        f"{results['env']}, preset {results['preset']}, {count} seed{'s' * (count != 1)}, {results['steps']:,} steps each"
-    ]
-    lines += ["", f"{'':28}" + "".join(f"{kind:>26}" for kind in found)]
+    lines = [f"{headline(results)}, {results['steps']:,} steps each", ""]
+    rows = [["mean [95 % interval] over seeds" if results["seeds"] >= ENOUGH_SEEDS else "", *found]]
     for name, label, unit in _ROWS:
         if all(one[name]["mean"] is not None for one in found.values()):
-            lines.append(f"{label:28}" + "".join(f"{_cell(one[name], unit):>26}" for one in found.values()))
-    worst = {kind: min(one["success_rate"]["per_seed"]) for kind, one in found.items()}
-    lines.append(f"{'worst seed, success rate':28}" + "".join(f"{value:>26.1%}" for value in worst.values()))
+            rows.append([label, *(_cell(one[name], unit) for one in found.values())])
+    rows.append(["worst seed, success rate", *(f"{min(one['success_rate']['per_seed']):.1%}" for one in found.values())])
+    lines += cli.columns(rows)
     if "given_up" in results:
         counts, limit = results["given_up"], results["given_up"]["after_steps"]
         told = ", ".join(f"{counts[kind]:,} {kind}" for kind in found)
@@ -91,21 +92,31 @@ def table(results: dict[str, Any], path: Path) -> str:
 def summary(runs: Mapping[str, Path]) -> str:
     """A line for each of several runs, by name: success after training, and violating steps during and after it."""
     heads = (
-        "steps", "80 % after", "stochastic", "deterministic", "worst seed", "cost/episode", "cost of training", "wall [s]",
+        "", "algorithm", "rta", "steps", "80 % after", "stochastic", "deterministic", "worst seed", "cost/episode",
+        "cost of training", "wall [s]",
     )  # fmt: skip
-    lines = [" " * 20 + "".join(f"{head:>17}" for head in heads)]
+    rows: list[Sequence[str]] = [heads]
     for name, run in runs.items():
         results = read_json(run / "results.json")
         found = [results["evaluation"][kind] for kind in ("stochastic", "deterministic")]
         success = [one["success_rate"] for one in found]
-        reached = results["interaction_efficiency"]["timesteps"]
-        lines.append(
-            f"{name:20}{results['steps']:>17,}{f'{reached:,}' if reached else 'never':>17}"
-            f"{success[0]['mean']:>17.2%}{success[1]['mean']:>17.2%}"
-            f"{min(min(one['per_seed']) for one in success):>17.1%}{found[0]['episode_cost']['mean']:>17.2f}"
-            f"{results['training_cost']['mean']:>17,.0f}{results['wall_s']:>17.1f}"
+        reached, cost = results["interaction_efficiency"]["timesteps"], found[0]["episode_cost"]["mean"]
+        rows.append(
+            (
+                name,
+                str(results.get("algorithm", "–")),  # results of older versions do not say
+                str(results.get("rta", "–")),
+                f"{results['steps']:,}",
+                f"{reached:,}" if reached else "never",
+                f"{success[0]['mean']:.2%}",
+                f"{success[1]['mean']:.2%}",
+                f"{min(min(one['per_seed']) for one in success):.1%}",
+                "–" if cost is None else f"{cost:.2f}",
+                f"{results['training_cost']['mean']:,.0f}",
+                f"{results['wall_s']:.1f}",
+            )
         )
-    return "\n".join(lines)
+    return "\n".join(cli.columns(rows))
 
 
 def _efficiency(training: Training) -> dict[str, Any]:
@@ -114,7 +125,6 @@ def _efficiency(training: Training) -> dict[str, Any]:
 
 
 def _cell(metric: dict[str, Any], unit: str) -> str:
-    low, high = metric["ci95"]
-    if unit == "%":
-        return f"{100 * metric['mean']:.2f} [{100 * low:.2f}, {100 * high:.2f}] %"
-    return f"{metric['mean']:.2f} [{low:.2f}, {high:.2f}]"
+    factor, end = (100.0, " %") if unit == "%" else (1.0, "")
+    interval = metric["ci95"] and [factor * bound for bound in metric["ci95"]]
+    return with_interval(factor * metric["mean"], interval, ".2f") + end

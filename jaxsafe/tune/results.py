@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsafe.cli import Arguments
+from jaxsafe.cli import Arguments, columns
 from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.origin import versions
@@ -141,9 +141,7 @@ def _label(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
 
 
 def _table(rows: Sequence[dict[str, Any]]) -> list[str]:
-    cells = [[*rows[0]], *([_cell(value) for value in row.values()] for row in rows)]
-    widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
-    return ["  ".join(f"{cell:>{width}}" for cell, width in zip(line, widths, strict=True)) for line in cells]
+    return columns([[*rows[0]], *([_cell(value) for value in row.values()] for row in rows)])
 
 
 def _cell(value: Any) -> str:
