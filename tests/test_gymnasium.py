@@ -1,5 +1,6 @@
 import copy
 import importlib
+import multiprocessing
 import pickle
 import subprocess
 import sys
@@ -284,6 +285,64 @@ def test_an_episode_can_be_watched() -> None:
     for _ in range(4):  # the third ends the episode and shows the start of the next
         batch.step(np.zeros((1, 2), np.float32))
     assert len(batch._frames[0]._past) == 2
+
+
+START = {"start": {"deputy": {"position": [30.0, 0.0], "velocity": [-0.9, 0.0]}}, "parameters": {"deputy.mass": 13.0}}
+
+
+def test_a_batch_starts_where_single_environments_do() -> None:
+    options: dict[str, Any] = {"overrides": SOON, "randomize": {"deputy.mass": [10, 14]}, "max_episode_steps": 3}
+    ours = GymVectorEnv("docking2d", 3, autoreset_mode="SameStep", **options)
+    theirs = SyncVectorEnv([lambda: GymEnv("docking2d", **options)] * 3, autoreset_mode="SameStep")
+    for seed in (5, None):
+        found, expected = (env.reset(seed=seed, options=dict(START)) for env in (ours, theirs))
+        np.testing.assert_allclose(found[0], expected[0], rtol=1e-6)
+        same(found[1], expected[1], np.ones(3, bool), "reset")
+        for action in actions(theirs, 5):  # an episode that follows starts at random
+            np.testing.assert_allclose(ours.step(action)[0], theirs.step(action)[0], rtol=1e-5, atol=1e-6)
+    before = ours.reset(seed=0)[0]
+    after, infos = ours.reset(options={**START, "reset_mask": np.array([False, True, False])})
+    assert np.array_equal(after[[0, 2]], before[[0, 2]])
+    assert np.array_equal(after[1], found[0][1])
+    assert infos["_cost"].tolist() == [False, True, False]
+    with pytest.raises(ConfigError, match="reset_to: unknown platform 'deputi'"):
+        ours.reset(options={**START, "start": {"deputi": {}}})
+    with pytest.raises(ConfigError, match=r"reset: options: expected a dict, found \['start'\]"):
+        ours.reset(options=["start"])  # type: ignore[arg-type]
+
+
+def test_workers_that_are_forked_are_refused_where_they_would_wait_for_ever() -> None:
+    with pytest.raises(ConfigError, match=r"^AsyncVectorEnv: forked processes .* 'spawn'.* for the compiled batch$"):
+        gym.make_vec("jaxsafe/Docking2D-v0", 2, vectorization_mode="async", vector_kwargs={"context": "fork"})
+    with pytest.raises(ConfigError, match="AsyncVectorEnv"):
+        gym.vector.AsyncVectorEnv([lambda: GymEnv("docking2d")], context="fork")
+
+
+@pytest.mark.filterwarnings("default")  # JAX warns of the fork
+def test_a_forked_process_is_told_what_works() -> None:
+    env = GymEnv("docking2d")
+    env.reset(seed=0)
+    uses = [lambda: env.step([0.0, 0.0]), env.reset, lambda: env.reset(options=START), lambda: GymEnv("docking2d")]
+    with multiprocessing.get_context("fork").Pool(1, initializer=_forked.extend, initargs=(uses,)) as pool:
+        for index in range(len(uses)):
+            with pytest.raises(ConfigError, match=r"process \d+: forked processes would wait"):
+                pool.apply_async(_use, (index,)).get(timeout=60)
+
+
+_forked: list[Any] = []
+
+
+def _use(index: int) -> None:
+    _forked[index]()
+
+
+@pytest.mark.slow
+def test_workers_that_are_spawned_work() -> None:
+    env = gym.make_vec("jaxsafe/Docking2D-v0", 2, vectorization_mode="async", vector_kwargs={"context": "spawn"})
+    expected = GymVectorEnv("docking2d", 2).reset(seed=0)[0]
+    np.testing.assert_allclose(env.reset(seed=0)[0], expected, rtol=1e-6)
+    env.step(env.action_space.sample())
+    env.close()
 
 
 @pytest.mark.parametrize(

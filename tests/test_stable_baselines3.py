@@ -39,6 +39,36 @@ def test_a_limit_is_a_truncation(make: Any) -> None:
     assert [info["TimeLimit.truncated"] for info in env.step(np.zeros((2, 2)))[3]] == [True, True]
 
 
+def test_options_place_lanes_and_the_infos_of_starts_are_kept(make: Any) -> None:
+    from stable_baselines3.common.vec_env import DummyVecEnv
+
+    from jaxsafe import ConfigError
+    from jaxsafe.adapters.gymnasium import GymEnv
+
+    def placed(x: float) -> dict[str, Any]:
+        return {"start": {"deputy": {"position": [x, 0.0], "velocity": [0.0, 0.0]}}}
+
+    env = make("docking2d", 3, max_episode_steps=2)
+    expected = DummyVecEnv([lambda: GymEnv("docking2d", max_episode_steps=2)] * 3)
+    for options in (placed(30.0), [placed(20.0), {}, placed(40.0)], None):
+        for one in (env, expected):
+            one.seed(5)
+            one.set_options(options)
+        np.testing.assert_allclose(env.reset(), expected.reset(), rtol=1e-6)
+        for _ in range(5):  # options are for one reset
+            np.testing.assert_allclose(env.step(np.ones((3, 2)))[0], expected.step(np.ones((3, 2)))[0], rtol=1e-5)
+            for ours, theirs in zip(env.reset_infos, expected.reset_infos, strict=True):
+                assert ours.keys() == theirs.keys()
+                assert ours["margins"] == pytest.approx(theirs["margins"])
+                assert ours["status"] == pytest.approx(theirs["status"])
+                assert (ours["outcome"], type(ours["cost"])) == (theirs["outcome"], type(theirs["cost"]))
+    with pytest.raises(ConfigError, match="set_options: expected options for 3 lanes, found 1"):
+        env.set_options([placed(20.0)])
+    env.set_options({"stat": {}})
+    with pytest.raises(ConfigError, match="reset: options: unknown 'stat'; choose from start, parameters"):
+        env.reset()
+
+
 def test_the_library_accepts_single_environments() -> None:
     from stable_baselines3.common.env_checker import check_env
 

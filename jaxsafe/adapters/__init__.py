@@ -17,6 +17,27 @@ from jaxsafe.envs import make
 from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.simulation.controllers import Actuator, AgentController
 
+FORKED = (
+    "forked processes would wait for ever for JAX's threads; start workers with context='spawn'"
+    " (make_vec: vector_kwargs={'context': 'spawn'})"
+)
+"""What is wrong with workers that are forked, and what works."""
+
+_process: int | None = None
+"""The process that has made or stepped environments; its threads of JAX are not in what it forks."""
+
+
+def refuse_fork() -> None:
+    """Raise in a process that was forked from one that has used JAX here.
+
+    Raises:
+        ConfigError: always there, since any computation would wait for ever.
+    """
+    global _process
+    if _process not in (None, os.getpid()):
+        raise ConfigError(f"process {os.getpid()}: {FORKED}")
+    _process = os.getpid()
+
 
 def environment(
     task: str | os.PathLike | Environment, overrides: Mapping[str, Any] | None, options: Mapping[str, Any]
@@ -26,6 +47,7 @@ def environment(
     Raises:
         ConfigError: as `jaxsafe.make`.
     """
+    refuse_fork()
     known = list(inspect.signature(make).parameters)[1:]
     for option in options:
         if option not in known:

@@ -53,3 +53,14 @@ def masked(found: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
         batch[name] = masked(value, mask) if isinstance(value, Mapping) else np.asarray(value)
         batch[f"_{name}"] = mask
     return batch
+
+
+def of_lane(infos: Mapping[str, Any], lane: int) -> dict[str, Any]:
+    """Return the info of one lane, as a single environment has it, from Gymnasium's form of a batch."""
+    found = {}
+    for name, value in infos.items():
+        if name.startswith("_") and name[1:] in infos:
+            continue
+        one = of_lane(value, lane) if isinstance(value, Mapping) else value[lane]
+        found[name] = one.item() if isinstance(one, np.generic) else one
+    return found

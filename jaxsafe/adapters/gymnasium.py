@@ -8,6 +8,8 @@ Observations, rewards and infos are NumPy arrays and Python numbers.
 
 from __future__ import annotations
 
+import inspect
+import multiprocessing
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -17,10 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from gymnasium.error import ResetNeeded
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from jaxsafe.adapters import checked_count, environment
+from jaxsafe.adapters import FORKED, checked_count, environment, refuse_fork
 from jaxsafe.adapters.conversion import facts, masked, spaces
 from jaxsafe.adapters.lanes import Episodes, Lanes
 from jaxsafe.environment import Environment, reset_to
@@ -30,6 +32,7 @@ from jaxsafe.errors import ConfigError, nearest
 class _Chains:
     """The chains of keys that episodes start from, one for each lane."""
 
+    env: Environment
     _lanes: Lanes
     _unseeded: np.ndarray
     """Where no chain has begun, or `np_random` is a new generator and the next chain begins from it; [num_envs]."""
@@ -46,6 +49,14 @@ class _Chains:
         self._np_random = value
         self._np_random_seed = -1  # Gymnasium's sign of a generator whose seed is unknown
         self._unseeded[:] = True
+
+    def _start(self, mask: np.ndarray, seeds: Sequence[int | None], placed: Episodes | None) -> None:
+        """Start an episode in each lane of the mask, at random or as it is placed."""
+        self._begin_chains(mask, seeds)
+        if placed is None:
+            self._lanes.restart(mask)
+        else:
+            self._lanes.place(mask, placed)
 
     def _begin_chains(self, mask: np.ndarray, seeds: Sequence[int | None]) -> None:
         """Begin a chain in each lane of the mask that is asked to, or has none."""
@@ -98,6 +109,7 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
         Raises:
             ConfigError: as `jaxsafe.make`.
         """
+        _refuse_forking_workers()
         self.env = environment(task, overrides, options)
         self.render_mode = _checked_render_mode(render_mode)
         self.observation_space, self.action_space = spaces(self.env)
@@ -109,12 +121,7 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
         """Start an episode: see the class."""
         super().reset(seed=seed)
         chosen = _checked_options(options, ("start", "parameters"))
-        self._begin_chains(_ALONE, [_checked_seed(seed)])
-        if chosen:
-            placed = reset_to(self.env, chosen.get("start", {}), chosen.get("parameters"))
-            self._lanes.place(jax.tree.map(lambda x: x[None], Episodes(*placed)))
-        else:
-            self._lanes.restart(_ALONE)
+        self._start(_ALONE, [_checked_seed(seed)], _placed(self.env, chosen))
         if self._frames is not None:
             self._frames.clear()
         observation, _, _, _, info = self._receive(self._lanes.now)
@@ -191,12 +198,32 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict]:
-        """Start an episode in each lane, or where `options["reset_mask"]` says."""
-        mask = _checked_mask(_checked_options(options, ("reset_mask",)).get("reset_mask"), self.num_envs)
+        """Start an episode in each lane, or where `options["reset_mask"]` says; the other options are those of `GymEnv`."""
+        chosen = dict(_checked_options(options, ("start", "parameters", "reset_mask")))
+        mask = _checked_mask(chosen.pop("reset_mask", None), self.num_envs)
         if not self._lanes.running and not mask.all():
             raise ResetNeeded("reset: the first reset takes no reset_mask")
-        self._begin_chains(mask, self._seeds(seed))
-        self._lanes.restart(mask)
+        placed = _placed(self.env, chosen)
+        self._start(mask, self._seeds(seed), placed)
+        return self._begun(mask)
+
+    def start_lanes(
+        self, seeds: Sequence[int | None], options: Sequence[Mapping[str, Any] | None]
+    ) -> tuple[np.ndarray, dict]:
+        """Start an episode in each lane, with the seed and the options of `GymEnv` that stand at its place.
+
+        Raises:
+            ConfigError: as `GymEnv.reset`.
+        """
+        asked = self._seeds(seeds)
+        groups = [(_checked_options(chosen, ("start", "parameters")), mask) for chosen, mask in _grouped(options)]
+        placements = [_placed(self.env, chosen) for chosen, _ in groups]
+        for placed, (_, mask) in zip(placements, groups, strict=True):
+            self._start(mask, asked, placed)
+        return self._begun(np.ones(self.num_envs, bool))
+
+    def _begun(self, mask: np.ndarray) -> tuple[np.ndarray, dict]:
+        """Return what a reset returns, after episodes have started in the lanes of the mask."""
         episodes = self._lanes.now
         self._over = np.where(mask, False, self._over)
         self._film(mask, episodes)
@@ -294,6 +321,20 @@ _ALONE = np.ones(1, bool)
 """The mask of the only lane."""
 
 
+def _refuse_forking_workers() -> None:
+    """Raise where `AsyncVectorEnv` makes the environment whose spaces it reads before it forks its workers.
+
+    They would wait for ever for JAX's threads. An error in a worker reaches its parent as a mere EOFError.
+    """
+    frame = inspect.currentframe()
+    while frame is not None:
+        if frame.f_code is AsyncVectorEnv.__init__.__code__:
+            chosen = frame.f_locals.get("context") or multiprocessing.get_start_method(allow_none=True)
+            if (chosen or multiprocessing.get_all_start_methods()[0]) == "fork":  # the first is the default
+                raise ConfigError(f"AsyncVectorEnv: {FORKED}, or leave out vectorization_mode for the compiled batch")
+        frame = frame.f_back
+
+
 MAX_SEED_BITS = 128
 """As many as Gymnasium's own seeds have, which are drawn where none is given."""
 
@@ -316,7 +357,22 @@ def _checked_action(env: Environment, action: Any) -> np.ndarray:
     return array.astype(np.int32 if whole else jnp.result_type(float))
 
 
+def _grouped(options: Sequence[Mapping[str, Any] | None]) -> list[tuple[Mapping[str, Any] | None, np.ndarray]]:
+    """Return each of the options with a mask of the lanes that have it; what is empty is one group."""
+    groups = {id(one) if one else None: one for one in options}
+    own = np.array([id(one) if one else None for one in options], object)
+    return [(one, own == key) for key, one in groups.items()]
+
+
+def _placed(env: Environment, chosen: Mapping[str, Any]) -> Episodes | None:
+    """Return the episode at the start that is chosen, None for one at random."""
+    refuse_fork()
+    return Episodes(*reset_to(env, chosen.get("start", {}), chosen.get("parameters"))) if chosen else None
+
+
 def _checked_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) -> Mapping[str, Any]:
+    if options and not isinstance(options, Mapping):
+        raise ConfigError(f"reset: options: expected a dict, found {options!r}")
     for option in options or {}:
         if option not in known:
             raise ConfigError(f"reset: options: unknown {option!r}; choose from {', '.join(known)}")

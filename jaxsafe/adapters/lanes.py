@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from jaxsafe.adapters import refuse_fork
 from jaxsafe.environment import Environment, reset, step
 from jaxsafe.renewal import renew
 from jaxsafe.rollout import cut_short
@@ -153,6 +154,7 @@ class Lanes:
 
         A seed of more than 32 bits begins at the key of its lowest 32, folded with the others.
         """
+        refuse_fork()
         size = max(1, *(-(-seed.bit_length() // 32) for seed in seeds))
         words = [[seed >> 32 * i & 0xFFFFFFFF for i in range(size)] for seed in seeds]
         keys = _raw_keys(self._layout.key_impl, np.array(words, np.uint32))
@@ -160,16 +162,20 @@ class Lanes:
 
     def restart(self, mask: np.ndarray) -> None:
         """Start an episode where the mask says, [num_envs]; the first time, everywhere."""
+        refuse_fork()
         self._keys, self._words = restart(self._layout, self._env, self._keys, self._words, mask)
         self.running = True
 
-    def place(self, episodes: Episodes) -> None:
-        """Go on from these; the chains of keys stay as they are."""
-        self._words = pack(self._layout.episodes, episodes)
+    def place(self, mask: np.ndarray, episode: Episodes) -> None:
+        """Go on from this episode, that of one lane, where the mask says; the chains of keys stay as they are."""
+        refuse_fork()
+        words = pack(self._layout.episodes, jax.tree.map(lambda x: x[None], episode))
+        self._words = np.where(mask, words, self._words)
         self.running = True
 
     def step(self, actions: np.ndarray) -> None:
-        """Advance every lane, [num_envs, action] in [-1, 1] or indices."""
+        """Advance every lane by its action, [num_envs, action]."""
+        refuse_fork()
         self._words = advance(self._layout, self._env, self._words, actions, self._limit)
 
 

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from jaxsafe.adapters.conversion import of_lane
 from jaxsafe.adapters.gymnasium import GymVectorEnv
 from jaxsafe.environment import Environment
-from jaxsafe.errors import missing
+from jaxsafe.errors import ConfigError, missing
 
 try:
     from stable_baselines3.common.vec_env import VecEnv
@@ -23,7 +24,8 @@ class SB3VecEnv(VecEnv):
     """Many environments in one compiled step; a lane whose episode ends starts anew in the same step.
 
     `infos` holds per lane `cost` and, where an episode has ended, `terminal_observation`, `TimeLimit.truncated`,
-    `is_success` and `outcome`. All other facts are in `self.env`, a `GymVectorEnv`.
+    `is_success` and `outcome`. `reset_infos` holds per lane all that `GymEnv.reset` tells of the latest start.
+    `set_options` takes the options of `GymEnv.reset`.
     """
 
     def __init__(
@@ -42,11 +44,18 @@ class SB3VecEnv(VecEnv):
         super().__init__(num_envs, self.env.single_observation_space, self.env.single_action_space)
 
     def reset(self) -> np.ndarray:
-        """Start an episode in each lane, from the seeds given before, if any."""
-        observation, _ = self.env.reset(seed=self._seeds)
+        """Start an episode in each lane, from the seeds and with the options given before, if any."""
+        observation, infos = self.env.start_lanes(self._seeds, self._options)
+        self.reset_infos = [of_lane(infos, lane) for lane in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         return observation
+
+    def set_options(self, options: list[dict] | dict | None = None) -> None:
+        """Give options of `GymEnv.reset` to the next reset, one dict for all lanes or one for each."""
+        if not isinstance(options, dict | None) and len(options) != self.num_envs:
+            raise ConfigError(f"set_options: expected options for {self.num_envs} lanes, found {len(options)}")
+        super().set_options(options)
 
     def step_async(self, actions: np.ndarray) -> None:
         self._actions = actions
@@ -55,6 +64,7 @@ class SB3VecEnv(VecEnv):
         observation, reward, terminated, truncated, facts = self.env.step(self._actions)
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{"cost": cost} for cost in facts["cost"].tolist()]
+        begun = {name: value for name, value in facts.items() if name in self.reset_infos[0]}
         for lane in np.flatnonzero(done):
             final = facts["final_info"]
             infos[lane] = {
@@ -64,6 +74,7 @@ class SB3VecEnv(VecEnv):
                 "is_success": bool(final["is_success"][lane]),
                 "outcome": final["outcome"][lane],
             }
+            self.reset_infos[lane] = of_lane(begun, int(lane))
         return observation, reward.astype(np.float32), done, infos
 
     def close(self) -> None:
