@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator
+import os
+import sysconfig
+import traceback
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 
 
 class ConfigError(ValueError):
@@ -61,6 +65,33 @@ def part(*path: str) -> Iterator[None]:
     except Exception as error:
         error.add_note("in " + ".".join(path))
         raise
+
+
+def told(error: BaseException, modules: Collection[str] = ()) -> str:
+    """Return kind and first line of an error, and where in the user's own code it arose: `TypeError: … (mine.py, line 3)`.
+
+    Args:
+        error: as it was caught.
+        modules: names of the user's modules, which may be installed like a library.
+    """
+    reason = next(iter(str(error).splitlines()), "")[:200]
+    frames = traceback.walk_tb(error.__traceback__)
+    own = [(frame.f_code.co_filename, line) for frame, line in frames if _is_own(frame, modules)]
+    if not own or isinstance(error, SyntaxError):  # which names its file itself
+        return f"{type(error).__name__}: {reason}"
+    path, line = own[-1]
+    near = os.path.relpath(path)
+    return f"{type(error).__name__}: {reason} ({path if near.startswith('..') else near}, line {line})"
+
+
+def _is_own(frame: FrameType, modules: Collection[str]) -> bool:
+    """Return whether this is neither jaxsafe nor another library nor Python itself."""
+    roots = {name.partition(".")[0] for name in modules}
+    if frame.f_globals.get("__name__", "").partition(".")[0] in roots:
+        return True
+    libraries = (os.path.dirname(__file__), *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
+    path = frame.f_code.co_filename
+    return not path.startswith(("<", *(os.path.join(library, "") for library in libraries)))
 
 
 def install(extra: str) -> str:

@@ -1,5 +1,6 @@
 """Environments as YAML and overrides: what is written reads back, and every fault is one line with its place."""
 
+import copy
 import re
 import subprocess
 import sys
@@ -546,7 +547,7 @@ class ChangesShape(Status, type="changes_shape_of_test"):
     [
         (
             "shape",
-            r"^memory\.status\.odd: is float32\[2\] after reset and float32\[3\] after a step$|status\.odd: is float32",
+            r"^memory\.status\.odd: is float32\[2\] after reset and float32\[3\] after a step$",
         ),
         ("dtype", r"status\.odd: is float32\[2\] after reset and int32\[2\] after a step"),
         ("structure", r"^status\.odd: its memory has another structure after a step than after reset$"),
@@ -691,11 +692,14 @@ def test_parts_within_parts_are_imported_too(env: Environment, directory: Path) 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("raise RuntimeError('first line\\nsecond line')", r"cannot import 'bad_of_test': RuntimeError: first line$"),
-        ("x = 1 / 0", r"cannot import 'bad_of_test': ZeroDivisionError: division by zero$"),
-        ("def", r"cannot import 'bad_of_test': SyntaxError: "),
+        ("raise RuntimeError('first line\\nsecond line')",
+         r"cannot import 'bad_of_test': RuntimeError: first line \(bad_of_test\.py, line 1\)$"),
+        ("x = 1 / 0", r"cannot import 'bad_of_test': ZeroDivisionError: division by zero \(bad_of_test\.py, line 1\)$"),
+        ("\n\ndef f():\n    import json\n    return json.loads('{')\nf()",
+         r"cannot import 'bad_of_test': JSONDecodeError: .* \(bad_of_test\.py, line 5\)$"),
+        ("def", r"cannot import 'bad_of_test': SyntaxError: [^(]*\(bad_of_test\.py, line 1\)$"),
         ("import no_such_module_of_test", r"cannot import 'bad_of_test': ModuleNotFoundError: No module named 'no_such"),
-        ("raise ValueError", r"cannot import 'bad_of_test': ValueError: $"),
+        ("raise ValueError", r"cannot import 'bad_of_test': ValueError:  \(bad_of_test\.py, line 1\)$"),
         ("from jaxsafe.processors.status import Status\nclass Mine(Status, type='speed'):\n    pass",
          r"type 'speed' of bad_of_test\.Mine: taken by jaxsafe\.processors\.status\.Speed; choose another name$"),
     ],
@@ -705,6 +709,26 @@ def test_a_module_that_cannot_be_imported_is_told_in_one_line(
 ) -> None:
     (directory / "bad_of_test.py").write_text(text)
     assert re.search(message, fault_in(tree | {"imports": ["bad_of_test"]}))
+
+
+def test_an_error_in_the_code_of_a_user_names_its_line(tree: dict[str, Any], directory: Path) -> None:
+    (directory / "helper_of_test.py").write_text("def divide(x):\n    return x / 'two'\n")
+    (directory / "fails_of_test.py").write_text(
+        "from helper_of_test import divide\n"
+        "from jaxsafe.processors.status import Status\n\n\n"
+        "class Fails(Status, type='fails_of_test'):\n"
+        "    def problem(self):\n"
+        "        return None if self.name != 'early' else 1 + None\n\n"
+        "    def process(self, memory, sim):\n"
+        "        return divide(sim.time)\n"
+    )
+    for name, message in (
+        ("late", r"^status\.late: cannot be computed: TypeError: .* \(helper_of_test\.py, line 2\)$"),
+        ("early", r"^status\.early: cannot be checked: TypeError: .* \(fails_of_test\.py, line 7\)$"),
+    ):
+        data = copy.deepcopy(tree) | {"imports": ["fails_of_test"]}
+        data["status"].append({"type": "fails_of_test", "name": name})
+        assert re.search(message, fault_in(data))
 
 
 def test_a_misspelt_type_of_a_user_s_module_is_refused(tree: dict[str, Any], directory: Path) -> None:

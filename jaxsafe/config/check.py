@@ -14,8 +14,9 @@ from jax.core import Tracer
 
 from jaxsafe.component import ANY, Component, Refers, choices, fields
 from jaxsafe.config.convert import expects, to_value
+from jaxsafe.config.imports import modules
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.errors import ConfigError, nearest, show
+from jaxsafe.errors import ConfigError, nearest, show, told
 from jaxsafe.paths import join, set_path
 from jaxsafe.processors.observation import Observe, ObserveAngle
 from jaxsafe.rta.prediction import judge
@@ -111,7 +112,12 @@ def _problems(component: Component, place: str) -> Iterator[tuple[str, str]]:
             if isinstance(inner, Component):
                 yield from _problems(inner, join(join(place, name), getattr(inner, "name", "")))
     with jax.ensure_compile_time_eval():  # inside a trace comparisons of constants would be traced too
-        problem = component.problem()
+        try:
+            problem = component.problem()
+        except ConfigError:
+            raise
+        except Exception as error:
+            raise ConfigError(f"{place}: cannot be checked: {told(error, modules(component))}") from error
     if problem:
         yield place, problem
 
@@ -274,8 +280,7 @@ def _check_tracing(env: Environment) -> None:
     except Exception as error:
         notes = getattr(error, "__notes__", ())
         place = next((note.removeprefix("in ") for note in notes if note.startswith("in ")), "environment")
-        reason = next(iter(str(error).splitlines()), "")
-        raise ConfigError(f"{place}: cannot be computed: {type(error).__name__}: {reason[:200]}") from error
+        raise ConfigError(f"{place}: cannot be computed: {told(error, modules(env))}") from error
     memory, later = vars(begin[0].memory), vars(after[0].memory)
     for section in ("status", "reward", "observation"):
         for name, first in memory[section].items():
@@ -285,7 +290,7 @@ def _check_tracing(env: Environment) -> None:
         raise ConfigError("rta: its memory has another structure after a step than after reset")
     for (path, old), new in zip(jax.tree_util.tree_leaves_with_path(begin), jax.tree.leaves(after), strict=True):
         if (old.shape, old.dtype) != (new.shape, new.dtype):
-            place = jax.tree_util.keystr(path, simple=True, separator=".")
+            place = jax.tree_util.keystr(path[1:], simple=True, separator=".").removeprefix("sim.")  # [0] is which record
             raise ConfigError(
                 f"{place}: is {old.dtype}{list(old.shape)} after reset and {new.dtype}{list(new.shape)} after a step"
             )

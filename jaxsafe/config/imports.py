@@ -8,7 +8,7 @@ import sys
 from typing import Any
 
 from jaxsafe.component import Component, fields
-from jaxsafe.errors import ConfigError, show
+from jaxsafe.errors import ConfigError, show, told
 from jaxsafe.paths import join
 
 
@@ -40,5 +40,4 @@ def import_modules(names: Any, place: str) -> None:
         except ConfigError:
             raise
         except (Exception, SystemExit) as error:
-            reason = next(iter(str(error).splitlines()), "")[:200]
-            raise ConfigError(f"{here}: cannot import {show(name)}: {type(error).__name__}: {reason}") from error
+            raise ConfigError(f"{here}: cannot import {show(name)}: {told(error, [name])}") from error
