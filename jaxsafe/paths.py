@@ -26,6 +26,17 @@ def as_given(value: Any, field: Field, place: str) -> Any:
     return value
 
 
+def get_path(component: Any, path: str) -> Any:
+    """Return the value at a dotted path, which must lead somewhere. Of named parts it is the names, as `set_path` takes."""
+    value = component
+    for name in path.split("."):
+        if value is component and name not in fields(type(component)):
+            value = getattr(component, component.shorthand)
+        value = value[_index(value, name, path)] if isinstance(value, tuple) else getattr(value, name)
+    named = isinstance(value, tuple) and all(hasattr(part, "name") for part in value)
+    return [part.name for part in value] if named else value
+
+
 def set_path(component: Any, path: str, value: Any, convert: Convert = as_given) -> Any:
     """Return the component with the value at one dotted path replaced.
 

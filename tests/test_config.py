@@ -18,9 +18,10 @@ import jaxsafe
 from jaxsafe import ConfigError, Environment
 from jaxsafe.component import normalise
 from jaxsafe.config import build, dump, load
-from jaxsafe.config.convert import to_component
+from jaxsafe.config.convert import to_component, to_data
 from jaxsafe.config.imports import import_modules, modules
 from jaxsafe.config.yaml import parse, write
+from jaxsafe.envs import adapt
 from jaxsafe.errors import ConfigWarning, show
 from jaxsafe.processors.reward import Failure
 from jaxsafe.processors.status import Status
@@ -1056,3 +1057,47 @@ def test_a_file_whose_tied_number_is_random_is_told(env: Environment) -> None:
     text = dump(env).replace("randomize: {}", "randomize: {deputy.mean_motion: [0.001, 0.002]}")
     with pytest.warns(ConfigWarning, match=f"^deputy.mean_motion is random alone: {SLOPES}"):
         load(text)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_a_variant_puts_in_all_in_which_variants_differ(task: str) -> None:
+    paper, released = (jaxsafe.make(task, variant=variant) for variant in ("paper", "released"))  # type: ignore[arg-type]
+    assert dump(paper) == dump(jaxsafe.make(task))
+    assert dump(adapt(paper, task, variant="released")) == dump(released)
+    assert dump(adapt(released, task, variant="paper")) == dump(paper)
+
+
+def test_a_filter_comes_from_a_file(tmp_path: Path) -> None:
+    default = jaxsafe.make("docking2d", rta="default")
+    (tmp_path / "filter.yaml").write_text(write(to_data(default.rta)))
+    (tmp_path / "env.yaml").write_text(dump(jaxsafe.make("docking3d", {"deputy.mass": 20.0}, rta="default")))
+    for name in ("filter", "env"):
+        found = jaxsafe.make("docking2d", rta=str(tmp_path / f"{name}.yaml"))
+        assert dump(found) == dump(default)
+    assert dump(jaxsafe.make("docking2d", {"rta.margin": 0.01}, rta=str(tmp_path / "filter.yaml"))) == dump(
+        jaxsafe.make("docking2d", {"rta.margin": 0.01}, rta="default")
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, r"rta\.yaml"),
+        ("", r"rta\.yaml: rta: expected a mapping"),
+        ("[1, 2]", r"rta\.yaml: rta: expected a mapping"),
+        ("margin: 0.1", r"rta\.yaml: rta: field 'type' is missing; choose from "),
+        ("type: simplx", r"rta\.yaml: rta: unknown type 'simplx'.*Did you mean 'simplex'"),
+        ("imports: 3\ntype: simplex", r"rta\.yaml: rta.imports: expected a list of modules"),
+        ("imports: [no_such_module]\ntype: simplex", r"rta\.yaml: rta.imports: cannot import 'no_such_module'"),
+        ("ENV", r"rta: .*rta\.yaml is an environment without a filter"),
+        ("platforms: 3", r"rta\.yaml: environment"),
+        ("{type: simplex, constraints: [collision], backups: [{type: brake, name: b}]}", "collision"),
+    ],
+)
+def test_a_file_without_a_filter_is_told(text: str | None, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "rta.yaml"
+    if text is not None:
+        path.write_text(dump(jaxsafe.make("docking2d")) if text == "ENV" else text)
+    with pytest.raises(ConfigError, match=message) as raised:
+        jaxsafe.make("docking2d", rta=str(path))
+    assert "\n" not in str(raised.value)

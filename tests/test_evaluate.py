@@ -9,10 +9,13 @@ import pytest
 from PIL import Image
 
 import jaxsafe
+from jaxsafe.cli import Arguments
+from jaxsafe.config import dump
 from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import episodes as episodes_module
 from jaxsafe.evaluate import seeds as seeds_module
 from jaxsafe.evaluate.__main__ import main
+from jaxsafe.evaluate.choice import EnvironmentChoice, differences
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.evaluate.seeds import Evaluator, batch_keys
 from jaxsafe.train.seeds import SeedMapper
@@ -161,6 +164,83 @@ def test_no_episode_is_cut_before_its_timeout(overrides: dict[str, Any], steps: 
 def test_a_change_of_the_observation_is_refused(whole: Path) -> None:
     with pytest.raises(ConfigError, match="env: the change gives observation_names"):
         main([f"run={whole}", "env.observation=[velocity,position,speed,velocity_limit]"])
+
+
+def chosen(*words: str) -> EnvironmentChoice:
+    return EnvironmentChoice.pop(Arguments.parse(words))
+
+
+def test_a_policy_acts_in_another_environment_that_fits_it(tmp_path: Path) -> None:
+    own, name = jaxsafe.make("docking2d", {"deputy.mass": 14.0}), "docking2d"
+    file = tmp_path / "mine.yaml"
+    file.write_text(dump(jaxsafe.make("docking2d", {"deputy.mass": 24.0, "terminal.timeout.limit": 100.0})))
+    other = chosen(f"env={file}", "env.deputy.mass=30").change(own, name, "x")
+    assert float(other.platform("deputy").mass) == 30.0  # type: ignore[attr-defined]
+    assert float(other.terminal[-1].limit) == 100.0  # type: ignore[attr-defined]
+    assert dump(chosen("env=docking2d").change(own, name, "x")) == dump(jaxsafe.make("docking2d"))
+    assert dump(chosen().change(own, name, "x")) == dump(own)
+    released = chosen("variant=released").change(own, name, "x")
+    assert float(released.platform("deputy").mass) == 14.0  # type: ignore[attr-defined]
+    assert released.outcomes == jaxsafe.make("docking2d", variant="released").outcomes
+
+
+@pytest.mark.parametrize(
+    ("actions", "words", "message"),
+    [
+        ("continuous", ["env=docking3d"], r"env: docking3d has observation_names .*, the policies of x have "),
+        ("continuous", ["env=rejoin2d"], r"env: rejoin2d has observation_names"),
+        ("continuous", ["env=docking2d_oriented"], r"env: docking2d_oriented has observation_names"),
+        ("continuous", ["env.observation=[velocity,position,speed,velocity_limit]"], "the change gives observation_names"),
+        ("continuous", ["env=FILE"], r"env: .*mine\.yaml has observation_names"),
+        ("continuous", ["actions=discrete"], r"the change gives num_action_points \(11, 11\).*; give actions=continuous$"),
+        ("discrete", ["env=docking2d"], r"has num_action_points \(\), .* \(11, 11\); give actions=discrete$"),
+        ("discrete", ["env.deputy.controller.actuators.thrust_x.points=5"], r"num_action_points \(5, 11\), .*11\)$"),
+        ("discrete", ["actions=discret"], "actions: unknown kind 'discret'.*Did you mean 'discrete'"),
+        ("continuous", ["env=docking4d"], "env: unknown task 'docking4d'"),
+        ("continuous", ["env=none.yaml"], r"none\.yaml"),
+        ("continuous", ["variant=code"], "variant: unknown variant 'code'"),
+        ("continuous", ["rta=safe"], r"rta: docking2d has no preset 'safe'; choose from none, .*, FILE\.yaml"),
+        ("continuous", ["rta=none.yaml"], r"none\.yaml"),
+    ],
+)
+def test_an_environment_that_does_not_fit_is_refused(
+    actions: Any, words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    other_order = {"observation": ["velocity", "position", "speed", "velocity_limit"]}
+    (tmp_path / "mine.yaml").write_text(dump(jaxsafe.make("docking2d", other_order)))
+    words = [word.replace("FILE", str(tmp_path / "mine.yaml")) for word in words]
+    with pytest.raises(ConfigError, match=message) as raised:
+        chosen(*words).change(jaxsafe.make("docking2d", actions=actions), "docking2d", "x")
+    assert "\n" not in str(raised.value)
+
+
+def test_a_discrete_policy_is_evaluated_where_actions_are_discrete() -> None:
+    own = jaxsafe.make("docking2d", actions="discrete")
+    env = chosen("env=docking2d", "actions=discrete", "rta=explicit_simplex").change(own, "docking2d", "x")
+    assert env.num_action_points == (11, 11)
+    assert env.rta is not None
+
+
+def test_what_is_defined_otherwise_than_in_training_is_told() -> None:
+    own = jaxsafe.make("docking2d")
+    assert differences(own, chosen("env.deputy.mass=24", "rta=default").change(own, "docking2d", "x")) == ""
+    words = ["env.observation.position.scale=10", "env.deputy.controller.actuators.thrust_y.high=2"]
+    told = differences(own, chosen(*words).change(own, "docking2d", "x"))
+    assert told == "defined otherwise than in training: observation position, actuator thrust_y"
+
+
+def test_another_environment_is_the_change_that_makes_it(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(dump(jaxsafe.make("docking2d", {"terminal.timeout.limit": 30.0, "deputy.mass": 24.0})))
+    words = [f"run={whole / 'policy' / 'seed_1.npz'}", "episodes=3", "deterministic=true"]
+    assert main([*words, f"env={file}", f"out={tmp_path / 'a'}"]) == 0
+    assert main([*words, "env.deputy.mass=24", "env.terminal.timeout.limit=30", f"out={tmp_path / 'b'}"]) == 0
+    a, b = (json.loads((tmp_path / name / "results.json").read_text()) for name in "ab")
+    assert a["evaluation"] == b["evaluation"]
+    assert a["changes"] == {"env": str(file)}
 
 
 def test_every_episode_is_counted_once_however_short() -> None:

@@ -214,7 +214,11 @@ def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFi
             r"each within ±1e\+18, found",
         ),
         (["run=nowhere"], "run: no run in 'nowhere'"),
-        (["run=pretrained/docking2d", "env=docking2d"], "env: pretrained/docking2d holds its own environment"),
+        (
+            ["run=pretrained/docking2d", "env=docking3d"],
+            "env: docking3d has observation_names",
+        ),
+        (["run=pretrained/docking2d", "env.deputy.mas=2"], "mas"),
         (["run=pretrained/docking2d", "box.position=[1,2]"], "box.position: means nothing without format=vnnlib"),
     ],
 )

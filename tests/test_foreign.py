@@ -123,6 +123,27 @@ def test_its_closed_loop_goes_to_a_verifier(tmp_path: Path, monkeypatch: pytest.
         export(["run=net.onnx", "env=docking2d", "inputs=network"])
 
 
+def test_changes_of_the_environment_come_before_what_a_network_must_fit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    np.savez("four.npz", kernel_0=np.full((4, 2), 0.1), bias_0=np.zeros(2))
+    words = ["run=four.npz", "env=docking2d", "env.observation=[position,velocity]"]
+    short = ["episodes=2", "env.terminal.timeout.limit=5"]
+    assert main([*words, *short, "variant=released", "rta=default", "out=x"]) == 0
+    changes = read_json(tmp_path / "x" / "results.json")["changes"]
+    assert changes["variant"] == "released"
+    assert changes["rta"] == "default"
+    assert changes["observation"] == ["position", "velocity"]
+    assert export([*words, "out=four.onnx"]) == 0
+    graph = onnxruntime.InferenceSession("four.onnx")
+    np.testing.assert_allclose(graph.run(None, {"input": np.ones((1, 4), np.float32)})[0], [[0.4, 0.4]], rtol=1e-6)
+    with pytest.raises(ConfigError, match=r"four\.npz: does not take an observation of 6 numbers"):
+        main(["run=four.npz", "env=docking2d"])
+    with pytest.raises(ConfigError, match=r"variant: unknown variant 'relesed'; choose from"):
+        main([*words, "variant=relesed"])
+
+
 def test_constants_casts_and_extremes_are_understood(tmp_path: Path) -> None:
     def graph(*nodes: onnx.NodeProto) -> Path:
         values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 6]) for name in ("obs", "out")]
@@ -179,8 +200,9 @@ def test_more_mistakes_are_named(tmp_path: Path) -> None:
         main(["run=x.onnx"])
     with pytest.raises(ConfigError, match="deterministic: expected true or nothing, found False"):
         main(["run=x.onnx", "env=docking2d", "deterministic=false"])
-    with pytest.raises(ConfigError, match="actions: means nothing but for a policy from elsewhere"):
-        main(["run=pretrained/docking2d", "actions=discrete"])
+    np.savez(tmp_path / "layers.npz", kernel_0=np.ones((6, 2)), bias_0=np.ones(2))
+    with pytest.raises(ConfigError, match=r"env: missing; the task in which .*layers\.npz shall act"):
+        main([f"run={tmp_path / 'layers.npz'}"])
     with pytest.raises(ConfigError, match="checkpoint: means nothing for a policy from elsewhere"):
         main(["run=x.npz", "env=docking2d", "checkpoint=best"])
     for words in (["run=x.onnx", "env=docking2d"], ["run=pretrained/docking2d"]):

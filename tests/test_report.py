@@ -209,7 +209,7 @@ def test_bad_options_of_report_are_told(words: list[str], message: str) -> None:
 
 
 def test_every_command_of_the_plan_is_valid() -> None:
-    from jaxsafe.envs import with_rta
+    from jaxsafe.envs import adapt
 
     items = plan([*TASKS], [*KINDS], ["seeds=10"])
     assert len({item.name for item in items}) == 40
@@ -220,7 +220,7 @@ def test_every_command_of_the_plan_is_valid() -> None:
             arguments = cli.Arguments.parse(words)
             rta = arguments.pop_text("rta")
             arguments.pop("seed")
-            changed = override(env if rta is None else with_rta(env, item.task, rta), arguments.pop_overrides())
+            changed = adapt(env, item.task, arguments.pop_overrides(), rta=rta)
             assert changed.observation_size == env.observation_size
             assert not arguments.options
 

@@ -12,8 +12,10 @@ from jaxsafe.config.imports import import_modules, modules
 from jaxsafe.config.override import override
 from jaxsafe.config.tied import warn_of_ties
 from jaxsafe.environment import Environment
+from jaxsafe.errors import ConfigError
+from jaxsafe.rta.filter import RTA
 
-__all__ = ["build", "describe", "dump", "from_data", "load", "override"]
+__all__ = ["build", "describe", "dump", "from_data", "load", "load_filter", "override"]
 
 
 def build(env: Environment) -> Environment:
@@ -36,6 +38,28 @@ def load(source: str | os.PathLike) -> Environment:
     env = from_data(data, "")
     warn_of_ties(env.replace(randomize={}), env)
     return env
+
+
+def load_filter(path: str | os.PathLike) -> RTA:
+    """Read a run time assurance filter from a YAML file: what stands under `rta` in an environment, or an environment.
+
+    Of an environment its filter is taken. A filter alone may begin with `imports`, as an environment may.
+
+    Raises:
+        ConfigError: one line that names the place, what was found and what is allowed.
+    """
+    from jaxsafe.config import yaml
+
+    data = yaml.read(path)
+    if isinstance(data, dict) and "imports" in data:
+        data = dict(data)
+        import_modules(data.pop("imports"), f"{path}: rta")
+    if not isinstance(data, dict) or "platforms" not in data:
+        return to_component(data, RTA, f"{path}: rta")
+    found = build(to_component(data, Environment, f"{path}: environment")).rta
+    if found is None:
+        raise ConfigError(f"rta: {path} is an environment without a filter; rta=none is for none")
+    return found
 
 
 def dump(env: Environment) -> str:

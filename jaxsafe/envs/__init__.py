@@ -6,11 +6,11 @@ import os
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
-from jaxsafe.config import build, load, override
+from jaxsafe.config import build, load, load_filter, override
 from jaxsafe.environment import Environment
 from jaxsafe.envs import _docking, docking2d, docking2d_oriented, docking3d, rejoin2d, rejoin3d
 from jaxsafe.errors import ConfigError, nearest, show
-from jaxsafe.paths import set_path
+from jaxsafe.paths import get_path, set_path
 from jaxsafe.rta.filter import RTA
 from jaxsafe.rta.presets import PRESETS
 from jaxsafe.simulation.controllers import Continuous, Discrete
@@ -58,8 +58,9 @@ def make(
         variant: `paper`, or `released` for the semantics of the published SafeRL code; None is `paper`.
         randomize: numbers drawn anew for each episode, by dotted path with their interval, for instance
             `{"deputy.mass": [10, 14]}`.
-        rta: run time assurance: the name of a preset of the task, `default` for the recommended one, a filter, or `none`
-            to remove what a file has; None leaves the environment as it is (the tasks by name have none).
+        rta: run time assurance: the name of a preset of the task, `default` for the recommended one, a filter, a YAML file
+            with one, as `jaxsafe.config.load_filter` reads it, or `none` to remove what a file has; None leaves the
+            environment as it is (the tasks by name have none).
 
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.
@@ -82,38 +83,53 @@ def make(
         env = load(name)
     else:
         raise ConfigError(f"env: unknown task {show(name)} and not a .yaml file; choose from {nearest(name, TASKS)}")
+    return adapt(env, name, overrides, actions=actions, variant=variant, randomize=randomize, rta=rta)
+
+
+def adapt(
+    env: Environment,
+    task: str,
+    overrides: Mapping[str, Any] | None = None,
+    *,
+    actions: str | None = None,
+    variant: str | None = None,
+    randomize: Mapping[str, Sequence[float]] | None = None,
+    rta: str | RTA | None = None,
+) -> Environment:
+    """Return an environment with what the options of `make` change; `task` is its name, or its file.
+
+    Raises:
+        ConfigError: as `make`.
+    """
     if variant is not None:
-        env = _with_variant(env, name, variant)
+        env = override(env, _variant_values(task, variant))
     if actions is not None:
         env = _with_actions(env, actions)
-    filters = {} if rta is None else {"rta": _filter(name, rta)}  # fits together with the overrides, not without
+    filters = {} if rta is None else {"rta": _filter(task, rta)}  # fits together with the overrides, not without
     random = {} if randomize is None else {"randomize": randomize}
     return override(env, {**filters, **(overrides or {}), **random})
 
 
-def _with_variant(env: Environment, task: str, variant: str) -> Environment:
+def _variant_values(task: str, variant: str) -> dict[str, Any]:
+    """Return all in which the variants of a task differ, by dotted path, as this variant has it."""
     if variant not in VARIANTS:
         raise ConfigError(f"variant: unknown variant {show(variant)}; choose from {nearest(variant, VARIANTS)}")
     if task not in TASKS:
         raise ConfigError(f"variant: {task} says itself what it is; a variant is for {', '.join(TASKS)}")
-    return override(env, VARIANTS[variant].get(task, {}))
-
-
-def with_rta(env: Environment, task: str, rta: str | RTA) -> Environment:
-    """The environment with a filter: one of the task's presets by name, a filter, or `none`.
-
-    Raises:
-        ConfigError: the task has no such preset.
-    """
-    return override(env, {"rta": _filter(task, rta)})
+    paper = TASKS[task]()
+    paths = {path: get_path(paper, path) for changes in VARIANTS.values() for path in changes.get(task, {})}
+    return {**paths, **VARIANTS[variant].get(task, {})}
 
 
 def _filter(task: str, rta: str | RTA) -> RTA | None:
     if isinstance(rta, RTA):
         return rta
+    if isinstance(rta, str) and rta.endswith((".yaml", ".yml")):
+        return load_filter(rta)
     presets = {"none": lambda: None, **PRESETS.get(task, {})}
     if not isinstance(rta, str) or rta not in presets:
-        raise ConfigError(f"rta: {task} has no preset {show(rta)}; choose from {nearest(rta, presets)}")
+        known = [*presets, "FILE.yaml"]
+        raise ConfigError(f"rta: {task} has no preset {show(rta)}; choose from {nearest(rta, known)}")
     return presets[rta]()
 
 

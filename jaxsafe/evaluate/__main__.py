@@ -8,16 +8,15 @@ from typing import Any
 from jaxsafe import cli
 from jaxsafe.train.seeds import claim_cores
 
-OPTIONS = ("run", "env", "actions", "activation", "rta", "episodes", "seed", "checkpoint", "deterministic", "render", "out")
+OPTIONS = ("run", "activation", "episodes", "seed", "checkpoint", "deterministic", "render", "out")
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     claim_cores()
     cli.enable_compilation_cache()
-    from jaxsafe.config import override
-    from jaxsafe.envs import with_rta
     from jaxsafe.errors import ConfigError
+    from jaxsafe.evaluate import choice
     from jaxsafe.evaluate.foreign import pop_source
     from jaxsafe.evaluate.report import evaluate, film
     from jaxsafe.evaluate.subject import load, load_foreign
@@ -27,13 +26,13 @@ def main(argv: Sequence[str]) -> int:
     run = arguments.pop_text("run")
     if run is None:
         raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
-    elsewhere = pop_source(arguments, run)
-    arguments.refuse_beside(["checkpoint"] if elsewhere else [], "for a policy from elsewhere, which env= says it is")
-    out, checkpoint, rta, render = (arguments.pop_text(name) for name in ("out", "checkpoint", "rta", "render"))
-    changes = arguments.pop_overrides()
+    chosen = choice.EnvironmentChoice.pop(arguments)
+    elsewhere = pop_source(arguments, run, chosen)
+    arguments.refuse_beside(["checkpoint"] if elsewhere else [], "for a policy from elsewhere")
+    out, checkpoint, render = (arguments.pop_text(name) for name in ("out", "checkpoint", "render"))
     episodes, seed = arguments.pop_count("episodes", 1000), arguments.pop_seed()
     deterministic = arguments.pop_flag("deterministic")
-    arguments.refuse_rest([*OPTIONS, "env.…"])
+    arguments.refuse_rest([*OPTIONS, *choice.OPTIONS])
     if render not in (None, "gif"):
         raise ConfigError(f"render: found {render!r}; choose from gif")
     if elsewhere and deterministic is False:
@@ -41,13 +40,15 @@ def main(argv: Sequence[str]) -> int:
     deterministic = True if elsewhere else deterministic
     kinds = {None: ("stochastic", "deterministic"), True: ("deterministic",), False: ("stochastic",)}[deterministic]
     subject = load_foreign(elsewhere) if elsewhere else load(run, checkpoint)
-    env = override(subject.env if rta is None else with_rta(subject.env, subject.name, rta), changes)
+    env = subject.env if elsewhere else chosen.change(subject.env, subject.name, run)
+    if told := choice.differences(subject.env, env):
+        print(told)
     request: dict[str, Any] = {
         "run": run,
         "episodes": episodes,
         "evaluation_seed": seed,
         "checkpoint": checkpoint or "last",
-        "changes": changes if rta is None else {"rta": rta, **changes},
+        "changes": {name: value for name, value in chosen.changes.items() if not (elsewhere and name == "env")},
     }
     path, results = evaluate(subject, env, kinds, request, out, render is not None)
     print(table(results, path))
@@ -63,10 +64,13 @@ def usage() -> str:
         "  run=RUN                a run directory, a policy file (.npz), or pretrained/TASK\n"
         "  run=FILE env=TASK      a policy from elsewhere: .onnx, or .npz with kernel_0, bias_0, … (activation=tanh);\n"
         "                         actions=discrete if it gives logits; it acts by its mode\n"
+        "  env=TASK|FILE.yaml     another environment of the same observation and action (default: that of the training)\n"
+        "  variant=paper|released   what the variants of a task differ in (default as in training)\n"
         "  episodes=N             episodes of each seed (default 1000)\n"
         "  seed=N                 evaluation key: other starts and other noise (default 0, as in the run's own results)\n"
         "  checkpoint=last|best|N best is per seed by success in the evaluations during training (default last)\n"
         "  rta=none|default|…     run time assurance (default as in training)\n"
+        "  rta=FILE.yaml          a filter, or an environment whose filter is taken\n"
         "  deterministic=true|false   one kind only (default both)\n"
         "  render=gif             draw the first episode of the first seed as an animation\n"
         "  env.PATH=VALUE         change the environment, for instance 'env.deputy.start.position.distance=[1000,1000]'\n"

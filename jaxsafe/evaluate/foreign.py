@@ -9,7 +9,7 @@ from __future__ import annotations
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -18,12 +18,11 @@ from jaxtyping import Array, Float
 
 from jaxsafe.cli import Arguments
 from jaxsafe.environment import Environment
-from jaxsafe.envs import make
 from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.evaluate.choice import EnvironmentChoice
 from jaxsafe.evaluate.graph import Network, read_graph
 from jaxsafe.rollout import Policy
 from jaxsafe.train.agent import Categorical, Gaussian, Params
-from jaxsafe.train.policy import PRETRAINED
 
 ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
 """Between the layers of an .npz."""
@@ -65,33 +64,42 @@ class Source(NamedTuple):
     """What a command says of a policy from elsewhere."""
 
     path: Path
-    task: str
-    actions: Any
+    choice: EnvironmentChoice
     activation: str
 
+    @property
+    def task(self) -> str:
+        """The name of the environment in which it shall act."""
+        return Path(self.choice.task or "").stem
+
     def read(self) -> ForeignPolicy:
-        """Read it; raises a ConfigError if there is no such task, or as `read_foreign` does."""
-        return read_foreign(self.path, make(self.task, actions=self.actions), self.activation)
+        """Read it; raises a ConfigError if there is no such environment, or as `read_foreign` does."""
+        return read_foreign(self.path, self.choice.make(), self.activation)
 
 
-def pop_source(arguments: Arguments, run: str) -> Source | None:
-    """Take `env`, `activation` and `actions` of a command: with `env`, `run` is a policy from elsewhere.
+def pop_source(arguments: Arguments, run: str, choice: EnvironmentChoice) -> Source | None:
+    """Take `activation` of a command; None if `run` is a policy of our own.
 
     Raises:
         ConfigError: the options do not fit each other.
     """
-    task = arguments.pop_text("env")
-    if run.endswith(".onnx") and task is None:
+    names = _names(run) if run.endswith(".npz") else set()
+    graph = run.endswith(".onnx")
+    if choice.task is None and (graph or "kernel_0.npy" in names):
         raise ConfigError(f"env: missing; the task in which {run} shall act, for instance env=docking2d")
-    if task is not None and (run.startswith(PRETRAINED) or Path(run).is_dir()):
-        raise ConfigError(
-            f"env: {run} holds its own environment; leave env={task} out, or change numbers by env.PATH=VALUE"
-        )
-    layers = task is not None and not run.endswith(".onnx")
+    layers = choice.task is not None and run.endswith(".npz") and "header.npy" not in names  # which policies of ours have
     arguments.refuse_beside([] if layers else ["activation"], "but for the layers in an .npz with env=TASK")
-    arguments.refuse_beside([] if task else ["actions"], "but for a policy from elsewhere, with env=TASK")
-    activation, actions = arguments.pop_text("activation"), arguments.pop_text("actions")
-    return None if task is None else Source(Path(run), task, actions, activation or "tanh")
+    activation = arguments.pop_text("activation") or "tanh"
+    return Source(Path(run), choice, activation) if graph or layers else None
+
+
+def _names(path: str) -> set[str]:
+    """Return what an archive holds, without reading any of it; nothing if there is none."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return set(archive.namelist())
+    except (OSError, ValueError, zipfile.BadZipFile):
+        return set()
 
 
 def read_foreign(path: Path, env: Environment, activation: str = "tanh") -> ForeignPolicy:

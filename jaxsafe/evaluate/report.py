@@ -9,7 +9,6 @@ from typing import Any
 import jax
 
 from jaxsafe.environment import Environment, require_success
-from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate.seeds import Evaluator, episode_rows, given_up
 from jaxsafe.evaluate.subject import Subject
 from jaxsafe.origin import versions
@@ -26,20 +25,16 @@ def evaluate(
 
     Args:
         subject: the policies.
-        env: the environment to evaluate in.
+        env: the environment to evaluate in, which the policies fit.
         kinds: of `stochastic` and `deterministic`.
         request: `run`, `episodes`, `evaluation_seed`, `checkpoint`, `changes`: what was asked for, part of the results.
         out: a new directory; None makes one in `subject.place`.
         render: whether to draw the first episode of the first policy as `episode_<kind>.gif` as well.
 
     Raises:
-        ConfigError: `out` holds something, or the policies do not fit the environment.
+        ConfigError: `out` holds something, or no outcome of the environment is a success.
     """
     require_success(env)
-    for what in ("observation_names", "action_names", "num_action_points"):
-        found, needed = getattr(env, what), getattr(subject.env, what)
-        if found != needed:
-            raise ConfigError(f"env: the change gives {what} {found}, the policies of {request['run']} have {needed}")
     episodes, seed = request["episodes"], request["evaluation_seed"]
     path = directory.make(
         out, subject.place, f"{request['checkpoint']}-{episodes}-seed{seed}" + "-changed" * bool(request["changes"])

@@ -39,9 +39,8 @@ def load_foreign(source: Source) -> Subject:
     """
     policy, mapper = source.read(), SeedMapper(1)
     params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], policy.params))
-    name = Path(source.task).stem
-    about = {"env": name, "preset": source.path.name, "algorithm": "unknown", "seeds": 1, "seed": 0, "steps": 0}
-    return Subject(name, policy.env, policy.agent, mapper, params, about, Path("evaluations") / source.path.stem)
+    about = {"env": source.task, "preset": source.path.name, "algorithm": "unknown", "seeds": 1, "seed": 0, "steps": 0}
+    return Subject(source.task, policy.env, policy.agent, mapper, params, about, Path("evaluations") / source.path.stem)
 
 
 def load(run: str, checkpoint: str | None) -> Subject:

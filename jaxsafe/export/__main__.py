@@ -16,9 +16,7 @@ if TYPE_CHECKING:
     from jaxsafe.train.policy import SavedPolicy
 
 FORMATS = ("onnx", "stablehlo", "vnnlib")
-OPTIONS = (
-    "run", "seed", "env", "actions", "activation", "format", "inputs", "batch", "steps", "box.FIELD", "out",
-)  # fmt: skip
+OPTIONS = ("run", "seed", "activation", "format", "inputs", "batch", "steps", "box.FIELD", "out")
 BOX = {"position": (70.0, 106.0), "velocity": (-0.28, 0.28)}
 """Starts of the closed-loop docking property of the verification community, in m and m/s, over 40 s."""
 
@@ -31,6 +29,7 @@ def main(argv: Sequence[str]) -> int:
     import jax
     import jax.numpy as jnp
 
+    from jaxsafe.evaluate import choice
     from jaxsafe.export import functions
     from jaxsafe.origin import versions
     from jaxsafe.train.files import write_bytes
@@ -53,7 +52,7 @@ def main(argv: Sequence[str]) -> int:
     inputs = _one_of("inputs", arguments.pop_text("inputs") or "observation", [*kinds])
     batch, steps = arguments.pop_count("batch", 1), arguments.pop_count("steps", 40)
     box = {word[4:]: arguments.pop(word) for word in boxes}
-    arguments.refuse_rest(OPTIONS)
+    arguments.refuse_rest([*OPTIONS, *choice.OPTIONS])
     about = {"policy": stem, "jaxsafe": versions()["jaxsafe"]}
     if form == "vnnlib":
         target = Path(out or f"{stem}_closed_loop.vnnlib")
@@ -87,16 +86,18 @@ def main(argv: Sequence[str]) -> int:
 
 def _policy(arguments: cli.Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy, str]:
     """What `run` and the options beside it mean, and the first part of the names of files."""
+    from jaxsafe.evaluate.choice import EnvironmentChoice, differences
     from jaxsafe.evaluate.foreign import pop_source
     from jaxsafe.train import directory
     from jaxsafe.train.policy import find_policy, is_single, read_policy
 
-    elsewhere = pop_source(arguments, run)
+    chosen = EnvironmentChoice.pop(arguments)
+    elsewhere = pop_source(arguments, run, chosen)
     single = is_single(run)
     arguments.refuse_beside(["seed"] if elsewhere or single else [], f"beside {run}, which is a single policy")
     seed = arguments.pop_seed()
     if elsewhere:
-        return elsewhere.read(), f"{Path(run).stem}_{Path(elsewhere.task).stem}"
+        return elsewhere.read(), f"{Path(run).stem}_{elsewhere.task}"
     if not single:
         directory.read(Path(run), "run")  # imports what a user's environment is made of
         known = {int(file.stem.removeprefix("seed_")) for file in (Path(run) / "policy").glob("seed_*.npz")}
@@ -105,7 +106,11 @@ def _policy(arguments: cli.Arguments, run: str) -> tuple[SavedPolicy | ForeignPo
         if seed not in known:
             raise ConfigError(f"seed: found {seed}; choose from {', '.join(map(str, sorted(known)))}")
     path = find_policy(run) if single else Path(run) / "policy" / f"seed_{seed}.npz"
-    return read_policy(path), path.stem if single else f"{Path(run).name}_{path.stem}"
+    saved = read_policy(path)
+    env = chosen.change(saved.env, str(saved.about.get("env", path.stem)), run)
+    if told := differences(saved.env, env):
+        print(told)
+    return saved._replace(env=env), path.stem if single else f"{Path(run).name}_{path.stem}"
 
 
 def _require_finite(run: str, saved: SavedPolicy | ForeignPolicy) -> None:
@@ -180,6 +185,8 @@ def usage() -> str:
         "  seed=N              which policy of a run (default 0)\n"
         "  run=FILE env=TASK   a policy from elsewhere: .onnx, or .npz with kernel_0, bias_0, … (activation=tanh);\n"
         "                      actions=discrete if it gives logits\n"
+        "  env=TASK|FILE.yaml  another environment of the same observation and action (default: that of the training)\n"
+        "  env.PATH=VALUE, variant=…, rta=…   change it, as in jaxsafe.evaluate\n"
         "  format=onnx         a graph of opset 17 with a fixed batch (default); needs the extra `export`\n"
         "  format=stablehlo    a jax.export artefact, any batch\n"
         "  format=vnnlib       the closed loop over steps as ONNX, the property that no safety margin is negative from\n"
