@@ -102,6 +102,16 @@ def test_nothing_counts_after_an_episode_ends_inside_a_repeated_action(
     assert state.info["truncation"].tolist() == once.info["truncation"].tolist() == [float(episode_length == 3)]
 
 
+@pytest.mark.parametrize("action_repeat", [1, 3])
+def test_an_action_that_is_no_number_is_a_failure_that_costs(brax: Any, action_repeat: int) -> None:
+    env = brax.wrap(brax.BraxEnv("docking2d"), action_repeat=action_repeat)
+    state = env.reset(jax.random.split(jax.random.PRNGKey(0), 2))
+    state = env.step(state, jnp.array([[0.0, 0.0], [jnp.nan, 0.0]]))
+    assert state.done.tolist() == [0.0, 1.0]
+    assert (float(state.metrics["cost"][1]), float(state.metrics["success"][1])) == (1.0, 0.0)
+    assert np.isfinite(state.obs).all()
+
+
 def test_a_return_has_a_gradient(brax: Any) -> None:
     env = brax.BraxEnv("docking2d")
     start = env.reset(jax.random.key(0))

@@ -236,6 +236,28 @@ def test_info_says_what_happened() -> None:
     assert sum(info["reward_terms"].values()) == pytest.approx(sum(info["reward_totals"].values()))
 
 
+@pytest.mark.parametrize("task", ["docking2d", "rejoin2d"])
+def test_an_action_that_is_no_number_ends_the_episode_as_a_failure_that_costs(task: str) -> None:
+    action = np.array([np.nan, 0.0], np.float32)
+    env = GymEnv(task)
+    env.reset(seed=0)
+    *_, terminated, truncated, info = env.step(action)
+    assert (terminated, truncated, info["cost"]) == (True, False, 1.0)
+    assert (info["outcome"], info["is_success"]) == ("diverged", False)
+    assert np.isfinite(env.reset()[0]).all()
+
+    batch, calm = (GymVectorEnv(task, 3, autoreset_mode="SameStep") for _ in range(2))
+    batch.reset(seed=0), calm.reset(seed=0)
+    zero = np.zeros((3, 2), np.float32)
+    observation, _, terminated, truncated, infos = batch.step(np.stack([zero[0], action, zero[0]]))
+    assert (terminated.tolist(), truncated.any()) == ([False, True, False], False)
+    final = infos["final_info"]
+    assert (final["cost"][1], final["outcome"][1], final["is_success"][1]) == (1.0, "diverged", False)
+    assert np.array_equal(observation[[0, 2]], calm.step(zero)[0][[0, 2]])
+    assert np.isfinite(observation).all()
+    assert np.isfinite(batch.step(zero)[0]).all()
+
+
 def test_every_option_of_make_is_understood() -> None:
     options: dict[str, Any] = {
         "actions": "discrete", "variant": "released", "rta": "explicit_simplex", "randomize": {"deputy.mass": [10, 14]},

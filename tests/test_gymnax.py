@@ -38,6 +38,14 @@ def test_a_step_is_ours_and_resets_by_itself(make: Any) -> None:
     assert int(state.num_steps) == 0
 
 
+def test_an_action_that_is_no_number_is_a_failure_that_costs(make: Any) -> None:
+    env = make("docking2d")
+    _, state = env.reset(jax.random.key(0))
+    observation, _, _, terminated, truncated, info = env.step(jax.random.key(1), state, jnp.array([jnp.nan, 0.0]))
+    assert (bool(terminated), bool(truncated), float(info["cost"]), bool(info["is_success"])) == (True, False, 1.0, False)
+    assert np.isfinite(observation).all()
+
+
 def test_instances_share_compiled_programs(make: Any) -> None:
     from jaxsafe.adapters import gymnax
 

@@ -39,6 +39,16 @@ def test_the_cost_of_a_lane_is_that_of_the_step_even_where_it_starts_anew() -> N
     assert (info["cost"] == 0.0).all()  # of the new start
 
 
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_an_action_that_is_no_number_costs_and_ends_the_episode(num_envs: int | None) -> None:
+    env = SafetyEnv("docking2d", num_envs)
+    env.reset(seed=0)
+    _, _, cost, terminated, truncated, _ = env.step(np.full(env.action_space.shape, np.nan, np.float32))
+    assert np.all(cost == 1.0)
+    assert np.all(terminated)
+    assert not np.any(truncated)
+
+
 @pytest.mark.peer
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")

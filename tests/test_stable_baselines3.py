@@ -39,6 +39,15 @@ def test_a_limit_is_a_truncation(make: Any) -> None:
     assert [info["TimeLimit.truncated"] for info in env.step(np.zeros((2, 2)))[3]] == [True, True]
 
 
+def test_an_action_that_is_no_number_is_a_failure_that_costs(make: Any) -> None:
+    env = make("docking2d", 2)
+    env.reset()
+    observation, _, done, infos = env.step(np.array([[0.0, 0.0], [np.nan, 0.0]]))
+    assert done.tolist() == [False, True]
+    assert (infos[1]["cost"], infos[1]["outcome"], infos[1]["is_success"]) == (1.0, "diverged", False)
+    assert np.isfinite(observation).all()
+
+
 def test_options_place_lanes_and_the_infos_of_starts_are_kept(make: Any) -> None:
     from stable_baselines3.common.vec_env import DummyVecEnv
 
