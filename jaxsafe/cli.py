@@ -20,6 +20,9 @@ from jaxsafe.streams import lasting_streams
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells expect."""
 
+DIVERGED = 3
+"""Exit code of a training or an evaluation in which the networks of a seed are not finite: there is no result for it."""
+
 PATHS = ("env", "out", "run", "runs", "resume", "policies")
 """Options that are paths, and taken as typed: `out=2024.10` is no number, and `out="my run #3"` has no comment."""
 

@@ -54,7 +54,7 @@ def main(argv: Sequence[str]) -> int:
     print(table(results, path))
     if render:
         print("films: " + ", ".join(str(film(path.parent, kind)) for kind in kinds))
-    return 0
+    return cli.DIVERGED if "diverged" in results else 0
 
 
 def usage() -> str:

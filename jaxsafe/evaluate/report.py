@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from jaxsafe.environment import Environment, require_success
 from jaxsafe.evaluate.seeds import Evaluator, episode_rows, given_up
@@ -15,7 +16,7 @@ from jaxsafe.origin import versions
 from jaxsafe.train import directory
 from jaxsafe.train.files import append_rows, write_json
 from jaxsafe.train.log import filter_name
-from jaxsafe.train.results import evaluation
+from jaxsafe.train.results import diverged_seeds, evaluation
 
 
 def evaluate(
@@ -45,21 +46,29 @@ def evaluate(
     except Exception:
         directory.discard_unused(path)
         raise
+    first = subject.facts["seed"]
+    left_out = _not_finite(subject)
     for kind, one in sums.items():
-        rows = episode_rows(env, one, subject.facts["seed"], step=subject.facts["steps"], kind=kind, final=True)
-        append_rows(path / "eval.jsonl", rows)
+        rows = episode_rows(env, one, first, step=subject.facts["steps"], kind=kind, final=True)
+        append_rows(path / "eval.jsonl", (row for row in rows if row["seed"] - first not in left_out))
     results = {
         **subject.facts,
         **request,
         "rta": filter_name(env),
         "versions": versions(),
-        "evaluation": evaluation(env, sums),
+        "evaluation": evaluation(env, sums, left_out),
     }
-    results |= given_up(env, sums)
+    results |= given_up(env, sums) | diverged_seeds({first + place: None for place in left_out})
     write_json(path / "results.json", results)
     for kind in kinds if render else ():
         _render(subject, evaluator, seed, kind, path)
     return path / "results.json", results
+
+
+def _not_finite(subject: Subject) -> list[int]:
+    """Return the places of the policies with a number that is not finite, as a training that diverged leaves them."""
+    leaves = jax.tree.leaves(subject.mapper.gather(subject.params))
+    return [place for place in range(subject.facts["seeds"]) if not all(np.isfinite(leaf[place]).all() for leaf in leaves)]
 
 
 def _render(subject: Subject, evaluator: Evaluator, seed: int, kind: str, path: Path) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.episodes import begin_recording, max_steps, record_steps, run_episodes
-from jaxsafe.metrics import METRICS, Episode, measures, over_seeds, summarise
+from jaxsafe.metrics import METRICS, Episode, measures, summarise
 from jaxsafe.rollout import Policy
 from jaxsafe.train.agent import Params
 from jaxsafe.train.ahead import Ahead
@@ -191,11 +191,6 @@ def given_up(env: Environment, kinds: Mapping[str, Episode]) -> dict[str, Any]:
     """
     counts = {kind: int(np.sum(np.asarray(episodes.outcome) == 0)) for kind, episodes in kinds.items()}
     return {"given_up": {"after_steps": max_steps(env), **counts}} if any(counts.values()) else {}
-
-
-def metrics_over_seeds(env: Environment, episodes: Episode) -> dict[str, Any]:
-    """Every metric of Section 5: mean, interval, interquartile mean and per seed."""
-    return {name: over_seeds(values) for name, values in metrics_per_seed(env, episodes).items()}
 
 
 def metrics_per_seed(env: Environment, episodes: Episode) -> dict[str, list[float | None]]:

@@ -27,6 +27,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.errors import ConfigError
     from jaxsafe.train import directory, hosts
     from jaxsafe.train.config import resolve_all
+    from jaxsafe.train.files import read_json
     from jaxsafe.train.results import summary
 
     arguments = cli.Arguments.parse(argv)
@@ -56,7 +57,7 @@ def main(argv: Sequence[str]) -> int:
         return cli.INTERRUPTED
     if len(runs) > 1 and hosts.leads():
         print(summary({run.name: run for run in runs}))
-    return 0
+    return cli.DIVERGED if hosts.leads() and any("diverged" in read_json(run / "results.json") for run in runs) else 0
 
 
 def _complete(run: Path) -> bool:

@@ -56,7 +56,9 @@ class ProgressLog:
         append_rows(self._jsonl, rows)
         append_csv(self._csv, rows)
         for row in rows if self._board else ():
-            for name in [key for key, value in row.items() if key not in ("seed", "step") and value is not None]:
+            for name in [
+                key for key, value in row.items() if key not in ("seed", "step", "diverged") and value is not None
+            ]:
                 self._board.add_scalar(f"{name}/seed_{row['seed']}", row[name], row["step"])  # type: ignore[union-attr]
 
     def close(self) -> None:
@@ -74,6 +76,7 @@ class ProgressLog:
 def progress_rows(env: Environment, curves: dict[str, np.ndarray], seed: int, batch_size: int, wall_s: float) -> list[dict]:
     """Rows from the arrays [seeds, updates] that a chunk returns, update after update."""
     num_seeds, num_updates = curves["count"].shape
+    known = (curves["count"] > 0) & ~curves["diverged"]
     measured = columns(env) + (["multiplier"] if "multiplier" in curves else [])
     return [
         {
@@ -82,7 +85,8 @@ def progress_rows(env: Environment, curves: dict[str, np.ndarray], seed: int, ba
             "wall_s": round(wall_s, 3),
             "episodes": int(curves["count"][i, j]),
             "cost": int(curves["cost"][i, j]),
-            **{name: float(f"{curves[name][i, j]:.6g}") if curves["count"][i, j] else None for name in measured},
+            **{name: float(f"{curves[name][i, j]:.6g}") if known[i, j] else None for name in measured},
+            "diverged": bool(curves["diverged"][i, j]),
         }
         for j in range(num_updates)
         for i in range(num_seeds)
@@ -126,6 +130,8 @@ class Display:
         """Show the state after `step` steps, from the latest row of each seed."""
         means = {name: _mean([row[name] for row in rows]) for name in ("success_rate", "return")}
         facts = f"success {_text(means['success_rate'], '.1%')}, return {_text(means['return'], '.2f')}"
+        if diverged := sum(row["diverged"] for row in rows):
+            facts += f", {diverged} of {len(rows)} seeds diverged and left out"
         if self._bar is not None:
             self._bar.set_postfix_str(facts, refresh=False)
             self._bar.update(step - self._done)
@@ -134,6 +140,13 @@ class Display:
             left = (time.monotonic() - begin) * (self._steps - step) / max(step - first, 1)
             print(f"{step:>10,} of {self._steps:,} steps, {facts}, {left:.0f} s left", flush=True)
         self._done = step
+
+    def tell(self, text: str) -> None:
+        """Print a line, above the bar if there is one."""
+        if self._bar is not None:
+            self._bar.write(text)
+        else:
+            print(text, flush=True)
 
     def close(self) -> None:
         """Leave the bar as it stands."""

@@ -16,6 +16,7 @@ from types import FrameType
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe import cli
@@ -89,6 +90,7 @@ class Training:
         self.checkpoints = Checkpoints(checkpoints or run, create=True)
         self.compile_s = 0.0
         self.updates = 0
+        self.diverged: dict[int, int] = {}  # by seed, the step after which its networks or returns were not finite
         self._prepared = False
 
     def prepare(self) -> None:
@@ -101,6 +103,8 @@ class Training:
         self.log = ProgressLog(self.run, self.step, self.updates * self.config.seeds, self.config.tensorboard)
         for name in ("eval.jsonl", "episodes.jsonl"):
             keep_rows(self.run / name, self._known, ("step",))
+        self.diverged = {}
+        self._find_diverged(self.log.rows)
         self._prepared = True
 
     @property
@@ -219,7 +223,18 @@ class Training:
         host = {name: value[:, :count] for name, value in self.mapper.gather(curves).items()}
         rows = progress_rows(self.env, host, self.config.seed, self.config.ppo.batch_size, self.clock.seconds)
         self.log.write(rows)
+        for seed in self._find_diverged(rows):
+            step = self.diverged[seed]
+            display.tell(f"seed {seed} has diverged by step {step:,}: networks or returns are not finite. It is stopped")
         display.show(self.step, rows[-self.config.seeds :])
+
+    def _find_diverged(self, rows: list[dict[str, Any]]) -> list[int]:
+        """Note the seeds that have diverged according to rows of the progress log; return those that are new."""
+        before = set(self.diverged)
+        for row in rows:
+            if row.get("diverged"):
+                self.diverged.setdefault(row["seed"], row["step"])
+        return [seed for seed in self.diverged if seed not in before]
 
     def _evaluate(self) -> None:
         """Periodic evaluation: rows, one logged episode, and the best parameters of each seed so far."""
@@ -234,14 +249,17 @@ class Training:
         deterministic = kind == "deterministic"
         episodes = self.evaluator.run(self.state.average, num_episodes, EVALUATION_SEED, deterministic)
         rows = episode_rows(self.env, episodes, self.config.seed, step=self.step, kind=kind, final=final)
-        append_rows(self.run / "eval.jsonl", rows)
+        append_rows(self.run / "eval.jsonl", (row for row in rows if row["seed"] not in self.diverged))
         return episodes
 
     def _record(self, num_episodes: int, final: bool) -> None:
-        """Log some episodes of the first seed step by step."""
+        """Log some episodes of the first seed that has not diverged step by step."""
+        index = next((i for i in range(self.config.seeds) if self.config.seed + i not in self.diverged), None)
+        if index is None:
+            return
         count = -(-num_episodes // self.config.log_every)
-        recorded = self.evaluator.record(self.params()[0], count, EVALUATION_SEED)
-        facts = {"step": self.step, "seed": self.config.seed, "kind": "deterministic", "final": final}
+        recorded = self.evaluator.record(self.params()[index], count, EVALUATION_SEED)
+        facts = {"step": self.step, "seed": self.config.seed + index, "kind": "deterministic", "final": final}
         for number, rows in enumerate(recorded):
             append_rows(self.run / "episodes.jsonl", ({**facts, "episode": number, **row} for row in rows))
 
@@ -278,13 +296,24 @@ def begin(shared: tuple, key: jax.Array, shard: Shard = WHOLE) -> TrainState:
 def chunk(
     shared: tuple, state: TrainState, length: int, limit: int, shard: Shard = WHOLE
 ) -> tuple[TrainState, dict[str, jax.Array]]:
-    """`length` updates of one seed, fewer at the end of the run, with the averages of the window after each."""
+    """`length` updates of one seed, fewer at the end of the run, with the averages of the window after each.
+
+    A seed that has diverged is counted on and otherwise left as it is.
+    """
     env, agent, hyper = shared
 
+    def leave(state: TrainState) -> TrainState:
+        return state.replace(num_updates=jnp.minimum(state.num_updates + 1, limit))
+
     def one(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
-        going = state.num_updates < limit
-        state = jax.lax.cond(going, lambda s: ppo.update(env, agent, hyper, limit, s, shard), lambda s: s, state)
-        counts = {"update": state.num_updates, "count": state.window.count, "cost": window.total_cost(state.window)}
+        going = (state.num_updates < limit) & ~ppo.diverged(state)
+        state = jax.lax.cond(going, lambda s: ppo.update(env, agent, hyper, limit, s, shard), leave, state)
+        counts = {
+            "update": state.num_updates,
+            "count": state.window.count,
+            "cost": window.total_cost(state.window),
+            "diverged": ppo.diverged(state),
+        }
         if agent.cost_critic:
             counts["multiplier"] = state.multiplier
         return state, {**counts, **window.means(state.window, env.outcomes)}
@@ -294,8 +323,9 @@ def chunk(
 
 @jax.jit
 def _keep_best(best: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
-    """Per seed, whichever succeeded more often; the later one if equal."""
-    better = now["success"] >= best["success"]
+    """Per seed, whichever succeeded more often; the later one if equal, but never one that is not finite."""
+    finite = jax.tree.map(lambda x: jnp.all(jnp.isfinite(x), axis=range(1, x.ndim)), now["params"])
+    better = (now["success"] >= best["success"]) & jax.tree.reduce(jnp.logical_and, finite)
     return choose(better, now, best)
 
 

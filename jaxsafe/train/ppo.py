@@ -171,6 +171,12 @@ def update(
     )  # fmt: skip
 
 
+def diverged(state: TrainState) -> Bool[Array, ""]:
+    """Return whether the networks, or the returns of the latest episodes, are no longer finite: nothing more is learnt."""
+    watched = (state.params, state.window.episodes.episode_return)
+    return ~jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(watched)]))
+
+
 def dual_ascent(ppo: PPO, multiplier: Array, window: Window, done: Array) -> Array:
     """The multiplier after an update in which episodes ended: log λ rises by rate·clip(J_C/limit − 1, −1, 1).
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from jaxsafe import cli
 from jaxsafe.environment import Environment
-from jaxsafe.evaluate.seeds import given_up, metrics_over_seeds
+from jaxsafe.evaluate.seeds import given_up, metrics_per_seed
 from jaxsafe.metrics import ENOUGH_SEEDS, Episode, interaction_efficiency, over_seeds, with_interval
 from jaxsafe.origin import versions
 from jaxsafe.train.config import TrainConfig
@@ -37,10 +37,12 @@ def finish(training: Training) -> dict[str, Any]:
     config, env, name = training.config, training.env, training.name
     with training.clock:
         episodes = training.evaluate_finally()
-    for index, params in enumerate(training.params()):
-        about = {"env": name, "preset": config.preset, "algorithm": config.algorithm}
-        about |= {"seed": config.seed + index, "step": training.step}
-        save_policy(training.run / "policy" / f"seed_{config.seed + index}.npz", env, config.agent, params, about)
+    for seed, params in enumerate(training.params(), start=config.seed):
+        if seed not in training.diverged:
+            about = {"env": name, "preset": config.preset, "algorithm": config.algorithm}
+            about |= {"seed": seed, "step": training.step}
+            save_policy(training.run / "policy" / f"seed_{seed}.npz", env, config.agent, params, about)
+    left_out = [seed - config.seed for seed in training.diverged]
     results = {
         **facts(config, env, name),
         "steps": training.step,
@@ -49,9 +51,10 @@ def finish(training: Training) -> dict[str, Any]:
         "training_computation_time": training.log.rows[-1]["wall_s"],  # [s] to the last update, and all before it
         "versions": versions(),
         "interaction_efficiency": _efficiency(training),
-        "training_cost": over_seeds(training.log.curve("cost")[1][-1].tolist()),  # violating steps
-        "evaluation": evaluation(env, episodes),
+        "training_cost": over_sound_seeds(training.log.curve("cost")[1][-1].tolist(), left_out),  # violating steps
+        "evaluation": evaluation(env, episodes, left_out),
         **given_up(env, episodes),
+        **diverged_seeds(training.diverged),
     }
     write_json(training.run / "results.json", results)
     return results
@@ -63,21 +66,39 @@ def facts(config: TrainConfig, env: Environment, name: str) -> dict[str, Any]:
     return {**how, "seeds": config.seeds, "seed": config.seed}
 
 
-def evaluation(env: Environment, episodes: dict[str, Episode]) -> dict[str, Any]:
-    """The metrics of each kind of evaluation."""
-    return {kind: metrics_over_seeds(env, one) for kind, one in episodes.items()}
+def evaluation(env: Environment, episodes: dict[str, Episode], left_out: Collection[int] = ()) -> dict[str, Any]:
+    """Return the metrics of each kind of evaluation. Seeds whose place is in `left_out` have None and are in no average."""
+    each = {kind: metrics_per_seed(env, one) for kind, one in episodes.items()}
+    return {
+        kind: {name: over_sound_seeds(values, left_out) for name, values in metrics.items()}
+        for kind, metrics in each.items()
+    }
+
+
+def over_sound_seeds(per_seed: Sequence[float | None], left_out: Collection[int]) -> dict[str, Any]:
+    """Return what `over_seeds` does, of the seeds that are not `left_out`; those stay among the values, as None."""
+    shown = [None if place in left_out else value for place, value in enumerate(per_seed)]
+    sound = [value for place, value in enumerate(per_seed) if place not in left_out]
+    return {**over_seeds(sound or [None]), "per_seed": shown}
+
+
+def diverged_seeds(steps: Mapping[int, int | None]) -> dict[str, Any]:
+    """Return the entry of the results about seeds that diverged: each with the step by which it had. Empty if none has."""
+    found = [{"seed": seed, "step": step} for seed, step in sorted(steps.items())]
+    return {"diverged": found} if found else {}
 
 
 def table(results: dict[str, Any], path: Path) -> str:
     """The results as text: a column for each kind, mean and 95 % interval over seeds."""
     found = results["evaluation"]
     lines = [f"{headline(results)}, {results['steps']:,} steps each", ""]
-    rows = [["mean [95 % interval] over seeds" if results["seeds"] >= ENOUGH_SEEDS else "", *found]]
+    sound = results["seeds"] - len(results.get("diverged", ()))
+    rows = [["mean [95 % interval] over seeds" if sound >= ENOUGH_SEEDS else "", *found]]
     for name, label, unit in _ROWS:
         if all(one[name]["mean"] is not None for one in found.values()):
             rows.append([label, *(_cell(one[name], unit) for one in found.values())])
-    rows.append(["worst seed, success rate", *(f"{min(one['success_rate']['per_seed']):.1%}" for one in found.values())])
-    lines += cli.columns(rows)
+    rows.append(["worst seed, success rate", *(percent(_least(one["success_rate"]), 1) for one in found.values())])
+    lines += [*cli.columns(rows), *told_diverged(results)]
     if "given_up" in results:
         counts, limit = results["given_up"], results["given_up"]["after_steps"]
         told = ", ".join(f"{counts[kind]:,} {kind}" for kind in found)
@@ -96,11 +117,14 @@ def summary(runs: Mapping[str, Path]) -> str:
         "cost of training", "wall [s]",
     )  # fmt: skip
     rows: list[Sequence[str]] = [heads]
+    diverged: list[str] = []
     for name, run in runs.items():
         results = read_json(run / "results.json")
         found = [results["evaluation"][kind] for kind in ("stochastic", "deterministic")]
         success = [one["success_rate"] for one in found]
         reached, cost = results["interaction_efficiency"]["timesteps"], found[0]["episode_cost"]["mean"]
+        known = [value for one in success for value in one["per_seed"] if value is not None]
+        diverged += [f"{name}: {line}" for line in told_diverged(results)]
         rows.append(
             (
                 name,
@@ -108,15 +132,36 @@ def summary(runs: Mapping[str, Path]) -> str:
                 str(results.get("rta", "–")),
                 f"{results['steps']:,}",
                 f"{reached:,}" if reached else "never",
-                f"{success[0]['mean']:.2%}",
-                f"{success[1]['mean']:.2%}",
-                f"{min(min(one['per_seed']) for one in success):.1%}",
-                "–" if cost is None else f"{cost:.2f}",
-                f"{results['training_cost']['mean']:,.0f}",
+                *(percent(one["mean"], 2) for one in success),
+                percent(min(known, default=None), 1),
+                _number(cost, ".2f"),
+                _number(results["training_cost"]["mean"], ",.0f"),
                 f"{results['wall_s']:.1f}",
             )
         )
-    return "\n".join(cli.columns(rows))
+    return "\n".join([*cli.columns(rows), *diverged])
+
+
+def told_diverged(results: Mapping[str, Any]) -> list[str]:
+    """Say which seeds diverged, and that no average has them; nothing if none did."""
+    diverged = results.get("diverged", [])
+    if not diverged:
+        return []
+    steps = ", ".join(f"{one['seed']}" + (f" by step {one['step']:,}" if one["step"] else "") for one in diverged)
+    return [f"DIVERGED, and left out of the averages: seed{'s' * (len(diverged) > 1)} {steps}"]
+
+
+def _least(metric: Mapping[str, Any]) -> float | None:
+    return min((value for value in metric["per_seed"] if value is not None), default=None)
+
+
+def percent(value: float | None, digits: int) -> str:
+    """Return a share as text, a dash where there is none."""
+    return _number(value, f".{digits}%")
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
 
 
 def _efficiency(training: Training) -> dict[str, Any]:

@@ -15,9 +15,13 @@ from jaxsafe.evaluate.seeds import BATCH, KINDS, given_up, in_batches, metrics_p
 from jaxsafe.metrics import Episode, interaction_efficiency
 from jaxsafe.train import memory
 from jaxsafe.train.loop import EVALUATION_SEED, MEMORY, begin, chunk
+from jaxsafe.train.results import diverged_seeds
 from jaxsafe.train.seeds import SeedMapper
 from jaxsafe.tune.settings import Setting, alike, lane
 from jaxsafe.types import Key
+
+CURVES = ("success_rate", "count", "return", "diverged")
+"""What is kept of the training curves."""
 
 CHUNKS = 20
 """Pieces that a training is cut into, so that Ctrl-C and the bar do not wait for its end."""
@@ -66,7 +70,7 @@ class Lanes:
         for first in range(0, self.like.config.num_updates, self.length):
             count = min(self.length, self.like.config.num_updates - first)
             state, rows = self._advance((), (lanes, state))
-            curves.append(self.mapper.gather({name: rows[name][:, :count] for name in ("success_rate", "count", "return")}))
+            curves.append(self.mapper.gather({name: rows[name][:, :count] for name in CURVES}))
             tick(count * len(some))
         curve = {name: np.concatenate([one[name] for one in curves], axis=1) for name in curves[0]}
         sums = {kind: self._episodes(lanes, state.average, kind == "deterministic") for kind in KINDS}
@@ -96,16 +100,24 @@ class Lanes:
 
     def _result(self, setting: Setting, curve: dict[str, np.ndarray], sums: dict[str, Episode]) -> dict[str, Any]:
         steps = (1 + np.arange(setting.config.num_updates)) * setting.config.ppo.batch_size
-        success, episodes = curve["success_rate"].T, curve["count"].T
-        last = curve["return"][:, -1]
+        diverged = curve["diverged"]
+        success = np.where(diverged, 0.0, curve["success_rate"]).T  # what diverged succeeds no more
+        episodes = curve["count"].T
+        last = np.where(diverged, np.nan, curve["return"])[:, -1]
+        left_out = np.flatnonzero(diverged[:, -1]).tolist()
+        evaluation = {kind: metrics_per_seed(setting.env, episodes) for kind, episodes in sums.items()}
+        for metric in (values for metrics in evaluation.values() for values in metrics.values()):
+            for place in left_out:
+                metric[place] = None
         return {
             **setting.changes,
             "steps": int(steps[-1]),
             "interaction_efficiency": interaction_efficiency(steps, success, episodes),
             "training_success": success[-1].tolist(),
             "training_return": last.tolist(),
-            "evaluation": {kind: metrics_per_seed(setting.env, episodes) for kind, episodes in sums.items()},
+            "evaluation": evaluation,
             **given_up(setting.env, sums),
+            **diverged_seeds({setting.config.seed + i: int(steps[np.argmax(diverged[i])]) for i in left_out}),
             "curve": {"steps": steps.tolist(), "success_rate": np.round(success.T, 4).tolist()},
         }
 

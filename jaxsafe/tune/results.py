@@ -15,6 +15,7 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.origin import versions
 from jaxsafe.train import directory
 from jaxsafe.train.files import append_rows, keep_rows, write_csv, write_json, write_text
+from jaxsafe.train.results import percent, told_diverged
 from jaxsafe.tune.settings import Setting
 
 Rows = dict[int, dict[str, Any]]
@@ -22,6 +23,9 @@ Rows = dict[int, dict[str, Any]]
 
 SHOWN = 20
 """Lines of the printed table."""
+
+NONE = {"80 % after": "never"}
+"""What the table shows, by column, where there is no value; a dash elsewhere."""
 
 LONGEST = 36
 """Letters of a legend's entry."""
@@ -73,6 +77,8 @@ def finish(path: Path, rows: Rows, swept: Sequence[str], rank: str) -> str:
 
     order = sorted(rows, key=lambda index: (_key(rows[index], rank), index))
     flat = [{"setting": index, **_flat(rows[index], swept)} for index in order]
+    names = dict.fromkeys(name for one in flat for name in one)  # settings with seeds that diverged have other columns
+    flat = [{name: one.get(name) for name in names} for one in flat]
     write_json(path / "results.json", {"rank": rank, "settings": [{"setting": i, **rows[i]} for i in order]})
     write_csv(path / "results.csv", flat)
     figure = sweep_curves(path, [(_label(i, rows[i], swept), rows[i]["curve"]) for i in order])
@@ -80,6 +86,7 @@ def finish(path: Path, rows: Rows, swept: Sequence[str], rank: str) -> str:
     if len(flat) > SHOWN:
         lines.append(f"… and {len(flat) - SHOWN} more")
     lines += [f"setting {index}: {_given_up(rows[index])}" for index in order if "given_up" in rows[index]]
+    lines += [f"setting {index}: {told}" for index in order for told in told_diverged(rows[index])]
     return "\n".join([*lines, f"results in {path / 'results.csv'}, figure {figure}"])
 
 
@@ -87,7 +94,9 @@ def line(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
     """One setting in short, as it is finished."""
     facts = _flat(row, swept)
     values = ", ".join(f"{name} {facts[name]}" for name in swept)
-    return f"setting {index}: {values}: 80 % after {_cell(facts['80 % after'])}, then {facts['stochastic']:.1%}"
+    reached = _cell(facts["80 % after"], NONE["80 % after"])
+    after = f"80 % after {reached}, then {percent(facts['stochastic'], 1)}"
+    return f"setting {index}: {values}: {'; '.join([after, *told_diverged(row)])}"
 
 
 def _given_up(row: dict[str, Any]) -> str:
@@ -97,41 +106,50 @@ def _given_up(row: dict[str, Any]) -> str:
     return f"{sum(counts.values()):,} episodes still running after {steps:,} steps, given up and counted as failures"
 
 
-def _key(row: dict[str, Any], rank: str) -> tuple[float, float, float]:
-    """Small is good: the chosen quantity first, then the others."""
+def _key(row: dict[str, Any], rank: str) -> tuple[float, ...]:
+    """Small is good: settings of which no seed diverged first, then the chosen quantity, then the others."""
     steps = row["interaction_efficiency"]["timesteps"] or float("inf")
-    success, deterministic = (-_mean(row, kind, "success_rate") for kind in ("stochastic", "deterministic"))
+    success, deterministic = (-(_mean(row, kind, "success_rate") or 0.0) for kind in ("stochastic", "deterministic"))
     area = -float(np.mean(row["curve"]["success_rate"]))
-    return {
+    quantities = {
         "steps": (steps, area, success),
         "success": (success, deterministic, steps),
         "deterministic": (deterministic, success, steps),
-    }[rank]
+    }
+    return len(row.get("diverged", ())), *quantities[rank]
 
 
 def _flat(row: dict[str, Any], swept: Sequence[str]) -> dict[str, Any]:
     each = row["interaction_efficiency"]["per_seed"]
+    known = _known(row, "stochastic", "success_rate")
     return {
         **{name: json.dumps(row[name]) if isinstance(row[name], (list, dict)) else row[name] for name in swept},
         "80 % after": row["interaction_efficiency"]["timesteps"],
         "seeds at 80 %": f"{sum(step is not None for step in each)}/{len(each)}",
         "training": round(float(np.mean(row["training_success"])), 4),
-        "stochastic": round(_mean(row, "stochastic", "success_rate"), 4),
-        "worst": round(min(row["evaluation"]["stochastic"]["success_rate"]), 4),
-        "deterministic": round(_mean(row, "deterministic", "success_rate"), 4),
-        "length": round(_mean(row, "deterministic", "episode_length"), 1),
-        **({"violating": round(_mean(row, "deterministic", "episode_safety_violation_rate"), 5)} if _measured(row) else {}),
+        "stochastic": _mean(row, "stochastic", "success_rate", 4),
+        "worst": None if not known else round(min(known), 4),
+        "deterministic": _mean(row, "deterministic", "success_rate", 4),
+        "length": _mean(row, "deterministic", "episode_length", 1),
+        **({"violating": _mean(row, "deterministic", "episode_safety_violation_rate", 5)} if _measured(row) else {}),
+        **({"diverged": len(row["diverged"])} if "diverged" in row else {}),
     }
 
 
 def _measured(row: dict[str, Any]) -> bool:
-    """Return whether the environment has safety constraints whose violations were counted."""
-    return None not in row["evaluation"]["deterministic"]["episode_safety_violation_rate"]
+    """Return whether violations of safety constraints were counted for some seed."""
+    return bool(_known(row, "deterministic", "episode_safety_violation_rate"))
 
 
-def _mean(row: dict[str, Any], kind: str, metric: str) -> float:
-    """The average of a metric over seeds."""
-    return float(np.mean(row["evaluation"][kind][metric]))
+def _mean(row: dict[str, Any], kind: str, metric: str, digits: int | None = None) -> float | None:
+    """Return the average of a metric over the seeds that have it, perhaps rounded; None if none has."""
+    known = _known(row, kind, metric)
+    mean = float(np.mean(known)) if known else None
+    return mean if mean is None or digits is None else round(mean, digits)
+
+
+def _known(row: dict[str, Any], kind: str, metric: str) -> list[float]:
+    return [value for value in row["evaluation"][kind][metric] if value is not None]
 
 
 def _label(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
@@ -141,8 +159,9 @@ def _label(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
 
 
 def _table(rows: Sequence[dict[str, Any]]) -> list[str]:
-    return columns([[*rows[0]], *([_cell(value) for value in row.values()] for row in rows)])
+    cells = ([_cell(value, NONE.get(name, "–")) for name, value in row.items()] for row in rows)
+    return columns([[*rows[0]], *cells])
 
 
-def _cell(value: Any) -> str:
-    return "never" if value is None else f"{value:,}" if isinstance(value, int) else str(value)
+def _cell(value: Any, none: str) -> str:
+    return none if value is None else f"{value:,}" if isinstance(value, int) else str(value)

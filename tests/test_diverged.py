@@ -1,0 +1,147 @@
+"""A training whose networks or returns are not finite stops for that seed and is never reported as a result."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from probes import Position, probe
+from tiny import TINY
+
+from jaxsafe import cli
+from jaxsafe.component import normalise
+from jaxsafe.evaluate import __main__ as evaluate
+from jaxsafe.train import __main__ as command
+from jaxsafe.train import directory
+from jaxsafe.train.agent import Agent
+from jaxsafe.train.checkpoint import Checkpoints
+from jaxsafe.train.loop import Training
+from jaxsafe.train.ppo import PPO, diverged, init
+from jaxsafe.train.restore import structure
+from jaxsafe.train.results import summary
+from jaxsafe.tune import __main__ as tune
+
+AT = 384
+"""The step after which the networks of a seed are not finite: between two evaluations."""
+
+
+def rows(run: Path, name: str, seed: int) -> list[dict[str, Any]]:
+    found = [json.loads(line) for line in (run / name).read_text().splitlines()]
+    return [{key: value for key, value in row.items() if key != "wall_s"} for row in found if row["seed"] == seed]
+
+
+def train(run: Path, monkeypatch: pytest.MonkeyPatch, spoilt: list[int]) -> None:
+    """Train as the fixture `whole` does, but for some seeds whose networks get a NaN on the way."""
+    original = Training._write_progress
+
+    def spoil_in_time(self: Training, *args: Any) -> None:
+        original(self, *args)
+        if self.step == AT:
+            spoil = lambda params: {**params, "log_std": params["log_std"].at[jnp.array(spoilt)].set(jnp.nan)}  # noqa: E731
+            self.state = self.state.replace(params=spoil(self.state.params), average=spoil(self.state.average))
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Training, "_write_progress", spoil_in_time)
+        assert command.main([*TINY, f"out={run}"]) == cli.DIVERGED
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("diverged") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        train(path, patch, [1])
+    return path
+
+
+def test_the_other_seeds_go_on_and_keep_their_bits(run: Path, whole: Path) -> None:
+    for seed in (0, 2):
+        for name in ("progress.jsonl", "eval.jsonl", "episodes.jsonl"):
+            assert rows(run, name, seed) == rows(whole, name, seed)
+        one, other = (np.load(path / "policy" / f"seed_{seed}.npz") for path in (run, whole))
+        assert all(one[name].tobytes() == other[name].tobytes() for name in one.files)
+
+
+def test_the_seed_stops_and_the_log_says_so(run: Path, whole: Path) -> None:
+    found, before = rows(run, "progress.jsonl", 1), rows(whole, "progress.jsonl", 1)
+    going = AT // 64
+    assert found[:going] == before[:going]
+    assert [row["step"] for row in found] == [row["step"] for row in before]  # a row for every update all the same
+    for row in found[going:]:
+        assert row["diverged"] is True
+        assert row["episodes"] == found[going - 1]["episodes"]
+        assert {row[name] for name in ("success_rate", "return", "violating_share", "episode_cost")} == {None}
+    assert not any(row["diverged"] for row in before)
+    assert {row["step"] for row in rows(run, "eval.jsonl", 1)} == {320}
+
+
+def test_no_figure_has_it_and_that_is_said(run: Path, whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    found, before = (json.loads((path / "results.json").read_text()) for path in (run, whole))
+    assert found["diverged"] == [{"seed": 1, "step": AT + 64}]
+    assert "diverged" not in before
+    for kind in ("stochastic", "deterministic"):
+        for name, metric in found["evaluation"][kind].items():
+            values = before["evaluation"][kind][name]["per_seed"]
+            assert metric["per_seed"] == [values[0], None, values[2]]
+            assert metric["mean"] == (None if values[0] is None else pytest.approx((values[0] + values[2]) / 2))
+    assert found["training_cost"]["per_seed"][1] is None
+    assert {path.name for path in (run / "policy").iterdir()} == {"seed_0.npz", "seed_2.npz"}
+    assert command.main([f"resume={run}"]) == cli.DIVERGED
+    capsys.readouterr()
+    assert f"DIVERGED, and left out of the averages: seed 1 by step {AT + 64}" in summary({"run": run})
+
+
+def test_its_best_checkpoint_is_one_from_before(run: Path) -> None:
+    config, env, _ = directory.read(run, "run")
+    content, _ = Checkpoints(run).restore(1280, structure(env, config))
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(content["best"]["params"]))
+    assert not np.isfinite(content["state"].params["log_std"][1]).any()
+
+
+def test_an_evaluation_says_the_same(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert evaluate.main([f"run={run}", "episodes=4", f"out={tmp_path / 'last'}"]) == cli.DIVERGED
+    assert "DIVERGED, and left out of the averages: seed 1" in capsys.readouterr().out
+    found = json.loads((tmp_path / "last" / "results.json").read_text())
+    assert found["evaluation"]["stochastic"]["safety_violation_rate"]["per_seed"][1] is None
+    assert rows(tmp_path / "last", "eval.jsonl", 1) == []
+    assert evaluate.main([f"run={run}", "episodes=4", "checkpoint=best", f"out={tmp_path / 'best'}"]) == 0
+
+
+def test_a_run_of_which_every_seed_diverged_has_no_result(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    train(tmp_path / "run", monkeypatch, [0, 1, 2])
+    told = capsys.readouterr().out
+    assert f"seed 2 has diverged by step {AT + 64}" in told
+    assert f"DIVERGED, and left out of the averages: seeds 0 by step {AT + 64}, 1 by step {AT + 64}, 2 by" in told
+    assert "violating steps" not in told
+    assert not (tmp_path / "run" / "policy").exists()
+    assert "DIVERGED" in summary({"run": tmp_path / "run"})
+
+
+def test_infinite_returns_count_too() -> None:
+    agent, ppo = normalise(Agent(hidden=(4,))), normalise(PPO(num_envs=2))
+    state = init(probe(Position(name="reward")), agent, ppo, jax.random.key(0))
+    assert not diverged(state)
+    returns = state.window.episodes.episode_return
+    for value in (jnp.inf, jnp.nan):
+        episodes = state.window.episodes.replace(episode_return=returns.at[3].set(value))
+        assert diverged(state.replace(window=state.window.replace(episodes=episodes)))
+
+
+def test_a_sweep_ranks_it_last_and_marks_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "sweep"
+    rates = "[1e30,3e-3]"
+    words = [f"sweep.ppo.learning_rate={rates}", "ppo.final_learning_rate=3e-3", "rank=success", f"out={path}"]
+    assert tune.main([*TINY, *words]) == 0
+    told = capsys.readouterr().out
+    first, last = json.loads((path / "results.json").read_text())["settings"]
+    assert (first["setting"], last["setting"]) == (1, 0)
+    assert "diverged" not in first
+    assert [one["seed"] for one in last["diverged"]] == [0, 1, 2]
+    assert set(last["evaluation"]["deterministic"]["safety_violation_rate"]) == {None}
+    assert last["training_success"] == [0.0, 0.0, 0.0]
+    assert "setting 0: DIVERGED, and left out of the averages: seeds 0 by step 64, 1 by step 64, 2 by step 64" in told
+    assert (path / "results.csv").read_text().splitlines()[-1].endswith(",3")
