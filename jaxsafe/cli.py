@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from jaxsafe.config import yaml
+from jaxsafe.config import imports, yaml
 from jaxsafe.errors import ConfigError, ConfigWarning, nearest, show
 from jaxsafe.streams import lasting_streams
 
@@ -31,6 +31,10 @@ MAX_COUNT = 2**31 - 1
 
 MAX_SEED = 2**32 - 1
 """The largest seed: keys of random numbers are made of its lowest 32 bits."""
+
+
+IMPORTS = "  imports=false          refuse files that name modules to import: that runs the code of whoever wrote them"
+"""The help of an option that every command has."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,7 +165,7 @@ def run(
     argv = sys.argv[1:]
     with lasting_streams() as stdout:
         if not argv or argv[0] in ("-h", "--help", "help"):
-            print(usage(), file=sys.stdout if argv else sys.stderr)
+            print(f"{usage()}\n{IMPORTS}", file=sys.stdout if argv else sys.stderr)
             code, leave = (0 if argv else 2), sys.exit
         else:
             code, finished = _run(main, argv)
@@ -177,7 +181,11 @@ def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tu
     """Return the exit code of a command, and whether it came to its end."""
     try:
         with _warnings_in_one_line():
-            return main(argv) or 0, True
+            flags, words = [], []
+        for word in argv:
+            (flags if word.partition("=")[0] == "imports" else words).append(word)
+        with imports.allowed(Arguments.parse(flags).pop_flag("imports") is not False):
+            return main(words) or 0, True
     except ConfigError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2, False

@@ -9,9 +9,11 @@ import pytest
 
 from jaxsafe import cli
 from jaxsafe.config import __main__ as config
+from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.evaluate.seeds import Evaluator
+from jaxsafe.export import __main__ as export
 from jaxsafe.plot import __main__ as plot
 from jaxsafe.rta import falsify
 from jaxsafe.train import __main__ as train
@@ -151,6 +153,18 @@ def test_bad_options_of_plot_are_told_in_one_line(fails: Callable[..., str]) -> 
 
 def test_bad_options_of_config_are_told_in_one_line(fails: Callable[..., str]) -> None:
     assert "Did you mean 'docking2d'?" in fails(config, "docking2")
+
+
+def test_a_stranger_s_run_imports_nothing_where_that_is_refused(fails: Callable[..., str], tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    (tmp_path / "evil_of_cli.py").write_text("open('ran', 'w')")
+    content = {"env": "docking2d", "training": {}, "environment": {"imports": ["evil_of_cli"]}}
+    (run / "config.yaml").write_text(yaml.write(content))
+    for module, words in ((train, ["resume=run"]), (evaluate, ["run=run"]), (plot, ["run=run"]), (export, ["run=run"])):
+        assert "whose code would run; imports=false refuses that" in fails(module, *words, "imports=false")
+    assert not (tmp_path / "ran").exists()
+    assert "imports: expected true or false, found 'no'" in fails(plot, "run=run", "imports=no")
 
 
 def test_a_broken_run_configuration_is_told_in_one_line(fails: Callable[..., str], tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from jaxsafe import ConfigError, Environment
 from jaxsafe.component import normalise
 from jaxsafe.config import build, dump, load
 from jaxsafe.config.convert import to_component, to_data
-from jaxsafe.config.imports import import_modules, modules
+from jaxsafe.config.imports import allowed, import_modules, modules
 from jaxsafe.config.yaml import parse, write
 from jaxsafe.envs import adapt
 from jaxsafe.errors import ConfigWarning, show
@@ -710,6 +710,15 @@ def test_a_module_that_cannot_be_imported_is_told_in_one_line(
 ) -> None:
     (directory / "bad_of_test.py").write_text(text)
     assert re.search(message, fault_in(tree | {"imports": ["bad_of_test"]}))
+
+
+def test_imports_can_be_refused(tree: dict[str, Any], directory: Path) -> None:
+    (directory / "evil_of_test.py").write_text("open('ran', 'w')")
+    with allowed(False):
+        found = fault_in(tree | {"imports": ["evil_of_test"]})
+        assert re.search(r"imports: names \['evil_of_test'\], whose code would run; imports=false refuses that$", found)
+        load(write(tree | {"imports": []}))
+    assert not (directory / "ran").exists()
 
 
 def test_an_error_in_the_code_of_a_user_names_its_line(tree: dict[str, Any], directory: Path) -> None:

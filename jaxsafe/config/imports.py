@@ -5,11 +5,26 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 from jaxsafe.component import Component, fields
 from jaxsafe.errors import ConfigError, show, told
 from jaxsafe.paths import join
+
+_allowed: ContextVar[bool] = ContextVar("allowed", default=True)
+
+
+@contextmanager
+def allowed(whether: bool) -> Iterator[None]:
+    """Say whether files may name modules to import, which runs their code."""
+    token = _allowed.set(whether)
+    try:
+        yield
+    finally:
+        _allowed.reset(token)
 
 
 def modules(component: Component) -> list[str]:
@@ -27,11 +42,13 @@ def import_modules(names: Any, place: str) -> None:
     """Import modules, from the current directory too.
 
     Raises:
-        ConfigError: `names` is not a list of names, or a module cannot be imported.
+        ConfigError: `names` is not a list of names, or a module cannot be imported or must not be.
     """
     here = join(place, "imports")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise ConfigError(f"{here}: expected a list of modules, found {show(names)}")
+    if names and not _allowed.get():
+        raise ConfigError(f"{here}: names {show(names)}, whose code would run; imports=false refuses that")
     if os.getcwd() not in sys.path and "" not in sys.path:
         sys.path.append(os.getcwd())
     for name in names:
