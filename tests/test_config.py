@@ -1110,3 +1110,9 @@ def test_a_file_without_a_filter_is_told(text: str | None, message: str, tmp_pat
     with pytest.raises(ConfigError, match=message) as raised:
         jaxsafe.make("docking2d", rta=str(path))
     assert "\n" not in str(raised.value)
+
+
+def test_a_section_of_thousands_of_parts_is_refused_at_once(tree: dict[str, Any]) -> None:
+    tree["status"] += [{"type": "speed", "name": f"speed_{index}", "of": "deputy"} for index in range(1001)]
+    message = fault(lambda: compose(tree))
+    assert message == "status: expected at most 1,000 parts, found 1,007"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import typing
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Annotated, Any
@@ -23,6 +24,9 @@ from jaxsafe.rta.prediction import judge
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.types import Sim
+
+MAX_PARTS = 1000
+"""Parts that a section may have. Each is traced by itself, which takes about ten seconds for as many."""
 
 _SECTIONS = ("platforms", "regions", "status", "constraints", "terminal", "reward", "observation")
 
@@ -129,8 +133,10 @@ def _reference(place: str, name: str, known: Iterable[str], which: str = "") -> 
 
 
 def _once(place: str, names: Sequence[str]) -> None:
-    for name in names:
-        if names.count(name) > 1:
+    if len(names) > MAX_PARTS:
+        raise ConfigError(f"{place}: expected at most {MAX_PARTS:,} parts, found {len(names):,}")
+    for name, count in Counter(names).items():
+        if count > 1:
             raise ConfigError(f"{place}: the name {show(name)} stands twice")
         if not name or "." in name:
             raise ConfigError(f"{place}: expected a name without dots, found {show(name)}")
