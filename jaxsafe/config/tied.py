@@ -83,9 +83,9 @@ def _ties(env: Environment) -> Iterator[Tie]:
         sloped = {f"status.{one.name}": one for one in limits} | {
             f"{platform.name}.start.{one.name}": one for one in starts
         }
-        for place, one in sloped.items():
-            if hasattr(platform, "mean_motion"):
-                yield Tie((f"{platform.name}.mean_motion", f"{place}.slope"), (platform.mean_motion, one.slope), 2.0)
+        motion = getattr(platform, "mean_motion", None)
+        for place, one in sloped.items() if motion is not None else ():
+            yield Tie((f"{platform.name}.mean_motion", f"{place}.slope"), (motion, one.slope), 2.0)
         for limit in limits:
             for start in starts:
                 for name in ("floor", "slope"):
