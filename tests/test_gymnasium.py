@@ -173,8 +173,9 @@ def test_a_generator_of_ones_own_waits_for_the_lanes_that_go_on() -> None:
     assert np.array_equal(only[0], expected[0])
 
 
-def test_lanes_start_as_single_environments_with_other_kinds_of_keys() -> None:
-    with jax.default_prng_impl("rbg"):
+@pytest.mark.parametrize("kind", ["rbg", "unsafe_rbg"])
+def test_lanes_start_as_single_environments_with_other_kinds_of_keys(kind: str) -> None:
+    with jax.default_prng_impl(kind):
         env, single = GymVectorEnv("docking2d", 3), GymEnv("docking2d")
         single.reset(seed=1)
         expected = [single.reset(seed=1)[0], *(single.reset()[0] for _ in range(2))]
@@ -221,10 +222,43 @@ def test_a_copy_goes_on_alike_and_compiles_nothing(build: Any, copied: Any) -> N
     assert programs() == before
 
 
+MODES = {
+    "key_reuse": lambda: jax.debug_key_reuse(True),
+    "nans": lambda: jax.debug_nans(True),
+    "double_precision": lambda: jax.enable_x64(True),
+    "rank_promotion": lambda: jax.numpy_rank_promotion("raise"),
+    "no_jit": lambda: jax.disable_jit(),
+}
+
+
+@pytest.mark.parametrize("mode", [pytest.param(mode, marks=[pytest.mark.slow] * (mode == "no_jit")) for mode in MODES])
+def test_the_modes_of_jax_change_nothing(mode: str) -> None:
+    def fly() -> list[np.ndarray]:
+        options: dict[str, Any] = {"autoreset_mode": "SameStep", "max_episode_steps": 2}
+        env, batch = GymEnv("docking2d"), GymVectorEnv("docking2d", 2, **options)
+        zero = np.zeros((2, 2), np.float32)
+        placed = [
+            env.reset(seed=3, options=FAST)[0],
+            env.step(zero[0])[0],
+            batch.reset(seed=3, options=FAST)[0],
+            batch.step(zero)[0],
+        ]
+        return [*placed, batch.step(zero)[0], env.reset(seed=2**70)[0], batch.reset(seed=3)[0]]
+
+    expected = fly()
+    with MODES[mode]():
+        found = fly()
+    for one, other in list(zip(found, expected, strict=True))[: 4 if mode == "double_precision" else None]:  # other starts
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+        assert one.dtype == (np.float64 if mode == "double_precision" else np.float32)
+
+
+FAST = {"start": {"deputy": {"position": [30.0, 0.0], "velocity": [-0.9, 0.0]}}}
+
+
 def test_info_says_what_happened() -> None:
     env = gym.make("jaxsafe/Docking2D-v0", rta="explicit_simplex")
-    fast = {"deputy": {"position": [30.0, 0.0], "velocity": [-0.9, 0.0]}}
-    observation, info = env.reset(options={"start": fast})
+    observation, info = env.reset(options=FAST)
     assert observation[0] == pytest.approx(0.3)
     assert (info["cost"], info["outcome"]) == (0.0, "running")
     *_, info = env.step(np.array([-1.0, 0.0], np.float32))
@@ -309,7 +343,7 @@ def test_an_episode_can_be_watched() -> None:
     assert len(batch._frames[0]._past) == 2
 
 
-START = {"start": {"deputy": {"position": [30.0, 0.0], "velocity": [-0.9, 0.0]}}, "parameters": {"deputy.mass": 13.0}}
+START = {**FAST, "parameters": {"deputy.mass": 13.0}}
 
 
 def test_a_batch_starts_where_single_environments_do() -> None:

@@ -211,11 +211,12 @@ def _raw_keys(impl: str, seeds: Array) -> Array:
     """Return the key of each seed, given as words of 32 bits, the lowest first, [num_envs, words]."""
 
     def raw_key(words: Array) -> Array:
-        key = jax.random.key(words[0], impl=impl)
+        raw = jax.random.key_data(jax.random.key(words[0], impl=impl))
         for i in range(1, words.size):
-            folded, _ = jax.random.split(jax.random.fold_in(key, words[i]))  # `unsafe_rbg` folds in any order alike
-            key = jnp.where(jnp.any(words[i:] > 0), folded, key)
-        return jax.random.key_data(key)
+            folded = jax.random.fold_in(jax.random.wrap_key_data(raw, impl=impl), words[i])
+            folded, _ = jax.random.split(folded)  # `unsafe_rbg` folds in any order alike
+            raw = jnp.where(jnp.any(words[i:] > 0), jax.random.key_data(folded), raw)
+        return raw
 
     return jax.lax.map(raw_key, seeds)
 
