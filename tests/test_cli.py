@@ -1,3 +1,4 @@
+import os
 import subprocess
 import sys
 import warnings
@@ -122,6 +123,14 @@ def test_what_fails_before_anything_comes_of_it_leaves_no_directory(
         with pytest.raises(RuntimeError, match="a compiler that fails"):
             command.main([*words, f"out={tmp_path / 'made'}"])
         assert not (tmp_path / "made").exists()
+
+
+@pytest.mark.skipif(os.sep != "/", reason="there a backslash is a slash")
+def test_a_directory_that_checkpoints_would_not_find_is_refused(fails: Callable[..., str], tmp_path: Path) -> None:
+    assert r"out: expected a path without \, which checkpoints take for /, found a\b" in fails(
+        train, "env=docking2d", r"out=a\b"
+    )
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_unwritable_output_is_told_in_one_line(fails: Callable[..., str], tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -65,6 +66,8 @@ def make(out: str | None, parent: Path, name: str) -> Path:
     Raises:
         ConfigError: `out` already holds something, or cannot be written.
     """
+    if os.sep == "/" and "\\" in os.path.abspath(out or parent / name):
+        raise ConfigError(f"out: expected a path without \\, which checkpoints take for /, found {out or parent / name}")
     try:
         path = Path(out) if out else _next_free(parent, name)
         if path.exists() and (not path.is_dir() or any(path.iterdir())):
