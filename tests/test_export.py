@@ -37,6 +37,8 @@ def test_another_runtime_acts_alike(task: str) -> None:
     policy = saved(task)
     _, starts = jax.jit(reset_batch, static_argnums=2)(policy.env, jax.random.key(0), 10_000)
     drawn = np.random.default_rng(0).uniform(-1, 1, (10_000, policy.env.observation_size))
+    limits = [name == "velocity_limit" for name in policy.env.observation_names]
+    drawn[:, limits] = np.abs(drawn[:, limits])  # none is negative
     observations = np.concatenate([starts.observation, drawn]).astype(np.float32)
     expected = jaxsafe.load_policy(task)(jax.random.key(0), observations)
     found = run(to_onnx(functions.action(policy).function, observations.shape), observations)
@@ -219,6 +221,14 @@ def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFi
             "env: docking3d has observation_names",
         ),
         (["run=pretrained/docking2d", "env.deputy.mas=2"], "mas"),
+        (
+            ["run=pretrained/docking2d", "inputs=state", "rta=default"],
+            "leave run time assurance out with rta=none",
+        ),
+        (
+            ["run=pretrained/docking2d", "format=vnnlib", "steps=1e6"],
+            "steps: expected a whole number from 1 to 2,000",
+        ),
         (["run=pretrained/docking2d", "box.position=[1,2]"], "box.position: means nothing without format=vnnlib"),
     ],
 )
@@ -231,6 +241,11 @@ def test_finite_numbers_are_told_apart() -> None:
     values = np.array([[0.0, -3e38, np.inf, -np.inf, np.nan]], np.float32)
     model = to_onnx(lambda x: jnp.where(jnp.isfinite(x), 1.0, 0.0), values.shape)
     np.testing.assert_array_equal(run(model, values), np.isfinite(values))
+
+
+def test_a_large_batch_takes_no_memory() -> None:
+    model = to_onnx(functions.action(saved("docking2d")).function, (10**9, 6))
+    assert [axis.dim_value for axis in model.graph.output[0].type.tensor_type.shape.dim] == [10**9, 2]
 
 
 def test_what_has_no_counterpart_is_named() -> None:

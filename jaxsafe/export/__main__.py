@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
@@ -11,6 +12,7 @@ from jaxsafe import cli
 from jaxsafe.errors import ConfigError, missing, nearest
 
 if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
     from jaxsafe.evaluate.foreign import ForeignPolicy
     from jaxsafe.export.functions import Exported
     from jaxsafe.train.policy import SavedPolicy
@@ -19,6 +21,9 @@ FORMATS = ("onnx", "stablehlo", "vnnlib")
 OPTIONS = ("run", "seed", "activation", "format", "inputs", "batch", "steps", "box.FIELD", "out")
 BOX = {"position": (70.0, 106.0), "velocity": (-0.28, 0.28)}
 """Starts of the closed-loop docking property of the verification community, in m and m/s, over 40 s."""
+
+MAX_STEPS = 2000
+"""Of the closed loop, as many as a docking episode has: each step is some 350 operators and 3 MiB while they are made."""
 
 MAX_BOUND = 1e18
 """Of a box: squares of larger numbers are infinite in single precision, and so is every margin."""
@@ -50,7 +55,7 @@ def main(argv: Sequence[str]) -> int:
     )
     arguments.refuse_beside([] if form == "vnnlib" else ["steps", *boxes], "without format=vnnlib")
     inputs = _one_of("inputs", arguments.pop_text("inputs") or "observation", [*kinds])
-    batch, steps = arguments.pop_count("batch", 1), arguments.pop_count("steps", 40)
+    batch, steps = arguments.pop_count("batch", 1), arguments.pop_count("steps", 40, most=MAX_STEPS)
     box = {word[4:]: arguments.pop(word) for word in boxes}
     arguments.refuse_rest([*OPTIONS, *choice.OPTIONS])
     about = {"policy": stem, "jaxsafe": versions()["jaxsafe"]}
@@ -63,7 +68,8 @@ def main(argv: Sequence[str]) -> int:
         if not saved.env.constraints:
             raise ConfigError("format: vnnlib asks whether a safety constraint holds, and this environment has none")
         loops = functions.closed_loop(saved, steps, unrolled=True), functions.closed_loop(saved, steps)
-        return _vnnlib(*loops, box, target, about)
+        with _with_advice(saved.env):
+            return _vnnlib(*loops, box, target, about)
     exported = kinds[inputs]()
     if form == "stablehlo":
         try:
@@ -79,7 +85,8 @@ def main(argv: Sequence[str]) -> int:
 
         target = Path(out or f"{stem}.onnx")
         facts = {"inputs": ", ".join(exported.inputs), "outputs": ", ".join(exported.outputs)}
-        write_onnx(target, exported.function, (batch, len(exported.inputs)), {**about, **facts})
+        with _with_advice(saved.env):
+            write_onnx(target, exported.function, (batch, len(exported.inputs)), {**about, **facts})
     print(f"{target}: {', '.join(exported.inputs)} -> {', '.join(exported.outputs)}")
     return 0
 
@@ -111,6 +118,15 @@ def _policy(arguments: cli.Arguments, run: str) -> tuple[SavedPolicy | ForeignPo
     if told := differences(saved.env, env):
         print(told)
     return saved._replace(env=env), path.stem if single else f"{Path(run).name}_{path.stem}"
+
+
+@contextmanager
+def _with_advice(env: Environment) -> Iterator[None]:
+    """Say of a filter, of which most have no counterpart in ONNX, how to leave it out."""
+    try:
+        yield
+    except ConfigError as error:
+        raise error if env.rta is None else ConfigError(f"{error}; leave run time assurance out with rta=none") from None
 
 
 def _require_finite(run: str, saved: SavedPolicy | ForeignPolicy) -> None:

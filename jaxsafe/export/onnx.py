@@ -54,7 +54,7 @@ def write_onnx(path: Path, function: Callable[[Any], Any], shape: Sequence[int],
 
 def to_onnx(function: Callable[[Any], Any], shape: Sequence[int]) -> Any:
     """The model of `write_onnx`."""
-    closed = jax.make_jaxpr(function)(jnp.zeros(shape, jnp.float32))
+    closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct(shape, jnp.float32))
     jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True], instantiate=True)  # what nothing needs may be anything
     graph = _Graph()
     [output] = graph.inline(jaxpr, closed.consts, ["input"])
