@@ -14,6 +14,7 @@ import jaxsafe
 from jaxsafe import ConfigError, Environment
 from jaxsafe.environment import require_success
 from jaxsafe.processors.status import Status
+from jaxsafe.processors.terminal import TooFar
 from jaxsafe.types import Sim, State, StatusName, TimeStep
 
 START = {"deputy": {"position": [100.0, 50.0], "velocity": [0.1, -0.2]}}
@@ -299,7 +300,7 @@ def test_reset_to_takes_arrays_inside_a_compiled_function() -> None:
 
 
 class Broken(Status, type="broken_for_this_test"):
-    """A number that does not exist near the chief."""
+    """A number that is none near the chief."""
 
     distance: StatusName
 
@@ -310,7 +311,8 @@ class Broken(Status, type="broken_for_this_test"):
 def test_a_status_that_is_not_a_number_ends_the_episode() -> None:
     plain = jaxsafe.make("docking2d")
     status = (*plain.status, Broken(name="broken", distance="docking_distance"))
-    env = jaxsafe.override(plain, {"status": status})
+    terminal = (*plain.terminal, TooFar(name="broken", distance="broken", limit=1e6))
+    env = jaxsafe.override(plain, {"status": status, "terminal": terminal})
     for distance, expected in ((100.0, ([], "running", 0.0)), (10.0, (["diverged"], "diverged", 1.0))):
         ended, outcome, timestep = ends(env, [distance, 0.0])
         assert (ended, outcome, float(timestep.cost)) == expected
