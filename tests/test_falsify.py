@@ -1,8 +1,17 @@
 """The file that the falsifier writes says what it was made by."""
 
 import json
+import shlex
 from pathlib import Path
+from typing import Any
 
+import jax
+import jax.numpy as jnp
+import pytest
+
+import jaxsafe
+from jaxsafe.rta.adversaries import ADVERSARIES
+from jaxsafe.rta.attack import attack, longest_episode
 from jaxsafe.rta.falsify import main, report
 
 
@@ -10,7 +19,7 @@ def test_the_numbers_name_the_command_and_the_versions_that_made_them(tmp_path: 
     argv = ["env=docking2d", "steps=40", "lanes=4", "policies=[uniform]", f"out={tmp_path / 'found.json'}"]
     assert main(argv) == 0
     found = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
-    assert found["command"] == " ".join(["python -m jaxsafe.rta.falsify", *argv])
+    assert found["command"] == f"python -m jaxsafe.rta.falsify {shlex.join(argv)}"
     assert {"jaxsafe", "jax", "device", "processor"} <= set(found["versions"])
     assert [(row["policy"], row["steps"], row["violating_steps"]) for row in found["policies"]] == [("uniform", 40, 0)]
 
@@ -23,6 +32,45 @@ def test_a_violation_is_the_exit_code_and_bounds_nothing(tmp_path: Path) -> None
     assert row["violation_bound"] is None
     assert "without a violation" not in report([row])
     assert "without a violation" not in report([{**row, "violating_steps": 0}])  # inside steps they count as well
+
+
+def test_episodes_are_what_is_counted_and_whole_ones_unless_told_otherwise(capsys: pytest.CaptureFixture[str]) -> None:
+    """Steps of an episode depend on each other, so a million of them bound nothing a step."""
+    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 30.0}, rta="default")
+    assert longest_episode(env) == 32
+    whole = attack(env, "uniform", longest_episode(env), 5, jax.random.key(0))
+    cut = attack(env, "uniform", 20, 5, jax.random.key(0))
+    assert (whole["whole_episodes"], whole["episodes"], whole["violation_bound"]) == (True, 5, 3.0 / 5)
+    assert (cut["whole_episodes"], cut["episodes"], cut["violation_bound"]) == (False, 5, 3.0 / 5)
+    assert main(["env=docking2d", "lanes=5", "policies=[uniform]", "env.terminal.timeout.limit=30"]) == 0
+    printed = capsys.readouterr().out
+    assert " 160 " in printed
+    assert "less than a share of 0.6 of the episodes has one" in printed
+
+
+def test_what_is_not_a_number_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(env: Any, sim: Any, key: Any) -> jax.Array:
+        return jnp.full(2, jnp.nan)
+
+    monkeypatch.setitem(ADVERSARIES, "broken", broken)
+    row = attack(jaxsafe.make("docking2d"), "broken", 7, 3, jax.random.key(0))
+    assert row["violating_steps"] == row["violating_steps_inside"] == 21
+    assert row["violation_bound"] is None
+    assert row["worst_margin"] is None
+    assert "no number" in report([row])
+    assert json.loads(json.dumps(row, allow_nan=False)) == row
+
+
+@pytest.mark.parametrize("policy", ["there_and_back", pytest.param("drain", marks=pytest.mark.slow)])
+def test_adversaries_that_turn_back_and_that_take_the_least_certificate(policy: str) -> None:
+    bare = jaxsafe.make("docking2d", {"terminal.timeout.limit": 200.0, "deputy.start.velocity.share": [0.0, 0.1]})
+    row = attack(bare, policy, 202, 8, jax.random.key(0))
+    assert row["violating_steps"] > 0
+    kept = attack(
+        jaxsafe.override(bare, {"rta": jaxsafe.make("docking2d", rta="default").rta}), policy, 202, 8, jax.random.key(0)
+    )
+    assert kept["violating_steps"] == kept["violating_steps_inside"] == kept["uncertified_steps"] == 0
+    assert kept["worst_margin"] < (0.001 if policy == "drain" else 0.1)
 
 
 def test_what_an_episode_draws_is_the_plant_that_is_counted_on() -> None:

@@ -28,7 +28,7 @@ from jaxsafe.types import (
 class Status(Processor):
     """Base of all statuses."""
 
-    def on_the_way(self, before: Sim, sim: Sim) -> Any:
+    def on_the_way(self, env: Any, before: Sim, sim: Sim) -> Any:
         """Return the output over the step from `before` to `sim`: for distances a lower bound, else that of `sim`."""
         return self.process(self.init(sim), sim)
 
@@ -42,8 +42,8 @@ class Distance(Status, type="distance"):
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
         return safe_norm(self._apart(sim))
 
-    def on_the_way(self, before: Sim, sim: Sim) -> Float[Array, ""]:
-        bend = _bend(before, sim, self.of) + _bend(before, sim, self.to)
+    def on_the_way(self, env: Any, before: Sim, sim: Sim) -> Float[Array, ""]:
+        bend = _bend(env, before, sim, self.of) + _bend(env, before, sim, self.to)
         return closest_approach(self._apart(before), self._apart(sim)) - bend
 
     def _apart(self, sim: Sim) -> Float[Array, " d"]:
@@ -59,8 +59,8 @@ class RegionDistance(Status, type="region_distance"):
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
         return safe_norm(self._apart(sim))
 
-    def on_the_way(self, before: Sim, sim: Sim) -> Float[Array, ""]:
-        bend = _bend(before, sim, self.of)  # a region is taken to move straight on
+    def on_the_way(self, env: Any, before: Sim, sim: Sim) -> Float[Array, ""]:
+        bend = _bend(env, before, sim, self.of)  # a region is taken to move straight on
         return closest_approach(self._apart(before), self._apart(sim)) - bend
 
     def _apart(self, sim: Sim) -> Float[Array, " d"]:
@@ -143,10 +143,6 @@ class DeltaV(Status, type="delta_v"):
         return safe_norm(delta_v) if self.norm == "l2" else jnp.sum(jnp.abs(delta_v))
 
 
-def _bend(before: Sim, sim: Sim, name: str) -> Float[Array, ""]:
-    """How far a platform's path may leave the straight line between two instants, from its change of velocity.
-
-    ‖Δv‖Δt/8 at a constant acceleration, and up to 32/27 of that where it stops on the way, at a limit.
-    """
-    change = sim.platforms[name].velocity - before.platforms[name].velocity
-    return 0.15 * safe_norm(change) * (sim.time - before.time)
+def _bend(env: Any, before: Sim, sim: Sim, name: str) -> Float[Array, ""]:
+    """How far a platform's path may leave the straight line between two instants."""
+    return env.platform(name).bend(before.platforms[name], sim.platforms[name], sim.time - before.time)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -9,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsafe.processors.terminal import Timeout, TooFar
+from jaxsafe.rta.filter import CertifiedRTA
 from jaxsafe.rta.prediction import advance, bounds, smallest_margin
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.types import Key, Sim
@@ -80,8 +83,54 @@ def head_on(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
     return _towards(env, sim, aim - own.position, key)
 
 
+def there_and_back(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+    """Away from the other platform for three quarters of the longest episode, or half of the way allowed, then back."""
+    way = _to_target(env, sim)
+    times = [one.limit for one in env.terminal if isinstance(one, Timeout)]
+    limits = [one.limit for one in env.terminal if isinstance(one, TooFar)]
+    back = jnp.zeros((), bool)
+    for limit in times:
+        back = back | (sim.time > 0.75 * limit)
+    for limit in limits:
+        back = back | (safe_norm(way) > 0.5 * limit)
+    return _towards(env, sim, jnp.where(back, way, -way), key)
+
+
+def drain(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+    """Of the controls at the bounds and in the middle, the one that a filter certifies with the least h on the way.
+
+    Without a filter that certifies, the one of the least h after the step.
+    """
+    low, high = bounds(env)
+    shares = jnp.array(list(itertools.product((0.0, 0.5, 1.0), repeat=low.shape[0])))
+    controls = low + shares * (high - low)
+
+    def value(u: Float[Array, " m"]) -> Float[Array, ""]:
+        later = advance(env, sim, u)
+        if not isinstance(env.rta, CertifiedRTA):
+            return smallest_margin(env, later)
+        least = jnp.max(env.rta.certify(env, sim, later))
+        return jnp.where(least >= env.rta.required_margin(env), least, jnp.inf)
+
+    values = jax.lax.map(value, controls)
+    return controls[jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values))]
+
+
 ADVERSARIES: dict[str, Adversary] = {
-    each.__name__: each for each in (uniform, bang_bang, greedy, inward, outward, sideways, accelerate, intercept, head_on)
+    each.__name__: each
+    for each in (
+        uniform,
+        bang_bang,
+        greedy,
+        inward,
+        outward,
+        sideways,
+        accelerate,
+        intercept,
+        head_on,
+        there_and_back,
+        drain,
+    )
 }
 """By name."""
 

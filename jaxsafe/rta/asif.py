@@ -40,9 +40,10 @@ class DiscreteASIF(CertifiedRTA, type="discrete_asif"):
     def propose(
         self, env: Any, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
-        spare = jnp.maximum(constraint(env, self.constraints[0]).margin(judge(env, sim)) - self.margin, 0.0)
+        required = self.required_margin(env)
+        spare = jnp.maximum(constraint(env, self.constraints[0]).margin(judge(env, sim)) - required, 0.0)
         rounding = 16.0 * jnp.finfo(desired.dtype).eps * constraint(env, self.constraints[0]).limit(judge(env, sim))
-        margin = self.margin + (1.0 - self.gamma) * spare + rounding
+        margin = required + (1.0 - self.gamma) * spare + rounding
         ball = speed_ball(env, sim, jnp.zeros_like(desired), self.constraints[0], margin)
         return project_box_ball(desired, *bounds(env), *ball)
 
@@ -116,7 +117,8 @@ class ExplicitASIF(CertifiedRTA, type="explicit_asif"):
     def unsuited(self, env: Any, sim: Sim) -> dict[str, Bool[Array, ""]]:
         rows, _ = self.rows(env, sim, env.action_size)
         reason = f"of degree {self.degree} the control has no influence on"
-        return {f"{reason} {name!r}": jnp.all(row == 0.0) for name, row in zip(self.constraints, rows, strict=True)}
+        empty = {f"{reason} {name!r}": jnp.all(row == 0.0) for name, row in zip(self.constraints, rows, strict=True)}
+        return empty | super().unsuited(env, sim)
 
     def propose(
         self, env: Any, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
@@ -169,7 +171,7 @@ class ImplicitASIF(CertifiedRTA, type="implicit_asif"):
     def propose(
         self, env: Any, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
-        low, high = bounds(env)
+        (low, high), required = bounds(env), self.required_margin(env)
 
         def least(u: Float[Array, " m"]) -> Float[Array, " backups"]:
             return self.certify(env, sim, advance(env, sim, u))
@@ -180,9 +182,9 @@ class ImplicitASIF(CertifiedRTA, type="implicit_asif"):
             best = jnp.argmax(values)
             known = jnp.isfinite(values[best])
             row = jnp.where(known, gains[:, best], 0.0)
-            short = jnp.where(known, self.margin + self.spare - values[best], 0.0)
+            short = jnp.where(known, required + self.spare - values[best], 0.0)
             projected, feasible = project_box_halfspace(desired, low, high, row, short + jnp.sum(row * proposal))
-            safe = values[best] >= self.margin
+            safe = values[best] >= required
             return (jnp.where(safe, proposal, projected), safe | (known & feasible)), None
 
         return jax.lax.scan(improve, (desired, jnp.ones((), bool)), length=self.rounds)[0]

@@ -1,12 +1,13 @@
 """Adversaries at work on an environment, with or without a filter, and what is counted while they are.
 
 Violations are counted at the samples, and inside the steps by moving the platforms to `PARTS` instants of each with the
-control held, separations also between two of them.
+control held, separations also between two of them. A margin or a state that is not a number is a violation.
 """
 
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any
 
 import jax
@@ -15,12 +16,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsafe.environment import Environment, drawn, step
+from jaxsafe.errors import ConfigError
 from jaxsafe.paths import set_path
+from jaxsafe.processors.terminal import Timeout
 from jaxsafe.rollout import reset_batch
 from jaxsafe.rta.adversaries import ADVERSARIES
-from jaxsafe.rta.prediction import advance, bounds, smallest_margin
+from jaxsafe.rta.prediction import bounds, commanded, smallest_margin
 from jaxsafe.simulation.controllers import Continuous
-from jaxsafe.types import Key, Sim, State, TimeStep
+from jaxsafe.types import Key, Number, Sim, State, TimeStep
 
 PARTS = 8
 KNOTS, HOLD = 8, 8
@@ -44,38 +47,58 @@ def attack(env: Environment, name: str, num_steps: int, num_lanes: int, key: Key
         env: the environment, with or without run time assurance.
         name: one of `adversaries.ADVERSARIES`, or `search`: the cross-entropy method on sequences of `KNOTS` controls, each
             held for `HOLD` steps, from random starts, which minimises the smallest h on the way against the filter.
-        num_steps: steps in each lane; for the search all of them divide into its sequences.
+        num_steps: steps in each lane, `longest_episode` for whole ones; the search divides all of them into its sequences.
         num_lanes: episodes side by side.
         key: a typed PRNG key.
 
     Returns:
-        Plain numbers: steps, episodes, violations, worst margins, interventions, mean correction, unsafe starts.
+        Plain numbers: steps, episodes, violations, worst margins, interventions, mean correction, unsafe starts. Episodes
+        are those that ended, or, where some lane has none that did, the first parts of one in each lane. Where nothing was
+        violated, the share of episodes with a violation is below `violation_bound` with 95 % confidence, by the rule of
+        three. It is None after a violation, and for the search, whose episodes do not depend on chance alone.
     """
     physical = _with_physical_actions(env)
     if name == SEARCH:
         starts = max(1, round(num_steps * num_lanes / (KNOTS * HOLD * POPULATION * ROUNDS)))
-        counts, episodes = _search(physical, starts, key), starts * POPULATION * ROUNDS
+        counts, begun = _search(physical, starts, key), starts * POPULATION * ROUNDS
+        whole, episodes = False, begun
     else:
         counts = _follow(physical, name, num_steps, num_lanes, key)
-        episodes = num_lanes + int(np.sum(counts["ended"]))
+        ended = int(np.sum(counts["ended"]))
+        whole, begun = bool(np.all(counts["ended"] > 0)), num_lanes + ended
+        episodes = ended if whole else num_lanes
     found = {one: np.asarray(value, float) for one, value in counts.items()}
     total = {one: found[one].sum() for one in _ADDED}
     steps = int(total["steps"])
+    clean = not (total["violating"] or total["violating_inside"])
     return {
         "policy": name,
         "steps": steps,
         "episodes": episodes,
         "violating_steps": int(total["violating"]),
         "violating_steps_inside": int(total["violating_inside"]),
-        "worst_margin": float(found["lowest"].min()),
-        "worst_margin_inside": float(found["lowest_inside"].min()),
+        "worst_margin": _finite_or_none(found["lowest"].min()),
+        "worst_margin_inside": _finite_or_none(found["lowest_inside"].min()),
         "intervention_rate": float(total["intervening"] / steps),
         "mean_correction": float(total["correction"] / steps),
         "uncertified_steps": int(total["uncertified"]),
         "infeasible_steps": int(total["infeasible"]),
-        "unsafe_starts": float(total["unsafe_starts"] / episodes),
-        "violation_bound": None if total["violating"] or total["violating_inside"] else 3.0 / steps,
+        "unsafe_starts": float(total["unsafe_starts"] / begun),
+        "whole_episodes": whole,
+        "violation_bound": 3.0 / episodes if clean and name != SEARCH else None,
     }
+
+
+def longest_episode(env: Environment) -> int:
+    """The steps after which every episode has ended, by its time limit.
+
+    Raises:
+        ConfigError: the task has no time limit.
+    """
+    limits = [float(one.limit) for one in env.terminal if isinstance(one, Timeout)]
+    if not limits:
+        raise ConfigError("steps: the task has no time limit, so give the number of steps")
+    return math.ceil(min(limits) / float(env.dt)) + 2  # a timeout needs t > limit, and limit / dt may round down
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2, 3))
@@ -146,14 +169,16 @@ def _step(env: Environment, state: State, controls: Float[Array, "n m"]) -> tupl
     inside = jax.vmap(lambda state, control: _inside(drawn(env, state.parameters), state.sim, control))(
         state, info.control_actual
     )
+    finite = jax.vmap(_finite)(after)
+    lowest, inside = (jnp.where(jnp.isnan(one), -jnp.inf, one) for one in (lowest, inside))
     facts = {
         "steps": zero + 1.0,
-        "violating": lowest < 0.0,
-        "violating_inside": inside < 0.0,
+        "violating": ~(lowest >= 0.0) | ~finite,
+        "violating_inside": ~(inside >= 0.0) | ~finite,
         "ended": timestep.done,
         "intervening": info.intervening,
         "correction": zero if info.rta is None else info.rta.correction,
-        "uncertified": zero + 1.0 if info.rta is None else ~info.rta.certified,
+        "uncertified": zero + 1.0 if info.rta is None else ~info.rta.certified | ~finite,
         "infeasible": zero if info.rta is None else ~info.rta.feasible,
         "unsafe_starts": zero,
         "lowest": lowest,
@@ -165,10 +190,27 @@ def _step(env: Environment, state: State, controls: Float[Array, "n m"]) -> tupl
 def _inside(env: Environment, before: Sim, control: Float[Array, " m"]) -> Float[Array, ""]:
     """The smallest h within a step."""
     before = before.replace(regions={}, status={})
-    shares = jnp.arange(1, PARTS + 1) / PARTS
-    later = jax.vmap(lambda share: advance(env.replace(dt=env.dt * share), before, control))(shares)
+    later = jax.vmap(lambda share: within_step(env, before, control, share))(jnp.arange(1, PARTS + 1) / PARTS)
     earlier = jax.tree.map(lambda start, way: jnp.concatenate([start[None], way[:-1]]), before, later)
     return jnp.min(jax.vmap(lambda a, b: smallest_margin(env, b, a))(earlier, later))
+
+
+def within_step(env: Environment, before: Sim, control: Float[Array, " m"], share: Number) -> Sim:
+    """The simulation after a share of a step, all controls being those of the whole step."""
+    platforms = {}
+    for platform in env.platforms:
+        state = before.platforms[platform.name]
+        controls = platform.held(state, commanded(env, platform, before, control), env.dt)
+        platforms[platform.name] = platform.step(state, controls, env.dt * share)
+    return before.replace(time=before.time + env.dt * share, platforms=platforms, regions={}, status={})
+
+
+def _finite(state: State) -> Array:
+    return functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state.sim.platforms)])
+
+
+def _finite_or_none(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
 
 
 def _nothing(num_lanes: int) -> Counts:
@@ -186,7 +228,7 @@ def _unsafe(first: TimeStep) -> Array:
     """Which starts are outside the safe set, as far as is known."""
     if first.info.rta is not None:
         return ~first.info.rta.certified
-    return jnp.min(jnp.stack(list(first.info.margins.values())), axis=0) < 0.0
+    return ~(jnp.min(jnp.stack(list(first.info.margins.values())), axis=0) >= 0.0)
 
 
 def _with_physical_actions(env: Environment) -> Environment:

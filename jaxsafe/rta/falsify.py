@@ -1,6 +1,6 @@
 """`python -m jaxsafe.rta.falsify env=docking2d rta=default`: tries to break a filter, and counts what happened.
 
-Every adversary acts for a number of steps from the task's own starts; the last one searches for sequences of controls that
+Every adversary acts on whole episodes from the task's own starts; the last one searches for sequences of controls that
 defeat the filter. Violations are counted at the samples and inside the steps, see `attack`.
 """
 
@@ -14,6 +14,9 @@ from typing import Any
 
 from jaxsafe import cli, origin
 
+MOST_STEPS = 1_000_000
+"""Of each adversary, where `steps` is not given. Episodes longer than this allows are cut."""
+
 OPTIONS = ("env", "rta", "steps", "lanes", "seed", "policies", "actions", "variant", "out")
 
 
@@ -25,22 +28,29 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
     ]
     lines += [
         f"{row['policy']:12} {row['steps']:>10,} {row['violating_steps']:>10,} {row['violating_steps_inside']:>8,}"
-        f" {row['worst_margin']:>10.3g} {row['worst_margin_inside']:>10.3g} {row['intervention_rate']:>8.2%}"
+        f" {_number(row['worst_margin']):>10} {_number(row['worst_margin_inside']):>10} {row['intervention_rate']:>8.2%}"
         f" {row['mean_correction']:>8.3g}"
         for row in rows
     ]
-    clean = [row for row in rows if not violated(row)]
-    if clean:
-        steps = sum(row["steps"] for row in clean)
+    bounded = [row for row in rows if row["violation_bound"] is not None]
+    if bounded:
+        share = max(row["violation_bound"] for row in bounded)
+        cut = "" if all(row["whole_episodes"] for row in bounded) else ", which were cut off,"
+        clean = sum(not violated(row) for row in rows)
         lines.append(
-            f"{len(clean)} of {len(rows)} without a violation: below {3.0 / steps:.1g} a step with 95 % confidence"
+            f"{clean} of {len(rows)} without a violation: against each random one less than a share of {share:.1g}"
+            f" of the episodes{cut} has one, with 95 % confidence"
         )
     return "\n".join(lines)
 
 
 def violated(row: dict[str, Any]) -> bool:
     """Whether a constraint was, at a sample or inside a step."""
-    return row["violation_bound"] is None
+    return bool(row["violating_steps"] or row["violating_steps_inside"])
+
+
+def _number(value: float | None) -> str:
+    return "no number" if value is None else f"{value:.3g}"
 
 
 def main(argv: Sequence[str]) -> int:
@@ -51,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.envs import make
     from jaxsafe.errors import ConfigError, nearest
     from jaxsafe.rta.adversaries import ADVERSARIES
-    from jaxsafe.rta.attack import SEARCH, attack
+    from jaxsafe.rta.attack import SEARCH, attack, longest_episode
     from jaxsafe.rta.presets import PRESETS
     from jaxsafe.train.files import write_text
 
@@ -59,7 +69,8 @@ def main(argv: Sequence[str]) -> int:
     task, out = arguments.pop_text("env"), arguments.pop_text("out")
     options: dict[str, Any] = {name: arguments.pop_text(name) for name in ("rta", "variant", "actions")}
     changes = arguments.pop_overrides()
-    steps, lanes = arguments.pop_count("steps", 100_000), arguments.pop_count("lanes", 256)
+    steps = arguments.pop_count("steps", MOST_STEPS) if "steps" in arguments.options else None
+    lanes = arguments.pop_count("lanes", 64)
     known = (*ADVERSARIES, SEARCH)
     seed, policies = arguments.pop_seed(), arguments.pop("policies", list(known))
     arguments.refuse_rest([*OPTIONS, "env.…"])
@@ -75,9 +86,10 @@ def main(argv: Sequence[str]) -> int:
         raise ConfigError(f"env: {task} has no safety constraint")
     facts: dict[str, Any] = {"command": f"python -m jaxsafe.rta.falsify {shlex.join(argv)}", "commit": origin.commit()}
     facts |= {"versions": origin.versions(), "env": task, **options, "seed": seed}
+    length = min(longest_episode(env), max(1, MOST_STEPS // lanes)) if steps is None else -(-steps // lanes)
     rows = []
     for name in policies if isinstance(policies, list) else [policies]:
-        rows.append(attack(env, name, -(-steps // lanes), lanes, jax.random.key(seed)))
+        rows.append(attack(env, name, length, lanes, jax.random.key(seed)))
         print(report(rows[-1:]).splitlines()[1] if len(rows) > 1 else "\n".join(report(rows).splitlines()[:2]), flush=True)
         if out:  # after each, so that nothing is lost if the run is stopped
             write_text(Path(out), json.dumps({**facts, "policies": rows}, indent=1, ensure_ascii=False) + "\n")
@@ -93,7 +105,8 @@ def usage() -> str:
     return (
         "usage: python -m jaxsafe.rta.falsify env=TASK [key=value …]\n\n"
         "  rta=default            the filter to attack (that of a file: its own); none attacks the bare task\n"
-        "  steps=N                steps of each adversary (default 100000), over lanes=N episodes at once (default 256)\n"
+        "  lanes=N                episodes at once (default 64)\n"
+        "  steps=N                steps of each adversary over all of them (default: whole episodes, up to a million)\n"
         "  policies=[a,b]         some adversaries only\n"
         "  seed=N                 (default 0)\n"
         "  env.PATH=VALUE         change the environment\n"

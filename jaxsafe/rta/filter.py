@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -20,9 +22,13 @@ from jaxsafe.rta.prediction import (
     repeat,
     smallest_margin,
 )
+from jaxsafe.rta.speed_limit import speed_limit_facts
 from jaxsafe.types import ConstraintName, Number, Record, RTAInfo, Sim
 
 Margin = Annotated[Number, Unit("as the constraint"), Range(0.0)]
+
+Faults = dict[str, Bool[Array, ""]]
+"""Why a proof does not hold, each with whether that is so at a state."""
 
 
 class RTA(Component):
@@ -56,6 +62,7 @@ class RTAMemory(Record):
     intervening: Bool[Array, ""]
     backup_index: Int[Array, ""]  # the backup controller that the last certificate is about
     certified: Bool[Array, ""]  # whether following it is known to be safe
+    ahead: Mapping[str, Any]  # the platforms at the end of that certificate's horizon; empty without a horizon
 
 
 class BackupController(Component):
@@ -75,6 +82,22 @@ class BackupController(Component):
         """
         raise NotImplementedError
 
+    def faults(self, env: Any, sim: Sim, rta: CertifiedRTA) -> Faults:
+        """Return what is missing at a state for the proof that this controller keeps the constraints; nothing by default.
+
+        Where anything is missing the filter certifies nothing. A filter that lacks it at all of a few starts is refused.
+
+        Args:
+            env: the environment, with the numbers of this episode.
+            sim: the simulation at the state.
+            rta: the filter that asks.
+        """
+        return {}
+
+    def duration(self, env: Any) -> Number:
+        """Return the time it may take to the terminal set [s]; 0 where that is not known."""
+        return jnp.zeros_like(env.dt)
+
 
 class TerminalSet(Component):
     """States from which the backup controller stays safe for ever: where a certificate may end."""
@@ -83,14 +106,33 @@ class TerminalSet(Component):
         """Whether the state is in the set."""
         raise NotImplementedError
 
+    def faults(self, env: Any, sim: Sim, rta: CertifiedRTA) -> Faults:
+        """Return what is missing at a state for the proof of this set, as `BackupController.faults` does."""
+        return {}
+
+
+class Paths(Record):
+    """What becomes of a state under each backup controller."""
+
+    least: Float[Array, " backups"]  # smallest h on the way
+    certified: Bool[Array, " backups"]  # whether it keeps the margin, ends in the terminal set, and its proof holds
+    ahead: Mapping[str, Any]  # the platforms at the end, with an axis of backups in front; empty without a horizon
+
+    @property
+    def values(self) -> Float[Array, " backups"]:
+        """The smallest h of those that are certified but for the margin, −∞ of the others."""
+        return jnp.where(self.certified, self.least, -jnp.inf)
+
 
 class CertifiedRTA(RTA):
     """A filter that lets a control pass only after predicting with the plant's own map that it is safe.
 
     A control is certified if after the step every constraint keeps its `margin`, h ≥ margin, and, with a `horizon`, also on
-    the way of a backup controller from there over that many steps, which must end in the `terminal` set. What is not
-    certified is replaced by the backup controller of the last certificate. After an intervention control returns to the
-    agent only with `release` on top of the margin.
+    the way of a backup controller from there over that many steps, which must end in the `terminal` set. What the proof of
+    the backup controller or the set assumes of the environment's numbers is checked as well. What is not certified is
+    replaced by the backup controller of the last certificate, which is renewed while it acts. Where that fails, or nothing
+    was certified yet, the backup controllers compete: the first that is certified acts, and until then the one of the
+    largest h on its way. After an intervention control returns to the agent only with `release` on top of the margin.
     Without `enforce` a feasible proposal acts whatever the prediction says, as filters of the literature do: to compare.
     """
 
@@ -124,11 +166,35 @@ class CertifiedRTA(RTA):
         """
         raise NotImplementedError
 
+    def required_margin(self, env: Any) -> Number:
+        """Return the h to keep at samples: `margin`, or more where a constraint would be broken inside a step.
+
+        For speed limits that depends on the length of a step, see docs/rta.md; separations are bounded within the step.
+        """
+        facts = [speed_limit_facts(env, name) for name in self.constraints]
+        return functools.reduce(jnp.maximum, [one.least_margin for one in facts if one], self.margin)
+
+    def unsuited(self, env: Any, sim: Sim) -> dict[str, Bool[Array, ""]]:
+        if not self.enforce:
+            return {}
+        found = dict(self.terminal.faults(env, sim, self)) if self.terminal else {}
+        for backup in self.backups:
+            found |= backup.faults(env, sim, self)
+            if self.horizon:
+                fault = f"{self.horizon} steps of the horizon are too short for backup controller {backup.name!r}"
+                found[fault] = self.horizon * env.dt < backup.duration(env)
+        return found
+
     def begin(self, env: Any, sim: Sim) -> tuple[RTAMemory, RTAInfo]:
         """Memory with the backup controller that is safest from the start."""
-        values = self.certify(env, sim, sim)
-        best, no, yes = _highest(values), jnp.zeros((), bool), jnp.ones((), bool)
-        memory = RTAMemory(no, best, values[best] >= self.margin)
+        paths = self.follow(env, sim, sim)
+        best, no, yes = self._best(env, paths), jnp.zeros((), bool), jnp.ones((), bool)
+        memory = RTAMemory(
+            intervening=no,
+            backup_index=best,
+            certified=paths.values[best] >= self.required_margin(env),
+            ahead=_chosen(paths.ahead, best),
+        )
         return memory, RTAInfo(jnp.zeros_like(sim.time), yes, memory.certified, self.lowest(env, sim, sim), best)
 
     def filter(
@@ -140,22 +206,31 @@ class CertifiedRTA(RTA):
         backup = self._backup(env, sim, memory, later)
         proposal, feasible = self.propose(env, sim, wanted, backup)
 
-        after = advance(env, sim, proposal, later)
-        values = self.certify(env, sim, after)
-        best = _highest(values)
-        required = self.margin + jnp.where(memory.intervening, self.release, 0.0)
-        safe = values[best] >= required
-        passes = finite & (safe if self.enforce else feasible)
+        # A certificate with a horizon is dear, and one a step is made. From a state that is certified it is the proposal's.
+        # From another the backup acts whatever is proposed, and it is the backup's.
+        known = memory.certified if self.enforce and self.horizon else jnp.ones((), bool)
+        after, backed = advance(env, sim, proposal, later), advance(env, sim, backup, later)
+        paths = self.follow(env, sim, _where(known, after, backed))
+        best, required = self._best(env, paths), self.required_margin(env)
+        safe = paths.values[best] >= required + jnp.where(memory.intervening, self.release, 0.0)
+        passes = finite & known & (safe if self.enforce else feasible)
 
-        fallback = self.lowest(env, sim, advance(env, sim, backup, later))
-        kept = fallback >= self.margin if self.horizon == 0 else memory.certified & ~jnp.isnan(fallback)
+        fallback = self.lowest(env, sim, backed)
+        fresh = passes | ~known
+        if self.horizon:
+            kept, ahead = self._renew(env, sim, memory, backed, fallback)
+            kept = jnp.where(known, kept, paths.values[best] >= required)
+            ahead = _where(fresh, _chosen(paths.ahead, best), ahead)
+        else:
+            kept, ahead = self.follow(env, sim, backed).values[0] >= required, {}
         actual = jnp.where(passes, proposal, backup)
         correction = jnp.where(jnp.isfinite(desired), actual - wanted, actual)
         certified = jnp.where(passes, safe, kept)
         memory = RTAMemory(
             intervening=jnp.any(correction != 0.0) | ~finite,
-            backup_index=jnp.where(passes, best, memory.backup_index),
+            backup_index=jnp.where(fresh, best, memory.backup_index),
             certified=certified,
+            ahead=ahead,
         )
         info = RTAInfo(
             correction=jnp.sqrt(jnp.sum(correction**2)),
@@ -171,20 +246,36 @@ class CertifiedRTA(RTA):
         return smallest_margin(env, sim, before, self.constraints)
 
     def certify(self, env: Any, before: Sim, sim: Sim) -> Float[Array, " backups"]:
-        """Return for each backup controller the smallest h on its way from `sim`; −∞ if it ends outside the last set."""
+        """Return for each backup controller the smallest h on its way from `sim`, −∞ if that proves nothing.
+
+        It proves nothing where the way ends outside the terminal set, or where the proof of the controller or of the set
+        does not hold for the numbers of the environment.
+        """
+        return self.follow(env, before, sim).values
+
+    def follow(self, env: Any, before: Sim, sim: Sim) -> Paths:
+        """Return what becomes of `sim`, one step after `before`, under each backup controller."""
         first = self.lowest(env, before, sim)
+        holds = jnp.stack([_none(backup.faults(env, sim, self)) for backup in self.backups]) & _finite(sim)
         if self.terminal is None:
-            return first[None]
+            return Paths(least=first[None], certified=holds & jnp.isfinite(first), ahead={})
         together = [[one] for one in self.backups] if others_react(env, sim) else [self.backups]
-        return jnp.concatenate([self._follow(env, backups, first, sim) for backups in together])
+        least, ends = zip(*(self._follow(env, backups, first, sim) for backups in together), strict=True)
+        ends = [end for several in ends for end in several]
+        reached = jnp.stack([self._ended(env, end) for end in ends])
+        platforms = [end.platforms for end in ends]
+        ahead = jax.tree.map(lambda *leaves: jnp.stack(leaves), *platforms)
+        return Paths(least=jnp.concatenate(least), certified=reached & holds, ahead=ahead)
 
     def _follow(
         self, env: Any, backups: Sequence[BackupController], first: Float[Array, ""], sim: Sim
-    ) -> Float[Array, " backups"]:
-        """`certify` for backup controllers among whom the other platforms move alike, and so are predicted once."""
+    ) -> tuple[Float[Array, " backups"], list[Sim]]:
+        """The smallest h, and the end, for backup controllers among whom the other platforms move alike.
+
+        These are predicted once.
+        """
         low, high = bounds(env)
-        plant, terminal = env.agent_platform, self.terminal
-        assert terminal is not None
+        plant = env.agent_platform
 
         def placed(sim: Sim, own: Any) -> Sim:
             return sim.replace(platforms={**sim.platforms, env.agent: own})
@@ -204,8 +295,33 @@ class CertifiedRTA(RTA):
         sim = sim.replace(regions={}, status={})
         start = (sim, [sim.platforms[env.agent]] * len(backups), [first] * len(backups))
         last, crafts, least = repeat(one, start, self.horizon)
-        reached = jnp.stack([terminal.contains(env, placed(last, own)) for own in crafts])
-        return jnp.where(reached, jnp.stack(least), -jnp.inf)
+        return jnp.stack(least), [placed(last, own) for own in crafts]
+
+    def _ended(self, env: Any, end: Sim) -> Bool[Array, ""]:
+        """Whether a certificate may end in a state."""
+        assert self.terminal is not None
+        return self.terminal.contains(env, end) & _none(self.terminal.faults(env, end, self)) & _finite(end)
+
+    def _renew(
+        self, env: Any, sim: Sim, memory: RTAMemory, backed: Sim, fallback: Float[Array, ""]
+    ) -> tuple[Bool[Array, ""], Mapping[str, Any]]:
+        """The certificate of the state after a step of backing up, and the end of its horizon.
+
+        All but the last of its steps are those of the certificate before it, so only that one is predicted.
+        """
+        end = sim.replace(time=sim.time + self.horizon * env.dt, platforms=memory.ahead, regions={}, status={})
+        later = others_later(env, end)
+        further = advance(env, end, self._backup(env, end, memory, later), later)
+        holds = jnp.stack([_none(backup.faults(env, backed, self)) for backup in self.backups])[memory.backup_index]
+        keeps = (self.lowest(env, end, further) >= self.required_margin(env)) & (fallback >= 0.0)
+        renewed = memory.certified & keeps & self._ended(env, further) & holds & _finite(backed)
+        return renewed, jax.lax.stop_gradient(further.platforms)
+
+    def _best(self, env: Any, paths: Paths) -> Int[Array, ""]:
+        """The backup controller of the largest h on its way, among those that are certified if there are any."""
+        certified = paths.values >= self.required_margin(env)
+        compared = jnp.where(jnp.any(certified), paths.values, paths.least)
+        return jnp.argmax(jnp.where(jnp.isnan(compared), -jnp.inf, compared)).astype(jnp.int32)
 
     def _backup(self, env: Any, sim: Sim, memory: RTAMemory, later: Others) -> Float[Array, " m"]:
         each = jnp.stack([backup.control(env, sim, later) for backup in self.backups])
@@ -227,5 +343,17 @@ def repeated(parts: Sequence[Any]) -> str | None:
     return f"the name {twice!r} is there twice" if twice else None
 
 
-def _highest(values: Float[Array, " n"]) -> Int[Array, ""]:
-    return jnp.argmax(jnp.where(jnp.isnan(values), -jnp.inf, values)).astype(jnp.int32)
+def _none(faults: Faults) -> Bool[Array, ""]:
+    return ~functools.reduce(jnp.logical_or, faults.values(), jnp.zeros((), bool))
+
+
+def _finite(sim: Sim) -> Bool[Array, ""]:
+    return functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(sim.platforms)])
+
+
+def _where(condition: Bool[Array, ""], this: Any, other: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), this, other)
+
+
+def _chosen(ahead: Mapping[str, Any], index: Int[Array, ""]) -> Mapping[str, Any]:
+    return jax.lax.stop_gradient(jax.tree.map(lambda leaf: leaf[index], ahead))

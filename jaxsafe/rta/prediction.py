@@ -34,8 +34,11 @@ def advance(env: Any, sim: Sim, control: Float[Array, " m"], later: Others | Non
 
 
 def later_sim(env: Any, sim: Sim, platforms: Others) -> Sim:
-    """The simulation one step later, from its platforms then."""
-    return sim.replace(time=sim.time + env.dt, platforms=platforms, regions={}, status={})
+    """The simulation one step later, from its platforms then. Its time is a whole number of steps, as in the plant."""
+    time = sim.time + env.dt
+    whole = jnp.round(time / env.dt) * env.dt
+    time = jnp.where(jnp.abs(time - whole) < 1e-3 * env.dt, whole, time)
+    return sim.replace(time=time, platforms=platforms, regions={}, status={})
 
 
 def others_later(env: Any, sim: Sim) -> Others:
@@ -86,7 +89,7 @@ def judge(env: Any, sim: Sim, before: Sim | None = None) -> Sim:
     sim = sim.replace(regions={region.name: region.place(sim.platforms) for region in env.regions}, status={})
     earlier = None if before is None else judge(env, before)
     for status in env.status:
-        value = status.process(status.init(sim), sim) if earlier is None else status.on_the_way(earlier, sim)
+        value = status.process(status.init(sim), sim) if earlier is None else status.on_the_way(env, earlier, sim)
         sim = sim.replace(status={**sim.status, status.name: value})
     return sim
 

@@ -41,7 +41,7 @@ class Blend(CertifiedRTA, type="blend"):
         mixed = backup + shares[:, None] * (desired - backup)
         mixed = mixed.at[-1].set(desired)  # to the last bit
         values = jax.vmap(lambda u: jnp.max(self.certify(env, sim, advance(env, sim, u))))(mixed)
-        passes = values >= self.margin
+        passes = values >= self.required_margin(env)
         largest = self.parts - 1 - jnp.argmax(passes[::-1])
         return jnp.where(jnp.any(passes), mixed[largest], backup), jnp.any(passes)
 
@@ -65,14 +65,14 @@ class CollisionSimplex(RTA, type="collision_simplex"):
         no, zero = jnp.zeros((), bool), jnp.zeros((), jnp.int32)
         nearest, _ = self._predict(env, sim)
         info = RTAInfo(jnp.zeros_like(sim.time), ~no, no, nearest - self.engage, zero)
-        return RTAMemory(no, zero, no), info
+        return RTAMemory(intervening=no, backup_index=zero, certified=no, ahead={}), info
 
     def filter(
         self, env: Any, sim: Sim, memory: RTAMemory, desired: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], RTAMemory, RTAInfo]:
         wanted, finite = admissible(env, desired)
         nearest, turn = self._predict(env, sim)
-        on = jnp.where(memory.intervening, nearest <= self.release, nearest <= self.engage)
+        on = ~(nearest > jnp.where(memory.intervening, self.release, self.engage))  # also where it is not a number
         controls = {"heading_rate": turn, "acceleration": jnp.zeros_like(turn)}
         backup = admissible(env, jnp.stack([controls[name] for name in env.action_names]))[0]
         actual = jnp.where(on, backup, wanted)

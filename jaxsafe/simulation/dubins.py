@@ -193,6 +193,20 @@ class Dubins3D(Platform, type="dubins3d"):
         turn = controls.get("heading_rate", self._turn(sin_cos(state.roll), state.speed))
         return Dubins3DState(state.velocity, turn, acceleration, gamma, roll)
 
+    def held(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Controls:
+        if "heading_rate" not in controls:
+            return controls
+        others = {name: value for name, value in controls.items() if name != "heading_rate"}
+        return {**others, "roll_rate": self._roll_rate(state, controls, dt)}
+
+    def bend(self, before: Dubins3DState, after: Dubins3DState, dt: Seconds) -> Float[Array, ""]:
+        """As for any platform, and for the acceleration across the velocity, which changes with the roll.
+
+        While it passes from one value to another, in whatever way, the path leaves that of its mean by ‖Δa‖Δt²/54 at most.
+        """
+        across = [self.gravity * jnp.tan(state.roll) * jnp.cos(state.flight_path_angle) for state in (before, after)]
+        return super().bend(before, after, dt) + jnp.abs(across[1] - across[0]) * dt**2 / 54.0
+
     def _turn(self, bank: tuple[Array, Array], speed: Array) -> Array:
         """Heading rate ψ̇ = g/v tan φ from the sine and cosine of the bank φ, by one division."""
         return self.gravity * bank[0] / (speed * bank[1])

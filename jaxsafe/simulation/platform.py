@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxsafe.component import Component, Range
 from jaxsafe.errors import ConfigError, nearest, show
 from jaxsafe.simulation.controllers import Controller, Controls, Uncontrolled
+from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.simulation.initializers import Initializer
 from jaxsafe.types import Key, Record, Seconds, Sim
 
@@ -57,6 +58,17 @@ class Platform(Component):
     def step_within_limits(self, state: Any, controls: Controls, dt: Seconds) -> Any:
         """`step` for controls under which no state reaches a limit before the end, which may be cheaper to compute."""
         return self.step(state, controls, dt)
+
+    def held(self, state: Any, controls: Controls, dt: Seconds) -> Controls:
+        """Return controls that do over a part of a step what the given ones do over all of it, `dt` seconds."""
+        return controls
+
+    def bend(self, before: Any, after: Any, dt: Seconds) -> Float[Array, ""]:
+        """Return how far the path may leave the straight line between the states before and after a step.
+
+        It is ‖Δv‖Δt/8 at a constant acceleration, and up to 32/27 of that where it stops on the way, at a limit.
+        """
+        return 0.15 * safe_norm(after.velocity - before.velocity) * dt
 
     def derivative(self, state: Any, controls: Controls) -> Any:
         """Return the time derivative of the state, a record like it: f(x) + g(x)u, Eq. (3)."""

@@ -24,6 +24,10 @@ class Command(Component):
         """Return the control in physical units, held over the step."""
         raise NotImplementedError
 
+    def extremes(self) -> tuple[Number, Number]:
+        """Return the smallest and the largest control there can be at any time; infinite where that is not known."""
+        return -jnp.inf, jnp.inf
+
 
 class Scripted(Controller, type="scripted"):
     """Follows its commands; controls without one are 0."""
@@ -46,6 +50,9 @@ class Constant(Command, type="constant"):
     def value(self, sim: Sim) -> Float[Array, ""]:
         return self.at
 
+    def extremes(self) -> tuple[Number, Number]:
+        return self.at, self.at
+
 
 class Schedule(Command, type="schedule"):
     """Piecewise constant: `values[k]` from `times[k]` until the next time, 0 before the first."""
@@ -64,6 +71,9 @@ class Schedule(Command, type="schedule"):
         steps = jnp.diff(self.values, prepend=0.0)
         return jnp.sum(jnp.where(reached(sim.time, self.times), steps, 0.0))
 
+    def extremes(self) -> tuple[Number, Number]:
+        return jnp.minimum(jnp.min(self.values), 0.0), jnp.maximum(jnp.max(self.values), 0.0)
+
 
 class Sinusoid(Command, type="sinusoid"):
     """Weaving: amplitude · sin(2π t/period + phase)."""
@@ -74,3 +84,7 @@ class Sinusoid(Command, type="sinusoid"):
 
     def value(self, sim: Sim) -> Float[Array, ""]:
         return self.amplitude * sin_cos(2.0 * jnp.pi * sim.time / self.period + self.phase)[0]
+
+    def extremes(self) -> tuple[Number, Number]:
+        size = jnp.abs(self.amplitude)
+        return -size, size

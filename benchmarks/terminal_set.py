@@ -1,0 +1,188 @@
+"""From which angles does the backup of oriented docking hold the speed limit for ever, and how far from the chief?
+
+`align_and_brake` turns the thrust axis along the velocity. Let e be the course less the axis and w the turn of the body.
+What e and w become over a step depends on the distance and on the velocity only by how far the course may turn, and that
+has a bound. So the plane of e and w is cut into cells, each cell is mapped with interval arithmetic to all cells that it
+may reach under every course within the bound, and the cells are followed until there are no new ones. Printed are
+
+- the largest angle that is ever reached from `angle` or less at any spin,
+- the steps until the axis is within `angle`, from any angle and spin, and then until it is within `aligned`,
+- the distance up to which the weaker thrust holds the limit at that largest angle, against gravity and the shrinking limit.
+
+`docs/rta.md` has the proof that these are steps of; `jaxsafe/rta/backups.py` keeps the numbers.
+
+    python benchmarks/terminal_set.py [angle=75] [dt=1] [cells=1440]
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from isolated import words
+
+import jaxsafe
+from jaxsafe.rta.presets import TURN
+from jaxsafe.rta.speed_limit import speed_limit_facts
+
+LOW_SHARE = 0.3
+"""Below this share of the speed limit nothing is asked of the angle: the limit is far."""
+
+FLIPS = 6
+"""How often the nearer end of the axis may change on the way, see docs/rta.md."""
+
+MOST_STEPS = 200
+
+SLACK = 1.01
+"""For the straightened limit, and for speeds a little below it."""
+
+
+def main() -> None:
+    """Prove and print."""
+    options = words(angle="75", dt="1", cells="1440")
+    env = jaxsafe.make("docking2d_oriented", {"dt": float(options["dt"])})
+    proof = Proof(env, float(options["angle"]), int(options["cells"]))
+    for line in proof.lines():
+        print(line)
+
+
+class Proof:
+    """Angles in degrees, rates in degrees a second."""
+
+    def __init__(self, env: jaxsafe.Environment, angle: float, cells: int) -> None:
+        plant: Any = env.agent_platform
+        backup, wheel = TURN["backups"][0], plant.controller.actuators[1]
+        facts = speed_limit_facts(env, "velocity_limit")
+        assert facts is not None
+        self.margin = max(float(facts.least_margin), backup.margin)
+        self.dt, self.n = float(env.dt), float(facts.mean_motion)
+        self.floor, self.slope = float(facts.floor), float(facts.slope)
+        self.weakest, self.strongest = float(facts.weakest), float(facts.strongest)
+        self.wheel = math.degrees(float(wheel.high))
+        self.spin = math.degrees(float(plant.attitude_rate_limits[1]))
+        self.angle, self.aligned = angle, math.degrees(backup.aligned)
+        edges = np.linspace(-90.0, 90.0, cells + 1)
+        spins = np.linspace(-self.spin, self.spin, 161)
+        self.low, self.high = (grid[..., None] for grid in (edges[:-1], edges[1:]))
+        self.slower, self.faster = spins[None, :-1], spins[None, 1:]
+        self.width = 180.0 / cells
+        self.num = (cells, 160)
+
+    def gravity(self, share: float) -> float:
+        """How far gravity and the Coriolis force turn the course in a step, at a share of the speed limit."""
+        return math.degrees((2.0 * self.n + 1.5 * self.n / share) * self.dt)
+
+    def needed(self, first: bool) -> float:
+        """What thrust must take off in a step so that the limit is kept with twice the margin, as a share of the speed."""
+        return SLACK * (2.0 * self.n * self.dt + first * self.margin / (self.floor - 2.0 * self.margin))
+
+    def thrust_turn(self, error: np.ndarray, first: bool) -> np.ndarray:
+        """How far the least thrust that holds the limit turns the course in a step; infinite where none holds it."""
+        error = np.radians(np.minimum(error, 90.0))
+        sine, cosine = np.sin(error), np.maximum(np.cos(error), 1e-9)
+        root = cosine**2 - 2.0 * self.needed(first) * sine**2  # thrust across the velocity lengthens it
+        push = SLACK * (cosine - np.sqrt(np.maximum(root, 0.0))) / np.maximum(sine, 1e-9) ** 2
+        turn = np.degrees(np.arctan2(push * sine, 1.0 - push * cosine))
+        return np.where((root > 0.0) & (error > 1e-3), turn, np.where(error > 1e-3, np.inf, 0.0))
+
+    def course(self, first: bool) -> np.ndarray:
+        """How far the course may turn in a step, for each cell of the angle."""
+        error = np.maximum(np.abs(self.low), np.abs(self.high)) + self.spin * self.dt + 1.0
+        near = self.gravity(0.99) + self.thrust_turn(error, first)
+        return np.maximum(near, self.gravity(LOW_SHARE))
+
+    def swing(self) -> float:
+        """The largest angle after a step of braking along the body from within `aligned`, above `LOW_SHARE`."""
+        least = LOW_SHARE * self.floor
+        across = math.sin(math.radians(self.aligned + self.spin * self.dt + 1.0))
+        ratio = (least + self.strongest * self.dt) * across / least
+        return math.degrees(math.asin(min(ratio, 1.0))) + self.spin * self.dt + 1.0
+
+    def rate(self, error: np.ndarray) -> np.ndarray:
+        return np.sign(error) * np.minimum(self.spin, np.sqrt(1.6 * self.wheel * np.abs(error)))
+
+    def after(self, error: np.ndarray, spin: np.ndarray) -> np.ndarray:
+        """The spin after a step: it grows with both."""
+        return np.clip(self.rate(error), spin - self.wheel * self.dt, spin + self.wheel * self.dt)
+
+    def image(self, cells: np.ndarray, course: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+        """All cells that may be reached in a step in which the course turns by up to `course` either way.
+
+        Those beyond ±90°, where the angle is one from the other end of the axis, stand apart.
+        """
+        slowest, fastest = self.after(self.low, self.slower), self.after(self.high, self.faster)
+        least = self.low - (self.faster + fastest) / 2.0 * self.dt - course
+        most = self.high - (self.slower + slowest) / 2.0 * self.dt + course
+        step = 2.0 * self.spin / self.num[1]
+        columns = np.floor((np.stack([slowest, fastest]) + self.spin) / step + [[[-1e-9]], [[1e-9]]]).astype(int)
+        columns = np.clip(columns, 0, self.num[1] - 1)
+        rows = np.floor((np.stack([least, most]) + 90.0) / self.width + [[[-1e-9]], [[1e-9]]])
+        rows = np.clip(rows, -self.num[0], 2 * self.num[0] - 1).astype(int)
+        marks = np.zeros((3 * self.num[0] + 1, self.num[1] + 1), int)  # corners of rectangles; their sums fill them
+        chosen = np.nonzero(cells)
+        first, last = (side[chosen] + self.num[0] for side in rows)
+        left, right = (side[chosen] for side in columns)
+        for row, column, sign in ((first, left, 1), (last + 1, left, -1), (first, right + 1, -1), (last + 1, right + 1, 1)):
+            np.add.at(marks, (row, column), sign)
+        filled = marks.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0
+        below, same, above = filled.reshape(3, *self.num)
+        return same, below | above
+
+    def within(self, angle: float) -> np.ndarray:
+        """The cells of an angle or less, at any spin."""
+        inside = np.maximum(np.abs(self.low), np.abs(self.high)) <= angle + 1e-9
+        return np.broadcast_to(inside, self.num)
+
+    def closure(self) -> np.ndarray | None:
+        """The cells that are ever reached from `angle` or less at any spin; None if the axis escapes."""
+        begin, aligned, first = self.within(self.angle), self.within(self.aligned), self.course(first=True)
+        known = begin | np.logical_or(*self.image(begin & ~aligned, first))
+        fresh, later = known & ~aligned, self.course(first=False)
+        while fresh.any():
+            if not np.isfinite(later[np.nonzero(fresh)[0]]).all():
+                return None
+            reached = np.logical_or(*self.image(fresh, later))
+            fresh = reached & ~known
+            known |= reached
+        return known
+
+    def largest(self, cells: np.ndarray) -> float:
+        """The largest angle of some cells."""
+        return float(np.maximum(np.abs(self.low), np.abs(self.high))[cells.any(axis=1)].max())
+
+    def steps(self, begin: np.ndarray, goal: float, course: np.ndarray | float) -> int | None:
+        """The steps until all cells have been within an angle, if the nearer end changes `FLIPS` times; None if never."""
+        goals, layers = self.within(goal), [begin, *(np.zeros(self.num, bool) for _ in range(FLIPS))]
+        for count in range(MOST_STEPS):
+            layers = [cells & ~goals for cells in layers]
+            if not any(cells.any() for cells in layers):
+                return count
+            images = [self.image(cells, course) for cells in layers]
+            layers = [images[0][0], *(images[i + 1][0] | images[i][1] for i in range(FLIPS))]
+        return None
+
+    def hold(self, largest: float) -> float:
+        """The distance up to which the weaker thrust holds the limit at the largest angle."""
+        angle = math.radians(largest + self.spin * self.dt + 1.0)
+        spare = self.weakest * math.cos(angle) / SLACK - self.margin / self.dt - self.slope * self.floor
+        return spare / max(3.0 * self.n**2, self.slope**2)
+
+    def lines(self) -> list[str]:
+        """What was proved, in words."""
+        known, swing = self.closure(), self.swing()
+        if known is None or swing > self.angle:
+            return [f"not proved: from {self.angle:g}° the angle may escape (swing {swing:.1f}°)"]
+        largest = self.largest(known)
+        every, drift, later = np.ones(self.num, bool), self.gravity(LOW_SHARE), self.course(first=False)
+        turned, within = self.steps(every, self.angle, drift), self.steps(known, self.aligned, later)
+        return [
+            f"dt {self.dt:g} s, margin {self.margin:g} m/s, wheel {self.wheel:g}°/s², spin {self.spin:g}°/s",
+            f"from {self.angle:g}° at any spin: never above {largest:.2f}°; braking swings it to {swing:.1f}° at most",
+            f"from any angle and spin: within {self.angle:g}° after {turned} steps, then {self.aligned:g}° after {within}",
+            f"the limit is held up to {self.hold(largest):.0f} m",
+        ]
+
+
+if __name__ == "__main__":
+    main()
