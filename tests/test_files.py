@@ -1,9 +1,11 @@
+import json
 from pathlib import Path
 
 import pytest
 
 from jaxsafe.errors import ConfigError
-from jaxsafe.train.files import append_csv, append_rows, keep_rows, read_rows, write_json, write_text
+from jaxsafe.train.files import append_csv, append_rows, keep_rows, read_json, read_rows, write_json, write_text
+from jaxsafe.train.forms import COUNT, MAYBE, OTHERS, numbers
 
 
 def test_a_last_line_cut_short_by_a_kill_is_not_a_row(tmp_path: Path) -> None:
@@ -25,7 +27,39 @@ def test_a_line_that_is_no_row_of_the_log_is_an_error_that_names_it(tmp_path: Pa
     for line in ('{"a": 1}', "[1]", "null0"):
         log.write_text(line + "\n")
         with pytest.raises(ConfigError, match=r"log\.jsonl, line 1: not a "):
-            read_rows(log, ("step",))
+            read_rows(log, {"step": COUNT})
+
+
+@pytest.mark.parametrize(
+    ("row", "found"),
+    [
+        ({"step": "1"}, r"step: expected a whole number ≥ 0, found '1'"),
+        ({"step": True}, "step: expected a whole number ≥ 0, found True"),
+        ({"step": 2**64}, "step: expected a whole number ≥ 0, found 1844674"),
+        ({"step": 1, "at": [{"x": "0"}]}, r"at\.\[0\]\.x: expected a number or null, found '0'"),
+        ({"step": 1, "at": {}}, r"at: expected a list, found {}"),
+        ({"step": 1, "at": [], "more": []}, r"more: expected a list of length 2, each a number or null, found \[\]"),
+        ({"step": 1, "at": []}, "more: expected a list of length 2, each a number or null, found nothing"),
+    ],
+)
+def test_a_row_of_another_form_is_told_with_its_line_and_place(tmp_path: Path, row: dict, found: str) -> None:
+    log = tmp_path / "log.jsonl"
+    log.write_text('{"step": 0, "at": [], "more": [1, null]}\n' + json.dumps(row) + "\n")
+    with pytest.raises(ConfigError, match=rf"log\.jsonl, line 2: not a row of this log: {found}"):
+        read_rows(log, {"step": COUNT, "at": [{OTHERS: MAYBE}], "more": numbers(2)})
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 40 + "]" * 40, "[" * 10**6, '{"a":' * 40 + "0" + "}" * 40, "NaN", "[Infinity]", "{"]
+)
+def test_what_is_nested_deeply_or_no_json_is_not_read(tmp_path: Path, text: str) -> None:
+    for name, read, wrong in (
+        ("x.json", read_json, "not a JSON file"),
+        ("x.jsonl", read_rows, "line 1: not a line of JSON"),
+    ):
+        (tmp_path / name).write_text(f"{text}\n")
+        with pytest.raises(ConfigError, match=wrong):
+            read(tmp_path / name)
 
 
 def test_logs_are_cut_back_to_the_rows_to_keep(tmp_path: Path) -> None:

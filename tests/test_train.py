@@ -19,13 +19,14 @@ from tiny import TINY
 from jaxsafe import cli
 from jaxsafe.envs import TASKS
 from jaxsafe.errors import ConfigError
+from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.train import __main__ as command
 from jaxsafe.train import directory, hosts
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import recipe
 from jaxsafe.train.loop import Clock, Training
 from jaxsafe.train.policy import load_policy, read_policy
-from jaxsafe.train.restore import structure
+from jaxsafe.train.restore import restore
 
 
 def logs(run: Path) -> dict[str, list[dict[str, Any]]]:
@@ -41,7 +42,7 @@ def logs(run: Path) -> dict[str, list[dict[str, Any]]]:
 def final_state(run: Path) -> Any:
     config, env, _ = directory.read(run, "run")
     checkpoints = Checkpoints(run)
-    content, facts = checkpoints.restore(checkpoints.steps[-1], structure(env, config))
+    content, facts = restore(checkpoints, checkpoints.steps[-1], env, config)
     state = content["state"].replace(key=jax.random.key_data(content["state"].key))
     return {"state": state, "best": content["best"], "updates": facts["updates"]}
 
@@ -378,6 +379,100 @@ def test_a_damaged_progress_log_is_told_before_anything_is_done(tmp_path: Path, 
     (run / "progress.jsonl").unlink()
     with pytest.raises(ConfigError, match=r"progress\.jsonl: expected 60 rows up to step 1280, found 0"):
         command.main([f"resume={run}"])
+
+
+def test_a_log_that_lost_its_end_is_gone_back_to_the_checkpoint_that_it_covers(
+    tmp_path: Path, whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    (run / "results.json").unlink()
+    lines = (run / "progress.jsonl").read_text().splitlines(keepends=True)
+    (run / "progress.jsonl").write_text(
+        "".join(lines[:47]) + lines[47][:9]
+    )  # up to step 960 with 15 whole updates of 3 seeds
+    assert command.main([f"resume={run}"]) == 0
+    assert "progress.jsonl ends before the checkpoint of step 1,280: going on from 960" in capsys.readouterr().out
+    assert_same_end(run, whole)
+
+
+def flip(file: Path, place: float, bit: int) -> None:
+    content = bytearray(file.read_bytes())
+    content[int(place * len(content))] ^= 1 << bit
+    file.write_bytes(content)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_flipped_bit_in_a_checkpoint_is_told_or_changes_nothing(tmp_path: Path, whole: Path, seed: int) -> None:
+    draw, expected, refused = random.Random(seed), final_state(whole), 0
+    for number in range(4):
+        run = tmp_path / str(number)
+        shutil.copytree(whole / "checkpoints" / "1280", run / "checkpoints" / "1280")
+        shutil.copy(whole / "config.yaml", run)
+        data = sorted((run / "checkpoints").rglob("d/*"), key=lambda file: -file.stat().st_size)[:2]
+        flip([*data, run / "checkpoints" / "1280" / "facts" / "metadata"][number % 3], draw.random(), draw.randrange(8))
+        try:
+            found = final_state(run)
+        except ConfigError:
+            refused += 1
+        else:
+            jax.tree.map(np.testing.assert_array_equal, found, expected)
+    assert refused
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("seeds: 3", "seeds: 5", r"config\.yaml: training\.seeds: found 5, but the checkpoints were made with 3; put"),
+        ("seed: 0", "seed: 1", r"config\.yaml: training\.seed: found 1, but .* made with 0"),
+        ("gamma: 0.", "gamma: 0.1", r"config\.yaml: training\.ppo\.gamma: found 0\.1"),
+        ("dt: 1.0", "dt: 2.0", r"config\.yaml: environment\.dt: found 2\.0, but .* made with 1\.0"),
+        ("hidden: [8]", "hidden: [9]", r"config\.yaml: training\.agent\.hidden\.\[0\]: found 9"),
+    ],
+)
+def test_a_checkpoint_is_tied_to_the_configuration_that_made_it(
+    tmp_path: Path, whole: Path, old: str, new: str, message: str
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    (run / "results.json").unlink()
+    text = (run / "config.yaml").read_text()
+    assert old in text
+    (run / "config.yaml").write_text(text.replace(old, new))
+    for main, option in ((command.main, "resume"), (evaluate.main, "run")):
+        with pytest.raises(ConfigError, match=message):
+            main([f"{option}={run}"])
+
+
+def test_a_run_may_go_on_for_longer_and_look_at_itself_more_often(tmp_path: Path, whole: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    text = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(
+        text.replace("steps: 1280", "steps: 1500").replace("eval_every: 320", "eval_every: 64")
+    )
+    jax.tree.map(np.testing.assert_array_equal, final_state(run), final_state(whole))
+
+
+@pytest.mark.parametrize("name", ["sha256", "made_from", "updates", "wall_s", None])
+def test_facts_of_a_checkpoint_are_checked_and_those_of_before_are_known(
+    tmp_path: Path, whole: Path, name: str | None
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    file = run / "checkpoints" / "1280" / "facts" / "metadata"
+    facts = json.loads(file.read_text())
+    if name is None:  # as they were before checkpoints had digests
+        file.write_text(json.dumps({key: facts[key] for key in ("updates", "wall_s", "compile_s")}))
+        jax.tree.map(np.testing.assert_array_equal, final_state(run), final_state(whole))
+        return
+    for value in (None, "x", -1, [[]], 10**30):
+        file.write_text(json.dumps({**facts, name: value}))
+        with pytest.raises(ConfigError, match=r"checkpoint|config\.yaml"):
+            final_state(run)
+    file.write_text(json.dumps([facts]))
+    with pytest.raises(ConfigError, match="facts: expected a mapping"):
+        final_state(run)
 
 
 def test_a_corrupt_checkpoint_leaves_one_line_on_standard_error(tmp_path: Path, whole: Path) -> None:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import hashlib
 import io
+import json
 import logging
 import shutil
 import time
@@ -21,6 +23,7 @@ import numpy as np
 
 from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.train import hosts
+from jaxsafe.train.forms import check
 from jaxsafe.types import is_key
 
 logging.getLogger("absl").setLevel(logging.ERROR)
@@ -31,6 +34,9 @@ QUIET_S = 0.5
 
 SETTLE_S = 10.0
 """How long they get for that at most."""
+
+PRECISION, DIGEST = "precision", "sha256"
+"""Facts that are added to those of a checkpoint: the type of its numbers, and the digest of all else in it."""
 
 ASIDE = ".before"
 """Ends the name of a checkpoint while the one that takes its place is written."""
@@ -57,8 +63,13 @@ class Checkpoints:
         return sorted(self._manager.all_steps()) if hasattr(self, "_manager") else []
 
     def save(self, step: int, state: Any, facts: dict[str, Any]) -> None:
-        """Write one checkpoint, or write it anew: a pytree of arrays on the host, of keys their words, and some JSON."""
+        """Write one checkpoint, or write it anew: a pytree of arrays on the host, of keys their words, and some JSON.
+
+        A digest of both is written with them, which `restore` compares.
+        """
         ocp = self._ocp
+        facts = {**facts, PRECISION: jnp.result_type(float).name}
+        facts[DIGEST] = _digest(state, facts)
         place, before = self.directory / str(step), self.directory / f"{step}{ASIDE}"
         if step in self.steps:
             if hosts.leads():
@@ -79,23 +90,51 @@ class Checkpoints:
                 before.rename(before.with_suffix(""))
         hosts.meet("taken back")
 
-    def restore(self, step: int, like: Any) -> tuple[Any, dict[str, Any]]:
-        """Read one checkpoint, as arrays on the host, into the structure and shapes of `like`.
+    def facts(self, step: int) -> dict[str, Any]:
+        """Read the JSON of one checkpoint, as it stands there.
 
         Raises:
-            ConfigError: there is none at this step, or it is broken or of another run.
+            ConfigError: there is none at this step, or it is broken.
         """
+        facts = self._read(step, facts=self._ocp.args.JsonRestore())["facts"]
+        check(facts, {}, f"{self.directory / str(step)}: facts")
+        return facts
+
+    def restore(self, step: int, like: Any) -> Any:
+        """Read one checkpoint, as arrays on the host, into the structure and shapes of `like`.
+
+        A checkpoint that was written before there were digests is read without comparing one.
+
+        Raises:
+            ConfigError: there is none at this step, or it is broken, damaged or of another run.
+        """
+        facts, place, now = self.facts(step), self.directory / str(step), jnp.result_type(float).name
+        if facts.get(PRECISION, now) != now:
+            raise ConfigError(f"{place}: checkpoint was written in {facts[PRECISION]}, this process computes in {now}")
+        abstract = jax.tree.map(_empty, like)
+        state = self._read(step, state=self._ocp.args.StandardRestore(abstract))["state"]
+        for (path, found), wanted in zip(
+            jax.tree_util.tree_leaves_with_path(state), jax.tree.leaves(abstract), strict=True
+        ):
+            if found.shape != wanted.shape:
+                name = jax.tree_util.keystr(path, simple=True, separator="/")
+                raise ConfigError(
+                    f"{place}: checkpoint is of another run: {name} has shape {found.shape}, expected {wanted.shape}"
+                )
+        digest = facts.pop(DIGEST, None)
+        if (digest is not None or PRECISION in facts) and digest != _digest(state, facts):
+            raise ConfigError(f"{place}: checkpoint is damaged: its content is not what was written")
+        return jax.tree.map(_as, state, like)
+
+    def _read(self, step: int, **args: Any) -> Any:
         if step not in self.steps:
             raise ConfigError(
                 f"checkpoint: no step {step} in {self.directory}; choose from {nearest(step, self.steps) or 'none'}"
             )
-        ocp = self._ocp
-        abstract = jax.tree.map(_empty, like)
-        args = ocp.args.Composite(state=ocp.args.StandardRestore(abstract), facts=ocp.args.JsonRestore())
-        restored, reason = {}, ""
+        read, reason = {}, ""
         with _silence() as complaints:
             try:
-                restored = self._manager.restore(step, args=args)
+                read = self._manager.restore(step, args=self._ocp.args.Composite(**args))
             except Exception as error:  # orbax and tensorstore raise whatever their layers raise
                 lines = [line for line in str(error).splitlines() if line.strip()]
                 reason = (lines or [type(error).__name__])[0][:120]
@@ -103,7 +142,7 @@ class Checkpoints:
                 _settle(complaints)
         if reason:
             raise ConfigError(f"{self.directory / str(step)}: checkpoint cannot be read: {reason}")
-        return jax.tree.map(_as, restored["state"], like), restored["facts"]
+        return read
 
 
 @contextlib.contextmanager
@@ -124,6 +163,16 @@ def _settle(complaints: io.StringIO) -> None:
         said = complaints.tell()
         time.sleep(QUIET_S)
     gc.collect()
+
+
+def _digest(state: Any, facts: dict[str, Any]) -> str:
+    """Return the SHA-256 of arrays with their names, types and shapes, and of the facts."""
+    found = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+    for path, leaf in jax.tree_util.tree_leaves_with_path(state):
+        array = np.asarray(leaf)
+        found.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}".encode())
+        found.update(array.tobytes())
+    return found.hexdigest()
 
 
 def _empty(shape: Any) -> np.ndarray:

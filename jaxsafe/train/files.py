@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe.errors import ConfigError
+from jaxsafe.train.forms import ANYTHING, check, is_deep
 
 
 def write_text(path: Path, text: str) -> None:
@@ -35,56 +36,71 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(finite(value), indent=2, allow_nan=False) + "\n")
 
 
-def read_json(path: Path) -> Any:
-    """Read a JSON file.
+def read_json(path: Path, form: Any = ANYTHING) -> Any:
+    """Read a JSON file of a form.
 
     Raises:
-        ConfigError: it is missing or broken.
+        ConfigError: it is missing, broken, or of another form.
     """
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        value = _decode(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError:
         raise ConfigError(f"{path}: not a JSON file") from None
+    check(value, form, str(path))
+    return value
 
 
 def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Add a line of JSON for each row."""
     with open(path, "a", encoding="utf-8") as file:
-        file.writelines(json.dumps(finite(row), allow_nan=False) + "\n" for row in rows)
+        file.writelines(map(_line, rows))
 
 
-def read_rows(path: Path, needs: Sequence[str] = ()) -> list[dict[str, Any]]:
-    """The rows of a log; a last line that a kill cut short is not one, and neither is a missing file.
+def write_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    """Replace a log by these rows, or leave it as it was."""
+    write_text(path, "".join(map(_line, rows)))
+
+
+def read_rows(path: Path, form: Any = ANYTHING) -> list[dict[str, Any]]:
+    """Return the rows of a log, none if there is no file. A last line that a kill cut short is not a row.
 
     Raises:
-        ConfigError: another line is broken, or lacks one of the columns in `needs`.
+        ConfigError: another line is broken, or a row has not this form.
     """
     if not path.exists():
         return []
     lines = path.read_bytes().split(b"\n")
     rows = []
     for number, line in enumerate(lines, start=1):
+        if not line:
+            continue
+        place = f"{path}, line {number}"
         try:
-            row = json.loads(line) if line else None
+            row = _decode(line)
         except ValueError:  # of JSON or of UTF-8
             if number < len(lines):
-                raise ConfigError(f"{path}, line {number}: not a line of JSON") from None
-            row = None
-        if line and row is not None:
-            if not isinstance(row, dict) or not set(needs) <= set(row):
-                raise ConfigError(f"{path}, line {number}: not a row of this log")
-            rows.append(row)
+                raise ConfigError(f"{place}: not a line of JSON") from None
+            continue
+        for part in ({}, form):
+            check(row, part, f"{place}: not a row of this log")
+        rows.append(row)
     return rows
 
 
-def keep_rows(path: Path, keep: Callable[[dict[str, Any]], bool], needs: Sequence[str] = ()) -> list[dict[str, Any]]:
+def keep_rows(path: Path, keep: Callable[[dict[str, Any]], bool], form: Any = ANYTHING) -> list[dict[str, Any]]:
     """Cut a log back to the rows to keep, and return them; errors as in `read_rows`."""
-    rows = [row for row in read_rows(path, needs) if keep(row)]
+    rows = [row for row in read_rows(path, form) if keep(row)]
     if path.exists():
-        write_text(path, "".join(json.dumps(row) + "\n" for row in rows))
+        write_rows(path, rows)
     return rows
+
+
+def sync(path: Path) -> None:
+    """Wait until the disk has what was written to a file."""
+    with open(path, "ab") as file:
+        os.fsync(file.fileno())
 
 
 def append_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -106,6 +122,25 @@ def finite(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: finite(item) for key, item in value.items()}
     return [finite(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+def _decode(text: str | bytes) -> Any:
+    """Return the value of a JSON text; a ValueError if it is none, or holds NaN or too many lists inside each other."""
+    try:
+        value = json.loads(text, parse_constant=_refuse)
+    except RecursionError:
+        raise ValueError("too deep") from None
+    if is_deep(value):
+        raise ValueError("too deep")
+    return value
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is not JSON")
+
+
+def _line(row: Mapping[str, Any]) -> str:
+    return json.dumps(finite(row), allow_nan=False) + "\n"
 
 
 def _csv(rows: Sequence[Mapping[str, Any]], header: bool) -> str:

@@ -13,10 +13,39 @@ import numpy as np
 from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError, install
 from jaxsafe.metrics import measures
-from jaxsafe.train.files import append_csv, append_rows, keep_rows, write_csv
+from jaxsafe.train.files import append_csv, append_rows, read_rows, write_csv, write_rows
+from jaxsafe.train.forms import COUNT, FLAG, MAYBE, NUMBER, OTHERS
 
-NEEDS = ("seed", "step", "wall_s", "episodes", "cost", "success_rate", "return", "length")
-"""Columns that every row of the progress log has."""
+NEEDS = {
+    **dict.fromkeys(("seed", "step", "episodes", "cost"), COUNT),
+    "wall_s": NUMBER,
+    **dict.fromkeys(("success_rate", "return", "length"), MAYBE),
+    OTHERS: MAYBE | FLAG,
+}
+"""The form of every row of the progress log: columns that all have, and what the others hold."""
+
+
+def read_progress(run: Path) -> list[dict[str, Any]]:
+    """Return the rows of a run's progress log, none if it has not begun.
+
+    Raises:
+        ConfigError: a row is broken, has not the columns of the first, or stands in the wrong place.
+    """
+    path = run / "progress.jsonl"
+    rows = read_rows(path, NEEDS)
+    seeds = [row["seed"] for row in rows if row["step"] == rows[0]["step"]]
+    for index, row in enumerate(rows):
+        place = f"{path}, row {index + 1}"
+        if row.keys() != rows[0].keys():
+            different = ", ".join(sorted(row.keys() ^ rows[0].keys()))
+            raise ConfigError(f"{place}: expected the columns of the first row, they differ in {different}")
+        first = rows[index - index % len(seeds)]  # of the same update
+        if row["seed"] != seeds[index % len(seeds)] or row["step"] != first["step"]:
+            wanted = f"seed {seeds[index % len(seeds)]} at step {first['step']}"
+            raise ConfigError(f"{place}: expected {wanted}, found seed {row['seed']} at step {row['step']}")
+        if first is row and index and row["step"] <= rows[index - 1]["step"]:
+            raise ConfigError(f"{place}: expected a step after {rows[index - 1]['step']}, found {row['step']}")
+    return rows
 
 
 def filter_name(env: Environment) -> str:
@@ -41,9 +70,11 @@ class ProgressLog:
             ConfigError: rows are missing or broken.
         """
         self._jsonl, self._csv = run / "progress.jsonl", run / "progress.csv"
-        self.rows = keep_rows(self._jsonl, lambda row: row["step"] <= resume_step, NEEDS)
+        self.rows = [row for row in read_progress(run) if row["step"] <= resume_step]
         if len(self.rows) != expected:
             raise ConfigError(f"{self._jsonl}: expected {expected} rows up to step {resume_step}, found {len(self.rows)}")
+        if self._jsonl.exists():
+            write_rows(self._jsonl, self.rows)
         if self.rows:
             write_csv(self._csv, self.rows)
         else:

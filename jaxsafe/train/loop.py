@@ -1,8 +1,8 @@
 """The host's side of training: compiled chunks of updates, and between them logs, evaluations and checkpoints.
 
 All that decides the numbers is a function of the configuration and of the state in the checkpoint, and chunks begin at the
-same updates however often a run is interrupted: a resumed run ends bit for bit where the uninterrupted one ends, if as many
-devices share a seed.
+same updates however often a run is interrupted: a resumed run ends bit for bit where the uninterrupted one ends, if it has
+as many processor cores or accelerators as before.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import shutil
 import signal
 import time
+from collections import Counter
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -29,10 +30,11 @@ from jaxsafe.train import hosts, memory, ppo, window
 from jaxsafe.train.ahead import Ahead
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import TrainConfig
-from jaxsafe.train.files import append_rows, keep_rows, read_rows
-from jaxsafe.train.log import Display, ProgressLog, progress_rows
+from jaxsafe.train.files import append_rows, keep_rows, sync
+from jaxsafe.train.forms import COUNT
+from jaxsafe.train.log import Display, ProgressLog, progress_rows, read_progress
 from jaxsafe.train.ppo import TrainState
-from jaxsafe.train.restore import structure
+from jaxsafe.train.restore import made_from, restore, structure
 from jaxsafe.train.seeds import LANES, SEEDS, SeedMapper
 
 EVALUATION_SEED = 0
@@ -102,7 +104,7 @@ class Training:
         self._keep_copies()
         self.log = ProgressLog(self.run, self.step, self.updates * self.config.seeds, self.config.tensorboard)
         for name in ("eval.jsonl", "episodes.jsonl"):
-            keep_rows(self.run / name, self._known, ("step",))
+            keep_rows(self.run / name, self._known, {"step": COUNT})
         self.diverged = {}
         self._find_diverged(self.log.rows)
         self._prepared = True
@@ -173,7 +175,7 @@ class Training:
         like = self.mapper.like(jax.eval_shape(fresh, self.shared, keys), STATE)
         self.advance = Ahead(advance, self.shared, like)  # the longest first
         if self.checkpoints.steps:
-            self._restore(content)
+            self._restore()
         else:
             self.state = fresh(self.shared, keys)
             never = self.mapper.place(np.full(self.config.seeds, -1.0, np.float32))
@@ -182,8 +184,18 @@ class Training:
             self.evaluator.prepare(like.average)
         self.compile_s += time.monotonic() - begin
 
-    def _restore(self, content: Any) -> None:
-        content, facts = self.checkpoints.restore(self.checkpoints.steps[-1], content)
+    def _restore(self) -> None:
+        """Go back to the newest checkpoint that the progress log covers: a loss of power may have cut off its end."""
+        steps = self.checkpoints.steps
+        rows = Counter(row["step"] for row in read_progress(self.run))
+        done = {step: sum(count for at, count in rows.items() if at <= step) for step in steps}
+        covered = [step for step in steps if done[step] == step // self.config.ppo.batch_size * self.config.seeds]
+        newest = max(covered, default=steps[-1])  # without one, the log is refused when it is opened
+        if newest != steps[-1]:
+            print(
+                f"{self.run / 'progress.jsonl'} ends before the checkpoint of step {steps[-1]:,}: going on from {newest:,}"
+            )
+        content, facts = restore(self.checkpoints, newest, self.env, self.config)
         self.state, self.best = self.mapper.place(content["state"], STATE), self.mapper.place(content["best"])
         self.updates, self.compile_s = facts["updates"], facts["compile_s"]
         self.clock.spent += facts["wall_s"]
@@ -193,7 +205,7 @@ class Training:
         interval = self.config.every(self.config.checkpoint_every)
         due = (self.updates // interval + 1) * interval
         reached = -(-due // self.chunk) * self.chunk * self.config.ppo.batch_size
-        if any(row["step"] > reached for row in read_rows(self.run / "progress.jsonl", ("step",))):
+        if any(row["step"] > reached for row in read_progress(self.run)):
             print(f"checkpoints after step {self.step:,} are missing: going on from there, the longer logs kept as *.bak")
             for log in self.run.glob("*.jsonl"):
                 shutil.copy(log, log.with_suffix(".jsonl.bak"))
@@ -264,7 +276,14 @@ class Training:
             append_rows(self.run / "episodes.jsonl", ({**facts, "episode": number, **row} for row in rows))
 
     def _save(self) -> None:
-        facts = {"updates": self.updates, "wall_s": self.clock.seconds, "compile_s": self.compile_s}
+        for log in self.run.glob("*.jsonl"):
+            sync(log)  # a checkpoint outlives a loss of power, so the rows before it must
+        facts = {
+            "updates": self.updates,
+            "wall_s": self.clock.seconds,
+            "compile_s": self.compile_s,
+            "made_from": made_from(self.env, self.config),
+        }
         self.checkpoints.save(self.step, self.mapper.gather({"state": self.state, "best": self.best}), facts)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import reprlib
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +12,12 @@ import jax.numpy as jnp
 
 from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError, nearest
-from jaxsafe.train import ppo
+from jaxsafe.train import directory, ppo
 from jaxsafe.train.agent import Params
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import TrainConfig
+from jaxsafe.train.files import finite
+from jaxsafe.train.forms import AMOUNT, COUNT, check
 from jaxsafe.train.seeds import SeedMapper
 
 
@@ -30,6 +34,64 @@ def structure(env: Environment, config: TrainConfig) -> dict[str, Any]:
     }
 
 
+MAY_CHANGE = (
+    "steps",
+    "devices_per_seed",
+    "out",
+    "eval_every",
+    "eval_episodes",
+    "episodes",
+    "checkpoint_every",
+    "log_every",
+    "tensorboard",
+)
+"""Options that may differ from those of a checkpoint: how long to train, on what, and when to look at it."""
+
+
+def made_from(env: Environment, config: TrainConfig) -> dict[str, Any]:
+    """Return what a checkpoint is tied to, as JSON has it: the environment and the options that decide the numbers."""
+    content = json.loads(json.dumps(finite(directory.described(config, env))))
+    for name in MAY_CHANGE:
+        del content["training"][name]
+    return content
+
+
+def restore(checkpoints: Checkpoints, step: int, env: Environment, config: TrainConfig) -> tuple[Any, dict[str, Any]]:
+    """Read a checkpoint of this environment and configuration: its arrays and its facts.
+
+    Raises:
+        ConfigError: it cannot be read, or another environment or configuration made it.
+    """
+    facts, place = checkpoints.facts(step), f"{checkpoints.directory / str(step)}: facts"
+    check(facts, {"updates": COUNT, "wall_s": AMOUNT, "compile_s": AMOUNT}, place)
+    if "made_from" in facts:
+        path, before, now = _difference(facts["made_from"], made_from(env, config))
+        if path:
+            raise ConfigError(
+                f"{checkpoints.directory.parent / 'config.yaml'}: {path}: found {now}, but the checkpoints were made with"
+                f" {before}; put that back, or begin a new run"
+            )
+    if facts["updates"] * config.ppo.batch_size != step:
+        raise ConfigError(f"{place}: updates: expected those of {step} steps, found {facts['updates']}")
+    return checkpoints.restore(step, structure(env, config)), facts
+
+
+def _difference(before: Any, now: Any, place: str = "") -> tuple[str, Any, Any]:
+    """Return the dotted path to the first place where two trees of data differ, and what both have there."""
+    if isinstance(before, dict) and isinstance(now, dict):
+        names = [*dict.fromkeys([*before, *now])]
+        pairs = [(name, before.get(name, "nothing"), now.get(name, "nothing")) for name in names]
+    elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
+        pairs = [(f"[{index}]", *pair) for index, pair in enumerate(zip(before, now, strict=True))]
+    else:
+        return ("", None, None) if before == now else (place, reprlib.repr(before), reprlib.repr(now))
+    for name, one, other in pairs:
+        found = _difference(one, other, f"{place}.{name}" if place else name)
+        if found[0]:
+            return found
+    return "", None, None
+
+
 def load_params(mapper: SeedMapper, run: Path, config: TrainConfig, env: Environment, which: str) -> tuple[Params, int]:
     """The networks of every seed from a checkpoint, `last`, `best` or a step, and the step of that checkpoint.
 
@@ -43,5 +105,5 @@ def load_params(mapper: SeedMapper, run: Path, config: TrainConfig, env: Environ
         choices = ["last", "best", *map(str, checkpoints.steps)]
         raise ConfigError(f"checkpoint: found {which!r}; choose from {nearest(which, choices)}")
     step = int(which) if which.isdecimal() else checkpoints.steps[-1]
-    content, _ = checkpoints.restore(step, structure(env, config))
+    content, _ = restore(checkpoints, step, env, config)
     return mapper.place(content["best"]["params"] if which == "best" else content["state"].average), step

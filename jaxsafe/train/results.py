@@ -8,11 +8,12 @@ from typing import Any
 
 from jaxsafe import cli
 from jaxsafe.environment import Environment
-from jaxsafe.evaluate.seeds import given_up, metrics_per_seed
+from jaxsafe.evaluate.seeds import KINDS, given_up, metrics_per_seed
 from jaxsafe.metrics import ENOUGH_SEEDS, Episode, interaction_efficiency, over_seeds, with_interval
 from jaxsafe.origin import versions
 from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.files import read_json, write_json
+from jaxsafe.train.forms import AMOUNT, COUNT, NULL, NUMBER, OTHERS, SHARE, TEXT, Kind, check, numbers
 from jaxsafe.train.log import filter_name, headline
 from jaxsafe.train.loop import Training
 from jaxsafe.train.policy import save_policy
@@ -30,6 +31,13 @@ _ROWS = (
     ("episode_violation_severity_max", "violation severity, max", "%"),
     ("intervention_rate", "steps with an intervention", "%"),
 )
+
+_METRICS = {
+    **{name: AMOUNT for name, *_ in _ROWS},
+    "average_return": NUMBER,
+    **dict.fromkeys(("success_rate", "safety_violation_rate", "episode_safety_violation_rate", "intervention_rate"), SHARE),
+}
+"""The form of the values of each metric that every evaluation has."""
 
 
 def finish(training: Training) -> dict[str, Any]:
@@ -110,6 +118,49 @@ def table(results: dict[str, Any], path: Path) -> str:
     return "\n".join([*lines, f"results in {path}"])
 
 
+def read_results(path: Path) -> dict[str, Any]:
+    """Read the `results.json` of a run.
+
+    Raises:
+        ConfigError: it is missing, broken, or not what a run writes.
+    """
+    results = read_json(path)
+    check_results(results, str(path), training=True)
+    return results
+
+
+def check_results(results: Any, place: str, training: bool) -> None:
+    """Raise a ConfigError unless these are the results of a training, or of an evaluation of its policies.
+
+    Args:
+        results: what a file holds.
+        place: of the results, for the message.
+        training: whether they are those of a training.
+    """
+    check(results, {"seeds": COUNT, "seed": COUNT, "steps": COUNT, "evaluation": {OTHERS: {OTHERS: {}}}}, place)
+    seeds = results["seeds"]
+    for kind, metrics in results["evaluation"].items():
+        for name, values in _METRICS.items():
+            check(metrics.get(name), _metric(seeds, values), f"{place}: evaluation.{kind}.{name}")
+    if training:
+        form = {
+            "evaluation": {kind: {} for kind in KINDS},
+            "wall_s": AMOUNT,
+            "compile_s": AMOUNT,
+            "interaction_efficiency": {"timesteps": COUNT | NULL, "per_seed": numbers(seeds, COUNT | NULL)},
+            "training_cost": _metric(seeds, AMOUNT),
+            "versions": {"device": TEXT, OTHERS: TEXT | NULL},
+        }
+        check(results, form, place)
+    check(results.get("diverged", []), [{"seed": COUNT, "step": COUNT | NULL}], f"{place}: diverged")
+
+
+def _metric(seeds: int, kind: Kind) -> dict[str, Any]:
+    """Return the form of a metric over seeds, some of which may not be known."""
+    unknown = kind | NULL
+    return {"mean": unknown, "ci95": numbers(2, kind) | NULL, "per_seed": numbers(seeds, unknown)}
+
+
 def summary(runs: Mapping[str, Path]) -> str:
     """A line for each of several runs, by name: success after training, and violating steps during and after it."""
     heads = (
@@ -119,7 +170,7 @@ def summary(runs: Mapping[str, Path]) -> str:
     rows: list[Sequence[str]] = [heads]
     diverged: list[str] = []
     for name, run in runs.items():
-        results = read_json(run / "results.json")
+        results = read_results(run / "results.json")
         found = [results["evaluation"][kind] for kind in ("stochastic", "deterministic")]
         success = [one["success_rate"] for one in found]
         reached, cost = results["interaction_efficiency"]["timesteps"], found[0]["episode_cost"]["mean"]
