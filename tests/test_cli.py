@@ -1,10 +1,16 @@
+import io
+import json
 import os
+import random
 import subprocess
 import sys
+import tracemalloc
 import warnings
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -18,6 +24,8 @@ from jaxsafe.export import __main__ as export
 from jaxsafe.plot import __main__ as plot
 from jaxsafe.rta import falsify
 from jaxsafe.train import __main__ as train
+from jaxsafe.train import config as config_module
+from jaxsafe.train import policy as policy_module
 from jaxsafe.train.loop import Training
 from jaxsafe.train.policy import read_policy
 from jaxsafe.tune import __main__ as tune
@@ -204,6 +212,81 @@ def test_policy_files_cannot_run_code_and_broken_ones_are_told_in_one_line(tmp_p
         read_policy(tmp_path / "other.npz")
     with pytest.raises(ConfigError, match="cannot be read: No such file"):
         read_policy(tmp_path / "none.npz")
+
+
+def rewritten(source: Path, target: Path, change: Callable[[dict], object], compression: int = zipfile.ZIP_STORED) -> Path:
+    """A policy file with another header."""
+    with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", compression) as new:
+        for name in old.namelist():
+            content = old.read(name)
+            if name == "header.npy":
+                header = json.loads(str(np.load(io.BytesIO(content))))
+                text = change(header)
+                buffer = io.BytesIO()
+                np.save(buffer, np.array(text if isinstance(text, str) else json.dumps(header)))
+                content = buffer.getvalue()
+            new.writestr(name, content)
+    return target
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda header: header.update(seed="x"), "header: seed: expected a whole number ≥ 0, found 'x'"),
+        (lambda header: header.update(step=None), "header: step: expected a whole number ≥ 0, found None"),
+        (lambda header: header.update(env=[1]), r"header: env: expected text, found \[1\]"),
+        (lambda header: header["agent"].update(hidden=[1e30]), r"agent\.hidden\.\[0\]: expected .*, found 1e\+30"),
+        (lambda header: header["agent"].update(hidden=[8] * 10**4), "agent.hidden: expected at most 64 layers"),
+        (lambda header: header["agent"].update(hidden=[9]), r"expected numbers of shape \(9,\), found float32 of shape"),
+        (lambda header: header["agent"].update(log_std=[0.0] * 7), "agent"),
+        (lambda header: "[" * 10**5, "not a policy file"),
+        (lambda header: "null", "expected format 'jaxsafe policy 1'"),
+    ],
+)
+def test_the_header_of_a_policy_file_is_checked(
+    tmp_path: Path, whole: Path, change: Callable[[dict], object], message: str
+) -> None:
+    path = rewritten(whole / "policy" / "seed_0.npz", tmp_path / "x.npz", change)
+    with pytest.raises(ConfigError, match=message) as caught:
+        read_policy(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_damaged_policy_file_is_told_and_what_is_not_asked_for_is_not_read(tmp_path: Path, whole: Path) -> None:
+    source, path, draw = whole / "policy" / "seed_0.npz", tmp_path / "x.npz", random.Random(0)
+    expected = read_policy(source)
+    rewritten(source, path, lambda header: None, zipfile.ZIP_DEFLATED)
+    content = path.read_bytes()
+    for _ in range(25):
+        damaged = bytearray(content)
+        damaged[draw.randrange(len(content))] ^= 1 << draw.randrange(8)
+        path.write_bytes(damaged)
+        try:
+            found = read_policy(path)
+        except ConfigError:
+            continue
+        jax.tree.map(np.testing.assert_array_equal, found.params, expected.params)
+    np.save(tmp_path / "x.npy", np.ones(3))
+    path.write_bytes((tmp_path / "x.npy").read_bytes())
+    with pytest.raises(ConfigError, match="not a policy file"):
+        read_policy(path)
+    path.write_bytes(content)
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as file, file.open("more.npy", "w", force_zip64=True) as more:
+        for _ in range(64):
+            more.write(bytes(2**20))
+    tracemalloc.start()
+    jax.tree.map(np.testing.assert_array_equal, read_policy(path).params, expected.params)
+    assert tracemalloc.get_traced_memory()[1] < 2**25
+    tracemalloc.stop()
+
+
+def test_a_package_without_its_files_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(policy_module, "_PRETRAINED", tmp_path / "x.zip" / "pretrained")
+    with pytest.raises(ConfigError, match=r"policy: no policies in .*x\.zip.*; install the package unpacked"):
+        read_policy(policy_module.find_policy("docking2d"))
+    monkeypatch.setattr(config_module, "__file__", str(tmp_path / "x.zip" / "jaxsafe" / "train" / "config.py"))
+    with pytest.raises(ConfigError, match=r"preset: no recipes in .*x\.zip.*; install the package unpacked"):
+        config_module.recipe("docking2d", None)
 
 
 def test_a_path_may_begin_with_the_home_directory(monkeypatch: pytest.MonkeyPatch) -> None:

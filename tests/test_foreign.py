@@ -1,4 +1,8 @@
+import contextlib
 import itertools
+import random
+import zipfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -144,12 +148,108 @@ def test_changes_of_the_environment_come_before_what_a_network_must_fit(
         main([*words, "variant=relesed"])
 
 
-def test_constants_casts_and_extremes_are_understood(tmp_path: Path) -> None:
-    def graph(*nodes: onnx.NodeProto) -> Path:
-        values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 6]) for name in ("obs", "out")]
-        onnx.save(helper.make_model(helper.make_graph(nodes, "net", values[:1], values[1:])), tmp_path / "net.onnx")
-        return tmp_path / "net.onnx"
+def graph_of(path: Path, *nodes: onnx.NodeProto, kind: int = TensorProto.FLOAT, opset: int = 17, **weights: Any) -> Path:
+    """Write a graph from `obs`, six numbers, to `out`."""
+    values = [helper.make_tensor_value_info("obs", kind, [1, 6]), helper.make_tensor_value_info("out", kind, ["n", "m"])]
+    constants = [numpy_helper.from_array(np.asarray(value), name) for name, value in weights.items()]
+    graph = helper.make_graph(nodes, "net", values[:1], values[1:], constants)
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8), path)
+    return path
 
+
+def node(kind: str, names: str, results: str = "out", **attributes: Any) -> onnx.NodeProto:
+    return helper.make_node(kind, names.split(), results.split(), **attributes)
+
+
+LAST = node("Slice", "y begins ends axes")  # the first two of y
+BOUNDS = {"begins": [0], "ends": [2], "axes": [1]}
+
+
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        [node("Mod", "obs w", "y", fmod=1)],
+        [node("Split", "obs", "y z", axis=1)],
+        [node("Split", "obs", "a y z", axis=1)],
+        [node("Split", "obs sizes", "z y", axis=1)],
+        [node("Cast", "obs", "i", to=7), node("Div", "i three", "q"), node("Cast", "q", "y", to=1)],
+        [node("Cast", "obs", "i", to=7), node("Mod", "i three", "q"), node("Cast", "q", "y", to=1)],
+        [node("ReduceSum", "obs none", "sum"), node("Add", "obs sum", "y")],
+        [node("Clip", "obs ! high", "y")],
+    ],
+    ids=lambda nodes: "-".join(one.op_type for one in nodes),
+)
+def test_operators_mean_what_the_runtime_means(nodes: list[onnx.NodeProto], tmp_path: Path) -> None:
+    for one in nodes:
+        one.input[:] = ["" if name == "!" else name for name in one.input]
+    extra = {
+        "w": np.array([0.3], np.float32),
+        "sizes": [2, 4],
+        "three": [3],
+        "none": np.array([], np.int64),
+        "high": np.float32(0.5),
+        **BOUNDS,
+    }
+    path = graph_of(tmp_path / "net.onnx", *nodes, LAST, **extra)
+    observations = np.array([[-1.0, -7.9, 2.5, -0.4, 4.0, 5.0], [7.1, 0.7, -2.5, 1.0, -4.0, 9.0]], np.float32)
+    session = onnxruntime.InferenceSession(path)
+    expected = [np.asarray(session.run(None, {"obs": one[None]})[0])[0] for one in observations]
+    _, agent, weights = read_foreign(path, jaxsafe.make("docking2d"))
+    found = [agent.network(weights, jnp.asarray(one)) for one in observations]
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("nodes", "options", "message"),
+    [
+        ([node("Mod", "obs w", "y")], {}, "Mod of floats needs the attribute fmod=1"),
+        ([node("Split", "obs sizes", "y z", axis=1)], {"sizes": [2, 9]}, r"Split has sizes \[2, 9\] for 2 outputs"),
+        ([node("Split", "obs sizes", "y z", axis=1)], {"sizes": [9, -3]}, r"Split has sizes \[9, -3\]"),
+        ([node("Split", "obs sizes", "y", axis=1)], {"sizes": [2, 4]}, r"Split has sizes \[2, 4\] for 1 outputs"),
+        ([node("Identity", "obs", "y")], {"kind": TensorProto.INT64}, "obs: expected an input of FLOAT, found INT64"),
+        ([node("Identity", "obs")], {"opset": 1}, "net.onnx: opset: expected 7 to"),
+        ([node("Add", "obs w", "y")], {"w": np.array([1j], np.complex64)}, "w: expected real numbers, found complex64"),
+        ([node("Constant", "", "c"), node("Add", "obs c", "y")], {}, "net.onnx: "),
+        ([node("ReduceSum", "obs", "y", noop_with_empty_axes=1)], {}, "the attribute noop_with_empty_axes=1 is not known"),
+        ([node("Expand", "obs shape", "y")], {"shape": [10**6, 10**6, 6]}, "Expand makes an array of more than"),
+        ([node("Identity", "obs", "y", domain="else")], {}, "net.onnx: cannot be read: No opset import for domain 'else'"),
+        ([node("Shape", "obs", "y")], {}, "the operator Shape is not known here"),
+    ],
+)
+def test_graphs_that_are_not_what_they_seem_are_refused(
+    nodes: list[onnx.NodeProto], options: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    options = {"w": np.array([0.3], np.float32), **BOUNDS, **options}
+    graph = graph_of(tmp_path / "net.onnx", *nodes, *([] if "opset" in options else [LAST]), **options)
+    with pytest.raises(ConfigError, match=message) as caught:
+        read_foreign(graph, jaxsafe.make("docking2d"))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_damaged_graph_is_told(tmp_path: Path) -> None:
+    env = jaxsafe.make("docking2d")
+    good = as_torch_writes_it(tmp_path / "x.onnx", random_layers(6, 4, 2)).read_bytes()
+    model = onnx.load(tmp_path / "x.onnx")
+    model.graph.initializer[0].data_type = 99
+    (tmp_path / "x.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(ConfigError, match=r"x\.onnx: cannot be read"):
+        read_foreign(tmp_path / "x.onnx", env)
+    model = onnx.load_from_string(good)
+    model.graph.input[0].type.tensor_type.shape.dim[1].dim_value = 5
+    (tmp_path / "x.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(ConfigError, match=r"does not take an observation of 6 numbers: its input is declared as \[0, 5\]"):
+        read_foreign(tmp_path / "x.onnx", env)
+    draw = random.Random(0)
+    for _ in range(40):
+        damaged = bytearray(good)
+        damaged[draw.randrange(len(good))] ^= 1 << draw.randrange(8)
+        (tmp_path / "x.onnx").write_bytes(damaged[: draw.choice([len(good), draw.randrange(len(good))])])
+        with contextlib.suppress(ConfigError):  # any other error is a fault
+            read_foreign(tmp_path / "x.onnx", env)
+
+
+def test_constants_casts_and_extremes_are_understood(tmp_path: Path) -> None:
+    graph = partial(graph_of, tmp_path / "net.onnx")
     low = helper.make_node("Constant", [], ["low"], value_float=0.25)
     high = helper.make_node("Constant", [], ["high"], value_floats=[0.5] * 6)
     ends = helper.make_node("Constant", [], ["ends"], value_ints=[2])
@@ -187,6 +287,38 @@ def test_constants_casts_and_extremes_are_understood(tmp_path: Path) -> None:
 def test_what_does_not_fit_is_named(make: Any, message: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=message):
         read_foreign(make(tmp_path), jaxsafe.make("docking2d"))
+
+
+def claim(path: Path, name: str, header: str, content: bytes = b"") -> None:
+    """Put a member with a header of one's own into an archive."""
+    text = header.encode().ljust(118) + b"\n"
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as file:
+        file.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + content)
+
+
+@pytest.mark.parametrize(
+    ("header", "message"),
+    [
+        ("{'descr': '<f4', 'fortran_order': False, 'shape': (10000000000000, 2)}", "does not take an observation of 6"),
+        ("{'descr': '<f4', 'fortran_order': False, 'shape': (6, 4000000000)}", "x.npz: expected 2 outputs"),
+        ("{'descr': '<f4', 'fortran_order': False, 'shape': (6, 2)}", "cannot be read: not an .npz of numbers"),
+        (
+            "{'descr': '<c8', 'fortran_order': False, 'shape': (6, 2)}",
+            "kernel_0: expected a matrix of numbers, found c",
+        ),
+        (
+            "{'descr': '<f4', 'fortran_order': False, 'shape': (12,)}",
+            r"expected a matrix of numbers, found float32 of",
+        ),
+        ("{'descr': '|O', 'fortran_order': False, 'shape': (6, 2)}", "expected a matrix of numbers, found object"),
+        ("{'descr': " + "[" * 60 + "}", "not an .npz of numbers"),
+    ],
+)
+def test_arrays_that_claim_what_does_not_fit_are_not_read(header: str, message: str, tmp_path: Path) -> None:
+    claim(tmp_path / "x.npz", "kernel_0", header)
+    claim(tmp_path / "x.npz", "bias_0", "{'descr': '<f4', 'fortran_order': False, 'shape': (1,)}", b"\0\0\0\0")
+    with pytest.raises(ConfigError, match=message):
+        read_foreign(tmp_path / "x.npz", jaxsafe.make("docking2d"))
 
 
 def test_more_mistakes_are_named(tmp_path: Path) -> None:

@@ -6,10 +6,9 @@ one after the other.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,9 +22,14 @@ from jaxsafe.evaluate.choice import EnvironmentChoice
 from jaxsafe.evaluate.graph import Network, read_graph
 from jaxsafe.rollout import Policy
 from jaxsafe.train.agent import Categorical, Gaussian, Params
+from jaxsafe.train.archive import open_archive
+from jaxsafe.train.policy import MAX_LAYERS
 
 ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
 """Between the layers of an .npz."""
+
+MAX_NAMES = 200
+"""Letters of the names in a file that a message repeats."""
 
 
 @jax.tree_util.register_static
@@ -98,7 +102,7 @@ def _names(path: str) -> set[str]:
     try:
         with zipfile.ZipFile(path) as archive:
             return set(archive.namelist())
-    except (OSError, ValueError, zipfile.BadZipFile):
+    except Exception:  # whatever it is, reading it tells more
         return set()
 
 
@@ -113,35 +117,52 @@ def read_foreign(path: Path, env: Environment, activation: str = "tanh") -> Fore
     Raises:
         ConfigError: the file cannot be read, or its inputs and outputs are not those of the environment.
     """
-    network, weights = read_graph(path) if path.suffix == ".onnx" else _layers(path, activation)
-    wanted = sum(env.num_action_points) or env.action_size
-    observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
-    try:
-        found = jax.eval_shape(network, weights, observation).shape
-    except Exception as error:  # JAX and the operators below refuse in many ways
-        reason = str(error).partition("\n")[0]
-        raise ConfigError(f"{path}: does not take an observation of {env.observation_size} numbers: {reason}") from None
-    if found != (wanted,):
-        raise ConfigError(f"{path}: expected {wanted} outputs ({', '.join(env.action_names)}), found shape {found}")
+    if path.suffix == ".onnx":
+        network, weights = read_graph(path)
+        _check(path, env, network, weights)
+    else:
+        network, weights = _read_layers(path, env, activation)
     return ForeignPolicy(env, ForeignAgent(network), weights)
 
 
-def _layers(path: Path, activation: str) -> tuple[Network, dict[str, np.ndarray]]:
+def _check(path: Path, env: Environment, network: Network, weights: Mapping[str, Any]) -> None:
+    """Raise a ConfigError unless a network, of these weights or their shapes, takes observations and gives actions."""
+    wanted = sum(env.num_action_points) or env.action_size
+    observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
+    try:
+        found = jax.eval_shape(network, weights, observation)
+    except Exception as error:  # JAX and the operators below refuse in many ways
+        reason = str(error).partition("\n")[0]
+        raise ConfigError(f"{path}: does not take an observation of {env.observation_size} numbers: {reason}") from None
+    if found.shape != (wanted,):
+        raise ConfigError(f"{path}: expected {wanted} outputs ({', '.join(env.action_names)}), found shape {found.shape}")
+    if not jnp.issubdtype(found.dtype, jnp.floating):
+        raise ConfigError(f"{path}: expected outputs that are real numbers, found {found.dtype}")
+
+
+def _read_layers(path: Path, env: Environment, activation: str) -> tuple[Network, dict[str, np.ndarray]]:
+    """Read the layers in an .npz, after their names and shapes alone have shown that they fit."""
     if activation not in ACTIVATIONS:
         raise ConfigError(f"activation: found {activation!r}; choose from {nearest(activation, ACTIVATIONS)}")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            weights = {name: np.asarray(file[name], np.float32) for name in file.files}
-    except (OSError, TypeError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ConfigError(
-            f"{path}: cannot be read: {getattr(error, 'strerror', None) or 'not an .npz of numbers'}"
-        ) from None
-    count = len(weights) // 2
-    expected = {f"{kind}_{i}" for i in range(count) for kind in ("kernel", "bias")}
-    if not count or set(weights) != expected:
-        raise ConfigError(
-            f"{path}: expected kernel_0, bias_0, kernel_1, …, found {', '.join(sorted(weights)) or 'nothing'}"
-        )
+    with open_archive(path, "cannot be read: not an .npz of numbers") as archive:
+        count = len(archive.names) // 2
+        expected = {f"{kind}_{i}" for i in range(count) for kind in ("kernel", "bias")}
+        if not count or set(archive.names) != expected or count > MAX_LAYERS:
+            found = ", ".join(sorted(archive.names))[:MAX_NAMES] or "nothing"
+            raise ConfigError(f"{path}: expected kernel_0, bias_0, kernel_1, …, found {found}")
+        network, shapes = _network(count, activation), {}
+        for name in archive.names:
+            shape, dtype = archive.describe(name)
+            if dtype.kind not in "fiu" or len(shape) != (2 if name.startswith("kernel") else 1):
+                wanted = "a matrix" if name.startswith("kernel") else "a list"
+                raise ConfigError(f"{path}: {name}: expected {wanted} of numbers, found {dtype} of shape {shape}")
+            shapes[name] = jax.ShapeDtypeStruct(shape, jnp.float32)
+        _check(path, env, network, shapes)
+        return network, {name: archive.read(name).astype(np.float32) for name in archive.names}
+
+
+def _network(count: int, activation: str) -> Network:
+    """Return the function of so many layers."""
 
     def network(weights: Mapping[str, Array], x: Array) -> Array:
         for i in range(count):
@@ -149,4 +170,4 @@ def _layers(path: Path, activation: str) -> tuple[Network, dict[str, np.ndarray]
             x = ACTIVATIONS[activation](x) if i < count - 1 else x
         return x
 
-    return network, weights
+    return network

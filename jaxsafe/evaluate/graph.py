@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import functools
+import reprlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,15 @@ from jaxsafe.errors import ConfigError, missing
 
 Network = Callable[[Mapping[str, Array], Float[Array, " o"]], Float[Array, " a"]]
 """From weights and one observation to one output."""
+
+DOMAINS = ("", "ai.onnx")
+"""Those of ONNX itself: an operator of another domain may have the name of one of these and mean something else."""
+
+MIN_OPSET = 7
+"""Before it, shapes of operands were matched by an attribute."""
+
+MAX_NODES, MAX_SIZE = 10_000, 2**26
+"""Operators of a graph, and numbers of an array that one of them makes: a small file could ask for any."""
 
 
 def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
@@ -33,59 +43,112 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
     try:
         model = onnx.load(path)
         onnx.checker.check_model(model)
-    except Exception as error:  # protobuf, the checker and the file system have errors of their own
-        raise ConfigError(f"{path}: cannot be read: {str(error).splitlines()[0]}") from None
+        nodes = [_node(path, node) for node in model.graph.node]
+        weights = {one.name: numpy_helper.to_array(one) for one in model.graph.initializer}
+        constants = {
+            outputs[0]: _constant(path, attributes) for kind, _, outputs, attributes in nodes if kind == "Constant"
+        }
+    except ConfigError:
+        raise
+    except Exception as error:  # protobuf, the checker, numpy and the file system have errors of their own
+        reason = next(iter(str(error).splitlines()), type(error).__name__)
+        raise ConfigError(f"{path}: cannot be read: {reason}") from None
     graph = model.graph
-    weights = {one.name: numpy_helper.to_array(one) for one in graph.initializer}
+    for opset in model.opset_import:
+        newest = onnx.defs.onnx_opset_version()
+        if opset.domain in DOMAINS and not MIN_OPSET <= opset.version <= newest:
+            raise ConfigError(f"{path}: opset: expected {MIN_OPSET} to {newest}, found {opset.version}")
     inputs = [one for one in graph.input if one.name not in weights]
     if len(inputs) != 1 or len(graph.output) != 1:
         raise ConfigError(f"{path}: expected one input and one output, found {len(inputs)} and {len(graph.output)}")
-    rank = len(inputs[0].type.tensor_type.shape.dim)
-    nodes = [
-        (
-            node.op_type,
-            list(node.input),
-            list(node.output),
-            {one.name: onnx.helper.get_attribute_value(one) for one in node.attribute},
-        )
-        for node in graph.node
-    ]
-    for kind, *_ in nodes:
-        if kind not in _OPERATORS and kind not in ("Constant", "Split"):
-            raise ConfigError(f"{path}: the operator {kind} is not known here")
-    constants = {
-        outputs[0]: numpy_helper.to_array(attributes["value"]) if "value" in attributes else _constant(path, attributes)
-        for kind, _, outputs, attributes in nodes
-        if kind == "Constant"
-    }
+    [declared] = inputs
+    kind = declared.type.tensor_type.elem_type
+    if kind not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT16):
+        known = kind in onnx.TensorProto.DataType.values()
+        found = onnx.TensorProto.DataType.Name(kind) if known else kind
+        raise ConfigError(f"{path}: {declared.name}: expected an input of FLOAT, found {found}")
+    sizes = [axis.dim_value for axis in declared.type.tensor_type.shape.dim]  # 0 where it has a name
+    if len(nodes) > MAX_NODES:
+        raise ConfigError(f"{path}: expected at most {MAX_NODES:,} operators, found {len(nodes):,}")
+    for name, value in {**weights, **constants}.items():
+        if value.dtype.kind not in "iub" and not jnp.issubdtype(value.dtype, jnp.floating):
+            raise ConfigError(f"{path}: {name}: expected real numbers, found {value.dtype}")
     # what says shapes and axes must be known while tracing; what computes are the weights
     whole = {name: value for name, value in {**weights, **constants}.items() if value.dtype.kind in "iu"}
     floats = {name: value for name, value in {**weights, **constants}.items() if value.dtype.kind not in "iu"}
 
     def network(weights: Mapping[str, Array], observation: Array) -> Array:
-        values: dict[str, Any] = {**whole, **weights, inputs[0].name: observation.reshape((1,) * (rank - 1) + (-1,))}
+        if any(size > 1 for size in sizes[:-1]) or (sizes and sizes[-1] not in (0, observation.size)):
+            raise TypeError(f"its input is declared as {sizes}")
+        values: dict[str, Any] = {**whole, **weights, declared.name: observation.reshape((1,) * (len(sizes) - 1) + (-1,))}
         for kind, names, outputs, attributes in nodes:
             if kind == "Constant":
                 continue
             given: list[Any] = [values[name] if name else None for name in names]
-            if kind == "Split":
-                ends = np.cumsum(given[1] if len(given) > 1 else attributes["split"])[:-1]
-                results = jnp.split(given[0], ends, axis=attributes.get("axis", 0))
-            else:
-                results = [_OPERATORS[kind](given, attributes)]
+            results = _split(given, attributes, len(outputs)) if kind == "Split" else [_OPERATORS[kind](given, attributes)]
+            if any(result.size > MAX_SIZE for result in results):
+                raise TypeError(f"{kind} makes an array of more than {MAX_SIZE:,} numbers")
             values |= dict(zip(outputs, results, strict=True))
         return values[graph.output[0].name].ravel()
 
     return network, floats
 
 
+def _node(path: Path, node: Any) -> tuple[str, list[str], list[str], dict[str, Any]]:
+    """Return kind, inputs, outputs and attributes of an operator; a ConfigError for what is not known here."""
+    from onnx import helper
+
+    kind = node.op_type
+    if kind not in (*_OPERATORS, "Constant", "Split") or node.domain not in DOMAINS:
+        raise ConfigError(f"{path}: the operator {kind} is not known here")
+    attributes = {one.name: helper.get_attribute_value(one) for one in node.attribute}
+    for name, value in attributes.items():
+        if name not in _ATTRIBUTES.get(kind, "").split() and value != 0:
+            raise ConfigError(f"{path}: {kind}: the attribute {name}={reprlib.repr(value)} is not known here")
+    return kind, list(node.input), list(node.output), attributes
+
+
 def _constant(path: Path, attributes: Mapping[str, Any]) -> np.ndarray:
-    """A constant that is given as one number or a list."""
+    """Return the value of a constant: an array, one number, or a list."""
+    from onnx import numpy_helper
+
+    if len(attributes) != 1:
+        raise ConfigError(f"{path}: Constant: expected one attribute, found {', '.join(attributes) or 'nothing'}")
     [(kind, value)] = attributes.items()
+    if kind == "value":
+        return numpy_helper.to_array(value)
     types = {"value_float": np.float32, "value_floats": np.float32, "value_int": np.int64, "value_ints": np.int64}
     if kind not in types:
         raise ConfigError(f"{path}: a constant of kind {kind} is not known here")
     return np.asarray(value, types[kind])
+
+
+def _split(x: list[Any], a: Mapping[str, Any], count: int) -> list[Array]:
+    """Cut an array into parts of given sizes, or into as many equal parts as there are outputs."""
+    axis, given = a.get("axis", 0), x[1] if len(x) > 1 and x[1] is not None else a.get("split")
+    whole = x[0].shape[axis]
+    part = -(-whole // count)  # the last one is smaller where they cannot be equal
+    equal = [min(part, max(0, whole - i * part)) for i in range(count)]
+    sizes = equal if given is None else [int(size) for size in given]
+    if len(sizes) != count or min(sizes) < 0 or sum(sizes) != whole:
+        raise TypeError(f"Split has sizes {sizes} for {count} outputs of an axis of {whole}")
+    return jnp.split(x[0], np.cumsum(sizes)[:-1], axis=axis)
+
+
+def _mod(x: list[Any], a: Mapping[str, Any]) -> Array:
+    """Return a remainder: of the sign of the dividend with `fmod`, which floats need, else of the divisor."""
+    if a.get("fmod", 0):
+        return jnp.fmod(*x)
+    if any(jnp.issubdtype(jnp.result_type(one), jnp.floating) for one in x):
+        raise TypeError("Mod of floats needs the attribute fmod=1")
+    return jnp.mod(*x)
+
+
+def _divide(x: list[Any], a: Mapping[str, Any]) -> Array:
+    """Return a quotient, of whole numbers the whole part."""
+    if all(jnp.issubdtype(jnp.result_type(one), jnp.integer) for one in x):
+        return jnp.sign(x[0]) * jnp.sign(x[1]) * (jnp.abs(x[0]) // jnp.abs(x[1]))
+    return jnp.divide(*x)
 
 
 def _cast(x: list[Any], a: Mapping[str, Any]) -> Array:
@@ -116,8 +179,13 @@ def _axes(x: list[Any], a: Mapping[str, Any]) -> Any:
     return None if axes is None else tuple(int(axis) for axis in axes)
 
 
+def _reduced(x: list[Any], a: Mapping[str, Any]) -> Any:
+    return _axes(x, a) or None  # without axes, over all
+
+
 def _reshape(x: list[Any], a: Mapping[str, Any]) -> Array:
-    shape = [x[0].shape[i] if size == 0 else int(size) for i, size in enumerate(x[1])]
+    kept = not a.get("allowzero", 0)
+    shape = [x[0].shape[i] if size == 0 and kept else int(size) for i, size in enumerate(x[1])]
     return x[0].reshape(shape)
 
 
@@ -128,16 +196,18 @@ def _clip(x: list[Any], a: Mapping[str, Any]) -> Array:
 
 
 _ELEMENTWISE = {
-    "Add": jnp.add, "Sub": jnp.subtract, "Mul": jnp.multiply, "Div": jnp.divide, "Pow": jnp.power,
+    "Add": jnp.add, "Sub": jnp.subtract, "Mul": jnp.multiply, "Pow": jnp.power,
     "Neg": jnp.negative, "Exp": jnp.exp, "Log": jnp.log, "Sqrt": jnp.sqrt, "Tanh": jnp.tanh,
     "Abs": jnp.abs, "Sin": jnp.sin, "Cos": jnp.cos, "Atan": jnp.arctan, "Relu": jax.nn.relu, "Sigmoid": jax.nn.sigmoid,
     "Softplus": jax.nn.softplus, "Identity": lambda x: x, "Where": jnp.where, "Not": jnp.logical_not,
     "And": jnp.logical_and, "Or": jnp.logical_or, "Less": jnp.less, "Greater": jnp.greater, "LessOrEqual": jnp.less_equal,
     "GreaterOrEqual": jnp.greater_equal, "Equal": jnp.equal, "Sign": jnp.sign, "Round": jnp.round, "Floor": jnp.floor,
-    "MatMul": jnp.matmul, "Mod": jnp.mod,
+    "MatMul": jnp.matmul,
 }  # fmt: skip
 _OPERATORS: Mapping[str, Callable[[list[Any], Mapping[str, Any]], Any]] = {
     **{name: lambda x, a, f=function: f(*x) for name, function in _ELEMENTWISE.items()},
+    "Div": _divide,
+    "Mod": _mod,
     "Gemm": _gemm,
     "Slice": _slice,
     "Reshape": _reshape,
@@ -153,8 +223,30 @@ _OPERATORS: Mapping[str, Callable[[list[Any], Mapping[str, Any]], Any]] = {
     "Cast": _cast,
     "Max": lambda x, a: functools.reduce(jnp.maximum, x),
     "Min": lambda x, a: functools.reduce(jnp.minimum, x),
-    "ReduceSum": lambda x, a: jnp.sum(x[0], axis=_axes(x, a), keepdims=bool(a.get("keepdims", 1))),
-    "ReduceMax": lambda x, a: jnp.max(x[0], axis=_axes(x, a), keepdims=bool(a.get("keepdims", 1))),
+    "ReduceSum": lambda x, a: jnp.sum(x[0], axis=_reduced(x, a), keepdims=bool(a.get("keepdims", 1))),
+    "ReduceMax": lambda x, a: jnp.max(x[0], axis=_reduced(x, a), keepdims=bool(a.get("keepdims", 1))),
     "ArgMax": lambda x, a: jnp.argmax(x[0], axis=a.get("axis", 0), keepdims=bool(a.get("keepdims", 1))),
     "Reciprocal": lambda x, a: 1.0 / x[0],
 }
+
+_ATTRIBUTES: Mapping[str, str] = {
+    "Constant": "value value_float value_floats value_int value_ints value_string",
+    "Split": "axis split num_outputs",
+    "Gemm": "alpha beta transA transB",
+    "Slice": "axes starts ends",
+    "Reshape": "allowzero",
+    "Clip": "min max",
+    "LeakyRelu": "alpha",
+    "Elu": "alpha",
+    "Flatten": "axis",
+    "Concat": "axis",
+    "Unsqueeze": "axes",
+    "Squeeze": "axes",
+    "Transpose": "perm",
+    "Cast": "to saturate round_mode",
+    "ReduceSum": "axes keepdims",
+    "ReduceMax": "axes keepdims",
+    "ArgMax": "axis keepdims",
+    "Mod": "fmod",
+}
+"""The attributes that are understood. Any other may only be 0, which is its default in each of these operators."""

@@ -203,9 +203,16 @@ def recipe(task: str, preset: str | None) -> dict[str, Any]:
 
 
 def configs() -> Path:
-    """The directory of recipes: inside the installed package, or beside it in a checkout."""
+    """The directory of recipes: inside the installed package, or beside it in a checkout.
+
+    Raises:
+        ConfigError: there is none, as in a zipped package.
+    """
     package = Path(__file__).resolve().parent.parent
-    return next(path for path in (package / "configs", package.parent / "configs") if path.is_dir())
+    for path in (package / "configs", package.parent / "configs"):
+        if path.is_dir():
+            return path
+    raise ConfigError(f"preset: no recipes in {package / 'configs'}; install the package unpacked, as pip does")
 
 
 def usage() -> str:

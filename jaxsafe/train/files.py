@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
@@ -36,6 +37,25 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(finite(value), indent=2, allow_nan=False) + "\n")
 
 
+def parse_json(text: str | bytes, infinite: bool = False) -> Any:
+    """Return the value of a JSON text.
+
+    Args:
+        text: to read.
+        infinite: whether `NaN` and `Infinity` are numbers, which JSON has not.
+
+    Raises:
+        ValueError: it is none, or holds too many lists and mappings inside each other.
+    """
+    try:
+        value = json.loads(text, parse_constant=None if infinite else _refuse)
+    except RecursionError:
+        raise ValueError("too deep") from None
+    if is_deep(value):
+        raise ValueError("too deep")
+    return value
+
+
 def read_json(path: Path, form: Any = ANYTHING) -> Any:
     """Read a JSON file of a form.
 
@@ -43,7 +63,7 @@ def read_json(path: Path, form: Any = ANYTHING) -> Any:
         ConfigError: it is missing, broken, or of another form.
     """
     try:
-        value = _decode(path.read_text(encoding="utf-8"))
+        value = parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError:
@@ -78,7 +98,7 @@ def read_rows(path: Path, form: Any = ANYTHING) -> list[dict[str, Any]]:
             continue
         place = f"{path}, line {number}"
         try:
-            row = _decode(line)
+            row = parse_json(line)
         except ValueError:  # of JSON or of UTF-8
             if number < len(lines):
                 raise ConfigError(f"{place}: not a line of JSON") from None
@@ -115,6 +135,25 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     write_text(path, _csv(rows, header=True))
 
 
+def read_csv(path: Path, form: Any = ANYTHING) -> list[dict[str, Any]]:
+    """Read the rows of a CSV file: numbers where the text is one, None where there is none.
+
+    Raises:
+        ConfigError: it cannot be read, or a row has not this form.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        found = list(csv.DictReader(io.StringIO(text, newline=""), restkey="more"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
+    except (ValueError, csv.Error):
+        raise ConfigError(f"{path}: not a CSV file") from None
+    rows = [{name: _number(value) for name, value in row.items()} for row in found]
+    for number, row in enumerate(rows, start=1):
+        check(row, form, f"{path}, row {number}")
+    return rows
+
+
 def finite(value: Any) -> Any:
     """The same data with every NaN and infinity as None."""
     if isinstance(value, float):
@@ -124,15 +163,12 @@ def finite(value: Any) -> Any:
     return [finite(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
-def _decode(text: str | bytes) -> Any:
-    """Return the value of a JSON text; a ValueError if it is none, or holds NaN or too many lists inside each other."""
-    try:
-        value = json.loads(text, parse_constant=_refuse)
-    except RecursionError:
-        raise ValueError("too deep") from None
-    if is_deep(value):
-        raise ValueError("too deep")
-    return value
+def _number(text: Any) -> Any:
+    """Return the number that a text is, None for an empty one, and else the text."""
+    for kind in (int, float):
+        with contextlib.suppress(TypeError, ValueError):
+            return kind(text)
+    return text or None
 
 
 def _refuse(constant: str) -> None:

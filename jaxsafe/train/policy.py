@@ -8,7 +8,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +21,9 @@ from jaxsafe.environment import Environment
 from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.rollout import Policy
 from jaxsafe.train.agent import Agent, Params
-from jaxsafe.train.files import write_bytes
+from jaxsafe.train.archive import Archive, open_archive
+from jaxsafe.train.files import parse_json, write_bytes
+from jaxsafe.train.forms import COUNT, TEXT, check
 
 
 def save_policy(path: Path, env: Environment, agent: Agent, params: Params, about: dict[str, Any]) -> None:
@@ -36,6 +37,12 @@ def save_policy(path: Path, env: Environment, agent: Agent, params: Params, abou
     np.savez(buffer, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
     write_bytes(path, buffer.getvalue())
 
+
+MAX_LAYERS = 64
+"""Hidden layers that a policy file may have: each takes a while to trace."""
+
+_ABOUT = {"env": TEXT, "preset": TEXT, "seed": COUNT, "step": COUNT}
+"""What else a header says, if it does."""
 
 PRETRAINED = "pretrained/"
 """Before a name where a run may be given as well."""
@@ -58,22 +65,25 @@ def read_policy(path: str | os.PathLike) -> SavedPolicy:
     Raises:
         ConfigError: the file cannot be read, or holds something else.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            header = json.loads(str(file["header"]))
-            arrays = {name: file[name] for name in file.files if name != "header"}
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read: {error.strerror or 'not a policy file'}") from None
-    except (ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        raise ConfigError(f"{path}: not a policy file (.npz without pickles, as in <run>/policy/)") from None
+    with open_archive(path, "not a policy file (.npz without pickles, as in <run>/policy/)") as archive:
+        header = parse_json(str(archive.read("header")), infinite=True)
     if not isinstance(header, dict) or header.pop("format", None) != "jaxsafe policy 1":
         raise ConfigError(f"{path}: not a policy file: expected format 'jaxsafe policy 1'")
     from jaxsafe.config import build
 
     env = build(to_component(header.pop("environment", None), Environment, f"{path}: environment"))
     agent = normalise(to_component(header.pop("agent", None), Agent, f"{path}: agent"))
-    like = jax.eval_shape(lambda key: agent.init(key, env), jax.random.key(0))
-    return SavedPolicy(env, agent, _fill(like, arrays, str(path)), header)
+    check(header, {name: form for name, form in _ABOUT.items() if name in header}, f"{path}: header")
+    if len(agent.hidden) > MAX_LAYERS:
+        raise ConfigError(f"{path}: agent.hidden: expected at most {MAX_LAYERS} layers, found {len(agent.hidden):,}")
+    try:
+        like = jax.eval_shape(lambda key: agent.init(key, env), jax.random.key(0))
+    except ConfigError:
+        raise
+    except Exception as error:  # JAX refuses in many ways
+        raise ConfigError(f"{path}: agent: does not fit the environment: {str(error).partition(chr(10))[0]}") from None
+    with open_archive(path, "not a policy file, or a damaged one") as archive:
+        return SavedPolicy(env, agent, _fill(like, archive, str(path)), header)
 
 
 def load_policy(policy: str | os.PathLike, deterministic: bool = True) -> Policy:
@@ -106,19 +116,21 @@ def find_policy(policy: str | os.PathLike) -> Path:
     path, known = Path(policy), {file.stem: file for file in sorted(_PRETRAINED.glob("*.npz"))}
     if path.suffix == ".npz":
         return path
+    if not known:
+        raise ConfigError(f"policy: no policies in {_PRETRAINED}; install the package unpacked, as pip does")
     name = str(policy).removeprefix(PRETRAINED)
     if name not in known:
         raise ConfigError(f"policy: {str(policy)!r} is no .npz file and not pretrained; choose from {nearest(name, known)}")
     return known[name]
 
 
-def _fill(like: Any, arrays: dict[str, np.ndarray], path: str) -> Any:
+def _fill(like: Any, archive: Archive, path: str) -> Any:
     def pick(key: Any, leaf: jax.ShapeDtypeStruct) -> jax.Array:
         name = jax.tree_util.keystr(key, simple=True, separator="/")
-        found = arrays.get(name)
-        if found is None or found.shape != leaf.shape or found.dtype.kind != "f":
-            what = "nothing" if found is None else f"{found.dtype} of shape {found.shape}"
+        shape, dtype = archive.describe(name) if name in archive.names else (None, None)
+        if dtype is None or shape != leaf.shape or dtype.kind != "f":
+            what = "nothing" if dtype is None else f"{dtype} of shape {shape}"
             raise ConfigError(f"{path}: {name}: expected numbers of shape {leaf.shape}, found {what}")
-        return jnp.asarray(found, leaf.dtype)
+        return jnp.asarray(archive.read(name), leaf.dtype)
 
     return jax.tree_util.tree_map_with_path(pick, like)
