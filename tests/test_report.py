@@ -1,7 +1,9 @@
 import csv
 import json
 import os
+import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,9 +23,9 @@ from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.report import __main__ as command
 from jaxsafe.report import run as running
 from jaxsafe.report.measures import failed_seeds, finished, samples_per_second, steps_to, wall_to
-from jaxsafe.report.page import DIRECTORY, Report
+from jaxsafe.report.page import DIRECTORY, Report, _number, _percent, _rate
 from jaxsafe.report.plan import KINDS, SHIPPED, Item, best_seed, plan
-from jaxsafe.report.record import kept
+from jaxsafe.report.record import keep, kept
 from jaxsafe.rollout import reset_batch
 from jaxsafe.train import __main__ as train
 from jaxsafe.train import directory
@@ -162,6 +164,73 @@ def test_an_interrupted_report_goes_on(calls: list[list[str]], whole: Path) -> N
     assert command.main(["tasks=docking2d", "kinds=features", "film=false", *REST]) == 0
     assert calls[0] == ["jaxsafe.train", f"resume={run}"]
     assert len(calls) == 3
+
+
+def test_a_report_killed_while_its_figures_were_drawn_draws_them(calls: list[list[str]]) -> None:
+    run, words = Path("runs/report/docking2d-features"), ["tasks=docking2d", "kinds=features", "film=false", *REST]
+    assert train.main([*TINY, f"out={run}"]) == 0
+    pictures = {file.name: file.read_bytes() for file in (run / "figures").iterdir()}
+    (run / "figures").rename(run / "figures.part")
+    (run / "figures.part" / "trajectories.png").write_bytes(b"half")
+    (run / "figures.part" / "old.png").write_bytes(b"of another version")
+    assert command.main(words) == 0
+    assert calls[0] == ["jaxsafe.train", f"resume={run}"]
+    assert {file.name: file.read_bytes() for file in (run / "figures").iterdir()} == pictures
+    for name in ("trajectories.png", "speed_distance.png"):
+        assert Path("report/baselines", f"docking2d_{name}").read_bytes() == pictures[name]
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        (".json", r"(?s)^.*$", "{}", "options: expected a mapping, found nothing"),
+        (".json", r"(?s)^.*$", "null", "expected a mapping, found None"),
+        (".json", r'"command": ".*"', '"command": 1', "command: expected text, found 1"),
+        (".json", r'"timesteps": null', '"timesteps": "x"', "interaction_efficiency.timesteps: expected a whole number"),
+        (
+            ".json",
+            r'"seeds": 3,\n    "seed": 0,',
+            '"seeds": 3,',
+            "results: seed: expected a whole number ≥ 0, found",
+        ),
+        (".csv", r"(?s)^.*$", "seed,step\n1,2\n", "row 1: "),
+        (".csv", r"(?m)^0,64,", "0,x,", "row 1: step: expected a whole number ≥ 0, found 'x'"),
+        (".csv", r"(?s)^.*$", "\0", "csv"),
+    ],
+)
+def test_a_broken_record_is_left_out_with_a_line_that_says_so(
+    calls: list[list[str]], whole: Path, file: str, old: str, new: str, message: str
+) -> None:
+    [item] = plan(["docking2d"], ["plain"], REST)
+    shutil.copytree(whole, "run")
+    keep(item, Path("run"), Path("report"), "python -m jaxsafe.report")
+    assert len(kept([item], Path("report"))[0]) == 1
+    path = Path("report", f"{item.name}{file}")
+    text, count = re.subn(old, lambda _: new, path.read_text(), count=1)
+    assert count
+    path.write_text(text)
+    records, [line] = kept([item], Path("report"))
+    assert not records
+    assert line.startswith(f"report/{item.name}{file}")
+    assert message in line
+    assert line.endswith("it is left out, report it again")
+    assert "\n" not in line
+
+
+def test_a_run_whose_configuration_is_broken_is_told(calls: list[list[str]]) -> None:
+    run = Path("runs/report/docking2d-plain")
+    run.mkdir(parents=True)
+    for text in ("{}", "null", "env: x\ntraining: 1\nenvironment: {}", "env: x\ntraining: {}\nenvironment: []"):
+        (run / "config.yaml").write_text(text)
+        with pytest.raises(ConfigError, match=r"docking2d-plain/config\.yaml: "):
+            command.main(["tasks=docking2d", "kinds=plain", *REST])
+
+
+def test_what_is_not_known_is_a_dash_on_the_page_and_a_seed_without_success_failed(whole: Path) -> None:
+    unknown = {"mean": None, "ci95": None, "iqm": None, "per_seed": [None, 1.0, 1.0]}
+    assert (_percent(unknown), _number(unknown), _rate(unknown, 100, 3)) == ("–", "–", "–")
+    results = {"seed": 4, "evaluation": {way: {"success_rate": unknown} for way in ("stochastic", "deterministic")}}
+    assert failed_seeds(results) == [4]
 
 
 def test_ctrl_c_gives_the_training_time_to_save(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ Of a run with run time assurance also what it altered, see `interventions`.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -67,6 +68,7 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
             figures["interventions"] = interventions(most_altered(episodes), env, title)
     place = run / "figures"
     new = place if place.exists() else place.with_name("figures.part")  # for the first time all or none
+    shutil.rmtree(place.with_name("figures.part"), ignore_errors=True)  # of a command that was killed
     paths = [save(figure, new / f"{name}.png") for name, figure in figures.items()]
     if new != place:
         new.rename(place)

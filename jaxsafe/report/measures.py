@@ -10,9 +10,13 @@ from jaxsafe.plot.figures import curve_table
 
 
 def failed_seeds(results: Mapping[str, Any]) -> list[int]:
-    """The seeds of a run that succeed in less than 95 % of their episodes after training, stochastic or deterministic."""
+    """The seeds of a run that succeed in less than 95 % of their episodes after training, stochastic or deterministic.
+
+    A seed whose success is not known failed.
+    """
     each = [results["evaluation"][way]["success_rate"]["per_seed"] for way in ("stochastic", "deterministic")]
-    return [seed for seed, pair in enumerate(zip(*each, strict=True), start=results["seed"]) if min(pair) < 0.95]
+    pairs = enumerate(zip(*each, strict=True), start=results["seed"])
+    return [seed for seed, pair in pairs if any(rate is None or rate < 0.95 for rate in pair)]
 
 
 def finished(curves: Sequence[Mapping[str, Any]], step: int) -> float:

@@ -16,6 +16,7 @@ from jaxsafe.report.plan import CERTIFIED_STARTS, FILM, KINDS, PAPER_STEPS, SHIP
 from jaxsafe.report.record import Record
 from jaxsafe.train import window
 from jaxsafe.train.files import write_text
+from jaxsafe.train.results import known, least
 
 DIRECTORY = "baselines"
 """Beside the page: records, curves, figures and films."""
@@ -156,7 +157,7 @@ class Report:
             each = [evaluation[kind]["success_rate"] for kind in ("stochastic", "deterministic")]
             rows.append([
                 item.task, item.kind, *(_percent(one) for one in each),
-                f"{100 * min(min(one['per_seed']) for one in each):.1f} %",
+                _share(least(each), 1),
                 ", ".join(map(str, failed_seeds(found))) or "none",
                 *(_number(evaluation["deterministic"][name]) for name in ("average_return", "episode_length")),
             ])  # fmt: skip
@@ -195,7 +196,7 @@ class Report:
                 rows.append([
                     item.task, item.kind, kind, _rate(one["safety_violation_rate"], starts, found["seeds"]),
                     _percent(one["episode_safety_violation_rate"]),
-                    *(f"{100 * one[f'episode_violation_severity_{name}']['mean']:.1f} %" for name in ("mean", "max")),
+                    *(_share(one[f"episode_violation_severity_{name}"]["mean"], 1) for name in ("mean", "max")),
                     _number(cost, 0) if kind == "stochastic" else "",
                 ])  # fmt: skip
         return _section(
@@ -224,7 +225,7 @@ class Report:
                 rows.append([
                     item.task, trained, label, starts, _percent(one["success_rate"]),
                     _rate(one["safety_violation_rate"], self.episodes[item.name], results["seeds"]),
-                    _percent(share) if share["mean"] is not None else "–",
+                    _percent(share),
                     _number(own["training_cost"], 0) if results is own else "",
                 ])  # fmt: skip
         return (
@@ -251,7 +252,7 @@ class Report:
                 record.item.task, name,
                 *(_percent(found["evaluation"][kind]["success_rate"]) for kind in found["evaluation"]),
                 *(_percent(one[metric]) for metric in ("safety_violation_rate", "episode_safety_violation_rate")),
-                f"{100 * one['episode_violation_severity_max']['mean']:.1f} %",
+                _share(one["episode_violation_severity_max"]["mean"], 1),
                 _number(one["average_return"]), _number(one["control_usage_l1"]), _number(one["episode_length"], 1),
             ])  # fmt: skip
         return (
@@ -278,10 +279,10 @@ class Report:
             docks = record.item.task.startswith("docking")
             rows.append([
                 record.item.task, str(best_seed(record.results)),
-                *(f"{100 * one['success_rate']['mean']:.2f} %" for one in (drawn, mode)),
-                f"{100 * mode['episode_safety_violation_rate']['mean']:.2f} %",
-                f"{mode['control_usage_l1']['mean']:.2f}" if docks else "–",
-                *(f"{mode[metric]['mean']:.1f}" for metric in ("average_return", "episode_length")),
+                *(_share(one["success_rate"]["mean"]) for one in (drawn, mode)),
+                _share(mode["episode_safety_violation_rate"]["mean"]),
+                known(mode["control_usage_l1"]["mean"], ".2f") if docks else "–",
+                *(known(mode[metric]["mean"], ".1f") for metric in ("average_return", "episode_length")),
             ])  # fmt: skip
         return (
             _section(
@@ -365,7 +366,13 @@ def _section(title: str, text: str, heads: str, rows: Sequence[Sequence[str]]) -
     return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
 
 
+def _share(value: float | None, digits: int = 2) -> str:
+    return "–" if value is None else f"{100 * value:.{digits}f} %"
+
+
 def _percent(metric: Mapping[str, Any]) -> str:
+    if metric["mean"] is None:
+        return "–"
     interval = metric["ci95"] and [100.0 * bound for bound in metric["ci95"]]
     return f"{with_interval(100.0 * metric['mean'], interval, '.2f')} %"
 
@@ -378,4 +385,4 @@ def _number(metric: Mapping[str, Any], digits: int = 2) -> str:
 
 def _rate(metric: Mapping[str, Any], starts: int, seeds: int) -> str:
     """A share of episodes; a zero with the bound that it proves, of starts: all seeds have the same."""
-    return _percent(metric) if metric["mean"] else f"0 of {starts * seeds:,} (< {300 / starts:.2g} %)"
+    return _percent(metric) if metric["mean"] != 0 else f"0 of {starts * seeds:,} (< {300 / starts:.2g} %)"

@@ -123,8 +123,8 @@ def best_seed(results: Mapping[str, Any]) -> int:
     """
     found = results["evaluation"]["deterministic"]
     columns = [found[name]["per_seed"] for name in ("success_rate", "episode_safety_violation_rate", "average_return")]
-    rank = [
-        (success, -(violating or 0.0), -math.inf if value is None else value)  # no steps, and not finite: null
+    rank = [  # what is not known is null
+        (-1.0 if success is None else success, -(violating or 0.0), -math.inf if value is None else value)
         for success, violating, value in zip(*columns, strict=True)
     ]
     return results["seed"] + rank.index(max(rank))

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import csv
 import json
-import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxsafe.config import yaml
+from jaxsafe.errors import ConfigError
 from jaxsafe.report.plan import Item
 from jaxsafe.report.run import FILM_FILE, answers, options_of
-from jaxsafe.train.files import finite, read_json, read_rows, write_csv, write_json
+from jaxsafe.train.directory import read_content
+from jaxsafe.train.files import finite, read_csv, read_json, write_bytes, write_csv, write_json
+from jaxsafe.train.forms import MAYBE, NULL, OTHERS, TEXT, check
+from jaxsafe.train.log import NEEDS, check_order, read_progress
+from jaxsafe.train.results import check_results, read_results
 
 CURVES = ("wall_s", "success_rate", "return", "length", "delta_v", "violating_share", "cost", "episodes")
 
@@ -38,50 +40,65 @@ def keep(item: Item, run: Path, files: Path, command: str) -> None:
             _copy(run / "figures" / f"{figure}.png", files / f"{item.task}_{figure}.png")
     if (run / "film" / FILM_FILE).exists():
         _copy(run / "film" / FILM_FILE, files / f"{item.task}.gif")
-    rows = read_rows(run / "progress.jsonl")
+    rows = read_progress(run)
     write_csv(files / f"{item.name}.csv", [{name: row.get(name) for name in ("seed", "step", *CURVES)} for row in rows])
     evaluations = {name: item.evaluation_directory(run, name) / "results.json" for name in item.evaluations}
     record = {
         "command": command,
-        "commit": yaml.read(run / "config.yaml").get("commit"),
+        "commit": read_content(run).get("commit"),
         "words": item.words,
         "options": options_of(item),
-        "results": read_json(run / "results.json"),
+        "results": read_results(run / "results.json"),
         "evaluations": {name: read_json(path) for name, path in evaluations.items()},
     }
     write_json(files / f"{item.name}.json", record)
 
 
 def kept(items: Iterable[Item], files: Path) -> tuple[list[Record], list[str]]:
-    """The records there are of these items, and a line for each that is of other options than the item has today."""
-    records, old = [], []
+    """Load the records of these items. For each made with other options, or broken, return a warning instead."""
+    records, left_out = [], []
     for item in items:
         path = files / f"{item.name}.json"
         if not path.exists():
             continue
-        found = read_json(path)
-        if found["options"] != json.loads(json.dumps(finite(options_of(item)))):
-            old.append(f"{path}: was made with other options and is left out; report it again")
+        try:
+            found = read_json(path, {"options": {}})
+            if found["options"] != json.loads(json.dumps(finite(options_of(item)))):
+                left_out.append(f"{path}: was made with other options and is left out; report it again")
+                continue
+            record = _record(item, found, path)
+        except ConfigError as error:
+            left_out.append(f"{error}; it is left out, report it again")
             continue
-        with open(path.with_suffix(".csv"), encoding="utf-8", newline="") as file:
-            curves = [_numbers(row) for row in csv.DictReader(file)]
-        values = {name: found[name] for name in ("command", "commit", "options", "results")}
-        evaluations = found["evaluations"]
-        current = {name: one for name, one in evaluations.items() if answers(item.evaluations.get(name, []), one)}
-        old += [
+        left_out += [
             f"{path}: its evaluation {name!r} was made with other options and is left out; report it again"
-            for name in evaluations.keys() - current.keys()
+            for name in found["evaluations"].keys() - record.evaluations.keys()
         ]
-        records.append(Record(item=item, curves=curves, evaluations=current, **values))
-    return records, old
+        records.append(record)
+    return records, left_out
+
+
+def _record(item: Item, found: dict[str, Any], path: Path) -> Record:
+    """Return the record of an item, with those evaluations that have today's options.
+
+    Raises:
+        ConfigError: what the page takes from it is not there, or not what it should be.
+    """
+    form = {"command": TEXT, "commit": TEXT | NULL, "evaluations": {OTHERS: {}}}
+    check(found, form, str(path))
+    check_results(found.get("results"), f"{path}: results", training=True)
+    for name, results in found["evaluations"].items():
+        check_results(results, f"{path}: evaluations.{name}", training=False)
+    table = path.with_suffix(".csv")
+    curves = read_csv(table, {**dict.fromkeys(CURVES, MAYBE), **NEEDS})
+    check_order(curves, table)
+    if not curves:
+        raise ConfigError(f"{table}: expected a row for every update, found none")
+    values = {name: found[name] for name in ("command", "commit", "options", "results")}
+    every = found["evaluations"].items()
+    current = {name: one for name, one in every if answers(item.evaluations.get(name, []), one)}
+    return Record(item=item, curves=curves, evaluations=current, **values)
 
 
 def _copy(source: Path, target: Path) -> None:
-    target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copy(source, target)
-
-
-def _numbers(row: Mapping[str, str]) -> dict[str, Any]:
-    return {name: float(text) if text else None for name, text in row.items()} | {
-        name: int(row[name]) for name in ("seed", "step")
-    }
+    write_bytes(target, source.read_bytes())

@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe.cli import INTERRUPTED, Arguments, in_main_thread
-from jaxsafe.config import yaml
 from jaxsafe.errors import ConfigError
 from jaxsafe.report.plan import BEST, FILM, Item, best_seed
 from jaxsafe.train.config import resolve
-from jaxsafe.train.directory import described
+from jaxsafe.train.directory import described, read_content
 from jaxsafe.train.files import read_json, write_bytes
+from jaxsafe.train.results import read_results
 
 FILM_FILE = "episode_deterministic.gif"
 
@@ -32,7 +32,7 @@ def train(item: Item, runs: Path) -> Path:
     run = runs / item.name
     if (run / "config.yaml").exists():
         _refuse_other(item, run)
-        if not (run / "results.json").exists():
+        if not (run / "results.json").exists() or not (run / "figures").exists():  # figures come last
             _call("jaxsafe.train", [f"resume={run}"])
     else:
         _call("jaxsafe.train", [*item.words, f"out={run}"])
@@ -47,11 +47,11 @@ def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
         KeyboardInterrupt: the user stopped it.
     """
     if item.kind == "features" and not (run / BEST).exists():
-        best = best_seed(read_json(run / "results.json"))
+        best = best_seed(read_results(run / "results.json"))
         write_bytes(run / BEST, (run / "policy" / f"seed_{best}.npz").read_bytes())
     for name, options in item.evaluations.items():
         out = item.evaluation_directory(run, name)
-        if not (out / "results.json").exists() or not answers(options, read_json(out / "results.json")):
+        if not (out / "results.json").exists() or not answers(options, read_json(out / "results.json", {})):
             shutil.rmtree(out, ignore_errors=True)  # of an evaluation that was interrupted, or of other options
             _call("jaxsafe.evaluate", [f"run={item.subject(run, name)}", f"episodes={episodes}", *options, f"out={out}"])
     film = run / "film"
@@ -64,8 +64,8 @@ def answers(options: Sequence[str], results: Mapping[str, Any]) -> bool:
     """Whether the results of an evaluation are those of these options, which follow `python -m jaxsafe.evaluate run=…`."""
     arguments = Arguments.parse(options)
     filters = {"rta": arguments.pop_text("rta")} if "rta" in arguments.options else {}
-    return results["changes"] == {**filters, **arguments.pop_overrides()} and (
-        results["evaluation_seed"] == arguments.pop_seed()
+    return results.get("changes") == {**filters, **arguments.pop_overrides()} and (
+        results.get("evaluation_seed") == arguments.pop_seed()
     )
 
 
@@ -79,7 +79,7 @@ def options_of(item: Item) -> dict[str, Any]:
 
 def _refuse_other(item: Item, run: Path) -> None:
     """The numbers of an old run must not pass as those of a new recipe."""
-    content = yaml.read(run / "config.yaml")
+    content = read_content(run)
     content["training"].pop("out", None)
     if any(content[part] != value for part, value in options_of(item).items()):
         raise ConfigError(f"runs: {run} was trained with other options; remove it, or give another directory")

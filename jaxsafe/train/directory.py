@@ -19,6 +19,7 @@ from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.origin import commit, versions
 from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.files import write_text
+from jaxsafe.train.forms import NULL, NUMBER, TEXT, check
 
 
 def create(config: TrainConfig, env: Environment, name: str) -> Path:
@@ -63,6 +64,8 @@ def runs(path: Path) -> list[Path]:
 def make(out: str | None, parent: Path, name: str) -> Path:
     """Make the directory that `out` asks for, or else the next free one of a name in `parent`.
 
+    What a kill left of a file that was being written is nothing.
+
     Raises:
         ConfigError: `out` already holds something, or cannot be written.
     """
@@ -70,7 +73,7 @@ def make(out: str | None, parent: Path, name: str) -> Path:
         raise ConfigError(f"out: expected a path without \\, which checkpoints take for /, found {out or parent / name}")
     try:
         path = Path(out) if out else _next_free(parent, name)
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        if path.exists() and (not path.is_dir() or any(file.suffix != ".part" for file in path.iterdir())):
             advice = f"continue it with resume={path}" if (path / "config.yaml").exists() else "choose an empty one"
             raise ConfigError(f"out: {path} already holds something and is never overwritten; {advice}")
         path.mkdir(parents=True, exist_ok=True)
@@ -89,13 +92,25 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
         beside = [str(found.parent) for found in path.parent.glob("*/config.yaml")] if path.parent.is_dir() else []
         choice = f"; choose from {nearest(path, sorted(beside))}" if beside else ""
         raise ConfigError(f"{option}: no run in {str(path)!r} (a directory with config.yaml){choice}")
-    content = yaml.read(path / "config.yaml")
-    place = f"{path / 'config.yaml'}: "
-    if not isinstance(content, dict) or not {"env", "training", "environment"} <= set(content):
-        raise ConfigError(f"{place}expected the keys env, training and environment")
+    content, place = read_content(path), f"{path / 'config.yaml'}: "
     config = normalise(to_component(content["training"], TrainConfig, f"{place}training"))
     env = jaxsafe.config.from_data(content["environment"], f"{place}environment")
     return config, env, str(content["env"])
+
+
+def read_content(path: Path) -> dict[str, Any]:
+    """Return what `config.yaml` of a run holds, as data.
+
+    Raises:
+        ConfigError: it cannot be read, or is that of no run.
+    """
+    file = path / "config.yaml"
+    content = yaml.read(file)
+    if not isinstance(content, dict) or not {"env", "training", "environment"} <= set(content):
+        raise ConfigError(f"{file}: expected the keys env, training and environment")
+    form = {"env": TEXT | NUMBER, "training": {}, "environment": {}}
+    check(content, form | ({"commit": TEXT | NULL} if "commit" in content else {}), str(file))
+    return content
 
 
 def discard_unused(path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,8 +31,13 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
     Raises:
         ConfigError: a row is broken, has not the columns of the first, or stands in the wrong place.
     """
-    path = run / "progress.jsonl"
-    rows = read_rows(path, NEEDS)
+    rows = read_rows(run / "progress.jsonl", NEEDS)
+    check_order(rows, run / "progress.jsonl")
+    return rows
+
+
+def check_order(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Raise a ConfigError unless rows of a progress log have the same columns and come update by update, seed by seed."""
     seeds = [row["seed"] for row in rows if row["step"] == rows[0]["step"]]
     for index, row in enumerate(rows):
         place = f"{path}, row {index + 1}"
@@ -45,7 +50,6 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
             raise ConfigError(f"{place}: expected {wanted}, found seed {row['seed']} at step {row['step']}")
         if first is row and index and row["step"] <= rows[index - 1]["step"]:
             raise ConfigError(f"{place}: expected a step after {rows[index - 1]['step']}, found {row['step']}")
-    return rows
 
 
 def filter_name(env: Environment) -> str:
@@ -82,7 +86,17 @@ class ProgressLog:
         self._board = tensorboard_writer()(str(run / "tensorboard"), purge_step=resume_step + 1) if tensorboard else None
 
     def write(self, rows: list[dict[str, Any]]) -> None:
-        """Add rows to all logs."""
+        """Add rows to all logs.
+
+        Raises:
+            ConfigError: the log was begun with other columns.
+        """
+        different = rows[0].keys() ^ self.rows[0].keys() if self.rows else ()
+        if different:
+            names = ", ".join(sorted(different))
+            raise ConfigError(
+                f"{self._jsonl}: another version of jaxsafe began it; columns differ in {names}; begin a new run"
+            )
         self.rows += rows
         append_rows(self._jsonl, rows)
         append_csv(self._csv, rows)

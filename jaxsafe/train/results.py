@@ -105,7 +105,7 @@ def table(results: dict[str, Any], path: Path) -> str:
     for name, label, unit in _ROWS:
         if all(one[name]["mean"] is not None for one in found.values()):
             rows.append([label, *(_cell(one[name], unit) for one in found.values())])
-    rows.append(["worst seed, success rate", *(percent(_least(one["success_rate"]), 1) for one in found.values())])
+    rows.append(["worst seed, success rate", *(percent(least([one["success_rate"]]), 1) for one in found.values())])
     lines += [*cli.columns(rows), *told_diverged(results)]
     if "given_up" in results:
         counts, limit = results["given_up"], results["given_up"]["after_steps"]
@@ -174,7 +174,6 @@ def summary(runs: Mapping[str, Path]) -> str:
         found = [results["evaluation"][kind] for kind in ("stochastic", "deterministic")]
         success = [one["success_rate"] for one in found]
         reached, cost = results["interaction_efficiency"]["timesteps"], found[0]["episode_cost"]["mean"]
-        known = [value for one in success for value in one["per_seed"] if value is not None]
         diverged += [f"{name}: {line}" for line in told_diverged(results)]
         rows.append(
             (
@@ -184,9 +183,9 @@ def summary(runs: Mapping[str, Path]) -> str:
                 f"{results['steps']:,}",
                 f"{reached:,}" if reached else "never",
                 *(percent(one["mean"], 2) for one in success),
-                percent(min(known, default=None), 1),
-                _number(cost, ".2f"),
-                _number(results["training_cost"]["mean"], ",.0f"),
+                percent(least(success), 1),
+                known(cost, ".2f"),
+                known(results["training_cost"]["mean"], ",.0f"),
                 f"{results['wall_s']:.1f}",
             )
         )
@@ -202,16 +201,18 @@ def told_diverged(results: Mapping[str, Any]) -> list[str]:
     return [f"DIVERGED, and left out of the averages: seed{'s' * (len(diverged) > 1)} {steps}"]
 
 
-def _least(metric: Mapping[str, Any]) -> float | None:
-    return min((value for value in metric["per_seed"] if value is not None), default=None)
+def least(metrics: Sequence[Mapping[str, Any]]) -> float | None:
+    """Return the worst seed's value of several metrics, of those seeds that have one."""
+    return min((value for metric in metrics for value in metric["per_seed"] if value is not None), default=None)
 
 
 def percent(value: float | None, digits: int) -> str:
     """Return a share as text, a dash where there is none."""
-    return _number(value, f".{digits}%")
+    return known(value, f".{digits}%")
 
 
-def _number(value: float | None, form: str) -> str:
+def known(value: float | None, form: str) -> str:
+    """Return a number as text, a dash where it is not known."""
     return "–" if value is None else format(value, form)
 
 
