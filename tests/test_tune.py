@@ -177,6 +177,33 @@ def test_a_killed_sweep_goes_on_and_ends_the_same(swept: Path, tmp_path: Path) -
     assert (path / "results.csv").read_text() == (swept / "results.csv").read_text()
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("sweep.yaml", "{}", "sweep.yaml: request: expected a mapping, found nothing"),
+        ("sweep.yaml", "null", "sweep.yaml: expected a mapping, found None"),
+        ("sweep.yaml", "[]", r"sweep.yaml: expected a mapping, found \[\]"),
+        ("sweep.yaml", "{request: {1: 2}, first: {}}", "sweep.yaml: request: expected text, found 1"),
+        ("settings.jsonl", '{"setting": 0}', "row 1: interaction_efficiency: expected a mapping, found nothing"),
+        ("settings.jsonl", '{"setting": "0"}', "line 1: not a row of this log: setting: expected a whole number"),
+        ("settings.jsonl", '{"setting": 4}', "row 1: setting: expected one of the 4 settings, each once, found 4"),
+        ("settings.jsonl", ("ppo.gamma", 0.5), r"row 1: ppo\.gamma: expected 0\..* in setting 0, found 0\.5"),
+        ("settings.jsonl", ("training_success", [1, 2, 3]), "training_success: expected a list of length 3, each a number"),
+        ("settings.jsonl", ("curve", {"steps": []}), "curve.steps: expected a list of length 20, each a whole number"),
+    ],
+)
+def test_broken_files_of_a_sweep_are_told(swept: Path, tmp_path: Path, name: str, text: Any, message: str) -> None:
+    path = tmp_path / "sweep"
+    path.mkdir()
+    for file in ("sweep.yaml", "settings.jsonl"):
+        shutil.copy(swept / file, path)
+    if not isinstance(text, str):
+        text = json.dumps(results(swept)[0] | dict([text]))
+    (path / name).write_text(f"{text}\n")
+    with pytest.raises(ConfigError, match=message):
+        command.main([f"resume={path}"])
+
+
 def test_an_interrupted_sweep_says_how_to_go_on(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:

@@ -43,7 +43,7 @@ def main(argv: Sequence[str]) -> int:
         path = results.create(out, request, found[0])
     else:
         results.refuse_other(path, found[0])
-    rows = results.read(path)
+    rows = results.read(path, found)
     left = [i for i in range(len(found)) if i not in rows]
     print(
         f"{len(found)} settings × {found[0].config.seeds} seeds, {len(alike(found, left))} to compile, in {path}",

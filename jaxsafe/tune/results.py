@@ -11,10 +11,11 @@ import numpy as np
 
 from jaxsafe.cli import Arguments, columns
 from jaxsafe.config import yaml
-from jaxsafe.errors import ConfigError
+from jaxsafe.errors import ConfigError, show
 from jaxsafe.origin import versions
 from jaxsafe.train import directory
 from jaxsafe.train.files import append_rows, keep_rows, write_csv, write_json, write_text
+from jaxsafe.train.forms import COUNT, NULL, OTHERS, SHARE, TEXT, Kind, check, numbers
 from jaxsafe.train.results import percent, told_diverged
 from jaxsafe.tune.settings import Setting
 
@@ -47,7 +48,10 @@ def read_request(path: Path) -> Arguments:
     """
     if not (path / "sweep.yaml").is_file():
         raise ConfigError(f"resume: no sweep in {str(path)!r} (a directory with sweep.yaml)")
-    return Arguments(dict(yaml.read(path / "sweep.yaml")["request"]))
+    request = _content(path)["request"]
+    for name in request:
+        check(name, TEXT, f"{path / 'sweep.yaml'}: request")
+    return Arguments(dict(request))
 
 
 def refuse_other(path: Path, first: Setting) -> None:
@@ -57,13 +61,60 @@ def refuse_other(path: Path, first: Setting) -> None:
         ConfigError: what the sweep was begun with has changed.
     """
     now = yaml.write(directory.described(first.config, first.env))
-    if yaml.read(path / "sweep.yaml").get("first") != yaml.parse(now, "first"):
+    if _content(path)["first"] != yaml.parse(now, "first"):
         raise ConfigError(f"resume: the recipe or the environment of {path} has changed since it was begun; begin it anew")
 
 
-def read(path: Path) -> Rows:
-    """The results so far; a line that a kill cut short is cut off."""
-    return {row.pop("setting"): row for row in keep_rows(path / "settings.jsonl", lambda _: True, ("setting",))}
+def _content(path: Path) -> dict[str, Any]:
+    content = yaml.read(path / "sweep.yaml")
+    check(content, {"request": {}, "first": {}}, str(path / "sweep.yaml"))
+    return content
+
+
+def read(path: Path, found: Sequence[Setting]) -> Rows:
+    """Read the results so far; a line that a kill cut short is cut off.
+
+    Args:
+        path: of the sweep.
+        found: its settings.
+
+    Raises:
+        ConfigError: a line is broken, or is not of one of these settings.
+    """
+    file, rows = path / "settings.jsonl", {}
+    for number, row in enumerate(keep_rows(file, lambda _: True, {"setting": COUNT}), start=1):
+        index, place = row.pop("setting"), f"{file}, row {number}"
+        if index >= len(found) or index in rows:
+            raise ConfigError(f"{place}: setting: expected one of the {len(found)} settings, each once, found {index}")
+        check(row, _form(found[index]), place)
+        check(row.get("diverged", []), [{"seed": COUNT, "step": COUNT | NULL}], f"{place}: diverged")
+        check(row.get("given_up", {"after_steps": 0}), {"after_steps": COUNT, OTHERS: COUNT}, f"{place}: given_up")
+        for name, value in found[index].changes.items():
+            if row.get(name) != json.loads(json.dumps(value)):
+                raise ConfigError(
+                    f"{place}: {name}: expected {show(value)} in setting {index}, found {show(row.get(name))}"
+                )
+        rows[index] = row
+    return rows
+
+
+def _form(setting: Setting) -> dict[str, Any]:
+    """Return the form of the results of a setting, as far as they are read."""
+    seeds, updates = setting.config.seeds, setting.config.num_updates
+    rate, curve = numbers(seeds, SHARE | NULL), numbers(updates, SHARE | NULL)
+    metrics = {"success_rate": rate, "episode_safety_violation_rate": rate, "episode_length": numbers(seeds)}
+    return {
+        "interaction_efficiency": {"timesteps": COUNT | NULL, "per_seed": numbers(seeds, COUNT | NULL)},
+        "training_success": rate,
+        "evaluation": {"stochastic": metrics, "deterministic": metrics},
+        "curve": {
+            "steps": numbers(updates, COUNT),
+            "success_rate": Kind(
+                f"{seeds} lists of length {updates}, each a share",
+                lambda value: isinstance(value, list) and len(value) == seeds and all(map(curve.fits, value)),
+            ),
+        },
+    }
 
 
 def add(path: Path, rows: Mapping[int, dict[str, Any]]) -> None:
@@ -110,7 +161,7 @@ def _key(row: dict[str, Any], rank: str) -> tuple[float, ...]:
     """Small is good: settings of which no seed diverged first, then the chosen quantity, then the others."""
     steps = row["interaction_efficiency"]["timesteps"] or float("inf")
     success, deterministic = (-(_mean(row, kind, "success_rate") or 0.0) for kind in ("stochastic", "deterministic"))
-    area = -float(np.mean(row["curve"]["success_rate"]))
+    area = -float(np.mean(np.nan_to_num(np.array(row["curve"]["success_rate"], float))))
     quantities = {
         "steps": (steps, area, success),
         "success": (success, deterministic, steps),
@@ -126,7 +177,7 @@ def _flat(row: dict[str, Any], swept: Sequence[str]) -> dict[str, Any]:
         **{name: json.dumps(row[name]) if isinstance(row[name], (list, dict)) else row[name] for name in swept},
         "80 % after": row["interaction_efficiency"]["timesteps"],
         "seeds at 80 %": f"{sum(step is not None for step in each)}/{len(each)}",
-        "training": round(float(np.mean(row["training_success"])), 4),
+        "training": round(float(np.mean(np.nan_to_num(np.array(row["training_success"], float)))), 4),
         "stochastic": _mean(row, "stochastic", "success_rate", 4),
         "worst": None if not known else round(min(known), 4),
         "deterministic": _mean(row, "deterministic", "success_rate", 4),
