@@ -488,6 +488,34 @@ def test_a_corrupt_checkpoint_leaves_one_line_on_standard_error(tmp_path: Path, 
     assert "checkpoint cannot be read" in found.stderr
 
 
+FULL = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from jaxsafe import cli
+from jaxsafe.train.checkpoint import Checkpoints
+
+def main(argv):
+    checkpoints = Checkpoints(Path(argv[0]), create=True)
+    checkpoints.save(1, {"a": np.zeros(3)}, {})
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+    checkpoints.save(int(argv[1]), {"a": np.random.default_rng(0).random(200_000)}, {})
+
+cli.run(main, str, cli.at_once)
+"""
+
+
+@pytest.mark.parametrize("step", [1, 2])
+def test_a_checkpoint_without_room_is_one_line_and_leaves_the_one_before(tmp_path: Path, step: int) -> None:
+    call = [sys.executable, "-c", FULL, str(tmp_path), str(step)]
+    found = subprocess.run(call, capture_output=True, text=True, check=False)
+    assert found.returncode == 2
+    [line] = found.stderr.splitlines()
+    assert line.startswith(f"error: {tmp_path}/checkpoints/{step}: checkpoint cannot be written: File too large")
+    assert Checkpoints(tmp_path).steps == [1]
+    assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["1"]
+
+
 def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(tmp_path: Path) -> None:
     words = [*TINY, "algorithm=ppo_lagrangian", "cost_limit=3"]
     straight, stopped = tmp_path / "straight", tmp_path / "stopped"

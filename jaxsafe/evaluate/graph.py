@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import functools
-import reprlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.errors import ConfigError, missing
+from jaxsafe.errors import ConfigError, missing, show
 
 Network = Callable[[Mapping[str, Array], Float[Array, " o"]], Float[Array, " a"]]
 """From weights and one observation to one output."""
@@ -104,7 +103,7 @@ def _node(path: Path, node: Any) -> tuple[str, list[str], list[str], dict[str, A
     attributes = {one.name: helper.get_attribute_value(one) for one in node.attribute}
     for name, value in attributes.items():
         if name not in _ATTRIBUTES.get(kind, "").split() and value != 0:
-            raise ConfigError(f"{path}: {kind}: the attribute {name}={reprlib.repr(value)} is not known here")
+            raise ConfigError(f"{path}: {kind}: the attribute {name}={show(value)} is not known here")
     return kind, list(node.input), list(node.output), attributes
 
 

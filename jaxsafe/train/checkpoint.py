@@ -6,12 +6,14 @@ That one also if it is of the same step: it is moved aside, and goes only when t
 from __future__ import annotations
 
 import contextlib
+import functools
 import gc
 import hashlib
 import io
 import json
 import logging
 import shutil
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -34,6 +36,9 @@ QUIET_S = 0.5
 
 SETTLE_S = 10.0
 """How long they get for that at most."""
+
+MAX_REASON = 120
+"""Letters of an error of orbax or tensorstore that a message repeats."""
 
 PRECISION, DIGEST = "precision", "sha256"
 """Facts that are added to those of a checkpoint: the type of its numbers, and the digest of all else in it."""
@@ -66,6 +71,9 @@ class Checkpoints:
         """Write one checkpoint, or write it anew: a pytree of arrays on the host, of keys their words, and some JSON.
 
         A digest of both is written with them, which `restore` compares.
+
+        Raises:
+            ConfigError: there is no room for it, or it cannot be written for another reason.
         """
         ocp = self._ocp
         facts = {**facts, PRECISION: jnp.result_type(float).name}
@@ -77,18 +85,40 @@ class Checkpoints:
             hosts.meet("moved aside")
             self._manager.reload()
         args = ocp.args.Composite(state=ocp.args.StandardSave(state), facts=ocp.args.JsonSave(facts))
-        self._manager.save(step, args=args, force=True)
+        reason = ""
+        with _silence() as complaints:
+            try:
+                self._manager.save(step, args=args, force=True)
+            except (OSError, ValueError, RuntimeError) as error:
+                if jax.process_count() > 1 and "os_error_code" not in str(error):
+                    raise  # by the loss of another process, perhaps
+                reason = str(error).strip().rpartition(": ")[2].partition(" [")[0][:MAX_REASON] or type(error).__name__
+            if reason:
+                _ignore_late_complaints()
+                _settle(complaints)
         if hosts.leads():
-            shutil.rmtree(before, ignore_errors=True)
+            if reason:
+                self._take_back()
+            else:
+                shutil.rmtree(before, ignore_errors=True)
+        if reason:
+            raise ConfigError(f"{place}: checkpoint cannot be written: {reason}; make room, then resume")
 
     def _recover(self) -> None:
-        """Take a checkpoint back whose successor of the same step was never written."""
-        for before in self.directory.glob(f"*{ASIDE}") if hosts.leads() else ():
+        """In one process take back what was not finished; the others wait."""
+        if hosts.leads():
+            self._take_back()
+        hosts.meet("taken back")
+
+    def _take_back(self) -> None:
+        """Take a checkpoint back whose successor of the same step was never written, and remove what is left of that."""
+        for part in self.directory.glob("*.orbax-checkpoint-tmp*"):
+            shutil.rmtree(part, ignore_errors=True)
+        for before in self.directory.glob(f"*{ASIDE}"):
             if before.with_suffix("").exists():
                 shutil.rmtree(before)
             else:
                 before.rename(before.with_suffix(""))
-        hosts.meet("taken back")
 
     def facts(self, step: int) -> dict[str, Any]:
         """Read the JSON of one checkpoint, as it stands there.
@@ -137,8 +167,9 @@ class Checkpoints:
                 read = self._manager.restore(step, args=self._ocp.args.Composite(**args))
             except Exception as error:  # orbax and tensorstore raise whatever their layers raise
                 lines = [line for line in str(error).splitlines() if line.strip()]
-                reason = (lines or [type(error).__name__])[0][:120]
+                reason = (lines or [type(error).__name__])[0][:MAX_REASON]
             if reason:  # outside the except clause: the error keeps the failed tasks, which complain when they go
+                _ignore_late_complaints()
                 _settle(complaints)
         if reason:
             raise ConfigError(f"{self.directory / str(step)}: checkpoint cannot be read: {reason}")
@@ -147,14 +178,30 @@ class Checkpoints:
 
 @contextlib.contextmanager
 def _silence() -> Iterator[io.StringIO]:
-    """Nothing on standard error: threads and tasks of a failed read complain one by one."""
-    logger = logging.getLogger("asyncio")
-    before, logger.disabled = logger.disabled, True
+    """Nothing on standard error: threads and tasks of what fails complain one by one, also through loggers."""
+    loggers = [logging.getLogger(name) for name in ("asyncio", "absl")]
+    before = [logger.disabled for logger in loggers]
+    for logger in loggers:
+        logger.disabled = True
     try:
         with contextlib.redirect_stderr(io.StringIO()) as complaints:
             yield complaints
     finally:
-        logger.disabled = before
+        for logger, disabled in zip(loggers, before, strict=True):
+            logger.disabled = disabled
+
+
+@functools.cache
+def _ignore_late_complaints() -> None:
+    """From now on say nothing of what comes to an event loop after its end: threads of a failed read may take long."""
+    previous = sys.unraisablehook
+
+    def hook(what: sys.UnraisableHookArgs) -> None:
+        if "Event loop is closed" not in str(what.exc_value):
+            previous(what)
+
+    sys.unraisablehook = hook
+    logging.getLogger("asyncio").addFilter(lambda record: "never retrieved" not in record.getMessage())
 
 
 def _settle(complaints: io.StringIO) -> None:

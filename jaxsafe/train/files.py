@@ -8,7 +8,7 @@ import io
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ def write_bytes(path: Path, content: bytes) -> None:
     """As `write_text`, for bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
-    with open(part, "wb") as file:
+    with _named(path), open(part, "wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
@@ -35,6 +35,16 @@ def write_bytes(path: Path, content: bytes) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write an indented JSON file; NaN and infinity become null."""
     write_text(path, json.dumps(finite(value), indent=2, allow_nan=False) + "\n")
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Let an error of writing, which knows no file, name the file."""
+    try:
+        yield
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
 
 
 def parse_json(text: str | bytes, infinite: bool = False) -> Any:
@@ -74,7 +84,7 @@ def read_json(path: Path, form: Any = ANYTHING) -> Any:
 
 def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Add a line of JSON for each row."""
-    with open(path, "a", encoding="utf-8") as file:
+    with _named(path), open(path, "a", encoding="utf-8") as file:
         file.writelines(map(_line, rows))
 
 
@@ -126,7 +136,7 @@ def sync(path: Path) -> None:
 def append_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Add rows to a CSV file, with the header if it is new."""
     new = not path.exists()
-    with open(path, "a", encoding="utf-8", newline="") as file:
+    with _named(path), open(path, "a", encoding="utf-8", newline="") as file:
         file.write(_csv(rows, header=new))
 
 

@@ -7,11 +7,10 @@ must be there; `OTHERS: form` is the form of all further keys, which are not loo
 from __future__ import annotations
 
 import math
-import reprlib
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from jaxsafe.errors import ConfigError
+from jaxsafe.errors import ConfigError, show
 
 OTHERS = ...
 """Stands in a mapping for every key that the mapping does not name."""
@@ -68,7 +67,7 @@ def check(value: Any, form: Any, place: str) -> None:
     found = _problem(value, form)
     if found is not None:
         path, wanted, wrong = found
-        shown = "nothing" if wrong is _ABSENT else reprlib.repr(wrong)
+        shown = "nothing" if wrong is _ABSENT else show(wrong)
         raise ConfigError(f"{place}: {'.'.join(path)}{': ' if path else ''}expected {wanted}, found {shown}")
 
 

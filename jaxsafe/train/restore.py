@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import reprlib
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.errors import ConfigError, nearest, show
 from jaxsafe.train import directory, ppo
 from jaxsafe.train.agent import Params
 from jaxsafe.train.checkpoint import Checkpoints
@@ -84,7 +83,7 @@ def _difference(before: Any, now: Any, place: str = "") -> tuple[str, Any, Any]:
     elif isinstance(before, list) and isinstance(now, list) and len(before) == len(now):
         pairs = [(f"[{index}]", *pair) for index, pair in enumerate(zip(before, now, strict=True))]
     else:
-        return ("", None, None) if before == now else (place, reprlib.repr(before), reprlib.repr(now))
+        return ("", None, None) if before == now else (place, show(before), show(now))
     for name, one, other in pairs:
         found = _difference(one, other, f"{place}.{name}" if place else name)
         if found[0]:
