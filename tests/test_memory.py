@@ -1,3 +1,4 @@
+import resource
 from collections.abc import Callable
 from pathlib import Path
 
@@ -56,6 +57,19 @@ def test_limits_of_control_groups_are_known(
     own = ["3:cpu:/x", f"{2 - version}:{controllers}:{path}"]
     monkeypatch.setattr(memory, "_lines", lambda name: own if name == "/proc/self/cgroup" else lines(name))
     assert memory._container() == (1000 - 700 + 50 if path == "/job/step" else None)
+
+
+def test_the_limit_of_the_process_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resource, "getrlimit", lambda _: (memory.GIB, resource.RLIM_INFINITY))
+    lines = memory._lines
+    monkeypatch.setattr(memory, "_lines", lambda name: ["100 50 7"] if name == "/proc/self/statm" else lines(name))
+    left = memory.GIB - 100 * resource.getpagesize()
+    assert memory._process() == left
+    found = memory.available()
+    assert found is not None
+    assert found <= left
+    monkeypatch.setattr(resource, "getrlimit", lambda _: 2 * (resource.RLIM_INFINITY,))
+    assert memory._process() is None
 
 
 def test_devices_of_one_machine_share_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -107,7 +107,8 @@ def _policy(arguments: cli.Arguments, run: str) -> tuple[SavedPolicy | ForeignPo
         return elsewhere.read(), f"{Path(run).stem}_{elsewhere.task}"
     if not single:
         directory.read(Path(run), "run")  # imports what a user's environment is made of
-        known = {int(file.stem.removeprefix("seed_")) for file in (Path(run) / "policy").glob("seed_*.npz")}
+        stems = [file.stem.removeprefix("seed_") for file in (Path(run) / "policy").glob("seed_*.npz")]
+        known = {int(stem) for stem in stems if stem.isdecimal()}
         if not known:
             raise ConfigError(f"run: {run} has no policies yet; finish it with: python -m jaxsafe.train resume={run}")
         if seed not in known:

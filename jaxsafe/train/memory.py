@@ -11,6 +11,11 @@ from jaxsafe.errors import ConfigError
 from jaxsafe.train import hosts
 from jaxsafe.types import is_key
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None
+
 GIB = 2**30
 
 GROUPS = {
@@ -53,12 +58,12 @@ def require(needed: int, devices: int, what: str) -> None:
 
 
 def available() -> int | None:
-    """Bytes free on an accelerator, or on this machine and within the limit of its container; None if nobody tells."""
+    """Bytes free on an accelerator, or on this machine within the limits of container and process; None if nobody tells."""
     device = jax.local_devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats() or {}
         return stats["bytes_limit"] - stats.get("bytes_in_use", 0) if "bytes_limit" in stats else None
-    known = [free for free in (_machine(), _container()) if free is not None]
+    known = [free for free in (_machine(), _container(), _process()) if free is not None]
     return min(known) if known else None
 
 
@@ -67,6 +72,17 @@ def _machine() -> int | None:
         if line.startswith("MemAvailable:"):
             return 1024 * int(line.split()[1])
     return None
+
+
+def _process() -> int | None:
+    """What `ulimit -v` leaves this process."""
+    if resource is None:
+        return None
+    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    pages = [int(line.split()[0]) for line in _lines("/proc/self/statm")]
+    if most == resource.RLIM_INFINITY or not pages:
+        return None
+    return max(0, most - pages[0] * resource.getpagesize())
 
 
 def _container() -> int | None:
