@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from jaxsafe.component import Component, Range, Unit, fields
@@ -156,7 +157,7 @@ def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:
     for platform, key_i in zip(env.platforms, jax.random.split(key, len(env.platforms)), strict=True):
         with part("platforms", platform.name):
             sim = sim.replace(platforms={**sim.platforms, platform.name: platform.reset(key_i, sim)})
-    return _begin(env, sim, parameters)
+    return _with_own_buffers(_begin(env, sim, parameters), beside=env)
 
 
 def reset_to(
@@ -182,7 +183,7 @@ def reset_to(
         if name not in known:
             raise ConfigError(f"reset_to: unknown platform {show(name)}; choose from {nearest(name, known)}")
     platforms = {name: platform.place(start.get(name, {})) for name, platform in known.items()}
-    return _begin(env, _blank(env).replace(platforms=platforms), parameters)
+    return _with_own_buffers(_begin(env, _blank(env).replace(platforms=platforms), parameters), beside=(env, start))
 
 
 def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep]:
@@ -219,6 +220,21 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
     info = _info(env, sim, terms, totals, desired, actual, assurance)
     timestep = _time_step(env, sim, observation, jnp.asarray(sum(terms.values())), info)
     return State(sim, memory, totals, num_steps, state.parameters), timestep
+
+
+def _with_own_buffers(started: tuple[State, TimeStep], beside: Any) -> tuple[State, TimeStep]:
+    """Copy arrays that stand in several places, or `beside` the state, so that the state may be donated.
+
+    A compiled reset returns an array for each place by itself.
+    """
+    seen = {id(leaf) for leaf in jax.tree.leaves(beside)}
+
+    def own(leaf: Any) -> Any:
+        shared = id(leaf) in seen and not isinstance(leaf, Tracer)
+        seen.add(id(leaf))
+        return jnp.copy(leaf) if shared else leaf
+
+    return jax.tree.map(own, started)
 
 
 def _draw_parameters(env: Environment, key: Key) -> Parameters:

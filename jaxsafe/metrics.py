@@ -86,10 +86,10 @@ def accumulate(episode: Episode, timestep: TimeStep) -> Episode:
         info.outcome,
         episode.delta_v + info.status.get("delta_v", 0.0),
         episode.delta_v_l1 + info.status.get("delta_v_l1", 0.0),
-        episode.violating_steps + (timestep.cost > 0.0),
+        episode.violating_steps + (timestep.cost > 0.0).astype(jnp.int32),
         episode.severity_sum + severity,
         jnp.maximum(episode.severity_max, severity),
-        episode.interventions + info.intervening,
+        episode.interventions + info.intervening.astype(jnp.int32),
         info.reward_totals,
     )
 

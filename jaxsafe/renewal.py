@@ -101,6 +101,6 @@ def _lanes(flags: Flags, rank: Int[Array, " k"], size: int) -> Int[Array, " k"]:
     bits = flags.words[here]
     before = flags.ends[here] - jax.lax.population_count(bits).astype(jnp.int32)
     upto = (jnp.uint32(2) << jnp.arange(BITS, dtype=jnp.uint32)) - 1  # bits 0 … b; the last overflows to all
-    seen = jax.lax.population_count(bits[:, None] & upto).astype(jnp.int32)
+    seen = jax.lax.population_count(bits[:, None] & upto[None]).astype(jnp.int32)
     bit = jnp.sum(seen <= (rank - before)[:, None], axis=1)
     return jnp.where(word < count, here + bit * count, size)

@@ -125,5 +125,6 @@ def step_or_reset_batch(
 
 def cut_short(state: State, timestep: TimeStep, max_episode_steps: Array | float) -> TimeStep:
     """The time step, truncated if its episode is still running after `max_episode_steps`."""
-    cut = ~timestep.done & (state.num_steps >= max_episode_steps)
+    number = jnp.result_type(float)
+    cut = ~timestep.done & (state.num_steps.astype(number) >= jnp.asarray(max_episode_steps, number))
     return timestep.replace(truncated=timestep.truncated | cut)

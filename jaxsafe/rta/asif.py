@@ -71,7 +71,7 @@ def speed_ball(
     (velocity, limit), (pushed, gained) = linear(after, origin)  # v̄ and c, Bᵀ and g
     c = limit - margin
     beta = jnp.max(jnp.sum(pushed * pushed, axis=-1))
-    return beta, jnp.sum(pushed * velocity, axis=-1) - c * gained, jnp.sum(velocity**2) - c * c
+    return beta, jnp.sum(pushed * velocity[None], axis=-1) - c * gained, jnp.sum(velocity**2) - c * c
 
 
 def linear(function: Callable[[Array], T], at: Float[Array, " m"]) -> tuple[T, T]:

@@ -64,7 +64,7 @@ class Brake(BackupController, type="brake"):
             return plant.step(sim.platforms[env.agent], dict(zip(names, u, strict=True)), env.dt).velocity
 
         drift, pushed = linear(velocity, jnp.zeros(len(names), env.dt.dtype))
-        return -jnp.sum(pushed * drift, axis=-1) / jnp.max(jnp.sum(pushed * pushed, axis=-1))
+        return -jnp.sum(pushed * drift[None], axis=-1) / jnp.max(jnp.sum(pushed * pushed, axis=-1))
 
     def faults(self, env: Any, sim: Sim, rta: CertifiedRTA) -> Faults:
         if rta.terminal is not None and type(rta.terminal) is not Slow:

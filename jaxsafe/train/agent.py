@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.lax import broadcast_to_rank
 from jaxtyping import Array, Float
 
 from jaxsafe.component import ANY, Component, Range, Unit
@@ -66,7 +67,8 @@ class Agent(Component):
             return Gaussian(mean=out, log_std=params["log_std"])
         sharpness = (self.prior_std * jnp.exp(-params["log_std"])) ** 2  # of each actuator, then of each of its logits
         sharpness = jnp.sum(sharpness[:, None] * np.repeat(np.eye(len(points), dtype=np.float32), points, axis=1), axis=0)
-        return Categorical(logits=sharpness * (out + _prior(points, self.prior_std)), points=points)
+        prior = broadcast_to_rank(_prior(points, self.prior_std), out.ndim)
+        return Categorical(logits=broadcast_to_rank(sharpness, out.ndim) * (out + prior), points=points)
 
     def critic_inputs(
         self, inputs: Float[Array, "*batch i"], reward_totals: Mapping[str, Float[Array, "*batch"]]
@@ -105,11 +107,13 @@ class Gaussian(Component):
         return self.mean
 
     def sample(self, key: Key, shard: Shard = WHOLE) -> Float[Array, "*batch a"]:
-        return self.mean + jnp.exp(self.log_std) * shard.draw(jax.random.normal, key, self.mean.shape, self.mean.dtype)
+        noise = shard.draw(jax.random.normal, key, self.mean.shape, self.mean.dtype)
+        return self.mean + broadcast_to_rank(jnp.exp(self.log_std), noise.ndim) * noise
 
     def log_prob(self, action: Float[Array, "*batch a"]) -> Float[Array, "*batch"]:
-        z = (action - self.mean) * jnp.exp(-self.log_std)
-        return jnp.sum(-0.5 * z * z - self.log_std - 0.5 * jnp.log(2.0 * jnp.pi), axis=-1)
+        z = (action - self.mean) * broadcast_to_rank(jnp.exp(-self.log_std), self.mean.ndim)
+        log_std = broadcast_to_rank(self.log_std, z.ndim)
+        return jnp.sum(-0.5 * z * z - log_std - 0.5 * jnp.log(2.0 * jnp.pi), axis=-1)
 
     def entropy(self) -> Float[Array, "*batch"]:
         total = jnp.sum(self.log_std + 0.5 * jnp.log(2.0 * jnp.pi * jnp.e), axis=-1)
@@ -148,8 +152,12 @@ class Categorical(Component):
 def mlp(layers: Sequence[Params], x: Float[Array, "*batch i"]) -> Float[Array, "*batch o"]:
     """Perceptron with tanh between layers and none after the last."""
     for layer in layers[:-1]:
-        x = jnp.tanh(x @ layer["kernel"] + layer["bias"])
-    return x @ layers[-1]["kernel"] + layers[-1]["bias"]
+        x = jnp.tanh(_affine(layer, x))
+    return _affine(layers[-1], x)
+
+
+def _affine(layer: Params, x: Float[Array, "*batch i"]) -> Float[Array, "*batch o"]:
+    return x @ layer["kernel"] + broadcast_to_rank(layer["bias"], x.ndim)
 
 
 def _normals(key: Key, shapes: Sequence[tuple[int, int]]) -> list[Array]:
@@ -176,7 +184,7 @@ def _orthogonal(normal: Float[Array, "m n"]) -> Float[Array, "m n"]:
     so as many at once as there are cores wait forever (jaxlib 0.10).
     """
     q, r = jnp.linalg.qr(normal if normal.shape[0] >= normal.shape[1] else normal.T)
-    q = q * jnp.sign(jnp.diagonal(r))
+    q = q * jnp.sign(jnp.diagonal(r))[None]
     return q if q.shape == normal.shape else q.T
 
 

@@ -252,6 +252,7 @@ def gae(reward: Array, value: Array, next_value: Array, terminated: Array, done:
     V(s_{t+1}) is the value of the state that the step led to, before any reset, so an episode that is truncated, or still
     running at the end of the batch, counts what would follow, and one that terminated does not.
     """
+    terminated, done = terminated.astype(reward.dtype), done.astype(reward.dtype)
     delta = reward + gamma * next_value * (1.0 - terminated) - value
 
     def backward(following: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -288,7 +289,8 @@ def learn(
     def minibatch_step(carry: tuple[Params, optax.OptState], rows: Array) -> tuple[tuple[Params, optax.OptState], None]:
         params, optimizer = carry
         gradient = shard.mean(mean_gradient(params, shard.own(rows)))
-        step, optimizer = _optimizer(ppo).update(gradient, optimizer)
+        with jax.numpy_dtype_promotion("standard"):  # Adam of optax raises a float to a whole number
+            step, optimizer = _optimizer(ppo).update(gradient, optimizer)
         return (jax.tree.map(lambda p, s: p - step_size * s, params, step), optimizer), None
 
     def epoch(carry: tuple[Params, optax.OptState], key: Key) -> tuple[tuple[Params, optax.OptState], None]:

@@ -32,13 +32,13 @@ def empty_window(like: Episode) -> Window:
 def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
     """Add those of [num_steps, num_envs] episodes that are done, in order of time; those of the last step run on."""
     finished = done.ravel()
-    order = jnp.cumsum(finished) - 1
+    order = jnp.cumsum(finished, dtype=jnp.int32) - 1
     latest = finished & (order >= order[-1] + 1 - SIZE)
     slot = jnp.where(latest, (window.count + order) % SIZE, SIZE)  # out of range: dropped
     row = jnp.full(SIZE, -1).at[slot].set(jnp.arange(slot.size), mode="drop")  # one scatter, which is dear to compile
     ring = jax.tree.map(lambda old, new: jnp.where(row < 0, old, new.ravel()[row]), window.episodes, episodes)
-    cost = jnp.sum(jnp.where(done, episodes.violating_steps, 0))
-    running_cost = jnp.sum(jnp.where(done[-1], 0, episodes.violating_steps[-1]))
+    cost = jnp.sum(jnp.where(done, episodes.violating_steps, 0), dtype=jnp.int32)
+    running_cost = jnp.sum(jnp.where(done[-1], 0, episodes.violating_steps[-1]), dtype=jnp.int32)
     return Window(ring, window.count + order[-1] + 1, window.cost + cost, running_cost)
 
 
@@ -60,18 +60,26 @@ def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:
     A share is an average of shares: every episode counts alike, however long it is. The rates of `metrics.summarise` are
     other numbers under other names: there every step counts alike.
     """
-    filled = jnp.arange(SIZE) < window.count
-    weight = filled / jnp.maximum(jnp.minimum(window.count, SIZE), 1)
+    filled = (jnp.arange(SIZE, dtype=window.count.dtype) < window.count).astype(jnp.result_type(float))
+    weight = filled / jnp.maximum(jnp.minimum(window.count, SIZE), 1).astype(filled.dtype)
     episodes = window.episodes
-    share = {name: jnp.sum(weight * (episodes.outcome == index)) for index, name in enumerate(outcomes) if index}
+    lengths = jnp.maximum(episodes.length, 1).astype(weight.dtype)
+
+    def mean(values: Array) -> Array:
+        return jnp.sum(weight * values.astype(weight.dtype))
+
+    def mean_share_of_steps(steps: Array) -> Array:
+        return jnp.sum(weight * steps.astype(weight.dtype) / lengths)
+
+    share = {name: mean(episodes.outcome == index) for index, name in enumerate(outcomes) if index}
     return {
         "success_rate": share.get("success", jnp.zeros(())),
-        "return": jnp.sum(weight * episodes.episode_return),
-        "length": jnp.sum(weight * episodes.length),
-        "delta_v": jnp.sum(weight * episodes.delta_v),
-        "violating_share": jnp.sum(weight * episodes.violating_steps / jnp.maximum(episodes.length, 1)),
-        "episode_cost": jnp.sum(weight * episodes.violating_steps),
-        "intervention_share": jnp.sum(weight * episodes.interventions / jnp.maximum(episodes.length, 1)),
+        "return": mean(episodes.episode_return),
+        "length": mean(episodes.length),
+        "delta_v": mean(episodes.delta_v),
+        "violating_share": mean_share_of_steps(episodes.violating_steps),
+        "episode_cost": mean(episodes.violating_steps),
+        "intervention_share": mean_share_of_steps(episodes.interventions),
         **{f"outcome/{name}": value for name, value in share.items()},
-        **{f"reward/{name}": jnp.sum(weight * total) for name, total in episodes.reward_totals.items()},
+        **{f"reward/{name}": mean(total) for name, total in episodes.reward_totals.items()},
     }

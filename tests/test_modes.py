@@ -1,0 +1,127 @@
+"""Everything works in the modes that JAX offers for debugging, for other random numbers and for double precision."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsafe
+from jaxsafe.cli import Arguments
+from jaxsafe.envs import TASKS
+from jaxsafe.evaluate.episodes import run_episodes
+from jaxsafe.rta.presets import PRESETS
+from jaxsafe.train.config import resolve
+from jaxsafe.train.loop import begin, chunk
+
+Mode = Callable[[], AbstractContextManager]
+
+CHECKED_WHILE_TRACING: dict[str, Mode] = {
+    "x64": lambda: jax.enable_x64(True),
+    "rank_promotion": lambda: jax.numpy_rank_promotion("raise"),
+    "dtype_promotion": lambda: jax.numpy_dtype_promotion("strict"),
+}
+CHECKED_WHILE_RUNNING: dict[str, Mode] = {
+    "rbg": lambda: jax.default_prng_impl("rbg"),
+    "unsafe_rbg": lambda: jax.default_prng_impl("unsafe_rbg"),
+    "key_reuse": lambda: jax.debug_key_reuse(True),
+    "nans": lambda: jax.debug_nans(True),
+    "tracer_leaks": jax.checking_leaks,
+    "disable_jit": jax.disable_jit,
+}
+TRAININGS: dict[str, dict[str, Any]] = {
+    "ppo": {},
+    "ppo_lagrangian": {"algorithm": "ppo_lagrangian", "cost_limit": 1},
+    "discrete": {"actions": "discrete"},
+    "corrected": {"rta": "default", "rta_training": "corrected"},
+}
+SMALL = {
+    "agent.hidden": [4], "ppo.num_envs": 2, "ppo.num_steps": 2, "ppo.num_epochs": 1, "ppo.num_minibatches": 1,
+    "env.terminal.timeout.limit": 1,
+}  # fmt: skip
+
+
+def core(env: jaxsafe.Environment, key: jax.Array, num_envs: int) -> Any:
+    """A start, a step, and a rollout long enough for a second start."""
+    key_reset, key_rollout = jax.random.split(key)
+    state, timestep = jaxsafe.reset(env, key_reset)
+    action = jnp.zeros(env.action_size, int if env.num_action_points else timestep.observation.dtype)
+    state, timestep = jaxsafe.step(env, state, action)
+
+    def policy(key: jax.Array, observation: jax.Array) -> jax.Array:
+        return jnp.broadcast_to(action, (*observation.shape[:-1], env.action_size))
+
+    return state, timestep, jaxsafe.rollout(env, policy, key_rollout, 3, num_envs)
+
+
+def learn(words: dict[str, Any], key: jax.Array, run: Callable[..., Any]) -> Any:
+    """Two updates, and an evaluation of what they learn."""
+    config, env, _ = resolve(Arguments({"env": "docking2d", **SMALL, **words}))
+    shared = env, config.agent, config.ppo
+    keys = jax.random.split(key)
+
+    def train(shared: Any, keys: jax.Array) -> Any:
+        state, curves = chunk(shared, begin(shared, keys[0]), 2, 2)
+        env, agent, _ = shared
+        return state, curves, run_episodes(env, agent.policy(env, state.average, False), keys[1], 2)
+
+    return run(train, shared, keys)
+
+
+@pytest.mark.parametrize("mode", CHECKED_WHILE_TRACING)
+@pytest.mark.parametrize("task", ["docking2d", pytest.param("rejoin3d", marks=pytest.mark.slow)])
+def test_steps_and_rollouts_can_be_traced(mode: str, task: str) -> None:
+    with CHECKED_WHILE_TRACING[mode]():
+        env = jaxsafe.make(task)
+        for num_envs in (2, 300):
+            jax.eval_shape(lambda env, key, n=num_envs: core(env, key, n), env, jax.random.key(0))
+
+
+@pytest.mark.parametrize("mode", CHECKED_WHILE_TRACING)
+@pytest.mark.parametrize("training", TRAININGS)
+def test_training_and_evaluation_can_be_traced(mode: str, training: str) -> None:
+    with CHECKED_WHILE_TRACING[mode]():
+        learn(TRAININGS[training], jax.random.key(0), jax.eval_shape)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", CHECKED_WHILE_TRACING)
+@pytest.mark.parametrize(("task", "rta"), [(task, rta) for task in TASKS for rta in PRESETS[task]])
+def test_every_filter_can_be_traced(mode: str, task: str, rta: str) -> None:
+    with CHECKED_WHILE_TRACING[mode]():
+        env = jaxsafe.make(task, rta=rta)
+        jax.eval_shape(lambda env, key: core(env, key, 2), env, jax.random.key(0))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", CHECKED_WHILE_RUNNING)
+def test_everything_runs(mode: str) -> None:
+    with CHECKED_WHILE_RUNNING[mode]():
+        key = jax.random.key(0)
+        plain, filtered = jaxsafe.make("docking2d"), jaxsafe.make("docking2d", rta="default")
+        for env in (plain, filtered):
+            _, timestep, _ = jax.jit(lambda env, key: core(env, key, 2))(env, key)
+            assert bool(jnp.isfinite(timestep.observation).all())
+        state, _ = learn(TRAININGS["ppo"], key, lambda function, *given: jax.jit(function)(*given))[:2]
+        assert int(state.num_updates) == 2
+        assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(state.params))
+
+
+@pytest.mark.parametrize("rta", [None, "default"])
+def test_a_state_may_be_donated_after_an_eager_start(rta: str | None) -> None:
+    env = jaxsafe.make("docking2d", rta=rta, randomize={"deputy.mass": [10, 14]})
+    place = {"position": jnp.array([60.0, 40.0]), "velocity": jnp.zeros(2)}
+    given = {"deputy.mass": jnp.array(12.0)}
+    step = jax.jit(jaxsafe.step, donate_argnums=1)
+    starts = jaxsafe.reset(env, jax.random.key(0)), jaxsafe.reset_to(env, {"deputy": place}, given)
+    for state, timestep in starts:
+        leaves = jax.tree.leaves(state)
+        assert len({leaf.unsafe_buffer_pointer() for leaf in leaves}) == len(leaves)
+        before = np.asarray(timestep.observation)
+        step(env, state, jnp.zeros(2))
+        kept = jax.tree.leaves((env, place, given, timestep))
+        assert not any(leaf.is_deleted() for leaf in kept)
+        np.testing.assert_array_equal(timestep.observation, before)
