@@ -35,7 +35,12 @@ _SAME = {
     "stop_gradient": "Identity", "logistic": "Sigmoid", "pow": "Pow",
 }  # fmt: skip
 _INSIDE = {"jit": "jaxpr", "pjit": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
-_TYPES = {"float32": TensorProto.FLOAT, "int32": TensorProto.INT32, "bool": TensorProto.BOOL}
+_TYPES = {
+    "float32": TensorProto.FLOAT, "float64": TensorProto.FLOAT, "int32": TensorProto.INT32, "int64": TensorProto.INT32,
+    "bool": TensorProto.BOOL,
+}  # fmt: skip
+"""The graph is of single precision, also where JAX computes in double precision."""
+_NARROW = {"float64": np.float32, "int64": np.int32}
 
 
 def write_onnx(path: Path, function: Callable[[Any], Any], shape: Sequence[int], about: dict[str, str]) -> Path:
@@ -85,14 +90,17 @@ class _Graph:
         return output
 
     def constant(self, value: Any) -> str:
-        name, array = self._name(), np.asarray(value)
-        if array.dtype == np.float64:
-            array = array.astype(np.float32)
-        self.constants.append(numpy_helper.from_array(array, name))
-        return name
+        array = np.asarray(value)
+        return self._initializer(array.astype(_NARROW.get(array.dtype.name, array.dtype)))
 
     def integers(self, *values: int) -> str:
-        return self.constant(np.array(values, np.int64))
+        """Add whole numbers that are not data: shapes, axes and bounds."""
+        return self._initializer(np.array(values, np.int64))
+
+    def _initializer(self, array: np.ndarray) -> str:
+        name = self._name()
+        self.constants.append(numpy_helper.from_array(array, name))
+        return name
 
     def inline(self, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[str]) -> list[str]:
         """Add the equations of a jaxpr; the names of its results."""
