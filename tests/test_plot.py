@@ -282,6 +282,35 @@ def test_a_run_without_rows_is_told_in_one_line(whole: Path, tmp_path: Path) -> 
         draw_all(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "old", "new", "message"),
+    [
+        ("episodes.jsonl", '"position": [', '"position": ["x", ', "row 1: platforms.chief.position: expected a list"),
+        ("episodes.jsonl", '"final": false', '"final": null', "row 1: final: expected true or false, found None"),
+        ("episodes.jsonl", '"speed"', '"sped"', "row 1: status.speed: expected a number or null, found nothing"),
+        ("progress.jsonl", '"return": null', '"return": "x"', "line 1: not a row of this log: return: expected"),
+        ("progress.jsonl", '"step": 64', '"step": 65', "progress.jsonl, row "),
+        ("results.json", '"mean": 0.0', '"mean": -1', "expected a number from 0 to 1 or null, found -1"),
+        ("results.json", '"wall_s"', '"wall"', "results.json: wall_s: expected a number ≥ 0, found nothing"),
+    ],
+)
+def test_what_is_drawn_or_told_is_checked_first(
+    whole: Path, tmp_path: Path, name: str, old: str, new: str, message: str
+) -> None:
+    for run in ("one", "other"):
+        (tmp_path / run).mkdir()
+        for file in ("config.yaml", "progress.jsonl", "episodes.jsonl", "results.json"):
+            shutil.copy(whole / file, tmp_path / run)
+    path = tmp_path / "one" / name
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+    runs = f"[{tmp_path / 'one'},{tmp_path / 'other'}]" if name == "results.json" else str(tmp_path / "one")
+    with pytest.raises(ConfigError) as caught:
+        main([f"run={runs}"])
+    assert message in str(caught.value)
+
+
 def test_several_runs_in_one_figure_with_a_table(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
