@@ -231,3 +231,27 @@ def test_degenerate_problems_give_numbers() -> None:
         slopes = jax.jacrev(lambda u, project=project, rest=problem[1:]: project(u, *rest)[0])(problem[0])
         assert np.isfinite(found).all()
         assert np.isfinite(slopes).all()
+
+
+@pytest.mark.parametrize("slack", [None, 1.0])
+def test_a_row_of_zeros_has_derivatives(slack: float | None) -> None:
+    low, high = -jnp.ones(2), jnp.ones(2)
+
+    def value(rows: jax.Array) -> jax.Array:
+        return jnp.sum(nearest_control(jnp.array([0.9, 0.9]), low, high, rows, jnp.array([-1.0, -0.5]), slack)[0])
+
+    slopes = jax.grad(value)(jnp.array([[0.0, 0.0], [-1.0, 0.0]]))
+    assert np.isfinite(slopes).all()
+    assert np.abs(slopes).max() > 0.0
+
+
+def test_a_control_on_its_bound_keeps_its_derivative() -> None:
+    low, high, corner = -jnp.ones(2), jnp.ones(2), jnp.array([1.0, -1.0])
+    problems = [
+        (project_box_halfspace, (jnp.array([1.0, 0.0]), -5.0)),
+        (project_box_ball, (1.0, jnp.zeros(2), -9.0)),
+        (nearest_control, (jnp.eye(2), jnp.array([-5.0, -5.0]))),
+    ]
+    for project, rest in problems:
+        slope = jax.jacfwd(lambda u, project=project, rest=rest: project(u, low, high, *rest)[0])(corner)
+        np.testing.assert_array_equal(slope, np.eye(2))

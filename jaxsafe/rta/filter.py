@@ -22,6 +22,7 @@ from jaxsafe.rta.prediction import (
     repeat,
     smallest_margin,
 )
+from jaxsafe.rta.projection import within
 from jaxsafe.rta.speed_limit import speed_limit_facts
 from jaxsafe.types import ConstraintName, Number, Record, RTAInfo, Sim
 
@@ -333,7 +334,7 @@ def admissible(env: Any, control: Float[Array, " m"]) -> tuple[Float[Array, " m"
     """The control within its bounds, 0 for what is not a number, and whether all of it was finite."""
     low, high = bounds(env)
     finite = jnp.isfinite(control)
-    return jnp.clip(jnp.where(finite, control, 0.0), low, high), jnp.all(finite)
+    return within(jnp.where(finite, control, 0.0), low, high), jnp.all(finite)
 
 
 def repeated(parts: Sequence[Any]) -> str | None:

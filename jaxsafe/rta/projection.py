@@ -47,7 +47,7 @@ def project_box_halfspace(
 
     met, feasible = values[0] >= b, values[-1] >= b
     multiplier = jnp.where(met, 0.0, jnp.where(feasible, step, bends[-1]))
-    return jnp.clip(u + multiplier * a, low, high), feasible
+    return within(u + multiplier * a, low, high), feasible
 
 
 def project_box_ball(
@@ -90,7 +90,12 @@ def project_box_ball(
 
     met, feasible = values[0] <= 0.0, values[-1] <= 0.0
     t = jnp.where(met, 0.0, jnp.where(feasible, jnp.clip(t, before, after), 1.0))
-    return jnp.clip(u + t * towards, low, high), feasible
+    return within(u + t * towards, low, high), feasible
+
+
+def within(control: Float[Array, " m"], low: Float[Array, " m"], high: Float[Array, " m"]) -> Float[Array, " m"]:
+    """The control within its bounds. On a bound it keeps its derivative, of which `jnp.clip` takes half away."""
+    return jnp.where(control < low, low, jnp.where(control > high, high, control))
 
 
 def _change(bends: Sequence[Array], met: Sequence[Array]) -> tuple[Array, Array]:

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxsafe.rta.projection import within
 from jaxsafe.types import Number
 
 
@@ -49,8 +50,8 @@ def nearest_control(
         and the second says whether each row by itself can be met.
     """
     count, size = rows.shape
-    lengths = jnp.sqrt(jnp.sum(rows * rows, axis=-1))
-    scale = jnp.where(lengths > 0.0, lengths, 1.0)
+    squared = jnp.sum(rows * rows, axis=-1)
+    scale = jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0))  # a row of zeros has no derivative of its length
     rows, offsets = rows / scale[:, None], offsets / scale
     cost = None if slack is None else slack * scale**2
     allowed = 30.0 * float(jnp.finfo(u.dtype).eps) if tolerance is None else tolerance
@@ -67,7 +68,7 @@ def nearest_control(
         gram[i][i] = jnp.where(active, gram[i][i] + (0.0 if cost is None else 1.0 / cost[i]), 1.0)
     gap = [jnp.where(active, offsets[i] - _dot(begin, rows[i]), 0.0) for i, active in enumerate(actives)]
     multipliers, regular = _solve(gram, gap)
-    w = [jnp.clip(begin[k] + _dot(multipliers, [some[k] for some in reach]), low[k], high[k]) for k in range(size)]
+    w = [within(begin[k] + _dot(multipliers, [some[k] for some in reach]), low[k], high[k]) for k in range(size)]
 
     missing = [jnp.maximum(offsets[i] - _dot(w, rows[i]), 0.0) for i in range(count)]
     value = sum((w[k] - u[k]) ** 2 for k in range(size))
@@ -78,7 +79,10 @@ def nearest_control(
         valid, value = regular, value + sum(cost[i] * missing[i] ** 2 for i in range(count))
         feasible = jnp.all(jnp.sum(jnp.where(rows > 0.0, rows * high, rows * low), axis=-1) >= offsets)
     best = jnp.argmin(jnp.where(valid, value, jnp.inf))
-    return jnp.where(jnp.any(valid), jnp.stack([one[best] for one in w]), jnp.clip(u, low, high)), feasible
+    # On a bound several patterns give u itself, and the first of them holds it there; u has its own derivative.
+    unaltered = jnp.all(jnp.sum(rows * u, axis=-1) >= offsets) & jnp.all((u >= low) & (u <= high))
+    chosen = jnp.where(unaltered, u, jnp.stack([one[best] for one in w]))
+    return jnp.where(jnp.any(valid), chosen, within(u, low, high)), feasible
 
 
 def _patterns(size: int, count: int, *, soft: bool) -> tuple[np.ndarray, np.ndarray]:
