@@ -180,11 +180,11 @@ def run(
 def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tuple[int, bool]:
     """Return the exit code of a command, and whether it came to its end."""
     try:
-        with _warnings_in_one_line():
-            flags, words = [], []
+        flags, words = [], []
         for word in argv:
             (flags if word.partition("=")[0] == "imports" else words).append(word)
-        with imports.allowed(Arguments.parse(flags).pop_flag("imports") is not False):
+        allowed = Arguments.parse(flags).pop_flag("imports") is not False
+        with imports.allowed(allowed), _warnings_in_one_line():
             return main(words) or 0, True
     except ConfigError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
