@@ -30,7 +30,6 @@ CHECKED_WHILE_RUNNING: dict[str, Mode] = {
     "key_reuse": lambda: jax.debug_key_reuse(True),
     "nans": lambda: jax.debug_nans(True),
     "tracer_leaks": jax.checking_leaks,
-    "disable_jit": jax.disable_jit,
 }
 TRAININGS: dict[str, dict[str, Any]] = {
     "ppo": {},
@@ -100,10 +99,10 @@ def test_every_filter_can_be_traced(mode: str, task: str, rta: str) -> None:
 @pytest.mark.parametrize("mode", CHECKED_WHILE_RUNNING)
 def test_everything_runs(mode: str) -> None:
     with CHECKED_WHILE_RUNNING[mode]():
-        key = jax.random.key(0)
+        *keys, key = jax.random.split(jax.random.key(0), 3)
         plain, filtered = jaxsafe.make("docking2d"), jaxsafe.make("docking2d", rta="default")
-        for env in (plain, filtered):
-            _, timestep, _ = jax.jit(lambda env, key: core(env, key, 2))(env, key)
+        for env, key_core in zip((plain, filtered), keys, strict=True):
+            _, timestep, _ = jax.jit(lambda env, key: core(env, key, 2))(env, key_core)
             assert bool(jnp.isfinite(timestep.observation).all())
         state, _ = learn(TRAININGS["ppo"], key, lambda function, *given: jax.jit(function)(*given))[:2]
         assert int(state.num_updates) == 2
