@@ -196,6 +196,25 @@ def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tu
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED, False
+    except (AssertionError, RuntimeError):
+        if (fault := _platform_fault()) is None:
+            raise
+        print(f"error: {fault}", file=sys.stderr)
+        return 2, False
+
+
+def _platform_fault() -> str | None:
+    """Return what is wrong with the platform that the user chose for JAX, None if nothing is."""
+    chosen = os.environ.get("JAX_PLATFORMS")
+    if not chosen:
+        return None
+    import jax
+
+    try:
+        jax.devices()
+    except (AssertionError, RuntimeError):
+        return f"JAX_PLATFORMS: no device of {chosen!r} can be used here; leave it out, or choose cpu"
+    return None
 
 
 @contextmanager

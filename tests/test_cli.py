@@ -322,6 +322,13 @@ def test_import_draws_in_only_what_the_core_needs() -> None:
     assert found.stdout.strip() == "[]"
 
 
+def test_a_platform_of_jax_that_is_not_there_is_told_in_one_line() -> None:
+    command = [sys.executable, "-m", "jaxsafe.config", "docking2d"]
+    found = subprocess.run(command, env={**os.environ, "JAX_PLATFORMS": "rocm"}, capture_output=True, text=True)
+    assert (found.returncode, found.stdout) == (2, "")
+    assert found.stderr == "error: JAX_PLATFORMS: no device of 'rocm' can be used here; leave it out, or choose cpu\n"
+
+
 def test_paths_are_taken_as_typed() -> None:
     words = ["out=my run #3", "run=a: b", "resume='x'", "runs=true", "policies=007", "env=my # task.yaml"]
     arguments = cli.Arguments.parse(words)

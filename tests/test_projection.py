@@ -9,6 +9,7 @@ import pytest
 from qpsolvers import solve_qp
 from scipy.optimize import minimize, nnls
 
+import jaxsafe
 from jaxsafe.rta.projection import project_box_ball, project_box_halfspace
 from jaxsafe.rta.qp import nearest_control
 
@@ -255,3 +256,18 @@ def test_a_control_on_its_bound_keeps_its_derivative() -> None:
     for project, rest in problems:
         slope = jax.jacfwd(lambda u, project=project, rest=rest: project(u, low, high, *rest)[0])(corner)
         np.testing.assert_array_equal(slope, np.eye(2))
+
+
+@pytest.mark.parametrize("rta", ["default", "explicit_simplex", "explicit_asif"])
+def test_a_step_that_nothing_was_altered_in_has_a_derivative(rta: str) -> None:
+    env = jaxsafe.make("docking2d", rta=rta)
+    state, _ = jaxsafe.reset_to(env, {"deputy": {"position": [120.0, 0.0], "velocity": [0.0, 0.0]}})
+
+    def outcome(action: Any) -> Any:
+        timestep = jaxsafe.step(env, state, action)[1]
+        return timestep.observation, timestep.reward, timestep.info.rta.correction, timestep.info.rta.predicted_margin
+
+    for action in (jnp.zeros(2), jnp.array([0.1, 0.2]), jnp.array([1.0, -1.0])):
+        assert outcome(action)[2] == 0.0
+        for slope in jax.tree.leaves(jax.jacrev(outcome)(action)):
+            assert jnp.isfinite(slope).all()

@@ -24,6 +24,7 @@ from jaxsafe.rta.prediction import (
 )
 from jaxsafe.rta.projection import within
 from jaxsafe.rta.speed_limit import speed_limit_facts
+from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.types import ConstraintName, Number, Record, RTAInfo, Sim
 
 Margin = Annotated[Number, Unit("as the constraint"), Range(0.0)]
@@ -234,7 +235,7 @@ class CertifiedRTA(RTA):
             ahead=ahead,
         )
         info = RTAInfo(
-            correction=jnp.sqrt(jnp.sum(correction**2)),
+            correction=safe_norm(correction),
             feasible=feasible,
             certified=certified,
             predicted_margin=jnp.where(passes, self.lowest(env, sim, after), fallback),
