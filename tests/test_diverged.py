@@ -14,6 +14,8 @@ from tiny import TINY
 from jaxsafe import cli
 from jaxsafe.component import normalise
 from jaxsafe.evaluate import __main__ as evaluate
+from jaxsafe.plot.compare import compare_curves
+from jaxsafe.plot.figures import progress, training_curves
 from jaxsafe.train import __main__ as command
 from jaxsafe.train import directory
 from jaxsafe.train.agent import Agent
@@ -145,3 +147,18 @@ def test_a_sweep_ranks_it_last_and_marks_it(tmp_path: Path, capsys: pytest.Captu
     assert last["training_success"] == [0.0, 0.0, 0.0]
     assert "setting 0: DIVERGED, and left out of the averages: seeds 0 by step 64, 1 by step 64, 2 by step 64" in told
     assert (path / "results.csv").read_text().splitlines()[-1].endswith(",3")
+
+
+def test_curves_leave_out_the_seeds_that_diverged_and_say_so(run: Path, whole: Path) -> None:
+    broken, sound = progress(run), progress(whole)
+    figure = training_curves(broken, "steps", "title")
+    assert "without seed 1, which diverged" in figure.get_suptitle()
+    mean = {line.get_label(): line for line in figure.axes[1].lines}["mean"]
+    alone = [row for row in sound if row["seed"] != 1]
+    expected = {line.get_label(): line for line in training_curves(alone, "steps", "title").axes[1].lines}["mean"]
+    np.testing.assert_array_equal(mean.get_ydata(), expected.get_ydata())
+    compared = compare_curves({"broken": broken, "sound": sound}, "title")
+    names = [text.get_text() for text in compared.legends[0].get_texts()]
+    assert names == ["broken, without seed 1, which diverged", "sound"]
+    every = [row | {"diverged": True, "return": None} for row in sound]
+    assert "diverged" not in training_curves(every, "steps", "title").get_suptitle()

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxsafe.metrics import ENOUGH_EPISODES, ENOUGH_SEEDS, bootstrap_interval
-from jaxsafe.plot.figures import ALWAYS, AXES, CURVES, curve_table, panel_grid, set_axes
+from jaxsafe.plot.figures import ALWAYS, AXES, CURVES, curve_table, panel_grid, set_axes, without_diverged
 from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, plain
 
 LOOKS = tuple(product(("-", "--"), (BLUE, ORANGE, GREEN, "#CC79A7", GREY, "#E69F00", "#56B4E9")))
@@ -40,6 +40,8 @@ def compare_curves(
         x: `steps` or `wall`.
         mark: a name and the place on the horizontal axis of the first panel where it stands.
     """
+    sound = {run: without_diverged(rows) for run, rows in runs.items()}
+    runs = {f"{run}{left_out}": rows for run, (rows, left_out) in sound.items()}
     every = [row for rows in runs.values() for row in rows]
     curves = [curve for curve in CURVES if curve[0] in ALWAYS or any(row.get(curve[0]) for row in every)]
     figure, panels = panel_grid(len(curves), 3.6)

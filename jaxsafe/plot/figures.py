@@ -90,6 +90,7 @@ def progress(run: Path) -> list[dict[str, Any]]:
 def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figure:
     """A panel for each quantity: every seed thin, their mean, and its 95 % interval where there are enough of them."""
     column, label = AXES[x]
+    rows, left_out = without_diverged(rows)
     curves = [curve for curve in CURVES if curve[0] in ALWAYS or any(row.get(curve[0]) for row in rows)]
     figure, panels = panel_grid(len(curves), 4.2)
     for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
@@ -98,8 +99,20 @@ def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figur
         set_axes(panel, label, quantity, name)
     if panels[0].get_legend_handles_labels()[0]:
         panels[0].legend(loc="best", fontsize="small", frameon=False)
-    figure.suptitle(f"{plain(title)}\nthe last 100 training episodes", fontsize="medium")
+    figure.suptitle(f"{plain(title)}\nthe last 100 training episodes{left_out}", fontsize="medium")
     return figure
+
+
+def without_diverged(rows: Sequence[Mapping[str, Any]]) -> tuple[Sequence[Mapping[str, Any]], str]:
+    """Return the rows of the seeds that have not diverged, and words that say which were left out.
+
+    Where every seed has diverged all rows are returned: their curves end where they did.
+    """
+    diverged = {row["seed"] for row in rows if row.get("diverged")}
+    sound = [row for row in rows if row["seed"] not in diverged]
+    if not diverged or not sound:
+        return rows, ""
+    return sound, f", without seed{'s' * (len(diverged) > 1)} {', '.join(map(str, sorted(diverged)))}, which diverged"
 
 
 def set_axes(panel: Axes, label: str, quantity: str, name: str) -> None:
