@@ -109,6 +109,26 @@ def test_everything_runs(mode: str) -> None:
         assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(state.params))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("rta", [None, "default", "explicit_simplex"])
+def test_steps_and_filters_run_without_compilation(rta: str | None) -> None:
+    env, key = jaxsafe.make("docking2d", rta=rta), jax.random.key(0)
+    compiled = jax.jit(lambda env, key: core(env, key, 2))(env, key)
+    with jax.disable_jit():
+        eager = core(env, key, 2)
+    for left, right in zip(jax.tree.leaves(compiled[:2]), jax.tree.leaves(eager[:2]), strict=True):
+        if jnp.issubdtype(left.dtype, jnp.number):
+            np.testing.assert_allclose(left, right, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_training_runs_without_compilation() -> None:
+    with jax.disable_jit():
+        state = learn(TRAININGS["ppo"], jax.random.key(0), lambda function, *given: function(*given))[0]
+    assert int(state.num_updates) == 2
+    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(state.params))
+
+
 @pytest.mark.parametrize("rta", [None, "default"])
 def test_a_state_may_be_donated_after_an_eager_start(rta: str | None) -> None:
     env = jaxsafe.make("docking2d", rta=rta, randomize={"deputy.mass": [10, 14]})
