@@ -97,7 +97,7 @@ def test_no_figure_has_it_and_that_is_said(run: Path, whole: Path, capsys: pytes
 
 def test_its_best_checkpoint_is_one_from_before(run: Path) -> None:
     config, env, _ = directory.read(run, "run")
-    content, _ = Checkpoints(run).restore(1280, structure(env, config))
+    content = Checkpoints(run).restore(1280, structure(env, config))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(content["best"]["params"]))
     assert not np.isfinite(content["state"].params["log_std"][1]).any()
 

@@ -63,7 +63,8 @@ def load(run: str, checkpoint: str | None) -> Subject:
 def _of_file(path: Path) -> Subject:
     saved, mapper = read_policy(path), SeedMapper(1)
     params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], saved.params))
-    about = {"env": path.stem, "preset": "unknown", "algorithm": "unknown", "seed": 0, "step": 0} | saved.about
-    found = {**{name: about[name] for name in ("env", "preset", "algorithm")}, "seeds": 1}
+    about = {"env": path.stem, "preset": "unknown", "seed": 0, "step": 0} | saved.about
+    algorithm = "ppo_lagrangian" if saved.agent.cost_critic else "ppo"  # no other has a critic of the cost
+    found = {"env": about["env"], "preset": about["preset"], "algorithm": algorithm, "seeds": 1}
     found |= {"seed": about["seed"], "steps": about["step"]}
     return Subject(str(about["env"]), saved.env, saved.agent, mapper, params, found, Path("evaluations") / path.stem)

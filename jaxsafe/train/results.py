@@ -47,8 +47,7 @@ def finish(training: Training) -> dict[str, Any]:
         episodes = training.evaluate_finally()
     for seed, params in enumerate(training.params(), start=config.seed):
         if seed not in training.diverged:
-            about = {"env": name, "preset": config.preset, "algorithm": config.algorithm}
-            about |= {"seed": seed, "step": training.step}
+            about = {"env": name, "preset": config.preset, "seed": seed, "step": training.step}
             save_policy(training.run / "policy" / f"seed_{seed}.npz", env, config.agent, params, about)
     left_out = [seed - config.seed for seed in training.diverged]
     results = {
@@ -164,8 +163,8 @@ def _metric(seeds: int, kind: Kind) -> dict[str, Any]:
 def summary(runs: Mapping[str, Path]) -> str:
     """A line for each of several runs, by name: success after training, and violating steps during and after it."""
     heads = (
-        "", "algorithm", "rta", "steps", "80 % after", "stochastic", "deterministic", "worst seed", "cost/episode",
-        "cost of training", "wall [s]",
+        "", "steps", "80 % after", "stochastic", "deterministic", "worst seed", "cost/episode", "cost of training",
+        "wall [s]", "algorithm", "rta",
     )  # fmt: skip
     rows: list[Sequence[str]] = [heads]
     diverged: list[str] = []
@@ -178,8 +177,6 @@ def summary(runs: Mapping[str, Path]) -> str:
         rows.append(
             (
                 name,
-                str(results.get("algorithm", "–")),  # results of older versions do not say
-                str(results.get("rta", "–")),
                 f"{results['steps']:,}",
                 f"{reached:,}" if reached else "never",
                 *(percent(one["mean"], 2) for one in success),
@@ -187,6 +184,8 @@ def summary(runs: Mapping[str, Path]) -> str:
                 known(cost, ".2f"),
                 known(results["training_cost"]["mean"], ",.0f"),
                 f"{results['wall_s']:.1f}",
+                str(results.get("algorithm", "–")),  # results of older versions do not say
+                str(results.get("rta", "–")),
             )
         )
     return "\n".join([*cli.columns(rows), *diverged])
