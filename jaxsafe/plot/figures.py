@@ -87,7 +87,7 @@ def progress(run: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def training_curves(rows: Sequence[dict[str, Any]], x: str, title: str) -> Figure:
+def training_curves(rows: Sequence[Mapping[str, Any]], x: str, title: str) -> Figure:
     """A panel for each quantity: every seed thin, their mean, and its 95 % interval where there are enough of them."""
     column, label = AXES[x]
     rows, left_out = without_diverged(rows)
