@@ -896,7 +896,7 @@ LAUGHS = "\n".join([f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in ra
          r"its aliases stand for more than 1,000,000 values$"),
         ('"\\ud800"', r"found a control character in '\\ud800'$"),
         ('"a\\0b"', r"found a control character in 'a\\x00b'$"),
-        ('"\\UFFFFFFFF"', r"Python int too large"),
+        ('"\\UFFFFFFFF"', r"^key: not valid YAML: (Python int too large|chr)"),  # Python's own words, which differ
         ("9" * 5000, r"not valid YAML: Exceeds the limit"),
         ("x" * (2**20 + 1), r"^key: expected at most 1,048,576 letters$"),
     ],
