@@ -95,4 +95,4 @@ def _arc(state: Any, rate: Float[Array, ""], times: Float[Array, " n"]) -> Float
     """Positions in the plane at constant speed and heading rate."""
     half = rate * times / 2.0
     chord = state.speed * times * jnp.sinc(half / jnp.pi)
-    return state.position + chord[:, None] * direction(state.heading + half)
+    return state.position[None] + chord[:, None] * direction(state.heading + half)
