@@ -16,9 +16,9 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.component import Component, Range, Unit, fields
+from jaxsafe.component import Component, Range, Unit
 from jaxsafe.errors import ConfigError, nearest, part, show
-from jaxsafe.paths import set_path
+from jaxsafe.paths import references, set_path
 from jaxsafe.processors.constraint import Constraint
 from jaxsafe.processors.observation import Observation
 from jaxsafe.processors.reward import Reward
@@ -350,13 +350,8 @@ def _diverged(env: Environment, sim: Sim) -> Bool[Array, ""]:
 
 def _judging(env: Environment) -> list[str]:
     """The statuses that terminal conditions and constraints name."""
-    named = [
-        getattr(item, name)
-        for item in (*env.terminal, *env.constraints)
-        for name, field in fields(type(item)).items()
-        if field.refers and field.refers.section == "status"
-    ]
-    return list(dict.fromkeys(named))
+    found = (reference for item in (*env.terminal, *env.constraints) for reference in references(item, ""))
+    return list(dict.fromkeys(name for _, refers, name in found if refers.section == "status"))
 
 
 def _is_float(value: Array) -> bool:

@@ -6,10 +6,11 @@ component's `shorthand` field, a platform of an environment.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+import typing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Annotated, Any
 
-from jaxsafe.component import Component, Field, fields
+from jaxsafe.component import Component, Field, Refers, fields
 from jaxsafe.errors import ConfigError, nearest, show
 
 Convert = Callable[[Any, Field, str], Any]
@@ -94,3 +95,29 @@ def _index(items: tuple, name: str, place: str) -> int:
     if name not in names:
         raise ConfigError(f"{join(place, name)}: unknown name {show(name)}; choose from {nearest(name, names)}")
     return names.index(name)
+
+
+def references(component: Component, place: str) -> Iterator[tuple[str, Refers, str]]:
+    """Yield each name of another part that a component has: the place of the name, what it refers to, and the name."""
+    for name, field in fields(type(component)).items():
+        value, here = getattr(component, name), join(place, name)
+        for refers, one in [(field.refers, value)] if field.refers else _listed(field.hint, value):
+            if isinstance(one, str):
+                yield here, refers, one
+        if isinstance(value, Mapping):
+            yield from ((here, refers, key) for refers in _key_refers(field.hint) for key in value)
+        for inner in value if isinstance(value, tuple) else (value,):
+            if isinstance(inner, Component):
+                yield from references(inner, join(here, getattr(inner, "name", "")))
+
+
+def _listed(hint: Any, value: Any) -> list[tuple[Refers, Any]]:
+    """The names in a `tuple[Annotated[str, Refers(…)], …]`, each with what it refers to."""
+    return [(refers, one) for refers in _key_refers(hint) for one in value] if isinstance(value, tuple) else []
+
+
+def _key_refers(hint: Any) -> list[Refers]:
+    """What the keys of `Mapping[Annotated[str, Refers(…)], …]`, or the elements of such a tuple, refer to."""
+    key = next(iter(typing.get_args(hint)), None)
+    marks = typing.get_args(key)[1:] if typing.get_origin(key) is Annotated else ()
+    return [mark for mark in marks if isinstance(mark, Refers)]

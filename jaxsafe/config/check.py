@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import typing
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxsafe.component import ANY, Component, Refers, choices, fields
+from jaxsafe.component import ANY, Component, choices, fields
 from jaxsafe.config.convert import expects, to_value
 from jaxsafe.config.imports import modules
 from jaxsafe.environment import Environment, reset, step
 from jaxsafe.errors import ConfigError, nearest, show, told
-from jaxsafe.paths import join, set_path
+from jaxsafe.paths import join, references, set_path
 from jaxsafe.processors.observation import Observe, ObserveAngle
 from jaxsafe.rta.prediction import judge
 from jaxsafe.simulation.geometry import Region
@@ -69,32 +68,6 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
         _check_computable(*_shapes(env), jnp.result_type(float))
         _check_suited(env)
     return env
-
-
-def references(component: Component, place: str) -> Iterator[tuple[str, Refers, str]]:
-    """Yield each name of another part that a component has: the place of the name, what it refers to, and the name."""
-    for name, field in fields(type(component)).items():
-        value, here = getattr(component, name), join(place, name)
-        for refers, one in [(field.refers, value)] if field.refers else _listed(field.hint, value):
-            if isinstance(one, str):
-                yield here, refers, one
-        if isinstance(value, Mapping):
-            yield from ((here, refers, key) for refers in _key_refers(field.hint) for key in value)
-        for inner in value if isinstance(value, tuple) else (value,):
-            if isinstance(inner, Component):
-                yield from references(inner, join(here, getattr(inner, "name", "")))
-
-
-def _listed(hint: Any, value: Any) -> list[tuple[Refers, Any]]:
-    """The names in a `tuple[Annotated[str, Refers(…)], …]`, each with what it refers to."""
-    return [(refers, one) for refers in _key_refers(hint) for one in value] if isinstance(value, tuple) else []
-
-
-def _key_refers(hint: Any) -> list[Refers]:
-    """What the keys of `Mapping[Annotated[str, Refers(…)], …]`, or the elements of such a tuple, refer to."""
-    key = next(iter(typing.get_args(hint)), None)
-    marks = typing.get_args(key)[1:] if typing.get_origin(key) is Annotated else ()
-    return [mark for mark in marks if isinstance(mark, Refers)]
 
 
 def _check_problems(env: Environment) -> None:

@@ -11,9 +11,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
-from jaxsafe.config.check import references
 from jaxsafe.environment import SUCCESS
 from jaxsafe.errors import ConfigError
+from jaxsafe.paths import references
 from jaxsafe.processors.constraint import Separation, SpeedLimit
 from jaxsafe.streams import printable
 from jaxsafe.train.files import write_bytes
