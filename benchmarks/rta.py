@@ -32,11 +32,11 @@ from jaxsafe.component import normalise
 from jaxsafe.config import override
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 from jaxsafe.rta.attack import attack
-from jaxsafe.rta.prediction import bounds
 from jaxsafe.rta.presets import PRESETS
 from jaxsafe.rta.qp import nearest_control
 from jaxsafe.train.agent import Agent
 from jaxsafe.train.ppo import PPO, init, update
+from jaxsafe.transition import bounds
 
 OUT = Path(__file__).parent / "results" / "rta.json"
 BATCH = 4096

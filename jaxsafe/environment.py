@@ -25,10 +25,11 @@ from jaxsafe.processors.reward import Reward
 from jaxsafe.processors.status import Status
 from jaxsafe.processors.terminal import Terminal
 from jaxsafe.rta.filter import RTA
-from jaxsafe.rta.prediction import advance
+from jaxsafe.simulation.controllers import Actuator
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.initializers import uniform
 from jaxsafe.simulation.platform import Platform, placed
+from jaxsafe.transition import advance, update_statuses
 from jaxsafe.types import Info, Key, Memory, Number, ParameterPath, PlatformName, RTAInfo, Sim, State, TimeStep
 
 Parameters = Mapping[str, Float[Array, ""]]
@@ -89,6 +90,11 @@ class Environment(Component):
     def success(self) -> int:
         """The index of the outcome `success`; −1, which nothing ends with, where the task has none."""
         return self.outcomes.index(SUCCESS) if SUCCESS in self.outcomes else -1
+
+    @property
+    def actuators(self) -> tuple[Actuator, ...]:
+        """The actuators, in the order of the action; empty where the agent's controller lists none."""
+        return getattr(self.agent_platform.controller, "actuators", ())
 
     @property
     def action_names(self) -> tuple[str, ...]:
@@ -211,7 +217,7 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
     sim = _blank(env).replace(time=num_steps.astype(env.dt.dtype) * env.dt, platforms=platforms)
     sim = sim.replace(intervening=jnp.zeros((), bool) if assurance is None else rta_memory.intervening)
 
-    sim, status_memory = _statuses(env, sim, state.memory.status)
+    sim, status_memory = update_statuses(env, sim, state.memory.status)
     sim = _terminal(env, sim)
     sim, reward_memory, terms, totals = _rewards(env, sim, state)
     observation, observation_memory = _observations(env, sim, state.memory.observation)
@@ -271,7 +277,7 @@ def _blank(env: Environment) -> Sim:
 
 def _begin(env: Environment, sim: Sim, parameters: Parameters) -> tuple[State, TimeStep]:
     """Initialise all processors from placed platforms: `init` and `process`, no `increment`."""
-    sim, status_memory = _statuses(env, sim, None)
+    sim, status_memory = update_statuses(env, sim, None)
     ended = _terminal(env, sim)
     observation, observation_memory = _observations(env, sim, None)
     reward_memory = {}
@@ -304,20 +310,6 @@ def _checked(env: Environment, action: Array) -> Array:
             f"action: expected whole numbers, indices of {env.num_action_points} points, found {action.dtype}"
         )
     return action
-
-
-def _statuses(env: Environment, sim: Sim, memory: Mapping[str, Any] | None) -> tuple[Sim, dict[str, Any]]:
-    """Regions, then statuses in order; each sees only those before it. Without memory: the start of an episode."""
-    for region in env.regions:
-        with part("regions", region.name):
-            sim = sim.replace(regions={**sim.regions, region.name: region.place(sim.platforms)})
-    memories = {}
-    for status in env.status:
-        with part("status", status.name):
-            own = status.init(sim) if memory is None else status.increment(memory[status.name], sim, env.dt)
-            sim = sim.replace(status={**sim.status, status.name: status.process(own, sim)})
-        memories[status.name] = own
-    return sim, memories
 
 
 def _terminal(env: Environment, sim: Sim) -> Sim:

@@ -21,8 +21,8 @@ from scipy import stats
 import jaxsafe
 from jaxsafe import Environment
 from jaxsafe.envs import TASKS
-from jaxsafe.rta.prediction import bounds
 from jaxsafe.simulation.platform import Platform
+from jaxsafe.transition import bounds
 from jaxsafe.types import State, TimeStep
 
 GOLDEN = Path(__file__).parent / "golden"

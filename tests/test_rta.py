@@ -17,11 +17,12 @@ from jaxsafe.rta.adversaries import intercept
 from jaxsafe.rta.asif import ExplicitASIF, Polynomial
 from jaxsafe.rta.attack import attack, within_step
 from jaxsafe.rta.cascade import Cascade, Stage
-from jaxsafe.rta.prediction import advance, bounds, constraint, judge, others_later, others_react
+from jaxsafe.rta.prediction import others_react
 from jaxsafe.rta.presets import DOCKING as DOCKING_FILTER
 from jaxsafe.rta.presets import PRESETS
 from jaxsafe.rta.simplex import Blend, CollisionSimplex, Simplex
 from jaxsafe.simulation.scripted import Command
+from jaxsafe.transition import advance, bounds, constraint, judge, others_later
 from jaxsafe.types import Length, PlatformName, Positive, Sim
 
 slow = partial(pytest.param, marks=pytest.mark.slow)  # to compile

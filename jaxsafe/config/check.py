@@ -19,9 +19,9 @@ from jaxsafe.environment import Environment, reset, step
 from jaxsafe.errors import ConfigError, nearest, show, told
 from jaxsafe.paths import join, references, set_path
 from jaxsafe.processors.observation import Observe, ObserveAngle
-from jaxsafe.rta.prediction import judge
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.platform import Platform
+from jaxsafe.transition import judge
 from jaxsafe.types import Sim
 
 MAX_PARTS = 1000

@@ -136,5 +136,4 @@ def _filter(task: str, rta: str | RTA) -> RTA | None:
 def _with_actions(env: Environment, actions: str) -> Environment:
     if actions not in _ACTIONS:
         raise ConfigError(f"actions: unknown kind {show(actions)}; choose from {nearest(actions, _ACTIONS)}")
-    actuators = getattr(env.agent_platform.controller, "actuators", ())
-    return set_path(env, f"{env.agent}.controller", _ACTIONS[actions](actuators=actuators))
+    return set_path(env, f"{env.agent}.controller", _ACTIONS[actions](actuators=env.actuators))

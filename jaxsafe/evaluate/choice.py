@@ -65,12 +65,8 @@ def differences(trained: Environment, env: Environment) -> str:
     Empty if there is nothing of the kind.
     """
     found = []
-    pairs = {"observation": (trained.observation, env.observation), "actuator": (_actuators(trained), _actuators(env))}
+    pairs = {"observation": (trained.observation, env.observation), "actuator": (trained.actuators, env.actuators)}
     for what, (before, after) in pairs.items():
         known = {part.name: to_data(part) for part in before}
         found += [f"{what} {part.name}" for part in after if to_data(part) != known.get(part.name)]
     return f"defined otherwise than in training: {', '.join(found)}" if found else ""
-
-
-def _actuators(env: Environment) -> tuple[Any, ...]:
-    return getattr(env.agent_platform.controller, "actuators", ())

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, control_unit, labelled, length_unit, margin_unit, plain
+
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
 
 SHADE = "#F0E442"  # of the same palette
 Rows = list[dict[str, Any]]
@@ -22,7 +25,7 @@ def most_altered(episodes: Sequence[tuple[int, Rows]]) -> Rows:
     return max((rows for step, rows in episodes if step == last), key=lambda rows: int(_intervening(rows).sum()))
 
 
-def interventions(rows: Rows, env: Any, title: str) -> Figure:
+def interventions(rows: Rows, env: Environment, title: str) -> Figure:
     """A panel for each control, desired and actual, and one for h of each constraint, over time in s.
 
     Steps on which the filter altered the control are shaded. The margin that it predicted stands with h where it is about
@@ -33,8 +36,9 @@ def interventions(rows: Rows, env: Any, title: str) -> Figure:
         env: the environment, for bounds and units.
         title: of the figure.
     """
-    actuators, length = env.agent_platform.controller.actuators, length_unit(env)
-    apart = len(getattr(env.rta, "constraints", ())) != 1
+    actuators, length = env.actuators, length_unit(env)
+    judged = getattr(env.rta, "constraints", ())
+    apart = len(judged) != 1
     count = len(actuators) + len(env.constraints) + apart
     figure = Figure(figsize=(7.0, 1.0 + 1.35 * count), layout="constrained")
     panels = np.atleast_1d(figure.subplots(count, 1, sharex=True))
@@ -48,7 +52,7 @@ def interventions(rows: Rows, env: Any, title: str) -> Figure:
     for panel, constraint in zip(lower, env.constraints, strict=False):
         panel.plot(times, _column(rows, "margins", constraint.name), color=GREEN, linewidth=1.6, label="h")
         _name(panel, f"h of {constraint.name}", margin_unit(constraint, length))
-    watched = lower[-1] if apart else lower[[one.name for one in env.constraints].index(env.rta.constraints[0])]
+    watched = lower[-1] if apart else lower[[one.name for one in env.constraints].index(judged[0])]
     watched.plot(
         times, _column(rows, "rta", "predicted_margin"), color="black", linewidth=0.8, linestyle="--", label="h, predicted"
     )

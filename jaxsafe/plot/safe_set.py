@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -27,10 +27,10 @@ from jaxsafe.envs import TASKS, make
 from jaxsafe.errors import ConfigError
 from jaxsafe.plot.style import GREY, ORANGE, labelled, length_unit, margin_unit, plain, save
 from jaxsafe.rta.filter import CertifiedRTA
-from jaxsafe.rta.prediction import constraint
 from jaxsafe.simulation.cwh import Spacecraft
 from jaxsafe.simulation.dubins import Dubins2D, Dubins3D
 from jaxsafe.simulation.oriented import OrientedSpacecraft
+from jaxsafe.transition import constraint
 from jaxsafe.types import Sim
 
 OPTIONS = ("env", "rta", "x", "y", "points", "out")
@@ -71,7 +71,7 @@ def planes(env: Environment) -> Planes:
     )
 
 
-def survey(env: Any, start: Start, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
+def survey(env: Environment, start: Start, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
     """H and h on a grid, each [m, n], in the unit of the constraint.
 
     Args:
@@ -84,7 +84,7 @@ def survey(env: Any, start: Start, x: Any, y: Any) -> tuple[np.ndarray, np.ndarr
         The highest H of all backup controllers, −∞ where each ends outside of the terminal set, and the smallest h.
     """
 
-    def states(env: Any, x: Any, y: Any) -> Sim:
+    def states(env: Environment, x: Any, y: Any) -> Sim:
         return jax.vmap(lambda y: jax.vmap(lambda x: place(env, start(x, y)))(x))(y)
 
     best, h = _assess(env, jax.jit(states)(env, jnp.asarray(x), jnp.asarray(y)))
@@ -92,12 +92,13 @@ def survey(env: Any, start: Start, x: Any, y: Any) -> tuple[np.ndarray, np.ndarr
 
 
 @jax.jit
-def _assess(env: Any, sims: Sim) -> tuple[Float[Array, "m n"], Float[Array, "m n"]]:
+def _assess(env: Environment, sims: Sim) -> tuple[Float[Array, "m n"], Float[Array, "m n"]]:
     """H and h of a grid of states; a program of its own, so that all panels share it."""
 
     def one(sim: Sim) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        values = env.rta.certify(env, sim, sim)
-        return jnp.max(jnp.where(jnp.isnan(values), -jnp.inf, values)), env.rta.lowest(env, sim, sim)
+        rta = cast(CertifiedRTA, env.rta)
+        values = rta.certify(env, sim, sim)
+        return jnp.max(jnp.where(jnp.isnan(values), -jnp.inf, values)), rta.lowest(env, sim, sim)
 
     return jax.vmap(jax.vmap(one))(sims)
 

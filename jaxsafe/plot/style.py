@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -19,11 +19,14 @@ from jaxsafe.streams import printable
 from jaxsafe.train.files import write_bytes
 from jaxsafe.types import units
 
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
+
 ZERO_WIDTH_SPACE = "\u200b"
 BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8A8A8A"  # Okabe-Ito, safe for colour-blind readers
 
 
-def length_unit(env: Any) -> str | None:
+def length_unit(env: Environment) -> str | None:
     """The unit of positions: m or ft; None if the platform does not say."""
     return units(type(env.agent_platform.rest())).get("position")
 
@@ -56,7 +59,7 @@ def labelled(quantity: str, unit: str | None) -> str:
     return f"{quantity} [{unit}]" if unit else quantity
 
 
-def kept_out(env: Any) -> set[str]:
+def kept_out(env: Environment) -> set[str]:
     """Return the names of the regions to stay out of: a constraint or a failure watches them, and no success does."""
     status = {part.name: part for part in env.status}
 

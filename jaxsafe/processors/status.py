@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -24,11 +24,14 @@ from jaxsafe.types import (
     StatusName,
 )
 
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
+
 
 class Status(Processor):
     """Base of all statuses."""
 
-    def on_the_way(self, env: Any, before: Sim, sim: Sim) -> Any:
+    def on_the_way(self, env: Environment, before: Sim, sim: Sim) -> Any:
         """Return the output over the step from `before` to `sim`: for distances a lower bound, else that of `sim`."""
         return self.process(self.init(sim), sim)
 
@@ -42,7 +45,7 @@ class Distance(Status, type="distance"):
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
         return safe_norm(self._apart(sim))
 
-    def on_the_way(self, env: Any, before: Sim, sim: Sim) -> Float[Array, ""]:
+    def on_the_way(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, ""]:
         bend = _bend(env, before, sim, self.of) + _bend(env, before, sim, self.to)
         return closest_approach(self._apart(before), self._apart(sim)) - bend
 
@@ -59,7 +62,7 @@ class RegionDistance(Status, type="region_distance"):
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
         return safe_norm(self._apart(sim))
 
-    def on_the_way(self, env: Any, before: Sim, sim: Sim) -> Float[Array, ""]:
+    def on_the_way(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, ""]:
         bend = _bend(env, before, sim, self.of)  # a region is taken to move straight on
         return closest_approach(self._apart(before), self._apart(sim)) - bend
 
@@ -143,6 +146,6 @@ class DeltaV(Status, type="delta_v"):
         return safe_norm(delta_v) if self.norm == "l2" else jnp.sum(jnp.abs(delta_v))
 
 
-def _bend(env: Any, before: Sim, sim: Sim, name: str) -> Float[Array, ""]:
+def _bend(env: Environment, before: Sim, sim: Sim, name: str) -> Float[Array, ""]:
     """How far a platform's path may leave the straight line between two instants."""
     return env.platform(name).bend(before.platforms[name], sim.platforms[name], sim.time - before.time)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -12,27 +12,30 @@ from jaxtyping import Array, Float
 
 from jaxsafe.processors.terminal import Timeout, TooFar
 from jaxsafe.rta.filter import CertifiedRTA
-from jaxsafe.rta.prediction import advance, bounds, smallest_margin
 from jaxsafe.simulation.geometry import safe_norm
+from jaxsafe.transition import advance, bounds, smallest_margin
 from jaxsafe.types import Key, Sim
+
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
 
 Adversary = Callable[[Any, Sim, Key], Float[Array, " m"]]
 """`adversary(env, sim, key)`: a control in physical units."""
 
 
-def uniform(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+def uniform(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     """Any control."""
     low, high = bounds(env)
     return low + (high - low) * jax.random.uniform(key, low.shape)
 
 
-def bang_bang(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+def bang_bang(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     """Every actuator at one of its bounds."""
     low, high = bounds(env)
     return jnp.where(jax.random.bernoulli(key, shape=low.shape), low, high)
 
 
-def greedy(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+def greedy(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     """The control that lowers the smallest h after the step most steeply; a random one where it has no influence."""
 
     def h(u: Float[Array, " m"]) -> Float[Array, ""]:
@@ -41,29 +44,29 @@ def greedy(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
     return _steer(env, h, -1.0, key)
 
 
-def inward(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+def inward(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     """Towards the other platform: pursuit, ramming from behind."""
     return _towards(env, sim, _to_target(env, sim), key)
 
 
-def outward(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+def outward(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     """Away from the other platform."""
     return _towards(env, sim, -_to_target(env, sim), key)
 
 
-def sideways(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+def sideways(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     """Across the velocity, which bends the path without changing the speed at first."""
     velocity = sim.platforms[env.agent].velocity
     across = jnp.stack([-velocity[1], velocity[0], *jnp.zeros(velocity.size - 2)])
     return _towards(env, sim, across, key)
 
 
-def accelerate(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+def accelerate(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     """Along the velocity."""
     return _towards(env, sim, sim.platforms[env.agent].velocity, key)
 
 
-def intercept(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+def intercept(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     """Towards the point at which the other platform can be met at the present speed."""
     own, other = sim.platforms[env.agent], _target(env, sim)
     ahead = other.position - own.position
@@ -74,7 +77,7 @@ def intercept(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
     return _towards(env, sim, ahead + other.velocity * time, key)
 
 
-def head_on(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+def head_on(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     """Gets 2 500 ft or m ahead of the other platform first, then turns on it."""
     own, other = sim.platforms[env.agent], _target(env, sim)
     course = other.velocity / jnp.maximum(safe_norm(other.velocity), 1e-3)
@@ -83,7 +86,7 @@ def head_on(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
     return _towards(env, sim, aim - own.position, key)
 
 
-def there_and_back(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+def there_and_back(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     """Away from the other platform for three quarters of the longest episode, or half of the way allowed, then back."""
     way = _to_target(env, sim)
     times = [one.limit for one in env.terminal if isinstance(one, Timeout)]
@@ -96,7 +99,7 @@ def there_and_back(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
     return _towards(env, sim, jnp.where(back, way, -way), key)
 
 
-def drain(env: Any, sim: Sim, key: Key) -> Float[Array, " m"]:
+def drain(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     """Of the controls at the bounds and in the middle, the one that a filter certifies with the least h on the way.
 
     Without a filter that certifies, the one of the least h after the step.
@@ -135,15 +138,15 @@ ADVERSARIES: dict[str, Adversary] = {
 """By name."""
 
 
-def _target(env: Any, sim: Sim) -> Any:
+def _target(env: Environment, sim: Sim) -> Any:
     return sim.platforms[next(platform.name for platform in env.platforms if platform.name != env.agent)]
 
 
-def _to_target(env: Any, sim: Sim) -> Float[Array, " d"]:
+def _to_target(env: Environment, sim: Sim) -> Float[Array, " d"]:
     return _target(env, sim).position - sim.platforms[env.agent].position
 
 
-def _towards(env: Any, sim: Sim, aim: Float[Array, " d"], key: Key) -> Float[Array, " m"]:
+def _towards(env: Environment, sim: Sim, aim: Float[Array, " d"], key: Key) -> Float[Array, " m"]:
     """The control that turns the velocity over the next steps most towards a direction."""
     aim = aim / jnp.maximum(safe_norm(aim), 1e-6)
 
@@ -154,7 +157,7 @@ def _towards(env: Any, sim: Sim, aim: Float[Array, " d"], key: Key) -> Float[Arr
     return _steer(env, along, 1.0, key)
 
 
-def _steer(env: Any, value: Callable[[Array], Array], sign: float, key: Key) -> Float[Array, " m"]:
+def _steer(env: Environment, value: Callable[[Array], Array], sign: float, key: Key) -> Float[Array, " m"]:
     """Every actuator at the bound that its derivative favours; where there is none, at random."""
     low, high = bounds(env)
     slope = sign * jax.grad(value)((low + high) / 2.0)

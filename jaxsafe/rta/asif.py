@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,10 +16,13 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsafe.component import Component, Range, Unit
 from jaxsafe.rta.filter import CertifiedRTA
-from jaxsafe.rta.prediction import advance, bounds, commanded, constraint, judge
 from jaxsafe.rta.projection import project_box_ball, project_box_halfspace
 from jaxsafe.rta.qp import nearest_control
+from jaxsafe.transition import advance, bounds, commanded, constraint, judge
 from jaxsafe.types import Number, Sim
+
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
 
 T = TypeVar("T")
 
@@ -38,7 +41,7 @@ class DiscreteASIF(CertifiedRTA, type="discrete_asif"):
         return super().problem() or (None if len(self.constraints) == 1 else "expected one constraint, a speed limit")
 
     def propose(
-        self, env: Any, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
+        self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
         required = self.required_margin(env)
         spare = jnp.maximum(constraint(env, self.constraints[0]).margin(judge(env, sim)) - required, 0.0)
@@ -49,7 +52,7 @@ class DiscreteASIF(CertifiedRTA, type="discrete_asif"):
 
 
 def speed_ball(
-    env: Any, sim: Sim, control: Float[Array, " m"], name: str, margin: Number, free: int | None = None
+    env: Environment, sim: Sim, control: Float[Array, " m"], name: str, margin: Number, free: int | None = None
 ) -> tuple[Float[Array, ""], Float[Array, " f"], Float[Array, ""]]:
     """β, p and k of the ball β‖w‖² + 2p·w + k ≤ 0 in which a speed limit keeps a margin after the step.
 
@@ -114,26 +117,26 @@ class ExplicitASIF(CertifiedRTA, type="explicit_asif"):
     degree: Annotated[int, Range(1, 3)] = 1
     slack: SlackCost | None = None
 
-    def unsuited(self, env: Any, sim: Sim) -> dict[str, Bool[Array, ""]]:
+    def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
         rows, _ = self.rows(env, sim, env.action_size)
         reason = f"of degree {self.degree} the control has no influence on"
         empty = {f"{reason} {name!r}": jnp.all(row == 0.0) for name, row in zip(self.constraints, rows, strict=True)}
         return empty | super().unsuited(env, sim)
 
     def propose(
-        self, env: Any, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
+        self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
         rows, offsets = self.rows(env, sim, desired.shape[0])
         if len(rows) == 1 and self.slack is None:
             return project_box_halfspace(desired, *bounds(env), rows[0], offsets[0])
         return nearest_control(desired, *bounds(env), rows, offsets, self.slack)
 
-    def rows(self, env: Any, sim: Sim, size: int) -> tuple[Float[Array, "c m"], Float[Array, " c"]]:
+    def rows(self, env: Environment, sim: Sim, size: int) -> tuple[Float[Array, "c m"], Float[Array, " c"]]:
         """Barrier rows a·u ≥ b, one a constraint."""
         both = [self._row(env, sim, name, size) for name in self.constraints]
         return jnp.stack([a for a, _ in both]), jnp.stack([b for _, b in both])
 
-    def _row(self, env: Any, sim: Sim, name: str, size: int) -> tuple[Float[Array, " m"], Float[Array, ""]]:
+    def _row(self, env: Environment, sim: Sim, name: str, size: int) -> tuple[Float[Array, " m"], Float[Array, ""]]:
         def h(platforms: Any) -> Array:
             return constraint(env, name).margin(judge(env, sim.replace(platforms=platforms)))
 
@@ -148,7 +151,7 @@ class ExplicitASIF(CertifiedRTA, type="explicit_asif"):
         (drift, value), (gains, _) = linear(rate, jnp.zeros(size, env.dt.dtype))
         return gains, -(drift + self.strengthening.of(value))
 
-    def _lift(self, env: Any, sim: Sim, psi: Any, size: int) -> Any:
+    def _lift(self, env: Environment, sim: Sim, psi: Any, size: int) -> Any:
         def lifted(platforms: Any) -> Array:
             still = jnp.zeros(size, env.dt.dtype)
             value, slope = jax.jvp(psi, (platforms,), (_derivative(env, sim, platforms, still),))
@@ -169,7 +172,7 @@ class ImplicitASIF(CertifiedRTA, type="implicit_asif"):
     rounds: Annotated[int, Range(1, 8)] = 2
 
     def propose(
-        self, env: Any, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
+        self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
         (low, high), required = bounds(env), self.required_margin(env)
 
@@ -190,7 +193,7 @@ class ImplicitASIF(CertifiedRTA, type="implicit_asif"):
         return jax.lax.scan(improve, (desired, jnp.ones((), bool)), length=self.rounds)[0]
 
 
-def _derivative(env: Any, sim: Sim, platforms: Any, control: Float[Array, " m"]) -> Any:
+def _derivative(env: Environment, sim: Sim, platforms: Any, control: Float[Array, " m"]) -> Any:
     """ẋ of all platforms, as a tangent."""
     return {
         platform.name: platform.derivative(platforms[platform.name], commanded(env, platform, sim, control))

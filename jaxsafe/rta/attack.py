@@ -21,8 +21,8 @@ from jaxsafe.paths import set_path
 from jaxsafe.processors.terminal import Timeout
 from jaxsafe.rollout import reset_batch
 from jaxsafe.rta.adversaries import ADVERSARIES
-from jaxsafe.rta.prediction import bounds, commanded, smallest_margin
 from jaxsafe.simulation.controllers import Continuous
+from jaxsafe.transition import bounds, commanded, smallest_margin
 from jaxsafe.types import Key, Number, Sim, State, TimeStep
 
 PARTS = 8
@@ -233,6 +233,5 @@ def _unsafe(first: TimeStep) -> Array:
 
 def _with_physical_actions(env: Environment) -> Environment:
     """The environment with the agent's actions in physical units."""
-    controller: Any = env.agent_platform.controller
-    actuators = tuple(one.replace(rescale=False) for one in controller.actuators)
+    actuators = tuple(one.replace(rescale=False) for one in env.actuators)
     return set_path(env, f"{env.agent}.controller", Continuous(actuators=actuators))

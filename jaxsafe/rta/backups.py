@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,6 @@ from jaxsafe.processors.constraint import Separation
 from jaxsafe.processors.status import Distance
 from jaxsafe.rta.asif import linear, speed_ball
 from jaxsafe.rta.filter import BackupController, CertifiedRTA, Faults, TerminalSet
-from jaxsafe.rta.prediction import Others, bounds, constraint, undirected
 from jaxsafe.rta.projection import project_box_ball
 from jaxsafe.rta.speed_limit import LARGEST_TURN, SpeedLimitFacts, distance_and_speed, off_centre, speed_limit_facts
 from jaxsafe.simulation.controllers import Uncontrolled
@@ -25,7 +24,13 @@ from jaxsafe.simulation.geometry import direction, safe_norm
 from jaxsafe.simulation.oriented import OrientedSpacecraft
 from jaxsafe.simulation.scripted import Constant, Scripted
 from jaxsafe.simulation.trig import arctan, wrap
+from jaxsafe.transition import Others, bounds, constraint, undirected
 from jaxsafe.types import ConstraintName, Length, Number, PlatformName, Positive, Radians, Sim
+
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
+
+Aircraft = Dubins2D | Dubins3D
 
 PROVED_ANGLE = math.radians(75.0)
 """From this misalignment or less, at any spin, `align_and_brake` never lets it grow beyond `LARGEST_ANGLE`. This and the
@@ -57,7 +62,7 @@ EQUAL = 1.001
 class Brake(BackupController, type="brake"):
     """Thrust that brings the velocity to 0 at the end of the step, or as near as the bounds allow (dead beat)."""
 
-    def control(self, env: Any, sim: Sim, later: Others) -> Float[Array, " m"]:
+    def control(self, env: Environment, sim: Sim, later: Others) -> Float[Array, " m"]:
         plant, names = env.agent_platform, env.action_names
 
         def velocity(u: Float[Array, " m"]) -> Array:
@@ -66,7 +71,7 @@ class Brake(BackupController, type="brake"):
         drift, pushed = linear(velocity, jnp.zeros(len(names), env.dt.dtype))
         return -jnp.sum(pushed * drift[None], axis=-1) / jnp.max(jnp.sum(pushed * pushed, axis=-1))
 
-    def faults(self, env: Any, sim: Sim, rta: CertifiedRTA) -> Faults:
+    def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         if rta.terminal is not None and type(rta.terminal) is not Slow:
             return {}
         if type(env.agent_platform) is not Spacecraft:
@@ -103,11 +108,12 @@ class AlignAndBrake(BackupController, type="align_and_brake"):
     aligned: Annotated[Radians, Positive] = jnp.pi / 30
     steep: Annotated[Radians, Positive] = jnp.pi * 5 / 12
 
-    def control(self, env: Any, sim: Sim, later: Others) -> Float[Array, " 2"]:
+    def control(self, env: Environment, sim: Sim, later: Others) -> Float[Array, " 2"]:
+        plant = cast(OrientedSpacecraft, env.agent_platform)
         state = sim.platforms[env.agent]
         low, high = bounds(env)
         error = misalignment(state)
-        ceiling = env.agent_platform.attitude_rate_limits[1]
+        ceiling = plant.attitude_rate_limits[1]
         rate = jnp.sign(error) * jnp.minimum(ceiling, _safe_sqrt(1.6 * high[1] * jnp.abs(error)))
         turn = jnp.clip((rate - state.attitude_rate) / env.dt, low[1], high[1])
 
@@ -116,10 +122,10 @@ class AlignAndBrake(BackupController, type="align_and_brake"):
         hold, feasible = project_box_ball(jnp.zeros(1, turn.dtype), low[:1], high[:1], *ball)
         hold = jnp.where(feasible | (jnp.abs(error) <= self.steep), hold[0], 0.0)
         along = jnp.sum(state.velocity * direction(state.attitude))
-        brake = -along * env.agent_platform.mass / env.dt
+        brake = -along * plant.mass / env.dt
         return jnp.stack([jnp.where(jnp.abs(error) <= self.aligned, brake, hold), turn])
 
-    def faults(self, env: Any, sim: Sim, rta: CertifiedRTA) -> Faults:
+    def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         if rta.terminal is not None and type(rta.terminal) is not AlignedOrSlow:
             return {}
         if type(env.agent_platform) is not OrientedSpacecraft:
@@ -134,8 +140,7 @@ class AlignAndBrake(BackupController, type="align_and_brake"):
         if isinstance(found, str):
             return {found: _true()}
         (facts,), kept, required = found, 2.0 * self._margin(env), rta.required_margin(env)
-        controller: Any = env.agent_platform.controller
-        wheel = controller.actuators[1]
+        wheel = env.actuators[1]
         distance, _ = distance_and_speed(env, sim)
         n, slope, limits = facts.mean_motion, facts.slope, env.agent_platform.attitude_rate_limits
         rates = (n / MEAN_MOTION, slope / (2.0 * MEAN_MOTION), 3.0 * n**2 / jnp.maximum(slope, 1e-9) / (1.5 * MEAN_MOTION))
@@ -169,11 +174,11 @@ class AlignAndBrake(BackupController, type="align_and_brake"):
             ),
         }
 
-    def duration(self, env: Any) -> Number:
+    def duration(self, env: Environment) -> Number:
         """A reversal of the spin, and the turn out of the angles beyond 75°."""
         return 12.0 + jnp.zeros_like(env.dt)
 
-    def _margin(self, env: Any) -> Number:
+    def _margin(self, env: Environment) -> Number:
         facts = speed_limit_facts(env, self.constraint)
         return self.margin if facts is None else jnp.maximum(self.margin, facts.least_margin)
 
@@ -183,10 +188,10 @@ class Slow(TerminalSet, type="slow"):
 
     speed: Annotated[Number, Unit("m/s"), Positive]
 
-    def contains(self, env: Any, sim: Sim) -> Bool[Array, ""]:
+    def contains(self, env: Environment, sim: Sim) -> Bool[Array, ""]:
         return safe_norm(sim.platforms[env.agent].velocity) <= self.speed
 
-    def faults(self, env: Any, sim: Sim, rta: CertifiedRTA) -> Faults:
+    def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         if _packaged_but(Brake, rta):
             return {"slow is proved to be kept by brake alone": _true()}
         found = [facts for name in rta.constraints if (facts := speed_limit_facts(env, name))]
@@ -200,11 +205,11 @@ class AlignedOrSlow(TerminalSet, type="aligned_or_slow"):
     angle: Annotated[Radians, Positive]
     speed: Annotated[Number, Unit("m/s"), Positive]
 
-    def contains(self, env: Any, sim: Sim) -> Bool[Array, ""]:
+    def contains(self, env: Environment, sim: Sim) -> Bool[Array, ""]:
         state = sim.platforms[env.agent]
         return (jnp.abs(misalignment(state)) <= self.angle) | (safe_norm(state.velocity) <= self.speed)
 
-    def faults(self, env: Any, sim: Sim, rta: CertifiedRTA) -> Faults:
+    def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         if _packaged_but(AlignAndBrake, rta):
             return {"aligned_or_slow is proved to be kept by align_and_brake alone": _true()}
         found = _speed_limits(env, rta)
@@ -219,7 +224,7 @@ class AlignedOrSlow(TerminalSet, type="aligned_or_slow"):
             "angle of aligned_or_slow is larger than 75°": self.angle > EQUAL * PROVED_ANGLE,
         }
 
-    def _farthest(self, env: Any, sim: Sim, facts: SpeedLimitFacts) -> Any:
+    def _farthest(self, env: Environment, sim: Sim, facts: SpeedLimitFacts) -> Any:
         """How far from the chief a craft is at most until the backup has stopped it."""
         distance, speed = distance_and_speed(env, sim)
         almost = facts.replace(weakest=0.98 * facts.weakest)  # aligned to 6°, and what the body turns within a step
@@ -250,7 +255,7 @@ class MatchVelocity(BackupController, type="match_velocity"):
     dead_zone: Annotated[Radians, Range(0.0)] = 0.2
     within_limits: ClassVar[bool] = True
 
-    def control(self, env: Any, sim: Sim, later: Others) -> Float[Array, " m"]:
+    def control(self, env: Environment, sim: Sim, later: Others) -> Float[Array, " m"]:
         own, lead, ahead = sim.platforms[env.agent], sim.platforms[self.lead], later[self.lead]
         sign = 1.0 if self.turn == "left" else -1.0
         away = self._away(own.position - lead.position)
@@ -259,7 +264,7 @@ class MatchVelocity(BackupController, type="match_velocity"):
         goal = ahead.heading if self.climb is None else lead.heading
         goal += (lead.velocity[0] * away[1] - lead.velocity[1] * away[0]) / level
         error = sign * wrap(sign * (goal - own.heading), -self.dead_zone, 2.0 * jnp.pi)
-        speed = jnp.clip(ahead.speed + faster, *env.agent_platform.speed_limits)
+        speed = jnp.clip(ahead.speed + faster, *cast(Aircraft, env.agent_platform).speed_limits)
         wanted = {"acceleration": (speed - own.speed) / env.dt}
         if self.climb is None:
             wanted["heading_rate"] = error / env.dt
@@ -269,16 +274,16 @@ class MatchVelocity(BackupController, type="match_velocity"):
             wanted |= self._in_space(env, own, error, turning, ahead.flight_path_angle + steeper)
         return jnp.stack([wanted[name] for name in env.action_names])
 
-    def duration(self, env: Any) -> Number:
+    def duration(self, env: Environment) -> Number:
         """A full turn, and in space the roll that begins it."""
-        plant = env.agent_platform
         if self.climb is None:
             return (2.0 * jnp.pi - self.dead_zone) / _authority(env, "heading_rate") + 2.0 * env.dt
+        plant = cast(Dubins3D, env.agent_platform)
         bank = jnp.minimum(-plant.roll_limits[0], plant.roll_limits[1])
         turn = 2.0 * jnp.pi * plant.speed_limits[1] / (plant.gravity * jnp.tan(bank))
         return turn + bank / _authority(env, "roll_rate")
 
-    def faults(self, env: Any, sim: Sim, rta: CertifiedRTA) -> Faults:
+    def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         if rta.terminal is None:
             return {"match_velocity keeps no separation by itself: give a horizon and a terminal set": _true()}
         return {}
@@ -287,8 +292,8 @@ class MatchVelocity(BackupController, type="match_velocity"):
         distance = safe_norm(apart)
         return 0.1 * jnp.maximum(self.clearance - distance, 0.0) * apart / jnp.maximum(distance, 1.0)
 
-    def _in_space(self, env: Any, own: Any, error: Array, turning: Array, angle: Array) -> dict[str, Array]:
-        plant = env.agent_platform
+    def _in_space(self, env: Environment, own: Any, error: Array, turning: Array, angle: Array) -> dict[str, Array]:
+        plant = cast(Dubins3D, env.agent_platform)
         bank = arctan(own.speed * (0.25 * error + turning) / plant.gravity)
         bank = jnp.clip(bank, plant.roll_limits[0], plant.roll_limits[1])
         lowest, highest = plant.flight_path_angle_limits
@@ -315,14 +320,14 @@ class VelocityMatched(TerminalSet, type="velocity_matched"):
     drift: Annotated[Number, Unit("s"), Range(0.0)] = 1.0
     lag: Annotated[Number, Unit("s"), Range(0.0)] = 0.0
 
-    def contains(self, env: Any, sim: Sim) -> Bool[Array, ""]:
+    def contains(self, env: Environment, sim: Sim) -> Bool[Array, ""]:
         one, other = sim.platforms[self.of], sim.platforms[self.to]
         accelerating = _acceleration(env, sim, self.of) - _acceleration(env, sim, self.to)
         relative = safe_norm(one.velocity - other.velocity) + self.lag * safe_norm(accelerating)
         apart = safe_norm(one.position - other.position)
         return (relative < self._tolerance(env)) & (apart >= self.clearance + self.drift * relative)
 
-    def _tolerance(self, env: Any) -> Number:
+    def _tolerance(self, env: Environment) -> Number:
         """`tolerance`, or in space what the proof and the rates of the actuators allow, if that is less."""
         plant = env.agent_platform
         if type(plant) is not Dubins3D:
@@ -337,19 +342,19 @@ class VelocityMatched(TerminalSet, type="velocity_matched"):
         ]
         return functools.reduce(jnp.minimum, allowed, self.tolerance)
 
-    def faults(self, env: Any, sim: Sim, rta: CertifiedRTA) -> Faults:
+    def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         agent = env.agent
         others = {self.of, self.to} - {agent}
-        plant = env.agent_platform
+        plant = cast(Aircraft, env.agent_platform)
         if agent not in (self.of, self.to) or len(others) != 1 or type(plant) not in (Dubins2D, Dubins3D):
             return {"velocity_matched is proved for an aircraft that is the agent, and another one": _true()}
         (name,) = others
-        lead = env.platform(name)
+        lead = cast(Aircraft, env.platform(name))
         if type(lead) is not type(plant):
             return {"velocity_matched is proved for two aircraft of one kind": _true()}
         if _packaged_but(MatchVelocity, rta) or any(one.lead != name for one in rta.backups if type(one) is MatchVelocity):
             return {f"velocity_matched is proved to be kept by match_velocity of {name!r} alone": _true()}
-        limits = [constraint(env, one) for one in rta.constraints]
+        limits = [cast(Separation, constraint(env, one)) for one in rta.constraints]
         if not all(_separates(env, limit, {agent, name}) for limit in limits):
             return {f"velocity_matched keeps separations of {agent!r} and {name!r} alone": _true()}
         if type(lead.controller) not in (Uncontrolled, Scripted):
@@ -371,11 +376,11 @@ class VelocityMatched(TerminalSet, type="velocity_matched"):
             return faults | self._faults_in_plane(env, rta, name, extremes)
         return faults | self._faults_in_space(env, state, name, commands, extremes)
 
-    def _faults_in_plane(self, env: Any, rta: CertifiedRTA, name: str, extremes: Any) -> Faults:
+    def _faults_in_plane(self, env: Environment, rta: CertifiedRTA, name: str, extremes: Any) -> Faults:
         """What is missing for Proposition 6."""
-        error = 1.01 * self.tolerance / env.agent_platform.speed_limits[0]
+        error = 1.01 * self.tolerance / cast(Aircraft, env.agent_platform).speed_limits[0]
         spare = {"heading_rate": error / env.dt, "acceleration": self.tolerance / env.dt}
-        ranges = {one.name: (one.low, one.high) for one in env.agent_platform.controller.actuators}
+        ranges = {one.name: (one.low, one.high) for one in env.actuators}
         faster = []
         for control, (least, most) in extremes.items():
             low, high = ranges.get(control, (0.0, 0.0))
@@ -389,9 +394,9 @@ class VelocityMatched(TerminalSet, type="velocity_matched"):
             "an aircraft turns too far within a step": ~(functools.reduce(jnp.maximum, turns) * env.dt <= 0.85),
         }
 
-    def _faults_in_space(self, env: Any, state: Any, name: str, commands: Any, extremes: Any) -> Faults:
+    def _faults_in_space(self, env: Environment, state: Any, name: str, commands: Any, extremes: Any) -> Faults:
         """What is missing for Proposition 7."""
-        plant = env.agent_platform
+        plant = cast(Dubins3D, env.agent_platform)
         if "heading_rate" in commands and type(commands["heading_rate"]) is not Constant:
             return {f"{name!r} may change its turn, which in space the agent cannot copy in time": _true()}
         turning = jnp.tan(state.roll)
@@ -413,7 +418,7 @@ class VelocityMatched(TerminalSet, type="velocity_matched"):
         }
 
 
-def _acceleration(env: Any, sim: Sim, name: str) -> Float[Array, " d"]:
+def _acceleration(env: Environment, sim: Sim, name: str) -> Float[Array, " d"]:
     """v̇ of a platform, the agent's without control."""
     platform, state = env.platform(name), sim.platforms[name]
     controls = {} if name == env.agent else undirected(platform, sim)
@@ -439,7 +444,7 @@ def _is(value: Number, expected: float) -> Bool[Array, ""]:
     return jnp.abs(value - expected) <= (EQUAL - 1.0) * abs(expected)
 
 
-def _speed_limits(env: Any, rta: CertifiedRTA) -> list[SpeedLimitFacts] | str:
+def _speed_limits(env: Environment, rta: CertifiedRTA) -> list[SpeedLimitFacts] | str:
     """The facts of a filter's constraints, or what is missing if nothing is proved of one of them."""
     found = {name: speed_limit_facts(env, name) for name in rta.constraints}
     unknown = next((name for name, facts in found.items() if facts is None), None)
@@ -453,7 +458,7 @@ def _packaged_but(kind: type[BackupController], rta: CertifiedRTA) -> bool:
     return any(type(one).__module__ == __name__ and type(one) is not kind for one in rta.backups)
 
 
-def _separates(env: Any, limit: Any, platforms: set[str]) -> bool:
+def _separates(env: Environment, limit: Any, platforms: set[str]) -> bool:
     """Whether a constraint is the separation of two platforms."""
     if type(limit) is not Separation:
         return False
@@ -461,9 +466,9 @@ def _separates(env: Any, limit: Any, platforms: set[str]) -> bool:
     return type(status) is Distance and {status.of, status.to} == platforms
 
 
-def _authority(env: Any, name: str) -> Any:
+def _authority(env: Environment, name: str) -> Any:
     """The largest value of a control that is there in both directions; 0 without such an actuator."""
-    actuators = {one.name: one for one in env.agent_platform.controller.actuators}
+    actuators = {one.name: one for one in env.actuators}
     if name not in actuators:
         return jnp.zeros_like(env.dt)
     return jnp.maximum(jnp.minimum(-actuators[name].low, actuators[name].high), 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -11,6 +11,9 @@ from jaxsafe.component import Component
 from jaxsafe.rta.filter import RTA, admissible, repeated
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.types import Record, RTAInfo, Sim
+
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
 
 
 class Stage(Component):
@@ -39,19 +42,19 @@ class Cascade(RTA, type="cascade"):
     def problem(self) -> str | None:
         return repeated(self.stages) if self.stages else "expected at least one stage"
 
-    def unsuited(self, env: Any, sim: Sim) -> dict[str, Bool[Array, ""]]:
+    def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
         return {
             f"{stage.name}: {fault}": found
             for stage in self.stages
             for fault, found in stage.rta.unsuited(env, sim).items()
         }
 
-    def begin(self, env: Any, sim: Sim) -> tuple[CascadeMemory, RTAInfo]:
+    def begin(self, env: Environment, sim: Sim) -> tuple[CascadeMemory, RTAInfo]:
         memories, infos = zip(*(stage.rta.begin(env, sim) for stage in self.stages), strict=True)
         return CascadeMemory(jnp.zeros((), bool), memories), _together(infos, jnp.ones_like(infos[-1].certified))
 
     def filter(
-        self, env: Any, sim: Sim, memory: CascadeMemory, desired: Float[Array, " m"]
+        self, env: Environment, sim: Sim, memory: CascadeMemory, desired: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], CascadeMemory, RTAInfo]:
         control, memories, infos = desired, [], []
         valid = jnp.ones((), bool)

@@ -4,28 +4,22 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.component import Component, Range, Unit
-from jaxsafe.rta.prediction import (
-    Others,
-    advance,
-    bounds,
-    commanded,
-    later_sim,
-    others_later,
-    others_react,
-    repeat,
-    smallest_margin,
-)
+from jaxsafe.rta.prediction import others_react, repeat
 from jaxsafe.rta.projection import within
 from jaxsafe.rta.speed_limit import speed_limit_facts
 from jaxsafe.simulation.geometry import safe_norm
+from jaxsafe.transition import Others, advance, bounds, commanded, later_sim, others_later, smallest_margin
 from jaxsafe.types import ConstraintName, Number, Record, RTAInfo, Sim
+
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
 
 Margin = Annotated[Number, Unit("as the constraint"), Range(0.0)]
 
@@ -36,16 +30,16 @@ Faults = dict[str, Bool[Array, ""]]
 class RTA(Component):
     """A filter between desired and actual control (Section 2, Fig. 2): pure, with its memory in the state."""
 
-    def unsuited(self, env: Any, sim: Sim) -> dict[str, Bool[Array, ""]]:
+    def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
         """What would make the filter useless, each with whether it is so at a state; asked once, when it is built."""
         return {}
 
-    def begin(self, env: Any, sim: Sim) -> tuple[Any, RTAInfo]:
+    def begin(self, env: Environment, sim: Sim) -> tuple[Any, RTAInfo]:
         """Return the memory at the start of an episode, a record with `intervening`, and the facts about the start."""
         raise NotImplementedError
 
     def filter(
-        self, env: Any, sim: Sim, memory: Any, desired: Float[Array, " m"]
+        self, env: Environment, sim: Sim, memory: Any, desired: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], Any, RTAInfo]:
         """Return the control that acts, the memory after it, and what happened.
 
@@ -74,7 +68,7 @@ class BackupController(Component):
     within_limits: ClassVar[bool] = False
     """Whether no state of the plant reaches a limit before the end of a step, which makes prediction cheaper."""
 
-    def control(self, env: Any, sim: Sim, later: Others) -> Float[Array, " m"]:
+    def control(self, env: Environment, sim: Sim, later: Others) -> Float[Array, " m"]:
         """Return the control in physical units, action order; the filter clips it.
 
         Args:
@@ -84,7 +78,7 @@ class BackupController(Component):
         """
         raise NotImplementedError
 
-    def faults(self, env: Any, sim: Sim, rta: CertifiedRTA) -> Faults:
+    def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         """Return what is missing at a state for the proof that this controller keeps the constraints; nothing by default.
 
         Where anything is missing the filter certifies nothing. A filter that lacks it at all of a few starts is refused.
@@ -96,7 +90,7 @@ class BackupController(Component):
         """
         return {}
 
-    def duration(self, env: Any) -> Number:
+    def duration(self, env: Environment) -> Number:
         """Return the time it may take to the terminal set [s]; 0 where that is not known."""
         return jnp.zeros_like(env.dt)
 
@@ -104,11 +98,11 @@ class BackupController(Component):
 class TerminalSet(Component):
     """States from which the backup controller stays safe for ever: where a certificate may end."""
 
-    def contains(self, env: Any, sim: Sim) -> Bool[Array, ""]:
+    def contains(self, env: Environment, sim: Sim) -> Bool[Array, ""]:
         """Whether the state is in the set."""
         raise NotImplementedError
 
-    def faults(self, env: Any, sim: Sim, rta: CertifiedRTA) -> Faults:
+    def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         """Return what is missing at a state for the proof of this set, as `BackupController.faults` does."""
         return {}
 
@@ -156,7 +150,7 @@ class CertifiedRTA(RTA):
         return repeated(self.backups)
 
     def propose(
-        self, env: Any, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
+        self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
         """Return the control to certify, and whether it meets the filter's own constraints.
 
@@ -168,7 +162,7 @@ class CertifiedRTA(RTA):
         """
         raise NotImplementedError
 
-    def required_margin(self, env: Any) -> Number:
+    def required_margin(self, env: Environment) -> Number:
         """Return the h to keep at samples: `margin`, or more where a constraint would be broken inside a step.
 
         For speed limits that depends on the length of a step, see docs/rta.md; separations are bounded within the step.
@@ -176,7 +170,7 @@ class CertifiedRTA(RTA):
         facts = [speed_limit_facts(env, name) for name in self.constraints]
         return functools.reduce(jnp.maximum, [one.least_margin for one in facts if one], self.margin)
 
-    def unsuited(self, env: Any, sim: Sim) -> dict[str, Bool[Array, ""]]:
+    def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
         if not self.enforce:
             return {}
         found = dict(self.terminal.faults(env, sim, self)) if self.terminal else {}
@@ -187,7 +181,7 @@ class CertifiedRTA(RTA):
                 found[fault] = self.horizon * env.dt < backup.duration(env)
         return found
 
-    def begin(self, env: Any, sim: Sim) -> tuple[RTAMemory, RTAInfo]:
+    def begin(self, env: Environment, sim: Sim) -> tuple[RTAMemory, RTAInfo]:
         """Memory with the backup controller that is safest from the start."""
         paths = self.follow(env, sim, sim)
         best, no, yes = self._best(env, paths), jnp.zeros((), bool), jnp.ones((), bool)
@@ -200,7 +194,7 @@ class CertifiedRTA(RTA):
         return memory, RTAInfo(jnp.zeros_like(sim.time), yes, memory.certified, self.lowest(env, sim, sim), best)
 
     def filter(
-        self, env: Any, sim: Sim, memory: RTAMemory, desired: Float[Array, " m"]
+        self, env: Environment, sim: Sim, memory: RTAMemory, desired: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], RTAMemory, RTAInfo]:
         """Propose, certify, else back up."""
         wanted, finite = admissible(env, desired)
@@ -243,11 +237,11 @@ class CertifiedRTA(RTA):
         )
         return actual, memory, info
 
-    def lowest(self, env: Any, before: Sim, sim: Sim) -> Float[Array, ""]:
+    def lowest(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, ""]:
         """Return the smallest h of the constraints at `sim` and, for separations, on the way from `before`."""
         return smallest_margin(env, sim, before, self.constraints)
 
-    def certify(self, env: Any, before: Sim, sim: Sim) -> Float[Array, " backups"]:
+    def certify(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, " backups"]:
         """Return for each backup controller the smallest h on its way from `sim`, −∞ if that proves nothing.
 
         It proves nothing where the way ends outside the terminal set, or where the proof of the controller or of the set
@@ -255,7 +249,7 @@ class CertifiedRTA(RTA):
         """
         return self.follow(env, before, sim).values
 
-    def follow(self, env: Any, before: Sim, sim: Sim) -> Paths:
+    def follow(self, env: Environment, before: Sim, sim: Sim) -> Paths:
         """Return what becomes of `sim`, one step after `before`, under each backup controller."""
         first = self.lowest(env, before, sim)
         holds = jnp.stack([_none(backup.faults(env, sim, self)) for backup in self.backups]) & _finite(sim)
@@ -270,7 +264,7 @@ class CertifiedRTA(RTA):
         return Paths(least=jnp.concatenate(least), certified=reached & holds, ahead=ahead)
 
     def _follow(
-        self, env: Any, backups: Sequence[BackupController], first: Float[Array, ""], sim: Sim
+        self, env: Environment, backups: Sequence[BackupController], first: Float[Array, ""], sim: Sim
     ) -> tuple[Float[Array, " backups"], list[Sim]]:
         """The smallest h, and the end, for backup controllers among whom the other platforms move alike.
 
@@ -299,13 +293,13 @@ class CertifiedRTA(RTA):
         last, crafts, least = repeat(one, start, self.horizon)
         return jnp.stack(least), [placed(last, own) for own in crafts]
 
-    def _ended(self, env: Any, end: Sim) -> Bool[Array, ""]:
+    def _ended(self, env: Environment, end: Sim) -> Bool[Array, ""]:
         """Whether a certificate may end in a state."""
         assert self.terminal is not None
         return self.terminal.contains(env, end) & _none(self.terminal.faults(env, end, self)) & _finite(end)
 
     def _renew(
-        self, env: Any, sim: Sim, memory: RTAMemory, backed: Sim, fallback: Float[Array, ""]
+        self, env: Environment, sim: Sim, memory: RTAMemory, backed: Sim, fallback: Float[Array, ""]
     ) -> tuple[Bool[Array, ""], Mapping[str, Any]]:
         """The certificate of the state after a step of backing up, and the end of its horizon.
 
@@ -319,19 +313,19 @@ class CertifiedRTA(RTA):
         renewed = memory.certified & keeps & self._ended(env, further) & holds & _finite(backed)
         return renewed, jax.lax.stop_gradient(further.platforms)
 
-    def _best(self, env: Any, paths: Paths) -> Int[Array, ""]:
+    def _best(self, env: Environment, paths: Paths) -> Int[Array, ""]:
         """The backup controller of the largest h on its way, among those that are certified if there are any."""
         certified = paths.values >= self.required_margin(env)
         compared = jnp.where(jnp.any(certified), paths.values, paths.least)
         return jnp.argmax(jnp.where(jnp.isnan(compared), -jnp.inf, compared)).astype(jnp.int32)
 
-    def _backup(self, env: Any, sim: Sim, memory: RTAMemory, later: Others) -> Float[Array, " m"]:
+    def _backup(self, env: Environment, sim: Sim, memory: RTAMemory, later: Others) -> Float[Array, " m"]:
         each = jnp.stack([backup.control(env, sim, later) for backup in self.backups])
         chosen = each[memory.backup_index] if len(self.backups) > 1 else each[0]
         return admissible(env, chosen)[0]
 
 
-def admissible(env: Any, control: Float[Array, " m"]) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
+def admissible(env: Environment, control: Float[Array, " m"]) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
     """The control within its bounds, 0 for what is not a number, and whether all of it was finite."""
     low, high = bounds(env)
     finite = jnp.isfinite(control)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -11,16 +11,19 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsafe.component import Range, Unit
 from jaxsafe.rta.filter import RTA, CertifiedRTA, RTAMemory, admissible
-from jaxsafe.rta.prediction import advance, undirected
 from jaxsafe.simulation.geometry import direction, safe_norm, to_body
+from jaxsafe.transition import advance, undirected
 from jaxsafe.types import Length, Number, PlatformName, Positive, RadiansPerSecond, RTAInfo, Sim
+
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
 
 
 class Simplex(CertifiedRTA, type="simplex"):
     """The desired control if it is certified, else the backup control, Eq. (1)."""
 
     def propose(
-        self, env: Any, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
+        self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
         return desired, jnp.ones((), bool)
 
@@ -35,7 +38,7 @@ class Blend(CertifiedRTA, type="blend"):
     parts: Annotated[int, Range(1, 64)] = 8
 
     def propose(
-        self, env: Any, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
+        self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
         shares = jnp.arange(1, self.parts + 1, dtype=desired.dtype) / self.parts
         mixed = backup + shares[:, None] * (desired - backup)
@@ -61,14 +64,14 @@ class CollisionSimplex(RTA, type="collision_simplex"):
     engage: Annotated[Length, Positive] = 200.0
     release: Annotated[Length, Positive] = 250.0
 
-    def begin(self, env: Any, sim: Sim) -> tuple[RTAMemory, RTAInfo]:
+    def begin(self, env: Environment, sim: Sim) -> tuple[RTAMemory, RTAInfo]:
         no, zero = jnp.zeros((), bool), jnp.zeros((), jnp.int32)
         nearest, _ = self._predict(env, sim)
         info = RTAInfo(jnp.zeros_like(sim.time), ~no, no, nearest - self.engage, zero)
         return RTAMemory(intervening=no, backup_index=zero, certified=no, ahead={}), info
 
     def filter(
-        self, env: Any, sim: Sim, memory: RTAMemory, desired: Float[Array, " m"]
+        self, env: Environment, sim: Sim, memory: RTAMemory, desired: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], RTAMemory, RTAInfo]:
         wanted, finite = admissible(env, desired)
         nearest, turn = self._predict(env, sim)
@@ -80,7 +83,7 @@ class CollisionSimplex(RTA, type="collision_simplex"):
         correction = safe_norm(actual - wanted)
         return actual, memory, RTAInfo(correction, finite, jnp.zeros((), bool), nearest - self.engage, memory.backup_index)
 
-    def _predict(self, env: Any, sim: Sim) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def _predict(self, env: Environment, sim: Sim) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Smallest distance on the backup's way, and the turn that it makes."""
         own, other = sim.platforms[env.agent], sim.platforms[self.other]
         rate = undirected(env.platform(self.other), sim).get("heading_rate", jnp.zeros_like(sim.time))

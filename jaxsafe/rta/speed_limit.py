@@ -6,18 +6,21 @@ braking craft goes. A filter asks them before it certifies anything.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.processors.constraint import SpeedLimit
 from jaxsafe.processors.status import Distance, Speed, VelocityLimit
-from jaxsafe.rta.prediction import constraint
 from jaxsafe.simulation.cwh import Anchor, Spacecraft
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.simulation.oriented import OrientedSpacecraft
+from jaxsafe.transition import constraint
 from jaxsafe.types import Number, Record, Sim
+
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
 
 LARGEST_TURN = 0.05
 """Largest angle of the chief's orbit in a step [rad] for which the expansions of docs/rta.md hold."""
@@ -89,9 +92,11 @@ class SpeedLimitFacts(Record):
         return jnp.where(stops, distance + way + speed * dt, jnp.inf)
 
 
-def speed_limit_facts(env: Any, name: str) -> SpeedLimitFacts | None:
+def speed_limit_facts(env: Environment, name: str) -> SpeedLimitFacts | None:
     """The facts of a constraint; None where it, the plant or the chief is of a kind that nothing is proved of."""
-    limited, plant, kind = constraint(env, name), env.agent_platform, type(env.agent_platform)
+    limited = constraint(env, name)
+    plant: Any = env.agent_platform
+    kind = type(plant)
     if type(limited) is not SpeedLimit or kind not in (Spacecraft, OrientedSpacecraft):
         return None
     statuses = {status.name: status for status in env.status}
@@ -102,7 +107,7 @@ def speed_limit_facts(env: Any, name: str) -> SpeedLimitFacts | None:
     if type(distance) is not Distance or chief(env, distance) is None:
         return None
     pushes = plant.inputs if kind is Spacecraft else plant.inputs[:1]
-    actuators = {one.name: one for one in env.agent_platform.controller.actuators}
+    actuators = {one.name: one for one in env.actuators}
     if not set(plant.inputs) <= set(actuators):
         return None
     weakest = jnp.min(jnp.stack([jnp.minimum(-actuators[one].low, actuators[one].high) for one in pushes]))
@@ -122,7 +127,7 @@ def speed_limit_facts(env: Any, name: str) -> SpeedLimitFacts | None:
     )
 
 
-def chief(env: Any, distance: Distance) -> str | None:
+def chief(env: Environment, distance: Distance) -> str | None:
     """The platform at rest from which a distance of the agent is measured; None if there is none."""
     others = {distance.of, distance.to} - {env.agent}
     if len(others) != 1 or env.agent not in (distance.of, distance.to):
@@ -131,13 +136,13 @@ def chief(env: Any, distance: Distance) -> str | None:
     return other if type(env.platform(other)) is Anchor else None
 
 
-def distance_and_speed(env: Any, sim: Sim) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def distance_and_speed(env: Environment, sim: Sim) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Distance from the origin of Hill's frame, and speed, of the agent."""
     own = sim.platforms[env.agent]
     return safe_norm(own.position), safe_norm(own.velocity)
 
 
-def off_centre(env: Any, sim: Sim) -> Any:
+def off_centre(env: Environment, sim: Sim) -> Any:
     """Whether a platform that rests is elsewhere than at the origin of Hill's frame, where it would not rest."""
     resting = [sim.platforms[one.name].position for one in env.platforms if type(one) is Anchor]
     return jnp.any(jnp.stack([jnp.any(position != 0.0) for position in resting]))

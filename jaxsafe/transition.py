@@ -1,0 +1,151 @@
+"""How the world moves by one step, and how a state is judged. The environment and its filters both stand on this.
+
+A filter predicts with the functions that the environment steps with, so a certificate speaks about the very state that the
+step will reach.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.errors import part
+from jaxsafe.simulation.controllers import Controls
+from jaxsafe.types import Sim
+
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
+    from jaxsafe.processors.constraint import Constraint
+    from jaxsafe.simulation.platform import Platform
+
+Others = Mapping[str, Any]
+"""The states of all platforms but the agent's, by name."""
+
+
+def advance(env: Environment, sim: Sim, control: Float[Array, " m"], later: Others | None = None) -> Sim:
+    """Return the simulation one step later.
+
+    All platforms move at once. Regions and statuses are left out.
+
+    Args:
+        env: the environment.
+        sim: the simulation before the step.
+        control: the agent's control in physical units, in action order.
+        later: the other platforms after the step, where `others_later` has already found them.
+    """
+    platforms = {**(others_later(env, sim) if later is None else later)}
+    plant = env.agent_platform
+    with part("platforms", plant.name):
+        platforms[env.agent] = plant.step(sim.platforms[env.agent], commanded(env, plant, sim, control), env.dt)
+    return later_sim(env, sim, platforms)
+
+
+def later_sim(env: Environment, sim: Sim, platforms: Others) -> Sim:
+    """Return the simulation one step later, given its platforms then. Its time is a whole number of steps."""
+    time = sim.time + env.dt
+    whole = jnp.round(time / env.dt) * env.dt
+    time = jnp.where(jnp.abs(time - whole) < 1e-3 * env.dt, whole, time)
+    return sim.replace(time=time, platforms=platforms, regions={}, status={})
+
+
+def others_later(env: Environment, sim: Sim) -> Others:
+    """Return the platforms that are not the agent's one step later. No control of this step can change them."""
+    later = {}
+    for platform in env.platforms:
+        if platform.name != env.agent:
+            with part("platforms", platform.name):
+                later[platform.name] = platform.step(sim.platforms[platform.name], undirected(platform, sim), env.dt)
+    return later
+
+
+def commanded(env: Environment, platform: Platform, sim: Sim, control: Float[Array, " m"]) -> Controls:
+    """Return the controls of a platform. The agent's are given; the others follow their controllers."""
+    if platform.name == env.agent:
+        return dict(zip(env.action_names, control, strict=True))
+    return undirected(platform, sim)
+
+
+def undirected(platform: Platform, sim: Sim) -> Controls:
+    """Return the controls of a platform that is not the agent. No action reaches it."""
+    return platform.controller.control(jnp.zeros(0), sim)
+
+
+def place_regions(env: Environment, sim: Sim) -> Sim:
+    """Return the simulation with its regions where the platforms put them."""
+    regions = {}
+    for region in env.regions:
+        with part("regions", region.name):
+            regions[region.name] = region.place(sim.platforms)
+    return sim.replace(regions=regions)
+
+
+def update_statuses(env: Environment, sim: Sim, memory: Mapping[str, Any] | None) -> tuple[Sim, dict[str, Any]]:
+    """Place the regions, then compute the statuses in order. Each status sees only those before it.
+
+    Args:
+        env: the environment.
+        sim: the simulation, with its platforms.
+        memory: what the statuses remember from the step before, by name. None at the start of an episode.
+
+    Returns:
+        The simulation with regions and statuses, and what the statuses remember now.
+    """
+    sim = place_regions(env, sim)
+    memories = {}
+    for status in env.status:
+        with part("status", status.name):
+            own = status.init(sim) if memory is None else status.increment(memory[status.name], sim, env.dt)
+            sim = sim.replace(status={**sim.status, status.name: status.process(own, sim)})
+        memories[status.name] = own
+    return sim, memories
+
+
+def judge(env: Environment, sim: Sim, before: Sim | None = None) -> Sim:
+    """Return the simulation with regions and statuses from its platforms alone. No status remembers anything.
+
+    Args:
+        env: the environment.
+        sim: the simulation to judge.
+        before: the simulation one step earlier. If it is given, distances are lower bounds on the way from there, so that
+            nothing slips through between two instants.
+    """
+    if before is None:
+        return update_statuses(env, sim.replace(status={}), None)[0]
+    earlier = judge(env, before)
+    sim = place_regions(env, sim.replace(status={}))
+    for status in env.status:
+        sim = sim.replace(status={**sim.status, status.name: status.on_the_way(env, earlier, sim)})
+    return sim
+
+
+def constraint(env: Environment, name: str) -> Constraint:
+    """Return a safety constraint by name."""
+    return next(one for one in env.constraints if one.name == name)
+
+
+def smallest_margin(
+    env: Environment, sim: Sim, before: Sim | None = None, names: Collection[str] | None = None
+) -> Float[Array, ""]:
+    """Return the smallest h of some safety constraints.
+
+    Args:
+        env: the environment.
+        sim: the simulation.
+        before: the simulation one step earlier. If it is given, constraints that can be broken between two instants
+            (`Constraint.between`) count with a lower bound on the way from there.
+        names: of the constraints. None stands for all.
+    """
+    now = judge(env, sim)
+    way = now if before is None else judge(env, sim, before)
+    chosen = [one for one in env.constraints if names is None or one.name in names]
+    return jnp.min(jnp.stack([one.margin(way if one.between else now) for one in chosen]))
+
+
+def bounds(env: Environment) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """Return the lowest and the highest control in physical units, in action order."""
+    low = jnp.stack([actuator.low for actuator in env.actuators])
+    high = jnp.stack([actuator.high for actuator in env.actuators])
+    return low, high
