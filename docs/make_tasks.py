@@ -18,10 +18,10 @@ import jax
 import numpy as np
 
 import jaxsafe
-from jaxsafe.component import Component, fields
 from jaxsafe.envs import TASKS
 from jaxsafe.plot.style import control_unit, length_unit
 from jaxsafe.processors.observation import Observation, Observe, ObserveAngle, ObserveRegion
+from jaxsafe.schema.component import Component, fields
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.types import units
 

@@ -5,8 +5,8 @@ from jaxsafe.adapters.registration import register_ids
 from jaxsafe.config import override
 from jaxsafe.environment import Environment, reset, reset_to, step
 from jaxsafe.envs import make
-from jaxsafe.errors import ConfigError
 from jaxsafe.rollout import rollout
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.policy import load_policy
 
 register_ids()

@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
-from jaxsafe.config import imports, yaml
-from jaxsafe.errors import ConfigError, ConfigWarning, nearest, show
+from jaxsafe.schema import user_modules, yaml12
+from jaxsafe.schema.errors import ConfigError, ConfigWarning, nearest, show
 from jaxsafe.streams import lasting_streams
 
 INTERRUPTED = 130
@@ -57,7 +57,7 @@ class Arguments:
                 raise ConfigError(f"argument {show(word)}: expected key=value, for instance seeds=10")
             if key in options:
                 raise ConfigError(f"{key}: given twice")
-            options[key] = _path(text, key) if key in PATHS else yaml.parse(text, key)
+            options[key] = _path(text, key) if key in PATHS else yaml12.parse(text, key)
         return cls(options)
 
     def pop(self, key: str, default: Any = None) -> Any:
@@ -131,7 +131,7 @@ class Arguments:
 
 def _path(text: str, key: str) -> Any:
     """Return a path as typed, or a list of them in brackets; None where there is none."""
-    return _from_home(yaml.parse(text, key, as_text=True) if text.startswith("[") else text or None, key)
+    return _from_home(yaml12.parse(text, key, as_text=True) if text.startswith("[") else text or None, key)
 
 
 def _from_home(path: Any, key: str) -> Any:
@@ -184,7 +184,7 @@ def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tu
         for word in argv:
             (flags if word.partition("=")[0] == "imports" else words).append(word)
         allowed = Arguments.parse(flags).pop_flag("imports") is not False
-        with imports.allowed(allowed), _warnings_in_one_line():
+        with user_modules.allowed(allowed), _warnings_in_one_line():
             return main(words) or 0, True
     except ConfigError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

@@ -16,15 +16,15 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.component import Component, Range, Unit
-from jaxsafe.errors import ConfigError, nearest, part, show
-from jaxsafe.paths import references, set_path
 from jaxsafe.processors.constraint import Constraint
 from jaxsafe.processors.observation import Observation
 from jaxsafe.processors.reward import Reward
 from jaxsafe.processors.status import Status
 from jaxsafe.processors.terminal import Terminal
 from jaxsafe.rta.filter import RTA
+from jaxsafe.schema.component import Component, Range, Unit
+from jaxsafe.schema.dotted_paths import references, set_path
+from jaxsafe.schema.errors import ConfigError, nearest, part, show
 from jaxsafe.simulation.controllers import Actuator
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.initializers import uniform

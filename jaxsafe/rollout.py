@@ -11,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.errors import ConfigError, show
 from jaxsafe.renewal import choose, renew
+from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.types import Key, State, TimeStep
 

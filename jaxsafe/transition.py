@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.errors import part
+from jaxsafe.schema.errors import part
 from jaxsafe.simulation.controllers import Controls
 from jaxsafe.types import Sim
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsafe.component import Range, Refers, Unit
+from jaxsafe.schema.component import Range, Refers, Unit
 
 Key = Array
 """A typed PRNG key, as made by `jax.random.key`."""

@@ -5,7 +5,7 @@ import pytest
 
 from jaxsafe.adapters import action_bounds, observation_bounds
 from jaxsafe.envs import make
-from jaxsafe.errors import missing
+from jaxsafe.schema.errors import missing
 
 
 @pytest.mark.parametrize(

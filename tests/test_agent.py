@@ -8,7 +8,7 @@ import pytest
 import scipy.stats
 
 import jaxsafe
-from jaxsafe.component import normalise
+from jaxsafe.schema.component import normalise
 from jaxsafe.train.agent import Agent, Categorical, Gaussian
 
 KEY = jax.random.key(3)

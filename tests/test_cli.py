@@ -16,13 +16,13 @@ import pytest
 
 from jaxsafe import cli
 from jaxsafe.config import __main__ as config
-from jaxsafe.config import yaml
-from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.evaluate.seeds import Evaluator
 from jaxsafe.export import __main__ as export
 from jaxsafe.plot import __main__ as plot
 from jaxsafe.rta import falsify
+from jaxsafe.schema import yaml12
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import __main__ as train
 from jaxsafe.train import config as config_module
 from jaxsafe.train import policy as policy_module
@@ -177,7 +177,7 @@ def test_a_stranger_s_run_imports_nothing_where_that_is_refused(fails: Callable[
     run.mkdir()
     (tmp_path / "evil_of_cli.py").write_text("open('ran', 'w')")
     content = {"env": "docking2d", "training": {}, "environment": {"imports": ["evil_of_cli"]}}
-    (run / "config.yaml").write_text(yaml.write(content))
+    (run / "config.yaml").write_text(yaml12.write(content))
     for module, words in ((train, ["resume=run"]), (evaluate, ["run=run"]), (plot, ["run=run"]), (export, ["run=run"])):
         assert "whose code would run; imports=false refuses that" in fails(module, *words, "imports=false")
     assert not (tmp_path / "ran").exists()

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import jaxsafe
-from jaxsafe.component import normalise
 from jaxsafe.processors.terminal import Held, Timeout
+from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.clock import later, reached
 from jaxsafe.simulation.scripted import Schedule
 from jaxsafe.types import Sim

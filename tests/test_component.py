@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsafe.component import ANY, Component, Range, Unit, choices, field, fields, normalise
-from jaxsafe.config.convert import expects, to_value
-from jaxsafe.errors import ConfigError
 from jaxsafe.processors.reward import Failure
+from jaxsafe.schema.component import ANY, Component, Range, Unit, choices, field, fields, normalise
+from jaxsafe.schema.convert import expects, to_value
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.types import Length, Positive, StatusName
 
 Size = Annotated[Any, Unit("m"), Positive]

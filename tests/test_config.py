@@ -16,15 +16,15 @@ import pytest
 
 import jaxsafe
 from jaxsafe import ConfigError, Environment
-from jaxsafe.component import normalise
 from jaxsafe.config import build, dump, load
-from jaxsafe.config.convert import to_component, to_data
-from jaxsafe.config.imports import allowed, import_modules, modules
-from jaxsafe.config.yaml import parse, write
 from jaxsafe.envs import adapt
-from jaxsafe.errors import ConfigWarning, show
 from jaxsafe.processors.reward import Failure
 from jaxsafe.processors.status import Status
+from jaxsafe.schema.component import normalise
+from jaxsafe.schema.convert import to_component, to_data
+from jaxsafe.schema.errors import ConfigWarning, show
+from jaxsafe.schema.user_modules import allowed, import_modules, modules
+from jaxsafe.schema.yaml12 import parse, write
 from jaxsafe.simulation.cwh import Spacecraft
 from jaxsafe.simulation.scripted import Schedule, Scripted
 from jaxsafe.types import PlatformName

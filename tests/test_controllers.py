@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxsafe
-from jaxsafe.component import normalise
+from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.controllers import Actuator, Continuous, Discrete, Uncontrolled
 from jaxsafe.types import Sim
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm, expm_frechet
 
-from jaxsafe.component import normalise
+from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.controllers import Actuator, Continuous
 from jaxsafe.simulation.cwh import MEAN_MOTION, Anchor, Spacecraft, SpacecraftState, cwh_acceleration, cwh_flow
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import jaxsafe
-from jaxsafe.component import normalise
 from jaxsafe.envs import TASKS
+from jaxsafe.schema.component import normalise
 from jaxsafe.train.agent import Agent
 from jaxsafe.train.policy import find_policy, read_policy
 from jaxsafe.train.ppo import PPO, Batch, loss

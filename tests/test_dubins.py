@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from jaxsafe.component import normalise
+from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.dubins import GRAVITY, Dubins2D, Dubins2DState, Dubins3D, Dubins3DState
 
 NUM = 3000

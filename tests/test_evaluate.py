@@ -11,13 +11,13 @@ from PIL import Image
 import jaxsafe
 from jaxsafe.cli import Arguments
 from jaxsafe.config import dump
-from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import episodes as episodes_module
 from jaxsafe.evaluate import seeds as seeds_module
 from jaxsafe.evaluate.__main__ import main
 from jaxsafe.evaluate.choice import EnvironmentChoice, differences
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.evaluate.seeds import Evaluator, batch_keys
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.seeds import SeedMapper
 
 

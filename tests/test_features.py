@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxsafe
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.agent import Agent
 
 KEY = jax.random.key(3)

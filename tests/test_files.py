@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.files import append_csv, append_rows, keep_rows, read_json, read_rows, write_json, write_text
 from jaxsafe.train.forms import COUNT, MAYBE, OTHERS, numbers
 

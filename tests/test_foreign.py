@@ -15,12 +15,12 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 import jaxsafe
-from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate.__main__ import main
 from jaxsafe.evaluate.foreign import read_foreign
 from jaxsafe.export import functions
 from jaxsafe.export.__main__ import main as export
 from jaxsafe.export.onnx import write_onnx
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.files import read_json
 from jaxsafe.train.policy import find_policy, read_policy
 

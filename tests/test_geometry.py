@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxsafe.component import normalise
+from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.cwh import SpacecraftState
 from jaxsafe.simulation.dubins import Dubins2DState, Dubins3DState
 from jaxsafe.simulation.geometry import (

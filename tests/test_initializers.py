@@ -15,8 +15,8 @@ import pytest
 from scipy.stats import kstest, spearmanr
 
 import jaxsafe
-from jaxsafe.component import normalise
 from jaxsafe.environment import Environment
+from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.geometry import direction
 from jaxsafe.simulation.initializers import AroundAtAltitude, Direction, Fixed, Uniform, uniform
 from jaxsafe.types import Sim

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import hosts, memory
 from jaxsafe.train.__main__ import main
 from jaxsafe.tune.__main__ import main as tune

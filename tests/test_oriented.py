@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from jaxsafe.component import normalise
+from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.cwh import MASS, MEAN_MOTION, Spacecraft, SpacecraftState
 from jaxsafe.simulation.oriented import RATE_LIMIT, OrientedSpacecraft, OrientedState
 

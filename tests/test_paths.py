@@ -5,9 +5,9 @@ from typing import Any, ClassVar
 
 import pytest
 
-from jaxsafe.component import Component, Field
-from jaxsafe.errors import ConfigError
-from jaxsafe.paths import join, set_path
+from jaxsafe.schema.component import Component, Field
+from jaxsafe.schema.dotted_paths import join, set_path
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.types import Length
 
 

@@ -11,14 +11,14 @@ from matplotlib.image import imread
 from matplotlib.patches import Circle
 
 import jaxsafe
-from jaxsafe.config import yaml
 from jaxsafe.envs import TASKS
-from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.__main__ import main
 from jaxsafe.plot.compare import compare_curves, seed_curves
 from jaxsafe.plot.figures import _episodes, draw_all, speed_distance, training_curves, trajectories
 from jaxsafe.plot.style import GREEN, ORANGE, kept_out, save
+from jaxsafe.schema import yaml12
+from jaxsafe.schema.errors import ConfigError
 
 
 def rows(num_updates: int = 50, num_seeds: int = 4) -> list[dict]:
@@ -254,8 +254,8 @@ def test_a_run_whose_every_name_is_a_formula_is_drawn(
     monkeypatch.chdir(tmp_path)
     run = tmp_path / nasty
     shutil.copytree(whole, run, ignore=shutil.ignore_patterns("figures"))
-    content = yaml.parse((whole / "config.yaml").read_text().replace("features: docking2d", "features: x"), "x")
-    (run / "config.yaml").write_text(yaml.write(renamed(content)))
+    content = yaml12.parse((whole / "config.yaml").read_text().replace("features: docking2d", "features: x"), "x")
+    (run / "config.yaml").write_text(yaml12.write(renamed(content)))
     for log in ("episodes.jsonl", "progress.jsonl"):
         lines = (whole / log).read_text().splitlines()
         (run / log).write_text("".join(json.dumps(renamed(json.loads(line))) + "\n" for line in lines))

@@ -10,13 +10,14 @@ from matplotlib.contour import ContourSet
 from matplotlib.image import imread
 
 import jaxsafe
-from jaxsafe.config import describe, yaml
-from jaxsafe.errors import ConfigError
+from jaxsafe.config import describe
 from jaxsafe.plot import safe_set
 from jaxsafe.plot.figures import draw_all
 from jaxsafe.plot.interventions import interventions, most_altered
 from jaxsafe.plot.style import control_unit
 from jaxsafe.rta.cascade import Cascade, Stage
+from jaxsafe.schema import yaml12
+from jaxsafe.schema.errors import ConfigError
 
 
 def episode(env: jaxsafe.Environment, altered: tuple[int, ...]) -> list[dict]:
@@ -111,7 +112,7 @@ def test_only_a_run_with_a_filter_draws_interventions(whole: Path, tmp_path: Pat
     run.mkdir()
     shutil.copy(whole / "progress.jsonl", run)
     content = {"env": "docking2d", "training": {"preset": "features"}, "environment": describe(env)}
-    (run / "config.yaml").write_text(yaml.write(content))
+    (run / "config.yaml").write_text(yaml12.write(content))
     common = {
         "step": 1280, "final": True, "episode": 0,
         "platforms": {"chief": {"position": [0.0, 0.0]}, "deputy": {"position": [9.0, 0.0]}},

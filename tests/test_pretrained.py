@@ -8,9 +8,9 @@ import pytest
 
 import jaxsafe
 from jaxsafe.envs import TASKS
-from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate.__main__ import main
 from jaxsafe.evaluate.episodes import run_episodes
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.policy import find_policy, read_policy
 
 

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import jaxsafe
-from jaxsafe.component import normalise
 from jaxsafe.environment import Environment
 from jaxsafe.processors.constraint import Separation, SpeedLimit
 from jaxsafe.processors.observation import Observation, Observe, ObserveAngle, ObserveRegion, ObserveStatus
@@ -26,6 +25,7 @@ from jaxsafe.processors.reward import (
 )
 from jaxsafe.processors.status import DeltaV, Distance, InRegion, RegionDistance, Speed, TimeHeld, VelocityLimit
 from jaxsafe.processors.terminal import Crashed, Docked, Held, Holds, Timeout, TooClose, TooFar
+from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.cwh import SpacecraftState
 from jaxsafe.simulation.dubins import Dubins2DState, Dubins3DState
 from jaxsafe.simulation.geometry import Circle, Displacement

@@ -18,7 +18,6 @@ from tiny import TINY
 from jaxsafe import cli
 from jaxsafe.config import override
 from jaxsafe.envs import TASKS
-from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.report import __main__ as command
 from jaxsafe.report import run as running
@@ -27,6 +26,7 @@ from jaxsafe.report.page import DIRECTORY, Report, _number, _percent, _rate
 from jaxsafe.report.plan import KINDS, SHIPPED, Item, best_seed, plan
 from jaxsafe.report.record import keep, kept
 from jaxsafe.rollout import reset_batch
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import __main__ as train
 from jaxsafe.train import directory
 from jaxsafe.train.config import resolve_all

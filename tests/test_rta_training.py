@@ -12,9 +12,9 @@ from tiny import TINY
 
 import jaxsafe
 from jaxsafe.cli import Arguments
-from jaxsafe.component import normalise
-from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate.__main__ import main as evaluate
+from jaxsafe.schema.component import normalise
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.__main__ import main as train
 from jaxsafe.train.agent import Agent
 from jaxsafe.train.config import TrainConfig, resolve

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import jaxsafe
-from jaxsafe.component import normalise
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema.component import normalise
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.scripted import Command, Constant, Schedule, Scripted, Sinusoid
 from jaxsafe.types import Sim
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import jaxsafe
-from jaxsafe.component import normalise
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema.component import normalise
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.train.agent import Agent
 from jaxsafe.train.loop import STATE
@@ -52,7 +52,7 @@ STARTS = """
 from jaxsafe.train.seeds import SeedMapper, claim_cores
 claim_cores()
 import jax, jaxsafe, numpy as np
-from jaxsafe.component import normalise
+from jaxsafe.schema.component import normalise
 from jaxsafe.train.agent import Agent
 from jaxsafe.train.loop import programs
 from jaxsafe.train.ppo import PPO

@@ -13,9 +13,9 @@ from jax.flatten_util import ravel_pytree
 
 import jaxsafe
 from jaxsafe import ConfigError, Environment, metrics
-from jaxsafe.component import Component, fields
 from jaxsafe.config import dump, load
 from jaxsafe.envs import TASKS
+from jaxsafe.schema.component import Component, fields
 from jaxsafe.types import State, TimeStep
 
 CUSTOM = "custom_env"

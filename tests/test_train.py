@@ -18,8 +18,8 @@ from tiny import TINY
 
 from jaxsafe import cli
 from jaxsafe.envs import TASKS
-from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate import __main__ as evaluate
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import __main__ as command
 from jaxsafe.train import directory, hosts
 from jaxsafe.train.checkpoint import Checkpoints

@@ -9,8 +9,8 @@ import pytest
 from tiny import TINY
 
 from jaxsafe import cli
-from jaxsafe.config import yaml
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema import yaml12
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.config import recipe
 from jaxsafe.tune import __main__ as command
 from jaxsafe.tune.lanes import Lanes
@@ -159,9 +159,9 @@ def test_a_group_of_one_trains_once() -> None:
 def test_a_sweep_does_not_go_on_by_another_recipe(swept: Path, tmp_path: Path) -> None:
     path = tmp_path / "older"
     shutil.copytree(swept, path)
-    content = yaml.read(path / "sweep.yaml")
+    content = yaml12.read(path / "sweep.yaml")
     content["first"]["training"]["ppo"]["clip"] = 0.37
-    (path / "sweep.yaml").write_text(yaml.write(content))
+    (path / "sweep.yaml").write_text(yaml12.write(content))
     with pytest.raises(ConfigError, match=f"resume: the recipe or the environment of {path} has changed"):
         command.main([f"resume={path}"])
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxsafe.config import override
 from jaxsafe.environment import Environment, drawn
 from jaxsafe.envs import make
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.schema.errors import ConfigError, nearest
 from jaxsafe.simulation.controllers import Actuator, AgentController
 
 FORKED = (

@@ -13,8 +13,8 @@ from jaxtyping import Array
 
 from jaxsafe.adapters import action_bounds, checked_count, environment
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.errors import ConfigError, missing
 from jaxsafe.renewal import choose
+from jaxsafe.schema.errors import ConfigError, missing
 from jaxsafe.types import Key, TimeStep
 
 try:

@@ -26,7 +26,7 @@ from jaxsafe.adapters import FORKED, checked_count, environment, refuse_fork
 from jaxsafe.adapters.conversion import facts, masked, spaces
 from jaxsafe.adapters.lanes import Episodes, Lanes
 from jaxsafe.environment import Environment, reset_to
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.schema.errors import ConfigError, nearest
 
 
 class _Chains:

@@ -18,8 +18,8 @@ from jaxtyping import Array
 
 from jaxsafe.adapters import action_bounds, acts_in_physical_units, environment, observation_bounds
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.errors import missing
 from jaxsafe.rollout import cut_short, restarted
+from jaxsafe.schema.errors import missing
 from jaxsafe.types import Key, Record, State
 
 try:

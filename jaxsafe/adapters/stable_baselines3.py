@@ -12,7 +12,7 @@ import numpy as np
 from jaxsafe.adapters.conversion import of_lane
 from jaxsafe.adapters.gymnasium import GymVectorEnv
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError, missing
+from jaxsafe.schema.errors import ConfigError, missing
 
 try:
     from stable_baselines3.common.vec_env import VecEnv

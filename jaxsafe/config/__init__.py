@@ -5,15 +5,15 @@ from __future__ import annotations
 import os
 from typing import Any
 
-from jaxsafe.component import normalise
 from jaxsafe.config.check import check
-from jaxsafe.config.convert import to_component, to_data
-from jaxsafe.config.imports import import_modules, modules
 from jaxsafe.config.override import override
 from jaxsafe.config.tied import warn_of_ties
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError
 from jaxsafe.rta.filter import RTA
+from jaxsafe.schema.component import normalise
+from jaxsafe.schema.convert import to_component, to_data
+from jaxsafe.schema.errors import ConfigError
+from jaxsafe.schema.user_modules import import_modules, modules
 
 __all__ = ["build", "describe", "dump", "from_data", "load", "load_filter", "override"]
 
@@ -31,10 +31,10 @@ def load(source: str | os.PathLike) -> Environment:
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.
     """
-    from jaxsafe.config import yaml
+    from jaxsafe.schema import yaml12
 
     text = isinstance(source, str) and "\n" in source
-    data = yaml.parse(str(source), "environment") if text else yaml.read(source)
+    data = yaml12.parse(str(source), "environment") if text else yaml12.read(source)
     env = from_data(data, "")
     warn_of_ties(env.replace(randomize={}), env)
     return env
@@ -48,9 +48,9 @@ def load_filter(path: str | os.PathLike) -> RTA:
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.
     """
-    from jaxsafe.config import yaml
+    from jaxsafe.schema import yaml12
 
-    data = yaml.read(path)
+    data = yaml12.read(path)
     if isinstance(data, dict) and "imports" in data:
         data = dict(data)
         import_modules(data.pop("imports"), f"{path}: rta")
@@ -64,9 +64,9 @@ def load_filter(path: str | os.PathLike) -> RTA:
 
 def dump(env: Environment) -> str:
     """The complete environment as YAML text, so that `load(dump(env)) == env`."""
-    from jaxsafe.config import yaml
+    from jaxsafe.schema import yaml12
 
-    return yaml.write(describe(env))
+    return yaml12.write(describe(env))
 
 
 def describe(env: Environment) -> dict[str, Any]:

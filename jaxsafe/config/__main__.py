@@ -7,13 +7,14 @@ import sys
 from collections.abc import Sequence
 
 from jaxsafe import cli
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
-    from jaxsafe.config import describe, yaml
+    from jaxsafe.config import describe
     from jaxsafe.envs import make
+    from jaxsafe.schema import yaml12
 
     task, *words = argv
     if "=" in task:
@@ -24,7 +25,7 @@ def main(argv: Sequence[str]) -> int:
     arguments.refuse_rest([*options, "env.…"])
     env = make(task, changes, **options)  # type: ignore[arg-type]
     utf8 = codecs.lookup(sys.stdout.encoding).name == "utf-8"  # as whoever reads the file takes it to be
-    print(yaml.write(describe(env), ascii_only=not utf8), end="")
+    print(yaml12.write(describe(env), ascii_only=not utf8), end="")
     return 0
 
 

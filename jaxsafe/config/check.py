@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxsafe.component import ANY, Component, choices, fields
-from jaxsafe.config.convert import expects, to_value
-from jaxsafe.config.imports import modules
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.errors import ConfigError, nearest, show, told
-from jaxsafe.paths import join, references, set_path
 from jaxsafe.processors.observation import Observe, ObserveAngle
+from jaxsafe.schema.component import ANY, Component, choices, fields
+from jaxsafe.schema.convert import expects, to_value
+from jaxsafe.schema.dotted_paths import join, references, set_path
+from jaxsafe.schema.errors import ConfigError, nearest, show, told
+from jaxsafe.schema.user_modules import modules
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.transition import judge

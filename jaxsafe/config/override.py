@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxsafe.config.check import check
-from jaxsafe.config.convert import to_value
 from jaxsafe.config.tied import warn_of_ties
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError, show
-from jaxsafe.paths import set_path
+from jaxsafe.schema.convert import to_value
+from jaxsafe.schema.dotted_paths import set_path
+from jaxsafe.schema.errors import ConfigError, show
 
 
 def override(env: Environment, changes: Mapping[str, Any]) -> Environment:

@@ -10,11 +10,11 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigWarning
 from jaxsafe.processors.constraint import Separation
 from jaxsafe.processors.reward import Success
 from jaxsafe.processors.status import VelocityLimit
 from jaxsafe.processors.terminal import Timeout, TooClose
+from jaxsafe.schema.errors import ConfigWarning
 from jaxsafe.simulation.initializers import BelowSpeedLimit
 
 _OFTEN = {1.0: "equal to", 2.0: "twice"}

@@ -9,10 +9,10 @@ from typing import Any, Literal
 from jaxsafe.config import build, load, load_filter, override
 from jaxsafe.environment import Environment
 from jaxsafe.envs import _docking, docking2d, docking2d_oriented, docking3d, rejoin2d, rejoin3d
-from jaxsafe.errors import ConfigError, nearest, show
-from jaxsafe.paths import get_path, set_path
 from jaxsafe.rta.filter import RTA
 from jaxsafe.rta.presets import PRESETS
+from jaxsafe.schema.dotted_paths import get_path, set_path
+from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.simulation.controllers import Continuous, Discrete
 
 TASKS = {

@@ -15,11 +15,11 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     claim_cores()
     cli.enable_compilation_cache()
-    from jaxsafe.errors import ConfigError
     from jaxsafe.evaluate import choice
     from jaxsafe.evaluate.foreign import pop_source
     from jaxsafe.evaluate.report import evaluate, film
     from jaxsafe.evaluate.subject import load, load_foreign
+    from jaxsafe.schema.errors import ConfigError
     from jaxsafe.train.results import table
 
     arguments = cli.Arguments.parse(argv)

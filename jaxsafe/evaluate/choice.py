@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from jaxsafe.cli import Arguments
-from jaxsafe.config.convert import to_data
 from jaxsafe.environment import Environment
 from jaxsafe.envs import adapt, make
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema.convert import to_data
+from jaxsafe.schema.errors import ConfigError
 
 OPTIONS = ("env", "actions", "variant", "rta", "env.…")
 """The options of a command that say where a policy acts."""

@@ -18,10 +18,10 @@ from jaxtyping import Array, Float
 
 from jaxsafe.cli import Arguments
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.evaluate.choice import EnvironmentChoice
 from jaxsafe.evaluate.graph import Network, read_graph
 from jaxsafe.rollout import Policy
+from jaxsafe.schema.errors import ConfigError, nearest
 from jaxsafe.train.agent import Categorical, Gaussian, Params
 from jaxsafe.train.archive import open_archive
 from jaxsafe.train.policy import MAX_LAYERS

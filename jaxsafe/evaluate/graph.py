@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.errors import ConfigError, missing, show
+from jaxsafe.schema.errors import ConfigError, missing, show
 
 Network = Callable[[Mapping[str, Array], Float[Array, " o"]], Float[Array, " a"]]
 """From weights and one observation to one output."""

@@ -9,8 +9,8 @@ import jax
 import numpy as np
 
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError
 from jaxsafe.evaluate.foreign import ForeignAgent, Source
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import directory
 from jaxsafe.train.agent import Agent, Params
 from jaxsafe.train.policy import find_policy, is_single, read_policy

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from jaxsafe import cli
-from jaxsafe.errors import ConfigError, missing, nearest
+from jaxsafe.schema.errors import ConfigError, missing, nearest
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment

@@ -17,7 +17,7 @@ import numpy as np
 from jax.extend import core
 from jax.interpreters import partial_eval
 
-from jaxsafe.errors import ConfigError, missing
+from jaxsafe.schema.errors import ConfigError, missing
 from jaxsafe.train.files import write_bytes
 
 try:

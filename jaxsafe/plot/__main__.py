@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe import cli
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.schema.errors import ConfigError, nearest
 
 
 def main(argv: Sequence[str]) -> int:

@@ -20,10 +20,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError
 from jaxsafe.metrics import ENOUGH_SEEDS, bootstrap_interval
 from jaxsafe.plot.interventions import interventions, most_altered
 from jaxsafe.plot.style import BLUE, GREY, ORANGE, centre_patch, kept_out, labelled, length_unit, plain, region_patch, save
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import directory
 from jaxsafe.train.files import read_rows
 from jaxsafe.train.forms import ANYTHING, COUNT, FLAG, MAYBE, NUMBER, OTHERS, TEXT, check, numbers

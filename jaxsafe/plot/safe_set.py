@@ -24,9 +24,9 @@ from matplotlib.patches import Patch
 from jaxsafe import cli
 from jaxsafe.environment import Environment, reset_to
 from jaxsafe.envs import TASKS, make
-from jaxsafe.errors import ConfigError
 from jaxsafe.plot.style import GREY, ORANGE, labelled, length_unit, margin_unit, plain, save
 from jaxsafe.rta.filter import CertifiedRTA
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.cwh import Spacecraft
 from jaxsafe.simulation.dubins import Dubins2D, Dubins3D
 from jaxsafe.simulation.oriented import OrientedSpacecraft

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from jaxsafe.environment import SUCCESS
-from jaxsafe.errors import ConfigError
-from jaxsafe.paths import references
 from jaxsafe.processors.constraint import Separation, SpeedLimit
+from jaxsafe.schema.dotted_paths import references
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.streams import printable
 from jaxsafe.train.files import write_bytes
 from jaxsafe.types import units

@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from jaxtyping import Array, Float
 
-from jaxsafe.component import Component
+from jaxsafe.schema.component import Component
 from jaxsafe.types import Extent, Length, Sim, StatusName
 
 

@@ -7,8 +7,8 @@ from typing import Annotated, Any, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.component import ANY, Range, Unit
 from jaxsafe.processors.processor import Processor
+from jaxsafe.schema.component import ANY, Range, Unit
 from jaxsafe.simulation.geometry import direction, mag_norm, to_body
 from jaxsafe.types import AnyStatusName, Number, PlatformName, RegionName, Sim
 

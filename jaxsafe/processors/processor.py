@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
-from jaxsafe.component import Component
+from jaxsafe.schema.component import Component
 from jaxsafe.types import Number, Sim
 
 

@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.component import Component, Range, Unit
 from jaxsafe.processors.processor import Processor
 from jaxsafe.processors.terminal import Ends
+from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.types import (
     Extent,
     FlagName,

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsafe.component import Range
 from jaxsafe.processors.processor import Processor
+from jaxsafe.schema.component import Range
 from jaxsafe.simulation.geometry import closest_approach, safe_norm
 from jaxsafe.types import (
     FlagName,

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from jaxtyping import Array, Bool
 
-from jaxsafe.component import Component, Range
+from jaxsafe.schema.component import Component, Range
 from jaxsafe.simulation.clock import later, reached
 from jaxsafe.types import FlagName, Length, Reach, Seconds, Sim, StatusName
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe import cli
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError
 
 SEEDS = 10
 """Of every training, unless the user says otherwise."""

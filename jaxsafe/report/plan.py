@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxsafe.envs import TASKS
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.schema.errors import ConfigError, nearest
 
 PAPER_STEPS = {
     "rejoin2d": 300_000,

@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxsafe.errors import ConfigError
 from jaxsafe.report.plan import Item
 from jaxsafe.report.run import FILM_FILE, answers, options_of
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.directory import read_content
 from jaxsafe.train.files import finite, read_csv, read_json, write_bytes, write_csv, write_json
 from jaxsafe.train.forms import MAYBE, NULL, OTHERS, TEXT, check

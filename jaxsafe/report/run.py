@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe.cli import INTERRUPTED, Arguments, in_main_thread
-from jaxsafe.errors import ConfigError
 from jaxsafe.report.plan import BEST, FILM, Item, best_seed
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.config import resolve
 from jaxsafe.train.directory import described, read_content
 from jaxsafe.train.files import read_json, write_bytes

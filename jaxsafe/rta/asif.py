@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.component import Component, Range, Unit
 from jaxsafe.rta.filter import CertifiedRTA
 from jaxsafe.rta.projection import project_box_ball, project_box_halfspace
 from jaxsafe.rta.qp import nearest_control
+from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.transition import advance, bounds, commanded, constraint, judge
 from jaxsafe.types import Number, Sim
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.component import Component
 from jaxsafe.rta.filter import RTA, admissible, repeated
+from jaxsafe.schema.component import Component
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.types import Record, RTAInfo, Sim
 

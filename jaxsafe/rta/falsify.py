@@ -59,10 +59,10 @@ def main(argv: Sequence[str]) -> int:
     import jax
 
     from jaxsafe.envs import make
-    from jaxsafe.errors import ConfigError, nearest
     from jaxsafe.rta.adversaries import ADVERSARIES
     from jaxsafe.rta.attack import SEARCH, attack, longest_episode
     from jaxsafe.rta.presets import PRESETS
+    from jaxsafe.schema.errors import ConfigError, nearest
     from jaxsafe.train.files import write_text
 
     arguments = cli.Arguments.parse(argv)

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsafe.component import Component, Range, Unit
 from jaxsafe.rta.prediction import others_react, repeat
 from jaxsafe.rta.projection import within
 from jaxsafe.rta.speed_limit import speed_limit_facts
+from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.transition import Others, advance, bounds, commanded, later_sim, others_later, smallest_margin
 from jaxsafe.types import ConstraintName, Number, Record, RTAInfo, Sim

@@ -9,8 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.component import Range, Unit
 from jaxsafe.rta.filter import RTA, CertifiedRTA, RTAMemory, admissible
+from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.geometry import direction, safe_norm, to_body
 from jaxsafe.transition import advance, undirected
 from jaxsafe.types import Length, Number, PlatformName, Positive, RadiansPerSecond, RTAInfo, Sim

@@ -12,7 +12,7 @@ from typing import Annotated, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.component import Component, Range, Unit
+from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.types import Control, Number, Sim
 
 Bound = Annotated[Number, Unit("physical"), Control]

@@ -10,7 +10,7 @@ from typing import Annotated
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.component import Range, Unit
+from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.controllers import Controls
 from jaxsafe.simulation.integrate import sine_ratios
 from jaxsafe.simulation.platform import Platform

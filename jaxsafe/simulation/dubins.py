@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.component import Range, Unit
+from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.controllers import Controls
 from jaxsafe.simulation.geometry import direction, rotation
 from jaxsafe.simulation.integrate import (

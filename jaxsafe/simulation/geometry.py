@@ -9,7 +9,7 @@ from typing import Annotated, Any, ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.component import Component, Unit
+from jaxsafe.schema.component import Component, Unit
 from jaxsafe.simulation.trig import sin_cos
 from jaxsafe.types import Length, Number, Place, PlatformName, Radians, Reach, RegionState, Turn
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.component import ANY, Component, Range, Unit
+from jaxsafe.schema.component import ANY, Component, Range, Unit
 from jaxsafe.simulation.geometry import direction, safe_norm
 from jaxsafe.types import Key, MetresPerSecond, Number, PerSecond, Place, PlatformName, Reach, Sim, Turn
 

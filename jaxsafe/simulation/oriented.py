@@ -7,7 +7,7 @@ from typing import Annotated
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.component import Range, Unit
+from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.controllers import Controls
 from jaxsafe.simulation.cwh import MASS, MEAN_MOTION, MeanMotion, cwh_acceleration, cwh_flow
 from jaxsafe.simulation.geometry import direction, rotation

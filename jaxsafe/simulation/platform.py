@@ -11,8 +11,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jaxsafe.component import Component, Range
-from jaxsafe.errors import ConfigError, nearest, show
+from jaxsafe.schema.component import Component, Range
+from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.simulation.controllers import Controller, Controls, Uncontrolled
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.simulation.initializers import Initializer

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.component import Component, Range, Unit
+from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.simulation.clock import reached
 from jaxsafe.simulation.controllers import Bound, Controller, Controls
 from jaxsafe.simulation.trig import sin_cos

@@ -24,7 +24,7 @@ def main(argv: Sequence[str]) -> int:
     cli.enable_compilation_cache()
     import jax
 
-    from jaxsafe.errors import ConfigError
+    from jaxsafe.schema.errors import ConfigError
     from jaxsafe.train import directory, hosts
     from jaxsafe.train.config import resolve_all
     from jaxsafe.train.files import read_json

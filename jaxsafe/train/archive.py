@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError
 
 MAX_BYTES = 2**28
 """Bytes that an array may have, 256 MiB: 67 million weights. A few compressed bytes can claim to be terabytes."""

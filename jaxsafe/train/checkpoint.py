@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.errors import ConfigError, nearest
+from jaxsafe.schema.errors import ConfigError, nearest
 from jaxsafe.train import hosts
 from jaxsafe.train.forms import check
 from jaxsafe.types import is_key

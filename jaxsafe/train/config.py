@@ -10,14 +10,15 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.cli import Arguments
-from jaxsafe.component import Component, Range, fields, normalise
-from jaxsafe.config import override, yaml
-from jaxsafe.config.convert import expects, to_value
+from jaxsafe.config import override
 from jaxsafe.environment import Environment, require_success
 from jaxsafe.envs import TASKS, make
-from jaxsafe.errors import ConfigError, nearest, show
-from jaxsafe.paths import set_path
 from jaxsafe.processors.reward import Intervention
+from jaxsafe.schema import yaml12
+from jaxsafe.schema.component import Component, Range, fields, normalise
+from jaxsafe.schema.convert import expects, to_value
+from jaxsafe.schema.dotted_paths import set_path
+from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.train.agent import Agent
 from jaxsafe.train.log import tensorboard_writer
 from jaxsafe.train.ppo import MAX_COUNT, PPO
@@ -195,7 +196,7 @@ def recipe(task: str, preset: str | None) -> dict[str, Any]:
         ConfigError: the preset is not in the file.
     """
     file = configs() / f"{task}.yaml"
-    known = yaml.read(file) if file.is_file() else {"plain": {}}
+    known = yaml12.read(file) if file.is_file() else {"plain": {}}
     name = preset if preset is not None else ("features" if "features" in known else "plain")
     if name not in known:
         raise ConfigError(f"preset: unknown preset {show(name)}; choose from {nearest(name, known)}")

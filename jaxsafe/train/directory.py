@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Any
 
 import jaxsafe.config
-from jaxsafe.component import normalise
-from jaxsafe.config import yaml
-from jaxsafe.config.convert import to_component, to_data
 from jaxsafe.environment import Environment
 from jaxsafe.envs import TASKS
-from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.origin import commit, versions
+from jaxsafe.schema import yaml12
+from jaxsafe.schema.component import normalise
+from jaxsafe.schema.convert import to_component, to_data
+from jaxsafe.schema.errors import ConfigError, nearest
 from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.files import write_text
 from jaxsafe.train.forms import NULL, NUMBER, TEXT, check
@@ -31,7 +31,7 @@ def create(config: TrainConfig, env: Environment, name: str) -> Path:
     path = make(config.out, Path("runs"), name)
     content = {"env": name, **described(config, env), "commit": commit(), "versions": versions()}
     try:
-        write_text(path / "config.yaml", yaml.write(content))
+        write_text(path / "config.yaml", yaml12.write(content))
     except OSError as error:
         raise ConfigError(f"out: cannot write {error.filename}: {error.strerror}") from None
     return path
@@ -105,7 +105,7 @@ def read_content(path: Path) -> dict[str, Any]:
         ConfigError: it cannot be read, or is that of no run.
     """
     file = path / "config.yaml"
-    content = yaml.read(file)
+    content = yaml12.read(file)
     if not isinstance(content, dict) or not {"env", "training", "environment"} <= set(content):
         raise ConfigError(f"{file}: expected the keys env, training and environment")
     form = {"env": TEXT | NUMBER, "training": {}, "environment": {}}

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.geometry import rotation, safe_norm
 from jaxsafe.types import Number
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.forms import ANYTHING, check, is_deep
 
 

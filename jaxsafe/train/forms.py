@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from jaxsafe.errors import ConfigError, show
+from jaxsafe.schema.errors import ConfigError, show
 
 OTHERS = ...
 """Stands in a mapping for every key that the mapping does not name."""

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError, install
 from jaxsafe.metrics import measures
+from jaxsafe.schema.errors import ConfigError, install
 from jaxsafe.train.files import append_csv, append_rows, read_rows, write_csv, write_rows
 from jaxsafe.train.forms import COUNT, FLAG, MAYBE, NUMBER, OTHERS
 

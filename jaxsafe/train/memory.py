@@ -7,7 +7,7 @@ from typing import Any
 
 import jax
 
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import hosts
 from jaxsafe.types import is_key
 

@@ -15,11 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.component import normalise
-from jaxsafe.config.convert import to_component, to_data
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError, nearest
 from jaxsafe.rollout import Policy
+from jaxsafe.schema.component import normalise
+from jaxsafe.schema.convert import to_component, to_data
+from jaxsafe.schema.errors import ConfigError, nearest
 from jaxsafe.train.agent import Agent, Params
 from jaxsafe.train.archive import Archive, open_archive
 from jaxsafe.train.files import parse_json, write_bytes

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.train import directory, ppo
 from jaxsafe.train.agent import Params
 from jaxsafe.train.checkpoint import Checkpoints

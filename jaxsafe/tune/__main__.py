@@ -19,7 +19,7 @@ def main(argv: Sequence[str]) -> int:
     cli.enable_compilation_cache()
     from tqdm import tqdm
 
-    from jaxsafe.errors import ConfigError, nearest, show
+    from jaxsafe.schema.errors import ConfigError, nearest, show
     from jaxsafe.train import directory
     from jaxsafe.tune import results
     from jaxsafe.tune.lanes import train_all

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from jaxsafe.cli import Arguments, columns
-from jaxsafe.config import yaml
-from jaxsafe.errors import ConfigError, show
 from jaxsafe.origin import versions
+from jaxsafe.schema import yaml12
+from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.train import directory
 from jaxsafe.train.files import append_rows, keep_rows, write_csv, write_json, write_text
 from jaxsafe.train.forms import COUNT, NULL, OTHERS, SHARE, TEXT, Kind, check, numbers
@@ -36,7 +36,7 @@ def create(out: str | None, request: Mapping[str, Any], first: Setting) -> Path:
     """Make the directory of a sweep and write down what was asked for, and what its first setting is in full."""
     path = directory.make(out, Path("runs"), f"tune_{Path(str(request['env'])).stem}")
     whole = directory.described(first.config, first.env)
-    write_text(path / "sweep.yaml", yaml.write({"request": dict(request), "first": whole, "versions": versions()}))
+    write_text(path / "sweep.yaml", yaml12.write({"request": dict(request), "first": whole, "versions": versions()}))
     return path
 
 
@@ -60,13 +60,13 @@ def refuse_other(path: Path, first: Setting) -> None:
     Raises:
         ConfigError: what the sweep was begun with has changed.
     """
-    now = yaml.write(directory.described(first.config, first.env))
-    if _content(path)["first"] != yaml.parse(now, "first"):
+    now = yaml12.write(directory.described(first.config, first.env))
+    if _content(path)["first"] != yaml12.parse(now, "first"):
         raise ConfigError(f"resume: the recipe or the environment of {path} has changed since it was begun; begin it anew")
 
 
 def _content(path: Path) -> dict[str, Any]:
-    content = yaml.read(path / "sweep.yaml")
+    content = yaml12.read(path / "sweep.yaml")
     check(content, {"request": {}, "first": {}}, str(path / "sweep.yaml"))
     return content
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxsafe.cli import Arguments
 from jaxsafe.environment import Environment
-from jaxsafe.errors import ConfigError, show
+from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.train.config import TrainConfig, resolve
 
 PREFIX = "sweep."

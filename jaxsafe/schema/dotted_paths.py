@@ -10,8 +10,8 @@ import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
-from jaxsafe.component import Component, Field, Refers, fields
-from jaxsafe.errors import ConfigError, nearest, show
+from jaxsafe.schema.component import Component, Field, Refers, fields
+from jaxsafe.schema.errors import ConfigError, nearest, show
 
 Convert = Callable[[Any, Field, str], Any]
 """`convert(value, field, place)`: the value that the field takes, or a ConfigError that names the place."""

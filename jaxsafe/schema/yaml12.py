@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 from yaml.constructor import ConstructorError
 
-from jaxsafe.errors import ConfigError, show
+from jaxsafe.schema.errors import ConfigError, show
 
 MAX_LETTERS = 2**20
 """A text may be this long: PyYAML takes about ten seconds to read as much. An environment has some 10,000 letters."""

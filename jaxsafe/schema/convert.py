@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxsafe.component import ANY, Component, Field, Kind, Range, choices, fields, normalise, unwrap_optional
-from jaxsafe.component import field as field_of
-from jaxsafe.errors import ConfigError, nearest, show
-from jaxsafe.paths import join
+from jaxsafe.schema.component import ANY, Component, Field, Kind, Range, choices, fields, normalise, unwrap_optional
+from jaxsafe.schema.component import field as field_of
+from jaxsafe.schema.dotted_paths import join
+from jaxsafe.schema.errors import ConfigError, nearest, show
 
 
 def to_component(data: Any, base: type[Kind], place: str) -> Kind:

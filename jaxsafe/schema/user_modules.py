@@ -10,9 +10,9 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
 
-from jaxsafe.component import Component, fields
-from jaxsafe.errors import ConfigError, show, told
-from jaxsafe.paths import join
+from jaxsafe.schema.component import Component, fields
+from jaxsafe.schema.dotted_paths import join
+from jaxsafe.schema.errors import ConfigError, show, told
 
 _allowed: ContextVar[bool] = ContextVar("allowed", default=True)
 

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError
 
 ANY = -1
 """Length of a unit that takes one number or a list of them."""

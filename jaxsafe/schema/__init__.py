@@ -1,0 +1,1 @@
+"""Components and their fields, dotted paths into them, and how they are read and written. Nothing here knows a task."""
