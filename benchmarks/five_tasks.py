@@ -24,7 +24,7 @@ from isolated import CACHE, words
 
 from jaxsafe.envs import TASKS
 from jaxsafe.report.measures import failed_seeds, wall_to
-from jaxsafe.train.files import read_json, read_rows
+from jaxsafe.storage.files import read_json, read_rows
 
 OUT = Path(__file__).parent / "results" / "five_tasks.json"
 LEVEL = 0.95

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from jaxsafe.origin import processor
+from jaxsafe.storage.provenance import processor
 
 
 def about() -> dict[str, Any]:

@@ -44,18 +44,18 @@ def main() -> None:
 
 def probe(task: str, num_envs: int) -> dict[str, int]:
     """Train two updates of one seed on one device."""
-    from jaxsafe.train.seeds import SeedMapper, claim_cores
+    from jaxsafe.devices.seed_mapper import SeedMapper, claim_cores
 
     claim_cores()
     import jax
 
-    from jaxsafe import cli
-    from jaxsafe.train import memory
+    from jaxsafe.config.arguments import Arguments
+    from jaxsafe.devices import memory
     from jaxsafe.train.config import resolve
     from jaxsafe.train.loop import programs
 
     words = [f"env={task}", f"ppo.num_envs={num_envs}", f"ppo.num_steps={NUM_STEPS}", "ppo.num_epochs=1"]
-    config, env, _ = resolve(cli.Arguments.parse(words))
+    config, env, _ = resolve(Arguments.parse(words))
     mapper = SeedMapper(1)
     shared = mapper.replicate((env, config.agent, config.ppo))
     fresh, two = programs(mapper, 2, 2)

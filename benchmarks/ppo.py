@@ -62,7 +62,7 @@ def main() -> None:
 
 def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
     """Our PPO as `jaxsafe.train` runs it, `seeds` of them; samples of all seeds together."""
-    from jaxsafe.train.seeds import claim_cores
+    from jaxsafe.devices.seed_mapper import claim_cores
 
     claim_cores()
     import jax
@@ -82,8 +82,8 @@ def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
 
 def our_programs(task: str, seeds: int, updates: int) -> tuple[Any, Any, Any, Any]:
     """The fresh state and some updates of our PPO, and what both take: keys, and what all seeds share."""
+    from jaxsafe.devices.seed_mapper import SeedMapper
     from jaxsafe.train.loop import programs
-    from jaxsafe.train.seeds import SeedMapper
 
     config, env = settings(task)
     mapper = SeedMapper(seeds, config.shares)
@@ -93,18 +93,18 @@ def our_programs(task: str, seeds: int, updates: int) -> tuple[Any, Any, Any, An
 
 def settings(task: str) -> tuple[Any, Any]:
     """The configuration of our PPO, and the environment."""
-    from jaxsafe import cli
+    from jaxsafe.config.arguments import Arguments
     from jaxsafe.train.config import resolve
 
     sizes = {"num_envs": NUM_ENVS, "num_steps": NUM_STEPS, "num_epochs": NUM_EPOCHS, "num_minibatches": NUM_MINIBATCHES}
     words = [f"env={task}", "preset=plain", f"agent.hidden={list(HIDDEN)}", f"steps={10 * UPDATES * BATCH}"]
-    config, env, _ = resolve(cli.Arguments.parse([*words, *(f"ppo.{key}={value}" for key, value in sizes.items())]))
+    config, env, _ = resolve(Arguments.parse([*words, *(f"ppo.{key}={value}" for key, value in sizes.items())]))
     return config, env
 
 
 def networks_only(task: str) -> float:
     """What the networks and Adam need of our updates: no environments, no advantages, no shuffle."""
-    from jaxsafe.train.seeds import claim_cores
+    from jaxsafe.devices.seed_mapper import claim_cores
 
     claim_cores()
     import jax

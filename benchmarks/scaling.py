@@ -81,7 +81,7 @@ def projection(rates: dict[tuple[str, int], float], cores: int) -> list[dict[str
 
 def steps(task: str) -> float:
     """Environment steps a second of all cores."""
-    from jaxsafe.train.seeds import claim_cores
+    from jaxsafe.devices.seed_mapper import claim_cores
 
     claim_cores()
     import environments

@@ -103,11 +103,11 @@ def _jaxsafe(task: str, rta: str, tick: Callable[[], None]) -> None:
     import jax.numpy as jnp
 
     import jaxsafe
-    from jaxsafe import cli
+    from jaxsafe.config.arguments import Arguments
+    from jaxsafe.devices.seed_mapper import SeedMapper, claim_cores
     from jaxsafe.rollout import reset_batch, step_or_reset_batch
     from jaxsafe.train.config import resolve
     from jaxsafe.train.loop import programs
-    from jaxsafe.train.seeds import SeedMapper, claim_cores
 
     claim_cores()
     tick()
@@ -119,7 +119,7 @@ def _jaxsafe(task: str, rta: str, tick: Callable[[], None]) -> None:
     tick()
     step.compile()
     tick()
-    config, env, _ = resolve(cli.Arguments.parse([f"env={task}", f"rta={rta}", "seeds=10"]))
+    config, env, _ = resolve(Arguments.parse([f"env={task}", f"rta={rta}", "seeds=10"]))
     mapper = SeedMapper(config.seeds, config.shares)
     shared = mapper.replicate((env, config.agent, config.ppo))
     fresh, advance = programs(mapper, 10, config.num_updates)
@@ -236,7 +236,7 @@ def gymnax_step() -> None:
 
 def our_update() -> None:
     """PPO."""
-    from jaxsafe.train.seeds import claim_cores
+    from jaxsafe.devices.seed_mapper import claim_cores
 
     claim_cores()
     import jax

@@ -17,7 +17,7 @@ from typing import Any
 from jaxsafe.envs import TASKS
 from jaxsafe.metrics import with_interval
 from jaxsafe.report.plan import PAPER_STEPS, WITHOUT_RTA
-from jaxsafe.train.files import write_text
+from jaxsafe.storage.files import write_text
 
 ROOT = Path(__file__).parent.parent
 RESULTS, BASELINES = ROOT / "benchmarks" / "results", ROOT / "docs" / "baselines"

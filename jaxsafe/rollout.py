@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
+from jaxsafe.autoreset import choose, renew
+from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.renewal import choose, renew
 from jaxsafe.schema.errors import ConfigError, show
-from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.types import Key, State, TimeStep
 
 Policy = Callable[[Key, Array], Array]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxsafe.train.seeds import claim_cores
+from jaxsafe.devices.seed_mapper import claim_cores
 
 emitter = " --xla_cpu_use_fusion_emitters=false" * version("jaxlib").startswith("0.10.")
 os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count=2 --xla_backend_optimization_level=1{emitter}")

@@ -16,6 +16,7 @@ import pytest
 
 from jaxsafe import cli
 from jaxsafe.config import __main__ as config
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.evaluate.seeds import Evaluator
 from jaxsafe.export import __main__ as export
@@ -23,6 +24,7 @@ from jaxsafe.plot import __main__ as plot
 from jaxsafe.rta import falsify
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.storage.text_table import columns
 from jaxsafe.train import __main__ as train
 from jaxsafe.train import config as config_module
 from jaxsafe.train import policy as policy_module
@@ -51,10 +53,10 @@ def fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], t
 
 
 def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
-    arguments = cli.Arguments.parse(["out=2024.10", "run=007", "env.timeout=10.0"])
+    arguments = Arguments.parse(["out=2024.10", "run=007", "env.timeout=10.0"])
     assert (arguments.pop_text("out"), arguments.pop_text("run")) == ("2024.10", "007")
     assert arguments.pop_overrides() == {"timeout": 10.0}
-    assert cli.Arguments.parse(["run=[a, b]"]).pop("run") == ["a", "b"]
+    assert Arguments.parse(["run=[a, b]"]).pop("run") == ["a", "b"]
 
 
 @pytest.mark.parametrize(
@@ -291,16 +293,16 @@ def test_a_package_without_its_files_is_told(tmp_path: Path, monkeypatch: pytest
 
 def test_a_path_may_begin_with_the_home_directory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("HOME", "/home/me")
-    arguments = cli.Arguments.parse(["out=~/x", "run=[~/a,b/~,./~]", "env=~/mine.yaml", "rta=~x"])
+    arguments = Arguments.parse(["out=~/x", "run=[~/a,b/~,./~]", "env=~/mine.yaml", "rta=~x"])
     assert arguments.options == {
         "out": "/home/me/x", "run": ["/home/me/a", "b/~", "./~"], "env": "/home/me/mine.yaml", "rta": "~x",
     }  # fmt: skip
     with pytest.raises(ConfigError, match=r"^resume: no home directory for '~nobody-of-that-name/x'; write \./~nobody"):
-        cli.Arguments.parse(["resume=~nobody-of-that-name/x"])
+        Arguments.parse(["resume=~nobody-of-that-name/x"])
 
 
 def test_columns_of_a_table_never_touch() -> None:
-    lines = cli.columns([["", "a"], ["x", "123,456,789,012.00 [1, 2] %"], ["a long name", "-"]])
+    lines = columns([["", "a"], ["x", "123,456,789,012.00 [1, 2] %"], ["a long name", "-"]])
     assert [line.split("  ")[-1] for line in lines] == [" a", "123,456,789,012.00 [1, 2] %", "-"]
     assert len({len(line) for line in lines}) == 1
 
@@ -331,10 +333,10 @@ def test_a_platform_of_jax_that_is_not_there_is_told_in_one_line() -> None:
 
 def test_paths_are_taken_as_typed() -> None:
     words = ["out=my run #3", "run=a: b", "resume='x'", "runs=true", "policies=007", "env=my # task.yaml"]
-    arguments = cli.Arguments.parse(words)
+    arguments = Arguments.parse(words)
     assert [arguments.pop_text(word.partition("=")[0]) for word in words] == [word.partition("=")[2] for word in words]
-    assert cli.Arguments.parse(["run=[2024.10, 007, true]"]).pop("run") == ["2024.10", "007", "true"]
-    assert cli.Arguments.parse(["out="]).pop("out", "") is None
+    assert Arguments.parse(["run=[2024.10, 007, true]"]).pop("run") == ["2024.10", "007", "true"]
+    assert Arguments.parse(["out="]).pop("out", "") is None
 
 
 HUGE = "9" * 4000

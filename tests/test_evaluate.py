@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 
 import jaxsafe
-from jaxsafe.cli import Arguments
 from jaxsafe.config import dump
+from jaxsafe.config.arguments import Arguments
+from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.evaluate import episodes as episodes_module
 from jaxsafe.evaluate import seeds as seeds_module
 from jaxsafe.evaluate.__main__ import main
@@ -18,7 +19,6 @@ from jaxsafe.evaluate.choice import EnvironmentChoice, differences
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.evaluate.seeds import Evaluator, batch_keys
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.seeds import SeedMapper
 
 
 def zero(key: jax.Array, observation: jax.Array) -> jax.Array:

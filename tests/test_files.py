@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.files import append_csv, append_rows, keep_rows, read_json, read_rows, write_json, write_text
-from jaxsafe.train.forms import COUNT, MAYBE, OTHERS, numbers
+from jaxsafe.storage.files import append_csv, append_rows, keep_rows, read_json, read_rows, write_json, write_text
+from jaxsafe.storage.forms import COUNT, MAYBE, OTHERS, numbers
 
 
 def test_a_last_line_cut_short_by_a_kill_is_not_a_row(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from jaxsafe.export import functions
 from jaxsafe.export.__main__ import main as export
 from jaxsafe.export.onnx import write_onnx
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.files import read_json
+from jaxsafe.storage.files import read_json
 from jaxsafe.train.policy import find_policy, read_policy
 
 

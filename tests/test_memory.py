@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from jaxsafe.devices import memory, processes
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train import hosts, memory
 from jaxsafe.train.__main__ import main
 from jaxsafe.tune.__main__ import main as tune
 
@@ -35,7 +35,7 @@ def test_the_batch_of_an_update_is_counted(command: Callable, tmp_path: Path, mo
 
 def test_processes_of_one_machine_share_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "available", lambda: 10 * memory.GIB)
-    monkeypatch.setattr(hosts, "beside", lambda: 4)
+    monkeypatch.setattr(processes, "beside", lambda: 4)
     with pytest.raises(ConfigError, match=r"x: this training needs 16.0 GiB of memory, 10.0 GiB are free"):
         memory.require(2 * memory.GIB, 2, "x")
 
@@ -81,7 +81,7 @@ def test_devices_of_one_machine_share_its_memory(monkeypatch: pytest.MonkeyPatch
 
 def test_every_process_refuses_what_does_not_fit_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "available", lambda: 10 * memory.GIB)
-    monkeypatch.setattr(hosts, "anyone", lambda _: True)
+    monkeypatch.setattr(processes, "anyone", lambda _: True)
     with pytest.raises(ConfigError, match=r"x: this training needs 2.0 GiB of memory, another process has less"):
         memory.require(memory.GIB, 2, "x")
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxsafe
-from jaxsafe.cli import Arguments
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.rta.presets import PRESETS

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxsafe import origin
+from jaxsafe.storage import provenance
 
 
 def test_a_commit_is_that_of_the_code_and_says_when_the_code_is_another(
@@ -26,21 +26,21 @@ def test_a_commit_is_that_of_the_code_and_says_when_the_code_is_another(
     ):
         file.parent.mkdir(exist_ok=True, parents=True)
         file.write_text("first")
-    monkeypatch.setattr(origin, "__file__", str(package / "origin.py"))
-    assert origin.commit() is None
+    monkeypatch.setattr(provenance, "__file__", str(package / "origin.py"))
+    assert provenance.commit() is None
     git("init", "-q")
     git("add", "-A")
     git("commit", "-qm", "all of it")
     head = git("rev-parse", "HEAD")[:12]
-    assert origin.commit() == head
+    assert provenance.commit() == head
     for result in (tmp_path / "page.md", package / "policies" / "one.npz", package / "policies" / "another.npz"):
         result.write_text("another")
-    assert origin.commit() == head
+    assert provenance.commit() == head
     for code in (package / "code.py", tmp_path / "configs" / "task.yaml", package / "new.py"):
         code.write_text("another")
-        assert origin.commit() == f"{head} with changes"
+        assert provenance.commit() == f"{head} with changes"
         git("stash", "-q", "-u")
-        assert origin.commit() == head
+        assert provenance.commit() == head
 
 
 def test_a_package_inside_another_repository_has_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -51,8 +51,8 @@ def test_a_package_inside_another_repository_has_no_commit(tmp_path: Path, monke
     mine = ["git", "-C", str(tmp_path), "-c", "user.name=test", "-c", "user.email=test@example.org"]
     for words in (["init", "-q"], ["add", "mine.py"], ["commit", "-qm", "mine"]):
         subprocess.run([*mine, *words], check=True)
-    monkeypatch.setattr(origin, "__file__", str(package / "origin.py"))
-    assert origin.commit() is None
+    monkeypatch.setattr(provenance, "__file__", str(package / "origin.py"))
+    assert provenance.commit() is None
 
 
 @pytest.mark.parametrize(
@@ -72,4 +72,4 @@ def test_a_processor_is_named_with_what_tells_kinds_of_one_name_apart(
     file = tmp_path / "cpuinfo"
     if text is not None:
         file.write_text(text)
-    assert origin.processor(file) == name
+    assert provenance.processor(file) == name

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxsafe
-from jaxsafe.renewal import LARGE, LEAST, SHARE, renew
+from jaxsafe.autoreset import LARGE, LEAST, SHARE, renew
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 
 SIZES = (24, LARGE, 1000, 1031)  # few, many, no power of two, a prime

@@ -15,8 +15,8 @@ import jax
 import pytest
 from tiny import TINY
 
-from jaxsafe import cli
 from jaxsafe.config import override
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.report import __main__ as command
@@ -283,10 +283,10 @@ def test_every_command_of_the_plan_is_valid() -> None:
     items = plan([*TASKS], [*KINDS], ["seeds=10"])
     assert len({item.name for item in items}) == 40
     for item in items:
-        [(config, env, _)] = resolve_all(cli.Arguments.parse(item.words))
+        [(config, env, _)] = resolve_all(Arguments.parse(item.words))
         assert config.seeds == 10
         for words in item.evaluations.values():
-            arguments = cli.Arguments.parse(words)
+            arguments = Arguments.parse(words)
             rta = arguments.pop_text("rta")
             arguments.pop("seed")
             changed = adapt(env, item.task, arguments.pop_overrides(), rta=rta)
@@ -331,7 +331,7 @@ def test_the_best_policy_succeeds_most_then_violates_least_then_has_the_highest_
 def test_trainings_with_a_filter_start_where_it_promises_safety() -> None:
     begin = jax.jit(reset_batch, static_argnums=2)
     for item in plan(["docking2d_oriented"], ["rta", "unpunished"], ["seeds=2"]):
-        [(_, env, _)] = resolve_all(cli.Arguments.parse(item.words))
+        [(_, env, _)] = resolve_all(Arguments.parse(item.words))
         [deputy] = [platform for platform in env.platforms if platform.name == "deputy"]
         [share] = [start.share for start in deputy.start if start.name == "velocity"]
         fastest = override(env, {"deputy.start.velocity.share": [share[1], share[1]]})

@@ -11,7 +11,7 @@ import pytest
 from tiny import TINY
 
 import jaxsafe
-from jaxsafe.cli import Arguments
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.evaluate.__main__ import main as evaluate
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError

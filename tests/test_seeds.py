@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import jaxsafe
+from jaxsafe.devices.seed_mapper import SeedMapper
+from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.train.agent import Agent
 from jaxsafe.train.loop import STATE
 from jaxsafe.train.ppo import PPO, TrainState, init, update
-from jaxsafe.train.seeds import SeedMapper
 
 ENV = jaxsafe.make("docking2d")
 AGENT = normalise(Agent(features="docking"))
@@ -49,7 +49,7 @@ def test_a_seed_of_many_is_bit_for_bit_the_seed_alone(three: TrainState, seed: i
 
 
 STARTS = """
-from jaxsafe.train.seeds import SeedMapper, claim_cores
+from jaxsafe.devices.seed_mapper import SeedMapper, claim_cores
 claim_cores()
 import jax, jaxsafe, numpy as np
 from jaxsafe.schema.component import normalise

@@ -12,6 +12,7 @@ from tiny import TINY
 
 from jaxsafe import cli, make
 from jaxsafe.config import load
+from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.streams import LastingStream
 from jaxsafe.train import __main__ as train
 
@@ -116,7 +117,7 @@ def test_no_home_costs_only_the_compilation_cache(monkeypatch: pytest.MonkeyPatc
     place = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     jax.config.update("jax_compilation_cache_dir", None)
     try:
-        cli.enable_compilation_cache()
+        enable_compilation_cache()
         assert jax.config.jax_compilation_cache_dir is None  # type: ignore[attr-defined]
     finally:
         jax.config.update("jax_compilation_cache_dir", place)

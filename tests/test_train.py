@@ -17,11 +17,12 @@ from orbax.checkpoint import CheckpointManager
 from tiny import TINY
 
 from jaxsafe import cli
+from jaxsafe.devices import processes
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import __main__ as command
-from jaxsafe.train import directory, hosts
+from jaxsafe.train import directory
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import recipe
 from jaxsafe.train.loop import Clock, Training
@@ -175,7 +176,7 @@ def test_a_run_has_one_command_at_work_on_it(tmp_path: Path, whole: Path) -> Non
     shutil.copytree(whole, run)
     (run / "results.json").unlink()
     with (
-        hosts.own_files(run),
+        processes.own_files(run),
         pytest.raises(ConfigError, match=f"^{run}: another command is at work on this run; wait for its end, or stop it$"),
     ):
         command.main([f"resume={run}"])
@@ -187,7 +188,7 @@ def test_a_refused_training_leaves_its_directory_free(tmp_path: Path, monkeypatc
         raise ConfigError("ppo.num_envs: this training needs 9 GiB")
 
     with monkeypatch.context() as patch:
-        patch.setattr("jaxsafe.train.memory.require", refused)
+        patch.setattr("jaxsafe.devices.memory.require", refused)
         with pytest.raises(ConfigError, match="needs 9 GiB"):
             command.main([*TINY, f"out={tmp_path / 'run'}"])
     assert not (tmp_path / "run").exists()

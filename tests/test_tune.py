@@ -9,6 +9,7 @@ import pytest
 from tiny import TINY
 
 from jaxsafe import cli
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.config import recipe
@@ -22,9 +23,9 @@ GAMMA = recipe("docking2d", None)["ppo.gamma"]
 SWEEP = [*BASE, f"sweep.ppo.gamma=[{GAMMA},0.99]", "sweep.ppo.num_steps=[16,32]"]
 
 
-def options(*words: str) -> cli.Arguments:
+def options(*words: str) -> Arguments:
     swept = {word.partition("=")[0] for word in words}
-    return cli.Arguments.parse([*(word for word in TINY if f"sweep.{word.partition('=')[0]}" not in swept), *words])
+    return Arguments.parse([*(word for word in TINY if f"sweep.{word.partition('=')[0]}" not in swept), *words])
 
 
 def results(path: Path) -> dict[int, dict[str, Any]]:

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxsafe.adapters import action_bounds, checked_count, environment
+from jaxsafe.autoreset import choose
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.renewal import choose
 from jaxsafe.schema.errors import ConfigError, missing
 from jaxsafe.types import Key, TimeStep
 

@@ -16,8 +16,8 @@ import numpy as np
 from jaxtyping import Array
 
 from jaxsafe.adapters import refuse_fork
+from jaxsafe.autoreset import renew
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.renewal import renew
 from jaxsafe.rollout import cut_short
 from jaxsafe.types import State, TimeStep
 

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 
 from jaxsafe import cli
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema.errors import ConfigError
 
 
@@ -19,7 +20,7 @@ def main(argv: Sequence[str]) -> int:
     task, *words = argv
     if "=" in task:
         raise ConfigError(f"argument {task!r}: expected a task first, for instance docking3d")
-    arguments = cli.Arguments.parse(words)
+    arguments = Arguments.parse(words)
     changes = arguments.pop_overrides()
     options = {name: arguments.pop_text(name) for name in ("actions", "variant", "rta")}
     arguments.refuse_rest([*options, "env.…"])

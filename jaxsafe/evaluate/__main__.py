@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from jaxsafe import cli
-from jaxsafe.train.seeds import claim_cores
+from jaxsafe.config.arguments import Arguments
+from jaxsafe.devices.compilation_cache import enable_compilation_cache
+from jaxsafe.devices.seed_mapper import claim_cores
 
 OPTIONS = ("run", "activation", "episodes", "seed", "checkpoint", "deterministic", "render", "out")
 
@@ -14,7 +16,7 @@ OPTIONS = ("run", "activation", "episodes", "seed", "checkpoint", "deterministic
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     claim_cores()
-    cli.enable_compilation_cache()
+    enable_compilation_cache()
     from jaxsafe.evaluate import choice
     from jaxsafe.evaluate.foreign import pop_source
     from jaxsafe.evaluate.report import evaluate, film
@@ -22,7 +24,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.schema.errors import ConfigError
     from jaxsafe.train.results import table
 
-    arguments = cli.Arguments.parse(argv)
+    arguments = Arguments.parse(argv)
     run = arguments.pop_text("run")
     if run is None:
         raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from jaxsafe.cli import Arguments
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.environment import Environment
 from jaxsafe.envs import adapt, make
 from jaxsafe.schema.convert import to_data

@@ -16,14 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.cli import Arguments
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.choice import EnvironmentChoice
 from jaxsafe.evaluate.graph import Network, read_graph
 from jaxsafe.rollout import Policy
 from jaxsafe.schema.errors import ConfigError, nearest
+from jaxsafe.storage.archive import open_archive
 from jaxsafe.train.agent import Categorical, Gaussian, Params
-from jaxsafe.train.archive import open_archive
 from jaxsafe.train.policy import MAX_LAYERS
 
 ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}

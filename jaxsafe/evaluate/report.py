@@ -12,9 +12,9 @@ import numpy as np
 from jaxsafe.environment import Environment, require_success
 from jaxsafe.evaluate.seeds import Evaluator, episode_rows, given_up
 from jaxsafe.evaluate.subject import Subject
-from jaxsafe.origin import versions
+from jaxsafe.storage.files import append_rows, write_json
+from jaxsafe.storage.provenance import versions
 from jaxsafe.train import directory
-from jaxsafe.train.files import append_rows, write_json
 from jaxsafe.train.log import filter_name
 from jaxsafe.train.results import diverged_seeds, evaluation
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.foreign import ForeignAgent, Source
 from jaxsafe.schema.errors import ConfigError
@@ -16,7 +17,6 @@ from jaxsafe.train.agent import Agent, Params
 from jaxsafe.train.policy import find_policy, is_single, read_policy
 from jaxsafe.train.restore import load_params
 from jaxsafe.train.results import facts
-from jaxsafe.train.seeds import SeedMapper
 
 
 class Subject(NamedTuple):

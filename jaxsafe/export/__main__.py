@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
 
 from jaxsafe import cli
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema.errors import ConfigError, missing, nearest
 
 if TYPE_CHECKING:
@@ -36,10 +37,10 @@ def main(argv: Sequence[str]) -> int:
 
     from jaxsafe.evaluate import choice
     from jaxsafe.export import functions
-    from jaxsafe.origin import versions
-    from jaxsafe.train.files import write_bytes
+    from jaxsafe.storage.files import write_bytes
+    from jaxsafe.storage.provenance import versions
 
-    arguments = cli.Arguments.parse(argv)
+    arguments = Arguments.parse(argv)
     run, form, out = (arguments.pop_text(name) for name in ("run", "format", "out"))
     if run is None:
         raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
@@ -91,7 +92,7 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _policy(arguments: cli.Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy, str]:
+def _policy(arguments: Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy, str]:
     """What `run` and the options beside it mean, and the first part of the names of files."""
     from jaxsafe.evaluate.choice import EnvironmentChoice, differences
     from jaxsafe.evaluate.foreign import pop_source

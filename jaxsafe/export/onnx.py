@@ -18,7 +18,7 @@ from jax.extend import core
 from jax.interpreters import partial_eval
 
 from jaxsafe.schema.errors import ConfigError, missing
-from jaxsafe.train.files import write_bytes
+from jaxsafe.storage.files import write_bytes
 
 try:
     from onnx import TensorProto, checker, helper, numpy_helper

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.export.functions import Exported
-from jaxsafe.train.files import write_bytes
+from jaxsafe.storage.files import write_bytes
 from jaxsafe.types import Key
 
 Box = Sequence[tuple[float, float]]

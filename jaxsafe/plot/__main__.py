@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe import cli
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema.errors import ConfigError, nearest
 
 
@@ -15,7 +16,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.plot.figures import AXES, draw_all
     from jaxsafe.train import directory
 
-    arguments = cli.Arguments.parse(argv)
+    arguments = Arguments.parse(argv)
     several = isinstance(arguments.options.get("run"), list)
     arguments.refuse_beside([] if several else ["out"], "but for several runs, which run=[A,B] draws in one figure")
     run, x = arguments.pop("run") if several else arguments.pop_text("run"), arguments.pop_text("x") or "steps"

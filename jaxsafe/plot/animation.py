@@ -32,7 +32,7 @@ from jaxsafe.plot.style import (
 )
 from jaxsafe.processors.constraint import Separation
 from jaxsafe.processors.status import Distance
-from jaxsafe.train.files import write_bytes
+from jaxsafe.storage.files import write_bytes
 from jaxsafe.types import Sim, State, TimeStep
 
 FRAMES = 80

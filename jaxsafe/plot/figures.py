@@ -24,9 +24,9 @@ from jaxsafe.metrics import ENOUGH_SEEDS, bootstrap_interval
 from jaxsafe.plot.interventions import interventions, most_altered
 from jaxsafe.plot.style import BLUE, GREY, ORANGE, centre_patch, kept_out, labelled, length_unit, plain, region_patch, save
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.storage.files import read_rows
+from jaxsafe.storage.forms import ANYTHING, COUNT, FLAG, MAYBE, NUMBER, OTHERS, TEXT, check, numbers
 from jaxsafe.train import directory
-from jaxsafe.train.files import read_rows
-from jaxsafe.train.forms import ANYTHING, COUNT, FLAG, MAYBE, NUMBER, OTHERS, TEXT, check, numbers
 from jaxsafe.train.log import filter_name, headline, read_progress
 
 LAST_COLOUR = 0.85  # the end of the colour map is too light on white

@@ -22,6 +22,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxsafe import cli
+from jaxsafe.config.arguments import Arguments
+from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.environment import Environment, reset_to
 from jaxsafe.envs import TASKS, make
 from jaxsafe.plot.style import GREY, ORANGE, labelled, length_unit, margin_unit, plain, save
@@ -213,8 +215,8 @@ def _entries(surveys: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> list[Any]:
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
-    cli.enable_compilation_cache()
-    arguments = cli.Arguments.parse(argv)
+    enable_compilation_cache()
+    arguments = Arguments.parse(argv)
     task, rta, out = (arguments.pop_text(name) for name in ("env", "rta", "out"))
     changes, points = arguments.pop_overrides(), arguments.pop_count("points", 161, least=2)
     x, y = (_ends(arguments, name) for name in "xy")
@@ -232,7 +234,7 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _ends(arguments: cli.Arguments, key: str) -> Ends | None:
+def _ends(arguments: Arguments, key: str) -> Ends | None:
     value = arguments.pop(key)
     numbers = isinstance(value, list) and all(isinstance(one, (int, float)) for one in value)
     if value is not None and not (numbers and len(value) == 2 and value[0] < value[1]):

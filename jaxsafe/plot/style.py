@@ -15,8 +15,8 @@ from jaxsafe.environment import SUCCESS
 from jaxsafe.processors.constraint import Separation, SpeedLimit
 from jaxsafe.schema.dotted_paths import references
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.storage.files import write_bytes
 from jaxsafe.streams import printable
-from jaxsafe.train.files import write_bytes
 from jaxsafe.types import units
 
 if TYPE_CHECKING:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe import cli
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema.errors import ConfigError
 
 SEEDS = 10
@@ -21,10 +22,10 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.report.plan import BEST, KINDS, plan
     from jaxsafe.report.record import keep, kept
     from jaxsafe.report.run import evaluate, train
+    from jaxsafe.storage.files import write_bytes
     from jaxsafe.train.config import resolve
-    from jaxsafe.train.files import write_bytes
 
-    arguments = cli.Arguments.parse(argv)
+    arguments = Arguments.parse(argv)
     out, runs = Path(arguments.pop_text("out") or "report"), Path(arguments.pop_text("runs") or "runs/report")
     tasks, kinds = (_names(name, arguments.pop(name), [*known]) for name, known in (("tasks", TASKS), ("kinds", KINDS)))
     policies = arguments.pop_text("policies")
@@ -32,7 +33,7 @@ def main(argv: Sequence[str]) -> int:
     rest = [word for word in argv if word.partition("=")[0] in arguments.options]
     rest = rest if "seeds" in arguments.options else [f"seeds={SEEDS}", *rest]
     items = plan(tasks, kinds, rest)
-    episodes = [resolve(cli.Arguments.parse(item.words))[0].episodes for item in items]  # errors before anything is done
+    episodes = [resolve(Arguments.parse(item.words))[0].episodes for item in items]  # errors before anything is done
     command = f"python -m jaxsafe.report {shlex.join(argv)}".rstrip()
     try:
         for item, count in zip(items, episodes, strict=True):

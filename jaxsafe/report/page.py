@@ -14,8 +14,8 @@ from jaxsafe.plot.style import save
 from jaxsafe.report.measures import failed_seeds, finished, samples_per_second, steps_to, wall_to
 from jaxsafe.report.plan import CERTIFIED_STARTS, FILM, KINDS, PAPER_STEPS, SHIPPED, WITH_RTA, WITHOUT_RTA, best_seed
 from jaxsafe.report.record import Record
+from jaxsafe.storage.files import write_text
 from jaxsafe.train import window
-from jaxsafe.train.files import write_text
 from jaxsafe.train.results import known, least
 
 DIRECTORY = "baselines"

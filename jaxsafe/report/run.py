@@ -11,12 +11,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxsafe.cli import INTERRUPTED, Arguments, in_main_thread
+from jaxsafe.cli import INTERRUPTED
+from jaxsafe.config.arguments import Arguments
+from jaxsafe.devices.processes import in_main_thread
 from jaxsafe.report.plan import BEST, FILM, Item, best_seed
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.storage.files import read_json, write_bytes
 from jaxsafe.train.config import resolve
 from jaxsafe.train.directory import described, read_content
-from jaxsafe.train.files import read_json, write_bytes
 from jaxsafe.train.results import read_results
 
 FILM_FILE = "episode_deterministic.gif"

@@ -12,7 +12,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxsafe import cli, origin
+from jaxsafe import cli
+from jaxsafe.config.arguments import Arguments
+from jaxsafe.devices.compilation_cache import enable_compilation_cache
+from jaxsafe.storage import provenance
 
 MOST_STEPS = 1_000_000
 """Of each adversary, where `steps` is not given. Episodes longer than this allows are cut."""
@@ -55,7 +58,7 @@ def _number(value: float | None) -> str:
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code: 1 if there was a violation."""
-    cli.enable_compilation_cache()
+    enable_compilation_cache()
     import jax
 
     from jaxsafe.envs import make
@@ -63,9 +66,9 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.rta.attack import SEARCH, attack, longest_episode
     from jaxsafe.rta.presets import PRESETS
     from jaxsafe.schema.errors import ConfigError, nearest
-    from jaxsafe.train.files import write_text
+    from jaxsafe.storage.files import write_text
 
-    arguments = cli.Arguments.parse(argv)
+    arguments = Arguments.parse(argv)
     task, out = arguments.pop_text("env"), arguments.pop_text("out")
     options: dict[str, Any] = {name: arguments.pop_text(name) for name in ("rta", "variant", "actions")}
     changes = arguments.pop_overrides()
@@ -84,8 +87,8 @@ def main(argv: Sequence[str]) -> int:
     env = make(task, changes, **options)
     if not env.constraints:
         raise ConfigError(f"env: {task} has no safety constraint")
-    facts: dict[str, Any] = {"command": f"python -m jaxsafe.rta.falsify {shlex.join(argv)}", "commit": origin.commit()}
-    facts |= {"versions": origin.versions(), "env": task, **options, "seed": seed}
+    facts: dict[str, Any] = {"command": f"python -m jaxsafe.rta.falsify {shlex.join(argv)}", "commit": provenance.commit()}
+    facts |= {"versions": provenance.versions(), "env": task, **options, "seed": seed}
     length = min(longest_episode(env), max(1, MOST_STEPS // lanes)) if steps is None else -(-steps // lanes)
     rows = []
     for name in policies if isinstance(policies, list) else [policies]:

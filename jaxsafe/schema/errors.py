@@ -89,7 +89,10 @@ def _is_own(frame: FrameType, modules: Collection[str]) -> bool:
     roots = {name.partition(".")[0] for name in modules}
     if frame.f_globals.get("__name__", "").partition(".")[0] in roots:
         return True
-    libraries = (os.path.dirname(os.path.dirname(__file__)), *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
+    libraries = (
+        os.path.dirname(os.path.dirname(__file__)),
+        *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")),
+    )
     path = frame.f_code.co_filename
     return not path.startswith(("<", *(os.path.join(library, "") for library in libraries)))
 

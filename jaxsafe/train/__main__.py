@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxsafe import cli
-from jaxsafe.train.seeds import claim_cores
+from jaxsafe.config.arguments import Arguments
+from jaxsafe.devices.compilation_cache import enable_compilation_cache
+from jaxsafe.devices.seed_mapper import claim_cores
 
 if TYPE_CHECKING:
     from jaxsafe.train.loop import Training
@@ -21,33 +23,34 @@ BEGAN = time.monotonic()
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     claim_cores()
-    cli.enable_compilation_cache()
+    enable_compilation_cache()
     import jax
 
+    from jaxsafe.devices import processes
     from jaxsafe.schema.errors import ConfigError
-    from jaxsafe.train import directory, hosts
+    from jaxsafe.storage.files import read_json
+    from jaxsafe.train import directory
     from jaxsafe.train.config import resolve_all
-    from jaxsafe.train.files import read_json
     from jaxsafe.train.results import summary
 
-    arguments = cli.Arguments.parse(argv)
+    arguments = Arguments.parse(argv)
     if arguments.pop_flag("distributed"):
-        hosts.join()
+        processes.join()
     resume = arguments.pop_text("resume")
     if resume is None:
         resolved = resolve_all(arguments)
-        path = Path(hosts.from_leader(lambda: str(directory.create_all(resolved))))
+        path = Path(processes.from_leader(lambda: str(directory.create_all(resolved))))
     else:
         arguments.refuse_rest(["resume", "distributed"])
         path = Path(resume)
     runs = directory.runs(path)
     try:
-        with hosts.loss_told(f"go on with: python -m jaxsafe.train distributed=true resume={path}"):
+        with processes.loss_told(f"go on with: python -m jaxsafe.train distributed=true resume={path}"):
             try:
                 finished = _train([run for run in runs if not _complete(run)], path)
             except Exception as error:
                 alone = jax.process_count() == 1  # else it may be the loss of another process, after which the run goes on
-                if resume is None and hosts.leads() and (alone or isinstance(error, ConfigError)):
+                if resume is None and processes.leads() and (alone or isinstance(error, ConfigError)):
                     directory.discard_unused(path)
                 raise
     except KeyboardInterrupt:
@@ -55,19 +58,19 @@ def main(argv: Sequence[str]) -> int:
         raise
     if not finished:
         return cli.INTERRUPTED
-    if len(runs) > 1 and hosts.leads():
+    if len(runs) > 1 and processes.leads():
         print(summary({run.name: run for run in runs}))
-    return cli.DIVERGED if hosts.leads() and any("diverged" in read_json(run / "results.json") for run in runs) else 0
+    return cli.DIVERGED if processes.leads() and any("diverged" in read_json(run / "results.json") for run in runs) else 0
 
 
 def _complete(run: Path) -> bool:
     """Whether all is there, with figures if only they are missing."""
-    from jaxsafe.train import hosts
+    from jaxsafe.devices import processes
 
     if not (run / "results.json").exists():
         return False
     print(f"{run} is complete; nothing is left to do")
-    if not (run / "figures").exists() and hosts.leads():  # killed between the results and the figures
+    if not (run / "figures").exists() and processes.leads():  # killed between the results and the figures
         from jaxsafe.plot.figures import draw_all
 
         draw_all(run)
@@ -107,10 +110,11 @@ def _train(runs: Sequence[Path], path: Path) -> bool:
 
 def _open(run: Path, files: ExitStack, began: float) -> Training:
     """What is left of a run; its logs are closed with `files`, and its clock has run since `began`."""
-    from jaxsafe.train import directory, hosts
+    from jaxsafe.devices import processes
+    from jaxsafe.train import directory
     from jaxsafe.train.loop import Clock, Training
 
-    own = files.enter_context(hosts.own_files(run))
+    own = files.enter_context(processes.own_files(run))
     config, env, name = directory.read(run, "resume")
     return Training(config, env, name, own, Clock(time.monotonic() - began), run)
 

@@ -16,10 +16,10 @@ import numpy as np
 from jax.lax import broadcast_to_rank
 from jaxtyping import Array, Float
 
+from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment
 from jaxsafe.rollout import Policy
 from jaxsafe.schema.component import ANY, Component, Range, Unit
-from jaxsafe.shard import WHOLE, Shard
 from jaxsafe.train.features import FEATURES
 from jaxsafe.types import Dimensionless, Key, Number
 

@@ -23,9 +23,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsafe.devices import processes
 from jaxsafe.schema.errors import ConfigError, nearest
-from jaxsafe.train import hosts
-from jaxsafe.train.forms import check
+from jaxsafe.storage.forms import check
 from jaxsafe.types import is_key
 
 logging.getLogger("absl").setLevel(logging.ERROR)
@@ -80,9 +80,9 @@ class Checkpoints:
         facts[DIGEST] = _digest(state, facts)
         place, before = self.directory / str(step), self.directory / f"{step}{ASIDE}"
         if step in self.steps:
-            if hosts.leads():
+            if processes.leads():
                 place.rename(before)
-            hosts.meet("moved aside")
+            processes.meet("moved aside")
             self._manager.reload()
         args = ocp.args.Composite(state=ocp.args.StandardSave(state), facts=ocp.args.JsonSave(facts))
         reason = ""
@@ -96,7 +96,7 @@ class Checkpoints:
             if reason:
                 _ignore_late_complaints()
                 _settle(complaints)
-        if hosts.leads():
+        if processes.leads():
             if reason:
                 self._take_back()
             else:
@@ -106,9 +106,9 @@ class Checkpoints:
 
     def _recover(self) -> None:
         """In one process take back what was not finished; the others wait."""
-        if hosts.leads():
+        if processes.leads():
             self._take_back()
-        hosts.meet("taken back")
+        processes.meet("taken back")
 
     def _take_back(self) -> None:
         """Take a checkpoint back whose successor of the same step was never written, and remove what is left of that."""

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.cli import Arguments
 from jaxsafe.config import override
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.environment import Environment, require_success
 from jaxsafe.envs import TASKS, make
 from jaxsafe.processors.reward import Intervention

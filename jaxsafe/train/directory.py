@@ -12,14 +12,14 @@ from typing import Any
 import jaxsafe.config
 from jaxsafe.environment import Environment
 from jaxsafe.envs import TASKS
-from jaxsafe.origin import commit, versions
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.convert import to_component, to_data
 from jaxsafe.schema.errors import ConfigError, nearest
+from jaxsafe.storage.files import write_text
+from jaxsafe.storage.forms import NULL, NUMBER, TEXT, check
+from jaxsafe.storage.provenance import commit, versions
 from jaxsafe.train.config import TrainConfig
-from jaxsafe.train.files import write_text
-from jaxsafe.train.forms import NULL, NUMBER, TEXT, check
 
 
 def create(config: TrainConfig, env: Environment, name: str) -> Path:

@@ -13,8 +13,8 @@ import numpy as np
 from jaxsafe.environment import Environment
 from jaxsafe.metrics import measures
 from jaxsafe.schema.errors import ConfigError, install
-from jaxsafe.train.files import append_csv, append_rows, read_rows, write_csv, write_rows
-from jaxsafe.train.forms import COUNT, FLAG, MAYBE, NUMBER, OTHERS
+from jaxsafe.storage.files import append_csv, append_rows, read_rows, write_csv, write_rows
+from jaxsafe.storage.forms import COUNT, FLAG, MAYBE, NUMBER, OTHERS
 
 NEEDS = {
     **dict.fromkeys(("seed", "step", "episodes", "cost"), COUNT),

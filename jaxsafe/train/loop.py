@@ -20,22 +20,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe import cli
+from jaxsafe.autoreset import choose
+from jaxsafe.devices import memory, processes
+from jaxsafe.devices.background_compile import Ahead, without_collection
+from jaxsafe.devices.processes import in_main_thread
+from jaxsafe.devices.seed_mapper import LANES, SEEDS, SeedMapper
+from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.seeds import KINDS, Evaluator, episode_rows
 from jaxsafe.metrics import Episode
-from jaxsafe.renewal import choose
-from jaxsafe.shard import WHOLE, Shard
-from jaxsafe.train import hosts, memory, ppo, window
-from jaxsafe.train.ahead import Ahead
+from jaxsafe.storage.files import append_rows, keep_rows, sync
+from jaxsafe.storage.forms import COUNT
+from jaxsafe.train import ppo, window
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import TrainConfig
-from jaxsafe.train.files import append_rows, keep_rows, sync
-from jaxsafe.train.forms import COUNT
 from jaxsafe.train.log import Display, ProgressLog, progress_rows, read_progress
 from jaxsafe.train.ppo import TrainState
 from jaxsafe.train.restore import made_from, restore, structure
-from jaxsafe.train.seeds import LANES, SEEDS, SeedMapper
 
 EVALUATION_SEED = 0
 """Of the evaluations during and after training; `python -m jaxsafe.evaluate seed=…` chooses others."""
@@ -99,7 +100,7 @@ class Training:
         """Have the state, fresh or from the latest checkpoint, and begin to compile; the second call does nothing."""
         if self._prepared:
             return
-        with self.clock, cli.without_collection():
+        with self.clock, without_collection():
             self._begin()
         self._keep_copies()
         self.log = ProgressLog(self.run, self.step, self.updates * self.config.seeds, self.config.tensorboard)
@@ -137,10 +138,10 @@ class Training:
                     self._evaluate()
                 elif self._early_due():
                     self._record(1, final=False)
-                stopping = hosts.anyone(stop.requested)
+                stopping = processes.anyone(stop.requested)
                 if self._due(before, self.config.checkpoint_every) or stopping:
                     self._save()
-            stopping = stopping or hosts.anyone(stop.requested)  # it may have come with the last of them
+            stopping = stopping or processes.anyone(stop.requested)  # it may have come with the last of them
         display.close()
         self.log.close()
         return not stopping
@@ -152,7 +153,7 @@ class Training:
 
     def prepare_evaluation(self) -> None:
         """Compile, while other work goes on, what `evaluate_finally` needs."""
-        with self.clock, cli.without_collection():
+        with self.clock, without_collection():
             self.evaluator.prepare(self.state.average)
 
     def evaluate_finally(self) -> dict[str, Episode]:
@@ -356,7 +357,7 @@ class _StopRequest:
 
     def __enter__(self) -> _StopRequest:
         self.requested = False
-        numbers = (signal.SIGINT, signal.SIGTERM) if cli.in_main_thread() else ()
+        numbers = (signal.SIGINT, signal.SIGTERM) if in_main_thread() else ()
         self._previous = {number: signal.signal(number, self._set) for number in numbers}
         return self
 

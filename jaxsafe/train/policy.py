@@ -20,10 +20,10 @@ from jaxsafe.rollout import Policy
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.convert import to_component, to_data
 from jaxsafe.schema.errors import ConfigError, nearest
+from jaxsafe.storage.archive import Archive, open_archive
+from jaxsafe.storage.files import parse_json, write_bytes
+from jaxsafe.storage.forms import COUNT, TEXT, check
 from jaxsafe.train.agent import Agent, Params
-from jaxsafe.train.archive import Archive, open_archive
-from jaxsafe.train.files import parse_json, write_bytes
-from jaxsafe.train.forms import COUNT, TEXT, check
 
 
 def save_policy(path: Path, env: Environment, agent: Agent, params: Params, about: dict[str, Any]) -> None:

@@ -9,15 +9,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.storage.files import finite
+from jaxsafe.storage.forms import AMOUNT, COUNT, check
 from jaxsafe.train import directory, ppo
 from jaxsafe.train.agent import Params
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import TrainConfig
-from jaxsafe.train.files import finite
-from jaxsafe.train.forms import AMOUNT, COUNT, check
-from jaxsafe.train.seeds import SeedMapper
 
 
 def structure(env: Environment, config: TrainConfig) -> dict[str, Any]:

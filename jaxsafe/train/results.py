@@ -6,14 +6,14 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxsafe import cli
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.seeds import KINDS, given_up, metrics_per_seed
 from jaxsafe.metrics import ENOUGH_SEEDS, Episode, interaction_efficiency, over_seeds, with_interval
-from jaxsafe.origin import versions
+from jaxsafe.storage.files import read_json, write_json
+from jaxsafe.storage.forms import AMOUNT, COUNT, NULL, NUMBER, OTHERS, SHARE, TEXT, Kind, check, numbers
+from jaxsafe.storage.provenance import versions
+from jaxsafe.storage.text_table import columns
 from jaxsafe.train.config import TrainConfig
-from jaxsafe.train.files import read_json, write_json
-from jaxsafe.train.forms import AMOUNT, COUNT, NULL, NUMBER, OTHERS, SHARE, TEXT, Kind, check, numbers
 from jaxsafe.train.log import filter_name, headline
 from jaxsafe.train.loop import Training
 from jaxsafe.train.policy import save_policy
@@ -105,7 +105,7 @@ def table(results: dict[str, Any], path: Path) -> str:
         if all(one[name]["mean"] is not None for one in found.values()):
             rows.append([label, *(_cell(one[name], unit) for one in found.values())])
     rows.append(["worst seed, success rate", *(percent(least([one["success_rate"]]), 1) for one in found.values())])
-    lines += [*cli.columns(rows), *told_diverged(results)]
+    lines += [*columns(rows), *told_diverged(results)]
     if "given_up" in results:
         counts, limit = results["given_up"], results["given_up"]["after_steps"]
         told = ", ".join(f"{counts[kind]:,} {kind}" for kind in found)
@@ -188,7 +188,7 @@ def summary(runs: Mapping[str, Path]) -> str:
                 str(results.get("rta", "–")),
             )
         )
-    return "\n".join([*cli.columns(rows), *diverged])
+    return "\n".join([*columns(rows), *diverged])
 
 
 def told_diverged(results: Mapping[str, Any]) -> list[str]:

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jaxsafe import cli
-from jaxsafe.train.seeds import claim_cores
+from jaxsafe.config.arguments import Arguments
+from jaxsafe.devices.compilation_cache import enable_compilation_cache
+from jaxsafe.devices.seed_mapper import claim_cores
 
 RANKS = ("steps", "success", "deterministic")
 EPISODES = 200
@@ -16,7 +18,7 @@ EPISODES = 200
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     claim_cores()
-    cli.enable_compilation_cache()
+    enable_compilation_cache()
     from tqdm import tqdm
 
     from jaxsafe.schema.errors import ConfigError, nearest, show
@@ -25,7 +27,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.tune.lanes import train_all
     from jaxsafe.tune.settings import MAX_SETTINGS, alike, pop_sweep, settings
 
-    arguments, path = cli.Arguments.parse(argv), None
+    arguments, path = Arguments.parse(argv), None
     resume = arguments.pop_text("resume")
     if resume is not None:
         arguments.refuse_rest(["resume"])

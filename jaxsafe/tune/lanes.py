@@ -10,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsafe.devices import memory
+from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.evaluate.seeds import BATCH, KINDS, given_up, in_batches, metrics_per_seed
 from jaxsafe.metrics import Episode, interaction_efficiency
-from jaxsafe.train import memory
 from jaxsafe.train.loop import EVALUATION_SEED, MEMORY, begin, chunk
 from jaxsafe.train.results import diverged_seeds
-from jaxsafe.train.seeds import SeedMapper
 from jaxsafe.tune.settings import Setting, alike, lane
 from jaxsafe.types import Key
 

@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from jaxsafe.cli import Arguments, columns
-from jaxsafe.origin import versions
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError, show
+from jaxsafe.storage.files import append_rows, keep_rows, write_csv, write_json, write_text
+from jaxsafe.storage.forms import COUNT, NULL, OTHERS, SHARE, TEXT, Kind, check, numbers
+from jaxsafe.storage.provenance import versions
+from jaxsafe.storage.text_table import columns
 from jaxsafe.train import directory
-from jaxsafe.train.files import append_rows, keep_rows, write_csv, write_json, write_text
-from jaxsafe.train.forms import COUNT, NULL, OTHERS, SHARE, TEXT, Kind, check, numbers
 from jaxsafe.train.results import percent, told_diverged
 from jaxsafe.tune.settings import Setting
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.cli import Arguments
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.environment import Environment
 from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.train.config import TrainConfig, resolve

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.forms import ANYTHING, check, is_deep
+from jaxsafe.storage.forms import ANYTHING, check, is_deep
 
 
 def write_text(path: Path, text: str) -> None:

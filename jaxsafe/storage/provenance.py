@@ -47,8 +47,8 @@ def commit() -> str | None:
     git = shutil.which("git")
     if git is None:
         return None
-    package = Path(__file__).resolve().parent
-    ours = [git, "-C", str(package), "ls-files", "--error-unmatch", "origin.py"]
+    package = Path(__file__).resolve().parent.parent
+    ours = [git, "-C", str(package), "ls-files", "--error-unmatch", "types.py"]
     if subprocess.run(ours, capture_output=True, check=False).returncode:
         return None  # installed somewhere inside another repository
     code = [str(path) for path in (package, package.parent / "configs") if path.is_dir()] + [":(exclude)*.npz"]

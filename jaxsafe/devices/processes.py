@@ -12,6 +12,7 @@ import platform
 import re
 import shutil
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -161,3 +162,8 @@ def meet(name: str) -> None:
         from jax.experimental.multihost_utils import sync_global_devices
 
         sync_global_devices(name)
+
+
+def in_main_thread() -> bool:
+    """Return whether this is the main thread, the only one that may say what a signal does."""
+    return threading.current_thread() is threading.main_thread()

@@ -7,8 +7,8 @@ from typing import Any
 
 import jax
 
+from jaxsafe.devices import processes
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train import hosts
 from jaxsafe.types import is_key
 
 try:
@@ -50,9 +50,9 @@ def require(needed: int, devices: int, what: str) -> None:
         ConfigError: the devices do not have as much left; CPU devices of all processes on a machine share what it has.
     """
     free = available()
-    total = needed * devices * hosts.beside() if jax.local_devices()[0].platform == "cpu" else needed
+    total = needed * devices * processes.beside() if jax.local_devices()[0].platform == "cpu" else needed
     short = free is not None and total > free
-    if hosts.anyone(short):
+    if processes.anyone(short):
         found = f"{free / GIB:,.1f} GiB are free" if free is not None and short else "another process has less"
         raise ConfigError(f"{what}: this training needs {total / GIB:,.1f} GiB of memory, {found}")
 

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jaxsafe.devices import processes
+from jaxsafe.devices.shard import Shard
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.shard import Shard
-from jaxsafe.train import hosts
 from jaxsafe.types import is_key
 
 SEEDS = PartitionSpec("seeds")
@@ -126,7 +126,7 @@ class SeedMapper:
 
     def gather(self, tree: Any) -> Any:
         """Arrays on the host of every process, without the padding; of keys the words."""
-        return jax.tree.map(lambda x: hosts.gather(x)[: self.num_seeds], tree)
+        return jax.tree.map(lambda x: processes.gather(x)[: self.num_seeds], tree)
 
 
 def _groups(num_seeds: int, shares: Sequence[int]) -> list[list[Any]]:

@@ -1,0 +1,21 @@
+"""Where compiled programs are kept between runs."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def enable_compilation_cache() -> None:
+    """Keep compiled programs between runs, unless the user chose a place or none; the second start is then quick."""
+    import jax
+
+    if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
+        try:
+            base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+            (base / "jaxsafe").mkdir(parents=True, exist_ok=True)
+        except (OSError, RuntimeError):
+            return  # a home that cannot be written, or none at all, costs time and nothing else
+        jax.config.update("jax_compilation_cache_dir", str(base / "jaxsafe"))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
