@@ -28,13 +28,13 @@ from machine import about
 from tables import markdown
 
 import jaxsafe
+from jaxsafe.agents.agent import Agent
 from jaxsafe.config import override
+from jaxsafe.evaluate.run_adversaries import attack
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
-from jaxsafe.rta.attack import attack
 from jaxsafe.rta.presets import PRESETS
 from jaxsafe.rta.qp import nearest_control
 from jaxsafe.schema.component import normalise
-from jaxsafe.train.agent import Agent
 from jaxsafe.train.ppo import PPO, init, update
 from jaxsafe.transition import bounds
 

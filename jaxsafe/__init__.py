@@ -2,12 +2,12 @@
 
 import jaxsafe.quiet  # noqa: F401 before anything imports jaxlib
 from jaxsafe.adapters.registration import register_ids
+from jaxsafe.agents.policy_file import load_policy
 from jaxsafe.config import override
 from jaxsafe.environment import Environment, reset, reset_to, step
 from jaxsafe.envs import make
 from jaxsafe.rollout import rollout
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.policy import load_policy
 
 register_ids()
 

@@ -8,8 +8,9 @@ import pytest
 import scipy.stats
 
 import jaxsafe
+from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.distributions import Categorical, Gaussian
 from jaxsafe.schema.component import normalise
-from jaxsafe.train.agent import Agent, Categorical, Gaussian
 
 KEY = jax.random.key(3)
 

@@ -15,10 +15,12 @@ import numpy as np
 import pytest
 
 from jaxsafe import cli
+from jaxsafe.agents import policy_file as policy_module
+from jaxsafe.agents.policy_file import read_policy
 from jaxsafe.config import __main__ as config
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.evaluate import __main__ as evaluate
-from jaxsafe.evaluate.seeds import Evaluator
+from jaxsafe.evaluate.evaluator import Evaluator
 from jaxsafe.export import __main__ as export
 from jaxsafe.plot import __main__ as plot
 from jaxsafe.rta import falsify
@@ -27,9 +29,7 @@ from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.text_table import columns
 from jaxsafe.train import __main__ as train
 from jaxsafe.train import config as config_module
-from jaxsafe.train import policy as policy_module
 from jaxsafe.train.loop import Training
-from jaxsafe.train.policy import read_policy
 from jaxsafe.tune import __main__ as tune
 from jaxsafe.tune import lanes
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import jaxsafe
+from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.policy_file import find_policy, read_policy
 from jaxsafe.envs import TASKS
 from jaxsafe.schema.component import normalise
-from jaxsafe.train.agent import Agent
-from jaxsafe.train.policy import find_policy, read_policy
 from jaxsafe.train.ppo import PPO, Batch, loss
 
 DOCKING = {

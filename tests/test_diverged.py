@@ -12,13 +12,13 @@ from probes import Position, probe
 from tiny import TINY
 
 from jaxsafe import cli
+from jaxsafe.agents.agent import Agent
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.plot.compare import compare_curves
 from jaxsafe.plot.figures import progress, training_curves
 from jaxsafe.schema.component import normalise
 from jaxsafe.train import __main__ as command
 from jaxsafe.train import directory
-from jaxsafe.train.agent import Agent
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.loop import Training
 from jaxsafe.train.ppo import PPO, diverged, init

@@ -9,15 +9,15 @@ import pytest
 from PIL import Image
 
 import jaxsafe
+from jaxsafe.commands.environment_choice import EnvironmentChoice, differences
 from jaxsafe.config import dump
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.evaluate import episodes as episodes_module
-from jaxsafe.evaluate import seeds as seeds_module
+from jaxsafe.evaluate import evaluator as seeds_module
 from jaxsafe.evaluate.__main__ import main
-from jaxsafe.evaluate.choice import EnvironmentChoice, differences
 from jaxsafe.evaluate.episodes import run_episodes
-from jaxsafe.evaluate.seeds import Evaluator, batch_keys
+from jaxsafe.evaluate.evaluator import Evaluator, batch_keys
 from jaxsafe.schema.errors import ConfigError
 
 

@@ -12,14 +12,14 @@ import onnxruntime
 import pytest
 
 import jaxsafe
-from jaxsafe.evaluate.foreign import ACTIVATIONS
+from jaxsafe.agents.imported_policy import ACTIVATIONS
+from jaxsafe.agents.policy_file import SavedPolicy, find_policy, read_policy, save_policy
 from jaxsafe.export import functions
 from jaxsafe.export.__main__ import main
 from jaxsafe.export.onnx import to_onnx
 from jaxsafe.export.vnnlib import search, write_vnnlib
 from jaxsafe.rollout import reset_batch
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.policy import SavedPolicy, find_policy, read_policy, save_policy
 
 
 def saved(task: str) -> SavedPolicy:

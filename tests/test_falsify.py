@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import pytest
 
 import jaxsafe
-from jaxsafe.rta.adversaries import ADVERSARIES
-from jaxsafe.rta.attack import attack, longest_episode
+from jaxsafe.evaluate.adversaries import ADVERSARIES
+from jaxsafe.evaluate.run_adversaries import attack, longest_episode
 from jaxsafe.rta.falsify import main, report
 
 

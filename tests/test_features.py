@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import jaxsafe
+from jaxsafe.agents.agent import Agent
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.agent import Agent
 
 KEY = jax.random.key(3)
 COURSE = np.array([-300.0, 250.0])

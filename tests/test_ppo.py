@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from probes import Constant, Match, Position, probe
 
+from jaxsafe.agents.agent import Agent
 from jaxsafe.environment import Environment
 from jaxsafe.schema.component import normalise
 from jaxsafe.train import ppo as ppo_module
-from jaxsafe.train.agent import Agent
 from jaxsafe.train.ppo import PPO, TrainState, collect, discount, dual_ascent, gae, init, learning_rate, update
 from jaxsafe.types import Sim
 

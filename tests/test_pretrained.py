@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import jaxsafe
+from jaxsafe.agents.policy_file import find_policy, read_policy
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.__main__ import main
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.policy import find_policy, read_policy
 
 
 @pytest.mark.parametrize("task", TASKS)

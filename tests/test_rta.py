@@ -13,9 +13,9 @@ import jaxsafe
 from jaxsafe import ConfigError, Environment
 from jaxsafe.config import dump, load
 from jaxsafe.envs import TASKS
-from jaxsafe.rta.adversaries import intercept
+from jaxsafe.evaluate.adversaries import intercept
+from jaxsafe.evaluate.run_adversaries import attack, within_step
 from jaxsafe.rta.asif import ExplicitASIF, Polynomial
-from jaxsafe.rta.attack import attack, within_step
 from jaxsafe.rta.cascade import Cascade, Stage
 from jaxsafe.rta.prediction import others_react
 from jaxsafe.rta.presets import DOCKING as DOCKING_FILTER

@@ -11,12 +11,12 @@ import pytest
 from tiny import TINY
 
 import jaxsafe
+from jaxsafe.agents.agent import Agent
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.evaluate.__main__ import main as evaluate
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.__main__ import main as train
-from jaxsafe.train.agent import Agent
 from jaxsafe.train.config import TrainConfig, resolve
 from jaxsafe.train.ppo import PPO, Transition, collect, init
 

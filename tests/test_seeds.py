@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import jaxsafe
+from jaxsafe.agents.agent import Agent
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.agent import Agent
 from jaxsafe.train.loop import STATE
 from jaxsafe.train.ppo import PPO, TrainState, init, update
 
@@ -53,7 +53,7 @@ from jaxsafe.devices.seed_mapper import SeedMapper, claim_cores
 claim_cores()
 import jax, jaxsafe, numpy as np
 from jaxsafe.schema.component import normalise
-from jaxsafe.train.agent import Agent
+from jaxsafe.agents.agent import Agent
 from jaxsafe.train.loop import programs
 from jaxsafe.train.ppo import PPO
 shared = jaxsafe.make("docking2d_oriented"), normalise(Agent(features="approach")), normalise(PPO(num_envs=32))

@@ -17,6 +17,7 @@ from orbax.checkpoint import CheckpointManager
 from tiny import TINY
 
 from jaxsafe import cli
+from jaxsafe.agents.policy_file import load_policy, read_policy
 from jaxsafe.devices import processes
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate import __main__ as evaluate
@@ -26,7 +27,6 @@ from jaxsafe.train import directory
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import recipe
 from jaxsafe.train.loop import Clock, Training
-from jaxsafe.train.policy import load_policy, read_policy
 from jaxsafe.train.restore import restore
 
 

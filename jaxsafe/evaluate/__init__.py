@@ -1,1 +1,1 @@
-"""Evaluation: whole episodes of trained policies, their metrics, and a command line over run directories."""
+"""Whole episodes of policies and their metrics, and the adversaries that a filter is evaluated against."""

@@ -17,10 +17,10 @@ def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     claim_cores()
     enable_compilation_cache()
-    from jaxsafe.evaluate import choice
-    from jaxsafe.evaluate.foreign import pop_source
-    from jaxsafe.evaluate.report import evaluate, film
-    from jaxsafe.evaluate.subject import load, load_foreign
+    from jaxsafe.commands import environment_choice
+    from jaxsafe.commands.evaluation import evaluate, film
+    from jaxsafe.commands.policies import load, load_foreign
+    from jaxsafe.commands.policy_source import pop_source
     from jaxsafe.schema.errors import ConfigError
     from jaxsafe.train.results import table
 
@@ -28,13 +28,13 @@ def main(argv: Sequence[str]) -> int:
     run = arguments.pop_text("run")
     if run is None:
         raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
-    chosen = choice.EnvironmentChoice.pop(arguments)
+    chosen = environment_choice.EnvironmentChoice.pop(arguments)
     elsewhere = pop_source(arguments, run, chosen)
     arguments.refuse_beside(["checkpoint"] if elsewhere else [], "for a policy from elsewhere")
     out, checkpoint, render = (arguments.pop_text(name) for name in ("out", "checkpoint", "render"))
     episodes, seed = arguments.pop_count("episodes", 1000), arguments.pop_seed()
     deterministic = arguments.pop_flag("deterministic")
-    arguments.refuse_rest([*OPTIONS, *choice.OPTIONS])
+    arguments.refuse_rest([*OPTIONS, *environment_choice.OPTIONS])
     if render not in (None, "gif"):
         raise ConfigError(f"render: found {render!r}; choose from gif")
     if elsewhere and deterministic is False:
@@ -43,7 +43,7 @@ def main(argv: Sequence[str]) -> int:
     kinds = {None: ("stochastic", "deterministic"), True: ("deterministic",), False: ("stochastic",)}[deterministic]
     subject = load_foreign(elsewhere) if elsewhere else load(run, checkpoint)
     env = subject.env if elsewhere else chosen.change(subject.env, subject.name, run)
-    if told := choice.differences(subject.env, env):
+    if told := environment_choice.differences(subject.env, env):
         print(told)
     request: dict[str, Any] = {
         "run": run,

@@ -13,10 +13,10 @@ from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema.errors import ConfigError, missing, nearest
 
 if TYPE_CHECKING:
+    from jaxsafe.agents.imported_policy import ForeignPolicy
+    from jaxsafe.agents.policy_file import SavedPolicy
     from jaxsafe.environment import Environment
-    from jaxsafe.evaluate.foreign import ForeignPolicy
     from jaxsafe.export.functions import Exported
-    from jaxsafe.train.policy import SavedPolicy
 
 FORMATS = ("onnx", "stablehlo", "vnnlib")
 OPTIONS = ("run", "seed", "activation", "format", "inputs", "batch", "steps", "box.FIELD", "out")
@@ -35,7 +35,7 @@ def main(argv: Sequence[str]) -> int:
     import jax
     import jax.numpy as jnp
 
-    from jaxsafe.evaluate import choice
+    from jaxsafe.commands import environment_choice
     from jaxsafe.export import functions
     from jaxsafe.storage.files import write_bytes
     from jaxsafe.storage.provenance import versions
@@ -58,7 +58,7 @@ def main(argv: Sequence[str]) -> int:
     inputs = _one_of("inputs", arguments.pop_text("inputs") or "observation", [*kinds])
     batch, steps = arguments.pop_count("batch", 1), arguments.pop_count("steps", 40, most=MAX_STEPS)
     box = {word[4:]: arguments.pop(word) for word in boxes}
-    arguments.refuse_rest([*OPTIONS, *choice.OPTIONS])
+    arguments.refuse_rest([*OPTIONS, *environment_choice.OPTIONS])
     about = {"policy": stem, "jaxsafe": versions()["jaxsafe"]}
     if form == "vnnlib":
         target = Path(out or f"{stem}_closed_loop.vnnlib")
@@ -94,10 +94,10 @@ def main(argv: Sequence[str]) -> int:
 
 def _policy(arguments: Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy, str]:
     """What `run` and the options beside it mean, and the first part of the names of files."""
-    from jaxsafe.evaluate.choice import EnvironmentChoice, differences
-    from jaxsafe.evaluate.foreign import pop_source
+    from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
+    from jaxsafe.commands.environment_choice import EnvironmentChoice, differences
+    from jaxsafe.commands.policy_source import pop_source
     from jaxsafe.train import directory
-    from jaxsafe.train.policy import find_policy, is_single, read_policy
 
     chosen = EnvironmentChoice.pop(arguments)
     elsewhere = pop_source(arguments, run, chosen)
@@ -136,7 +136,7 @@ def _require_finite(run: str, saved: SavedPolicy | ForeignPolicy) -> None:
     import jax
     import numpy as np
 
-    from jaxsafe.train.policy import SavedPolicy
+    from jaxsafe.agents.policy_file import SavedPolicy
 
     wrong = (lambda x: ~np.isfinite(x)) if isinstance(saved, SavedPolicy) else np.isnan
     for path, leaf in jax.tree.leaves_with_path(saved.params):

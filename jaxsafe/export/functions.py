@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsafe.agents.imported_policy import ForeignPolicy
+from jaxsafe.agents.policy_file import SavedPolicy
 from jaxsafe.environment import Environment, reset_to, step
-from jaxsafe.evaluate.foreign import ForeignPolicy
-from jaxsafe.train.policy import SavedPolicy
 from jaxsafe.types import State, TimeStep
 
 Function = Callable[[Float[Array, "batch i"]], Float[Array, "batch o"]]

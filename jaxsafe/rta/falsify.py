@@ -62,8 +62,8 @@ def main(argv: Sequence[str]) -> int:
     import jax
 
     from jaxsafe.envs import make
-    from jaxsafe.rta.adversaries import ADVERSARIES
-    from jaxsafe.rta.attack import SEARCH, attack, longest_episode
+    from jaxsafe.evaluate.adversaries import ADVERSARIES
+    from jaxsafe.evaluate.run_adversaries import SEARCH, attack, longest_episode
     from jaxsafe.rta.presets import PRESETS
     from jaxsafe.schema.errors import ConfigError, nearest
     from jaxsafe.storage.files import write_text

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 import jax
 import jax.numpy as jnp
 
+from jaxsafe.agents.agent import Agent
 from jaxsafe.config import override
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.environment import Environment, require_success
@@ -19,7 +20,6 @@ from jaxsafe.schema.component import Component, Range, fields, normalise
 from jaxsafe.schema.convert import expects, to_value
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError, nearest, show
-from jaxsafe.train.agent import Agent
 from jaxsafe.train.log import tensorboard_writer
 from jaxsafe.train.ppo import MAX_COUNT, PPO
 from jaxsafe.types import Dimensionless, Positive

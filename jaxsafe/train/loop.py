@@ -27,7 +27,7 @@ from jaxsafe.devices.processes import in_main_thread
 from jaxsafe.devices.seed_mapper import LANES, SEEDS, SeedMapper
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment
-from jaxsafe.evaluate.seeds import KINDS, Evaluator, episode_rows
+from jaxsafe.evaluate.evaluator import KINDS, Evaluator, episode_rows
 from jaxsafe.metrics import Episode
 from jaxsafe.storage.files import append_rows, keep_rows, sync
 from jaxsafe.storage.forms import COUNT

@@ -20,12 +20,12 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsafe.agents.agent import Agent, Params
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment
 from jaxsafe.metrics import Episode, accumulate, begin
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 from jaxsafe.schema.component import Component, Range
-from jaxsafe.train.agent import Agent, Params
 from jaxsafe.train.shuffle import shuffle
 from jaxsafe.train.window import Window, empty_window, latest_cost, push
 from jaxsafe.types import Dimensionless, Key, Positive, Record, State, TimeStep

@@ -9,13 +9,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from jaxsafe.agents.agent import Params
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.storage.files import finite
 from jaxsafe.storage.forms import AMOUNT, COUNT, check
 from jaxsafe.train import directory, ppo
-from jaxsafe.train.agent import Params
 from jaxsafe.train.checkpoint import Checkpoints
 from jaxsafe.train.config import TrainConfig
 

@@ -6,8 +6,9 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxsafe.agents.policy_file import save_policy
 from jaxsafe.environment import Environment
-from jaxsafe.evaluate.seeds import KINDS, given_up, metrics_per_seed
+from jaxsafe.evaluate.evaluator import KINDS, given_up, metrics_per_seed
 from jaxsafe.metrics import ENOUGH_SEEDS, Episode, interaction_efficiency, over_seeds, with_interval
 from jaxsafe.storage.files import read_json, write_json
 from jaxsafe.storage.forms import AMOUNT, COUNT, NULL, NUMBER, OTHERS, SHARE, TEXT, Kind, check, numbers
@@ -16,7 +17,6 @@ from jaxsafe.storage.text_table import columns
 from jaxsafe.train.config import TrainConfig
 from jaxsafe.train.log import filter_name, headline
 from jaxsafe.train.loop import Training
-from jaxsafe.train.policy import save_policy
 
 _ROWS = (
     ("success_rate", "success rate", "%"),

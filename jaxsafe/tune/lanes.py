@@ -13,7 +13,7 @@ import numpy as np
 from jaxsafe.devices import memory
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.evaluate.episodes import run_episodes
-from jaxsafe.evaluate.seeds import BATCH, KINDS, given_up, in_batches, metrics_per_seed
+from jaxsafe.evaluate.evaluator import BATCH, KINDS, given_up, in_batches, metrics_per_seed
 from jaxsafe.metrics import Episode, interaction_efficiency
 from jaxsafe.train.loop import EVALUATION_SEED, MEMORY, begin, chunk
 from jaxsafe.train.results import diverged_seeds

@@ -9,9 +9,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxsafe.commands.policies import Subject
 from jaxsafe.environment import Environment, require_success
-from jaxsafe.evaluate.seeds import Evaluator, episode_rows, given_up
-from jaxsafe.evaluate.subject import Subject
+from jaxsafe.evaluate.evaluator import Evaluator, episode_rows, given_up
 from jaxsafe.storage.files import append_rows, write_json
 from jaxsafe.storage.provenance import versions
 from jaxsafe.train import directory

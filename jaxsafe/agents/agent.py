@@ -1,4 +1,4 @@
-"""The agent: features of the observation, two multilayer perceptrons, and the distribution over actions.
+"""The agent: features of the observation, two multilayer perceptrons, and a distribution over actions.
 
 Parameters are a plain dict of arrays, so a policy file is an .npz of them. The feature layer belongs to the agent: the
 environment's observation is the paper's in every preset.
@@ -16,11 +16,11 @@ import numpy as np
 from jax.lax import broadcast_to_rank
 from jaxtyping import Array, Float
 
-from jaxsafe.devices.shard import WHOLE, Shard
+from jaxsafe.agents.distributions import Categorical, Gaussian
+from jaxsafe.agents.features import FEATURES
 from jaxsafe.environment import Environment
 from jaxsafe.rollout import Policy
 from jaxsafe.schema.component import ANY, Component, Range, Unit
-from jaxsafe.train.features import FEATURES
 from jaxsafe.types import Dimensionless, Key, Number
 
 Params = dict[str, Any]
@@ -95,58 +95,6 @@ class Agent(Component):
     def policy(self, env: Environment, params: Params, deterministic: Array | bool) -> Policy:
         """Return `act` as a function of key and observation alone."""
         return lambda key, observation: self.act(env, params, key, observation, deterministic)
-
-
-class Gaussian(Component):
-    """Independent normal distributions; actions outside [−1, 1] are clipped by the actuators, not here."""
-
-    mean: Float[Array, "*batch a"]
-    log_std: Float[Array, " a"]
-
-    def mode(self) -> Float[Array, "*batch a"]:
-        return self.mean
-
-    def sample(self, key: Key, shard: Shard = WHOLE) -> Float[Array, "*batch a"]:
-        noise = shard.draw(jax.random.normal, key, self.mean.shape, self.mean.dtype)
-        return self.mean + broadcast_to_rank(jnp.exp(self.log_std), noise.ndim) * noise
-
-    def log_prob(self, action: Float[Array, "*batch a"]) -> Float[Array, "*batch"]:
-        z = (action - self.mean) * broadcast_to_rank(jnp.exp(-self.log_std), self.mean.ndim)
-        log_std = broadcast_to_rank(self.log_std, z.ndim)
-        return jnp.sum(-0.5 * z * z - log_std - 0.5 * jnp.log(2.0 * jnp.pi), axis=-1)
-
-    def entropy(self) -> Float[Array, "*batch"]:
-        total = jnp.sum(self.log_std + 0.5 * jnp.log(2.0 * jnp.pi * jnp.e), axis=-1)
-        return jnp.broadcast_to(total, self.mean.shape[:-1])
-
-
-class Categorical(Component):
-    """One independent choice per actuator; their logits stand one after the other."""
-
-    logits: Float[Array, "*batch points"]
-    points: tuple[int, ...]
-
-    def mode(self) -> Array:
-        return jnp.stack([jnp.argmax(block, axis=-1) for block in self._blocks()], axis=-1).astype(jnp.int32)
-
-    def sample(self, key: Key, shard: Shard = WHOLE) -> Array:
-        gumbel = shard.draw(jax.random.gumbel, key, self.logits.shape, self.logits.dtype)
-        return Categorical(logits=self.logits + gumbel, points=self.points).mode()
-
-    def log_prob(self, action: Array) -> Float[Array, "*batch"]:
-        chosen = [
-            jnp.take_along_axis(jax.nn.log_softmax(block), action[..., i : i + 1], axis=-1)[..., 0]
-            for i, block in enumerate(self._blocks())
-        ]
-        return jnp.sum(jnp.stack(chosen), axis=0)
-
-    def entropy(self) -> Float[Array, "*batch"]:
-        logs = [jax.nn.log_softmax(block) for block in self._blocks()]
-        return -jnp.sum(jnp.stack([jnp.sum(jnp.exp(log) * log, axis=-1) for log in logs]), axis=0)
-
-    def _blocks(self) -> list[Array]:
-        ends = [sum(self.points[: i + 1]) for i in range(len(self.points))]
-        return jnp.split(self.logits, ends[:-1], axis=-1)
 
 
 def mlp(layers: Sequence[Params], x: Float[Array, "*batch i"]) -> Float[Array, "*batch o"]:

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsafe.agents.agent import Agent, Params
 from jaxsafe.environment import Environment
 from jaxsafe.rollout import Policy
 from jaxsafe.schema.component import normalise
@@ -23,7 +24,6 @@ from jaxsafe.schema.errors import ConfigError, nearest
 from jaxsafe.storage.archive import Archive, open_archive
 from jaxsafe.storage.files import parse_json, write_bytes
 from jaxsafe.storage.forms import COUNT, TEXT, check
-from jaxsafe.train.agent import Agent, Params
 
 
 def save_policy(path: Path, env: Environment, agent: Agent, params: Params, about: dict[str, Any]) -> None:

@@ -6,7 +6,6 @@ one after the other.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,15 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.config.arguments import Arguments
+from jaxsafe.agents.agent import Params
+from jaxsafe.agents.distributions import Categorical, Gaussian
+from jaxsafe.agents.onnx_reader import Network, read_graph
+from jaxsafe.agents.policy_file import MAX_LAYERS
 from jaxsafe.environment import Environment
-from jaxsafe.evaluate.choice import EnvironmentChoice
-from jaxsafe.evaluate.graph import Network, read_graph
 from jaxsafe.rollout import Policy
 from jaxsafe.schema.errors import ConfigError, nearest
 from jaxsafe.storage.archive import open_archive
-from jaxsafe.train.agent import Categorical, Gaussian, Params
-from jaxsafe.train.policy import MAX_LAYERS
 
 ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
 """Between the layers of an .npz."""
@@ -58,53 +56,11 @@ class ForeignAgent:
 
 
 class ForeignPolicy(NamedTuple):
-    """What `jaxsafe.train.policy.SavedPolicy` is for a policy of our own, as far as acting needs it."""
+    """What `jaxsafe.agents.policy_file.SavedPolicy` is for a policy of our own, as far as acting needs it."""
 
     env: Environment
     agent: ForeignAgent
     params: Params
-
-
-class Source(NamedTuple):
-    """What a command says of a policy from elsewhere."""
-
-    path: Path
-    choice: EnvironmentChoice
-    activation: str
-
-    @property
-    def task(self) -> str:
-        """The name of the environment in which it shall act."""
-        return Path(self.choice.task or "").stem
-
-    def read(self) -> ForeignPolicy:
-        """Read it; raises a ConfigError if there is no such environment, or as `read_foreign` does."""
-        return read_foreign(self.path, self.choice.make(), self.activation)
-
-
-def pop_source(arguments: Arguments, run: str, choice: EnvironmentChoice) -> Source | None:
-    """Take `activation` of a command; None if `run` is a policy of our own.
-
-    Raises:
-        ConfigError: the options do not fit each other.
-    """
-    names = _names(run) if run.endswith(".npz") else set()
-    graph = run.endswith(".onnx")
-    if choice.task is None and (graph or "kernel_0.npy" in names):
-        raise ConfigError(f"env: missing; the task in which {run} shall act, for instance env=docking2d")
-    layers = choice.task is not None and run.endswith(".npz") and "header.npy" not in names  # which policies of ours have
-    arguments.refuse_beside([] if layers else ["activation"], "but for the layers in an .npz with env=TASK")
-    activation = arguments.pop_text("activation") or "tanh"
-    return Source(Path(run), choice, activation) if graph or layers else None
-
-
-def _names(path: str) -> set[str]:
-    """Return what an archive holds, without reading any of it; nothing if there is none."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return set(archive.namelist())
-    except Exception:  # whatever it is, reading it tells more
-        return set()
 
 
 def read_foreign(path: Path, env: Environment, activation: str = "tanh") -> ForeignPolicy:

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
+from jaxsafe.agents.agent import Params
 from jaxsafe.devices.background_compile import Ahead
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.episodes import begin_recording, max_steps, record_steps, run_episodes
 from jaxsafe.metrics import METRICS, Episode, measures, summarise
 from jaxsafe.rollout import Policy
-from jaxsafe.train.agent import Params
 from jaxsafe.types import Key, State, TimeStep
 
 BATCH = 100

@@ -8,13 +8,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxsafe.agents.agent import Agent, Params
+from jaxsafe.agents.imported_policy import ForeignAgent
+from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
+from jaxsafe.commands.policy_source import Source
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
-from jaxsafe.evaluate.foreign import ForeignAgent, Source
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import directory
-from jaxsafe.train.agent import Agent, Params
-from jaxsafe.train.policy import find_policy, is_single, read_policy
 from jaxsafe.train.restore import load_params
 from jaxsafe.train.results import facts
 

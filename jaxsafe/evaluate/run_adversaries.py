@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsafe.environment import Environment, drawn, step
+from jaxsafe.evaluate.adversaries import ADVERSARIES
 from jaxsafe.processors.terminal import Timeout
 from jaxsafe.rollout import reset_batch
-from jaxsafe.rta.adversaries import ADVERSARIES
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.controllers import Continuous

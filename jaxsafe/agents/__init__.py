@@ -1,0 +1,1 @@
+"""Agents: what they see, their networks, the distributions they draw actions from, and files of their weights."""

@@ -1,0 +1,64 @@
+"""The distributions over actions: normal for continuous ones, one choice per actuator for discrete ones."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax.lax import broadcast_to_rank
+from jaxtyping import Array, Float
+
+from jaxsafe.devices.shard import WHOLE, Shard
+from jaxsafe.schema.component import Component
+from jaxsafe.types import Key
+
+
+class Gaussian(Component):
+    """Independent normal distributions; actions outside [−1, 1] are clipped by the actuators, not here."""
+
+    mean: Float[Array, "*batch a"]
+    log_std: Float[Array, " a"]
+
+    def mode(self) -> Float[Array, "*batch a"]:
+        return self.mean
+
+    def sample(self, key: Key, shard: Shard = WHOLE) -> Float[Array, "*batch a"]:
+        noise = shard.draw(jax.random.normal, key, self.mean.shape, self.mean.dtype)
+        return self.mean + broadcast_to_rank(jnp.exp(self.log_std), noise.ndim) * noise
+
+    def log_prob(self, action: Float[Array, "*batch a"]) -> Float[Array, "*batch"]:
+        z = (action - self.mean) * broadcast_to_rank(jnp.exp(-self.log_std), self.mean.ndim)
+        log_std = broadcast_to_rank(self.log_std, z.ndim)
+        return jnp.sum(-0.5 * z * z - log_std - 0.5 * jnp.log(2.0 * jnp.pi), axis=-1)
+
+    def entropy(self) -> Float[Array, "*batch"]:
+        total = jnp.sum(self.log_std + 0.5 * jnp.log(2.0 * jnp.pi * jnp.e), axis=-1)
+        return jnp.broadcast_to(total, self.mean.shape[:-1])
+
+
+class Categorical(Component):
+    """One independent choice per actuator; their logits stand one after the other."""
+
+    logits: Float[Array, "*batch points"]
+    points: tuple[int, ...]
+
+    def mode(self) -> Array:
+        return jnp.stack([jnp.argmax(block, axis=-1) for block in self._blocks()], axis=-1).astype(jnp.int32)
+
+    def sample(self, key: Key, shard: Shard = WHOLE) -> Array:
+        gumbel = shard.draw(jax.random.gumbel, key, self.logits.shape, self.logits.dtype)
+        return Categorical(logits=self.logits + gumbel, points=self.points).mode()
+
+    def log_prob(self, action: Array) -> Float[Array, "*batch"]:
+        chosen = [
+            jnp.take_along_axis(jax.nn.log_softmax(block), action[..., i : i + 1], axis=-1)[..., 0]
+            for i, block in enumerate(self._blocks())
+        ]
+        return jnp.sum(jnp.stack(chosen), axis=0)
+
+    def entropy(self) -> Float[Array, "*batch"]:
+        logs = [jax.nn.log_softmax(block) for block in self._blocks()]
+        return -jnp.sum(jnp.stack([jnp.sum(jnp.exp(log) * log, axis=-1) for log in logs]), axis=0)
+
+    def _blocks(self) -> list[Array]:
+        ends = [sum(self.points[: i + 1]) for i in range(len(self.points))]
+        return jnp.split(self.logits, ends[:-1], axis=-1)
