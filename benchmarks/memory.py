@@ -51,8 +51,8 @@ def probe(task: str, num_envs: int) -> dict[str, int]:
 
     from jaxsafe.config.arguments import Arguments
     from jaxsafe.devices import memory
-    from jaxsafe.train.config import resolve
-    from jaxsafe.train.loop import programs
+    from jaxsafe.train.host.options import resolve
+    from jaxsafe.train.train import programs
 
     words = [f"env={task}", f"ppo.num_envs={num_envs}", f"ppo.num_steps={NUM_STEPS}", "ppo.num_epochs=1"]
     config, env, _ = resolve(Arguments.parse(words))

@@ -83,7 +83,7 @@ def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
 def our_programs(task: str, seeds: int, updates: int) -> tuple[Any, Any, Any, Any]:
     """The fresh state and some updates of our PPO, and what both take: keys, and what all seeds share."""
     from jaxsafe.devices.seed_mapper import SeedMapper
-    from jaxsafe.train.loop import programs
+    from jaxsafe.train.train import programs
 
     config, env = settings(task)
     mapper = SeedMapper(seeds, config.shares)
@@ -94,7 +94,7 @@ def our_programs(task: str, seeds: int, updates: int) -> tuple[Any, Any, Any, An
 def settings(task: str) -> tuple[Any, Any]:
     """The configuration of our PPO, and the environment."""
     from jaxsafe.config.arguments import Arguments
-    from jaxsafe.train.config import resolve
+    from jaxsafe.train.host.options import resolve
 
     sizes = {"num_envs": NUM_ENVS, "num_steps": NUM_STEPS, "num_epochs": NUM_EPOCHS, "num_minibatches": NUM_MINIBATCHES}
     words = [f"env={task}", "preset=plain", f"agent.hidden={list(HIDDEN)}", f"steps={10 * UPDATES * BATCH}"]

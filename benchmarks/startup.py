@@ -106,8 +106,8 @@ def _jaxsafe(task: str, rta: str, tick: Callable[[], None]) -> None:
     from jaxsafe.config.arguments import Arguments
     from jaxsafe.devices.seed_mapper import SeedMapper, claim_cores
     from jaxsafe.rollout import reset_batch, step_or_reset_batch
-    from jaxsafe.train.config import resolve
-    from jaxsafe.train.loop import programs
+    from jaxsafe.train.host.options import resolve
+    from jaxsafe.train.train import programs
 
     claim_cores()
     tick()

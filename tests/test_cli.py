@@ -28,8 +28,8 @@ from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.text_table import columns
 from jaxsafe.train import __main__ as train
-from jaxsafe.train import config as config_module
-from jaxsafe.train.loop import Training
+from jaxsafe.train.host import options as config_module
+from jaxsafe.train.host.session import Training
 from jaxsafe.tune import __main__ as tune
 from jaxsafe.tune import lanes
 

@@ -18,12 +18,12 @@ from jaxsafe.plot.compare import compare_curves
 from jaxsafe.plot.figures import progress, training_curves
 from jaxsafe.schema.component import normalise
 from jaxsafe.train import __main__ as command
-from jaxsafe.train import directory
-from jaxsafe.train.checkpoint import Checkpoints
-from jaxsafe.train.loop import Training
+from jaxsafe.train.host import run_directory
+from jaxsafe.train.host.checkpoint import Checkpoints
+from jaxsafe.train.host.restore import structure
+from jaxsafe.train.host.results import summary
+from jaxsafe.train.host.session import Training
 from jaxsafe.train.ppo import PPO, diverged, init
-from jaxsafe.train.restore import structure
-from jaxsafe.train.results import summary
 from jaxsafe.tune import __main__ as tune
 
 AT = 384
@@ -96,7 +96,7 @@ def test_no_figure_has_it_and_that_is_said(run: Path, whole: Path, capsys: pytes
 
 
 def test_its_best_checkpoint_is_one_from_before(run: Path) -> None:
-    config, env, _ = directory.read(run, "run")
+    config, env, _ = run_directory.read(run, "run")
     content = Checkpoints(run).restore(1280, structure(env, config))
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(content["best"]["params"]))
     assert not np.isfinite(content["state"].params["log_std"][1]).any()

@@ -14,8 +14,8 @@ from jaxsafe.config.arguments import Arguments
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.rta.presets import PRESETS
-from jaxsafe.train.config import resolve
-from jaxsafe.train.loop import begin, chunk
+from jaxsafe.train.host.options import resolve
+from jaxsafe.train.train import begin, chunk
 
 Mode = Callable[[], AbstractContextManager]
 

@@ -18,7 +18,7 @@ def test_a_commit_is_that_of_the_code_and_says_when_the_code_is_another(
 
     package = tmp_path / "package"
     for file in (
-        package / "origin.py",
+        package / "types.py",
         package / "code.py",
         package / "policies" / "one.npz",
         tmp_path / "configs" / "task.yaml",
@@ -26,7 +26,7 @@ def test_a_commit_is_that_of_the_code_and_says_when_the_code_is_another(
     ):
         file.parent.mkdir(exist_ok=True, parents=True)
         file.write_text("first")
-    monkeypatch.setattr(provenance, "__file__", str(package / "origin.py"))
+    monkeypatch.setattr(provenance, "__file__", str(package / "storage" / "provenance.py"))
     assert provenance.commit() is None
     git("init", "-q")
     git("add", "-A")
@@ -46,12 +46,12 @@ def test_a_commit_is_that_of_the_code_and_says_when_the_code_is_another(
 def test_a_package_inside_another_repository_has_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     package = tmp_path / ".venv" / "package"
     package.mkdir(parents=True)
-    (package / "origin.py").write_text("installed")
+    (package / "types.py").write_text("installed")
     (tmp_path / "mine.py").write_text("mine")
     mine = ["git", "-C", str(tmp_path), "-c", "user.name=test", "-c", "user.email=test@example.org"]
     for words in (["init", "-q"], ["add", "mine.py"], ["commit", "-qm", "mine"]):
         subprocess.run([*mine, *words], check=True)
-    monkeypatch.setattr(provenance, "__file__", str(package / "origin.py"))
+    monkeypatch.setattr(provenance, "__file__", str(package / "storage" / "provenance.py"))
     assert provenance.commit() is None
 
 

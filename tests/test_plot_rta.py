@@ -188,7 +188,7 @@ def test_the_safe_set_has_a_panel_for_each_plane(task: str) -> None:
 def test_the_command_writes_a_figure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.setattr(safe_set.cli, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(safe_set, "enable_compilation_cache", lambda: None)
     words = ["env=docking2d", "x=[0,50]", "y=[0,0.4]", "points=5", "env.rta.margin=0.05", f"out={tmp_path / 'here.png'}"]
     assert safe_set.main(words) == 0
     assert capsys.readouterr().out.strip() == str(tmp_path / "here.png")
@@ -208,7 +208,7 @@ def test_the_command_writes_a_figure(
     ],
 )
 def test_bad_options_are_told_in_one_line(words: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(safe_set.cli, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(safe_set, "enable_compilation_cache", lambda: None)
     with pytest.raises(ConfigError, match=message):
         safe_set.main(words)
 

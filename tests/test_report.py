@@ -28,8 +28,8 @@ from jaxsafe.report.record import keep, kept
 from jaxsafe.rollout import reset_batch
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import __main__ as train
-from jaxsafe.train import directory
-from jaxsafe.train.config import resolve_all
+from jaxsafe.train.host import run_directory
+from jaxsafe.train.host.options import resolve_all
 
 PAGE = Path(__file__).parent.parent / "docs" / "baselines.md"
 REST = [word for word in TINY if not word.startswith("env=")]
@@ -141,7 +141,7 @@ def test_an_evaluation_with_other_options_than_today_s_is_left_out_and_made_anew
 def test_a_record_is_of_the_commit_that_trained_it(calls: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
     words = ["tasks=docking2d", "kinds=plain", *REST]
     for now, trained in (("first", "first"), ("second", "first")):
-        monkeypatch.setattr(directory, "commit", lambda now=now: now)
+        monkeypatch.setattr(run_directory, "commit", lambda now=now: now)
         assert command.main(words) == 0
         assert f"`python -m jaxsafe.report {shlex.join(words)}` on commit {trained}: docking2d-plain" in (
             Path("report/baselines.md").read_text()

@@ -17,7 +17,7 @@ from jaxsafe.evaluate.__main__ import main as evaluate
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.__main__ import main as train
-from jaxsafe.train.config import TrainConfig, resolve
+from jaxsafe.train.host.options import TrainConfig, resolve
 from jaxsafe.train.ppo import PPO, Transition, collect, init
 
 step = jax.jit(jaxsafe.step)

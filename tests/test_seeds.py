@@ -12,8 +12,8 @@ from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.loop import STATE
 from jaxsafe.train.ppo import PPO, TrainState, init, update
+from jaxsafe.train.train import STATE
 
 ENV = jaxsafe.make("docking2d")
 AGENT = normalise(Agent(features="docking"))
@@ -54,7 +54,7 @@ claim_cores()
 import jax, jaxsafe, numpy as np
 from jaxsafe.schema.component import normalise
 from jaxsafe.agents.agent import Agent
-from jaxsafe.train.loop import programs
+from jaxsafe.train.train import programs
 from jaxsafe.train.ppo import PPO
 shared = jaxsafe.make("docking2d_oriented"), normalise(Agent(features="approach")), normalise(PPO(num_envs=32))
 def starts(count):

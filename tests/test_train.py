@@ -23,11 +23,11 @@ from jaxsafe.envs import TASKS
 from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import __main__ as command
-from jaxsafe.train import directory
-from jaxsafe.train.checkpoint import Checkpoints
-from jaxsafe.train.config import recipe
-from jaxsafe.train.loop import Clock, Training
-from jaxsafe.train.restore import restore
+from jaxsafe.train.host import run_directory
+from jaxsafe.train.host.checkpoint import Checkpoints
+from jaxsafe.train.host.options import recipe
+from jaxsafe.train.host.restore import restore
+from jaxsafe.train.host.session import Clock, Training
 
 
 def logs(run: Path) -> dict[str, list[dict[str, Any]]]:
@@ -41,7 +41,7 @@ def logs(run: Path) -> dict[str, list[dict[str, Any]]]:
 
 
 def final_state(run: Path) -> Any:
-    config, env, _ = directory.read(run, "run")
+    config, env, _ = run_directory.read(run, "run")
     checkpoints = Checkpoints(run)
     content, facts = restore(checkpoints, checkpoints.steps[-1], env, config)
     state = content["state"].replace(key=jax.random.key_data(content["state"].key))
@@ -218,7 +218,7 @@ def test_ctrl_c_stops_after_a_chunk_with_a_checkpoint_and_resumes(
 def _two_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let docking2d and a twin of it be all tasks, so that both run the program of `whole`."""
     two = {"docking2d": TASKS["docking2d"], "twin": TASKS["docking2d"]}
-    for module in ("jaxsafe.envs", "jaxsafe.train.config", "jaxsafe.train.directory"):
+    for module in ("jaxsafe.envs", "jaxsafe.train.host.options", "jaxsafe.train.host.run_directory"):
         monkeypatch.setattr(f"{module}.TASKS", two)
 
 
@@ -494,7 +494,7 @@ import resource, sys
 from pathlib import Path
 import numpy as np
 from jaxsafe import cli
-from jaxsafe.train.checkpoint import Checkpoints
+from jaxsafe.train.host.checkpoint import Checkpoints
 
 def main(argv):
     checkpoints = Checkpoints(Path(argv[0]), create=True)

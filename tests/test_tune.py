@@ -12,7 +12,7 @@ from jaxsafe import cli
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.config import recipe
+from jaxsafe.train.host.options import recipe
 from jaxsafe.tune import __main__ as command
 from jaxsafe.tune.lanes import Lanes
 from jaxsafe.tune.results import _flat, _key

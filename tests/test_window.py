@@ -6,7 +6,7 @@ import pytest
 import jaxsafe
 from jaxsafe.metrics import Episode, begin
 from jaxsafe.rollout import reset_batch
-from jaxsafe.train.window import SIZE, empty_window, latest_cost, means, push, total_cost
+from jaxsafe.train.recent_episodes import SIZE, empty_window, latest_cost, means, push, total_cost
 
 ENV = jaxsafe.make("docking2d")
 

@@ -14,9 +14,9 @@ from jaxsafe.environment import Environment, require_success
 from jaxsafe.evaluate.evaluator import Evaluator, episode_rows, given_up
 from jaxsafe.storage.files import append_rows, write_json
 from jaxsafe.storage.provenance import versions
-from jaxsafe.train import directory
-from jaxsafe.train.log import filter_name
-from jaxsafe.train.results import diverged_seeds, evaluation
+from jaxsafe.train.host import run_directory
+from jaxsafe.train.host.log import filter_name
+from jaxsafe.train.host.results import diverged_seeds, evaluation
 
 
 def evaluate(
@@ -37,14 +37,14 @@ def evaluate(
     """
     require_success(env)
     episodes, seed = request["episodes"], request["evaluation_seed"]
-    path = directory.make(
+    path = run_directory.make(
         out, subject.place, f"{request['checkpoint']}-{episodes}-seed{seed}" + "-changed" * bool(request["changes"])
     )
     try:
         evaluator = Evaluator(subject.mapper, env, subject.agent)
         sums = {kind: evaluator.run(subject.params, episodes, seed, kind == "deterministic") for kind in kinds}
     except Exception:
-        directory.discard_unused(path)
+        run_directory.discard_unused(path)
         raise
     first = subject.facts["seed"]
     left_out = _not_finite(subject)

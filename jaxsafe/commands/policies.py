@@ -15,9 +15,9 @@ from jaxsafe.commands.policy_source import Source
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train import directory
-from jaxsafe.train.restore import load_params
-from jaxsafe.train.results import facts
+from jaxsafe.train.host import run_directory
+from jaxsafe.train.host.restore import load_params
+from jaxsafe.train.host.results import facts
 
 
 class Subject(NamedTuple):
@@ -54,7 +54,7 @@ def load(run: str, checkpoint: str | None) -> Subject:
         if checkpoint is not None:
             raise ConfigError(f"checkpoint: {run} is a single policy; leave checkpoint={checkpoint} out")
         return _of_file(find_policy(run))
-    config, env, name = directory.read(Path(run), "run")
+    config, env, name = run_directory.read(Path(run), "run")
     mapper = SeedMapper(config.seeds)
     params, step = load_params(mapper, Path(run), config, env, checkpoint or "last")
     found = {**facts(config, env, name), "steps": step}

@@ -18,6 +18,9 @@ except ImportError:  # Windows
 
 GIB = 2**30
 
+OPTIONS = "ppo.num_envs, ppo.num_steps, seeds"
+"""Options to name when a training does not fit into memory."""
+
 GROUPS = {
     "": ("/sys/fs/cgroup", "memory.max", "memory.current", "inactive_file"),
     "memory": ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),

@@ -22,7 +22,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.commands.policies import load, load_foreign
     from jaxsafe.commands.policy_source import pop_source
     from jaxsafe.schema.errors import ConfigError
-    from jaxsafe.train.results import table
+    from jaxsafe.train.host.results import table
 
     arguments = Arguments.parse(argv)
     run = arguments.pop_text("run")

@@ -31,6 +31,9 @@ MAX_RECORDED_STEPS = 25_000
 
 Every task at a tenth of its time step is still recorded whole."""
 
+EVALUATION_SEED = 0
+"""The seed of the evaluations during and after training; `python -m jaxsafe.evaluate seed=…` chooses others."""
+
 KINDS = ("stochastic", "deterministic")
 
 

@@ -97,7 +97,7 @@ def _policy(arguments: Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy
     from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
     from jaxsafe.commands.environment_choice import EnvironmentChoice, differences
     from jaxsafe.commands.policy_source import pop_source
-    from jaxsafe.train import directory
+    from jaxsafe.train.host import run_directory
 
     chosen = EnvironmentChoice.pop(arguments)
     elsewhere = pop_source(arguments, run, chosen)
@@ -107,7 +107,7 @@ def _policy(arguments: Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy
     if elsewhere:
         return elsewhere.read(), f"{Path(run).stem}_{elsewhere.task}"
     if not single:
-        directory.read(Path(run), "run")  # imports what a user's environment is made of
+        run_directory.read(Path(run), "run")  # imports what a user's environment is made of
         stems = [file.stem.removeprefix("seed_") for file in (Path(run) / "policy").glob("seed_*.npz")]
         known = {int(stem) for stem in stems if stem.isdecimal()}
         if not known:

@@ -14,7 +14,7 @@ from jaxsafe.schema.errors import ConfigError, nearest
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
     from jaxsafe.plot.figures import AXES, draw_all
-    from jaxsafe.train import directory
+    from jaxsafe.train.host import run_directory
 
     arguments = Arguments.parse(argv)
     several = isinstance(arguments.options.get("run"), list)
@@ -29,7 +29,7 @@ def main(argv: Sequence[str]) -> int:
     if several:
         _compare(run, x, out)
         return 0
-    directory.read(Path(run), "run")
+    run_directory.read(Path(run), "run")
     for path in draw_all(Path(run), x):  # type: ignore[arg-type]
         print(path)
     return 0
@@ -40,13 +40,13 @@ def _compare(runs: Sequence[Any], x: str, out: Path) -> None:
     from jaxsafe.plot.compare import compare_curves
     from jaxsafe.plot.figures import progress
     from jaxsafe.plot.style import save
-    from jaxsafe.train import directory
-    from jaxsafe.train.results import summary
+    from jaxsafe.train.host import run_directory
+    from jaxsafe.train.host.results import summary
 
     paths = {Path(str(run)).name: Path(str(run)) for run in runs}
     if len(paths) < len(runs) or len(runs) < 2:
         raise ConfigError(f"run: expected several directories of different names, found {', '.join(map(str, runs))}")
-    tasks = {directory.read(path, "run")[2] for path in paths.values()}
+    tasks = {run_directory.read(path, "run")[2] for path in paths.values()}
     if len(tasks) > 1:
         raise ConfigError(f"run: expected runs of one task, found {', '.join(sorted(tasks))}")
     for path in paths.values():

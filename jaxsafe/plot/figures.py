@@ -26,8 +26,8 @@ from jaxsafe.plot.style import BLUE, GREY, ORANGE, centre_patch, kept_out, label
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import read_rows
 from jaxsafe.storage.forms import ANYTHING, COUNT, FLAG, MAYBE, NUMBER, OTHERS, TEXT, check, numbers
-from jaxsafe.train import directory
-from jaxsafe.train.log import filter_name, headline, read_progress
+from jaxsafe.train.host import run_directory
+from jaxsafe.train.host.log import filter_name, headline, read_progress
 
 LAST_COLOUR = 0.85  # the end of the colour map is too light on white
 NEAR = 3.0  # half the width of what is shown near the smallest region, in distances to its far end
@@ -53,7 +53,7 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
         ConfigError: the run has no progress log.
     """
     rows = progress(run)
-    config, env, name = directory.read(run, "run")
+    config, env, name = run_directory.read(run, "run")
     facts = {"env": name, "preset": config.preset, "algorithm": config.algorithm, "rta": filter_name(env)}
     title = headline({**facts, "seeds": len({row["seed"] for row in rows})})
     figures = {f"training_{x}": training_curves(rows, x, title)}

@@ -23,7 +23,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.report.record import keep, kept
     from jaxsafe.report.run import evaluate, train
     from jaxsafe.storage.files import write_bytes
-    from jaxsafe.train.config import resolve
+    from jaxsafe.train.host.options import resolve
 
     arguments = Arguments.parse(argv)
     out, runs = Path(arguments.pop_text("out") or "report"), Path(arguments.pop_text("runs") or "runs/report")

@@ -15,8 +15,8 @@ from jaxsafe.report.measures import failed_seeds, finished, samples_per_second, 
 from jaxsafe.report.plan import CERTIFIED_STARTS, FILM, KINDS, PAPER_STEPS, SHIPPED, WITH_RTA, WITHOUT_RTA, best_seed
 from jaxsafe.report.record import Record
 from jaxsafe.storage.files import write_text
-from jaxsafe.train import window
-from jaxsafe.train.results import known, least
+from jaxsafe.train.host.results import known, least
+from jaxsafe.train.recent_episodes import SIZE as WINDOW
 
 DIRECTORY = "baselines"
 """Beside the page: records, curves, figures and films."""
@@ -103,7 +103,7 @@ class Report:
         for record in self.records:
             item, found = record.item, record.results
             steps, per_seed = (found["interaction_efficiency"][name] for name in ("timesteps", "per_seed"))
-            paper, strict = PAPER_STEPS[item.task], steps_to(0.8, record.curves, window.SIZE)
+            paper, strict = PAPER_STEPS[item.task], steps_to(0.8, record.curves, WINDOW)
             rows.append([
                 item.task, item.kind, f"{paper:,}", f"{steps:,}" if steps else "never",
                 f"{paper / steps:.1f}" if steps else "–",
@@ -118,10 +118,10 @@ class Report:
             f" at least {ENOUGH_EPISODES}, on the average over seeds: Table 2 of the paper, whose measure is the average"
             " success. Beside it how many episodes a seed had finished by then, on the average: those still running do not"
             " count, and where episodes are long those that succeed may be the first to end. So the next column has the"
-            f" steps until it is 80 % of {window.SIZE} episodes of every seed. An episode that the recipe truncates counts"
+            f" steps until it is 80 % of {WINDOW} episodes of every seed. An episode that the recipe truncates counts"
             " as a failed one. The wall time is that of the whole command for all seeds: imports, compilation, training,"
             " evaluation; compiling is the wait for the training program.",
-            f"task | way | paper | here | paper / here | episodes | of {window.SIZE} episodes | seeds at 80 % | trained for"
+            f"task | way | paper | here | paper / here | episodes | of {WINDOW} episodes | seeds at 80 % | trained for"
             " | wall [s] | compiling [s]",
             rows,
         )

@@ -12,9 +12,9 @@ from jaxsafe.report.run import FILM_FILE, answers, options_of
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import finite, read_csv, read_json, write_bytes, write_csv, write_json
 from jaxsafe.storage.forms import MAYBE, NULL, OTHERS, TEXT, check
-from jaxsafe.train.directory import read_content
-from jaxsafe.train.log import NEEDS, check_order, read_progress
-from jaxsafe.train.results import check_results, read_results
+from jaxsafe.train.host.log import NEEDS, check_order, read_progress
+from jaxsafe.train.host.results import check_results, read_results
+from jaxsafe.train.host.run_directory import read_content
 
 CURVES = ("wall_s", "success_rate", "return", "length", "delta_v", "violating_share", "cost", "episodes")
 

@@ -17,9 +17,9 @@ from jaxsafe.devices.processes import in_main_thread
 from jaxsafe.report.plan import BEST, FILM, Item, best_seed
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import read_json, write_bytes
-from jaxsafe.train.config import resolve
-from jaxsafe.train.directory import described, read_content
-from jaxsafe.train.results import read_results
+from jaxsafe.train.host.options import resolve
+from jaxsafe.train.host.results import read_results
+from jaxsafe.train.host.run_directory import described, read_content
 
 FILM_FILE = "episode_deterministic.gif"
 

@@ -15,7 +15,7 @@ from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores
 
 if TYPE_CHECKING:
-    from jaxsafe.train.loop import Training
+    from jaxsafe.train.host.session import Training
 
 BEGAN = time.monotonic()
 
@@ -29,9 +29,9 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.devices import processes
     from jaxsafe.schema.errors import ConfigError
     from jaxsafe.storage.files import read_json
-    from jaxsafe.train import directory
-    from jaxsafe.train.config import resolve_all
-    from jaxsafe.train.results import summary
+    from jaxsafe.train.host import run_directory
+    from jaxsafe.train.host.options import resolve_all
+    from jaxsafe.train.host.results import summary
 
     arguments = Arguments.parse(argv)
     if arguments.pop_flag("distributed"):
@@ -39,11 +39,11 @@ def main(argv: Sequence[str]) -> int:
     resume = arguments.pop_text("resume")
     if resume is None:
         resolved = resolve_all(arguments)
-        path = Path(processes.from_leader(lambda: str(directory.create_all(resolved))))
+        path = Path(processes.from_leader(lambda: str(run_directory.create_all(resolved))))
     else:
         arguments.refuse_rest(["resume", "distributed"])
         path = Path(resume)
-    runs = directory.runs(path)
+    runs = run_directory.runs(path)
     try:
         with processes.loss_told(f"go on with: python -m jaxsafe.train distributed=true resume={path}"):
             try:
@@ -51,7 +51,7 @@ def main(argv: Sequence[str]) -> int:
             except Exception as error:
                 alone = jax.process_count() == 1  # else it may be the loss of another process, after which the run goes on
                 if resume is None and processes.leads() and (alone or isinstance(error, ConfigError)):
-                    directory.discard_unused(path)
+                    run_directory.discard_unused(path)
                 raise
     except KeyboardInterrupt:
         print(f"go on with: python -m jaxsafe.train resume={path}")
@@ -82,7 +82,7 @@ def _train(runs: Sequence[Path], path: Path) -> bool:
 
     The programs of a run are compiled while the one before it trains: to compile alone leaves cores idle.
     """
-    from jaxsafe.train.results import finish, table
+    from jaxsafe.train.host.results import finish, table
 
     trained, upcoming = [], None
     with ExitStack() as files:
@@ -111,17 +111,17 @@ def _train(runs: Sequence[Path], path: Path) -> bool:
 def _open(run: Path, files: ExitStack, began: float) -> Training:
     """What is left of a run; its logs are closed with `files`, and its clock has run since `began`."""
     from jaxsafe.devices import processes
-    from jaxsafe.train import directory
-    from jaxsafe.train.loop import Clock, Training
+    from jaxsafe.train.host import run_directory
+    from jaxsafe.train.host.session import Clock, Training
 
     own = files.enter_context(processes.own_files(run))
-    config, env, name = directory.read(run, "resume")
+    config, env, name = run_directory.read(run, "resume")
     return Training(config, env, name, own, Clock(time.monotonic() - began), run)
 
 
 def usage() -> str:
     """The help text."""
-    from jaxsafe.train.config import usage
+    from jaxsafe.train.host.options import usage
 
     return usage()
 

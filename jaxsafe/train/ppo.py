@@ -26,8 +26,8 @@ from jaxsafe.environment import Environment
 from jaxsafe.metrics import Episode, accumulate, begin
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 from jaxsafe.schema.component import Component, Range
+from jaxsafe.train.recent_episodes import Window, empty_window, latest_cost, push
 from jaxsafe.train.shuffle import shuffle
-from jaxsafe.train.window import Window, empty_window, latest_cost, push
 from jaxsafe.types import Dimensionless, Key, Positive, Record, State, TimeStep
 
 Share = Range(0.0, 1.0)

@@ -22,7 +22,7 @@ def main(argv: Sequence[str]) -> int:
     from tqdm import tqdm
 
     from jaxsafe.schema.errors import ConfigError, nearest, show
-    from jaxsafe.train import directory
+    from jaxsafe.train.host import run_directory
     from jaxsafe.tune import results
     from jaxsafe.tune.lanes import train_all
     from jaxsafe.tune.settings import MAX_SETTINGS, alike, pop_sweep, settings
@@ -60,7 +60,7 @@ def main(argv: Sequence[str]) -> int:
                 tqdm.write("\n".join(results.line(i, row, list(sweep)) for i, row in done.items()))
     except Exception:
         if resume is None:
-            directory.discard_unused(path)
+            run_directory.discard_unused(path)
         raise
     except KeyboardInterrupt:
         print(f"stopped with {len(rows)} of {len(found)} settings; go on with: python -m jaxsafe.tune resume={path}")

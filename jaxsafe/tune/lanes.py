@@ -13,10 +13,10 @@ import numpy as np
 from jaxsafe.devices import memory
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.evaluate.episodes import run_episodes
-from jaxsafe.evaluate.evaluator import BATCH, KINDS, given_up, in_batches, metrics_per_seed
+from jaxsafe.evaluate.evaluator import BATCH, EVALUATION_SEED, KINDS, given_up, in_batches, metrics_per_seed
 from jaxsafe.metrics import Episode, interaction_efficiency
-from jaxsafe.train.loop import EVALUATION_SEED, MEMORY, begin, chunk
-from jaxsafe.train.results import diverged_seeds
+from jaxsafe.train.host.results import diverged_seeds
+from jaxsafe.train.train import begin, chunk
 from jaxsafe.tune.settings import Setting, alike, lane
 from jaxsafe.types import Key
 
@@ -81,9 +81,9 @@ class Lanes:
     def _fitting(self, lanes: Any, keys: jax.Array) -> jax.stages.Compiled:
         """The program of some updates, refused before there is a state if either needs more memory than there is."""
         like = self.mapper.like(jax.eval_shape(self._init, (), (lanes, keys)))
-        memory.require(memory.size(like) // self.mapper.mesh.size, self.mapper.num_local_devices, MEMORY)
+        memory.require(memory.size(like) // self.mapper.mesh.size, self.mapper.num_local_devices, memory.OPTIONS)
         compiled = self.mapper.map(self._one_chunk).lower((), (lanes, like)).compile()
-        memory.require(memory.footprint(compiled), self.mapper.num_local_devices, MEMORY)
+        memory.require(memory.footprint(compiled), self.mapper.num_local_devices, memory.OPTIONS)
         return compiled
 
     def _one_chunk(self, _: tuple, one: tuple[Any, Any]) -> tuple[Any, dict[str, jax.Array]]:

@@ -16,8 +16,8 @@ from jaxsafe.storage.files import append_rows, keep_rows, write_csv, write_json,
 from jaxsafe.storage.forms import COUNT, NULL, OTHERS, SHARE, TEXT, Kind, check, numbers
 from jaxsafe.storage.provenance import versions
 from jaxsafe.storage.text_table import columns
-from jaxsafe.train import directory
-from jaxsafe.train.results import percent, told_diverged
+from jaxsafe.train.host import run_directory
+from jaxsafe.train.host.results import percent, told_diverged
 from jaxsafe.tune.settings import Setting
 
 Rows = dict[int, dict[str, Any]]
@@ -35,8 +35,8 @@ LONGEST = 36
 
 def create(out: str | None, request: Mapping[str, Any], first: Setting) -> Path:
     """Make the directory of a sweep and write down what was asked for, and what its first setting is in full."""
-    path = directory.make(out, Path("runs"), f"tune_{Path(str(request['env'])).stem}")
-    whole = directory.described(first.config, first.env)
+    path = run_directory.make(out, Path("runs"), f"tune_{Path(str(request['env'])).stem}")
+    whole = run_directory.described(first.config, first.env)
     write_text(path / "sweep.yaml", yaml12.write({"request": dict(request), "first": whole, "versions": versions()}))
     return path
 
@@ -61,7 +61,7 @@ def refuse_other(path: Path, first: Setting) -> None:
     Raises:
         ConfigError: what the sweep was begun with has changed.
     """
-    now = yaml12.write(directory.described(first.config, first.env))
+    now = yaml12.write(run_directory.described(first.config, first.env))
     if _content(path)["first"] != yaml12.parse(now, "first"):
         raise ConfigError(f"resume: the recipe or the environment of {path} has changed since it was begun; begin it anew")
 

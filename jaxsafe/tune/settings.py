@@ -15,7 +15,7 @@ import numpy as np
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.environment import Environment
 from jaxsafe.schema.errors import ConfigError, show
-from jaxsafe.train.config import TrainConfig, resolve
+from jaxsafe.train.host.options import TrainConfig, resolve
 
 PREFIX = "sweep."
 COMMON = ("env", "seeds", "seed", "episodes", "out", "preset")

@@ -20,7 +20,7 @@ from jaxsafe.schema.component import Component, Range, fields, normalise
 from jaxsafe.schema.convert import expects, to_value
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError, nearest, show
-from jaxsafe.train.log import tensorboard_writer
+from jaxsafe.train.host.log import tensorboard_writer
 from jaxsafe.train.ppo import MAX_COUNT, PPO
 from jaxsafe.types import Dimensionless, Positive
 
@@ -209,7 +209,7 @@ def configs() -> Path:
     Raises:
         ConfigError: there is none, as in a zipped package.
     """
-    package = Path(__file__).resolve().parent.parent
+    package = Path(__file__).resolve().parents[2]
     for path in (package / "configs", package.parent / "configs"):
         if path.is_dir():
             return path

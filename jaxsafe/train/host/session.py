@@ -11,7 +11,6 @@ import shutil
 import signal
 import time
 from collections import Counter
-from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -24,28 +23,17 @@ from jaxsafe.autoreset import choose
 from jaxsafe.devices import memory, processes
 from jaxsafe.devices.background_compile import Ahead, without_collection
 from jaxsafe.devices.processes import in_main_thread
-from jaxsafe.devices.seed_mapper import LANES, SEEDS, SeedMapper
-from jaxsafe.devices.shard import WHOLE, Shard
+from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
-from jaxsafe.evaluate.evaluator import KINDS, Evaluator, episode_rows
+from jaxsafe.evaluate.evaluator import EVALUATION_SEED, KINDS, Evaluator, episode_rows
 from jaxsafe.metrics import Episode
 from jaxsafe.storage.files import append_rows, keep_rows, sync
 from jaxsafe.storage.forms import COUNT
-from jaxsafe.train import ppo, window
-from jaxsafe.train.checkpoint import Checkpoints
-from jaxsafe.train.config import TrainConfig
-from jaxsafe.train.log import Display, ProgressLog, progress_rows, read_progress
-from jaxsafe.train.ppo import TrainState
-from jaxsafe.train.restore import made_from, restore, structure
-
-EVALUATION_SEED = 0
-"""Of the evaluations during and after training; `python -m jaxsafe.evaluate seed=…` chooses others."""
-
-STATE = ppo.over_devices(SEEDS, LANES)
-"""How the training states of all seeds lie on the devices."""
-
-MEMORY = "ppo.num_envs, ppo.num_steps, seeds"
-"""What decides how much of it a training needs."""
+from jaxsafe.train.host.checkpoint import Checkpoints
+from jaxsafe.train.host.log import Display, ProgressLog, progress_rows, read_progress
+from jaxsafe.train.host.options import TrainConfig
+from jaxsafe.train.host.restore import made_from, restore, structure
+from jaxsafe.train.train import STATE, programs
 
 
 class Clock:
@@ -170,7 +158,7 @@ class Training:
         """Have the state, fresh or restored, while all programs are compiled side by side."""
         content = structure(self.env, self.config)
         each = memory.size(content) // self.config.seeds * self.mapper.padded // self.mapper.mesh.size
-        memory.require(each, self.mapper.num_local_devices, MEMORY)
+        memory.require(each, self.mapper.num_local_devices, memory.OPTIONS)
         begin, keys = time.monotonic(), self.mapper.keys(self.config.seed)
         fresh, advance = programs(self.mapper, self.chunk, self.config.num_updates)
         like = self.mapper.like(jax.eval_shape(fresh, self.shared, keys), STATE)
@@ -216,7 +204,7 @@ class Training:
         begin, compiled = time.monotonic(), self.advance.compiled()
         self.compile_s += time.monotonic() - begin
         has = memory.size(self.state) // self.mapper.mesh.size  # which is there already
-        memory.require(memory.footprint(compiled) - has, self.mapper.num_local_devices, MEMORY)
+        memory.require(memory.footprint(compiled) - has, self.mapper.num_local_devices, memory.OPTIONS)
 
     def _due(self, before: int, every: int | None) -> bool:
         """Whether a chunk that began at update `before` passed a multiple of the interval or the end."""
@@ -286,59 +274,6 @@ class Training:
             "made_from": made_from(self.env, self.config),
         }
         self.checkpoints.save(self.step, self.mapper.gather({"state": self.state, "best": self.best}), facts)
-
-
-def programs(mapper: SeedMapper, length: int, limit: int) -> tuple[Any, Any]:
-    """What a training of all seeds runs on its devices, to be called or lowered; `shared` is `(env, agent, hyper)`.
-
-    Args:
-        mapper: of the seeds.
-        length: updates at a time.
-        limit: updates of the whole run.
-
-    Returns:
-        `(shared, keys) -> state` for `begin`, and `(shared, state) -> (state, curves)` for `chunk`.
-    """
-
-    def advance(shared: tuple, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
-        return chunk(shared, state, length, limit, mapper.shard)
-
-    fresh = mapper.map(partial(begin, shard=mapper.shard), returned=STATE, pairs=True)
-    return fresh, mapper.map(advance, STATE, (STATE, SEEDS))
-
-
-def begin(shared: tuple, key: jax.Array, shard: Shard = WHOLE) -> TrainState:
-    """Fresh networks and episodes of one seed."""
-    env, agent, hyper = shared
-    return ppo.init(env, agent, hyper, key, shard)
-
-
-def chunk(
-    shared: tuple, state: TrainState, length: int, limit: int, shard: Shard = WHOLE
-) -> tuple[TrainState, dict[str, jax.Array]]:
-    """`length` updates of one seed, fewer at the end of the run, with the averages of the window after each.
-
-    A seed that has diverged is counted on and otherwise left as it is.
-    """
-    env, agent, hyper = shared
-
-    def leave(state: TrainState) -> TrainState:
-        return state.replace(num_updates=jnp.minimum(state.num_updates + 1, limit))
-
-    def one(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
-        going = (state.num_updates < limit) & ~ppo.diverged(state)
-        state = jax.lax.cond(going, lambda s: ppo.update(env, agent, hyper, limit, s, shard), leave, state)
-        counts = {
-            "update": state.num_updates,
-            "count": state.window.count,
-            "cost": window.total_cost(state.window),
-            "diverged": ppo.diverged(state),
-        }
-        if agent.cost_critic:
-            counts["multiplier"] = state.multiplier
-        return state, {**counts, **window.means(state.window, env.outcomes)}
-
-    return jax.lax.scan(one, state, None, length=length)
 
 
 @jax.jit

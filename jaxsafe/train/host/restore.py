@@ -15,9 +15,10 @@ from jaxsafe.environment import Environment
 from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.storage.files import finite
 from jaxsafe.storage.forms import AMOUNT, COUNT, check
-from jaxsafe.train import directory, ppo
-from jaxsafe.train.checkpoint import Checkpoints
-from jaxsafe.train.config import TrainConfig
+from jaxsafe.train import ppo
+from jaxsafe.train.host import run_directory
+from jaxsafe.train.host.checkpoint import Checkpoints
+from jaxsafe.train.host.options import TrainConfig
 
 
 def structure(env: Environment, config: TrainConfig) -> dict[str, Any]:
@@ -49,7 +50,7 @@ MAY_CHANGE = (
 
 def made_from(env: Environment, config: TrainConfig) -> dict[str, Any]:
     """Return what a checkpoint is tied to, as JSON has it: the environment and the options that decide the numbers."""
-    content = json.loads(json.dumps(finite(directory.described(config, env))))
+    content = json.loads(json.dumps(finite(run_directory.described(config, env))))
     for name in MAY_CHANGE:
         del content["training"][name]
     return content

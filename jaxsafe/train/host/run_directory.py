@@ -19,7 +19,7 @@ from jaxsafe.schema.errors import ConfigError, nearest
 from jaxsafe.storage.files import write_text
 from jaxsafe.storage.forms import NULL, NUMBER, TEXT, check
 from jaxsafe.storage.provenance import commit, versions
-from jaxsafe.train.config import TrainConfig
+from jaxsafe.train.host.options import TrainConfig
 
 
 def create(config: TrainConfig, env: Environment, name: str) -> Path:

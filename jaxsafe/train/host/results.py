@@ -14,9 +14,9 @@ from jaxsafe.storage.files import read_json, write_json
 from jaxsafe.storage.forms import AMOUNT, COUNT, NULL, NUMBER, OTHERS, SHARE, TEXT, Kind, check, numbers
 from jaxsafe.storage.provenance import versions
 from jaxsafe.storage.text_table import columns
-from jaxsafe.train.config import TrainConfig
-from jaxsafe.train.log import filter_name, headline
-from jaxsafe.train.loop import Training
+from jaxsafe.train.host.log import filter_name, headline
+from jaxsafe.train.host.options import TrainConfig
+from jaxsafe.train.host.session import Training
 
 _ROWS = (
     ("success_rate", "success rate", "%"),
