@@ -47,8 +47,8 @@ def main() -> None:
 
 def trained(variant: str, asked: list[str]) -> dict[str, Any]:
     """Steps to 80 % success, and of the final evaluation the success and the length of episodes."""
+    from jaxsafe.commands import train as train
     from jaxsafe.devices.seed_mapper import claim_cores
-    from jaxsafe.train import __main__ as train
     from jaxsafe.train import ppo
 
     claim_cores()

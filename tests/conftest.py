@@ -30,7 +30,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished training run that nobody interrupted."""
     from tiny import TINY
 
-    from jaxsafe.train.__main__ import main
+    from jaxsafe.commands.train import main
 
     run = tmp_path_factory.mktemp("runs") / "whole"
     assert main([*TINY, f"out={run}"]) == 0

@@ -14,23 +14,22 @@ import jax
 import numpy as np
 import pytest
 
-from jaxsafe import cli
 from jaxsafe.agents import policy_file as policy_module
 from jaxsafe.agents.policy_file import read_policy
-from jaxsafe.config import __main__ as config
+from jaxsafe.commands import cli, falsify
+from jaxsafe.commands import config as config
+from jaxsafe.commands import evaluate as evaluate
+from jaxsafe.commands import export as export
+from jaxsafe.commands import plot as plot
+from jaxsafe.commands import train as train
+from jaxsafe.commands import tune as tune
 from jaxsafe.config.arguments import Arguments
-from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.evaluate.evaluator import Evaluator
-from jaxsafe.export import __main__ as export
-from jaxsafe.plot import __main__ as plot
-from jaxsafe.rta import falsify
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.text_table import columns
-from jaxsafe.train import __main__ as train
 from jaxsafe.train.host import options as config_module
 from jaxsafe.train.host.session import Training
-from jaxsafe.tune import __main__ as tune
 from jaxsafe.tune import lanes
 
 

@@ -11,20 +11,21 @@ import pytest
 from probes import Position, probe
 from tiny import TINY
 
-from jaxsafe import cli
 from jaxsafe.agents.agent import Agent
-from jaxsafe.evaluate import __main__ as evaluate
+from jaxsafe.commands import cli
+from jaxsafe.commands import evaluate as evaluate
+from jaxsafe.commands import train as command
+from jaxsafe.commands import tune as tune
+from jaxsafe.commands.run_figures import progress
 from jaxsafe.plot.compare import compare_curves
-from jaxsafe.plot.figures import progress, training_curves
+from jaxsafe.plot.figures import training_curves
 from jaxsafe.schema.component import normalise
-from jaxsafe.train import __main__ as command
 from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.checkpoint import Checkpoints
 from jaxsafe.train.host.restore import structure
 from jaxsafe.train.host.results import summary
 from jaxsafe.train.host.session import Training
 from jaxsafe.train.ppo import PPO, diverged, init
-from jaxsafe.tune import __main__ as tune
 
 AT = 384
 """The step after which the networks of a seed are not finite: between two evaluations."""

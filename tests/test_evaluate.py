@@ -10,12 +10,12 @@ from PIL import Image
 
 import jaxsafe
 from jaxsafe.commands.environment_choice import EnvironmentChoice, differences
+from jaxsafe.commands.evaluate import main
 from jaxsafe.config import dump
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.evaluate import episodes as episodes_module
 from jaxsafe.evaluate import evaluator as seeds_module
-from jaxsafe.evaluate.__main__ import main
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.evaluate.evaluator import Evaluator, batch_keys
 from jaxsafe.schema.errors import ConfigError

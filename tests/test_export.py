@@ -14,8 +14,8 @@ import pytest
 import jaxsafe
 from jaxsafe.agents.imported_policy import ACTIVATIONS
 from jaxsafe.agents.policy_file import SavedPolicy, find_policy, read_policy, save_policy
+from jaxsafe.commands.export import main
 from jaxsafe.export import functions
-from jaxsafe.export.__main__ import main
 from jaxsafe.export.onnx import to_onnx
 from jaxsafe.export.vnnlib import search, write_vnnlib
 from jaxsafe.rollout import reset_batch

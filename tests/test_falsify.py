@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import pytest
 
 import jaxsafe
+from jaxsafe.commands.falsify import main, report
 from jaxsafe.evaluate.adversaries import ADVERSARIES
 from jaxsafe.evaluate.run_adversaries import attack, longest_episode
-from jaxsafe.rta.falsify import main, report
 
 
 def test_the_numbers_name_the_command_and_the_versions_that_made_them(tmp_path: Path) -> None:

@@ -17,9 +17,9 @@ from onnx import TensorProto, helper, numpy_helper
 import jaxsafe
 from jaxsafe.agents.imported_policy import read_foreign
 from jaxsafe.agents.policy_file import find_policy, read_policy
-from jaxsafe.evaluate.__main__ import main
+from jaxsafe.commands.evaluate import main
+from jaxsafe.commands.export import main as export
 from jaxsafe.export import functions
-from jaxsafe.export.__main__ import main as export
 from jaxsafe.export.onnx import write_onnx
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import read_json

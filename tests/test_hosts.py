@@ -13,7 +13,7 @@ import pytest
 from test_train import assert_same_end
 from tiny import TINY
 
-from jaxsafe.train.__main__ import main
+from jaxsafe.commands.train import main
 
 LONG = [word for word in TINY if not word.startswith(("steps=", "checkpoint_every="))]
 LONG += ["steps=4000000", "checkpoint_every=12800"]

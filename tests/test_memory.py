@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+from jaxsafe.commands.train import main
+from jaxsafe.commands.tune import main as tune
 from jaxsafe.devices import memory, processes
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.__main__ import main
-from jaxsafe.tune.__main__ import main as tune
 
 
 def test_a_training_that_would_not_fit_is_refused_before_it_starts(tmp_path: Path) -> None:

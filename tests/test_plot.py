@@ -11,11 +11,12 @@ from matplotlib.image import imread
 from matplotlib.patches import Circle
 
 import jaxsafe
+from jaxsafe.commands.plot import main
+from jaxsafe.commands.run_figures import _episodes, draw_all
 from jaxsafe.envs import TASKS
 from jaxsafe.metrics import bootstrap_interval
-from jaxsafe.plot.__main__ import main
 from jaxsafe.plot.compare import compare_curves, seed_curves
-from jaxsafe.plot.figures import _episodes, draw_all, speed_distance, training_curves, trajectories
+from jaxsafe.plot.figures import speed_distance, training_curves, trajectories
 from jaxsafe.plot.style import GREEN, ORANGE, kept_out, save
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError

@@ -10,9 +10,10 @@ from matplotlib.contour import ContourSet
 from matplotlib.image import imread
 
 import jaxsafe
+from jaxsafe.commands import safe_set as command
+from jaxsafe.commands.run_figures import draw_all
 from jaxsafe.config import describe
 from jaxsafe.plot import safe_set
-from jaxsafe.plot.figures import draw_all
 from jaxsafe.plot.interventions import interventions, most_altered
 from jaxsafe.plot.style import control_unit
 from jaxsafe.rta.cascade import Cascade, Stage
@@ -188,9 +189,9 @@ def test_the_safe_set_has_a_panel_for_each_plane(task: str) -> None:
 def test_the_command_writes_a_figure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    monkeypatch.setattr(safe_set, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(command, "enable_compilation_cache", lambda: None)
     words = ["env=docking2d", "x=[0,50]", "y=[0,0.4]", "points=5", "env.rta.margin=0.05", f"out={tmp_path / 'here.png'}"]
-    assert safe_set.main(words) == 0
+    assert command.main(words) == 0
     assert capsys.readouterr().out.strip() == str(tmp_path / "here.png")
     assert imread(tmp_path / "here.png").shape[0] > 300
 
@@ -208,9 +209,9 @@ def test_the_command_writes_a_figure(
     ],
 )
 def test_bad_options_are_told_in_one_line(words: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(safe_set, "enable_compilation_cache", lambda: None)
+    monkeypatch.setattr(command, "enable_compilation_cache", lambda: None)
     with pytest.raises(ConfigError, match=message):
-        safe_set.main(words)
+        command.main(words)
 
 
 def test_a_cascade_has_no_certificate_of_its_own() -> None:

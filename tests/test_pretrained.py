@@ -8,8 +8,8 @@ import pytest
 
 import jaxsafe
 from jaxsafe.agents.policy_file import find_policy, read_policy
+from jaxsafe.commands.evaluate import main
 from jaxsafe.envs import TASKS
-from jaxsafe.evaluate.__main__ import main
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.schema.errors import ConfigError
 

@@ -15,10 +15,11 @@ import jax
 import pytest
 from tiny import TINY
 
+from jaxsafe.commands import evaluate as evaluate
+from jaxsafe.commands import train as train
 from jaxsafe.config import override
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.envs import TASKS
-from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.report import __main__ as command
 from jaxsafe.report import run as running
 from jaxsafe.report.measures import failed_seeds, finished, samples_per_second, steps_to, wall_to
@@ -27,7 +28,6 @@ from jaxsafe.report.plan import KINDS, SHIPPED, Item, best_seed, plan
 from jaxsafe.report.record import keep, kept
 from jaxsafe.rollout import reset_batch
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train import __main__ as train
 from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.options import resolve_all
 

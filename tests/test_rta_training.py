@@ -12,11 +12,11 @@ from tiny import TINY
 
 import jaxsafe
 from jaxsafe.agents.agent import Agent
+from jaxsafe.commands.evaluate import main as evaluate
+from jaxsafe.commands.train import main as train
 from jaxsafe.config.arguments import Arguments
-from jaxsafe.evaluate.__main__ import main as evaluate
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.__main__ import main as train
 from jaxsafe.train.host.options import TrainConfig, resolve
 from jaxsafe.train.ppo import PPO, Transition, collect, init
 

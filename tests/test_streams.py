@@ -10,11 +10,12 @@ import jax
 import pytest
 from tiny import TINY
 
-from jaxsafe import cli, make
+from jaxsafe import make
+from jaxsafe.commands import cli
+from jaxsafe.commands import train as train
+from jaxsafe.commands.streams import LastingStream
 from jaxsafe.config import load
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
-from jaxsafe.streams import LastingStream
-from jaxsafe.train import __main__ as train
 
 ROOT = Path(__file__).parent.parent
 

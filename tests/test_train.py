@@ -16,13 +16,13 @@ import pytest
 from orbax.checkpoint import CheckpointManager
 from tiny import TINY
 
-from jaxsafe import cli
 from jaxsafe.agents.policy_file import load_policy, read_policy
+from jaxsafe.commands import cli
+from jaxsafe.commands import evaluate as evaluate
+from jaxsafe.commands import train as command
 from jaxsafe.devices import processes
 from jaxsafe.envs import TASKS
-from jaxsafe.evaluate import __main__ as evaluate
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train import __main__ as command
 from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.checkpoint import Checkpoints
 from jaxsafe.train.host.options import recipe
@@ -493,7 +493,7 @@ FULL = """
 import resource, sys
 from pathlib import Path
 import numpy as np
-from jaxsafe import cli
+from jaxsafe.commands import cli
 from jaxsafe.train.host.checkpoint import Checkpoints
 
 def main(argv):

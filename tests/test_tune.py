@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from tiny import TINY
 
-from jaxsafe import cli
+from jaxsafe.commands import cli
+from jaxsafe.commands import tune as command
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.host.options import recipe
-from jaxsafe.tune import __main__ as command
 from jaxsafe.tune.lanes import Lanes
 from jaxsafe.tune.results import _flat, _key
 from jaxsafe.tune.settings import Span, alike, pop_sweep, settings

@@ -5,11 +5,8 @@ Of a run with run time assurance also what it altered, see `interventions`.
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
-from functools import partial
-from pathlib import Path
-from typing import Any, Literal
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -19,15 +16,8 @@ from matplotlib.colors import ListedColormap, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from jaxsafe.environment import Environment
 from jaxsafe.metrics import ENOUGH_SEEDS, bootstrap_interval
-from jaxsafe.plot.interventions import interventions, most_altered
-from jaxsafe.plot.style import BLUE, GREY, ORANGE, centre_patch, kept_out, labelled, length_unit, plain, region_patch, save
-from jaxsafe.schema.errors import ConfigError
-from jaxsafe.storage.files import read_rows
-from jaxsafe.storage.forms import ANYTHING, COUNT, FLAG, MAYBE, NUMBER, OTHERS, TEXT, check, numbers
-from jaxsafe.train.host import run_directory
-from jaxsafe.train.host.log import filter_name, headline, read_progress
+from jaxsafe.plot.style import BLUE, GREY, ORANGE, centre_patch, labelled, plain, region_patch
 
 LAST_COLOUR = 0.85  # the end of the colour map is too light on white
 NEAR = 3.0  # half the width of what is shown near the smallest region, in distances to its far end
@@ -44,47 +34,6 @@ AXES = {"steps": ("step", "environment steps per seed"), "wall": ("wall_s", "wal
 
 Rows = list[dict[str, Any]]
 Episodes = list[tuple[int, Rows]]
-
-
-def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
-    """Draw every figure for which the run has data, into `<run>/figures/`, and return their paths.
-
-    Raises:
-        ConfigError: the run has no progress log.
-    """
-    rows = progress(run)
-    config, env, name = run_directory.read(run, "run")
-    facts = {"env": name, "preset": config.preset, "algorithm": config.algorithm, "rta": filter_name(env)}
-    title = headline({**facts, "seeds": len({row["seed"] for row in rows})})
-    figures = {f"training_{x}": training_curves(rows, x, title)}
-    others = [platform.name for platform in env.platforms if platform.name != env.agent]
-    names = [*others[:1], env.agent]
-    episodes = _episodes(run / "episodes.jsonl", names, partial(_row_form, env, names))
-    if episodes:
-        figures["trajectories"] = trajectories(episodes, title, length_unit(env), env.regions, kept_out(env))
-        if {"docking_distance", "speed", "velocity_limit"} <= episodes[0][1][0]["status"].keys():
-            figures["speed_distance"] = speed_distance(episodes, title)
-        if "rta" in episodes[-1][1][0]:
-            figures["interventions"] = interventions(most_altered(episodes), env, title)
-    place = run / "figures"
-    new = place if place.exists() else place.with_name("figures.part")  # for the first time all or none
-    shutil.rmtree(place.with_name("figures.part"), ignore_errors=True)  # of a command that was killed
-    paths = [save(figure, new / f"{name}.png") for name, figure in figures.items()]
-    if new != place:
-        new.rename(place)
-    return [place / path.name for path in paths]
-
-
-def progress(run: Path) -> list[dict[str, Any]]:
-    """The progress log of a run.
-
-    Raises:
-        ConfigError: it has no rows.
-    """
-    rows = read_progress(run)
-    if not rows:
-        raise ConfigError(f"run: {run} has no rows in progress.jsonl yet; nothing to draw")
-    return rows
 
 
 def training_curves(rows: Sequence[Mapping[str, Any]], x: str, title: str) -> Figure:
@@ -253,59 +202,6 @@ def curve_table(
             at[index[row["step"]]] = row[column]
             values[index[row["step"]], seeds.index(row["seed"])] = np.nan if row[name] is None else row[name]
     return at, values
-
-
-def _episodes(path: Path, names: Sequence[str], form: Callable[[Rows], Any] | None = None) -> Episodes:
-    """Logged episodes of these platforms, each with the training step of its policy; those of the end only once.
-
-    Args:
-        path: of the log.
-        names: of the platforms.
-        form: what each row must look like, from all rows.
-
-    Raises:
-        ConfigError: a row lacks what the figures show, or has something else there.
-    """
-    grouped: dict[tuple[int, bool, int], Rows] = {}
-    rows = read_rows(path)
-    wanted = form(rows) if form else ANYTHING
-    for number, row in enumerate(rows, start=1):
-        check(row, wanted, f"{path}, row {number}")
-        row["platforms"] = {name: row["platforms"][name] for name in names}
-        grouped.setdefault((row["step"], row["final"], row["episode"]), []).append(row)
-    ended = {step for step, final, _ in grouped if final}
-    return [(step, rows) for (step, final, _), rows in grouped.items() if final or step not in ended]
-
-
-def _row_form(env: Environment, names: Sequence[str], rows: Rows) -> dict[str, Any]:
-    """Return the form of a row of an episode log; what older logs have not is asked of all rows if one has it."""
-    sizes = {platform.name: platform.dimension for platform in env.platforms}
-    place = {"position": numbers(max(sizes.values()))}
-    headed = any("heading" in vars(platform.rest()) for platform in env.platforms if platform.name == names[0])
-    form: dict[str, Any] = {
-        "step": COUNT,
-        "final": FLAG,
-        "episode": COUNT,
-        "platforms": {name: place | ({"heading": MAYBE} if headed and name == names[0] else {}) for name in names},
-        "status": {},
-    }
-    known = {key for row in rows for key in row}
-    shown = {"docking_distance", "speed", "velocity_limit"}
-    if any(isinstance(row.get("status"), Mapping) and shown <= row["status"].keys() for row in rows):
-        form["status"] = dict.fromkeys(sorted(shown), MAYBE)
-    if "regions" in known:
-        form["regions"] = {OTHERS: place}
-    if "rta" in known:
-        actuators = dict.fromkeys(env.action_names, MAYBE)
-        form |= {
-            "t": NUMBER,
-            "control_desired": actuators,
-            "control_actual": actuators,
-            "margins": {constraint.name: MAYBE for constraint in env.constraints},
-            "rta": {"intervening": FLAG, "predicted_margin": MAYBE},
-            "outcome": TEXT,
-        }
-    return form
 
 
 def _agent(rows: list[dict[str, Any]]) -> str:

@@ -1,4 +1,4 @@
-"""`python -m jaxsafe.plot.safe_set env=rejoin2d rta=default`: where a filter certifies, on planes through the state space.
+"""Where a filter certifies, on planes through the state space: `python -m jaxsafe.plot.safe_set env=rejoin2d`.
 
 H(x) is the smallest h on the way of the best backup controller from x; without a horizon it is h(x) itself. A state is
 certified where H(x) ≥ margin. For docking the plane is distance against speed, for rejoin the surroundings of the lead.
@@ -7,8 +7,7 @@ certified where H(x) ≥ margin. For docking the plane is distance against speed
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 import jax
@@ -21,12 +20,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxsafe import cli
-from jaxsafe.config.arguments import Arguments
-from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.environment import Environment, reset_to
-from jaxsafe.envs import TASKS, make
-from jaxsafe.plot.style import GREY, ORANGE, labelled, length_unit, margin_unit, plain, save
+from jaxsafe.plot.style import GREY, ORANGE, labelled, length_unit, margin_unit, plain
 from jaxsafe.rta.filter import CertifiedRTA
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.cwh import Spacecraft
@@ -35,7 +30,6 @@ from jaxsafe.simulation.oriented import OrientedSpacecraft
 from jaxsafe.transition import constraint
 from jaxsafe.types import Sim
 
-OPTIONS = ("env", "rta", "x", "y", "points", "out")
 SKY, LOST = "#56B4E9", "#C9C9C9"
 SHADES = LinearSegmentedColormap.from_list("shades", [ORANGE, "white", SKY]).with_extremes(bad=LOST)
 CERTIFIED: dict[str, Any] = {"color": "black", "linewidth": 1.4}
@@ -213,47 +207,7 @@ def _entries(surveys: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> list[Any]:
     return entries
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
-    enable_compilation_cache()
-    arguments = Arguments.parse(argv)
-    task, rta, out = (arguments.pop_text(name) for name in ("env", "rta", "out"))
-    changes, points = arguments.pop_overrides(), arguments.pop_count("points", 161, least=2)
-    x, y = (_ends(arguments, name) for name in "xy")
-    arguments.refuse_rest([*OPTIONS, "env.…"])
-    if task is None:
-        raise ConfigError("env: missing; for instance env=rejoin2d")
-    rta = rta or ("default" if task in TASKS else None)  # a file may have its own
-    env = make(task, changes, rta=rta)
-    print(
-        save(
-            draw(env, f"{Path(task).stem}, rta={rta or 'of the file'}", x, y, points),
-            Path(out or f"safe_set_{Path(task).stem}.png"),
-        )
-    )
-    return 0
-
-
-def _ends(arguments: Arguments, key: str) -> Ends | None:
-    value = arguments.pop(key)
-    numbers = isinstance(value, list) and all(isinstance(one, (int, float)) for one in value)
-    if value is not None and not (numbers and len(value) == 2 and value[0] < value[1]):
-        raise ConfigError(f"{key}: expected the ends of the axis, for instance [0,150], found {value!r}")
-    return None if value is None else (float(value[0]), float(value[1]))
-
-
-def usage() -> str:
-    """The help text."""
-    return (
-        "usage: python -m jaxsafe.plot.safe_set env=TASK [key=value …]\n\n"
-        "  rta=default            the filter, one that certifies states\n"
-        "  x=[LOW,HIGH]           ends of the first axis: distance [m], or how far ahead of the lead [ft]\n"
-        "  y=[LOW,HIGH]           ends of the second axis: speed [m/s], or how far to the left of the lead [ft]\n"
-        "  points=N               states along each axis (default 161)\n"
-        "  env.PATH=VALUE         change the environment\n"
-        "  out=FILE.png           where to write (default safe_set_TASK.png)"
-    )
-
-
 if __name__ == "__main__":
-    cli.run(main, usage)
+    from jaxsafe.commands.safe_set import command
+
+    command()

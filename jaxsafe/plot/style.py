@@ -14,9 +14,8 @@ from matplotlib.patches import Circle, Rectangle
 from jaxsafe.environment import SUCCESS
 from jaxsafe.processors.constraint import Separation, SpeedLimit
 from jaxsafe.schema.dotted_paths import references
-from jaxsafe.schema.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError, printable
 from jaxsafe.storage.files import write_bytes
-from jaxsafe.streams import printable
 from jaxsafe.types import units
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxsafe import cli
+from jaxsafe.commands import cli
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema.errors import ConfigError
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxsafe.cli import INTERRUPTED
+from jaxsafe.commands.cli import INTERRUPTED
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.devices.processes import in_main_thread
 from jaxsafe.report.plan import BEST, FILM, Item, best_seed

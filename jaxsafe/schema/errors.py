@@ -10,6 +10,12 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+CONTROLS = {code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0))}
+"""How control characters are spelt out."""
+
+ALLOWED = {ord(letter): letter for letter in "\n\t"}
+"""Control characters that are part of a text."""
+
 
 class ConfigError(ValueError):
     """A value from outside is wrong: a misspelt name, a wrong type, a number out of range, a broken file."""
@@ -48,6 +54,11 @@ def _pieces(value: object, most: int) -> Iterator[str]:
         yield "a number of thousands of digits"
     else:
         yield repr(value)
+
+
+def printable(text: str) -> str:
+    """Return a text with its control characters spelt out, and what is no Unicode replaced."""
+    return text.translate(CONTROLS | ALLOWED).encode(errors="replace").decode()
 
 
 def nearest(found: object, allowed: Iterable[object]) -> str:

@@ -13,16 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-CONTROLS = {code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0))}
-"""How control characters are spelt out."""
-
-ALLOWED = {ord(letter): letter for letter in "\n\t"}
-"""Control characters that are part of a text."""
-
-
-def printable(text: str) -> str:
-    """Return a text with its control characters spelt out, and what is no Unicode replaced."""
-    return text.translate(CONTROLS | ALLOWED).encode(errors="replace").decode()
+from jaxsafe.schema.errors import ALLOWED, CONTROLS
 
 
 class LastingStream:

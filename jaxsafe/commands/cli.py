@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
+from jaxsafe.commands.streams import lasting_streams
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema import user_modules
 from jaxsafe.schema.errors import ConfigError, ConfigWarning
-from jaxsafe.streams import lasting_streams
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells expect."""

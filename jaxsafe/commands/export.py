@@ -1,0 +1,224 @@
+"""`python -m jaxsafe.export run=pretrained/docking2d format=onnx`: a policy as a file for other tools."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeGuard
+
+from jaxsafe.commands import cli
+from jaxsafe.config.arguments import Arguments
+from jaxsafe.schema.errors import ConfigError, missing, nearest
+
+if TYPE_CHECKING:
+    from jaxsafe.agents.imported_policy import ForeignPolicy
+    from jaxsafe.agents.policy_file import SavedPolicy
+    from jaxsafe.environment import Environment
+    from jaxsafe.export.functions import Exported
+
+FORMATS = ("onnx", "stablehlo", "vnnlib")
+OPTIONS = ("run", "seed", "activation", "format", "inputs", "batch", "steps", "box.FIELD", "out")
+BOX = {"position": (70.0, 106.0), "velocity": (-0.28, 0.28)}
+"""Starts of the closed-loop docking property of the verification community, in m and m/s, over 40 s."""
+
+MAX_STEPS = 2000
+"""Of the closed loop, as many as a docking episode has: each step is some 350 operators and 3 MiB while they are made."""
+
+MAX_BOUND = 1e18
+"""Of a box: squares of larger numbers are infinite in single precision, and so is every margin."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command; returns the exit code."""
+    import jax
+    import jax.numpy as jnp
+
+    from jaxsafe.commands import environment_choice
+    from jaxsafe.export import functions
+    from jaxsafe.storage.files import write_bytes
+    from jaxsafe.storage.provenance import versions
+
+    arguments = Arguments.parse(argv)
+    run, form, out = (arguments.pop_text(name) for name in ("run", "format", "out"))
+    if run is None:
+        raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
+    form = _one_of("format", form or "onnx", FORMATS)
+    saved, stem = _policy(arguments, run)
+    _require_finite(run, saved)
+    kinds = {"observation": lambda: functions.action(saved), "state": lambda: functions.control(saved)}
+    if isinstance(saved, functions.SavedPolicy):
+        kinds["network"] = lambda: functions.network(saved)
+    boxes = [word for word in arguments.options if word.startswith("box.")]
+    arguments.refuse_beside(
+        {"onnx": [], "stablehlo": ["batch"], "vnnlib": ["batch", "inputs"]}[form], f"with format={form}"
+    )
+    arguments.refuse_beside([] if form == "vnnlib" else ["steps", *boxes], "without format=vnnlib")
+    inputs = _one_of("inputs", arguments.pop_text("inputs") or "observation", [*kinds])
+    batch, steps = arguments.pop_count("batch", 1), arguments.pop_count("steps", 40, most=MAX_STEPS)
+    box = {word[4:]: arguments.pop(word) for word in boxes}
+    arguments.refuse_rest([*OPTIONS, *environment_choice.OPTIONS])
+    about = {"policy": stem, "jaxsafe": versions()["jaxsafe"]}
+    if form == "vnnlib":
+        target = Path(out or f"{stem}_closed_loop.vnnlib")
+        if target.suffix != ".vnnlib" or target.with_suffix(".onnx").resolve() == Path(run).resolve():
+            raise ConfigError(
+                f"out: expected NAME.vnnlib, for which NAME.onnx is written too and is not {run}, found {target}"
+            )
+        if not saved.env.constraints:
+            raise ConfigError("format: vnnlib asks whether a safety constraint holds, and this environment has none")
+        loops = functions.closed_loop(saved, steps, unrolled=True), functions.closed_loop(saved, steps)
+        with _with_advice(saved.env):
+            return _vnnlib(*loops, box, target, about)
+    exported = kinds[inputs]()
+    if form == "stablehlo":
+        try:
+            import flatbuffers  # noqa: F401  jax.export needs it and does not ask for it
+        except ImportError as error:
+            raise missing(error, "flatbuffers", "export") from None
+        target = Path(out or f"{stem}.stablehlo")
+        shape = jax.export.symbolic_shape(f"batch, {len(exported.inputs)}")
+        made = jax.export.export(jax.jit(exported.function))(jax.ShapeDtypeStruct(shape, jnp.float32))
+        write_bytes(target, bytes(made.serialize()))
+    else:
+        from jaxsafe.export.onnx import write_onnx
+
+        target = Path(out or f"{stem}.onnx")
+        facts = {"inputs": ", ".join(exported.inputs), "outputs": ", ".join(exported.outputs)}
+        with _with_advice(saved.env):
+            write_onnx(target, exported.function, (batch, len(exported.inputs)), {**about, **facts})
+    print(f"{target}: {', '.join(exported.inputs)} -> {', '.join(exported.outputs)}")
+    return 0
+
+
+def _policy(arguments: Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy, str]:
+    """What `run` and the options beside it mean, and the first part of the names of files."""
+    from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
+    from jaxsafe.commands.environment_choice import EnvironmentChoice, differences
+    from jaxsafe.commands.policy_source import pop_source
+    from jaxsafe.train.host import run_directory
+
+    chosen = EnvironmentChoice.pop(arguments)
+    elsewhere = pop_source(arguments, run, chosen)
+    single = is_single(run)
+    arguments.refuse_beside(["seed"] if elsewhere or single else [], f"beside {run}, which is a single policy")
+    seed = arguments.pop_seed()
+    if elsewhere:
+        return elsewhere.read(), f"{Path(run).stem}_{elsewhere.task}"
+    if not single:
+        run_directory.read(Path(run), "run")  # imports what a user's environment is made of
+        stems = [file.stem.removeprefix("seed_") for file in (Path(run) / "policy").glob("seed_*.npz")]
+        known = {int(stem) for stem in stems if stem.isdecimal()}
+        if not known:
+            raise ConfigError(f"run: {run} has no policies yet; finish it with: python -m jaxsafe.train resume={run}")
+        if seed not in known:
+            raise ConfigError(f"seed: found {seed}; choose from {', '.join(map(str, sorted(known)))}")
+    path = find_policy(run) if single else Path(run) / "policy" / f"seed_{seed}.npz"
+    saved = read_policy(path)
+    env = chosen.change(saved.env, str(saved.about.get("env", path.stem)), run)
+    if told := differences(saved.env, env):
+        print(told)
+    return saved._replace(env=env), path.stem if single else f"{Path(run).name}_{path.stem}"
+
+
+@contextmanager
+def _with_advice(env: Environment) -> Iterator[None]:
+    """Say of a filter, of which most have no counterpart in ONNX, how to leave it out."""
+    try:
+        yield
+    except ConfigError as error:
+        raise error if env.rta is None else ConfigError(f"{error}; leave run time assurance out with rta=none") from None
+
+
+def _require_finite(run: str, saved: SavedPolicy | ForeignPolicy) -> None:
+    """Refuse what a training that diverged left; in a network from elsewhere an infinite constant may be a bound."""
+    import jax
+    import numpy as np
+
+    from jaxsafe.agents.policy_file import SavedPolicy
+
+    wrong = (lambda x: ~np.isfinite(x)) if isinstance(saved, SavedPolicy) else np.isnan
+    for path, leaf in jax.tree.leaves_with_path(saved.params):
+        if wrong(np.asarray(leaf, np.float64)).any():
+            name = jax.tree_util.keystr(path, simple=True, separator="/")
+            raise ConfigError(f"{run}: {name}: not all parameters are finite numbers, so there is no policy to export")
+
+
+def _one_of(name: str, value: str, known: Sequence[str]) -> str:
+    if value not in known:
+        raise ConfigError(f"{name}: found {value!r}; choose from {nearest(value, known)}")
+    return value
+
+
+def _vnnlib(unrolled: Exported, looped: Exported, given: dict[str, object], path: Path, about: dict[str, str]) -> int:
+    """Write graph and property, and say what a search for a counterexample finds."""
+    import jax
+
+    from jaxsafe.export.onnx import write_onnx
+    from jaxsafe.export.vnnlib import search, write_vnnlib
+
+    box = _box(unrolled.inputs, given)
+    graph = write_onnx(path.with_suffix(".onnx"), unrolled.function, (1, len(unrolled.inputs)), about)
+    print(f"{graph}\n{write_vnnlib(path, unrolled, box)}", flush=True)
+    worst = search(looped, box, jax.random.key(0))
+    start = ", ".join(f"{name} {value:.4g}" for name, value in zip(looped.inputs, worst.start, strict=True))
+    found = f"no counterexample among {worst.tried:,} starts, which proves nothing" if worst.margin >= 0.0 else "violated"
+    margin = "not a number" if worst.margin == -math.inf else f"{worst.margin:.4g}"
+    print(f"least margin {margin} from {start}: {found}")
+    return 0
+
+
+def _box(names: Sequence[str], given: dict[str, object]) -> list[tuple[float, float]]:
+    """The interval of each element: by its own name, its field's, or the field's without the platform."""
+    bounds, used = {**BOX, **given}, set()
+    box = []
+    for name in names:
+        parts = name.split(".")
+        keys = [name, ".".join(parts[:2]), parts[1]]
+        key = next((key for key in keys if key in bounds), None)
+        interval = bounds.get(key) if key else None
+        if not _is_interval(interval):
+            raise ConfigError(
+                f"box.{parts[1]}: expected [low, high] for {name}, each within ±{MAX_BOUND:.0e}, found {interval!r}"
+            )
+        used.add(key)
+        box.append((float(interval[0]), float(interval[1])))
+    for key in given:
+        if key not in used:
+            raise ConfigError(f"box.{key}: the state has no such field; it has {', '.join(names)}")
+    return box
+
+
+def _is_interval(value: Any) -> TypeGuard[Sequence[float]]:
+    numbers = isinstance(value, (list, tuple)) and len(value) == 2 and all(isinstance(one, (int, float)) for one in value)
+    return numbers and -MAX_BOUND <= value[0] <= value[1] <= MAX_BOUND
+
+
+def usage() -> str:
+    """The help text."""
+    return (
+        "usage: python -m jaxsafe.export run=RUN [key=value …]\n\n"
+        "  run=RUN             a run directory, a policy file (.npz), or pretrained/TASK\n"
+        "  seed=N              which policy of a run (default 0)\n"
+        "  run=FILE env=TASK   a policy from elsewhere: .onnx, or .npz with kernel_0, bias_0, … (activation=tanh);\n"
+        "                      actions=discrete if it gives logits\n"
+        "  env=TASK|FILE.yaml  another environment of the same observation and action (default: that of the training)\n"
+        "  env.PATH=VALUE, variant=…, rta=…   change it, as in jaxsafe.evaluate\n"
+        "  format=onnx         a graph of opset 17 with a fixed batch (default); needs the extra `export`\n"
+        "  format=stablehlo    a jax.export artefact, any batch\n"
+        "  format=vnnlib       the closed loop over steps as ONNX, the property that no safety margin is negative from\n"
+        "                      any start in the box as VNN-LIB, and the worst start that a search finds\n"
+        "  inputs=observation  from the paper's observation to the action, features included (default)\n"
+        "  inputs=network      from the features to the output of the network: matrix products and tanh\n"
+        "  inputs=state        from the state at a start to the control in physical units\n"
+        "  batch=N             (default 1)\n"
+        "  steps=N             of the closed loop (default 40)\n"
+        "  box.FIELD=[a,b]     starts of the property (default position [70, 106], velocity [-0.28, 0.28])\n"
+        "  out=FILE            (default: the policy's name)"
+    )
+
+
+def command() -> None:
+    """Run the command on the words of the command line."""
+    cli.run(main, usage)
