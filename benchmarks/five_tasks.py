@@ -20,10 +20,10 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from baselines.measures import failed_seeds, wall_to
 from isolated import CACHE, words
 
 from jaxsafe.envs import TASKS
-from jaxsafe.report.measures import failed_seeds, wall_to
 from jaxsafe.storage.files import read_json, read_rows
 
 OUT = Path(__file__).parent / "results" / "five_tasks.json"

@@ -14,9 +14,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from baselines.plan import PAPER_STEPS, WITHOUT_RTA
+
 from jaxsafe.envs import TASKS
 from jaxsafe.metrics import with_interval
-from jaxsafe.report.plan import PAPER_STEPS, WITHOUT_RTA
 from jaxsafe.storage.files import write_text
 
 ROOT = Path(__file__).parent.parent

@@ -13,6 +13,12 @@ from pathlib import Path
 
 import jax
 import pytest
+from baselines import __main__ as command
+from baselines import run as running
+from baselines.measures import failed_seeds, finished, samples_per_second, steps_to, wall_to
+from baselines.page import DIRECTORY, Report, _number, _percent, _rate
+from baselines.plan import KINDS, SHIPPED, Item, best_seed, plan
+from baselines.record import keep, kept
 from tiny import TINY
 
 from jaxsafe.commands import evaluate as evaluate
@@ -20,12 +26,6 @@ from jaxsafe.commands import train as train
 from jaxsafe.config import override
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.envs import TASKS
-from jaxsafe.report import __main__ as command
-from jaxsafe.report import run as running
-from jaxsafe.report.measures import failed_seeds, finished, samples_per_second, steps_to, wall_to
-from jaxsafe.report.page import DIRECTORY, Report, _number, _percent, _rate
-from jaxsafe.report.plan import KINDS, SHIPPED, Item, best_seed, plan
-from jaxsafe.report.record import keep, kept
 from jaxsafe.rollout import reset_batch
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.host import run_directory
@@ -55,7 +55,7 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
     words = ["tasks=docking2d", "kinds=features", "policies=best", *REST]
     assert command.main(words) == 0
     page = Path("report/baselines.md").read_text()
-    assert f"`python -m jaxsafe.report {shlex.join(words)}`" in page
+    assert f"`python benchmarks/baselines {shlex.join(words)}`" in page
     for section in (
         "Interaction efficiency",
         "After training",
@@ -104,7 +104,7 @@ def test_a_report_in_parts_makes_the_page_of_one(calls: list[list[str]], capsys:
         assert command.main([*words, f"kinds={kind}", "out=parts"]) == 0
     parts = Path("parts/baselines.md").read_text()
     assert [line for line in whole.splitlines() if "|" in line] == [line for line in parts.splitlines() if "|" in line]
-    assert parts.count("- `python -m jaxsafe.report") == 2
+    assert parts.count("- `python benchmarks/baselines") == 2
     assert sum(module == "jaxsafe.train" for module, *_ in calls) == 2
 
     record = Path("parts/baselines/docking2d-features.json")
@@ -143,7 +143,7 @@ def test_a_record_is_of_the_commit_that_trained_it(calls: list[list[str]], monke
     for now, trained in (("first", "first"), ("second", "first")):
         monkeypatch.setattr(run_directory, "commit", lambda now=now: now)
         assert command.main(words) == 0
-        assert f"`python -m jaxsafe.report {shlex.join(words)}` on commit {trained}: docking2d-plain" in (
+        assert f"`python benchmarks/baselines {shlex.join(words)}` on commit {trained}: docking2d-plain" in (
             Path("report/baselines.md").read_text()
         )
     assert len(calls) == 1
@@ -203,7 +203,7 @@ def test_a_broken_record_is_left_out_with_a_line_that_says_so(
 ) -> None:
     [item] = plan(["docking2d"], ["plain"], REST)
     shutil.copytree(whole, "run")
-    keep(item, Path("run"), Path("report"), "python -m jaxsafe.report")
+    keep(item, Path("run"), Path("report"), "python benchmarks/baselines")
     assert len(kept([item], Path("report"))[0]) == 1
     path = Path("report", f"{item.name}{file}")
     text, count = re.subn(old, lambda _: new, path.read_text(), count=1)

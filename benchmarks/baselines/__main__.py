@@ -1,8 +1,9 @@
-"""`python -m jaxsafe.report`: train and evaluate the baselines, and write the page with their tables and figures."""
+"""`python benchmarks/baselines`: train and evaluate the baselines, and write the page with their tables and figures."""
 
 from __future__ import annotations
 
 import shlex
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,17 +12,19 @@ from jaxsafe.commands import cli
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema.errors import ConfigError
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the package of this file is imported by its name
+
 SEEDS = 10
 """Of every training, unless the user says otherwise."""
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns the exit code."""
+    from baselines.page import DIRECTORY, Report
+    from baselines.plan import BEST, KINDS, plan
+    from baselines.record import keep, kept
+    from baselines.run import evaluate, train
     from jaxsafe.envs import TASKS
-    from jaxsafe.report.page import DIRECTORY, Report
-    from jaxsafe.report.plan import BEST, KINDS, plan
-    from jaxsafe.report.record import keep, kept
-    from jaxsafe.report.run import evaluate, train
     from jaxsafe.storage.files import write_bytes
     from jaxsafe.train.host.options import resolve
 
@@ -34,7 +37,7 @@ def main(argv: Sequence[str]) -> int:
     rest = rest if "seeds" in arguments.options else [f"seeds={SEEDS}", *rest]
     items = plan(tasks, kinds, rest)
     episodes = [resolve(Arguments.parse(item.words))[0].episodes for item in items]  # errors before anything is done
-    command = f"python -m jaxsafe.report {shlex.join(argv)}".rstrip()
+    command = f"python benchmarks/baselines {shlex.join(argv)}".rstrip()
     try:
         for item, count in zip(items, episodes, strict=True):
             run = train(item, runs)
@@ -62,10 +65,10 @@ def _names(option: str, value: Any, known: Sequence[str]) -> list[str]:
 
 def usage() -> str:
     """The help text."""
-    from jaxsafe.report.plan import KINDS
+    from baselines.plan import KINDS
 
     return (
-        "usage: python -m jaxsafe.report [key=value …]\n\n"
+        "usage: python benchmarks/baselines [key=value …]\n\n"
         "  trains every task in every way with ten seeds, evaluates, and writes OUT/baselines.md; takes hours.\n"
         "  May be done in parts: the page has also what was reported into OUT before, with the same options.\n\n"
         "  tasks=[docking2d,…]    some tasks only\n"

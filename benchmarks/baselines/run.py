@@ -11,10 +11,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from baselines.plan import BEST, FILM, Item, best_seed
 from jaxsafe.commands.cli import INTERRUPTED
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.devices.processes import in_main_thread
-from jaxsafe.report.plan import BEST, FILM, Item, best_seed
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import read_json, write_bytes
 from jaxsafe.train.host.options import resolve

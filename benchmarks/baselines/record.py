@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxsafe.report.plan import Item
-from jaxsafe.report.run import FILM_FILE, answers, options_of
+from baselines.plan import Item
+from baselines.run import FILM_FILE, answers, options_of
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import finite, read_csv, read_json, write_bytes, write_csv, write_json
 from jaxsafe.storage.forms import MAYBE, NULL, OTHERS, TEXT, check

@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from baselines.measures import failed_seeds, finished, samples_per_second, steps_to, wall_to
+from baselines.plan import CERTIFIED_STARTS, FILM, KINDS, PAPER_STEPS, SHIPPED, WITH_RTA, WITHOUT_RTA, best_seed
+from baselines.record import Record
 from jaxsafe.envs import TASKS
 from jaxsafe.metrics import ENOUGH_EPISODES, stratified_iqm, with_interval
 from jaxsafe.plot.compare import compare_curves, seed_curves
 from jaxsafe.plot.style import save
-from jaxsafe.report.measures import failed_seeds, finished, samples_per_second, steps_to, wall_to
-from jaxsafe.report.plan import CERTIFIED_STARTS, FILM, KINDS, PAPER_STEPS, SHIPPED, WITH_RTA, WITHOUT_RTA, best_seed
-from jaxsafe.report.record import Record
 from jaxsafe.storage.files import write_text
 from jaxsafe.train.host.results import known, least
 from jaxsafe.train.recent_episodes import SIZE as WINDOW
