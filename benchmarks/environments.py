@@ -116,6 +116,11 @@ def usual_way(num_envs: int, repeats: int) -> dict[str, Any]:
 
 def gymnax(name: str, num_envs: int, repeats: int, one_action: bool = False) -> dict[str, Any]:
     """An environment of gymnax, which resets by itself."""
+    return compiled(gymnax_steps(name, one_action), num_envs, repeats)
+
+
+def gymnax_steps(name: str, one_action: bool = False) -> Callable[[jax.Array, int, int], jax.Array]:
+    """Steps of gymnax's environment as `episode_steps` takes them of ours: of a key, environments and steps."""
     env, params = importlib.import_module("gymnax").make(name)
     space = env.action_space(params)
 
@@ -137,7 +142,7 @@ def gymnax(name: str, num_envs: int, repeats: int, one_action: bool = False) -> 
         _, state = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(key, num_envs), params)
         return jnp.sum(jax.lax.scan(one, state, jax.random.split(key, num_steps))[1])
 
-    return compiled(run, num_envs, repeats)
+    return run
 
 
 def brax(num_envs: int, repeats: int) -> dict[str, Any]:

@@ -80,24 +80,24 @@ def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
     return seeds * UPDATES * BATCH / (time.perf_counter() - start)
 
 
-def our_programs(task: str, seeds: int, updates: int) -> tuple[Any, Any, Any, Any]:
+def our_programs(task: str, seeds: int, updates: int, num_envs: int = NUM_ENVS) -> tuple[Any, Any, Any, Any]:
     """The fresh state and some updates of our PPO, and what both take: keys, and what all seeds share."""
     from jaxsafe.devices.seed_mapper import SeedMapper
     from jaxsafe.train.train import programs
 
-    config, env = settings(task)
+    config, env = settings(task, num_envs)
     mapper = SeedMapper(seeds, config.shares)
     shared = mapper.replicate((env, config.agent, config.ppo))
     return *programs(mapper, updates, config.num_updates), mapper.keys(0), shared
 
 
-def settings(task: str) -> tuple[Any, Any]:
+def settings(task: str, num_envs: int = NUM_ENVS) -> tuple[Any, Any]:
     """The configuration of our PPO, and the environment."""
     from jaxsafe.config.arguments import Arguments
     from jaxsafe.train.host.options import resolve
 
-    sizes = {"num_envs": NUM_ENVS, "num_steps": NUM_STEPS, "num_epochs": NUM_EPOCHS, "num_minibatches": NUM_MINIBATCHES}
-    words = [f"env={task}", "preset=plain", f"agent.hidden={list(HIDDEN)}", f"steps={10 * UPDATES * BATCH}"]
+    sizes = {"num_envs": num_envs, "num_steps": NUM_STEPS, "num_epochs": NUM_EPOCHS, "num_minibatches": NUM_MINIBATCHES}
+    words = [f"env={task}", "preset=plain", f"agent.hidden={list(HIDDEN)}", f"steps={10 * UPDATES * num_envs * NUM_STEPS}"]
     config, env, _ = resolve(Arguments.parse([*words, *(f"ppo.{key}={value}" for key, value in sizes.items())]))
     return config, env
 
@@ -146,14 +146,21 @@ def networks_only(task: str) -> float:
 def usual_way(task: str) -> float:
     """`usual_ppo.py`, one seed."""
     import jax
+
+    run, start = usual_program(task)
+    return timed(jax.jit(run), start(jax.random.key(0)))
+
+
+def usual_program(task: str, num_envs: int = NUM_ENVS) -> tuple[Callable, Callable]:
+    """Some updates of `usual_ppo.py` from what its start, of a key, returns."""
+    import jax
     import usual_ppo
 
     import jaxsafe
 
     env = jaxsafe.make(task)
     update = lambda carry, _: (usual_ppo.update(env, NUM_STEPS, NUM_EPOCHS, NUM_MINIBATCHES, carry), None)  # noqa: E731
-    start = usual_ppo.init(env, HIDDEN, NUM_ENVS, jax.random.key(0))
-    return timed(jax.jit(lambda carry: jax.lax.scan(update, carry, None, UPDATES)), start)
+    return lambda carry: jax.lax.scan(update, carry, None, UPDATES), partial(usual_ppo.init, env, HIDDEN, num_envs)
 
 
 def timed(run: Callable, start: Any) -> float:
@@ -173,17 +180,17 @@ def rejax(task: str) -> float:
     return timed(rejax_trainer(task, UPDATES), jax.random.PRNGKey(0))
 
 
-def rejax_trainer(task: str, updates: int) -> Any:
+def rejax_trainer(task: str, updates: int, num_envs: int = NUM_ENVS) -> Any:
     """Some updates from a key, to be compiled."""
     import jax
     from rejax import PPO  # pyright: ignore[reportMissingImports]
 
     from jaxsafe.adapters.gymnax import GymnaxEnv
 
-    env = GymnaxEnv(task, legacy=True)
+    env, steps = GymnaxEnv(task, legacy=True), updates * num_envs * NUM_STEPS
     algorithm = PPO.create(
-        env=env, env_params=env.default_params, total_timesteps=updates * BATCH, eval_freq=updates * BATCH,
-        skip_initial_evaluation=True, num_envs=NUM_ENVS, num_steps=NUM_STEPS,
+        env=env, env_params=env.default_params, total_timesteps=steps, eval_freq=steps,
+        skip_initial_evaluation=True, num_envs=num_envs, num_steps=NUM_STEPS,
         num_epochs=NUM_EPOCHS, num_minibatches=NUM_MINIBATCHES, learning_rate=3e-4,
         agent_kwargs={"hidden_layer_sizes": HIDDEN, "activation": "tanh"},
     )  # fmt: skip

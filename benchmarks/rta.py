@@ -75,36 +75,42 @@ def calls(repeats: int) -> list[dict[str, Any]]:
     for task, presets in PRESETS.items():
         for preset in (name for name in presets if name != "default"):
             env = jaxsafe.make(task, rta=preset)
-            seconds, first = timed(functools.partial(_filter, env, *met(env)), repeats)
+            seconds, first = timed(functools.partial(filter_batch, env, *met(env)), repeats)
             rows.append({"task": task, "filter": preset, "calls_per_s": BATCH / seconds, "compile_s": first - seconds})
             print(rows[-1], flush=True)
     return rows + cbfpy_calls(repeats) + run_time_assurance_calls(repeats)
 
 
 @jax.jit
-def _filter(env: Any, sims: Any, memories: Any, desired: Any) -> Any:
+def filter_batch(env: Any, sims: Any, memories: Any, desired: Any) -> Any:
+    """What the filter of an environment lets act, in each of a batch of simulations."""
     return jax.vmap(functools.partial(env.rta.filter, env))(sims, memories, desired)
 
 
-def met(env: jaxsafe.Environment) -> tuple[Any, Any, jax.Array]:
+def memories(env: jaxsafe.Environment, sims: Any) -> Any:
+    """What the filter of an environment remembers at the start of an episode, for each simulation; None without one."""
+    rta = env.rta
+    return None if rta is None else jax.jit(jax.vmap(lambda sim: rta.begin(env, sim)[0]))(sims)
+
+
+def met(env: jaxsafe.Environment, batch: int = BATCH) -> tuple[Any, Any, jax.Array]:
     """Simulations after 100 steps of random actions without a filter, the filter's memories, and random controls."""
-    size, (low, high), rta = env.action_size, bounds(env), env.rta
+    size, (low, high) = env.action_size, bounds(env)
 
     @jax.jit
     def run(env: Any, key: jax.Array) -> Any:
-        state, timestep = reset_batch(env, key, BATCH)
+        state, timestep = reset_batch(env, key, batch)
 
         def one(carry: Any, key: jax.Array) -> tuple[Any, None]:
             key_action, key_reset = jax.random.split(key)
-            action = jax.random.uniform(key_action, (BATCH, size), minval=-1.0)
+            action = jax.random.uniform(key_action, (batch, size), minval=-1.0)
             return step_or_reset_batch(env, carry[0], action, key_reset)[0], None
 
         return jax.lax.scan(one, (state, timestep.observation), jax.random.split(key, 100))[0][0]
 
-    desired = low + (high - low) * jax.random.uniform(jax.random.key(1), (BATCH, size))
+    desired = low + (high - low) * jax.random.uniform(jax.random.key(1), (batch, size))
     sims = run(override(env, {"rta": None}), jax.random.key(0)).sim
-    memories = None if rta is None else jax.jit(jax.vmap(lambda sim: rta.begin(env, sim)[0]))(sims)
-    return jax.block_until_ready((sims, memories, desired))
+    return jax.block_until_ready((sims, memories(env, sims), desired))
 
 
 def docking_states() -> tuple[jax.Array, jax.Array]:

@@ -393,6 +393,88 @@ def goals(_: Found) -> str:
     return markdown(["ratio", "goal", "more", "reached"], rows)
 
 
+def accelerator_tables(found: Found) -> list[str]:
+    """All tables of `accelerator.py` of which there are rows."""
+    makers = {
+        "numbers": accelerator_numbers,
+        "environments": accelerator_environments,
+        "ppo": accelerator_ppo,
+        "learning": accelerator_learning,
+        "filters": accelerator_filters,
+    }
+    return [make(found) for part, make in makers.items() if found["parts"].get(part, {}).get("rows")]
+
+
+def accelerator_numbers(found: Found) -> str:
+    """How many tests passed."""
+    counts = next((row for row in found["parts"]["numbers"]["rows"] if "test" not in row), {})
+    kinds = ("passed", "failed", "error", "skipped")
+    return markdown(["tests of numbers on the accelerator", *kinds], [["", *(str(counts.get(kind, 0)) for kind in kinds)]])
+
+
+def accelerator_environments(found: Found) -> str:
+    """Million steps a second, medians; compile time and memory of the largest batch."""
+    rows = found["parts"]["environments"]["rows"]
+    sizes = sorted({row["environments"] for row in rows})
+    rates = {(row["task"], row["environments"]): _three(row["steps_per_s"] / 1e6) for row in rows}
+    lines = []
+    for task in sorted({row["task"] for row in rows}, key=list(ENVIRONMENTS).index):
+        largest = max((row for row in rows if row["task"] == task), key=lambda row: row["environments"])
+        cells = [rates.get((task, size), "–") for size in sizes]
+        lines.append([ENVIRONMENTS[task], *cells, *_program(largest)])
+    heads = ["million steps/s on the accelerator at … environments", *(f"{size:,}" for size in sizes)]
+    return markdown([*heads, *PROGRAM], lines)
+
+
+def accelerator_ppo(found: Found) -> str:
+    """Million samples a second, medians; compile time and memory of the first column."""
+    rows = found["parts"]["ppo"]["rows"]
+    columns = [*dict.fromkeys((row["environments"], row["seeds"]) for row in rows)]
+    lines = []
+    for peer in dict.fromkeys(row["peer"] for row in rows):
+        mine = {(row["environments"], row["seeds"]): row for row in rows if row["peer"] == peer}
+        cells = [_three(mine[column]["samples_per_s"] / 1e6) if column in mine else "–" for column in columns]
+        lines.append([peer, *cells, *_program(next(iter(mine.values())))])
+    heads = [f"{seeds} seed{'s' * (seeds > 1)} × {size:,}" for size, seeds in columns]
+    return markdown(["million samples/s on the accelerator, seeds × environments", *heads, *PROGRAM], lines)
+
+
+def accelerator_learning(found: Found) -> str:
+    """Seconds until the average over seeds reached the level, and how far each seed was by then."""
+    lines = []
+    for row in found["parts"]["learning"]["rows"]:
+        each = [seconds for seconds in row["each_seed"] if seconds is not None]
+        lines.append([
+            row["task"], f"{row['seeds']} × {row['environments']:,}",
+            f"{row['seconds']:.2g}" if row["reached"] else f"not in {row['seconds']:.0f}",
+            f"{row['steps']:,}", f"{_three(row['samples_per_s'] / 1e6)}", f"{len(each)}", *_program(row),
+        ])  # fmt: skip
+    heads = ["95 % in training on the accelerator", "seeds × environments", "s", "steps a seed", "million samples/s"]
+    return markdown([*heads, "seeds at 95 % by then", *PROGRAM], lines)
+
+
+def accelerator_filters(found: Found) -> str:
+    """Calls a second, medians."""
+    rows = found["parts"]["filters"]["rows"]
+    rates = {(row["filter"], row["batch"], row["task"]): _scale(row["calls_per_s"]) for row in rows}
+    tasks = [task for task in TASKS if any(row["task"] == task for row in rows)]
+    lines = [
+        [f"`{name}`", f"{batch:,}", *(rates.get((name, batch, task), "") for task in tasks)]
+        for name, batch in dict.fromkeys((row["filter"], row["batch"]) for row in rows)
+    ]
+    return markdown(["filter calls/s on the accelerator", "batch", *tasks], lines)
+
+
+PROGRAM = ("compile [s]", "memory [MiB]")
+"""Columns of `_program`."""
+
+
+def _program(row: Found) -> list[str]:
+    """What compiling took beside other programs, and the memory that the program needs for intermediate results."""
+    memory = row["temporary_bytes"]
+    return [f"{row['compile_s']:.2g}", "–" if memory is None else f"{memory / 2**20:.0f}"]
+
+
 TABLES: Sequence[tuple[str, Callable[[Found], str], str]] = (
     ("environments", environments, "docs/performance.md"),
     ("environments", readme_environments, "README.md"),

@@ -1,5 +1,9 @@
 """The tables in the pages are those of the results in the repository."""
 
+import importlib
+import json
+import re
+import sys
 from pathlib import Path
 from types import ModuleType
 
@@ -53,3 +57,46 @@ def test_a_missed_goal_is_bold(tables: ModuleType, values: list[float], goal: fl
 def test_a_rounded_value_never_looks_as_if_it_reached_the_goal(tables: ModuleType) -> None:
     assert tables._reached([1.596], 1.6) == "**1.596**"
     assert tables._reached([2.96], 3.0) == "**2.96**"
+
+
+@pytest.fixture
+def accelerator(tables: ModuleType) -> ModuleType:
+    del tables  # which puts the benchmarks on the path
+    return importlib.import_module("accelerator")
+
+
+def test_the_accelerator_script_measures_and_says_what_it_skips(
+    accelerator: ModuleType, tables: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "accelerator.json"
+    words = ["minutes=3", "parts=environments", "tasks=docking2d", "sizes=1,8", "repeats=1", f"out={out}"]
+    monkeypatch.setattr(sys, "argv", ["accelerator.py", *words])
+    accelerator.main()
+    content = json.loads(out.read_text())
+    found = content["parts"]["environments"]
+    measured = {row["environments"]: row["steps_per_s"] for row in found["rows"] if row["task"] == "docking2d"}
+    assert set(measured) == {1, 8}
+    assert all(rate > 0 for rate in measured.values())
+    assert all("Pendulum" in reason for reason in found["skipped"])
+    assert any(line.startswith("| docking2d |") for line in tables.accelerator_environments(content).splitlines())
+
+
+def test_what_the_accelerator_script_has_no_time_for_is_named(
+    accelerator: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "accelerator.json"
+    monkeypatch.setattr(accelerator, "GRACE", 0.0)
+    monkeypatch.setattr(sys, "argv", ["accelerator.py", "minutes=0", "parts=learning", f"out={out}"])
+    accelerator.main()
+    assert json.loads(out.read_text())["parts"]["learning"] == {
+        "seconds": pytest.approx(0.0, abs=30.0),
+        "rows": [],
+        "skipped": ["learning: the rest, out of time"],
+    }
+
+
+def test_the_tests_of_the_accelerator_script_are_there(accelerator: ModuleType) -> None:
+    for test in accelerator.TESTS:
+        file, _, name = test.partition("::")
+        text = (ROOT / file).read_text(encoding="utf-8")
+        assert not name or re.search(rf"^def {name}\(", text, re.M), test

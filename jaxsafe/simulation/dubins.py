@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsafe.devices.backend import accelerated
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.controllers import Controls
 from jaxsafe.simulation.geometry import direction, rotation
@@ -152,7 +153,8 @@ class Dubins3D(Platform, type="dubins3d"):
         # A loop, not four copies: it keeps what it computed for one piece, where XLA would compute it again for each use.
         still = jnp.zeros_like(state.heading)
         start = (state.heading, still, still, still)
-        (heading, *moved), _ = jax.lax.scan(lambda carry, span: (self._fly(ramps, carry, span), None), start, spans)
+        one_piece = lambda carry, span: (self._fly(ramps, carry, span), None)  # noqa: E731
+        (heading, *moved), _ = jax.lax.scan(one_piece, start, spans, unroll=accelerated())
         return self._arrived(state, ramps, dt, heading, moved)
 
     def step_within_limits(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Dubins3DState:

@@ -21,6 +21,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.agents.agent import Agent, Params
+from jaxsafe.devices.backend import accelerated, packing, scan_packed
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment
 from jaxsafe.metrics import Episode, accumulate, begin
@@ -233,7 +234,8 @@ def collect(
         ), transition
 
     start = (state.env_state, state.observation, state.episode)
-    end, transitions = jax.lax.scan(one_step, start, jax.random.split(key, ppo.num_steps))
+    scan = scan_packed if accelerated() else jax.lax.scan
+    end, transitions = scan(one_step, start, jax.random.split(key, ppo.num_steps))
     return state.replace(env_state=end[0], observation=end[1], episode=end[2]), transitions
 
 
@@ -274,6 +276,7 @@ def learn(
     shard: Shard = WHOLE,
 ) -> tuple[Params, optax.OptState]:
     """Some epochs of minibatch steps, each epoch over a new shuffle of the batch."""
+    pack, unpack = packing(state.params)
 
     def gradient(params: Params, rows: Array) -> Params:
         return jax.grad(loss)(params, env, agent, ppo, jax.tree.map(lambda x: x[rows], batch))
@@ -288,16 +291,18 @@ def learn(
 
     def minibatch_step(carry: tuple[Params, optax.OptState], rows: Array) -> tuple[tuple[Params, optax.OptState], None]:
         params, optimizer = carry
-        gradient = shard.mean(mean_gradient(params, shard.own(rows)))
+        gradient = shard.mean(mean_gradient(unpack(params), shard.own(rows)))
         with jax.numpy_dtype_promotion("standard"):  # Adam of optax raises a float to a whole number
             step, optimizer = _optimizer(ppo).update(gradient, optimizer)
-        return (jax.tree.map(lambda p, s: p - step_size * s, params, step), optimizer), None
+        return (jax.tree.map(lambda p, s: p - step_size * s, params, pack(step)), optimizer), None
 
     def epoch(carry: tuple[Params, optax.OptState], key: Key) -> tuple[tuple[Params, optax.OptState], None]:
         rows = shuffle(key, ppo.batch_size).reshape(ppo.num_minibatches, -1)
         return jax.lax.scan(minibatch_step, carry, rows)
 
-    return jax.lax.scan(epoch, (state.params, state.optimizer), jax.random.split(key, ppo.num_epochs))[0]
+    start = (pack(state.params), state.optimizer)
+    params, optimizer = jax.lax.scan(epoch, start, jax.random.split(key, ppo.num_epochs))[0]
+    return unpack(params), optimizer
 
 
 def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch) -> Array:
@@ -346,7 +351,7 @@ def _in_chunks(critic: Callable[[Array], Array], seen: Float[Array, "t n c"]) ->
 
 def _num_chunks(samples: int) -> int:
     """In how many parts samples go through the networks."""
-    return 1 if jax.default_backend() != "cpu" or samples % CHUNK else max(1, samples // CHUNK)
+    return 1 if accelerated() or samples % CHUNK else max(1, samples // CHUNK)
 
 
 def _optimizer(ppo: PPO) -> optax.GradientTransformation:

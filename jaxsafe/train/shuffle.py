@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
+from jaxsafe.devices.backend import accelerated
 from jaxsafe.types import Key
 
 ROUNDS = 24
@@ -28,7 +29,7 @@ def shuffle(key: Key, size: int) -> Int[Array, " size"]:
         swap = _hash(jnp.maximum(order, partner).astype(jnp.uint32) ^ salt) >> 31 == 1
         return jnp.where(swap, partner, order), None
 
-    return jax.lax.scan(swap_or_not, jnp.arange(size, dtype=jnp.int32), (offsets, salts))[0]
+    return jax.lax.scan(swap_or_not, jnp.arange(size, dtype=jnp.int32), (offsets, salts), unroll=accelerated())[0]
 
 
 def _hash(x: Array) -> Array:

@@ -1,0 +1,471 @@
+"""What is a GPU worth to jaxsafe? Everything that one is needed for, measured by one command within ten minutes.
+
+The parts, the most important first. Each is a process of its own with a share of the time; what a part does not use goes to
+those after it, and what it has no time for is named in the results and on standard error.
+
+- `numbers`: tests of numbers on this device. Recorded steps and episodes in double precision, laws of the tasks, run time
+  assurance, and a training that goes on from a checkpoint.
+- `environments`: steps a second of the five tasks and of gymnax's Pendulum-v1, with random actions and automatic reset.
+- `ppo`: samples a second of PPO with the settings of `ppo.py`, beside rejax where it runs and `usual_ppo.py`.
+- `learning`: seconds until ten seeds of each task have 95 % success in training, by the recipe with the most environments.
+- `filters`: calls a second of the filters of `make(…, rta=…)`.
+
+Every row also has the seconds that its programs took to compile, beside those of other rows on as many threads as there are
+cores, and the memory that they need. Rows are written to `benchmarks/results/accelerator.json` as they are found, so a run
+that is stopped keeps what it has. On a CPU the sizes are small and say little; they are there so that the script is tested.
+
+    python benchmarks/accelerator.py [minutes=10] [parts=numbers,environments,…] [tasks=docking3d,…] [sizes=1,1024,…]
+        [seeds=10] [repeats=3] [out=FILE]
+
+`sizes` are the numbers of environments of `environments`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import re
+import signal
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from functools import partial
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from isolated import several, words
+from machine import usable_cores
+
+from jaxsafe.envs import TASKS
+
+HERE = Path(__file__).parent
+OUT = HERE / "results" / "accelerator.json"
+LEVEL = 0.95
+PEER = "gymnax:Pendulum-v1"
+
+
+class Sizes(NamedTuple):
+    """How large the measurements are on a kind of device."""
+
+    environments: str
+    ppo: Sequence[int]  # environments
+    filters: Sequence[int]  # states in a batch
+
+
+ACCELERATOR = Sizes("1,1024,16384,262144,1048576", ppo=(2048, 32768), filters=(4096, 65536))
+"""For PPO: as many environments as in `ppo.py`, and as many as an accelerator has room for."""
+
+CPU = Sizes("1,64,1024", ppo=(64,), filters=(64,))
+
+STEPS = 1000
+"""Steps of each environment in one measurement, so that resets have their share."""
+
+FEWER_STEPS_FROM = 2**17
+"""With so many environments a quarter of the steps take long enough to be measured."""
+
+COMPILING = 0.6
+"""The share of a part's time after which programs that are not compiled yet are skipped."""
+
+GRACE = 5.0
+"""Seconds beyond its time after which a part is ended."""
+
+TESTS = (
+    "tests/test_golden.py",
+    "tests/test_train.py::test_a_crashed_run_resumes_to_the_same_end",
+    "tests/test_rta.py::test_no_adversary_breaks_the_filter",
+    "tests/test_rta.py::test_a_control_that_is_certified_passes_unaltered",
+    "tests/test_rta.py::test_what_is_not_a_number_never_reaches_the_plant",
+    "tests/test_rta.py::test_in_float32_every_projection_is_certified",
+    "tests/test_seeds.py::test_a_seed_is_to_rounding_the_same_run_under_vmap",
+    "tests/test_suite.py::test_everything_stays_finite",
+    "tests/test_suite.py::test_everything_stays_finite_at_the_edges_of_space",
+    "tests/test_suite.py::test_limits_are_reached_and_never_exceeded",
+    "tests/test_suite.py::test_the_terms_sum_to_the_reward_and_to_the_totals",
+    "tests/test_suite.py::test_cost_is_one_exactly_where_a_margin_is_negative",
+    "tests/test_suite.py::test_at_most_one_outcome_ends_an_episode",
+    "tests/test_suite.py::test_planar_docking_is_spatial_docking_with_z_zero",
+    "tests/test_suite.py::test_planar_rejoin_is_spatial_rejoin_in_straight_level_flight",
+    "tests/test_suite.py::test_the_same_key_and_actions_give_the_same_bits",
+    "tests/test_suite.py::test_derivatives_of_a_return_are_those_of_finite_differences",
+    "tests/test_cwh.py",
+    "tests/test_dubins.py",
+    "tests/test_oriented.py",
+    "tests/test_trig.py",
+    "tests/test_shuffle.py",
+    "tests/test_ppo.py",
+)
+"""Those of `numbers`, the most telling first."""
+
+WORKERS = 8
+"""Processes that run tests side by side, where pytest-xdist is installed and there are as many cores."""
+
+
+class Request(NamedTuple):
+    """What a part is asked for."""
+
+    until: float  # on the monotonic clock
+    tasks: Sequence[str]
+    sizes: Sequence[int]
+    seeds: int
+    repeats: int
+
+    @property
+    def left(self) -> float:
+        """Seconds that are left."""
+        return self.until - time.monotonic()
+
+
+class Job(NamedTuple):
+    """One row to be measured."""
+
+    row: dict[str, Any]
+    prepare: Callable[[], Any]  # compiles on a thread; the function that is measured, which takes a number to begin from
+    measure: Callable[[Any, Request], dict[str, Any]]  # what a row says beside that
+
+
+def main() -> None:
+    """Run, write, print."""
+    options = words(
+        minutes="10",
+        parts=",".join(PARTS),
+        tasks=",".join(TASKS),
+        sizes="",
+        seeds="10",
+        repeats="3",
+        out=str(OUT),
+        seconds="",
+    )
+    chosen, tasks = several("parts", options["parts"], PARTS), several("tasks", options["tasks"], TASKS)
+    if "probe" in options:
+        probe(options, tasks)
+        return
+    inherited = dict(os.environ)
+    os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"  # this process computes nothing
+    import jax
+    import tables
+    from machine import about
+
+    until = time.monotonic() + 60.0 * float(options["minutes"])
+    options["sizes"] = options["sizes"] or sizes_here().environments
+    content: dict[str, Any] = {
+        **about(),
+        "platform": jax.default_backend(),
+        "minutes": float(options["minutes"]),
+        "parts": {},
+    }
+    out = Path(options["out"])
+    out.parent.mkdir(parents=True, exist_ok=True)
+    for i, name in enumerate(chosen):
+        share = PARTS[name].share / sum(PARTS[later].share for later in chosen[i:])
+        part = content["parts"][name] = {"seconds": 0.0, "rows": [], "skipped": []}
+        begin = time.monotonic()
+        for row in rows_of(name, options, max(share * (until - begin), 0.0), inherited):
+            print(f"{name}: {json.dumps(row)}", file=sys.stderr, flush=True)
+            part["skipped" if "skipped" in row else "rows"].append(row.get("skipped", row))
+            part["seconds"] = round(time.monotonic() - begin, 1)
+            out.write_text(json.dumps(content, indent=1) + "\n")
+    for table in tables.accelerator_tables(content):
+        print(f"{table}\n")
+
+
+def rows_of(name: str, options: dict[str, str], seconds: float, environment: dict[str, str]) -> Iterator[dict[str, Any]]:
+    """Run a part in a process of its own, and return its rows as it prints them; a last row says why it ended early."""
+    asked = [f"{key}={options[key]}" for key in ("tasks", "sizes", "seeds", "repeats")]
+    command = [sys.executable, __file__, f"probe={name}", f"seconds={seconds}", *asked]
+    with tempfile.TemporaryFile("w+") as errors:
+        with subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=errors, text=True, start_new_session=True, env=environment
+        ) as process:
+            overdue = threading.Timer(seconds + GRACE, os.killpg, (process.pid, signal.SIGKILL))
+            overdue.start()
+            for line in process.stdout or ():
+                if line.startswith("{"):
+                    yield json.loads(line)
+        overdue.cancel()
+        errors.seek(0)
+        said = errors.read()
+    sys.stderr.write(said)
+    if process.returncode == -signal.SIGKILL:
+        yield {"skipped": f"{name}: the rest, out of time"}
+    elif process.returncode:
+        yield {"skipped": f"{name}: the rest, exit code {process.returncode}: {said[-1500:]}"}
+
+
+def probe(options: dict[str, str], tasks: Sequence[str]) -> None:
+    """Measure one part and print its rows."""
+    until = time.monotonic() + float(options["seconds"])
+    sizes = [int(size) for size in options["sizes"].split(",")]
+    request = Request(until, tasks, sizes, int(options["seeds"]), int(options["repeats"]))
+    for row in PARTS[options["probe"]].run(request):
+        print(json.dumps(row), flush=True)
+    sys.stderr.flush()
+    os._exit(0)  # without waiting for programs that still compile
+
+
+def numbers(request: Request) -> Iterator[dict[str, Any]]:
+    """Test by test, whether it passed."""
+    command = [sys.executable, "-m", "pytest", "-v", "--tb=short", "-rN", "-p", "no:cacheprovider", *TESTS]
+    workers = min(WORKERS, usable_cores())
+    if workers > 2 and importlib.util.find_spec("xdist"):
+        command += ["-n", str(workers)]
+    environment = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false", "XLA_FLAGS": os.environ.get("XLA_FLAGS", " ")}
+    counts: dict[str, int] = {}
+    with subprocess.Popen(
+        command, cwd=HERE.parent, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        overdue = threading.Timer(max(request.left, 0.0), process.terminate)
+        overdue.start()
+        for line in process.stdout or ():
+            print(line, end="", file=sys.stderr)
+            outcome, name = re.search(r"\b(PASSED|FAILED|ERROR|SKIPPED)\b", line), re.search(r"tests/\S+::\S+", line)
+            if outcome and name:
+                counts[outcome.group()] = counts.get(outcome.group(), 0) + 1
+                if outcome.group() in ("FAILED", "ERROR"):
+                    yield {"test": name.group(), "outcome": outcome.group().lower()}
+    overdue.cancel()
+    yield {outcome.lower(): number for outcome, number in sorted(counts.items())}
+    if request.left <= 0.0:
+        yield {"skipped": "numbers: tests that had not run, out of time"}
+
+
+def environments(request: Request) -> Iterator[dict[str, Any]]:
+    """Steps a second; large batches of all tasks before small ones."""
+    import environments as peers
+    import jax
+
+    import jaxsafe
+
+    runs: dict[str, Any] = {task: partial(peers.episode_steps, jaxsafe.make(task)) for task in request.tasks}
+    try:
+        runs[PEER] = peers.gymnax_steps("Pendulum-v1")
+    except ImportError as error:
+        yield {"skipped": f"{PEER}: {error}"}
+
+    def prepare(run: Any, size: int, steps: int) -> Any:
+        program = jax.jit(run, static_argnums=(1, 2)).lower(jax.random.key(0), size, steps)
+        return Built(program.compile)
+
+    def measure(built: Built, request: Request, size: int, steps: int) -> dict[str, Any]:
+        seconds = timed(lambda seed: built.program(jax.random.key(seed)), request.repeats)
+        return {"steps_per_s": size * steps / statistics.median(seconds), "s_per_step": statistics.median(seconds) / steps}
+
+    jobs = []
+    for size in sorted(request.sizes, reverse=True):
+        steps = STEPS if size < FEWER_STEPS_FROM else STEPS // 4
+        for name, run in runs.items():
+            row = {"task": name, "environments": size}
+            jobs.append(Job(row, partial(prepare, run, size, steps), partial(measure, size=size, steps=steps)))
+    yield from measured(jobs, request)
+
+
+def ppo(request: Request) -> Iterator[dict[str, Any]]:
+    """Samples a second of one seed and of several at once."""
+    import jax
+    import ppo as settings
+
+    task = "docking2d" if "docking2d" in request.tasks else request.tasks[0]
+
+    def ours(seeds: int, num_envs: int) -> Any:
+        fresh, advance, keys, shared = settings.our_programs(task, seeds, settings.UPDATES, num_envs)
+        like = jax.eval_shape(fresh, shared, keys)
+        built = Built(advance.lower(shared, like).compile)
+        state = fresh(shared, keys)
+        return built.calling(lambda _: built.program(shared, state))
+
+    def usual(seeds: int, num_envs: int) -> Any:
+        run, start = settings.usual_program(task, num_envs)
+        keys = jax.random.split(jax.random.key(0), seeds)
+        carry = jax.block_until_ready(jax.jit(jax.vmap(start))(keys))
+        built = Built(jax.jit(jax.vmap(run)).lower(carry).compile)
+        return built.calling(lambda _: built.program(carry))
+
+    def rejax(seeds: int, num_envs: int) -> Any:
+        train = jax.vmap(settings.rejax_trainer(task, settings.UPDATES, num_envs))
+        keys = jax.random.split(jax.random.PRNGKey(0), seeds)
+        built = Built(jax.jit(train).lower(keys).compile)
+        return built.calling(lambda _: built.program(keys))
+
+    def measure(built: Built, request: Request, samples: int) -> dict[str, Any]:
+        seconds = timed(built.call, request.repeats)
+        return {"samples_per_s": samples / statistics.median(seconds)}
+
+    jobs, peers = [], {"jaxsafe": ours, "rejax": rejax, "usual way": usual}
+    for num_envs, seeds in ((size, count) for size in sizes_here().ppo for count in (1, request.seeds)):
+        for peer, prepare in peers.items():
+            row = {"peer": peer, "task": task, "seeds": seeds, "environments": num_envs}
+            samples = seeds * settings.UPDATES * num_envs * settings.NUM_STEPS
+            jobs.append(Job(row, partial(prepare, seeds, num_envs), partial(measure, samples=samples)))
+    yield from measured(jobs, request)
+
+
+def learning(request: Request) -> Iterator[dict[str, Any]]:
+    """Seconds to `LEVEL` of all seeds of a task."""
+    import jax
+    import numpy as np
+
+    from jaxsafe.config.arguments import Arguments
+    from jaxsafe.devices.seed_mapper import SeedMapper, claim_cores
+    from jaxsafe.train.host.options import configs, resolve
+    from jaxsafe.train.train import STATE, programs
+
+    claim_cores()
+
+    def prepare(task: str, preset: str) -> Any:
+        config, env, _ = resolve(Arguments.parse([f"env={task}", f"preset={preset}", f"seeds={request.seeds}"]))
+        mapper = SeedMapper(config.seeds, config.shares)
+        shared, keys = mapper.replicate((env, config.agent, config.ppo)), mapper.keys(config.seed)
+        fresh, advance = programs(mapper, 1, config.num_updates)
+        built = Built(advance.lower(shared, mapper.like(jax.eval_shape(fresh, shared, keys), STATE)).compile)
+        start = fresh(shared, keys)
+        jax.block_until_ready(built.program(shared, start))  # the first call also loads the program
+        built.config = config
+        return built.calling(lambda state: built.program(shared, start if state is None else state))
+
+    def measure(built: Built, request: Request) -> dict[str, Any]:
+        config, state, begin = built.config, None, time.monotonic()
+        reached: list[float | None] = [None] * config.seeds
+        mean, updates, seconds = 0.0, 0, 0.0
+        while updates < config.num_updates and mean < LEVEL and request.left > 0.0:
+            state, curves = built.call(state)
+            rates = np.asarray(curves["success_rate"])[: config.seeds, -1]
+            updates, mean, seconds = updates + 1, float(rates.mean()), time.monotonic() - begin
+            reached = [at if at is not None or rate < LEVEL else seconds for at, rate in zip(reached, rates, strict=True)]
+        return {
+            "environments": config.ppo.num_envs, "reached": mean >= LEVEL, "success": mean, "seconds": seconds,
+            "each_seed": reached, "steps": updates * config.ppo.batch_size,
+            "samples_per_s": config.seeds * updates * config.ppo.batch_size / max(seconds, 1e-9),
+        }  # fmt: skip
+
+    jobs = []
+    for task in request.tasks:
+        preset = largest(configs() / f"{task}.yaml")
+        jobs.append(Job({"task": task, "preset": preset, "seeds": request.seeds}, partial(prepare, task, preset), measure))
+    yield from measured(jobs, request)
+
+
+def filters(request: Request) -> Iterator[dict[str, Any]]:
+    """Calls a second; the recommended filter of each task first."""
+    import jax
+    import rta
+
+    import jaxsafe
+    from jaxsafe.rta.presets import PRESETS
+
+    batches, pool = sizes_here().filters, ThreadPoolExecutor(len(request.tasks))
+    met = {task: pool.submit(rta.met, jaxsafe.make(task), max(batches)) for task in request.tasks}
+
+    def prepare(task: str, preset: str, batch: int) -> Any:
+        env = jaxsafe.make(task, rta=preset)
+        sims, _, desired = jax.tree.map(lambda x: x[:batch], met[task].result())
+        memories = rta.memories(env, sims)
+        built = Built(rta.filter_batch.lower(env, sims, memories, desired).compile)
+        return built.calling(lambda _: built.program(env, sims, memories, desired))
+
+    def measure(built: Built, request: Request, batch: int) -> dict[str, Any]:
+        return {"calls_per_s": batch / statistics.median(timed(built.call, 5 * request.repeats))}
+
+    jobs = []
+    named = {task: [name for name in PRESETS[task] if name != "default"] for task in request.tasks}
+    for turn in zip_longest(*named.values()):  # the first of each task is its default
+        for task, preset in zip(named, turn, strict=True):
+            for batch in batches if preset else ():
+                row = {"task": task, "filter": preset, "batch": batch}
+                jobs.append(Job(row, partial(prepare, task, preset, batch), partial(measure, batch=batch)))
+    yield from measured(jobs, request)
+
+
+def sizes_here() -> Sizes:
+    """How large the measurements are on this device."""
+    import jax
+
+    return CPU if jax.default_backend() == "cpu" else ACCELERATOR
+
+
+class Built:
+    """A compiled program, what compiling took, and how to call it."""
+
+    call: Callable[[Any], Any]
+    config: Any = None
+
+    def __init__(self, compile_: Callable[[], Any]) -> None:
+        """Compile."""
+        begin = time.monotonic()
+        self.program = compile_()
+        self.compile_s = time.monotonic() - begin
+        self.temporary = getattr(self.program.memory_analysis(), "temp_size_in_bytes", None)
+
+    def calling(self, call: Callable[[Any], Any]) -> Built:
+        """Return this with how it is called."""
+        self.call = call
+        return self
+
+
+def measured(jobs: Sequence[Job], request: Request) -> Iterator[dict[str, Any]]:
+    """Compile all jobs side by side, then measure one after another what was compiled in time."""
+    pool = ThreadPoolExecutor(usable_cores())
+    futures = [pool.submit(job.prepare) for job in jobs]
+    wait(futures, timeout=max(COMPILING * request.left, 0.0))
+    for future in futures:
+        future.cancel()
+    for job, future in zip(jobs, futures, strict=True):
+        name = ", ".join(f"{key} {value}" for key, value in job.row.items())
+        if not future.done() or future.cancelled():
+            yield {"skipped": f"{name}: not compiled in time"}
+        elif (error := future.exception()) is not None:
+            yield {"skipped": f"{name}: {type(error).__name__}: {str(error)[:300]}"}
+        elif request.left <= 0.0:
+            yield {"skipped": f"{name}: out of time"}
+        else:
+            built = future.result()
+            try:
+                found = job.measure(built, request)
+            except Exception as problem:  # an error of the device ends one row, not the others
+                yield {"skipped": f"{name}: {type(problem).__name__}: {str(problem)[:300]}"}
+                continue
+            yield {**job.row, **found, "compile_s": round(built.compile_s, 1), "temporary_bytes": built.temporary}
+
+
+def timed(run: Callable[[int], Any], repeats: int) -> list[float]:
+    """Seconds of some calls, after one that is not counted."""
+    import jax
+
+    seconds = []
+    for seed in range(repeats + 1):
+        begin = time.perf_counter()
+        jax.block_until_ready(run(seed))
+        seconds.append(time.perf_counter() - begin)
+    return seconds[1:]
+
+
+def largest(recipes: Path) -> str:
+    """The name of the recipe with the most environments."""
+    from jaxsafe.schema import yaml12
+
+    known = yaml12.read(recipes)
+    return max(known, key=lambda name: known[name]["ppo"]["num_envs"])
+
+
+class Part(NamedTuple):
+    """One of the script's questions, and its share of the time."""
+
+    run: Callable[[Request], Iterator[dict[str, Any]]]
+    share: float
+
+
+PARTS = {
+    "numbers": Part(numbers, 0.28),
+    "environments": Part(environments, 0.24),
+    "ppo": Part(ppo, 0.18),
+    "learning": Part(learning, 0.18),
+    "filters": Part(filters, 0.12),
+}
+
+if __name__ == "__main__":
+    main()

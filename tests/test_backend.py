@@ -1,0 +1,83 @@
+"""What programs do otherwise on an accelerator has the same results."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsafe
+from jaxsafe import autoreset
+from jaxsafe.devices import backend
+from jaxsafe.devices.backend import packing, scan_packed
+from jaxsafe.rollout import reset_batch, step_or_reset_batch
+from jaxsafe.train import ppo, shuffle
+
+
+@pytest.fixture
+def as_accelerated(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
+    return lambda module: monkeypatch.setattr(module, "accelerated", lambda: True)
+
+
+def same(one: Any, other: Any) -> bool:
+    return jax.tree.structure(one) == jax.tree.structure(other) and all(
+        np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+    )
+
+
+def test_a_packed_scan_returns_what_a_scan_returns() -> None:
+    def step(carry: jax.Array, x: jax.Array) -> tuple[jax.Array, Any]:
+        carry = carry + x
+        return carry, {
+            "sum": carry,
+            "twice": 2 * carry,
+            "whole": carry.astype(int),
+            "rows": jnp.outer(carry, carry),
+            "none": (),
+        }
+
+    start, xs = jnp.zeros(3), jnp.arange(12.0).reshape(4, 3)
+    assert same(scan_packed(step, start, xs), jax.lax.scan(step, start, xs))
+
+
+def test_a_packed_tree_is_a_vector_on_an_accelerator_alone(as_accelerated: Callable[[Any], None]) -> None:
+    tree = {"kernel": jnp.ones((2, 3)), "bias": jnp.zeros(3)}
+    pack, unpack = packing(tree)
+    assert pack(tree) is tree
+    assert unpack(tree) is tree
+    as_accelerated(backend)
+    pack, unpack = packing(tree)
+    assert pack(tree).shape == (9,)
+    assert same(unpack(pack(tree)), tree)
+
+
+def test_an_accelerator_draws_the_same_starts(as_accelerated: Callable[[Any], None]) -> None:
+    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 3.0})
+    state, _ = reset_batch(env, jax.random.key(0), autoreset.LARGE)
+    action = jnp.zeros((autoreset.LARGE, env.action_size))
+
+    def following(_: None) -> Any:
+        return jax.lax.scan(lambda s, key: (step_or_reset_batch(env, s, action, key)[0][0], None), state, keys)[0]
+
+    keys = jax.random.split(jax.random.key(1), 8)
+    expected = jax.jit(following)(None).sim.platforms["deputy"].position
+    as_accelerated(autoreset)
+    found = jax.jit(lambda _: following(None))(None).sim.platforms["deputy"].position
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+
+
+def test_an_accelerator_learns_the_same(as_accelerated: Callable[[Any], None]) -> None:
+    from jaxsafe.agents.agent import Agent
+    from jaxsafe.schema.component import normalise
+
+    env, agent = jaxsafe.make("docking2d"), normalise(Agent(hidden=(8,)))
+    hyper = normalise(ppo.PPO(num_envs=4, num_steps=8, num_epochs=2))
+    start = ppo.init(env, agent, hyper, jax.random.key(0))
+    expected = jax.jit(lambda state: ppo.update(env, agent, hyper, 4, state))(start)
+    for module in (backend, ppo, shuffle):
+        as_accelerated(module)
+    found = jax.jit(lambda state: ppo.update(env, agent, hyper, 4, state))(start)
+    for one, other in zip(jax.tree.leaves(found.params), jax.tree.leaves(expected.params), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-5)
