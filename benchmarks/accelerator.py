@@ -356,7 +356,7 @@ def filters(request: Request) -> Iterator[dict[str, Any]]:
     import rta
 
     import jaxsafe
-    from jaxsafe.rta.presets import PRESETS
+    from jaxsafe.envs import TASKS
 
     batches, pool = sizes_here().filters, ThreadPoolExecutor(len(request.tasks))
     met = {task: pool.submit(rta.met, jaxsafe.make(task), max(batches)) for task in request.tasks}
@@ -372,7 +372,7 @@ def filters(request: Request) -> Iterator[dict[str, Any]]:
         return {"calls_per_s": batch / statistics.median(timed(built.call, 5 * request.repeats))}
 
     jobs = []
-    named = {task: [name for name in PRESETS[task] if name != "default"] for task in request.tasks}
+    named = {task: [name for name in TASKS[task].filters if name != "default"] for task in request.tasks}
     for turn in zip_longest(*named.values()):  # the first of each task is its default
         for task, preset in zip(named, turn, strict=True):
             for batch in batches if preset else ():

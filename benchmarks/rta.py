@@ -30,9 +30,9 @@ from tables import markdown
 import jaxsafe
 from jaxsafe.agents.agent import Agent
 from jaxsafe.config import override
+from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.run_adversaries import attack
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
-from jaxsafe.rta.presets import PRESETS
 from jaxsafe.rta.qp import nearest_control
 from jaxsafe.schema.component import normalise
 from jaxsafe.train.ppo import PPO, init, update
@@ -72,7 +72,8 @@ def timed(run: Callable[[], Any], repeats: int) -> tuple[float, float]:
 def calls(repeats: int) -> list[dict[str, Any]]:
     """Filter calls a second."""
     rows = []
-    for task, presets in PRESETS.items():
+    for task in TASKS:
+        presets = TASKS[task].filters
         for preset in (name for name in presets if name != "default"):
             env = jaxsafe.make(task, rta=preset)
             seconds, first = timed(functools.partial(filter_batch, env, *met(env)), repeats)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from baselines.plan import PAPER_STEPS, WITHOUT_RTA
+from baselines.plan import WITHOUT_RTA
 
 from jaxsafe.envs import TASKS
 from jaxsafe.metrics import with_interval
@@ -333,7 +333,7 @@ def readme_results(_: Found) -> str:
         own = _record(task, "features")["results"]
         each = [own["evaluation"][way]["success_rate"] for way in ("stochastic", "deterministic")]
         rows.append([
-            task, f"{PAPER_STEPS[task]:,}", _until(own["interaction_efficiency"]["timesteps"]), f"{own['steps']:,}",
+            task, f"{TASKS[task].paper_steps:,}", _until(own["interaction_efficiency"]["timesteps"]), f"{own['steps']:,}",
             *(f"{100 * one['mean']:.2f} %" for one in each), f"{100 * min(min(one['per_seed']) for one in each):.1f} %",
         ])  # fmt: skip
     heads = "task | 80 % in training, paper | here | trained for | success, stochastic | deterministic | worst seed"

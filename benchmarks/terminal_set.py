@@ -23,7 +23,7 @@ import numpy as np
 from isolated import words
 
 import jaxsafe
-from jaxsafe.rta.presets import TURN
+from jaxsafe.envs.docking import TURN
 from jaxsafe.rta.speed_limit import speed_limit_facts
 
 LOW_SHARE = 0.3

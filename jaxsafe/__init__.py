@@ -1,14 +1,11 @@
 """Aerospace SafeRL benchmarks as pure JAX functions."""
 
 import jaxsafe.quiet  # noqa: F401 before anything imports jaxlib
-from jaxsafe.adapters.registration import register_ids
 from jaxsafe.agents.policy_file import load_policy
 from jaxsafe.config import override
 from jaxsafe.environment import Environment, reset, reset_to, step
 from jaxsafe.envs import make
 from jaxsafe.rollout import rollout
 from jaxsafe.schema.errors import ConfigError
-
-register_ids()
 
 __all__ = ["ConfigError", "Environment", "load_policy", "make", "override", "reset", "reset_to", "rollout", "step"]

@@ -19,7 +19,6 @@ import jaxsafe
 from jaxsafe import ConfigError
 from jaxsafe.adapters import lanes
 from jaxsafe.adapters.gymnasium import GymEnv, GymVectorEnv
-from jaxsafe.adapters.registration import IDS
 from jaxsafe.adapters.safety_gymnasium import SafetyEnv
 from jaxsafe.envs import TASKS
 
@@ -52,7 +51,7 @@ def same(ours: Any, theirs: Any, where: np.ndarray, name: str) -> None:
     ("name", "kind"),
     [
         pytest.param(name, kind, marks=[pytest.mark.slow] if kind == "discrete" and name != "jaxsafe/Docking2D-v0" else [])
-        for name in IDS
+        for name in (task.gymnasium_id for task in TASKS.values())
         for kind in ("continuous", "discrete")
     ],
 )

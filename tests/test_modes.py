@@ -13,7 +13,6 @@ import jaxsafe
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.episodes import run_episodes
-from jaxsafe.rta.presets import PRESETS
 from jaxsafe.train.host.options import resolve
 from jaxsafe.train.train import begin, chunk
 
@@ -88,7 +87,7 @@ def test_training_and_evaluation_can_be_traced(mode: str, training: str) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", CHECKED_WHILE_TRACING)
-@pytest.mark.parametrize(("task", "rta"), [(task, rta) for task in TASKS for rta in PRESETS[task]])
+@pytest.mark.parametrize(("task", "rta"), [(task, rta) for task in TASKS for rta in TASKS[task].filters])
 def test_every_filter_can_be_traced(mode: str, task: str, rta: str) -> None:
     with CHECKED_WHILE_TRACING[mode]():
         env = jaxsafe.make(task, rta=rta)

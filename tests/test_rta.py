@@ -13,13 +13,12 @@ import jaxsafe
 from jaxsafe import ConfigError, Environment
 from jaxsafe.config import dump, load
 from jaxsafe.envs import TASKS
+from jaxsafe.envs.docking import BRAKE as DOCKING_FILTER
 from jaxsafe.evaluate.adversaries import intercept
 from jaxsafe.evaluate.run_adversaries import attack, within_step
 from jaxsafe.rta.asif import ExplicitASIF, Polynomial
 from jaxsafe.rta.cascade import Cascade, Stage
 from jaxsafe.rta.prediction import others_react
-from jaxsafe.rta.presets import DOCKING as DOCKING_FILTER
-from jaxsafe.rta.presets import PRESETS
 from jaxsafe.rta.simplex import Blend, CollisionSimplex, Simplex
 from jaxsafe.simulation.scripted import Command
 from jaxsafe.transition import advance, bounds, constraint, judge, others_later
@@ -39,7 +38,7 @@ SHORT = [
     slow("implicit_simplex", "rejoin2d", ("search",)),
 ]
 COMPARED = ("explicit_asif", "released")  # of the literature; they guarantee nothing
-LONG = [(preset, task) for task in PRESETS for preset in PRESETS[task] if preset not in (*COMPARED, "default")]
+LONG = [(preset, task) for task in TASKS for preset in TASKS[task].filters if preset not in (*COMPARED, "default")]
 
 BRAKE = {"type": "brake", "name": "brake"}
 SLOW = {"type": "slow", "speed": 0.1}
@@ -248,7 +247,7 @@ def test_the_same_adversaries_break_the_bare_task(task: str, policy: str) -> Non
 def test_an_environment_with_a_filter_is_written_and_read(task: str) -> None:
     bare = jaxsafe.make(task)
     assert jaxsafe.make(task, rta="none") == bare
-    for preset in PRESETS[task]:
+    for preset in TASKS[task].filters:
         env = jaxsafe.make(task, rta=preset)
         assert load(dump(env)) == env
         assert jaxsafe.override(env, {"rta": None}) == bare
@@ -306,7 +305,7 @@ def test_what_is_not_a_number_never_reaches_the_plant(task: str, value: float) -
         assert timestep.info.rta.certified
 
 
-@pytest.mark.parametrize("preset", PRESETS["rejoin2d"])
+@pytest.mark.parametrize("preset", TASKS["rejoin2d"].filters)
 def test_a_state_that_is_not_a_number_still_gives_a_control(preset: str) -> None:
     env = jaxsafe.make("rejoin2d", rta=preset)
     state, _ = reset(env, jax.random.key(0))

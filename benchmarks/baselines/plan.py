@@ -10,15 +10,6 @@ from typing import Any, NamedTuple
 from jaxsafe.envs import TASKS
 from jaxsafe.schema.errors import ConfigError, nearest
 
-PAPER_STEPS = {
-    "rejoin2d": 300_000,
-    "rejoin3d": 2_300_000,
-    "docking2d": 340_000,
-    "docking3d": 660_000,
-    "docking2d_oriented": 1_500_000,
-}
-"""Table 2 of the paper: environment steps to 80 % success in training."""
-
 
 class Kind(NamedTuple):
     """A way to train each task."""

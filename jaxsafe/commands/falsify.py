@@ -61,10 +61,9 @@ def main(argv: Sequence[str]) -> int:
     enable_compilation_cache()
     import jax
 
-    from jaxsafe.envs import make
+    from jaxsafe.envs import default_filter, make
     from jaxsafe.evaluate.adversaries import ADVERSARIES
     from jaxsafe.evaluate.run_adversaries import SEARCH, attack, longest_episode
-    from jaxsafe.rta.presets import PRESETS
     from jaxsafe.schema.errors import ConfigError, nearest
     from jaxsafe.storage.files import write_text
 
@@ -82,8 +81,7 @@ def main(argv: Sequence[str]) -> int:
     for name in policies if isinstance(policies, list) else [policies]:
         if name not in known:
             raise ConfigError(f"policies: unknown policy {name!r}; choose from {nearest(name, known)}")
-    if options["rta"] is None and task in PRESETS:
-        options["rta"] = "default"
+    options["rta"] = options["rta"] or default_filter(task)
     env = make(task, changes, **options)
     if not env.constraints:
         raise ConfigError(f"env: {task} has no safety constraint")

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from jaxsafe.agents.imported_policy import ForeignPolicy, read_foreign
 from jaxsafe.commands.environment_choice import EnvironmentChoice
 from jaxsafe.config.arguments import Arguments
+from jaxsafe.envs import short_name
 from jaxsafe.schema.errors import ConfigError
 
 
@@ -22,7 +23,7 @@ class Source(NamedTuple):
     @property
     def task(self) -> str:
         """The name of the environment in which it shall act."""
-        return Path(self.choice.task or "").stem
+        return short_name(self.choice.task or "")
 
     def read(self) -> ForeignPolicy:
         """Read it; raises a ConfigError if there is no such environment, or as `read_foreign` does."""

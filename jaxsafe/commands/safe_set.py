@@ -8,7 +8,7 @@ from pathlib import Path
 from jaxsafe.commands import cli
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
-from jaxsafe.envs import TASKS, make
+from jaxsafe.envs import default_filter, make, short_name
 from jaxsafe.plot.safe_set import Ends, draw
 from jaxsafe.plot.style import save
 from jaxsafe.schema.errors import ConfigError
@@ -26,12 +26,12 @@ def main(argv: Sequence[str]) -> int:
     arguments.refuse_rest([*OPTIONS, "env.…"])
     if task is None:
         raise ConfigError("env: missing; for instance env=rejoin2d")
-    rta = rta or ("default" if task in TASKS else None)  # a file may have its own
+    rta = rta or default_filter(task)  # a file may have its own
     env = make(task, changes, rta=rta)
     print(
         save(
-            draw(env, f"{Path(task).stem}, rta={rta or 'of the file'}", x, y, points),
-            Path(out or f"safe_set_{Path(task).stem}.png"),
+            draw(env, f"{short_name(task)}, rta={rta or 'of the file'}", x, y, points),
+            Path(out or f"safe_set_{short_name(task)}.png"),
         )
     )
     return 0

@@ -1,4 +1,8 @@
-"""The tasks by name, and `make`."""
+"""The tasks by name, and `make`.
+
+Each domain is a file, `rejoin` and `docking`, that ends in its tasks. `task` has the record of a task
+and the call that registers one.
+"""
 
 from __future__ import annotations
 
@@ -8,33 +12,36 @@ from typing import Any, Literal
 
 from jaxsafe.config import build, load, load_filter, override
 from jaxsafe.environment import Environment
-from jaxsafe.envs import _docking, docking2d, docking2d_oriented, docking3d, rejoin2d, rejoin3d
+from jaxsafe.envs import docking, rejoin  # noqa: F401 they register their tasks, in the order of the paper
+from jaxsafe.envs.task import (
+    TASKS,
+    Task,
+    default_filter,
+    find_task,
+    register,
+    short_name,
+    user_module,
+)
 from jaxsafe.rta.filter import RTA
-from jaxsafe.rta.presets import PRESETS
 from jaxsafe.schema.dotted_paths import get_path, set_path
 from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.simulation.controllers import Continuous, Discrete
 
-TASKS = {
-    "rejoin2d": rejoin2d.rejoin2d,
-    "rejoin3d": rejoin3d.rejoin3d,
-    "docking2d": docking2d.docking2d,
-    "docking3d": docking3d.docking3d,
-    "docking2d_oriented": docking2d_oriented.docking2d_oriented,
-}
-"""Every task that `make` knows by name."""
+__all__ = [
+    "TASKS",
+    "VARIANTS",
+    "Task",
+    "adapt",
+    "default_filter",
+    "find_task",
+    "make",
+    "register",
+    "short_name",
+    "user_module",
+]
 
-VARIANTS: dict[str, dict[str, Mapping[str, Any]]] = {
-    "paper": {},
-    "released": {
-        "rejoin2d": rejoin2d.RELEASED,
-        "rejoin3d": rejoin3d.RELEASED,
-        "docking2d": _docking.RELEASED,
-        "docking3d": _docking.RELEASED,
-        "docking2d_oriented": docking2d_oriented.RELEASED,
-    },
-}
-"""Overrides by variant and task: `paper` is the declaration itself, `released` the published SafeRL code's semantics."""
+VARIANTS = ("paper", "released")
+"""`paper` is a task as it is declared, `released` has the semantics of the published SafeRL code."""
 
 _ACTIONS = {"continuous": Continuous, "discrete": Discrete}
 
@@ -51,7 +58,8 @@ def make(
     """Return an environment, ready for `reset` and `step`.
 
     Args:
-        task: the name of a task, or the path of a YAML file as printed by `python -m jaxsafe.config`.
+        task: the name of a task, `MODULE:NAME` to import the module that registers it first, or the path of a YAML file
+            as printed by `python -m jaxsafe.config`.
         overrides: new values by dotted path, for instance `{"reward.delta_v.scale": -0.02}`.
         actions: `continuous`, in [−1, 1], or `discrete`, indices of points per actuator; None leaves what the task has
             (the tasks by name are continuous).
@@ -77,13 +85,10 @@ def make(
                 f"{option}: expected {'paths with values' if kinds is Mapping else 'a name'}, found {show(value)}"
             )
     name = os.fspath(task)
-    if name in TASKS:
-        env = build(TASKS[name]())
-    elif name.endswith((".yaml", ".yml")):
-        env = load(name)
-    else:
-        raise ConfigError(f"env: unknown task {show(name)} and not a .yaml file; choose from {nearest(name, TASKS)}")
-    return adapt(env, name, overrides, actions=actions, variant=variant, randomize=randomize, rta=rta)
+    env = load(name) if name.endswith((".yaml", ".yml")) else build(find_task(name).environment())
+    return adapt(
+        env, name, overrides, actions=actions, variant=variant, randomize=randomize, rta=rta
+    )
 
 
 def adapt(
@@ -105,35 +110,48 @@ def adapt(
         env = override(env, _variant_values(task, variant))
     if actions is not None:
         env = _with_actions(env, actions)
-    filters = {} if rta is None else {"rta": _filter(task, rta)}  # fits together with the overrides, not without
+    filters = (
+        {} if rta is None else {"rta": _filter(task, rta)}
+    )  # fits together with the overrides, not without
     random = {} if randomize is None else {"randomize": randomize}
     return override(env, {**filters, **(overrides or {}), **random})
 
 
-def _variant_values(task: str, variant: str) -> dict[str, Any]:
+def _variant_values(name: str, variant: str) -> dict[str, Any]:
     """Return all in which the variants of a task differ, by dotted path, as this variant has it."""
     if variant not in VARIANTS:
-        raise ConfigError(f"variant: unknown variant {show(variant)}; choose from {nearest(variant, VARIANTS)}")
-    if task not in TASKS:
-        raise ConfigError(f"variant: {task} says itself what it is; a variant is for {', '.join(TASKS)}")
-    paper = TASKS[task]()
-    paths = {path: get_path(paper, path) for changes in VARIANTS.values() for path in changes.get(task, {})}
-    return {**paths, **VARIANTS[variant].get(task, {})}
+        raise ConfigError(
+            f"variant: unknown variant {show(variant)}; choose from {nearest(variant, VARIANTS)}"
+        )
+    task = TASKS.get(name.rpartition(":")[2])
+    if task is None:
+        raise ConfigError(
+            f"variant: {name} says itself what it is; a variant is for {', '.join(TASKS)}"
+        )
+    if variant == "released":
+        return dict(task.released)
+    paper = task.environment()
+    return {path: get_path(paper, path) for path in task.released}
 
 
-def _filter(task: str, rta: str | RTA) -> RTA | None:
+def _filter(name: str, rta: str | RTA) -> RTA | None:
     if isinstance(rta, RTA):
         return rta
     if isinstance(rta, str) and rta.endswith((".yaml", ".yml")):
         return load_filter(rta)
-    presets = {"none": lambda: None, **PRESETS.get(task, {})}
+    task = TASKS.get(name.rpartition(":")[2])
+    presets = {"none": lambda: None, **(task.filters if task else {})}
     if not isinstance(rta, str) or rta not in presets:
         known = [*presets, "FILE.yaml"]
-        raise ConfigError(f"rta: {task} has no preset {show(rta)}; choose from {nearest(rta, known)}")
+        raise ConfigError(
+            f"rta: {name} has no preset {show(rta)}; choose from {nearest(rta, known)}"
+        )
     return presets[rta]()
 
 
 def _with_actions(env: Environment, actions: str) -> Environment:
     if actions not in _ACTIONS:
-        raise ConfigError(f"actions: unknown kind {show(actions)}; choose from {nearest(actions, _ACTIONS)}")
+        raise ConfigError(
+            f"actions: unknown kind {show(actions)}; choose from {nearest(actions, _ACTIONS)}"
+        )
     return set_path(env, f"{env.agent}.controller", _ACTIONS[actions](actuators=env.actuators))

@@ -13,7 +13,7 @@ from jaxsafe.agents.agent import Agent
 from jaxsafe.config import override
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.environment import Environment, require_success
-from jaxsafe.envs import TASKS, make
+from jaxsafe.envs import TASKS, make, short_name
 from jaxsafe.processors.reward import Intervention
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import Component, Range, fields, normalise
@@ -160,7 +160,7 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
         raise ConfigError(f"agent.log_std: expected one number or {count}, one for each action, found {found}")
     observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
     jax.eval_shape(lambda o: config.agent.inputs(env, o), observation)  # refuses features that this task cannot have
-    return config, env, Path(task).stem
+    return config, env, short_name(task)
 
 
 def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfig:
@@ -190,13 +190,13 @@ def _check_rta(config: TrainConfig, env: Environment) -> None:
 
 
 def recipe(task: str, preset: str | None) -> dict[str, Any]:
-    """Settings by dotted path from `configs/<task>.yaml`; for an environment without a file there is only `plain`.
+    """Settings by dotted path from the recipe of a task; for an environment without one there is only `plain`.
 
     Raises:
         ConfigError: the preset is not in the file.
     """
-    file = configs() / f"{task}.yaml"
-    known = yaml12.read(file) if file.is_file() else {"plain": {}}
+    registered = TASKS.get(task.rpartition(":")[2])
+    known = yaml12.read(configs() / registered.recipe) if registered and registered.recipe else {"plain": {}}
     name = preset if preset is not None else ("features" if "features" in known else "plain")
     if name not in known:
         raise ConfigError(f"preset: unknown preset {show(name)}; choose from {nearest(name, known)}")

@@ -11,7 +11,7 @@ from typing import Any
 
 import jaxsafe.config
 from jaxsafe.environment import Environment
-from jaxsafe.envs import TASKS
+from jaxsafe.envs import TASKS, user_module
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.convert import to_component, to_data
@@ -30,6 +30,11 @@ def create(config: TrainConfig, env: Environment, name: str) -> Path:
     """
     path = make(config.out, Path("runs"), name)
     content = {"env": name, **described(config, env), "commit": commit(), "versions": versions()}
+    module = user_module(name)
+    if module:  # where the run is read, it registers the task, so that its filters are known by name
+        environment = content["environment"]
+        content["environment"] = {"imports": [], **environment}
+        content["environment"]["imports"] = sorted({module, *environment.get("imports", [])})
     try:
         write_text(path / "config.yaml", yaml12.write(content))
     except OSError as error:

@@ -1,0 +1,128 @@
+"""The record of all that is known of a task, and the tasks by name.
+
+A package adds a task of its own with one call:
+
+    register(Task(name="hover", environment=hover))
+
+Then `make("hover")` knows it, Gymnasium knows its id, and `python -m jaxsafe.train env=MODULE:hover`
+imports the module that registers it and trains it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from gymnasium.envs import registration
+
+from jaxsafe.environment import Environment
+from jaxsafe.rta.filter import RTA
+from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.user_modules import import_modules
+
+Filters = Mapping[str, Callable[[], RTA]]
+"""Filters by the name of their preset. `default` is the recommended one."""
+
+TASKS: dict[str, Task] = {}
+"""Every registered task by its name."""
+
+_NAME = re.compile(r"[A-Za-z]\w*")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Task:
+    """All that is known of a task."""
+
+    name: str
+    environment: Callable[[], Environment]
+    """Returns the environment as it is declared, before `jaxsafe.config.build`."""
+    released: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """What `variant="released"` changes, by dotted path: the semantics of the released code."""
+    filters: Filters = dataclasses.field(default_factory=dict)
+    """What `rta=…` knows by name."""
+    gymnasium_id: str | None = None
+    """The id for `gymnasium.make`, for instance `my_package/Hover-v0`."""
+    recipe: str | Path | None = None
+    """The file of training recipes by preset. A relative path is one in the package's `configs/`.
+    Without a file there is only the preset `plain`, the options' defaults."""
+    paper_steps: int | None = None
+    """Table 2 of the paper: environment steps to 80 % success in training."""
+
+
+def register(task: Task) -> None:
+    """Make a task known by its name, and to Gymnasium by its id.
+
+    The same task defined again replaces the first, as happens when a notebook's cell runs twice.
+
+    Raises:
+        ConfigError: the name is not a plain word, or the name or the id is that of another task.
+    """
+    if not _NAME.fullmatch(task.name) or task.name == "all":
+        raise ConfigError(
+            f"task {show(task.name)}: expected a name of letters, digits and _, other than all"
+        )
+    known = TASKS.get(task.name)
+    if known and known.environment.__module__ != task.environment.__module__:
+        raise ConfigError(
+            f"task {task.name!r}: taken by {known.environment.__module__}; choose another name"
+        )
+    if task.gymnasium_id:
+        _register_id(task.gymnasium_id, task.name)
+    TASKS[task.name] = task
+
+
+def find_task(name: str) -> Task:
+    """Return the task of a name. `MODULE:NAME` imports the user's module first, which registers it.
+
+    Raises:
+        ConfigError: the module cannot be imported, or there is no such task.
+    """
+    module, _, task = name.rpartition(":")
+    if module:
+        import_modules([module], "env")
+    if task not in TASKS:
+        raise ConfigError(
+            f"env: unknown task {show(task)} and not a .yaml file; choose from {nearest(task, TASKS)}"
+        )
+    return TASKS[task]
+
+
+def default_filter(name: str) -> str | None:
+    """Return `default` if `rta=default` means something for a task; None if not, or for a file."""
+    if name.endswith((".yaml", ".yml")):
+        return None
+    return "default" if "default" in find_task(name).filters else None
+
+
+def short_name(name: str) -> str:
+    """Return the name without its module, of a task, or without folder and ending, of a file."""
+    return Path(name.rpartition(":")[2]).stem
+
+
+def user_module(name: str) -> str | None:
+    """Return the module that a user's task comes from; None for a task of this package or a file."""
+    task = TASKS.get(name)
+    if task is None or task.environment.__module__.partition(".")[0] == "jaxsafe":
+        return None
+    return task.environment.__module__
+
+
+def _register_id(gymnasium_id: str, task: str) -> None:
+    """Tell Gymnasium of a task; its environment loads when one is made.
+
+    No `max_episode_steps`: tasks end by themselves, and a second clock would truncate what they
+    terminate.
+    """
+    known = registration.registry.get(gymnasium_id)
+    if known is not None and known.kwargs.get("task") != task:
+        raise ConfigError(f"task {task!r}: Gymnasium has another environment called {gymnasium_id}")
+    if known is None:
+        registration.register(
+            gymnasium_id,
+            entry_point="jaxsafe.adapters.gymnasium:GymEnv",
+            vector_entry_point="jaxsafe.adapters.gymnasium:GymVectorEnv",
+            kwargs={"task": task},
+        )
