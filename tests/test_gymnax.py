@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxsafe
+from jaxsafe import ConfigError
 
 pytestmark = [pytest.mark.peer, pytest.mark.filterwarnings("default")]
 
@@ -82,6 +83,15 @@ def test_a_limit_of_its_own_truncates(make: Any) -> None:
     _, state = env.reset(jax.random.key(0), params)
     *_, terminated, truncated, _ = env.step(jax.random.key(1), state, jnp.zeros(2), params)
     assert (bool(terminated), bool(truncated)) == (False, True)
+
+
+def test_a_limit_that_no_program_can_count_to_is_refused(make: Any) -> None:
+    env = make("docking2d")
+    with pytest.raises(
+        ConfigError, match="max_steps_in_episode: expected a whole number from 1 to 2,147,483,647, found 1000"
+    ):
+        env.default_params.replace(max_steps_in_episode=10**10)
+    assert jax.tree.map(lambda _: 0, env.default_params).max_steps_in_episode == 0  # axes to map over
 
 
 def test_discrete_actions_are_one_choice(make: Any) -> None:
