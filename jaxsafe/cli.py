@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NoReturn
 
+from jaxsafe.address_space import is_shortage
 from jaxsafe.config import imports, yaml
 from jaxsafe.errors import ConfigError, ConfigWarning, nearest, show
 from jaxsafe.streams import lasting_streams
@@ -196,8 +197,12 @@ def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tu
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED, False
-    except (AssertionError, RuntimeError):
-        if (fault := _platform_fault()) is None:
+    except (AssertionError, ImportError, MemoryError, RuntimeError) as error:
+        if is_shortage(error):
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            print(f"error: memory is short: {reason}", file=sys.stderr)
+            return 2, False
+        if isinstance(error, ImportError | MemoryError) or (fault := _platform_fault()) is None:
             raise
         print(f"error: {fault}", file=sys.stderr)
         return 2, False
