@@ -70,8 +70,8 @@ STEPS = 1000
 FEWER_STEPS_FROM = 2**17
 """With so many environments a quarter of the steps take long enough to be measured."""
 
-COMPILING = 0.6
-"""The share of a part's time after which programs that are not compiled yet are skipped."""
+COMPILING = 0.75
+"""The share of what is left of a part's time after which programs that are not compiled yet are skipped."""
 
 GRACE = 5.0
 """Seconds beyond its time after which a part is ended."""
@@ -79,27 +79,20 @@ GRACE = 5.0
 TESTS = (
     "tests/test_golden.py",
     "tests/test_train.py::test_a_crashed_run_resumes_to_the_same_end",
+    "tests/test_seeds.py::test_a_seed_is_to_rounding_the_same_run_under_vmap",
     "tests/test_rta.py::test_no_adversary_breaks_the_filter",
     "tests/test_rta.py::test_a_control_that_is_certified_passes_unaltered",
     "tests/test_rta.py::test_what_is_not_a_number_never_reaches_the_plant",
     "tests/test_rta.py::test_in_float32_every_projection_is_certified",
-    "tests/test_seeds.py::test_a_seed_is_to_rounding_the_same_run_under_vmap",
     "tests/test_suite.py::test_everything_stays_finite",
     "tests/test_suite.py::test_everything_stays_finite_at_the_edges_of_space",
     "tests/test_suite.py::test_limits_are_reached_and_never_exceeded",
-    "tests/test_suite.py::test_the_terms_sum_to_the_reward_and_to_the_totals",
     "tests/test_suite.py::test_cost_is_one_exactly_where_a_margin_is_negative",
-    "tests/test_suite.py::test_at_most_one_outcome_ends_an_episode",
     "tests/test_suite.py::test_planar_docking_is_spatial_docking_with_z_zero",
     "tests/test_suite.py::test_planar_rejoin_is_spatial_rejoin_in_straight_level_flight",
-    "tests/test_suite.py::test_the_same_key_and_actions_give_the_same_bits",
-    "tests/test_suite.py::test_derivatives_of_a_return_are_those_of_finite_differences",
-    "tests/test_cwh.py",
-    "tests/test_dubins.py",
-    "tests/test_oriented.py",
+    "tests/test_cwh.py::test_in_float32_the_error_is_at_most_five_parts_in_ten_million",
+    "tests/test_dubins.py::test_in_float32_the_way_flown_has_six_digits",
     "tests/test_trig.py",
-    "tests/test_shuffle.py",
-    "tests/test_ppo.py",
 )
 """Those of `numbers`, the most telling first."""
 
@@ -211,16 +204,18 @@ def probe(options: dict[str, str], tasks: Sequence[str]) -> None:
 
 def numbers(request: Request) -> Iterator[dict[str, Any]]:
     """Test by test, whether it passed."""
-    command = [sys.executable, "-m", "pytest", "-v", "--tb=short", "-rN", "-p", "no:cacheprovider", *TESTS]
+    command = [sys.executable, "-m", "pytest", "-v", "--tb=short", "-rN", "-p", "no:cacheprovider", "-p", "no:benchmark"]
+    command += ["-W", "default", *TESTS]  # what other versions of packages warn of is no question of numbers
     workers = min(WORKERS, usable_cores())
     if workers > 2 and importlib.util.find_spec("xdist"):
-        command += ["-n", str(workers)]
+        command += [f"-n{workers}", f"--maxprocesses={workers}"]
     environment = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false", "XLA_FLAGS": os.environ.get("XLA_FLAGS", " ")}
     counts: dict[str, int] = {}
     with subprocess.Popen(
-        command, cwd=HERE.parent, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
-        overdue = threading.Timer(max(request.left, 0.0), process.terminate)
+        command, cwd=HERE.parent, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        start_new_session=True,
+    ) as process:  # fmt: skip
+        overdue = threading.Timer(max(request.left, 0.0), os.killpg, (process.pid, signal.SIGKILL))
         overdue.start()
         for line in process.stdout or ():
             print(line, end="", file=sys.stderr)
@@ -231,7 +226,7 @@ def numbers(request: Request) -> Iterator[dict[str, Any]]:
                     yield {"test": name.group(), "outcome": outcome.group().lower()}
     overdue.cancel()
     yield {outcome.lower(): number for outcome, number in sorted(counts.items())}
-    if request.left <= 0.0:
+    if process.returncode == -signal.SIGKILL:
         yield {"skipped": "numbers: tests that had not run, out of time"}
 
 
@@ -297,8 +292,11 @@ def ppo(request: Request) -> Iterator[dict[str, Any]]:
         return {"samples_per_s": samples / statistics.median(seconds)}
 
     jobs, peers = [], {"jaxsafe": ours, "rejax": rejax, "usual way": usual}
-    for num_envs, seeds in ((size, count) for size in sizes_here().ppo for count in (1, request.seeds)):
+    small, *large = sizes_here().ppo
+    for num_envs, seeds in ((small, 1), (small, request.seeds), *((size, 1) for size in large)):
         for peer, prepare in peers.items():
+            if peer == "usual way" and (num_envs, seeds) != (small, 1):
+                continue
             row = {"peer": peer, "task": task, "seeds": seeds, "environments": num_envs}
             samples = seeds * settings.UPDATES * num_envs * settings.NUM_STEPS
             jobs.append(Job(row, partial(prepare, seeds, num_envs), partial(measure, samples=samples)))
@@ -361,24 +359,28 @@ def filters(request: Request) -> Iterator[dict[str, Any]]:
     batches, pool = sizes_here().filters, ThreadPoolExecutor(len(request.tasks))
     met = {task: pool.submit(rta.met, jaxsafe.make(task), max(batches)) for task in request.tasks}
 
-    def prepare(task: str, preset: str, batch: int) -> Any:
+    def prepare(task: str, preset: str) -> Any:
         env = jaxsafe.make(task, rta=preset)
-        sims, _, desired = jax.tree.map(lambda x: x[:batch], met[task].result())
-        memories = rta.memories(env, sims)
-        built = Built(rta.filter_batch.lower(env, sims, memories, desired).compile)
-        return built.calling(lambda _: built.program(env, sims, memories, desired))
+        sims, _, desired = met[task].result()
+        given = (sims, rta.memories(env, sims), desired)
+        parts = [jax.tree.map(lambda x, batch=batch: x[:batch], given) for batch in batches]
+        built = Built(lambda: [rta.filter_batch.lower(env, *part).compile() for part in parts])
+        return built.calling(lambda index: built.programs[index](env, *parts[index]))
 
-    def measure(built: Built, request: Request, batch: int) -> dict[str, Any]:
-        return {"calls_per_s": batch / statistics.median(timed(built.call, 5 * request.repeats))}
+    def measure(built: Built, request: Request) -> dict[str, Any]:
+        seconds = [
+            statistics.median(timed(lambda _, index=index: built.call(index), 5 * request.repeats))
+            for index in range(len(batches))
+        ]
+        return {"calls_per_s": {str(batch): batch / each for batch, each in zip(batches, seconds, strict=True)}}
 
     jobs = []
     named = {task: [name for name in TASKS[task].filters if name != "default"] for task in request.tasks}
     for turn in zip_longest(*named.values()):  # the first of each task is its default
         for task, preset in zip(named, turn, strict=True):
-            for batch in batches if preset else ():
-                row = {"task": task, "filter": preset, "batch": batch}
-                jobs.append(Job(row, partial(prepare, task, preset, batch), partial(measure, batch=batch)))
-    yield from measured(jobs, request)
+            if preset:
+                jobs.append(Job({"task": task, "filter": preset}, partial(prepare, task, preset), measure))
+    yield from measured(jobs, request, len(request.tasks))
 
 
 def sizes_here() -> Sizes:
@@ -389,17 +391,23 @@ def sizes_here() -> Sizes:
 
 
 class Built:
-    """A compiled program, what compiling took, and how to call it."""
+    """One or more compiled programs, what compiling took, the memory of the last one, and how to call them."""
 
     call: Callable[[Any], Any]
     config: Any = None
 
     def __init__(self, compile_: Callable[[], Any]) -> None:
-        """Compile."""
-        begin = time.monotonic()
-        self.program = compile_()
+        """Compile; `compile_` returns a program or a list of them."""
+        begin, found = time.monotonic(), compile_()
+        self.programs = found if isinstance(found, list) else [found]
         self.compile_s = time.monotonic() - begin
-        self.temporary = getattr(self.program.memory_analysis(), "temp_size_in_bytes", None)
+        sizes = [getattr(program.memory_analysis(), "temp_size_in_bytes", None) for program in self.programs]
+        self.temporary = sizes[-1]
+
+    @property
+    def program(self) -> Any:
+        """The only program."""
+        return self.programs[0]
 
     def calling(self, call: Callable[[Any], Any]) -> Built:
         """Return this with how it is called."""
@@ -407,29 +415,49 @@ class Built:
         return self
 
 
-def measured(jobs: Sequence[Job], request: Request) -> Iterator[dict[str, Any]]:
-    """Compile all jobs side by side, then measure one after another what was compiled in time."""
-    pool = ThreadPoolExecutor(usable_cores())
-    futures = [pool.submit(job.prepare) for job in jobs]
-    wait(futures, timeout=max(COMPILING * request.left, 0.0))
-    for future in futures:
-        future.cancel()
-    for job, future in zip(jobs, futures, strict=True):
-        name = ", ".join(f"{key} {value}" for key, value in job.row.items())
-        if not future.done() or future.cancelled():
-            yield {"skipped": f"{name}: not compiled in time"}
-        elif (error := future.exception()) is not None:
-            yield {"skipped": f"{name}: {type(error).__name__}: {str(error)[:300]}"}
-        elif request.left <= 0.0:
-            yield {"skipped": f"{name}: out of time"}
-        else:
-            built = future.result()
-            try:
-                found = job.measure(built, request)
-            except Exception as problem:  # an error of the device ends one row, not the others
-                yield {"skipped": f"{name}: {type(problem).__name__}: {str(problem)[:300]}"}
-                continue
-            yield {**job.row, **found, "compile_s": round(built.compile_s, 1), "temporary_bytes": built.temporary}
+def measured(jobs: Sequence[Job], request: Request, size: int = sys.maxsize) -> Iterator[dict[str, Any]]:
+    """Compile some jobs side by side, at most two a core, then measure them one after another; then the next ones.
+
+    Nothing is measured while something compiles. Where the time is too short for another round like the one before, the
+    rest is skipped.
+    """
+    size, longest = min(size, 2 * usable_cores()), 0.0
+    for first in range(0, len(jobs), size):
+        turn, begin = jobs[first : first + size], time.monotonic()
+        if longest > request.left or request.left <= 0.0:
+            yield from ({"skipped": f"{named(job)}: out of time"} for job in jobs[first:])
+            return
+        pool = ThreadPoolExecutor(len(turn))
+        futures = [pool.submit(job.prepare) for job in turn]
+        wait(futures, timeout=COMPILING * request.left)
+        compiling = not all(future.done() for future in futures)
+        for job, future in zip(turn, futures, strict=True):
+            if not future.done():
+                yield {"skipped": f"{named(job)}: not compiled in time"}
+            elif (error := future.exception()) is not None:
+                yield {"skipped": f"{named(job)}: {type(error).__name__}: {str(error)[:300]}"}
+            elif request.left <= 0.0:
+                yield {"skipped": f"{named(job)}: out of time"}
+            else:
+                yield row_of(job, future.result(), request) | ({"beside_compilation": True} if compiling else {})
+        longest = max(longest, time.monotonic() - begin)
+        if compiling:
+            yield from ({"skipped": f"{named(job)}: out of time"} for job in jobs[first + size :])
+            return
+
+
+def row_of(job: Job, built: Built, request: Request) -> dict[str, Any]:
+    """Measure a job that is compiled; an error of the device ends its row, not the others."""
+    try:
+        found = job.measure(built, request)
+    except Exception as error:
+        return {"skipped": f"{named(job)}: {type(error).__name__}: {str(error)[:300]}"}
+    return {**job.row, **found, "compile_s": round(built.compile_s, 1), "temporary_bytes": built.temporary}
+
+
+def named(job: Job) -> str:
+    """Return how a job is called where it is skipped."""
+    return ", ".join(f"{key} {value}" for key, value in job.row.items())
 
 
 def timed(run: Callable[[int], Any], repeats: int) -> list[float]:
@@ -460,11 +488,11 @@ class Part(NamedTuple):
 
 
 PARTS = {
-    "numbers": Part(numbers, 0.28),
-    "environments": Part(environments, 0.24),
-    "ppo": Part(ppo, 0.18),
+    "numbers": Part(numbers, 0.27),
+    "environments": Part(environments, 0.20),
+    "ppo": Part(ppo, 0.22),
     "learning": Part(learning, 0.18),
-    "filters": Part(filters, 0.12),
+    "filters": Part(filters, 0.13),
 }
 
 if __name__ == "__main__":

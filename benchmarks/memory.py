@@ -1,7 +1,8 @@
 """How much memory does a training take, for each environment and for each seed?
 
 Stated: the bytes of a state of the task, and of what a seed keeps between updates without its environments. Predicted: what
-the compiled update needs in all, by XLA, which is what a training compares with the memory that is free before it starts.
+the compiled update needs in all, by XLA. A training compares that with the memory that is free before it starts, and adds
+what a process takes once: for compiling, for code and for the programs of its evaluations (`jaxsafe/devices/memory.py`).
 Measured: how far the resident memory of the process rises during two updates. Each row is a process of its own; on Linux.
 Writes `benchmarks/results/memory.json` and prints the table of docs/scaling.md:
 

@@ -456,13 +456,12 @@ def accelerator_learning(found: Found) -> str:
 def accelerator_filters(found: Found) -> str:
     """Calls a second, medians."""
     rows = found["parts"]["filters"]["rows"]
-    rates = {(row["filter"], row["batch"], row["task"]): _scale(row["calls_per_s"]) for row in rows}
-    tasks = [task for task in TASKS if any(row["task"] == task for row in rows)]
     lines = [
-        [f"`{name}`", f"{batch:,}", *(rates.get((name, batch, task), "") for task in tasks)]
-        for name, batch in dict.fromkeys((row["filter"], row["batch"]) for row in rows)
+        [row["task"], f"`{row['filter']}`", *(_scale(rate) for rate in row["calls_per_s"].values()), *_program(row)]
+        for row in rows
     ]
-    return markdown(["filter calls/s on the accelerator", "batch", *tasks], lines)
+    heads = [f"{int(batch):,} states" for batch in rows[0]["calls_per_s"]]
+    return markdown(["filter calls/s on the accelerator", "filter", *heads, *PROGRAM], lines)
 
 
 PROGRAM = ("compile [s]", "memory [MiB]")

@@ -1,5 +1,6 @@
 """Aerospace SafeRL benchmarks as pure JAX functions."""
 
+import jaxsafe.address_space
 import jaxsafe.quiet  # noqa: F401 before anything imports jaxlib
 from jaxsafe.agents.policy_file import load_policy
 from jaxsafe.config import override

@@ -270,6 +270,12 @@ def drawn(env: Environment, parameters: Parameters) -> Environment:
     return env
 
 
+def extremes(env: Environment) -> tuple[Environment, Environment]:
+    """Return the environment with the least and with the greatest value of each number that is random."""
+    low, high = ({path: interval[i] for path, interval in env.randomize.items()} for i in (0, 1))
+    return drawn(env, low), drawn(env, high)
+
+
 def _blank(env: Environment) -> Sim:
     never = {name: jnp.zeros((), bool) for name in env.outcomes[1:]}
     return Sim(jnp.zeros_like(env.dt), {}, {}, {}, never, jnp.zeros((), bool))

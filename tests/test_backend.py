@@ -1,5 +1,6 @@
 """What programs do otherwise on an accelerator has the same results."""
 
+import os
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,7 @@ import jaxsafe
 from jaxsafe import autoreset
 from jaxsafe.devices import backend
 from jaxsafe.devices.backend import packing, scan_packed
+from jaxsafe.devices.seed_mapper import claim_cores
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 from jaxsafe.train import ppo, shuffle
 
@@ -81,3 +83,16 @@ def test_an_accelerator_learns_the_same(as_accelerated: Callable[[Any], None]) -
     found = jax.jit(lambda state: ppo.update(env, agent, hyper, 4, state))(start)
     for one, other in zip(jax.tree.leaves(found.params), jax.tree.leaves(expected.params), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("plugin", "platforms", "disabled"), [(None, "", True), (object(), "", False), (object(), "cpu", True)]
+)
+def test_llvm_keeps_its_expensive_passes_for_an_accelerator(
+    monkeypatch: pytest.MonkeyPatch, plugin: object, platforms: str, disabled: bool
+) -> None:
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setenv("JAX_PLATFORMS", platforms)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: plugin)
+    claim_cores()
+    assert ("disable_expensive_passes" in os.environ["XLA_FLAGS"]) == disabled

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_modes import CHECKED_WHILE_RUNNING, CHECKED_WHILE_TRACING
 
 import jaxsafe
 from jaxsafe import ConfigError
@@ -144,3 +145,23 @@ def test_braxs_own_trainers_run(algorithm: str, monkeypatch: pytest.MonkeyPatch)
     import brax_docking2d
 
     assert brax_docking2d.train(algorithm)["eval/episode_reward"] > -2.0
+
+
+MODES = CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_it_works_in_every_mode_of_jax(brax: Any, mode: str) -> None:
+    with MODES[mode]():
+        env = brax.BraxEnv("docking2d", SHORT)
+        if mode == "dtype_promotion":  # Brax's own wrapper compares numbers of two types
+            state = jax.jit(env.reset)(jax.random.key(0))
+            action = np.zeros(2, np.float32)
+        else:
+            env = brax.wrap(env, episode_length=3, action_repeat=2)
+            state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
+            action = np.zeros((3, 2), np.float32)
+        step = jax.jit(env.step)
+        for _ in range(3):
+            state = step(state, action)
+        assert np.isfinite(state.obs).all()

@@ -7,7 +7,7 @@ import sys
 import tracemalloc
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
@@ -328,6 +328,53 @@ def test_a_platform_of_jax_that_is_not_there_is_told_in_one_line() -> None:
     found = subprocess.run(command, env={**os.environ, "JAX_PLATFORMS": "rocm"}, capture_output=True, text=True)
     assert (found.returncode, found.stdout) == (2, "")
     assert found.stderr == "error: JAX_PLATFORMS: no device of 'rocm' can be used here; leave it out, or choose cpu\n"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="ulimit -v means something on Linux")
+@pytest.mark.parametrize("kilobytes", [400_000, 1_500_000])
+@pytest.mark.parametrize(
+    "command", ["train env=docking2d", "evaluate run=pretrained/docking2d", "rta.falsify env=docking2d"]
+)
+def test_too_little_address_space_is_told_in_one_line(command: str, kilobytes: int, tmp_path: Path) -> None:
+    script = f"ulimit -v {kilobytes}; exec {sys.executable} -m jaxsafe.{command}"
+    environment = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parent.parent)}
+    found = subprocess.run(["bash", "-c", script], env=environment, cwd=tmp_path, capture_output=True, text=True)
+    assert (found.returncode, found.stdout) == (2, "")
+    assert found.stderr == (
+        f"error: memory is short: ulimit -v leaves {kilobytes / 2**20:.1f} GiB of address space, a command needs 2.0 GiB\n"
+    )
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(),
+        ImportError("lib.so: failed to map segment from shared object"),
+        RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 64 bytes."),
+    ],
+)
+def test_memory_that_is_short_is_told_in_one_line(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def main(argv: Sequence[str]) -> int:
+        raise error
+
+    monkeypatch.setattr(sys, "argv", ["command", "env=docking2d"])
+    with pytest.raises(SystemExit) as left:
+        cli.run(main, str)
+    assert left.value.code == 2
+    assert capsys.readouterr().err == f"error: memory is short: {str(error) or 'MemoryError'}\n"
+
+
+def test_an_error_that_has_to_do_with_something_else_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+    def main(argv: Sequence[str]) -> int:
+        raise ImportError("No module named 'mine'")
+
+    monkeypatch.setattr(sys, "argv", ["command", "env=docking2d"])
+    monkeypatch.setenv("JAX_PLATFORMS", "rocm")
+    with pytest.raises(ImportError, match="mine"):
+        cli.run(main, str)
 
 
 def test_paths_are_taken_as_typed() -> None:

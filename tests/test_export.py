@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from test_modes import CHECKED_WHILE_RUNNING, CHECKED_WHILE_TRACING
 
 import jaxsafe
 from jaxsafe.agents.imported_policy import ACTIVATIONS
@@ -113,6 +114,32 @@ def test_a_search_finds_the_least_margin() -> None:
     worst = search(functions.Exported(bowl, ("a", "b"), ("h",)), [(-1, 1), (-1, 1)], jax.random.key(0), starts=50)
     assert worst.margin == pytest.approx(-0.01, abs=1e-4)
     np.testing.assert_allclose(worst.start, [0.31, -0.7], atol=0.02)
+
+
+@pytest.mark.parametrize("mode", [*CHECKED_WHILE_TRACING, *CHECKED_WHILE_RUNNING])
+def test_the_modes_of_jax_change_nothing(mode: str, tmp_path: Path) -> None:
+    """Graphs are the same, and the search works."""
+    expected, found = tmp_path / "expected.onnx", tmp_path / "found.onnx"
+    words = ["run=pretrained/docking2d", "inputs=state"]
+    assert main([*words, f"out={expected}"]) == 0
+    bowl = lambda x: jnp.sum((x - jnp.array([[0.31, -0.7]])) ** 2, axis=-1, keepdims=True) - 0.01  # noqa: E731
+    with (CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING)[mode]():
+        assert main([*words, f"out={found}"]) == 0
+        assert main(["run=pretrained/docking2d", "format=stablehlo", f"out={tmp_path / 'x.stablehlo'}"]) == 0
+        exported = functions.Exported(bowl, ("a", "b"), ("h",))
+        worst = search(exported, [(-1, 1), (-1, 1)], jax.random.key(0), starts=50)
+    start = np.array([[80.0, -60.0, 0.1, -0.05]], np.float32)
+    left, right = (run(onnx.load(path), start) for path in (expected, found))
+    np.testing.assert_allclose(left, right, atol=1e-5)
+    assert worst.margin == pytest.approx(-0.01, abs=1e-4)
+    np.testing.assert_allclose(worst.start, [0.31, -0.7], atol=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["rank_promotion", "dtype_promotion"])
+def test_a_property_is_searched_where_types_and_ranks_are_strict(mode: str, tmp_path: Path) -> None:
+    with CHECKED_WHILE_TRACING[mode]():
+        assert main(["run=pretrained/docking2d", "format=vnnlib", "steps=2", f"out={tmp_path / 'x.vnnlib'}"]) == 0
 
 
 @pytest.mark.parametrize("where", ["everywhere", "in a corner", "inside"])

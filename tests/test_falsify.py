@@ -11,8 +11,10 @@ import pytest
 
 import jaxsafe
 from jaxsafe.commands.falsify import main, report
+from jaxsafe.environment import drawn
 from jaxsafe.evaluate.adversaries import ADVERSARIES
 from jaxsafe.evaluate.run_adversaries import attack, longest_episode
+from jaxsafe.processors.terminal import Timeout, time_limit
 
 
 def test_the_numbers_name_the_command_and_the_versions_that_made_them(tmp_path: Path) -> None:
@@ -46,6 +48,22 @@ def test_episodes_are_what_is_counted_and_whole_ones_unless_told_otherwise(capsy
     printed = capsys.readouterr().out
     assert " 160 " in printed
     assert "less than a share of 0.6 of the episodes has one" in printed
+
+
+def test_a_random_time_limit_is_read_as_each_episode_has_it() -> None:
+    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 10.0}, randomize={"terminal.timeout.limit": [5.0, 30.0]})
+    assert longest_episode(env) == 32
+    whole = attack(env, "there_and_back", longest_episode(env), 5, jax.random.key(0))
+    assert whole["whole_episodes"]
+    assert time_limit(env) == 10.0
+    assert time_limit(env.replace(terminal=(*env.terminal, Timeout(name="sooner", limit=jnp.float32(4.0))))) == 4.0
+    assert time_limit(env.replace(terminal=env.terminal[:1])) is None
+    sim = jaxsafe.reset(env, jax.random.key(0))[0].sim
+    key, away = jax.random.key(1), ADVERSARIES["outward"](env, sim, jax.random.key(1))
+    for limit, turned in ((5.0, True), (30.0, False)):  # at 4 s, as an episode with this limit has it
+        now = drawn(env, {"terminal.timeout.limit": jnp.float32(limit)})
+        control = ADVERSARIES["there_and_back"](now, sim.replace(time=jnp.float32(4.0)), key)
+        assert bool((control == away).all()) is not turned
 
 
 def test_what_is_not_a_number_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -226,6 +226,7 @@ MODES = {
     "nans": lambda: jax.debug_nans(True),
     "double_precision": lambda: jax.enable_x64(True),
     "rank_promotion": lambda: jax.numpy_rank_promotion("raise"),
+    "dtype_promotion": lambda: jax.numpy_dtype_promotion("strict"),
     "no_jit": lambda: jax.disable_jit(),
 }
 
@@ -408,6 +409,7 @@ def test_workers_that_are_spawned_work() -> None:
         (lambda: GymEnv("docking2d", render_mode="human"), "render_mode: found 'human'; choose from rgb_array"),
         (lambda: GymEnv("docking2d", max_episode_steps=0), "max_episode_steps: expected a whole number ≥ 1, found 0"),
         (lambda: GymEnv(jaxsafe.make("docking2d"), rta="default"), "rta: the environment is made already"),
+        (lambda: GymEnv("docking2d", max_episode_steps=10**400), "max_episode_steps: expected a whole number from 1 to 2"),
         (lambda: GymVectorEnv("docking2d", 0), "num_envs: expected a whole number ≥ 1, found 0"),
         (lambda: GymVectorEnv("docking2d", 2, autoreset_mode="Same"), "autoreset_mode: unknown mode 'Same'"),
         (lambda: GymEnv("docking2d").reset(options={"from": 3}), "reset: options: unknown 'from'; choose from start"),

@@ -4,8 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_modes import CHECKED_WHILE_RUNNING, CHECKED_WHILE_TRACING
 
 import jaxsafe
+from jaxsafe import ConfigError
 
 pytestmark = [pytest.mark.peer, pytest.mark.filterwarnings("default")]
 
@@ -84,6 +86,15 @@ def test_a_limit_of_its_own_truncates(make: Any) -> None:
     assert (bool(terminated), bool(truncated)) == (False, True)
 
 
+def test_a_limit_that_no_program_can_count_to_is_refused(make: Any) -> None:
+    env = make("docking2d")
+    with pytest.raises(
+        ConfigError, match="max_steps_in_episode: expected a whole number from 1 to 2,147,483,647, found 1000"
+    ):
+        env.default_params.replace(max_steps_in_episode=10**10)
+    assert jax.tree.map(lambda _: 0, env.default_params).max_steps_in_episode == 0  # axes to map over
+
+
 def test_discrete_actions_are_one_choice(make: Any) -> None:
     env, core = make("docking2d", actions="discrete"), jaxsafe.make("docking2d", actions="discrete")
     assert env.action_space().n == env.num_actions == 121
@@ -107,6 +118,25 @@ def test_the_action_space_is_the_actuators(make: Any) -> None:
     assert (space.low.tolist(), space.high.tolist()) == ([-3.0, -1.0], [0.5, 1.0])
     wide = env.default_params.replace(env=jaxsafe.override(env.env, {f"{thrust}.high": 2.0}))
     assert env.action_space(wide).high.tolist() == [2.0, 1.0]
+
+
+MODES = CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_it_works_in_every_mode_of_jax(make: Any, mode: str) -> None:
+    with MODES[mode]():
+        env, chosen = make("docking2d"), make("docking2d", actions="discrete", legacy=True)
+        params = env.default_params.replace(max_steps_in_episode=1)
+        starts, steps, first = jax.random.split(jax.random.key(0), 3)
+        starts, steps = jax.random.split(starts, 4), jax.random.split(steps, 5)
+        _, state = jax.vmap(env.reset, (0, None))(starts, params)
+        zero = np.zeros((4, 2), np.float32)
+        observation, *_, truncated, _ = jax.vmap(env.step, (0, 0, 0, None))(steps[:4], state, zero, params)
+        assert np.isfinite(observation).all()
+        assert truncated.all()
+        _, state = chosen.reset(first)
+        assert np.isfinite(chosen.step(steps[4], state, np.int32(3))[0]).all()
 
 
 @pytest.mark.slow

@@ -1,4 +1,7 @@
+import os
 import resource
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,6 +27,8 @@ def test_a_training_that_would_not_fit_is_refused_before_it_starts(tmp_path: Pat
 
 @pytest.mark.parametrize("command", [main, tune])
 def test_the_batch_of_an_update_is_counted(command: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "COMPILING", 0)
+    monkeypatch.setattr(memory, "RUNNING", 0)
     monkeypatch.setattr(memory, "available", lambda: 4 * 2**20)  # enough for the state, not for the update
     sizes = ["ppo.num_envs=1024", "ppo.num_steps=32", "ppo.num_minibatches=8", "steps=65536", "agent.hidden=[8]"]
     words = ["env=docking2d", "seeds=1", f"out={tmp_path / 'run'}", *sizes]
@@ -31,6 +36,64 @@ def test_the_batch_of_an_update_is_counted(command: Callable, tmp_path: Path, mo
         words.append("sweep.ppo.gamma=[0.9,0.95]")
     with pytest.raises(ConfigError, match=r"ppo.num_envs, .*: this training needs [\d.]+ GiB of memory, 0.0 GiB are free"):
         command(words)
+
+
+@pytest.mark.parametrize("command", [main, tune])
+def test_what_compiling_takes_is_counted(command: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available", lambda: memory.GIB)  # a hundred times the state and the update
+    words = ["env=docking2d", "seeds=1", f"out={tmp_path / 'run'}", "steps=4096"]
+    if command is tune:
+        words.append("sweep.ppo.gamma=[0.9,0.95]")
+    with pytest.raises(ConfigError, match=r"this training needs 1.4 GiB of memory, 1.0 GiB are free"):
+        command(words)
+
+
+def test_what_a_process_takes_once_is_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "available", lambda: 10 * memory.GIB)
+    memory.require(4 * memory.GIB, 2, "x", 2 * memory.GIB)
+    with pytest.raises(ConfigError, match=r"x: this training needs 11.0 GiB of memory"):
+        memory.require(4 * memory.GIB, 2, "x", 3 * memory.GIB)
+
+
+TRAINING = """
+import sys
+from pathlib import Path
+
+from jaxsafe.devices.seed_mapper import claim_cores
+
+claim_cores()
+from jaxsafe.devices import memory
+from jaxsafe.train.__main__ import main
+
+def resident(which):
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(which))
+
+def require(needed, devices, what, beside=0):
+    found.append((resident("VmRSS"), needed * devices + beside))
+
+found = []
+memory.require = require
+assert main(sys.argv[1:]) == 0
+peak = resident("VmHWM")
+(begun, compiling), (compiled, running) = found
+print(compiled - begun, compiling, peak - compiled, running)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is measured on Linux")
+@pytest.mark.parametrize("task", ["docking2d", "rejoin3d"])
+def test_a_training_takes_no_more_than_was_predicted(task: str, tmp_path: Path) -> None:
+    words = [f"env={task}", "seeds=2", "steps=16384", "ppo.num_epochs=1", f"out={tmp_path / 'run'}"]
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path), "XLA_FLAGS": ""}  # nothing is compiled already
+    words += ["eval_episodes=1", "episodes=1"]
+    done = subprocess.run(
+        [sys.executable, "-c", TRAINING, *words], env=environment, capture_output=True, text=True, check=True
+    )
+    taken, predicted, later, predicted_later = map(int, done.stdout.split()[-4:])
+    assert 0.5 * predicted < taken <= predicted
+    assert later <= predicted_later <= later + memory.RUNNING
 
 
 def test_processes_of_one_machine_share_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -139,6 +139,19 @@ def test_a_filter_that_could_certify_nothing_is_refused(task: str, changes: dict
         jaxsafe.make(task, changes, rta="default")
     assert str(caught.value).startswith("rta")
     assert "\n" not in str(caught.value)
+    with pytest.raises(ConfigError) as later:
+        jaxsafe.override(jaxsafe.make(task, rta="default"), changes)
+    assert str(later.value) == str(caught.value)
+
+
+def test_a_change_of_traced_numbers_is_not_refused() -> None:
+    env = jaxsafe.make("rejoin2d", rta="default")
+    jax.eval_shape(lambda minimum: jaxsafe.override(env, {"constraints.collision.minimum": minimum}), 200.0)
+
+    def fixed(x: jax.Array) -> jax.Array:
+        return x + jaxsafe.override(env, {"reward.success.value": 2.0}).dt
+
+    assert jax.jit(fixed)(jnp.float32(0.0)) == env.dt
 
 
 UNCERTIFIED = [

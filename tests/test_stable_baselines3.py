@@ -2,6 +2,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from test_modes import CHECKED_WHILE_RUNNING, CHECKED_WHILE_TRACING
 
 pytestmark = [pytest.mark.peer, pytest.mark.filterwarnings("default")]
 
@@ -95,3 +96,19 @@ def test_its_ppo_learns_docking(monkeypatch: pytest.MonkeyPatch) -> None:
     model = example.train()
     for deterministic in (False, True):
         assert example.success_rate(model, deterministic) >= 0.95
+
+
+MODES = CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_it_works_in_every_mode_of_jax(make: Any, mode: str) -> None:
+    with MODES[mode]():
+        env = make("docking2d", 3, max_episode_steps=2)
+        env.seed(0)
+        env.set_options({"start": {"deputy": {"position": [30.0, 0.0], "velocity": [-0.9, 0.0]}}})
+        env.reset()
+        for step in range(2):
+            observation, _, done, _ = env.step(np.zeros((3, 2), np.float32))
+            assert np.isfinite(observation).all()
+            assert done.all() == (step == 1)

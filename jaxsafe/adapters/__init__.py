@@ -12,9 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.config import override
-from jaxsafe.environment import Environment, drawn
+from jaxsafe.environment import Environment, extremes
 from jaxsafe.envs import make
-from jaxsafe.schema.errors import ConfigError, nearest
+from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.simulation.controllers import Actuator, AgentController
 
 FORKED = (
@@ -59,14 +59,20 @@ def environment(
     return override(task, overrides) if overrides else task
 
 
+MAX_COUNT = 2**31 - 1
+"""The largest number of environments or of steps: the programs count in 32 bits."""
+
+
 def checked_count(name: str, count: Any) -> int:
     """Return a number of environments or of steps.
 
     Raises:
-        ConfigError: it is no whole number, or below 1.
+        ConfigError: it is no whole number, below 1 or above `MAX_COUNT`.
     """
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-        raise ConfigError(f"{name}: expected a whole number ≥ 1, found {count!r}")
+        raise ConfigError(f"{name}: expected a whole number ≥ 1, found {show(count)}")
+    if count > MAX_COUNT:
+        raise ConfigError(f"{name}: expected a whole number from 1 to {MAX_COUNT:,}, found {show(count)}")
     return int(count)
 
 
@@ -87,8 +93,7 @@ def action_bounds(env: Environment) -> tuple[list[Any], list[Any]]:
     """
     if not acts_in_physical_units(env):
         return [-1.0] * env.action_size, [1.0] * env.action_size
-    ends = [drawn(env, {path: interval[i] for path, interval in env.randomize.items()}) for i in (0, 1)]
-    pairs = list(zip(*map(_actuators, ends), strict=True))
+    pairs = list(zip(*map(_actuators, extremes(env)), strict=True))
     low = [-1.0 if a.rescale else jnp.minimum(a.low, b.low) for a, b in pairs]
     high = [1.0 if a.rescale else jnp.maximum(a.high, b.high) for a, b in pairs]
     return low, high

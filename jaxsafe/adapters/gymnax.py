@@ -16,7 +16,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxsafe.adapters import action_bounds, acts_in_physical_units, environment, observation_bounds
+from jaxsafe.adapters import (
+    MAX_COUNT,
+    action_bounds,
+    acts_in_physical_units,
+    checked_count,
+    environment,
+    observation_bounds,
+)
 from jaxsafe.environment import Environment, reset, step
 from jaxsafe.rollout import cut_short, restarted
 from jaxsafe.schema.errors import missing
@@ -33,6 +40,11 @@ class GymnaxParams(Record):
 
     env: Environment
     max_steps_in_episode: int = 10_000  # longer than any of the five tasks lasts
+
+    def __post_init__(self) -> None:
+        """Refuse a limit that no program can count to. Traced limits, and trees of axes such as 0, are left alone."""
+        if isinstance(self.max_steps_in_episode, int) and self.max_steps_in_episode > MAX_COUNT:
+            checked_count("max_steps_in_episode", self.max_steps_in_episode)
 
 
 class GymnaxEnv:

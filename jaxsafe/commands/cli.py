@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NoReturn
 
+from jaxsafe.address_space import is_shortage
 from jaxsafe.commands.streams import lasting_streams
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema import user_modules
@@ -68,8 +69,12 @@ def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tu
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return INTERRUPTED, False
-    except (AssertionError, RuntimeError):
-        if (fault := _platform_fault()) is None:
+    except (AssertionError, ImportError, MemoryError, RuntimeError) as error:
+        if is_shortage(error):
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            print(f"error: memory is short: {reason}", file=sys.stderr)
+            return 2, False
+        if isinstance(error, ImportError | MemoryError) or (fault := _platform_fault()) is None:
             raise
         print(f"error: {fault}", file=sys.stderr)
         return 2, False

@@ -7,6 +7,7 @@ devices share the environments of a seed.
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -33,18 +34,26 @@ LANES = PartitionSpec("seeds", "lanes")
 def claim_cores() -> None:
     """Make every usable core a JAX device with one thread. Call before JAX touches its devices; what the user set stays.
 
-    LLVM's expensive passes take longer to compile and gave no faster program.
+    LLVM's expensive passes take longer to compile and gave no faster program on a CPU. Where JAX has a plugin for an
+    accelerator they stay: without them an update of PPO took 13 % longer on a GPU.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    for name, value in (
-        ("--xla_force_host_platform_device_count", f"={cores}"),
-        ("--xla_cpu_multi_thread_eigen", "=false"),
-        ("--xla_llvm_disable_expensive_passes", "=true"),
-    ):
+    passes = {} if accelerator_installed() else {"--xla_llvm_disable_expensive_passes": "=true"}
+    for name, value in {
+        "--xla_force_host_platform_device_count": f"={cores}",
+        "--xla_cpu_multi_thread_eigen": "=false",
+        **passes,
+    }.items():
         if name not in flags:
             flags += f" {name}{value}"
     os.environ["XLA_FLAGS"] = flags.strip()
+
+
+def accelerator_installed() -> bool:
+    """Return whether JAX may find an accelerator here, without asking it: it would set up its devices."""
+    only_cpu = os.environ.get("JAX_PLATFORMS") == "cpu"
+    return not only_cpu and importlib.util.find_spec("jax_plugins") is not None
 
 
 class SeedMapper:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.processors.terminal import Timeout, TooFar
+from jaxsafe.processors.terminal import TooFar, time_limit
 from jaxsafe.rta.filter import CertifiedRTA
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.transition import advance, bounds, smallest_margin
@@ -89,12 +89,9 @@ def head_on(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
 def there_and_back(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     """Away from the other platform for three quarters of the longest episode, or half of the way allowed, then back."""
     way = _to_target(env, sim)
-    times = [one.limit for one in env.terminal if isinstance(one, Timeout)]
-    limits = [one.limit for one in env.terminal if isinstance(one, TooFar)]
-    back = jnp.zeros((), bool)
-    for limit in times:
-        back = back | (sim.time > 0.75 * limit)
-    for limit in limits:
+    end = time_limit(env)
+    back = jnp.zeros((), bool) if end is None else sim.time > 0.75 * end
+    for limit in [one.limit for one in env.terminal if isinstance(one, TooFar)]:
         back = back | (safe_norm(way) > 0.5 * limit)
     return _towards(env, sim, jnp.where(back, way, -way), key)
 

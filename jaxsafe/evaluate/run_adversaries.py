@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.environment import Environment, drawn, step
+from jaxsafe.environment import Environment, drawn, extremes, step
 from jaxsafe.evaluate.adversaries import ADVERSARIES
-from jaxsafe.processors.terminal import Timeout
+from jaxsafe.processors.terminal import time_limit
 from jaxsafe.rollout import reset_batch
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError
@@ -90,15 +90,16 @@ def attack(env: Environment, name: str, num_steps: int, num_lanes: int, key: Key
 
 
 def longest_episode(env: Environment) -> int:
-    """The steps after which every episode has ended, by its time limit.
+    """Return the number of steps after which every episode has ended by its time limit, also where that is random.
 
     Raises:
         ConfigError: the task has no time limit.
     """
-    limits = [float(one.limit) for one in env.terminal if isinstance(one, Timeout)]
-    if not limits:
+    low, high = extremes(env)
+    limit = time_limit(high)
+    if limit is None:
         raise ConfigError("steps: the task has no time limit, so give the number of steps")
-    return math.ceil(min(limits) / float(env.dt)) + 2  # a timeout needs t > limit, and limit / dt may round down
+    return math.ceil(float(limit) / float(low.dt)) + 2  # a timeout needs t > limit, and limit / dt may round down
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2, 3))

@@ -50,9 +50,9 @@ def search(exported: Exported, box: Box, key: Key, starts: int = 10_000, best: i
 
     It may miss one: a search that finds nothing is no proof. A margin that is not a number is no safe one.
     """
-    low, high = (jnp.array([bounds[i] for bounds in box]) for i in (0, 1))
+    low, high = (jnp.array([[bounds[i] for bounds in box]], jnp.result_type(float)) for i in (0, 1))
     corners = np.stack(np.meshgrid(*([0.0, 1.0] for _ in box), indexing="ij"), axis=-1).reshape(-1, len(box))[:4096]
-    shares = jnp.concatenate([jnp.asarray(corners, jnp.float32), jax.random.uniform(key, (starts, len(box)))])
+    shares = jnp.concatenate([jnp.asarray(corners, low.dtype), jax.random.uniform(key, (starts, len(box)))])
 
     def least(share: jax.Array) -> jax.Array:
         margins = exported.function(low + share * (high - low))
@@ -76,5 +76,5 @@ def search(exported: Exported, box: Box, key: Key, starts: int = 10_000, best: i
     order = jnp.argsort(jax.jit(least)(shares))[:best]
     worst, at = descend(shares[order])
     index = int(jnp.argmin(worst))
-    start = np.asarray(low + at[index] * (high - low))
+    start = np.asarray(low[0] + at[index] * (high[0] - low[0]))
     return Worst(float(worst[index]), start, len(shares) + best * rounds)

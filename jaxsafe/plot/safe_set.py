@@ -1,7 +1,8 @@
 """Where a filter certifies, on planes through the state space: `python -m jaxsafe.plot.safe_set env=rejoin2d`.
 
 H(x) is the smallest h on the way of the best backup controller from x; without a horizon it is h(x) itself. A state is
-certified where H(x) ≥ margin. For docking the plane is distance against speed, for rejoin the surroundings of the lead.
+certified where H(x) reaches the margin that the filter keeps. For docking the plane is distance against speed, for rejoin
+the surroundings of the lead.
 """
 
 from __future__ import annotations
@@ -133,11 +134,12 @@ def draw(env: Environment, title: str, x: Ends | None = None, y: Ends | None = N
     figure = Figure(layout="compressed" if plane.spatial else "constrained")
     height = width * (high - low) / (right - left) if plane.spatial else 0.9 * width
     figure.set_size_inches(width * len(surveys) + 1.0, height + (1.2 if plane.spatial else 1.5))
+    required = float(env.rta.required_margin(env))
     panels = np.atleast_1d(figure.subplots(1, len(surveys), sharex=True, sharey=True))
     for panel, (each, (H, h)) in zip(panels, surveys.items(), strict=True):
         panel.pcolormesh(across, up, H, norm=scale, cmap=SHADES, shading="nearest", rasterized=True)
         finite_H = np.where(np.isneginf(H), -np.abs(h), H)  # so that a line between states can be interpolated
-        for values, level, look in ((h, 0.0, BOUNDARY), (finite_H, float(env.rta.margin), CERTIFIED)):
+        for values, level, look in ((h, 0.0, BOUNDARY), (finite_H, required, CERTIFIED)):
             if values.min() < level < values.max():
                 panel.contour(across, up, values, levels=[level], colors=look["color"], linewidths=look["linewidth"])
         panel.locator_params(nbins=5)
@@ -199,7 +201,7 @@ def _unit(env: Environment) -> str | None:
 def _entries(surveys: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> list[Any]:
     """What the lines mean and, where it occurs, the colour of −∞."""
     entries: list[Any] = [
-        Line2D([], [], label="H = margin; certified on the side of higher H", **CERTIFIED),
+        Line2D([], [], label="H = margin kept; certified on the side of higher H", **CERTIFIED),
         Line2D([], [], label="h = 0", **BOUNDARY),
     ]
     if any(np.isneginf(H).any() for H, _ in surveys.values()):

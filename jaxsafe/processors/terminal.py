@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import functools
+from typing import Annotated, Any, Literal
 
+import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jaxsafe.schema.component import Component, Range
 from jaxsafe.simulation.clock import later, reached
-from jaxsafe.types import FlagName, Length, Reach, Seconds, Sim, StatusName
+from jaxsafe.types import FlagName, Length, Number, Reach, Seconds, Sim, StatusName
 
 Ends = Literal["terminated", "truncated"]
 
@@ -104,3 +106,9 @@ class Timeout(Terminal, type="timeout"):
 
     def reached(self, sim: Sim) -> Bool[Array, ""]:
         return later(sim.time, self.limit)
+
+
+def time_limit(env: Any) -> Number | None:
+    """Return the seconds after which the first timeout of an environment ends an episode, None if it has no timeout."""
+    limits = [one.limit for one in env.terminal if isinstance(one, Timeout)]
+    return functools.reduce(jnp.minimum, limits) if limits else None

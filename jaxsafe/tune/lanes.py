@@ -81,9 +81,10 @@ class Lanes:
     def _fitting(self, lanes: Any, keys: jax.Array) -> jax.stages.Compiled:
         """The program of some updates, refused before there is a state if either needs more memory than there is."""
         like = self.mapper.like(jax.eval_shape(self._init, (), (lanes, keys)))
-        memory.require(memory.size(like) // self.mapper.mesh.size, self.mapper.num_local_devices, memory.OPTIONS)
+        state = memory.size(like) // self.mapper.mesh.size
+        memory.require(state, self.mapper.num_local_devices, memory.OPTIONS, memory.COMPILING)
         compiled = self.mapper.map(self._one_chunk).lower((), (lanes, like)).compile()
-        memory.require(memory.footprint(compiled), self.mapper.num_local_devices, memory.OPTIONS)
+        memory.require(memory.footprint(compiled), self.mapper.num_local_devices, memory.OPTIONS, memory.RUNNING)
         return compiled
 
     def _one_chunk(self, _: tuple, one: tuple[Any, Any]) -> tuple[Any, dict[str, jax.Array]]:

@@ -158,7 +158,7 @@ class Training:
         """Have the state, fresh or restored, while all programs are compiled side by side."""
         content = structure(self.env, self.config)
         each = memory.size(content) // self.config.seeds * self.mapper.padded // self.mapper.mesh.size
-        memory.require(each, self.mapper.num_local_devices, memory.OPTIONS)
+        memory.require(each, self.mapper.num_local_devices, memory.OPTIONS, memory.COMPILING)
         begin, keys = time.monotonic(), self.mapper.keys(self.config.seed)
         fresh, advance = programs(self.mapper, self.chunk, self.config.num_updates)
         like = self.mapper.like(jax.eval_shape(fresh, self.shared, keys), STATE)
@@ -204,7 +204,7 @@ class Training:
         begin, compiled = time.monotonic(), self.advance.compiled()
         self.compile_s += time.monotonic() - begin
         has = memory.size(self.state) // self.mapper.mesh.size  # which is there already
-        memory.require(memory.footprint(compiled) - has, self.mapper.num_local_devices, memory.OPTIONS)
+        memory.require(memory.footprint(compiled) - has, self.mapper.num_local_devices, memory.OPTIONS, memory.RUNNING)
 
     def _due(self, before: int, every: int | None) -> bool:
         """Whether a chunk that began at update `before` passed a multiple of the interval or the end."""
