@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from jaxsafe.config import build, load, load_filter, override
 from jaxsafe.environment import Environment
-from jaxsafe.envs import docking, rejoin  # noqa: F401 they register their tasks, in the order of the paper
+from jaxsafe.envs import docking, rejoin
 from jaxsafe.envs.task import (
     TASKS,
     Task,
@@ -39,6 +39,9 @@ __all__ = [
     "short_name",
     "user_module",
 ]
+
+for _task in (*rejoin.TASKS, *docking.TASKS):  # in the order of the paper
+    register(_task)
 
 VARIANTS = ("paper", "released")
 """`paper` is a task as it is declared, `released` has the semantics of the published SafeRL code."""

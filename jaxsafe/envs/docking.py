@@ -12,7 +12,7 @@ from typing import Any, Literal
 import jax.numpy as jnp
 
 from jaxsafe.environment import Environment
-from jaxsafe.envs.task import Filters, Task, register
+from jaxsafe.envs.task import Filters, Task
 from jaxsafe.processors.constraint import Constraint, SpeedLimit
 from jaxsafe.processors.observation import Observation, Observe, ObserveAngle, ObserveStatus
 from jaxsafe.processors.reward import (
@@ -293,7 +293,7 @@ FILTERS_ORIENTED: Filters = {
     "explicit_asif": lambda: _explicit_asif(TURN["backups"][0]),
 }
 
-register(
+TASKS = (
     Task(
         name="docking2d",
         environment=lambda: docking(2),
@@ -302,9 +302,7 @@ register(
         gymnasium_id="jaxsafe/Docking2D-v0",
         recipe="docking2d.yaml",
         paper_steps=340_000,
-    )
-)
-register(
+    ),
     Task(
         name="docking3d",
         environment=lambda: docking(3),
@@ -313,9 +311,7 @@ register(
         gymnasium_id="jaxsafe/Docking3D-v0",
         recipe="docking3d.yaml",
         paper_steps=660_000,
-    )
-)
-register(
+    ),
     Task(
         name="docking2d_oriented",
         environment=docking_oriented,
@@ -324,5 +320,6 @@ register(
         gymnasium_id="jaxsafe/Docking2DOriented-v0",
         recipe="docking2d_oriented.yaml",
         paper_steps=1_500_000,
-    )
+    ),
 )
+"""The tasks of this domain."""

@@ -11,7 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from jaxsafe.environment import Environment
-from jaxsafe.envs.task import Filters, Task, register
+from jaxsafe.envs.task import Filters, Task
 from jaxsafe.processors.constraint import Constraint, Separation
 from jaxsafe.processors.observation import Observation, Observe, ObserveRegion
 from jaxsafe.processors.reward import (
@@ -290,7 +290,7 @@ FILTERS_3D: Filters = {
     "explicit_asif": lambda: _explicit_asif(MATCH_3D["backups"][0]),
 }
 
-register(
+TASKS = (
     Task(
         name="rejoin2d",
         environment=rejoin2d,
@@ -299,9 +299,7 @@ register(
         gymnasium_id="jaxsafe/Rejoin2D-v0",
         recipe="rejoin2d.yaml",
         paper_steps=300_000,
-    )
-)
-register(
+    ),
     Task(
         name="rejoin3d",
         environment=rejoin3d,
@@ -310,5 +308,6 @@ register(
         gymnasium_id="jaxsafe/Rejoin3D-v0",
         recipe="rejoin3d.yaml",
         paper_steps=2_300_000,
-    )
+    ),
 )
+"""The tasks of this domain."""
