@@ -40,7 +40,9 @@ def refuse_fork() -> None:
 
 
 def environment(
-    task: str | os.PathLike | Environment, overrides: Mapping[str, Any] | None, options: Mapping[str, Any]
+    task: str | os.PathLike | Environment,
+    overrides: Mapping[str, Any] | None,
+    options: Mapping[str, Any],
 ) -> Environment:
     """What `jaxsafe.make` makes of the arguments of an adapter, or the environment that it was given.
 
@@ -55,7 +57,9 @@ def environment(
     if not isinstance(task, Environment):
         return make(task, overrides, **options)
     if options:
-        raise ConfigError(f"{next(iter(options))}: the environment is made already; give it to jaxsafe.make instead")
+        raise ConfigError(
+            f"{next(iter(options))}: the environment is made already; give it to jaxsafe.make instead"
+        )
     return override(task, overrides) if overrides else task
 
 
@@ -72,7 +76,9 @@ def checked_count(name: str, count: Any) -> int:
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise ConfigError(f"{name}: expected a whole number ≥ 1, found {show(count)}")
     if count > MAX_COUNT:
-        raise ConfigError(f"{name}: expected a whole number from 1 to {MAX_COUNT:,}, found {show(count)}")
+        raise ConfigError(
+            f"{name}: expected a whole number from 1 to {MAX_COUNT:,}, found {show(count)}"
+        )
     return int(count)
 
 
@@ -80,8 +86,14 @@ def observation_bounds(env: Environment) -> tuple[list[float], list[float]]:
     """The least and the greatest value of each element of an observation: infinite where it is not clipped."""
     bounds = []
     for item in env.observation:
-        size = sum(name == item.name or name.startswith(f"{item.name}.") for name in env.observation_names)
-        bounds += size * [(-math.inf, math.inf) if item.clip is None else (float(item.clip[0]), float(item.clip[1]))]
+        size = sum(
+            name == item.name or name.startswith(f"{item.name}.") for name in env.observation_names
+        )
+        bounds += size * [
+            (-math.inf, math.inf)
+            if item.clip is None
+            else (float(item.clip[0]), float(item.clip[1]))
+        ]
     return [low for low, _ in bounds], [high for _, high in bounds]
 
 

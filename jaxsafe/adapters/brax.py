@@ -34,7 +34,10 @@ class BraxEnv(Env):
     """
 
     def __init__(
-        self, task: str | os.PathLike | Environment, overrides: Mapping[str, Any] | None = None, **options: Any
+        self,
+        task: str | os.PathLike | Environment,
+        overrides: Mapping[str, Any] | None = None,
+        **options: Any,
     ) -> None:
         """Make the environment; `options` are `variant`, `randomize`, `rta` of `jaxsafe.make`.
 
@@ -53,7 +56,14 @@ class BraxEnv(Env):
     def reset(self, rng: Key) -> State:
         """A random start."""
         state, timestep = reset(self.env, rng)
-        return State(state, timestep.observation, timestep.reward, _number(timestep.done), self._metrics(timestep), {})
+        return State(
+            state,
+            timestep.observation,
+            timestep.reward,
+            _number(timestep.done),
+            self._metrics(timestep),
+            {},
+        )
 
     def step(self, state: State, action: Array) -> State:
         """Advance one time step of the task."""
@@ -84,7 +94,11 @@ class BraxEnv(Env):
 
     def _metrics(self, timestep: TimeStep) -> dict[str, Array]:
         terms = {f"reward_{name}": value for name, value in timestep.info.reward_terms.items()}
-        return {"cost": timestep.cost, "success": _number(timestep.info.outcome == self.env.success), **terms}
+        return {
+            "cost": timestep.cost,
+            "success": _number(timestep.info.outcome == self.env.success),
+            **terms,
+        }
 
 
 class Repeat(Wrapper):
@@ -126,7 +140,9 @@ class FreshStarts(Wrapper):
 
         def draw(taken: State) -> State:
             fresh = self.env.reset(now)
-            begun = choose(taken.done, (fresh.pipeline_state, fresh.obs), (taken.pipeline_state, taken.obs))
+            begun = choose(
+                taken.done, (fresh.pipeline_state, fresh.obs), (taken.pipeline_state, taken.obs)
+            )
             return taken.replace(pipeline_state=begun[0], obs=begun[1])
 
         following = jax.lax.cond(jnp.any(taken.done), draw, lambda taken: taken, taken)
@@ -134,7 +150,12 @@ class FreshStarts(Wrapper):
         return following
 
 
-def wrap(env: Env, episode_length: int = 1000, action_repeat: int = 1, randomization_fn: Callable | None = None) -> Wrapper:
+def wrap(
+    env: Env,
+    episode_length: int = 1000,
+    action_repeat: int = 1,
+    randomization_fn: Callable | None = None,
+) -> Wrapper:
     """What to give Brax's trainers as `wrap_env_fn`: many episodes side by side, each with a fresh start.
 
     Raises:
@@ -155,7 +176,9 @@ def mend_brax() -> None:
     def device_put_replicated(tree: Any, devices: Any) -> Any:
         copies = jax.tree.map(lambda x: jnp.stack([x] * len(devices)), tree)
         mesh = jax.sharding.Mesh(devices, ("i",))
-        return jax.device_put(copies, jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("i")))
+        return jax.device_put(
+            copies, jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("i"))
+        )
 
     jax.device_put_replicated = device_put_replicated
 

@@ -28,7 +28,9 @@ def spaces(env: Environment) -> tuple[gym.spaces.Box, Space]:
     if env.num_action_points:
         return observation, gym.spaces.MultiDiscrete(list(env.num_action_points))
     low, high = action_bounds(env)
-    return observation, gym.spaces.Box(np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32)
+    return observation, gym.spaces.Box(
+        np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32
+    )
 
 
 def facts(env: Environment, timestep: TimeStep) -> dict[str, Any]:

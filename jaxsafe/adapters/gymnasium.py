@@ -50,7 +50,9 @@ class _Chains:
         self._np_random_seed = -1  # Gymnasium's sign of a generator whose seed is unknown
         self._unseeded[:] = True
 
-    def _start(self, mask: np.ndarray, seeds: Sequence[int | None], placed: Episodes | None) -> None:
+    def _start(
+        self, mask: np.ndarray, seeds: Sequence[int | None], placed: Episodes | None
+    ) -> None:
         """Start an episode in each lane of the mask, at random or as it is placed."""
         self._begin_chains(mask, seeds)
         if placed is None:
@@ -71,7 +73,9 @@ class _Chains:
                 if known == -1
                 else range(known, known + len(seeds))
             )
-        self._lanes.seed(begin, [one if seed is None else seed for seed, one in zip(seeds, own, strict=True)])
+        self._lanes.seed(
+            begin, [one if seed is None else seed for seed, one in zip(seeds, own, strict=True)]
+        )
         self._unseeded &= ~begin
 
 
@@ -117,7 +121,9 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
         self._unseeded = np.ones(1, bool)
         self._frames = Frames(self.env) if render_mode else None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict]:
         """Start an episode: see the class."""
         super().reset(seed=seed)
         chosen = _checked_options(options, ("start", "parameters"))
@@ -142,7 +148,9 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
     def render(self) -> Any:
         """A picture of the episode so far, (height, width, 3), if there is a render mode."""
         if self._frames is None:
-            gym.logger.warn("render: no render_mode was chosen; make the environment with render_mode='rgb_array'")
+            gym.logger.warn(
+                "render: no render_mode was chosen; make the environment with render_mode='rgb_array'"
+            )
             return None
         if not self._lanes.running:
             raise ResetNeeded("render: call reset first")
@@ -151,8 +159,12 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
     def _receive(self, episodes: Episodes) -> tuple[np.ndarray, float, bool, bool, dict]:
         timestep: Any = jax.tree.map(lambda x: x[0], episodes.timestep)
         if self._frames is not None:
-            self._frames.add(jax.tree.map(lambda x: x[0], episodes.state.sim), timestep.info.margins)
-        info = jax.tree.map(lambda x: x.item() if isinstance(x, np.generic) else x, facts(self.env, timestep))
+            self._frames.add(
+                jax.tree.map(lambda x: x[0], episodes.state.sim), timestep.info.margins
+            )
+        info = jax.tree.map(
+            lambda x: x.item() if isinstance(x, np.generic) else x, facts(self.env, timestep)
+        )
         flags = bool(timestep.terminated), bool(timestep.truncated)
         return timestep.observation.copy(), float(timestep.reward), *flags, info
 
@@ -216,7 +228,10 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ConfigError: as `GymEnv.reset`.
         """
         asked = self._seeds(seeds)
-        groups = [(_checked_options(chosen, ("start", "parameters")), mask) for chosen, mask in _grouped(options)]
+        groups = [
+            (_checked_options(chosen, ("start", "parameters")), mask)
+            for chosen, mask in _grouped(options)
+        ]
         placements = [_placed(self.env, chosen) for chosen, _ in groups]
         for placed, (_, mask) in zip(placements, groups, strict=True):
             self._start(mask, asked, placed)
@@ -227,9 +242,13 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         episodes = self._lanes.now
         self._over = np.where(mask, False, self._over)
         self._film(mask, episodes)
-        return np.array(episodes.timestep.observation), masked(facts(self.env, episodes.timestep), mask)
+        return np.array(episodes.timestep.observation), masked(
+            facts(self.env, episodes.timestep), mask
+        )
 
-    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
         """Advance every lane one time step of the task.
 
         Raises:
@@ -241,10 +260,14 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         over = self._over
         if self.autoreset_mode is AutoresetMode.DISABLED and over.any():
             lanes = np.flatnonzero(over).tolist()
-            raise ResetNeeded(f"step: the episodes of lanes {lanes} are over; reset them with options={{'reset_mask': …}}")
+            raise ResetNeeded(
+                f"step: the episodes of lanes {lanes} are over; reset them with options={{'reset_mask': …}}"
+            )
         action = _checked_action(self.env, actions)
         if action.shape != self.action_space.shape:
-            raise ConfigError(f"actions: expected shape {self.action_space.shape}, found {action.shape}")
+            raise ConfigError(
+                f"actions: expected shape {self.action_space.shape}, found {action.shape}"
+            )
         self._lanes.step(action)
         restarted, final = np.zeros_like(over), {}
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and over.any():
@@ -259,7 +282,9 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             episodes = self._lanes.now
             final = {"final_obs": np.array(taken.observation), "final_info": facts(self.env, taken)}
         self._film(restarted, episodes)
-        infos = masked(facts(self.env, episodes.timestep), np.ones(self.num_envs, bool)) | masked(final, restarted)
+        infos = masked(facts(self.env, episodes.timestep), np.ones(self.num_envs, bool)) | masked(
+            final, restarted
+        )
         rewards = taken.reward.astype(np.float64)
         flags = np.array(taken.terminated), np.array(taken.truncated)
         return np.array(episodes.timestep.observation), rewards, *flags, infos
@@ -267,7 +292,9 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def render(self) -> Any:
         """A picture of each lane's episode so far, if there is a render mode."""
         if not self._frames:
-            gym.logger.warn("render: no render_mode was chosen; make the environments with render_mode='rgb_array'")
+            gym.logger.warn(
+                "render: no render_mode was chosen; make the environments with render_mode='rgb_array'"
+            )
             return None
         if not self._lanes.running:
             raise ResetNeeded("render: call reset first")
@@ -280,7 +307,9 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             first = _checked_seed(seed)
             return [None if first is None else first + lane for lane in range(self.num_envs)]
         if not isinstance(seed, Iterable):
-            raise ConfigError(f"reset: seed: expected a whole number ≥ 0, or one for each lane, found {seed!r}")
+            raise ConfigError(
+                f"reset: seed: expected a whole number ≥ 0, or one for each lane, found {seed!r}"
+            )
         seeds = [_checked_seed(one) for one in seed]
         if len(seeds) != self.num_envs:
             raise ConfigError(f"reset: seed: expected {self.num_envs} seeds, found {len(seeds)}")
@@ -291,7 +320,12 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         for lane, frames in enumerate(self._frames):
             if restarted[lane]:
                 frames.clear()
-            frames.add(*jax.tree.map(lambda x, lane=lane: x[lane], (episodes.state.sim, episodes.timestep.info.margins)))
+            frames.add(
+                *jax.tree.map(
+                    lambda x, lane=lane: x[lane],
+                    (episodes.state.sim, episodes.timestep.info.margins),
+                )
+            )
 
 
 class Frames:
@@ -329,9 +363,15 @@ def _refuse_forking_workers() -> None:
     frame = inspect.currentframe()
     while frame is not None:
         if frame.f_code is AsyncVectorEnv.__init__.__code__:
-            chosen = frame.f_locals.get("context") or multiprocessing.get_start_method(allow_none=True)
-            if (chosen or multiprocessing.get_all_start_methods()[0]) == "fork":  # the first is the default
-                raise ConfigError(f"AsyncVectorEnv: {FORKED}, or leave out vectorization_mode for the compiled batch")
+            chosen = frame.f_locals.get("context") or multiprocessing.get_start_method(
+                allow_none=True
+            )
+            if (
+                chosen or multiprocessing.get_all_start_methods()[0]
+            ) == "fork":  # the first is the default
+                raise ConfigError(
+                    f"AsyncVectorEnv: {FORKED}, or leave out vectorization_mode for the compiled batch"
+                )
         frame = frame.f_back
 
 
@@ -357,7 +397,9 @@ def _checked_action(env: Environment, action: Any) -> np.ndarray:
     return array.astype(np.int32 if whole else jnp.result_type(float))
 
 
-def _grouped(options: Sequence[Mapping[str, Any] | None]) -> list[tuple[Mapping[str, Any] | None, np.ndarray]]:
+def _grouped(
+    options: Sequence[Mapping[str, Any] | None],
+) -> list[tuple[Mapping[str, Any] | None, np.ndarray]]:
     """Return each of the options with a mask of the lanes that have it; what is empty is one group."""
     groups = {id(one) if one else None: one for one in options}
     own = np.array([id(one) if one else None for one in options], object)
@@ -367,10 +409,16 @@ def _grouped(options: Sequence[Mapping[str, Any] | None]) -> list[tuple[Mapping[
 def _placed(env: Environment, chosen: Mapping[str, Any]) -> Episodes | None:
     """Return the episode at the start that is chosen, None for one at random."""
     refuse_fork()
-    return Episodes(*reset_to(env, chosen.get("start", {}), chosen.get("parameters"))) if chosen else None
+    return (
+        Episodes(*reset_to(env, chosen.get("start", {}), chosen.get("parameters")))
+        if chosen
+        else None
+    )
 
 
-def _checked_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) -> Mapping[str, Any]:
+def _checked_options(
+    options: Mapping[str, Any] | None, known: tuple[str, ...]
+) -> Mapping[str, Any]:
     if options and not isinstance(options, Mapping):
         raise ConfigError(f"reset: options: expected a dict, found {options!r}")
     for option in options or {}:
@@ -382,8 +430,15 @@ def _checked_options(options: Mapping[str, Any] | None, known: tuple[str, ...]) 
 def _checked_mask(mask: Any, num_envs: int) -> np.ndarray:
     if mask is None:
         return np.ones(num_envs, bool)
-    if not isinstance(mask, np.ndarray) or mask.dtype != bool or mask.shape != (num_envs,) or not mask.any():
-        found = f"{mask.dtype} of shape {mask.shape}" if isinstance(mask, np.ndarray) else repr(mask)
+    if (
+        not isinstance(mask, np.ndarray)
+        or mask.dtype != bool
+        or mask.shape != (num_envs,)
+        or not mask.any()
+    ):
+        found = (
+            f"{mask.dtype} of shape {mask.shape}" if isinstance(mask, np.ndarray) else repr(mask)
+        )
         raise ConfigError(
             f"reset: reset_mask: expected a bool array of shape ({num_envs},), some of it True, found {found}"
         )
@@ -395,7 +450,9 @@ def _checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
         return AutoresetMode(mode)
     except ValueError:
         known = [one.value for one in AutoresetMode]
-        raise ConfigError(f"autoreset_mode: unknown mode {mode!r}; choose from {nearest(str(mode), known)}") from None
+        raise ConfigError(
+            f"autoreset_mode: unknown mode {mode!r}; choose from {nearest(str(mode), known)}"
+        ) from None
 
 
 def _checked_render_mode(render_mode: str | None) -> str | None:
@@ -405,4 +462,8 @@ def _checked_render_mode(render_mode: str | None) -> str | None:
 
 
 def _checked_limit(max_episode_steps: int | None) -> float:
-    return np.inf if max_episode_steps is None else float(checked_count("max_episode_steps", max_episode_steps))
+    return (
+        np.inf
+        if max_episode_steps is None
+        else float(checked_count("max_episode_steps", max_episode_steps))
+    )

@@ -79,7 +79,9 @@ class GymnaxEnv:
         """A random start: observation and state."""
         return _reset(key, params or self.default_params)
 
-    def step(self, key: Key, state: State, action: Array, params: GymnaxParams | None = None) -> tuple:
+    def step(
+        self, key: Key, state: State, action: Array, params: GymnaxParams | None = None
+    ) -> tuple:
         """One step, and a fresh start where it ends the episode: (observation, state, reward, terminated, truncated, info).
 
         With `legacy`, (observation, state, reward, done, info).
@@ -91,7 +93,11 @@ class GymnaxEnv:
     @property
     def num_actions(self) -> int:
         """Number of combinations of discrete actions, or of elements of a continuous one."""
-        return math.prod(self.env.num_action_points) if self.env.num_action_points else self.env.action_size
+        return (
+            math.prod(self.env.num_action_points)
+            if self.env.num_action_points
+            else self.env.action_size
+        )
 
     def action_space(self, params: GymnaxParams | None = None) -> Any:
         """Return `Box`, [−1, 1] or the limits of actuators that do not rescale, or `Discrete` over all combinations.
@@ -103,13 +109,18 @@ class GymnaxEnv:
         if not acts_in_physical_units(self.env):
             return spaces.Box(-1.0, 1.0, (self.env.action_size,), dtype=jnp.float32)
         low, high = action_bounds((params or self.default_params).env)
-        arrays = [jnp.stack(jnp.broadcast_arrays(*bounds), axis=-1).astype(jnp.float32) for bounds in (low, high)]
+        arrays = [
+            jnp.stack(jnp.broadcast_arrays(*bounds), axis=-1).astype(jnp.float32)
+            for bounds in (low, high)
+        ]
         return spaces.Box(*arrays, (self.env.action_size,), dtype=jnp.float32)
 
     def observation_space(self, params: GymnaxParams | None = None) -> Any:
         """`Box` with the bounds of what is clipped."""
         low, high = observation_bounds(self.env)
-        return spaces.Box(jnp.array(low), jnp.array(high), (len(low),), dtype=jnp.result_type(float))
+        return spaces.Box(
+            jnp.array(low), jnp.array(high), (len(low),), dtype=jnp.result_type(float)
+        )
 
 
 @jax.jit
@@ -120,7 +131,9 @@ def _reset(key: Key, params: GymnaxParams) -> tuple[Array, State]:
 
 
 @jax.jit
-def _step(key: Key, state: State, action: Array, params: GymnaxParams) -> tuple[Array, State, Array, dict[str, Array]]:
+def _step(
+    key: Key, state: State, action: Array, params: GymnaxParams
+) -> tuple[Array, State, Array, dict[str, Array]]:
     points = params.env.num_action_points
     chosen = jnp.stack(jnp.unravel_index(action, points)).astype(jnp.int32) if points else action
     state, timestep = step(params.env, state, chosen)

@@ -36,7 +36,9 @@ class Packing:
     read from a pickle are that object too.
     """
 
-    def __init__(self, structure: Any, shapes: tuple[tuple[tuple[int, ...], np.dtype], ...]) -> None:
+    def __init__(
+        self, structure: Any, shapes: tuple[tuple[tuple[int, ...], np.dtype], ...]
+    ) -> None:
         """Lay out leaves of these shapes, without the axis of lanes, and types."""
         self._structure, self._shapes = structure, shapes
         self._blocks: list[tuple[np.dtype, int, int, list[tuple[int, int, int]]]] = []
@@ -63,7 +65,9 @@ class Packing:
         leaves, word = jax.tree.leaves(tree), _unsigned(jnp.result_type(float))
 
         def words(leaf: Array, shape: tuple[int, ...], dtype: np.dtype) -> Array:
-            bits = leaf if dtype.kind == "b" else jax.lax.bitcast_convert_type(leaf, _unsigned(dtype))
+            bits = (
+                leaf if dtype.kind == "b" else jax.lax.bitcast_convert_type(leaf, _unsigned(dtype))
+            )
             return bits.astype(word).reshape((*leaf.shape[: leaf.ndim - len(shape)], -1)).T
 
         ordered = [i for *_, parts in self._blocks for i, _, _ in parts]
@@ -89,7 +93,9 @@ class Packing:
             return block.astype(_unsigned(dtype), copy=False).view(dtype)
 
         def leaf(part: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-            return part[0] if not shape else part.T.reshape((-1, *shape)) if len(shape) > 1 else part.T
+            return (
+                part[0] if not shape else part.T.reshape((-1, *shape)) if len(shape) > 1 else part.T
+            )
 
         return self._tree(np.asarray(words), typed, leaf)
 
@@ -186,7 +192,9 @@ def pack(packing: Packing, tree: Any) -> Array:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def restart(layout: Layout, env: Array, keys: Array, words: Array, mask: Array) -> tuple[Array, Array]:
+def restart(
+    layout: Layout, env: Array, keys: Array, words: Array, mask: Array
+) -> tuple[Array, Array]:
     """The next keys and words, with a new episode where the mask says."""
     running = (keys, layout.episodes.unpack(words))
 
@@ -233,5 +241,7 @@ def _start(impl: str, env: Environment, keys: Array) -> tuple[Array, Episodes]:
         return jax.random.key_data(following), Episodes(*reset(env, now))
 
     # What other kinds of keys draw under vmap depends on the first lane's key: a lane would start where it started before.
-    over_lanes = jax.vmap(start) if impl == "threefry2x32" else functools.partial(jax.lax.map, start)
+    over_lanes = (
+        jax.vmap(start) if impl == "threefry2x32" else functools.partial(jax.lax.map, start)
+    )
     return over_lanes(keys)

@@ -36,12 +36,19 @@ class SafetyEnv:
         else:
             self.env = GymVectorEnv(task, num_envs, overrides, autoreset_mode="SameStep", **options)
         self.num_envs = num_envs
-        self.observation_space, self.action_space = self.env.observation_space, self.env.action_space
-        self.single_observation_space = getattr(self.env, "single_observation_space", self.observation_space)
+        self.observation_space, self.action_space = (
+            self.env.observation_space,
+            self.env.action_space,
+        )
+        self.single_observation_space = getattr(
+            self.env, "single_observation_space", self.observation_space
+        )
         self.single_action_space = getattr(self.env, "single_action_space", self.action_space)
         self.metadata, self.render_mode = self.env.metadata, self.env.render_mode
 
-    def reset(self, *, seed: Any = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+    def reset(
+        self, *, seed: Any = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict]:
         """As Gymnasium's."""
         return self.env.reset(seed=seed, options=options)
 
@@ -51,7 +58,10 @@ class SafetyEnv:
         cost = info["cost"]
         if "final_obs" in info:
             cost = np.where(info["_final_obs"], info["final_info"]["cost"], cost)
-            for ours, theirs in (("final_obs", "final_observation"), ("_final_obs", "_final_observation")):
+            for ours, theirs in (
+                ("final_obs", "final_observation"),
+                ("_final_obs", "_final_observation"),
+            ):
                 info[theirs] = info.pop(ours)
         return observation, reward, cost, terminated, truncated, info
 

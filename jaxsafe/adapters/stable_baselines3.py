@@ -54,7 +54,9 @@ class SB3VecEnv(VecEnv):
     def set_options(self, options: list[dict] | dict | None = None) -> None:
         """Give options of `GymEnv.reset` to the next reset, one dict for all lanes or one for each."""
         if not isinstance(options, dict | None) and len(options) != self.num_envs:
-            raise ConfigError(f"set_options: expected options for {self.num_envs} lanes, found {len(options)}")
+            raise ConfigError(
+                f"set_options: expected options for {self.num_envs} lanes, found {len(options)}"
+            )
         super().set_options(options)
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -87,10 +89,16 @@ class SB3VecEnv(VecEnv):
         return [getattr(self.env, attr_name)] * len(self._lanes(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        raise AttributeError(f"{attr_name}: the lanes are one program; give options when making the environments")
+        raise AttributeError(
+            f"{attr_name}: the lanes are one program; give options when making the environments"
+        )
 
-    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        raise AttributeError(f"{method_name}: the lanes are one program without methods of their own; see self.env")
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
+    ) -> list[Any]:
+        raise AttributeError(
+            f"{method_name}: the lanes are one program without methods of their own; see self.env"
+        )
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         return [False] * len(self._lanes(indices))

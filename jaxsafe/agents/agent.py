@@ -30,7 +30,9 @@ class Agent(Component):
     """Actor and critic of the same shape, with nothing shared, for a given environment's spaces."""
 
     hidden: Annotated[tuple[int, ...], Range(1, largest=2**16)] = (64, 64)
-    features: Literal["none", "docking", "approach", "rejoin"] = "none"  # appended to the observation
+    features: Literal["none", "docking", "approach", "rejoin"] = (
+        "none"  # appended to the observation
+    )
     log_std: Annotated[Number, Unit("1", length=ANY), Range(largest=20.0)] = -0.7
     """Initial, of continuous actions in [−1, 1], one number or one for each; learnt, the same for all states."""
     prior_std: Annotated[Dimensionless, Range(0.0, open_low=True, smallest=1e-6, largest=1e6)] = 0.3
@@ -47,49 +49,85 @@ class Agent(Component):
         outputs = sum(env.num_action_points) or env.action_size
         seen = len(env.reward) if self.critic_sees_totals else 0
         actor, critic = (inputs, *self.hidden, outputs), (inputs + seen, *self.hidden, 1)
-        networks = {"actor": actor, "critic": critic, **({"cost_critic": critic} if self.cost_critic else {})}
-        normals = iter(_normals(key, [shape for sizes in networks.values() for shape in pairwise(sizes)]))
+        networks = {
+            "actor": actor,
+            "critic": critic,
+            **({"cost_critic": critic} if self.cost_critic else {}),
+        }
+        normals = iter(
+            _normals(key, [shape for sizes in networks.values() for shape in pairwise(sizes)])
+        )
         params: Params = {
-            name: _layers([next(normals) for _ in pairwise(sizes)], last_gain=0.01 if name == "actor" else 1.0)
+            name: _layers(
+                [next(normals) for _ in pairwise(sizes)], last_gain=0.01 if name == "actor" else 1.0
+            )
             for name, sizes in networks.items()
         }
         log_std = jnp.log(self.prior_std) if env.num_action_points else jnp.asarray(self.log_std)
         return {**params, "log_std": jnp.broadcast_to(log_std, env.action_size)}
 
-    def inputs(self, env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
+    def inputs(
+        self, env: Environment, observation: Float[Array, "*batch o"]
+    ) -> Float[Array, "*batch i"]:
         """Return what the networks see of an observation."""
         return FEATURES[self.features](env, observation)
 
-    def distribution(self, env: Environment, params: Params, inputs: Float[Array, "*batch i"]) -> Gaussian | Categorical:
+    def distribution(
+        self, env: Environment, params: Params, inputs: Float[Array, "*batch i"]
+    ) -> Gaussian | Categorical:
         """Return the policy, a distribution over actions."""
         out, points = mlp(params["actor"], inputs), env.num_action_points
         if not points:
             return Gaussian(mean=out, log_std=params["log_std"])
-        sharpness = (self.prior_std * jnp.exp(-params["log_std"])) ** 2  # of each actuator, then of each of its logits
-        sharpness = jnp.sum(sharpness[:, None] * np.repeat(np.eye(len(points), dtype=np.float32), points, axis=1), axis=0)
+        sharpness = (
+            self.prior_std * jnp.exp(-params["log_std"])
+        ) ** 2  # of each actuator, then of each of its logits
+        sharpness = jnp.sum(
+            sharpness[:, None] * np.repeat(np.eye(len(points), dtype=np.float32), points, axis=1),
+            axis=0,
+        )
         prior = broadcast_to_rank(_prior(points, self.prior_std), out.ndim)
-        return Categorical(logits=broadcast_to_rank(sharpness, out.ndim) * (out + prior), points=points)
+        return Categorical(
+            logits=broadcast_to_rank(sharpness, out.ndim) * (out + prior), points=points
+        )
 
     def critic_inputs(
         self, inputs: Float[Array, "*batch i"], reward_totals: Mapping[str, Float[Array, "*batch"]]
     ) -> Float[Array, "*batch c"]:
         """Return what the critic sees: the inputs of the actor, and perhaps the totals of the episode."""
-        seen = sorted(reward_totals) if self.critic_sees_totals else ()  # a dict's order does not survive compilation
-        return jnp.concatenate([inputs, *(reward_totals[name][..., None] for name in seen)], axis=-1)
+        seen = (
+            sorted(reward_totals) if self.critic_sees_totals else ()
+        )  # a dict's order does not survive compilation
+        return jnp.concatenate(
+            [inputs, *(reward_totals[name][..., None] for name in seen)], axis=-1
+        )
 
-    def value(self, params: Params, critic_inputs: Float[Array, "*batch c"]) -> Float[Array, "*batch"]:
+    def value(
+        self, params: Params, critic_inputs: Float[Array, "*batch c"]
+    ) -> Float[Array, "*batch"]:
         """Return the critic's V(s)."""
         return mlp(params["critic"], critic_inputs)[..., 0]
 
-    def cost_rate(self, params: Params, critic_inputs: Float[Array, "*batch c"]) -> Float[Array, "*batch"]:
+    def cost_rate(
+        self, params: Params, critic_inputs: Float[Array, "*batch c"]
+    ) -> Float[Array, "*batch"]:
         """Return the cost critic's (1 − γ)·V_C(s): what a step costs on the average from here on, whatever the horizon."""
         return mlp(params["cost_critic"], critic_inputs)[..., 0]
 
-    def act(self, env: Environment, params: Params, key: Key, observation: Array, deterministic: Array | bool) -> Array:
+    def act(
+        self,
+        env: Environment,
+        params: Params,
+        key: Key,
+        observation: Array,
+        deterministic: Array | bool,
+    ) -> Array:
         """Return an action for each observation: a sample, or the mode."""
         distribution = self.distribution(env, params, self.inputs(env, observation))
         return jax.tree.map(
-            lambda mode, sample: jnp.where(deterministic, mode, sample), distribution.mode(), distribution.sample(key)
+            lambda mode, sample: jnp.where(deterministic, mode, sample),
+            distribution.mode(),
+            distribution.sample(key),
         )
 
     def policy(self, env: Environment, params: Params, deterministic: Array | bool) -> Policy:

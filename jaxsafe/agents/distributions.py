@@ -42,7 +42,9 @@ class Categorical(Component):
     points: tuple[int, ...]
 
     def mode(self) -> Array:
-        return jnp.stack([jnp.argmax(block, axis=-1) for block in self._blocks()], axis=-1).astype(jnp.int32)
+        return jnp.stack([jnp.argmax(block, axis=-1) for block in self._blocks()], axis=-1).astype(
+            jnp.int32
+        )
 
     def sample(self, key: Key, shard: Shard = WHOLE) -> Array:
         gumbel = shard.draw(jax.random.gumbel, key, self.logits.shape, self.logits.dtype)

@@ -32,7 +32,9 @@ def docking(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Ar
     """
     position = _vector(env, observation, "position", "docking")
     distance = _norm(position)
-    return jnp.concatenate([observation, position / (distance + 0.01), jnp.log(distance + 0.005)], axis=-1)
+    return jnp.concatenate(
+        [observation, position / (distance + 0.01), jnp.log(distance + 0.005)], axis=-1
+    )
 
 
 def approach(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
@@ -44,11 +46,17 @@ def approach(env: Environment, observation: Float[Array, "*batch o"]) -> Float[A
     position = _vector(env, observation, "position", "approach")
     limit = jnp.maximum(_elements(env, observation, "velocity_limit", "approach"), SMALLEST_LIMIT)
     relative_to_limit = 1.0 / limit
-    velocity = _scale(env, "velocity") * _vector(env, observation, "velocity", "approach") * relative_to_limit
+    velocity = (
+        _scale(env, "velocity")
+        * _vector(env, observation, "velocity", "approach")
+        * relative_to_limit
+    )
     direction = position / (_norm(position) + 1e-3)
     along = jnp.sum(direction * velocity, axis=-1, keepdims=True)
     speed = _elements(env, observation, "speed", "approach") * relative_to_limit
-    return jnp.concatenate([docking(env, observation), velocity, along, velocity - along * direction, speed], axis=-1)
+    return jnp.concatenate(
+        [docking(env, observation), velocity, along, velocity - along * direction, speed], axis=-1
+    )
 
 
 def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
@@ -65,7 +73,8 @@ def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Arr
     distance, bearing = _magnitude_and_direction(env, observation, "lead_position")
     far, towards = _magnitude_and_direction(env, observation, "rejoin_position")
     (speed, along), (own_speed, own) = (
-        _magnitude_and_direction(env, observation, f"{name}_velocity") for name in ("lead", "wingman")
+        _magnitude_and_direction(env, observation, f"{name}_velocity")
+        for name in ("lead", "wingman")
     )
     way, relative = far * towards, speed * along - own_speed * own
     course = relative / (_norm(relative) + 0.01)
@@ -73,17 +82,23 @@ def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Arr
     across = bearing - closing * course
     approaching = jnp.maximum(-closing, 0.0)
     sine2 = jnp.sum(across * across, axis=-1, keepdims=True)
-    danger = [approaching * jnp.exp(-sine2 * scale) for scale in (1.0 / 0.15**2, distance**2 / 0.2**2)]
+    danger = [
+        approaching * jnp.exp(-sine2 * scale) for scale in (1.0 / 0.15**2, distance**2 / 0.2**2)
+    ]
     miss = 4.0 * across * distance
     per_10_s = _scale(env, "rejoin_position")[0] / (10.0 * _scale(env, "wingman_velocity")[0])
     change = relative + per_10_s * way
     near, urgent = (jnp.clip(5.0 * vector, -1.0, 1.0) for vector in (way, change))
-    level = () if "roll" not in env.observation_names else (bearing,)  # in the plane the observation has it
+    level = (
+        () if "roll" not in env.observation_names else (bearing,)
+    )  # in the plane the observation has it
     aim = (*level, way, near, relative, change, urgent)
     return jnp.concatenate([observation, *aim, closing, 4.0 * across, miss, *danger], axis=-1)
 
 
-FEATURES: Mapping[str, Features] = {each.__name__: each for each in (none, docking, approach, rejoin)}
+FEATURES: Mapping[str, Features] = {
+    each.__name__: each for each in (none, docking, approach, rejoin)
+}
 """By name, as in `agent.features`."""
 
 
@@ -115,9 +130,13 @@ def _scale(env: Environment, name: str) -> Number:
     return next(one.scale for one in env.observation if one.name == name)
 
 
-def _vector(env: Environment, observation: Float[Array, "*batch o"], name: str, features: str) -> Float[Array, "*batch d"]:
+def _vector(
+    env: Environment, observation: Float[Array, "*batch o"], name: str, features: str
+) -> Float[Array, "*batch d"]:
     axes = [f"{name}.{axis}" for axis in "xyz" if f"{name}.{axis}" in env.observation_names]
-    return jnp.concatenate([_elements(env, observation, axis, features) for axis in axes or [f"{name}.x"]], axis=-1)
+    return jnp.concatenate(
+        [_elements(env, observation, axis, features) for axis in axes or [f"{name}.x"]], axis=-1
+    )
 
 
 def _elements(
@@ -129,6 +148,8 @@ def _elements(
         ConfigError: the environment does not observe it.
     """
     if name not in env.observation_names:
-        raise ConfigError(f"agent.features: {features!r} needs an observation called {name!r}; choose none")
+        raise ConfigError(
+            f"agent.features: {features!r} needs an observation called {name!r}; choose none"
+        )
     index = env.observation_names.index(name)
     return observation[..., index : index + 1]

@@ -24,7 +24,11 @@ from jaxsafe.rollout import Policy
 from jaxsafe.schema.errors import ConfigError, nearest
 from jaxsafe.storage.archive import open_archive
 
-ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {"tanh": jnp.tanh, "relu": jax.nn.relu, "swish": jax.nn.swish}
+ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {
+    "tanh": jnp.tanh,
+    "relu": jax.nn.relu,
+    "swish": jax.nn.swish,
+}
 """Between the layers of an .npz."""
 
 MAX_NAMES = 200
@@ -39,11 +43,15 @@ class ForeignAgent:
         """`network(weights, observation)` of one observation."""
         self.network = network
 
-    def inputs(self, env: Environment, observation: Float[Array, "batch o"]) -> Float[Array, "batch o"]:
+    def inputs(
+        self, env: Environment, observation: Float[Array, "batch o"]
+    ) -> Float[Array, "batch o"]:
         """Return what the network sees: the observation as it is."""
         return observation
 
-    def distribution(self, env: Environment, params: Params, inputs: Array) -> Categorical | Gaussian:
+    def distribution(
+        self, env: Environment, params: Params, inputs: Array
+    ) -> Categorical | Gaussian:
         """Return what the network says of one observation or a batch; only its mode means something."""
         out = jnp.vectorize(lambda one: self.network(params, one), signature="(o)->(a)")(inputs)
         if env.num_action_points:
@@ -52,7 +60,9 @@ class ForeignAgent:
 
     def policy(self, env: Environment, params: Params, deterministic: Array | bool) -> Policy:
         """Return the action for each of a batch of observations."""
-        return lambda key, observation: self.distribution(env, params, self.inputs(env, observation)).mode()
+        return lambda key, observation: self.distribution(
+            env, params, self.inputs(env, observation)
+        ).mode()
 
 
 class ForeignPolicy(NamedTuple):
@@ -90,17 +100,25 @@ def _check(path: Path, env: Environment, network: Network, weights: Mapping[str,
         found = jax.eval_shape(network, weights, observation)
     except Exception as error:  # JAX and the operators below refuse in many ways
         reason = str(error).partition("\n")[0]
-        raise ConfigError(f"{path}: does not take an observation of {env.observation_size} numbers: {reason}") from None
+        raise ConfigError(
+            f"{path}: does not take an observation of {env.observation_size} numbers: {reason}"
+        ) from None
     if found.shape != (wanted,):
-        raise ConfigError(f"{path}: expected {wanted} outputs ({', '.join(env.action_names)}), found shape {found.shape}")
+        raise ConfigError(
+            f"{path}: expected {wanted} outputs ({', '.join(env.action_names)}), found shape {found.shape}"
+        )
     if not jnp.issubdtype(found.dtype, jnp.floating):
         raise ConfigError(f"{path}: expected outputs that are real numbers, found {found.dtype}")
 
 
-def _read_layers(path: Path, env: Environment, activation: str) -> tuple[Network, dict[str, np.ndarray]]:
+def _read_layers(
+    path: Path, env: Environment, activation: str
+) -> tuple[Network, dict[str, np.ndarray]]:
     """Read the layers in an .npz, after their names and shapes alone have shown that they fit."""
     if activation not in ACTIVATIONS:
-        raise ConfigError(f"activation: found {activation!r}; choose from {nearest(activation, ACTIVATIONS)}")
+        raise ConfigError(
+            f"activation: found {activation!r}; choose from {nearest(activation, ACTIVATIONS)}"
+        )
     with open_archive(path, "cannot be read: not an .npz of numbers") as archive:
         count = len(archive.names) // 2
         expected = {f"{kind}_{i}" for i in range(count) for kind in ("kernel", "bias")}
@@ -112,7 +130,9 @@ def _read_layers(path: Path, env: Environment, activation: str) -> tuple[Network
             shape, dtype = archive.describe(name)
             if dtype.kind not in "fiu" or len(shape) != (2 if name.startswith("kernel") else 1):
                 wanted = "a matrix" if name.startswith("kernel") else "a list"
-                raise ConfigError(f"{path}: {name}: expected {wanted} of numbers, found {dtype} of shape {shape}")
+                raise ConfigError(
+                    f"{path}: {name}: expected {wanted} of numbers, found {dtype} of shape {shape}"
+                )
             shapes[name] = jax.ShapeDtypeStruct(shape, jnp.float32)
         _check(path, env, network, shapes)
         return network, {name: archive.read(name).astype(np.float32) for name in archive.names}

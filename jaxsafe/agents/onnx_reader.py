@@ -45,46 +45,72 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
         nodes = [_node(path, node) for node in model.graph.node]
         weights = {one.name: numpy_helper.to_array(one) for one in model.graph.initializer}
         constants = {
-            outputs[0]: _constant(path, attributes) for kind, _, outputs, attributes in nodes if kind == "Constant"
+            outputs[0]: _constant(path, attributes)
+            for kind, _, outputs, attributes in nodes
+            if kind == "Constant"
         }
     except ConfigError:
         raise
-    except Exception as error:  # protobuf, the checker, numpy and the file system have errors of their own
+    except (
+        Exception
+    ) as error:  # protobuf, the checker, numpy and the file system have errors of their own
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise ConfigError(f"{path}: cannot be read: {reason}") from None
     graph = model.graph
     for opset in model.opset_import:
         newest = onnx.defs.onnx_opset_version()
         if opset.domain in DOMAINS and not MIN_OPSET <= opset.version <= newest:
-            raise ConfigError(f"{path}: opset: expected {MIN_OPSET} to {newest}, found {opset.version}")
+            raise ConfigError(
+                f"{path}: opset: expected {MIN_OPSET} to {newest}, found {opset.version}"
+            )
     inputs = [one for one in graph.input if one.name not in weights]
     if len(inputs) != 1 or len(graph.output) != 1:
-        raise ConfigError(f"{path}: expected one input and one output, found {len(inputs)} and {len(graph.output)}")
+        raise ConfigError(
+            f"{path}: expected one input and one output, found {len(inputs)} and {len(graph.output)}"
+        )
     [declared] = inputs
     kind = declared.type.tensor_type.elem_type
     if kind not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT16):
         known = kind in onnx.TensorProto.DataType.values()
         found = onnx.TensorProto.DataType.Name(kind) if known else kind
         raise ConfigError(f"{path}: {declared.name}: expected an input of FLOAT, found {found}")
-    sizes = [axis.dim_value for axis in declared.type.tensor_type.shape.dim]  # 0 where it has a name
+    sizes = [
+        axis.dim_value for axis in declared.type.tensor_type.shape.dim
+    ]  # 0 where it has a name
     if len(nodes) > MAX_NODES:
         raise ConfigError(f"{path}: expected at most {MAX_NODES:,} operators, found {len(nodes):,}")
     for name, value in {**weights, **constants}.items():
         if value.dtype.kind not in "iub" and not jnp.issubdtype(value.dtype, jnp.floating):
             raise ConfigError(f"{path}: {name}: expected real numbers, found {value.dtype}")
     # what says shapes and axes must be known while tracing; what computes are the weights
-    whole = {name: value for name, value in {**weights, **constants}.items() if value.dtype.kind in "iu"}
-    floats = {name: value for name, value in {**weights, **constants}.items() if value.dtype.kind not in "iu"}
+    whole = {
+        name: value for name, value in {**weights, **constants}.items() if value.dtype.kind in "iu"
+    }
+    floats = {
+        name: value
+        for name, value in {**weights, **constants}.items()
+        if value.dtype.kind not in "iu"
+    }
 
     def network(weights: Mapping[str, Array], observation: Array) -> Array:
-        if any(size > 1 for size in sizes[:-1]) or (sizes and sizes[-1] not in (0, observation.size)):
+        if any(size > 1 for size in sizes[:-1]) or (
+            sizes and sizes[-1] not in (0, observation.size)
+        ):
             raise TypeError(f"its input is declared as {sizes}")
-        values: dict[str, Any] = {**whole, **weights, declared.name: observation.reshape((1,) * (len(sizes) - 1) + (-1,))}
+        values: dict[str, Any] = {
+            **whole,
+            **weights,
+            declared.name: observation.reshape((1,) * (len(sizes) - 1) + (-1,)),
+        }
         for kind, names, outputs, attributes in nodes:
             if kind == "Constant":
                 continue
             given: list[Any] = [values[name] if name else None for name in names]
-            results = _split(given, attributes, len(outputs)) if kind == "Split" else [_OPERATORS[kind](given, attributes)]
+            results = (
+                _split(given, attributes, len(outputs))
+                if kind == "Split"
+                else [_OPERATORS[kind](given, attributes)]
+            )
             if any(result.size > MAX_SIZE for result in results):
                 raise TypeError(f"{kind} makes an array of more than {MAX_SIZE:,} numbers")
             values |= dict(zip(outputs, results, strict=True))
@@ -103,7 +129,9 @@ def _node(path: Path, node: Any) -> tuple[str, list[str], list[str], dict[str, A
     attributes = {one.name: helper.get_attribute_value(one) for one in node.attribute}
     for name, value in attributes.items():
         if name not in _ATTRIBUTES.get(kind, "").split() and value != 0:
-            raise ConfigError(f"{path}: {kind}: the attribute {name}={show(value)} is not known here")
+            raise ConfigError(
+                f"{path}: {kind}: the attribute {name}={show(value)} is not known here"
+            )
     return kind, list(node.input), list(node.output), attributes
 
 
@@ -112,11 +140,18 @@ def _constant(path: Path, attributes: Mapping[str, Any]) -> np.ndarray:
     from onnx import numpy_helper
 
     if len(attributes) != 1:
-        raise ConfigError(f"{path}: Constant: expected one attribute, found {', '.join(attributes) or 'nothing'}")
+        raise ConfigError(
+            f"{path}: Constant: expected one attribute, found {', '.join(attributes) or 'nothing'}"
+        )
     [(kind, value)] = attributes.items()
     if kind == "value":
         return numpy_helper.to_array(value)
-    types = {"value_float": np.float32, "value_floats": np.float32, "value_int": np.int64, "value_ints": np.int64}
+    types = {
+        "value_float": np.float32,
+        "value_floats": np.float32,
+        "value_int": np.int64,
+        "value_ints": np.int64,
+    }
     if kind not in types:
         raise ConfigError(f"{path}: a constant of kind {kind} is not known here")
     return np.asarray(value, types[kind])
@@ -222,9 +257,15 @@ _OPERATORS: Mapping[str, Callable[[list[Any], Mapping[str, Any]], Any]] = {
     "Cast": _cast,
     "Max": lambda x, a: functools.reduce(jnp.maximum, x),
     "Min": lambda x, a: functools.reduce(jnp.minimum, x),
-    "ReduceSum": lambda x, a: jnp.sum(x[0], axis=_reduced(x, a), keepdims=bool(a.get("keepdims", 1))),
-    "ReduceMax": lambda x, a: jnp.max(x[0], axis=_reduced(x, a), keepdims=bool(a.get("keepdims", 1))),
-    "ArgMax": lambda x, a: jnp.argmax(x[0], axis=a.get("axis", 0), keepdims=bool(a.get("keepdims", 1))),
+    "ReduceSum": lambda x, a: jnp.sum(
+        x[0], axis=_reduced(x, a), keepdims=bool(a.get("keepdims", 1))
+    ),
+    "ReduceMax": lambda x, a: jnp.max(
+        x[0], axis=_reduced(x, a), keepdims=bool(a.get("keepdims", 1))
+    ),
+    "ArgMax": lambda x, a: jnp.argmax(
+        x[0], axis=a.get("axis", 0), keepdims=bool(a.get("keepdims", 1))
+    ),
     "Reciprocal": lambda x, a: 1.0 / x[0],
 }
 

@@ -26,13 +26,20 @@ from jaxsafe.storage.files import parse_json, write_bytes
 from jaxsafe.storage.forms import COUNT, TEXT, check
 
 
-def save_policy(path: Path, env: Environment, agent: Agent, params: Params, about: dict[str, Any]) -> None:
+def save_policy(
+    path: Path, env: Environment, agent: Agent, params: Params, about: dict[str, Any]
+) -> None:
     """Write weights, the agent's structure and the complete environment they belong to."""
     arrays = {
         jax.tree_util.keystr(key, simple=True, separator="/"): np.asarray(leaf)
         for key, leaf in jax.tree.leaves_with_path(params)
     }
-    header = {"format": "jaxsafe policy 1", "agent": to_data(agent), "environment": to_data(env), **about}
+    header = {
+        "format": "jaxsafe policy 1",
+        "agent": to_data(agent),
+        "environment": to_data(env),
+        **about,
+    }
     buffer = io.BytesIO()
     np.savez(buffer, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
     write_bytes(path, buffer.getvalue())
@@ -65,7 +72,9 @@ def read_policy(path: str | os.PathLike) -> SavedPolicy:
     Raises:
         ConfigError: the file cannot be read, or holds something else.
     """
-    with open_archive(path, "not a policy file (.npz without pickles, as in <run>/policy/)") as archive:
+    with open_archive(
+        path, "not a policy file (.npz without pickles, as in <run>/policy/)"
+    ) as archive:
         header = parse_json(str(archive.read("header")), infinite=True)
     if not isinstance(header, dict) or header.pop("format", None) != "jaxsafe policy 1":
         raise ConfigError(f"{path}: not a policy file: expected format 'jaxsafe policy 1'")
@@ -73,15 +82,21 @@ def read_policy(path: str | os.PathLike) -> SavedPolicy:
 
     env = build(to_component(header.pop("environment", None), Environment, f"{path}: environment"))
     agent = normalise(to_component(header.pop("agent", None), Agent, f"{path}: agent"))
-    check(header, {name: form for name, form in _ABOUT.items() if name in header}, f"{path}: header")
+    check(
+        header, {name: form for name, form in _ABOUT.items() if name in header}, f"{path}: header"
+    )
     if len(agent.hidden) > MAX_LAYERS:
-        raise ConfigError(f"{path}: agent.hidden: expected at most {MAX_LAYERS} layers, found {len(agent.hidden):,}")
+        raise ConfigError(
+            f"{path}: agent.hidden: expected at most {MAX_LAYERS} layers, found {len(agent.hidden):,}"
+        )
     try:
         like = jax.eval_shape(lambda key: agent.init(key, env), jax.random.key(0))
     except ConfigError:
         raise
     except Exception as error:  # JAX refuses in many ways
-        raise ConfigError(f"{path}: agent: does not fit the environment: {str(error).partition(chr(10))[0]}") from None
+        raise ConfigError(
+            f"{path}: agent: does not fit the environment: {str(error).partition(chr(10))[0]}"
+        ) from None
     with open_archive(path, "not a policy file, or a damaged one") as archive:
         return SavedPolicy(env, agent, _fill(like, archive, str(path)), header)
 
@@ -117,10 +132,14 @@ def find_policy(policy: str | os.PathLike) -> Path:
     if path.suffix == ".npz":
         return path
     if not known:
-        raise ConfigError(f"policy: no policies in {_PRETRAINED}; install the package unpacked, as pip does")
+        raise ConfigError(
+            f"policy: no policies in {_PRETRAINED}; install the package unpacked, as pip does"
+        )
     name = str(policy).removeprefix(PRETRAINED)
     if name not in known:
-        raise ConfigError(f"policy: {str(policy)!r} is no .npz file and not pretrained; choose from {nearest(name, known)}")
+        raise ConfigError(
+            f"policy: {str(policy)!r} is no .npz file and not pretrained; choose from {nearest(name, known)}"
+        )
     return known[name]
 
 
@@ -130,7 +149,9 @@ def _fill(like: Any, archive: Archive, path: str) -> Any:
         shape, dtype = archive.describe(name) if name in archive.names else (None, None)
         if dtype is None or shape != leaf.shape or dtype.kind != "f":
             what = "nothing" if dtype is None else f"{dtype} of shape {shape}"
-            raise ConfigError(f"{path}: {name}: expected numbers of shape {leaf.shape}, found {what}")
+            raise ConfigError(
+                f"{path}: {name}: expected numbers of shape {leaf.shape}, found {what}"
+            )
         return jnp.asarray(archive.read(name), leaf.dtype)
 
     return jax.tree_util.tree_map_with_path(pick, like)

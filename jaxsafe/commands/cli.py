@@ -90,7 +90,9 @@ def _platform_fault() -> str | None:
     try:
         jax.devices()
     except (AssertionError, RuntimeError):
-        return f"JAX_PLATFORMS: no device of {chosen!r} can be used here; leave it out, or choose cpu"
+        return (
+            f"JAX_PLATFORMS: no device of {chosen!r} can be used here; leave it out, or choose cpu"
+        )
     return None
 
 

@@ -25,14 +25,18 @@ def main(argv: Sequence[str]) -> int:
     options = {name: arguments.pop_text(name) for name in ("actions", "variant", "rta")}
     arguments.refuse_rest([*options, "env.…"])
     env = make(task, changes, **options)  # type: ignore[arg-type]
-    utf8 = codecs.lookup(sys.stdout.encoding).name == "utf-8"  # as whoever reads the file takes it to be
+    utf8 = (
+        codecs.lookup(sys.stdout.encoding).name == "utf-8"
+    )  # as whoever reads the file takes it to be
     print(yaml12.write(describe(env), ascii_only=not utf8), end="")
     return 0
 
 
 def usage() -> str:
     """The help text."""
-    options = "[actions=continuous|discrete] [variant=paper|released] [rta=PRESET] [env.PATH=VALUE …]"
+    options = (
+        "[actions=continuous|discrete] [variant=paper|released] [rta=PRESET] [env.PATH=VALUE …]"
+    )
     return f"usage: python -m jaxsafe.config TASK {options}"
 
 

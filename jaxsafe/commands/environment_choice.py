@@ -26,12 +26,18 @@ class EnvironmentChoice(NamedTuple):
         """Take what is said out of a command line."""
         task, overrides = arguments.pop_text("env"), arguments.pop_overrides()
         given = {name: arguments.pop_text(name) for name in ("actions", "variant", "rta")}
-        return cls(task, {name: value for name, value in given.items() if value is not None}, overrides)
+        return cls(
+            task, {name: value for name, value in given.items() if value is not None}, overrides
+        )
 
     @property
     def changes(self) -> dict[str, Any]:
         """All that is said, for the results."""
-        return {**({} if self.task is None else {"env": self.task}), **self.options, **self.overrides}
+        return {
+            **({} if self.task is None else {"env": self.task}),
+            **self.options,
+            **self.overrides,
+        }
 
     def make(self) -> Environment:
         """Return the environment of a task; raises as `jaxsafe.make`."""
@@ -48,14 +54,24 @@ class EnvironmentChoice(NamedTuple):
         Raises:
             ConfigError: what is said is wrong, or the observation or the action is not theirs.
         """
-        env = adapt(trained, name, self.overrides, **self.options) if self.task is None else self.make()
+        env = (
+            adapt(trained, name, self.overrides, **self.options)
+            if self.task is None
+            else self.make()
+        )
         for what in ("observation_names", "action_names", "num_action_points"):
             found, needed = getattr(env, what), getattr(trained, what)
             if found != needed:
                 kind = "discrete" if trained.num_action_points else "continuous"
-                advice = f"; give actions={kind}" if bool(env.num_action_points) != bool(trained.num_action_points) else ""
+                advice = (
+                    f"; give actions={kind}"
+                    if bool(env.num_action_points) != bool(trained.num_action_points)
+                    else ""
+                )
                 where = "the change gives" if self.task is None else f"{self.task} has"
-                raise ConfigError(f"env: {where} {what} {found}, the policies of {run} have {needed}{advice}")
+                raise ConfigError(
+                    f"env: {where} {what} {found}, the policies of {run} have {needed}{advice}"
+                )
         return env
 
 
@@ -65,7 +81,10 @@ def differences(trained: Environment, env: Environment) -> str:
     Empty if there is nothing of the kind.
     """
     found = []
-    pairs = {"observation": (trained.observation, env.observation), "actuator": (trained.actuators, env.actuators)}
+    pairs = {
+        "observation": (trained.observation, env.observation),
+        "actuator": (trained.actuators, env.actuators),
+    }
     for what, (before, after) in pairs.items():
         known = {part.name: to_data(part) for part in before}
         found += [f"{what} {part.name}" for part in after if to_data(part) != known.get(part.name)]

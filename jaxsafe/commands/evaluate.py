@@ -27,7 +27,9 @@ def main(argv: Sequence[str]) -> int:
     arguments = Arguments.parse(argv)
     run = arguments.pop_text("run")
     if run is None:
-        raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
+        raise ConfigError(
+            "run: missing; for instance run=runs/docking3d or run=pretrained/docking3d"
+        )
     chosen = environment_choice.EnvironmentChoice.pop(arguments)
     elsewhere = pop_source(arguments, run, chosen)
     arguments.refuse_beside(["checkpoint"] if elsewhere else [], "for a policy from elsewhere")
@@ -38,9 +40,15 @@ def main(argv: Sequence[str]) -> int:
     if render not in (None, "gif"):
         raise ConfigError(f"render: found {render!r}; choose from gif")
     if elsewhere and deterministic is False:
-        raise ConfigError("deterministic: expected true or nothing, found False; a policy from elsewhere acts by its mode")
+        raise ConfigError(
+            "deterministic: expected true or nothing, found False; a policy from elsewhere acts by its mode"
+        )
     deterministic = True if elsewhere else deterministic
-    kinds = {None: ("stochastic", "deterministic"), True: ("deterministic",), False: ("stochastic",)}[deterministic]
+    kinds = {
+        None: ("stochastic", "deterministic"),
+        True: ("deterministic",),
+        False: ("stochastic",),
+    }[deterministic]
     subject = load_foreign(elsewhere) if elsewhere else load(run, checkpoint)
     env = subject.env if elsewhere else chosen.change(subject.env, subject.name, run)
     if told := environment_choice.differences(subject.env, env):
@@ -50,7 +58,11 @@ def main(argv: Sequence[str]) -> int:
         "episodes": episodes,
         "evaluation_seed": seed,
         "checkpoint": checkpoint or "last",
-        "changes": {name: value for name, value in chosen.changes.items() if not (elsewhere and name == "env")},
+        "changes": {
+            name: value
+            for name, value in chosen.changes.items()
+            if not (elsewhere and name == "env")
+        },
     }
     path, results = evaluate(subject, env, kinds, request, out, render is not None)
     print(table(results, path))

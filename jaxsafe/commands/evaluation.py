@@ -20,7 +20,12 @@ from jaxsafe.train.host.results import diverged_seeds, evaluation
 
 
 def evaluate(
-    subject: Subject, env: Environment, kinds: Sequence[str], request: dict[str, Any], out: str | None, render: bool = False
+    subject: Subject,
+    env: Environment,
+    kinds: Sequence[str],
+    request: dict[str, Any],
+    out: str | None,
+    render: bool = False,
 ) -> tuple[Path, dict[str, Any]]:
     """Evaluate every policy; write `results.json` and `eval.jsonl` and return the place of the first and its content.
 
@@ -38,11 +43,16 @@ def evaluate(
     require_success(env)
     episodes, seed = request["episodes"], request["evaluation_seed"]
     path = run_directory.make(
-        out, subject.place, f"{request['checkpoint']}-{episodes}-seed{seed}" + "-changed" * bool(request["changes"])
+        out,
+        subject.place,
+        f"{request['checkpoint']}-{episodes}-seed{seed}" + "-changed" * bool(request["changes"]),
     )
     try:
         evaluator = Evaluator(subject.mapper, env, subject.agent)
-        sums = {kind: evaluator.run(subject.params, episodes, seed, kind == "deterministic") for kind in kinds}
+        sums = {
+            kind: evaluator.run(subject.params, episodes, seed, kind == "deterministic")
+            for kind in kinds
+        }
     except Exception:
         run_directory.discard_unused(path)
         raise
@@ -50,7 +60,9 @@ def evaluate(
     left_out = _not_finite(subject)
     for kind, one in sums.items():
         rows = episode_rows(env, one, first, step=subject.facts["steps"], kind=kind, final=True)
-        append_rows(path / "eval.jsonl", (row for row in rows if row["seed"] - first not in left_out))
+        append_rows(
+            path / "eval.jsonl", (row for row in rows if row["seed"] - first not in left_out)
+        )
     results = {
         **subject.facts,
         **request,
@@ -68,7 +80,11 @@ def evaluate(
 def _not_finite(subject: Subject) -> list[int]:
     """Return the places of the policies with a number that is not finite, as a training that diverged leaves them."""
     leaves = jax.tree.leaves(subject.mapper.gather(subject.params))
-    return [place for place in range(subject.facts["seeds"]) if not all(np.isfinite(leaf[place]).all() for leaf in leaves)]
+    return [
+        place
+        for place in range(subject.facts["seeds"])
+        if not all(np.isfinite(leaf[place]).all() for leaf in leaves)
+    ]
 
 
 def _render(subject: Subject, evaluator: Evaluator, seed: int, kind: str, path: Path) -> None:

@@ -43,16 +43,22 @@ def main(argv: Sequence[str]) -> int:
     arguments = Arguments.parse(argv)
     run, form, out = (arguments.pop_text(name) for name in ("run", "format", "out"))
     if run is None:
-        raise ConfigError("run: missing; for instance run=runs/docking3d or run=pretrained/docking3d")
+        raise ConfigError(
+            "run: missing; for instance run=runs/docking3d or run=pretrained/docking3d"
+        )
     form = _one_of("format", form or "onnx", FORMATS)
     saved, stem = _policy(arguments, run)
     _require_finite(run, saved)
-    kinds = {"observation": lambda: functions.action(saved), "state": lambda: functions.control(saved)}
+    kinds = {
+        "observation": lambda: functions.action(saved),
+        "state": lambda: functions.control(saved),
+    }
     if isinstance(saved, functions.SavedPolicy):
         kinds["network"] = lambda: functions.network(saved)
     boxes = [word for word in arguments.options if word.startswith("box.")]
     arguments.refuse_beside(
-        {"onnx": [], "stablehlo": ["batch"], "vnnlib": ["batch", "inputs"]}[form], f"with format={form}"
+        {"onnx": [], "stablehlo": ["batch"], "vnnlib": ["batch", "inputs"]}[form],
+        f"with format={form}",
     )
     arguments.refuse_beside([] if form == "vnnlib" else ["steps", *boxes], "without format=vnnlib")
     inputs = _one_of("inputs", arguments.pop_text("inputs") or "observation", [*kinds])
@@ -62,13 +68,21 @@ def main(argv: Sequence[str]) -> int:
     about = {"policy": stem, "jaxsafe": versions()["jaxsafe"]}
     if form == "vnnlib":
         target = Path(out or f"{stem}_closed_loop.vnnlib")
-        if target.suffix != ".vnnlib" or target.with_suffix(".onnx").resolve() == Path(run).resolve():
+        if (
+            target.suffix != ".vnnlib"
+            or target.with_suffix(".onnx").resolve() == Path(run).resolve()
+        ):
             raise ConfigError(
                 f"out: expected NAME.vnnlib, for which NAME.onnx is written too and is not {run}, found {target}"
             )
         if not saved.env.constraints:
-            raise ConfigError("format: vnnlib asks whether a safety constraint holds, and this environment has none")
-        loops = functions.closed_loop(saved, steps, unrolled=True), functions.closed_loop(saved, steps)
+            raise ConfigError(
+                "format: vnnlib asks whether a safety constraint holds, and this environment has none"
+            )
+        loops = (
+            functions.closed_loop(saved, steps, unrolled=True),
+            functions.closed_loop(saved, steps),
+        )
         with _with_advice(saved.env):
             return _vnnlib(*loops, box, target, about)
     exported = kinds[inputs]()
@@ -79,7 +93,9 @@ def main(argv: Sequence[str]) -> int:
             raise missing(error, "flatbuffers", "export") from None
         target = Path(out or f"{stem}.stablehlo")
         shape = jax.export.symbolic_shape(f"batch, {len(exported.inputs)}")
-        made = jax.export.export(jax.jit(exported.function))(jax.ShapeDtypeStruct(shape, jnp.float32))
+        made = jax.export.export(jax.jit(exported.function))(
+            jax.ShapeDtypeStruct(shape, jnp.float32)
+        )
         write_bytes(target, bytes(made.serialize()))
     else:
         from jaxsafe.export.onnx import write_onnx
@@ -102,18 +118,26 @@ def _policy(arguments: Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy
     chosen = EnvironmentChoice.pop(arguments)
     elsewhere = pop_source(arguments, run, chosen)
     single = is_single(run)
-    arguments.refuse_beside(["seed"] if elsewhere or single else [], f"beside {run}, which is a single policy")
+    arguments.refuse_beside(
+        ["seed"] if elsewhere or single else [], f"beside {run}, which is a single policy"
+    )
     seed = arguments.pop_seed()
     if elsewhere:
         return elsewhere.read(), f"{Path(run).stem}_{elsewhere.task}"
     if not single:
         run_directory.read(Path(run), "run")  # imports what a user's environment is made of
-        stems = [file.stem.removeprefix("seed_") for file in (Path(run) / "policy").glob("seed_*.npz")]
+        stems = [
+            file.stem.removeprefix("seed_") for file in (Path(run) / "policy").glob("seed_*.npz")
+        ]
         known = {int(stem) for stem in stems if stem.isdecimal()}
         if not known:
-            raise ConfigError(f"run: {run} has no policies yet; finish it with: python -m jaxsafe.train resume={run}")
+            raise ConfigError(
+                f"run: {run} has no policies yet; finish it with: python -m jaxsafe.train resume={run}"
+            )
         if seed not in known:
-            raise ConfigError(f"seed: found {seed}; choose from {', '.join(map(str, sorted(known)))}")
+            raise ConfigError(
+                f"seed: found {seed}; choose from {', '.join(map(str, sorted(known)))}"
+            )
     path = find_policy(run) if single else Path(run) / "policy" / f"seed_{seed}.npz"
     saved = read_policy(path)
     env = chosen.change(saved.env, str(saved.about.get("env", path.stem)), run)
@@ -128,7 +152,11 @@ def _with_advice(env: Environment) -> Iterator[None]:
     try:
         yield
     except ConfigError as error:
-        raise error if env.rta is None else ConfigError(f"{error}; leave run time assurance out with rta=none") from None
+        raise (
+            error
+            if env.rta is None
+            else ConfigError(f"{error}; leave run time assurance out with rta=none")
+        ) from None
 
 
 def _require_finite(run: str, saved: SavedPolicy | ForeignPolicy) -> None:
@@ -142,7 +170,9 @@ def _require_finite(run: str, saved: SavedPolicy | ForeignPolicy) -> None:
     for path, leaf in jax.tree.leaves_with_path(saved.params):
         if wrong(np.asarray(leaf, np.float64)).any():
             name = jax.tree_util.keystr(path, simple=True, separator="/")
-            raise ConfigError(f"{run}: {name}: not all parameters are finite numbers, so there is no policy to export")
+            raise ConfigError(
+                f"{run}: {name}: not all parameters are finite numbers, so there is no policy to export"
+            )
 
 
 def _one_of(name: str, value: str, known: Sequence[str]) -> str:
@@ -151,7 +181,13 @@ def _one_of(name: str, value: str, known: Sequence[str]) -> str:
     return value
 
 
-def _vnnlib(unrolled: Exported, looped: Exported, given: dict[str, object], path: Path, about: dict[str, str]) -> int:
+def _vnnlib(
+    unrolled: Exported,
+    looped: Exported,
+    given: dict[str, object],
+    path: Path,
+    about: dict[str, str],
+) -> int:
     """Write graph and property, and say what a search for a counterexample finds."""
     import jax
 
@@ -159,11 +195,19 @@ def _vnnlib(unrolled: Exported, looped: Exported, given: dict[str, object], path
     from jaxsafe.export.vnnlib import search, write_vnnlib
 
     box = _box(unrolled.inputs, given)
-    graph = write_onnx(path.with_suffix(".onnx"), unrolled.function, (1, len(unrolled.inputs)), about)
+    graph = write_onnx(
+        path.with_suffix(".onnx"), unrolled.function, (1, len(unrolled.inputs)), about
+    )
     print(f"{graph}\n{write_vnnlib(path, unrolled, box)}", flush=True)
     worst = search(looped, box, jax.random.key(0))
-    start = ", ".join(f"{name} {value:.4g}" for name, value in zip(looped.inputs, worst.start, strict=True))
-    found = f"no counterexample among {worst.tried:,} starts, which proves nothing" if worst.margin >= 0.0 else "violated"
+    start = ", ".join(
+        f"{name} {value:.4g}" for name, value in zip(looped.inputs, worst.start, strict=True)
+    )
+    found = (
+        f"no counterexample among {worst.tried:,} starts, which proves nothing"
+        if worst.margin >= 0.0
+        else "violated"
+    )
     margin = "not a number" if worst.margin == -math.inf else f"{worst.margin:.4g}"
     print(f"least margin {margin} from {start}: {found}")
     return 0
@@ -191,7 +235,11 @@ def _box(names: Sequence[str], given: dict[str, object]) -> list[tuple[float, fl
 
 
 def _is_interval(value: Any) -> TypeGuard[Sequence[float]]:
-    numbers = isinstance(value, (list, tuple)) and len(value) == 2 and all(isinstance(one, (int, float)) for one in value)
+    numbers = (
+        isinstance(value, (list, tuple))
+        and len(value) == 2
+        and all(isinstance(one, (int, float)) for one in value)
+    )
     return numbers and -MAX_BOUND <= value[0] <= value[1] <= MAX_BOUND
 
 

@@ -69,7 +69,9 @@ def main(argv: Sequence[str]) -> int:
 
     arguments = Arguments.parse(argv)
     task, out = arguments.pop_text("env"), arguments.pop_text("out")
-    options: dict[str, Any] = {name: arguments.pop_text(name) for name in ("rta", "variant", "actions")}
+    options: dict[str, Any] = {
+        name: arguments.pop_text(name) for name in ("rta", "variant", "actions")
+    }
     changes = arguments.pop_overrides()
     steps = arguments.pop_count("steps", MOST_STEPS) if "steps" in arguments.options else None
     lanes = arguments.pop_count("lanes", 64)
@@ -80,20 +82,37 @@ def main(argv: Sequence[str]) -> int:
         raise ConfigError("env: missing; for instance env=docking3d")
     for name in policies if isinstance(policies, list) else [policies]:
         if name not in known:
-            raise ConfigError(f"policies: unknown policy {name!r}; choose from {nearest(name, known)}")
+            raise ConfigError(
+                f"policies: unknown policy {name!r}; choose from {nearest(name, known)}"
+            )
     options["rta"] = options["rta"] or default_filter(task)
     env = make(task, changes, **options)
     if not env.constraints:
         raise ConfigError(f"env: {task} has no safety constraint")
-    facts: dict[str, Any] = {"command": f"python -m jaxsafe.rta.falsify {shlex.join(argv)}", "commit": provenance.commit()}
+    facts: dict[str, Any] = {
+        "command": f"python -m jaxsafe.rta.falsify {shlex.join(argv)}",
+        "commit": provenance.commit(),
+    }
     facts |= {"versions": provenance.versions(), "env": task, **options, "seed": seed}
-    length = min(longest_episode(env), max(1, MOST_STEPS // lanes)) if steps is None else -(-steps // lanes)
+    length = (
+        min(longest_episode(env), max(1, MOST_STEPS // lanes))
+        if steps is None
+        else -(-steps // lanes)
+    )
     rows = []
     for name in policies if isinstance(policies, list) else [policies]:
         rows.append(attack(env, name, length, lanes, jax.random.key(seed)))
-        print(report(rows[-1:]).splitlines()[1] if len(rows) > 1 else "\n".join(report(rows).splitlines()[:2]), flush=True)
+        print(
+            report(rows[-1:]).splitlines()[1]
+            if len(rows) > 1
+            else "\n".join(report(rows).splitlines()[:2]),
+            flush=True,
+        )
         if out:  # after each, so that nothing is lost if the run is stopped
-            write_text(Path(out), json.dumps({**facts, "policies": rows}, indent=1, ensure_ascii=False) + "\n")
+            write_text(
+                Path(out),
+                json.dumps({**facts, "policies": rows}, indent=1, ensure_ascii=False) + "\n",
+            )
     if report(rows).splitlines()[-1].endswith("confidence"):
         print(report(rows).splitlines()[-1])
     if out:

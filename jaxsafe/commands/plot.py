@@ -19,8 +19,13 @@ def main(argv: Sequence[str]) -> int:
 
     arguments = Arguments.parse(argv)
     several = isinstance(arguments.options.get("run"), list)
-    arguments.refuse_beside([] if several else ["out"], "but for several runs, which run=[A,B] draws in one figure")
-    run, x = arguments.pop("run") if several else arguments.pop_text("run"), arguments.pop_text("x") or "steps"
+    arguments.refuse_beside(
+        [] if several else ["out"], "but for several runs, which run=[A,B] draws in one figure"
+    )
+    run, x = (
+        arguments.pop("run") if several else arguments.pop_text("run"),
+        arguments.pop_text("x") or "steps",
+    )
     out = Path(arguments.pop_text("out") or "comparison.png")
     arguments.refuse_rest(["run", "x", "out"])
     if run is None:
@@ -46,13 +51,17 @@ def _compare(runs: Sequence[Any], x: str, out: Path) -> None:
 
     paths = {Path(str(run)).name: Path(str(run)) for run in runs}
     if len(paths) < len(runs) or len(runs) < 2:
-        raise ConfigError(f"run: expected several directories of different names, found {', '.join(map(str, runs))}")
+        raise ConfigError(
+            f"run: expected several directories of different names, found {', '.join(map(str, runs))}"
+        )
     tasks = {run_directory.read(path, "run")[2] for path in paths.values()}
     if len(tasks) > 1:
         raise ConfigError(f"run: expected runs of one task, found {', '.join(sorted(tasks))}")
     for path in paths.values():
         if not (path / "results.json").exists():
-            raise ConfigError(f"run: {path} has no results.json; finish it with python -m jaxsafe.train resume={path}")
+            raise ConfigError(
+                f"run: {path} has no results.json; finish it with python -m jaxsafe.train resume={path}"
+            )
     figure = compare_curves({name: progress(path) for name, path in paths.items()}, tasks.pop(), x)
     print(summary(paths))
     print(save(figure, out))

@@ -40,8 +40,23 @@ def load_foreign(source: Source) -> Subject:
     """
     policy, mapper = source.read(), SeedMapper(1)
     params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], policy.params))
-    about = {"env": source.task, "preset": source.path.name, "algorithm": "unknown", "seeds": 1, "seed": 0, "steps": 0}
-    return Subject(source.task, policy.env, policy.agent, mapper, params, about, Path("evaluations") / source.path.stem)
+    about = {
+        "env": source.task,
+        "preset": source.path.name,
+        "algorithm": "unknown",
+        "seeds": 1,
+        "seed": 0,
+        "steps": 0,
+    }
+    return Subject(
+        source.task,
+        policy.env,
+        policy.agent,
+        mapper,
+        params,
+        about,
+        Path("evaluations") / source.path.stem,
+    )
 
 
 def load(run: str, checkpoint: str | None) -> Subject:
@@ -52,7 +67,9 @@ def load(run: str, checkpoint: str | None) -> Subject:
     """
     if is_single(run):
         if checkpoint is not None:
-            raise ConfigError(f"checkpoint: {run} is a single policy; leave checkpoint={checkpoint} out")
+            raise ConfigError(
+                f"checkpoint: {run} is a single policy; leave checkpoint={checkpoint} out"
+            )
         return _of_file(find_policy(run))
     config, env, name = run_directory.read(Path(run), "run")
     mapper = SeedMapper(config.seeds)
@@ -65,7 +82,17 @@ def _of_file(path: Path) -> Subject:
     saved, mapper = read_policy(path), SeedMapper(1)
     params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], saved.params))
     about = {"env": path.stem, "preset": "unknown", "seed": 0, "step": 0} | saved.about
-    algorithm = "ppo_lagrangian" if saved.agent.cost_critic else "ppo"  # no other has a critic of the cost
+    algorithm = (
+        "ppo_lagrangian" if saved.agent.cost_critic else "ppo"
+    )  # no other has a critic of the cost
     found = {"env": about["env"], "preset": about["preset"], "algorithm": algorithm, "seeds": 1}
     found |= {"seed": about["seed"], "steps": about["step"]}
-    return Subject(str(about["env"]), saved.env, saved.agent, mapper, params, found, Path("evaluations") / path.stem)
+    return Subject(
+        str(about["env"]),
+        saved.env,
+        saved.agent,
+        mapper,
+        params,
+        found,
+        Path("evaluations") / path.stem,
+    )

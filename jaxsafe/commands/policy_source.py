@@ -39,9 +39,15 @@ def pop_source(arguments: Arguments, run: str, choice: EnvironmentChoice) -> Sou
     names = _names(run) if run.endswith(".npz") else set()
     graph = run.endswith(".onnx")
     if choice.task is None and (graph or "kernel_0.npy" in names):
-        raise ConfigError(f"env: missing; the task in which {run} shall act, for instance env=docking2d")
-    layers = choice.task is not None and run.endswith(".npz") and "header.npy" not in names  # which policies of ours have
-    arguments.refuse_beside([] if layers else ["activation"], "but for the layers in an .npz with env=TASK")
+        raise ConfigError(
+            f"env: missing; the task in which {run} shall act, for instance env=docking2d"
+        )
+    layers = (
+        choice.task is not None and run.endswith(".npz") and "header.npy" not in names
+    )  # which policies of ours have
+    arguments.refuse_beside(
+        [] if layers else ["activation"], "but for the layers in an .npz with env=TASK"
+    )
     activation = arguments.pop_text("activation") or "tanh"
     return Source(Path(run), choice, activation) if graph or layers else None
 

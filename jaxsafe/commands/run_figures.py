@@ -27,21 +27,32 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
     """
     rows = progress(run)
     config, env, name = run_directory.read(run, "run")
-    facts = {"env": name, "preset": config.preset, "algorithm": config.algorithm, "rta": filter_name(env)}
+    facts = {
+        "env": name,
+        "preset": config.preset,
+        "algorithm": config.algorithm,
+        "rta": filter_name(env),
+    }
     title = headline({**facts, "seeds": len({row["seed"] for row in rows})})
     figures = {f"training_{x}": training_curves(rows, x, title)}
     others = [platform.name for platform in env.platforms if platform.name != env.agent]
     names = [*others[:1], env.agent]
     episodes = _episodes(run / "episodes.jsonl", names, partial(_row_form, env, names))
     if episodes:
-        figures["trajectories"] = trajectories(episodes, title, length_unit(env), env.regions, kept_out(env))
+        figures["trajectories"] = trajectories(
+            episodes, title, length_unit(env), env.regions, kept_out(env)
+        )
         if {"docking_distance", "speed", "velocity_limit"} <= episodes[0][1][0]["status"].keys():
             figures["speed_distance"] = speed_distance(episodes, title)
         if "rta" in episodes[-1][1][0]:
             figures["interventions"] = interventions(most_altered(episodes), env, title)
     place = run / "figures"
-    new = place if place.exists() else place.with_name("figures.part")  # for the first time all or none
-    shutil.rmtree(place.with_name("figures.part"), ignore_errors=True)  # of a command that was killed
+    new = (
+        place if place.exists() else place.with_name("figures.part")
+    )  # for the first time all or none
+    shutil.rmtree(
+        place.with_name("figures.part"), ignore_errors=True
+    )  # of a command that was killed
     paths = [save(figure, new / f"{name}.png") for name, figure in figures.items()]
     if new != place:
         new.rename(place)
@@ -60,7 +71,9 @@ def progress(run: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def _episodes(path: Path, names: Sequence[str], form: Callable[[Rows], Any] | None = None) -> Episodes:
+def _episodes(
+    path: Path, names: Sequence[str], form: Callable[[Rows], Any] | None = None
+) -> Episodes:
     """Logged episodes of these platforms, each with the training step of its policy; those of the end only once.
 
     Args:
@@ -79,24 +92,35 @@ def _episodes(path: Path, names: Sequence[str], form: Callable[[Rows], Any] | No
         row["platforms"] = {name: row["platforms"][name] for name in names}
         grouped.setdefault((row["step"], row["final"], row["episode"]), []).append(row)
     ended = {step for step, final, _ in grouped if final}
-    return [(step, rows) for (step, final, _), rows in grouped.items() if final or step not in ended]
+    return [
+        (step, rows) for (step, final, _), rows in grouped.items() if final or step not in ended
+    ]
 
 
 def _row_form(env: Environment, names: Sequence[str], rows: Rows) -> dict[str, Any]:
     """Return the form of a row of an episode log; what older logs have not is asked of all rows if one has it."""
     sizes = {platform.name: platform.dimension for platform in env.platforms}
     place = {"position": numbers(max(sizes.values()))}
-    headed = any("heading" in vars(platform.rest()) for platform in env.platforms if platform.name == names[0])
+    headed = any(
+        "heading" in vars(platform.rest())
+        for platform in env.platforms
+        if platform.name == names[0]
+    )
     form: dict[str, Any] = {
         "step": COUNT,
         "final": FLAG,
         "episode": COUNT,
-        "platforms": {name: place | ({"heading": MAYBE} if headed and name == names[0] else {}) for name in names},
+        "platforms": {
+            name: place | ({"heading": MAYBE} if headed and name == names[0] else {})
+            for name in names
+        },
         "status": {},
     }
     known = {key for row in rows for key in row}
     shown = {"docking_distance", "speed", "velocity_limit"}
-    if any(isinstance(row.get("status"), Mapping) and shown <= row["status"].keys() for row in rows):
+    if any(
+        isinstance(row.get("status"), Mapping) and shown <= row["status"].keys() for row in rows
+    ):
         form["status"] = dict.fromkeys(sorted(shown), MAYBE)
     if "regions" in known:
         form["regions"] = {OTHERS: place}

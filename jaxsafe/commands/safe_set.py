@@ -41,7 +41,9 @@ def _ends(arguments: Arguments, key: str) -> Ends | None:
     value = arguments.pop(key)
     numbers = isinstance(value, list) and all(isinstance(one, (int, float)) for one in value)
     if value is not None and not (numbers and len(value) == 2 and value[0] < value[1]):
-        raise ConfigError(f"{key}: expected the ends of the axis, for instance [0,150], found {value!r}")
+        raise ConfigError(
+            f"{key}: expected the ends of the axis, for instance [0,150], found {value!r}"
+        )
     return None if value is None else (float(value[0]), float(value[1]))
 
 

@@ -43,7 +43,9 @@ class LastingStream:
         except OSError as error:
             self.error = error
             nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self._stream.fileno())  # for what is in the buffer, for libraries and for child processes
+            os.dup2(
+                nowhere, self._stream.fileno()
+            )  # for what is in the buffer, for libraries and for child processes
             os.close(nowhere)
 
 
@@ -54,7 +56,10 @@ def lasting_streams() -> Iterator[LastingStream]:
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass  # a file that gets the number of a closed stream would receive what libraries print there
     os.close(number)
-    sys.stdout, sys.stderr = _lasting(before[0]), _lasting(before[1], allowed="\r")  # with which a bar is drawn anew
+    sys.stdout, sys.stderr = (
+        _lasting(before[0]),
+        _lasting(before[1], allowed="\r"),
+    )  # with which a bar is drawn anew
     try:
         yield sys.stdout
     finally:

@@ -45,12 +45,20 @@ def main(argv: Sequence[str]) -> int:
         path = Path(resume)
     runs = run_directory.runs(path)
     try:
-        with processes.loss_told(f"go on with: python -m jaxsafe.train distributed=true resume={path}"):
+        with processes.loss_told(
+            f"go on with: python -m jaxsafe.train distributed=true resume={path}"
+        ):
             try:
                 finished = _train([run for run in runs if not _complete(run)], path)
             except Exception as error:
-                alone = jax.process_count() == 1  # else it may be the loss of another process, after which the run goes on
-                if resume is None and processes.leads() and (alone or isinstance(error, ConfigError)):
+                alone = (
+                    jax.process_count() == 1
+                )  # else it may be the loss of another process, after which the run goes on
+                if (
+                    resume is None
+                    and processes.leads()
+                    and (alone or isinstance(error, ConfigError))
+                ):
                     run_directory.discard_unused(path)
                 raise
     except KeyboardInterrupt:
@@ -60,7 +68,11 @@ def main(argv: Sequence[str]) -> int:
         return cli.INTERRUPTED
     if len(runs) > 1 and processes.leads():
         print(summary({run.name: run for run in runs}))
-    return cli.DIVERGED if processes.leads() and any("diverged" in read_json(run / "results.json") for run in runs) else 0
+    return (
+        cli.DIVERGED
+        if processes.leads() and any("diverged" in read_json(run / "results.json") for run in runs)
+        else 0
+    )
 
 
 def _complete(run: Path) -> bool:
@@ -70,7 +82,9 @@ def _complete(run: Path) -> bool:
     if not (run / "results.json").exists():
         return False
     print(f"{run} is complete; nothing is left to do")
-    if not (run / "figures").exists() and processes.leads():  # killed between the results and the figures
+    if (
+        not (run / "figures").exists() and processes.leads()
+    ):  # killed between the results and the figures
         from jaxsafe.commands.run_figures import draw_all
 
         draw_all(run)
@@ -89,13 +103,17 @@ def _train(runs: Sequence[Path], path: Path) -> bool:
         for run, following in zip_longest(runs, runs[1:]):
             training = upcoming or _open(run, files, BEGAN)
             config = training.config
-            print(f"{training.name}: {config.seeds} seeds × {training.num_steps:,} steps, preset {config.preset}, in {run}")
+            print(
+                f"{training.name}: {config.seeds} seeds × {training.num_steps:,} steps, preset {config.preset}, in {run}"
+            )
             training.prepare()
             upcoming = following and _open(following, files, time.monotonic())
             if upcoming:
                 upcoming.prepare()
             if not training.train():
-                print(f"stopped at step {training.step:,}; go on with: python -m jaxsafe.train resume={path}")
+                print(
+                    f"stopped at step {training.step:,}; go on with: python -m jaxsafe.train resume={path}"
+                )
                 return False
             trained.append((run, training))
         for _, training in trained:

@@ -36,7 +36,11 @@ def main(argv: Sequence[str]) -> int:
     rank = arguments.pop("rank", RANKS[0])
     if rank not in RANKS:
         raise ConfigError(f"rank: unknown order {show(rank)}; choose from {nearest(rank, RANKS)}")
-    samples = arguments.pop_count("samples", 1, most=MAX_SETTINGS) if "samples" in arguments.options else None
+    samples = (
+        arguments.pop_count("samples", 1, most=MAX_SETTINGS)
+        if "samples" in arguments.options
+        else None
+    )
     draw = arguments.pop_seed("draw")
     arguments.options.setdefault("episodes", EPISODES)
     sweep = pop_sweep(arguments)
@@ -53,7 +57,9 @@ def main(argv: Sequence[str]) -> int:
     )
     total = sum(found[i].config.num_updates for i in left)
     try:
-        with tqdm(total=total, unit=" updates", disable=None) as bar:  # none where there is no terminal
+        with tqdm(
+            total=total, unit=" updates", disable=None
+        ) as bar:  # none where there is no terminal
             for done in train_all(found, left, bar.update):
                 results.add(path, done)
                 rows |= done
@@ -63,7 +69,9 @@ def main(argv: Sequence[str]) -> int:
             run_directory.discard_unused(path)
         raise
     except KeyboardInterrupt:
-        print(f"stopped with {len(rows)} of {len(found)} settings; go on with: python -m jaxsafe.tune resume={path}")
+        print(
+            f"stopped with {len(rows)} of {len(found)} settings; go on with: python -m jaxsafe.tune resume={path}"
+        )
         return cli.INTERRUPTED
     print(results.finish(path, rows, list(sweep), rank))
     return 0

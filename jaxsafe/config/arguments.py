@@ -37,7 +37,9 @@ class Arguments:
         for word in argv:
             key, equals, text = word.partition("=")
             if not equals or not key:
-                raise ConfigError(f"argument {show(word)}: expected key=value, for instance seeds=10")
+                raise ConfigError(
+                    f"argument {show(word)}: expected key=value, for instance seeds=10"
+                )
             if key in options:
                 raise ConfigError(f"{key}: given twice")
             options[key] = _path(text, key) if key in PATHS else yaml12.parse(text, key)
@@ -71,7 +73,9 @@ class Arguments:
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
             raise ConfigError(f"{key}: expected a whole number ≥ {least}, found {show(given)}")
         if value > most:
-            raise ConfigError(f"{key}: expected a whole number from {least} to {most:,}, found {show(given)}")
+            raise ConfigError(
+                f"{key}: expected a whole number from {least} to {most:,}, found {show(given)}"
+            )
         return value
 
     def pop_seed(self, key: str = "seed") -> int:
@@ -114,7 +118,9 @@ class Arguments:
 
 def _path(text: str, key: str) -> Any:
     """Return a path as typed, or a list of them in brackets; None where there is none."""
-    return _from_home(yaml12.parse(text, key, as_text=True) if text.startswith("[") else text or None, key)
+    return _from_home(
+        yaml12.parse(text, key, as_text=True) if text.startswith("[") else text or None, key
+    )
 
 
 def _from_home(path: Any, key: str) -> Any:
@@ -125,5 +131,7 @@ def _from_home(path: Any, key: str) -> Any:
         return path
     expanded = os.path.expanduser(path)
     if expanded == path:
-        raise ConfigError(f"{key}: no home directory for {path!r}; write ./{path} for a name that begins with ~")
+        raise ConfigError(
+            f"{key}: no home directory for {path!r}; write ./{path} for a name that begins with ~"
+        )
     return expanded

@@ -89,13 +89,17 @@ def _problems(component: Component, place: str) -> Iterator[tuple[str, str]]:
         for inner in value if isinstance(value, tuple) else (value,):
             if isinstance(inner, Component):
                 yield from _problems(inner, join(join(place, name), getattr(inner, "name", "")))
-    with jax.ensure_compile_time_eval():  # inside a trace comparisons of constants would be traced too
+    with (
+        jax.ensure_compile_time_eval()
+    ):  # inside a trace comparisons of constants would be traced too
         try:
             problem = component.problem()
         except ConfigError:
             raise
         except Exception as error:
-            raise ConfigError(f"{place}: cannot be checked: {told(error, modules(component))}") from error
+            raise ConfigError(
+                f"{place}: cannot be checked: {told(error, modules(component))}"
+            ) from error
     if problem:
         yield place, problem
 
@@ -103,7 +107,9 @@ def _problems(component: Component, place: str) -> Iterator[tuple[str, str]]:
 def _reference(place: str, name: str, known: Iterable[str], which: str = "") -> None:
     known = list(known)
     if name not in known:
-        raise ConfigError(f"{place}: nothing{which} is called {show(name)}; choose from {nearest(name, known) or 'none'}")
+        raise ConfigError(
+            f"{place}: nothing{which} is called {show(name)}; choose from {nearest(name, known) or 'none'}"
+        )
 
 
 def _once(place: str, names: Sequence[str]) -> None:
@@ -140,7 +146,10 @@ def _check_space(env: Environment) -> None:
                 f" choose from {nearest('', sorted(fitting))}"
             )
         for status in env.status:
-            if getattr(status, "region", None) == region.name and getattr(status, "of", None) == region.on:
+            if (
+                getattr(status, "region", None) == region.name
+                and getattr(status, "of", None) == region.on
+            ):
                 raise ConfigError(
                     f"status.{status.name}.of: region {region.name!r} is on {region.on!r} itself; choose another"
                 )
@@ -157,7 +166,9 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
                 f" choose from {nearest(name, platform.inputs) or 'none'}"
             )
     if is_agent and not (controller.takes_actions and controller.names):
-        raise ConfigError(f"agent: {platform.name!r} cannot be the agent: its controller takes no actions")
+        raise ConfigError(
+            f"agent: {platform.name!r} cannot be the agent: its controller takes no actions"
+        )
     if controller.takes_actions and not is_agent:
         raise ConfigError(
             f"{place}.controller ({controller.type_name}): only the agent takes actions; choose from scripted, uncontrolled"
@@ -167,7 +178,9 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
     for initializer in platform.start:
         here = f"{place}.start.{initializer.name}"
         if initializer.name not in rest:
-            raise ConfigError(f"{here}: no such state field; choose from {nearest(initializer.name, rest)}")
+            raise ConfigError(
+                f"{here}: no such state field; choose from {nearest(initializer.name, rest)}"
+            )
         if getattr(initializer, "direction", None) is not None:
             drawn = 1 + len(initializer.direction.intervals)  # type: ignore[attr-defined]
             if (drawn,) != rest[initializer.name].shape:
@@ -183,30 +196,42 @@ def _check_randomized(env: Environment) -> None:
     def convert(value: Any, field: Any, place: str) -> Any:
         one = field.unit.length in (None, ANY) if field.unit else isinstance(value, Mapping)
         if not one:
-            raise ConfigError(f"{place}: expected the path of one number, found that of {expects(field)}")
+            raise ConfigError(
+                f"{place}: expected the path of one number, found that of {expects(field)}"
+            )
         return to_value(value, field, place)
 
     leaves: dict[int, str] = {}
     for path, interval in env.randomize.items():
         if path.split(".")[0] == "randomize":
-            raise ConfigError(f"randomize.{path}: expected the path of a number outside `randomize`")
+            raise ConfigError(
+                f"randomize.{path}: expected the path of a number outside `randomize`"
+            )
         if isinstance(interval, Tracer):
             continue
-        low, high = np.asarray(interval).tolist()  # an element of a constant array would be traced inside a trace
+        low, high = np.asarray(
+            interval
+        ).tolist()  # an element of a constant array would be traced inside a trace
         if not np.isfinite(low) or not np.isfinite(high):
             raise ConfigError(f"randomize.{path}: expected finite bounds, found [{low}, {high}]")
         for value in (low, high, *([0.0] if low < 0.0 < high else [])):
             try:
                 changed = set_path(env, path, value, convert)
                 if _shapes(changed) != _shapes(env):
-                    raise ConfigError(f"{path}: expected the path of one number, found that of a list")
+                    raise ConfigError(
+                        f"{path}: expected the path of one number, found that of a list"
+                    )
                 _check_problems(changed)
             except ConfigError as error:
                 raise ConfigError(f"randomize: {error}") from None
         mark = object()
-        index = next(i for i, leaf in enumerate(jax.tree.leaves(set_path(env, path, mark))) if leaf is mark)
+        index = next(
+            i for i, leaf in enumerate(jax.tree.leaves(set_path(env, path, mark))) if leaf is mark
+        )
         if index in leaves:
-            raise ConfigError(f"randomize: {path} and {leaves[index]} are the same number; leave one out")
+            raise ConfigError(
+                f"randomize: {path} and {leaves[index]} are the same number; leave one out"
+            )
         leaves[index] = path
 
 
@@ -231,7 +256,9 @@ def _check_kinds(env: Environment) -> None:
 
     def statuses(env: Environment) -> Mapping[str, Any]:
         platforms = {platform.name: platform.rest() for platform in env.platforms}
-        return judge(env, Sim(jnp.zeros_like(env.dt), platforms, {}, {}, {}, jnp.zeros((), bool))).status
+        return judge(
+            env, Sim(jnp.zeros_like(env.dt), platforms, {}, {}, {}, jnp.zeros((), bool))
+        ).status
 
     try:
         found = jax.eval_shape(statuses, env)
@@ -240,9 +267,14 @@ def _check_kinds(env: Environment) -> None:
     for section in _SECTIONS:
         for part in getattr(env, section):
             for place, refers, name in references(part, f"{section}.{part.name}"):
-                if refers.section == "status" and refers.boolean not in (None, found[name].dtype == bool):
+                if refers.section == "status" and refers.boolean not in (
+                    None,
+                    found[name].dtype == bool,
+                ):
                     wanted = "true or false" if refers.boolean else "a number"
-                    raise ConfigError(f"{place}: expected a status that is {wanted}, found {name!r}, which is not")
+                    raise ConfigError(
+                        f"{place}: expected a status that is {wanted}, found {name!r}, which is not"
+                    )
 
 
 def _check_tracing(env: Environment) -> None:
@@ -259,18 +291,26 @@ def _check_tracing(env: Environment) -> None:
         raise
     except Exception as error:
         notes = getattr(error, "__notes__", ())
-        place = next((note.removeprefix("in ") for note in notes if note.startswith("in ")), "environment")
+        place = next(
+            (note.removeprefix("in ") for note in notes if note.startswith("in ")), "environment"
+        )
         raise ConfigError(f"{place}: cannot be computed: {told(error, modules(env))}") from error
     memory, later = vars(begin[0].memory), vars(after[0].memory)
     for section in ("status", "reward", "observation"):
         for name, first in memory[section].items():
             if jax.tree.structure(first) != jax.tree.structure(later[section][name]):
-                raise ConfigError(f"{section}.{name}: its memory has another structure after a step than after reset")
+                raise ConfigError(
+                    f"{section}.{name}: its memory has another structure after a step than after reset"
+                )
     if jax.tree.structure(memory["rta"]) != jax.tree.structure(later["rta"]):
         raise ConfigError("rta: its memory has another structure after a step than after reset")
-    for (path, old), new in zip(jax.tree_util.tree_leaves_with_path(begin), jax.tree.leaves(after), strict=True):
+    for (path, old), new in zip(
+        jax.tree_util.tree_leaves_with_path(begin), jax.tree.leaves(after), strict=True
+    ):
         if (old.shape, old.dtype) != (new.shape, new.dtype):
-            place = jax.tree_util.keystr(path[1:], simple=True, separator=".").removeprefix("sim.")  # [0] is which record
+            place = jax.tree_util.keystr(path[1:], simple=True, separator=".").removeprefix(
+                "sim."
+            )  # [0] is which record
             raise ConfigError(
                 f"{place}: is {old.dtype}{list(old.shape)} after reset and {new.dtype}{list(new.shape)} after a step"
             )

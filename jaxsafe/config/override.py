@@ -27,7 +27,9 @@ def override(env: Environment, changes: Mapping[str, Any]) -> Environment:
     changed = env
     for path, value in changes.items():
         if not isinstance(path, str):
-            raise ConfigError(f"override: expected dotted paths such as 'deputy.mass', found {show(path)}")
+            raise ConfigError(
+                f"override: expected dotted paths such as 'deputy.mass', found {show(path)}"
+            )
         changed = set_path(changed, path, value, to_value)
     checked = check(changed, before=env)
     warn_of_ties(env, checked)

@@ -47,13 +47,18 @@ def warn_of_ties(before: Environment, after: Environment) -> None:
         after: the environment with what a user changed. Numbers that are traced are not judged.
     """
     held = {tie.paths: tie for tie in _ties(before) if not tie.traced and tie.holds}
-    newly_random = {path.removeprefix("platforms.") for path in after.randomize if path not in before.randomize}
+    newly_random = {
+        path.removeprefix("platforms.") for path in after.randomize if path not in before.randomize
+    }
     alone: dict[tuple[str, str, float], list[str]] = {}
     for tie in _ties(after):
         if tie.paths not in held or tie.traced:
             continue
         random = [path in newly_random for path in tie.paths]
-        changed = [not np.array_equal(*pair) for pair in zip(tie.numbers, held[tie.paths].numbers, strict=True)]
+        changed = [
+            not np.array_equal(*pair)
+            for pair in zip(tie.numbers, held[tie.paths].numbers, strict=True)
+        ]
         if not any(random) and (tie.holds or all(changed)):
             continue
         index = random.index(True) if any(random) else changed.index(True)
@@ -61,9 +66,15 @@ def warn_of_ties(before: Environment, after: Environment) -> None:
         verb = "is random" if any(random) else "changes"
         alone.setdefault((tie.paths[index], verb, factor), []).append(tie.paths[1 - index])
     for (path, verb, factor), others in alone.items():
-        was = f"{'was' if len(others) == 1 else 'were'} {_OFTEN.get(factor, f'{factor:g} times')} it"
+        was = (
+            f"{'was' if len(others) == 1 else 'were'} {_OFTEN.get(factor, f'{factor:g} times')} it"
+        )
         kept = "keeps its value" if len(others) == 1 else "keep their values"
-        warnings.warn(f"{path} {verb} alone: {' and '.join(others)}, which {was}, {kept}", ConfigWarning, stacklevel=3)
+        warnings.warn(
+            f"{path} {verb} alone: {' and '.join(others)}, which {was}, {kept}",
+            ConfigWarning,
+            stacklevel=3,
+        )
 
 
 def _ties(env: Environment) -> Iterator[Tie]:
@@ -89,5 +100,8 @@ def _ties(env: Environment) -> Iterator[Tie]:
         for limit in limits:
             for start in starts:
                 for name in ("floor", "slope"):
-                    paths = f"status.{limit.name}.{name}", f"{platform.name}.start.{start.name}.{name}"
+                    paths = (
+                        f"status.{limit.name}.{name}",
+                        f"{platform.name}.start.{start.name}.{name}",
+                    )
                     yield Tie(paths, (getattr(limit, name), getattr(start, name)))

@@ -29,7 +29,11 @@ def network(saved: SavedPolicy) -> Exported:
     """The actor alone: from what it sees (features) to means, or logits of discrete actions."""
     size = saved.params["actor"][0]["kernel"].shape[0]
     count = saved.params["actor"][-1]["bias"].size
-    names = saved.env.action_names if count == saved.env.action_size else tuple(f"logit_{i}" for i in range(count))
+    names = (
+        saved.env.action_names
+        if count == saved.env.action_size
+        else tuple(f"logit_{i}" for i in range(count))
+    )
 
     def function(features: Array) -> Array:
         distribution = saved.agent.distribution(saved.env, saved.params, features)
@@ -85,7 +89,9 @@ def closed_loop(saved: SavedPolicy | ForeignPolicy, steps: int, unrolled: bool =
             found.append(following)
         return jnp.concatenate(found)
 
-    names = tuple(f"{constraint.name}_{t}" for t in range(steps + 1) for constraint in env.constraints)
+    names = tuple(
+        f"{constraint.name}_{t}" for t in range(steps + 1) for constraint in env.constraints
+    )
     return Exported(jax.vmap(one), state_names(env), names)
 
 

@@ -34,7 +34,12 @@ _SAME = {
     "ge": "GreaterOrEqual", "eq": "Equal", "and": "And", "or": "Or", "not": "Not", "copy": "Identity",
     "stop_gradient": "Identity", "logistic": "Sigmoid", "pow": "Pow",
 }  # fmt: skip
-_INSIDE = {"jit": "jaxpr", "pjit": "jaxpr", "custom_jvp_call": "call_jaxpr", "custom_vjp_call": "call_jaxpr"}
+_INSIDE = {
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+}
 _TYPES = {
     "float32": TensorProto.FLOAT, "float64": TensorProto.FLOAT, "int32": TensorProto.INT32, "int64": TensorProto.INT32,
     "bool": TensorProto.BOOL,
@@ -43,7 +48,9 @@ _TYPES = {
 _NARROW = {"float64": np.float32, "int64": np.int32}
 
 
-def write_onnx(path: Path, function: Callable[[Any], Any], shape: Sequence[int], about: dict[str, str]) -> Path:
+def write_onnx(
+    path: Path, function: Callable[[Any], Any], shape: Sequence[int], about: dict[str, str]
+) -> Path:
     """Write `function`, of one float array of that shape, as a checked ONNX file.
 
     The graph has one input, `input`, and one output, `output`; `about` becomes its metadata.
@@ -60,7 +67,9 @@ def write_onnx(path: Path, function: Callable[[Any], Any], shape: Sequence[int],
 def to_onnx(function: Callable[[Any], Any], shape: Sequence[int]) -> Any:
     """The model of `write_onnx`."""
     closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct(shape, jnp.float32))
-    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True], instantiate=True)  # what nothing needs may be anything
+    jaxpr, _ = partial_eval.dce_jaxpr(
+        closed.jaxpr, [True], instantiate=True
+    )  # what nothing needs may be anything
     graph = _Graph()
     [output] = graph.inline(jaxpr, closed.consts, ["input"])
     graph.node("Identity", [output], "output")
@@ -73,7 +82,9 @@ def to_onnx(function: Callable[[Any], Any], shape: Sequence[int]) -> Any:
         [helper.make_tensor_value_info("output", _TYPES[result.dtype.name], result.shape)],
         graph.constants,
     )
-    model = helper.make_model(made, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jaxsafe", ir_version=8)
+    model = helper.make_model(
+        made, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jaxsafe", ir_version=8
+    )
     checker.check_model(model, full_check=True)
     return model
 
@@ -84,7 +95,9 @@ class _Graph:
         self.constants: list[Any] = []
         self._count = 0
 
-    def node(self, kind: str, inputs: Sequence[str], output: str | None = None, **attributes: Any) -> str:
+    def node(
+        self, kind: str, inputs: Sequence[str], output: str | None = None, **attributes: Any
+    ) -> str:
         output = output or self._name()
         self.nodes.append(helper.make_node(kind, list(inputs), [output], **attributes))
         return output
@@ -105,8 +118,12 @@ class _Graph:
     def inline(self, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[str]) -> list[str]:
         """Add the equations of a jaxpr; the names of its results."""
         names: dict[Any, str] = dict(zip(jaxpr.invars, inputs, strict=True))
-        names |= {var: self.constant(value) for var, value in zip(jaxpr.constvars, consts, strict=True)}
-        read = lambda atom: self.constant(atom.val) if isinstance(atom, core.Literal) else names[atom]  # noqa: E731
+        names |= {
+            var: self.constant(value) for var, value in zip(jaxpr.constvars, consts, strict=True)
+        }
+        read = lambda atom: (
+            self.constant(atom.val) if isinstance(atom, core.Literal) else names[atom]
+        )  # noqa: E731
         for equation in jaxpr.eqns:
             results = self._equation(equation, [read(atom) for atom in equation.invars])
             names |= dict(zip(equation.outvars, results, strict=True))
@@ -149,7 +166,9 @@ class _Graph:
 
     def _pieces(self, whole: str, sizes: Sequence[int], axis: int) -> list[str]:
         results = [self._name() for _ in sizes]
-        self.nodes.append(helper.make_node("Split", [whole, self.integers(*sizes)], results, axis=axis))
+        self.nodes.append(
+            helper.make_node("Split", [whole, self.integers(*sizes)], results, axis=axis)
+        )
         return results
 
     def _masked(self, whole: str, mask: Any) -> str:
@@ -162,7 +181,9 @@ class _Graph:
 
     def _iota(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
         axis = params["dimension"]
-        along = np.arange(out.shape[axis]).reshape([-1 if i == axis else 1 for i in range(len(out.shape))])
+        along = np.arange(out.shape[axis]).reshape(
+            [-1 if i == axis else 1 for i in range(len(out.shape))]
+        )
         return self.constant(np.broadcast_to(along, out.shape).astype(out.dtype))
 
     def _ne(self, inputs: list[str], *_: Any) -> str:
@@ -194,7 +215,11 @@ class _Graph:
 
     def _stack(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
         axis = params.get("axis", params.get("dimension", 0))
-        return self.node("Concat", [self.node("Unsqueeze", [one, self.integers(axis)]) for one in inputs], axis=axis)
+        return self.node(
+            "Concat",
+            [self.node("Unsqueeze", [one, self.integers(axis)]) for one in inputs],
+            axis=axis,
+        )
 
     def _reshape(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
         return self.node("Reshape", [inputs[0], self.integers(*out.shape)])
@@ -206,7 +231,11 @@ class _Graph:
         for size, axis in zip(shapes[0], params["broadcast_dimensions"], strict=True):
             aligned[axis] = size
         reshaped = self.node("Reshape", [inputs[0], self.integers(*aligned)])
-        return reshaped if tuple(aligned) == out.shape else self.node("Expand", [reshaped, self.integers(*out.shape)])
+        return (
+            reshaped
+            if tuple(aligned) == out.shape
+            else self.node("Expand", [reshaped, self.integers(*out.shape)])
+        )
 
     def _slice(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
         begin, end, strides = params["start_indices"], params["limit_indices"], params["strides"]
@@ -224,10 +253,19 @@ class _Graph:
 
     def _argmax(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
         [axis] = params["axes"]
-        return self.node("Cast", [self.node("ArgMax", inputs, axis=axis, keepdims=0)], to=_TYPES[out.dtype.name])
+        return self.node(
+            "Cast", [self.node("ArgMax", inputs, axis=axis, keepdims=0)], to=_TYPES[out.dtype.name]
+        )
 
     def _dot_general(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
         (left, right), batch = params["dimension_numbers"][0], params["dimension_numbers"][1]
-        if any(batch) or tuple(left) != (len(shapes[0]) - 1,) or tuple(right) != (0,) or len(shapes[1]) > 2:
-            raise ConfigError(f"onnx: a product of shapes {shapes} over axes {left} and {right} has no counterpart here")
+        if (
+            any(batch)
+            or tuple(left) != (len(shapes[0]) - 1,)
+            or tuple(right) != (0,)
+            or len(shapes[1]) > 2
+        ):
+            raise ConfigError(
+                f"onnx: a product of shapes {shapes} over axes {left} and {right} has no counterpart here"
+            )
         return self.node("MatMul", inputs)

@@ -34,25 +34,37 @@ def write_vnnlib(path: Path, exported: Exported, box: Box) -> Path:
 
     VNN-LIB knows no strict inequality, so a margin of 0, which is safe, counts as unsafe.
     """
-    lines = [f"; unsafe if any of {len(exported.outputs)} margins is <= 0; unsat: every start in the box is safe"]
+    lines = [
+        f"; unsafe if any of {len(exported.outputs)} margins is <= 0; unsat: every start in the box is safe"
+    ]
     lines += [f"; X_{i} is {name}" for i, name in enumerate(exported.inputs)]
     lines += [f"(declare-const X_{i} Real)" for i in range(len(exported.inputs))]
     lines += [f"(declare-const Y_{i} Real)" for i in range(len(exported.outputs))]
     for i, (low, high) in enumerate(box):
         lines += [f"(assert (>= X_{i} {low!r}))", f"(assert (<= X_{i} {high!r}))"]
-    lines += ["(assert (or", *(f"    (and (<= Y_{i} 0.0))" for i in range(len(exported.outputs))), "))"]
+    lines += [
+        "(assert (or",
+        *(f"    (and (<= Y_{i} 0.0))" for i in range(len(exported.outputs))),
+        "))",
+    ]
     write_bytes(path, ("\n".join(lines) + "\n").encode())
     return path
 
 
-def search(exported: Exported, box: Box, key: Key, starts: int = 10_000, best: int = 64, rounds: int = 100) -> Worst:
+def search(
+    exported: Exported, box: Box, key: Key, starts: int = 10_000, best: int = 64, rounds: int = 100
+) -> Worst:
     """Look for a start in the box with a negative margin: corners, random starts, then descent from the worst of them.
 
     It may miss one: a search that finds nothing is no proof. A margin that is not a number is no safe one.
     """
     low, high = (jnp.array([[bounds[i] for bounds in box]], jnp.result_type(float)) for i in (0, 1))
-    corners = np.stack(np.meshgrid(*([0.0, 1.0] for _ in box), indexing="ij"), axis=-1).reshape(-1, len(box))[:4096]
-    shares = jnp.concatenate([jnp.asarray(corners, low.dtype), jax.random.uniform(key, (starts, len(box)))])
+    corners = np.stack(np.meshgrid(*([0.0, 1.0] for _ in box), indexing="ij"), axis=-1).reshape(
+        -1, len(box)
+    )[:4096]
+    shares = jnp.concatenate(
+        [jnp.asarray(corners, low.dtype), jax.random.uniform(key, (starts, len(box)))]
+    )
 
     def least(share: jax.Array) -> jax.Array:
         margins = exported.function(low + share * (high - low))
@@ -60,12 +72,18 @@ def search(exported: Exported, box: Box, key: Key, starts: int = 10_000, best: i
 
     @jax.jit
     def descend(share: jax.Array) -> tuple[jax.Array, jax.Array]:
-        def one(i: int, carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        def one(
+            i: int, carry: tuple[jax.Array, jax.Array, jax.Array]
+        ) -> tuple[jax.Array, jax.Array, jax.Array]:
             share, worst, at = carry
             gradient = jax.grad(lambda s: jnp.sum(least(s)))(share)
-            gradient = jnp.where(jnp.isfinite(gradient), gradient, 0.0)  # from where there is no slope, stay
+            gradient = jnp.where(
+                jnp.isfinite(gradient), gradient, 0.0
+            )  # from where there is no slope, stay
             length = jnp.linalg.norm(gradient, axis=-1, keepdims=True)
-            moved = jnp.clip(share - 0.1 * 0.95**i * gradient / jnp.maximum(length, 1e-12), 0.0, 1.0)
+            moved = jnp.clip(
+                share - 0.1 * 0.95**i * gradient / jnp.maximum(length, 1e-12), 0.0, 1.0
+            )
             found = least(moved)
             better = found < worst
             return moved, jnp.where(better, found, worst), jnp.where(better[:, None], moved, at)

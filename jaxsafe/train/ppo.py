@@ -50,14 +50,18 @@ class PPO(Component):
 
     num_envs: Annotated[int, Range(1, largest=MAX_COUNT)] = 16  # episodes run side by side
     num_steps: Annotated[int, Range(1, largest=MAX_COUNT)] = 128  # steps of each between updates
-    max_episode_steps: Annotated[Dimensionless, Range(1.0)] = 1e6  # episodes of training are truncated after as many
+    max_episode_steps: Annotated[Dimensionless, Range(1.0)] = (
+        1e6  # episodes of training are truncated after as many
+    )
     num_epochs: Annotated[int, Range(1, largest=10_000)] = 10
     num_minibatches: Annotated[int, Range(1, largest=MAX_COUNT)] = 2
     learning_rate: Annotated[Dimensionless, Positive] = 3e-3
     final_learning_rate: Annotated[Dimensionless, Range(0.0)] = 3e-4  # reached at the end
     learning_rate_decay: Literal["linear", "exponential"] = "linear"  # on the way there
     gamma: Annotated[Dimensionless, Share] = 0.97
-    horizon_growth: Annotated[Dimensionless, Positive] = 1.0  # factor on 1/(1 − γ), reached exponentially at the end
+    horizon_growth: Annotated[Dimensionless, Positive] = (
+        1.0  # factor on 1/(1 − γ), reached exponentially at the end
+    )
     gae_lambda: Annotated[Dimensionless, Share] = 1.0
     clip: Annotated[Dimensionless, Positive] = 0.2
     noise_decay: Annotated[Dimensionless, Range(0.0, largest=20.0)] = (
@@ -66,11 +70,21 @@ class PPO(Component):
     value_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.5
     entropy_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.0
     max_grad_norm: Annotated[Dimensionless, Positive] = 0.5
-    averaging: Annotated[Dimensionless, Share] = 0.0  # share of the training over which the kept networks are averaged
-    learns_from: Literal["desired", "actual"] = "desired"  # control, where run time assurance changed it
-    cost_limit: Annotated[Dimensionless, Positive] = 25.0  # PPO-Lagrangian: violating steps that an episode may have
-    multiplier: Annotated[Dimensionless, Positive] = 0.01  # at the start, in reward per violating step
-    multiplier_rate: Annotated[Dimensionless, Range(0.0)] = 0.03  # by which its logarithm changes in an update, at most
+    averaging: Annotated[Dimensionless, Share] = (
+        0.0  # share of the training over which the kept networks are averaged
+    )
+    learns_from: Literal["desired", "actual"] = (
+        "desired"  # control, where run time assurance changed it
+    )
+    cost_limit: Annotated[Dimensionless, Positive] = (
+        25.0  # PPO-Lagrangian: violating steps that an episode may have
+    )
+    multiplier: Annotated[Dimensionless, Positive] = (
+        0.01  # at the start, in reward per violating step
+    )
+    multiplier_rate: Annotated[Dimensionless, Range(0.0)] = (
+        0.03  # by which its logarithm changes in an update, at most
+    )
 
     @property
     def batch_size(self) -> int:
@@ -104,7 +118,9 @@ class Transition(NamedTuple):
     """One step of every environment, stacked [num_steps, num_envs]."""
 
     inputs: Float[Array, "t n i"]  # what the actor saw
-    totals: Mapping[str, Float[Array, "t n"]]  # of each reward term before the step, if the critic sees them
+    totals: Mapping[
+        str, Float[Array, "t n"]
+    ]  # of each reward term before the step, if the critic sees them
     action: Array
     log_prob: Float[Array, "t n"]
     reward: Float[Array, "t n"]
@@ -148,7 +164,12 @@ def init(env: Environment, agent: Agent, ppo: PPO, key: Key, shard: Shard = WHOL
 
 
 def update(
-    env: Environment, agent: Agent, ppo: PPO, total_updates: Array | int, state: TrainState, shard: Shard = WHOLE
+    env: Environment,
+    agent: Agent,
+    ppo: PPO,
+    total_updates: Array | int,
+    state: TrainState,
+    shard: Shard = WHOLE,
 ) -> TrainState:
     """Collect one batch with the current policy and improve policy and value on it.
 
@@ -159,13 +180,17 @@ def update(
     progress = state.num_updates / total_updates
     gamma = discount(ppo, progress)
     batch = _to_batch(agent, ppo, gamma, state, transitions, shard)
-    params, optimizer = learn(env, agent, ppo, learning_rate(ppo, progress), state, batch, key_learn, shard)
+    params, optimizer = learn(
+        env, agent, ppo, learning_rate(ppo, progress), state, batch, key_learn, shard
+    )
     params = {**params, "log_std": params["log_std"] - ppo.noise_decay / total_updates}
     episode, done = shard.join((transitions.episode, transitions.done), axis=1)
     window = push(state.window, episode, done)
     multiplier = dual_ascent(ppo, state.multiplier, window, done) if agent.cost_critic else ()
     share = 1.0 / jnp.maximum(ppo.averaging * total_updates, 1.0)
-    average = jax.tree.map(lambda old, new: (1.0 - share) * old + share * new, state.average, params)
+    average = jax.tree.map(
+        lambda old, new: (1.0 - share) * old + share * new, state.average, params
+    )
     return state.replace(
         params=params, optimizer=optimizer, window=window, num_updates=state.num_updates + 1, average=average,
         multiplier=multiplier,
@@ -210,7 +235,9 @@ def collect(
 ) -> tuple[TrainState, Transition]:
     """Run every environment for `num_steps`; episodes go on from one update to the next."""
 
-    def one_step(carry: tuple[State, Array, Episode], key: Key) -> tuple[tuple[State, Array, Episode], Transition]:
+    def one_step(
+        carry: tuple[State, Array, Episode], key: Key
+    ) -> tuple[tuple[State, Array, Episode], Transition]:
         env_state, observation, episode = carry
         key_act, key_reset = jax.random.split(key)
         inputs = agent.inputs(env, observation)
@@ -246,7 +273,15 @@ def _acted(env: Environment, action: Array, timestep: TimeStep) -> Array:
     return jnp.where(timestep.info.intervening[:, None], acted, action)
 
 
-def gae(reward: Array, value: Array, next_value: Array, terminated: Array, done: Array, gamma: Array, lam: Array) -> Array:
+def gae(
+    reward: Array,
+    value: Array,
+    next_value: Array,
+    terminated: Array,
+    done: Array,
+    gamma: Array,
+    lam: Array,
+) -> Array:
     """Generalised advantage estimates along the leading axis.
 
     δ_t = r_t + γ V(s_{t+1})(1 − terminated_t) − V(s_t),  A_t = δ_t + γλ(1 − done_t) A_{t+1}
@@ -289,14 +324,20 @@ def learn(
         total, _ = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), rows.reshape(parts, -1))
         return jax.tree.map(lambda x: x / parts, total)
 
-    def minibatch_step(carry: tuple[Params, optax.OptState], rows: Array) -> tuple[tuple[Params, optax.OptState], None]:
+    def minibatch_step(
+        carry: tuple[Params, optax.OptState], rows: Array
+    ) -> tuple[tuple[Params, optax.OptState], None]:
         params, optimizer = carry
         gradient = shard.mean(mean_gradient(unpack(params), shard.own(rows)))
-        with jax.numpy_dtype_promotion("standard"):  # Adam of optax raises a float to a whole number
+        with jax.numpy_dtype_promotion(
+            "standard"
+        ):  # Adam of optax raises a float to a whole number
             step, optimizer = _optimizer(ppo).update(gradient, optimizer)
         return (jax.tree.map(lambda p, s: p - step_size * s, params, pack(step)), optimizer), None
 
-    def epoch(carry: tuple[Params, optax.OptState], key: Key) -> tuple[tuple[Params, optax.OptState], None]:
+    def epoch(
+        carry: tuple[Params, optax.OptState], key: Key
+    ) -> tuple[tuple[Params, optax.OptState], None]:
         rows = shuffle(key, ppo.batch_size).reshape(ppo.num_minibatches, -1)
         return jax.lax.scan(minibatch_step, carry, rows)
 
@@ -310,7 +351,9 @@ def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch)
     policy = agent.distribution(env, params, batch.inputs)
     log_ratio = policy.log_prob(batch.action) - batch.log_prob
     bounded = jax.lax.stop_gradient(jnp.minimum(log_ratio, MAX_LOG_RATIO))
-    ratio = jnp.exp(bounded + (log_ratio - jax.lax.stop_gradient(log_ratio)))  # the second term, 0, has the derivative
+    ratio = jnp.exp(
+        bounded + (log_ratio - jax.lax.stop_gradient(log_ratio))
+    )  # the second term, 0, has the derivative
     clipped = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
     seen = agent.critic_inputs(batch.inputs, batch.totals)
@@ -319,34 +362,54 @@ def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch)
     if agent.cost_critic:
         value_error += 0.5 * (agent.cost_rate(params, seen) - batch.cost_target) ** 2
     entropy = policy.entropy()
-    return jnp.mean(-surrogate + ppo.value_coefficient * value_error - ppo.entropy_coefficient * entropy)
+    return jnp.mean(
+        -surrogate + ppo.value_coefficient * value_error - ppo.entropy_coefficient * entropy
+    )
 
 
 def _to_batch(
-    agent: Agent, ppo: PPO, gamma: Array, state: TrainState, transitions: Transition, shard: Shard = WHOLE
+    agent: Agent,
+    ppo: PPO,
+    gamma: Array,
+    state: TrainState,
+    transitions: Transition,
+    shard: Shard = WHOLE,
 ) -> Batch:
     """Advantages, normalised over the whole batch, and targets of the critics; all samples in one row."""
     t, params = transitions, state.params
-    seen = [agent.critic_inputs(*one) for one in ((t.inputs, t.totals), (t.next_inputs, t.episode.reward_totals))]
+    seen = [
+        agent.critic_inputs(*one)
+        for one in ((t.inputs, t.totals), (t.next_inputs, t.episode.reward_totals))
+    ]
     value, next_value = (_in_chunks(partial(agent.value, params), one) for one in seen)
     advantage = gae(t.reward, value, next_value, t.terminated, t.done, gamma, ppo.gae_lambda)
     target, cost_target = advantage + value, ()
     if agent.cost_critic:
         rate, next_rate = (_in_chunks(partial(agent.cost_rate, params), one) for one in seen)
-        cost_advantage = gae((1.0 - gamma) * t.cost, rate, next_rate, t.terminated, t.done, gamma, ppo.gae_lambda)
+        cost_advantage = gae(
+            (1.0 - gamma) * t.cost, rate, next_rate, t.terminated, t.done, gamma, ppo.gae_lambda
+        )
         cost_target = cost_advantage + rate
         advantage -= state.multiplier * cost_advantage / (1.0 - gamma)
-    batch = shard.join(Batch(t.inputs, t.totals, t.action, t.log_prob, advantage, target, cost_target), axis=1)
+    batch = shard.join(
+        Batch(t.inputs, t.totals, t.action, t.log_prob, advantage, target, cost_target), axis=1
+    )
     advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8)
     batch = batch._replace(advantage=advantage)
     return jax.tree.map(lambda x: x.reshape(ppo.batch_size, *x.shape[2:]), batch)
 
 
-def _in_chunks(critic: Callable[[Array], Array], seen: Float[Array, "t n c"]) -> Float[Array, "t n"]:
+def _in_chunks(
+    critic: Callable[[Array], Array], seen: Float[Array, "t n c"]
+) -> Float[Array, "t n"]:
     """What a critic says of each sample."""
     t, n, size = seen.shape
     parts = _num_chunks(t * n)
-    return critic(seen) if parts == 1 else jax.lax.map(critic, seen.reshape(parts, -1, size)).reshape(t, n)
+    return (
+        critic(seen)
+        if parts == 1
+        else jax.lax.map(critic, seen.reshape(parts, -1, size)).reshape(t, n)
+    )
 
 
 def _num_chunks(samples: int) -> int:
@@ -356,4 +419,6 @@ def _num_chunks(samples: int) -> int:
 
 def _optimizer(ppo: PPO) -> optax.GradientTransformation:
     """Gradient clipping and Adam's direction; the step size is the schedule's."""
-    return optax.flatten(optax.chain(optax.clip_by_global_norm(ppo.max_grad_norm), optax.scale_by_adam(eps=1e-5)))
+    return optax.flatten(
+        optax.chain(optax.clip_by_global_norm(ppo.max_grad_norm), optax.scale_by_adam(eps=1e-5))
+    )

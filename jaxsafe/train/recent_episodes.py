@@ -35,8 +35,12 @@ def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
     order = jnp.cumsum(finished, dtype=jnp.int32) - 1
     latest = finished & (order >= order[-1] + 1 - SIZE)
     slot = jnp.where(latest, (window.count + order) % SIZE, SIZE)  # out of range: dropped
-    row = jnp.full(SIZE, -1).at[slot].set(jnp.arange(slot.size), mode="drop")  # one scatter, which is dear to compile
-    ring = jax.tree.map(lambda old, new: jnp.where(row < 0, old, new.ravel()[row]), window.episodes, episodes)
+    row = (
+        jnp.full(SIZE, -1).at[slot].set(jnp.arange(slot.size), mode="drop")
+    )  # one scatter, which is dear to compile
+    ring = jax.tree.map(
+        lambda old, new: jnp.where(row < 0, old, new.ravel()[row]), window.episodes, episodes
+    )
     cost = jnp.sum(jnp.where(done, episodes.violating_steps, 0), dtype=jnp.int32)
     running_cost = jnp.sum(jnp.where(done[-1], 0, episodes.violating_steps[-1]), dtype=jnp.int32)
     return Window(ring, window.count + order[-1] + 1, window.cost + cost, running_cost)
@@ -51,7 +55,9 @@ def latest_cost(window: Window, number: int = 25) -> Array:
     """The mean cost, in violating steps, of the latest finished episodes; 0 while there are none."""
     known = jnp.minimum(window.count, number)
     age = (window.count - 1 - jnp.arange(SIZE)) % SIZE
-    return jnp.sum(jnp.where(age < known, window.episodes.violating_steps, 0)) / jnp.maximum(known, 1)
+    return jnp.sum(jnp.where(age < known, window.episodes.violating_steps, 0)) / jnp.maximum(
+        known, 1
+    )
 
 
 def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:
@@ -60,7 +66,9 @@ def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:
     A share is an average of shares: every episode counts alike, however long it is. The rates of `metrics.summarise` are
     other numbers under other names: there every step counts alike.
     """
-    filled = (jnp.arange(SIZE, dtype=window.count.dtype) < window.count).astype(jnp.result_type(float))
+    filled = (jnp.arange(SIZE, dtype=window.count.dtype) < window.count).astype(
+        jnp.result_type(float)
+    )
     weight = filled / jnp.maximum(jnp.minimum(window.count, SIZE), 1).astype(filled.dtype)
     episodes = window.episodes
     lengths = jnp.maximum(episodes.length, 1).astype(weight.dtype)

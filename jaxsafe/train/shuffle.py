@@ -20,7 +20,9 @@ def shuffle(key: Key, size: int) -> Int[Array, " size"]:
     and Rogaway, "An enciphering scheme based on a card shuffle", CRYPTO 2012).
     """
     offsets, salts = jax.random.bits(key, (2 * ROUNDS,), jnp.uint32).reshape(2, ROUNDS)
-    offsets = (offsets % size).astype(jnp.int32)  # some offsets are likelier than others by less than size/2³²
+    offsets = (offsets % size).astype(
+        jnp.int32
+    )  # some offsets are likelier than others by less than size/2³²
 
     def swap_or_not(order: Array, round_: tuple[Array, Array]) -> tuple[Array, None]:
         offset, salt = round_
@@ -29,7 +31,9 @@ def shuffle(key: Key, size: int) -> Int[Array, " size"]:
         swap = _hash(jnp.maximum(order, partner).astype(jnp.uint32) ^ salt) >> 31 == 1
         return jnp.where(swap, partner, order), None
 
-    return jax.lax.scan(swap_or_not, jnp.arange(size, dtype=jnp.int32), (offsets, salts), unroll=accelerated())[0]
+    return jax.lax.scan(
+        swap_or_not, jnp.arange(size, dtype=jnp.int32), (offsets, salts), unroll=accelerated()
+    )[0]
 
 
 def _hash(x: Array) -> Array:

@@ -56,7 +56,9 @@ def chunk(
 
     def one(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
         going = (state.num_updates < limit) & ~ppo.diverged(state)
-        state = jax.lax.cond(going, lambda s: ppo.update(env, agent, hyper, limit, s, shard), leave, state)
+        state = jax.lax.cond(
+            going, lambda s: ppo.update(env, agent, hyper, limit, s, shard), leave, state
+        )
         counts = {
             "update": state.num_updates,
             "count": state.window.count,

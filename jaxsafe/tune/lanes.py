@@ -13,7 +13,14 @@ import numpy as np
 from jaxsafe.devices import memory
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.evaluate.episodes import run_episodes
-from jaxsafe.evaluate.evaluator import BATCH, EVALUATION_SEED, KINDS, given_up, in_batches, metrics_per_seed
+from jaxsafe.evaluate.evaluator import (
+    BATCH,
+    EVALUATION_SEED,
+    KINDS,
+    given_up,
+    in_batches,
+    metrics_per_seed,
+)
 from jaxsafe.metrics import Episode, interaction_efficiency
 from jaxsafe.train.host.results import diverged_seeds
 from jaxsafe.train.train import begin, chunk
@@ -51,7 +58,9 @@ class Lanes:
         """Prepare for `count` settings such as `like`: on a CPU a few at a time that keep all cores busy, else all."""
         self.like, self.seeds, devices = like, like.config.seeds, jax.devices()
         on_cpu = devices[0].platform == "cpu"
-        self.at_once = min(count, math.lcm(self.seeds, len(devices)) // self.seeds) if on_cpu else count
+        self.at_once = (
+            min(count, math.lcm(self.seeds, len(devices)) // self.seeds) if on_cpu else count
+        )
         self.mapper = SeedMapper(self.at_once * self.seeds)
         self.length = -(-like.config.num_updates // CHUNKS)
         self._init = self.mapper.map(lambda _, one: begin(*one))
@@ -63,7 +72,9 @@ class Lanes:
         places = self.mapper.pad(np.arange(self.at_once * self.seeds))
         trees = [lane(some[min(place // self.seeds, len(some) - 1)]) for place in places]
         lanes = self.mapper.place(jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees))
-        keys = self.mapper.place(jax.vmap(jax.random.key)(jnp.asarray(self.like.config.seed + places % self.seeds)))
+        keys = self.mapper.place(
+            jax.vmap(jax.random.key)(jnp.asarray(self.like.config.seed + places % self.seeds))
+        )
         self._advance = self._advance or self._fitting(lanes, keys)
         state = self._init((), (lanes, keys))
         curves = []
@@ -73,10 +84,15 @@ class Lanes:
             curves.append(self.mapper.gather({name: rows[name][:, :count] for name in CURVES}))
             tick(count * len(some))
         curve = {name: np.concatenate([one[name] for one in curves], axis=1) for name in curves[0]}
-        sums = {kind: self._episodes(lanes, state.average, kind == "deterministic") for kind in KINDS}
+        sums = {
+            kind: self._episodes(lanes, state.average, kind == "deterministic") for kind in KINDS
+        }
         split = lambda table: table.reshape(self.at_once, self.seeds, *table.shape[1:])[: len(some)]  # noqa: E731
         curve, sums = jax.tree.map(split, (curve, sums))
-        return [self._result(setting, *jax.tree.map(lambda x, i=i: x[i], (curve, sums))) for i, setting in enumerate(some)]
+        return [
+            self._result(setting, *jax.tree.map(lambda x, i=i: x[i], (curve, sums)))
+            for i, setting in enumerate(some)
+        ]
 
     def _fitting(self, lanes: Any, keys: jax.Array) -> jax.stages.Compiled:
         """The program of some updates, refused before there is a state if either needs more memory than there is."""
@@ -84,7 +100,12 @@ class Lanes:
         state = memory.size(like) // self.mapper.mesh.size
         memory.require(state, self.mapper.num_local_devices, memory.OPTIONS, memory.COMPILING)
         compiled = self.mapper.map(self._one_chunk).lower((), (lanes, like)).compile()
-        memory.require(memory.footprint(compiled), self.mapper.num_local_devices, memory.OPTIONS, memory.RUNNING)
+        memory.require(
+            memory.footprint(compiled),
+            self.mapper.num_local_devices,
+            memory.OPTIONS,
+            memory.RUNNING,
+        )
         return compiled
 
     def _one_chunk(self, _: tuple, one: tuple[Any, Any]) -> tuple[Any, dict[str, jax.Array]]:
@@ -99,14 +120,18 @@ class Lanes:
 
         return in_batches(batch, self.like.config.episodes, EVALUATION_SEED)
 
-    def _result(self, setting: Setting, curve: dict[str, np.ndarray], sums: dict[str, Episode]) -> dict[str, Any]:
+    def _result(
+        self, setting: Setting, curve: dict[str, np.ndarray], sums: dict[str, Episode]
+    ) -> dict[str, Any]:
         steps = (1 + np.arange(setting.config.num_updates)) * setting.config.ppo.batch_size
         diverged = curve["diverged"]
         success = np.where(diverged, 0.0, curve["success_rate"]).T  # what diverged succeeds no more
         episodes = curve["count"].T
         last = np.where(diverged, np.nan, curve["return"])[:, -1]
         left_out = np.flatnonzero(diverged[:, -1]).tolist()
-        evaluation = {kind: metrics_per_seed(setting.env, episodes) for kind, episodes in sums.items()}
+        evaluation = {
+            kind: metrics_per_seed(setting.env, episodes) for kind, episodes in sums.items()
+        }
         for metric in (values for metrics in evaluation.values() for values in metrics.values()):
             for place in left_out:
                 metric[place] = None
@@ -118,7 +143,9 @@ class Lanes:
             "training_return": last.tolist(),
             "evaluation": evaluation,
             **given_up(setting.env, sums),
-            **diverged_seeds({setting.config.seed + i: int(steps[np.argmax(diverged[i])]) for i in left_out}),
+            **diverged_seeds(
+                {setting.config.seed + i: int(steps[np.argmax(diverged[i])]) for i in left_out}
+            ),
             "curve": {"steps": steps.tolist(), "success_rate": np.round(success.T, 4).tolist()},
         }
 

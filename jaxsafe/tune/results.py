@@ -37,7 +37,10 @@ def create(out: str | None, request: Mapping[str, Any], first: Setting) -> Path:
     """Make the directory of a sweep and write down what was asked for, and what its first setting is in full."""
     path = run_directory.make(out, Path("runs"), f"tune_{Path(str(request['env'])).stem}")
     whole = run_directory.described(first.config, first.env)
-    write_text(path / "sweep.yaml", yaml12.write({"request": dict(request), "first": whole, "versions": versions()}))
+    write_text(
+        path / "sweep.yaml",
+        yaml12.write({"request": dict(request), "first": whole, "versions": versions()}),
+    )
     return path
 
 
@@ -63,7 +66,9 @@ def refuse_other(path: Path, first: Setting) -> None:
     """
     now = yaml12.write(run_directory.described(first.config, first.env))
     if _content(path)["first"] != yaml12.parse(now, "first"):
-        raise ConfigError(f"resume: the recipe or the environment of {path} has changed since it was begun; begin it anew")
+        raise ConfigError(
+            f"resume: the recipe or the environment of {path} has changed since it was begun; begin it anew"
+        )
 
 
 def _content(path: Path) -> dict[str, Any]:
@@ -86,10 +91,18 @@ def read(path: Path, found: Sequence[Setting]) -> Rows:
     for number, row in enumerate(keep_rows(file, lambda _: True, {"setting": COUNT}), start=1):
         index, place = row.pop("setting"), f"{file}, row {number}"
         if index >= len(found) or index in rows:
-            raise ConfigError(f"{place}: setting: expected one of the {len(found)} settings, each once, found {index}")
+            raise ConfigError(
+                f"{place}: setting: expected one of the {len(found)} settings, each once, found {index}"
+            )
         check(row, _form(found[index]), place)
-        check(row.get("diverged", []), [{"seed": COUNT, "step": COUNT | NULL}], f"{place}: diverged")
-        check(row.get("given_up", {"after_steps": 0}), {"after_steps": COUNT, OTHERS: COUNT}, f"{place}: given_up")
+        check(
+            row.get("diverged", []), [{"seed": COUNT, "step": COUNT | NULL}], f"{place}: diverged"
+        )
+        check(
+            row.get("given_up", {"after_steps": 0}),
+            {"after_steps": COUNT, OTHERS: COUNT},
+            f"{place}: given_up",
+        )
         for name, value in found[index].changes.items():
             if row.get(name) != json.loads(json.dumps(value)):
                 raise ConfigError(
@@ -103,16 +116,25 @@ def _form(setting: Setting) -> dict[str, Any]:
     """Return the form of the results of a setting, as far as they are read."""
     seeds, updates = setting.config.seeds, setting.config.num_updates
     rate, curve = numbers(seeds, SHARE | NULL), numbers(updates, SHARE | NULL)
-    metrics = {"success_rate": rate, "episode_safety_violation_rate": rate, "episode_length": numbers(seeds)}
+    metrics = {
+        "success_rate": rate,
+        "episode_safety_violation_rate": rate,
+        "episode_length": numbers(seeds),
+    }
     return {
-        "interaction_efficiency": {"timesteps": COUNT | NULL, "per_seed": numbers(seeds, COUNT | NULL)},
+        "interaction_efficiency": {
+            "timesteps": COUNT | NULL,
+            "per_seed": numbers(seeds, COUNT | NULL),
+        },
         "training_success": rate,
         "evaluation": {"stochastic": metrics, "deterministic": metrics},
         "curve": {
             "steps": numbers(updates, COUNT),
             "success_rate": Kind(
                 f"{seeds} lists of length {updates}, each a share",
-                lambda value: isinstance(value, list) and len(value) == seeds and all(map(curve.fits, value)),
+                lambda value: (
+                    isinstance(value, list) and len(value) == seeds and all(map(curve.fits, value))
+                ),
             ),
         },
     }
@@ -129,15 +151,22 @@ def finish(path: Path, rows: Rows, swept: Sequence[str], rank: str) -> str:
 
     order = sorted(rows, key=lambda index: (_key(rows[index], rank), index))
     flat = [{"setting": index, **_flat(rows[index], swept)} for index in order]
-    names = dict.fromkeys(name for one in flat for name in one)  # settings with seeds that diverged have other columns
+    names = dict.fromkeys(
+        name for one in flat for name in one
+    )  # settings with seeds that diverged have other columns
     flat = [{name: one.get(name) for name in names} for one in flat]
-    write_json(path / "results.json", {"rank": rank, "settings": [{"setting": i, **rows[i]} for i in order]})
+    write_json(
+        path / "results.json",
+        {"rank": rank, "settings": [{"setting": i, **rows[i]} for i in order]},
+    )
     write_csv(path / "results.csv", flat)
     figure = sweep_curves(path, [(_label(i, rows[i], swept), rows[i]["curve"]) for i in order])
     lines = _table(flat[:SHOWN])
     if len(flat) > SHOWN:
         lines.append(f"… and {len(flat) - SHOWN} more")
-    lines += [f"setting {index}: {_given_up(rows[index])}" for index in order if "given_up" in rows[index]]
+    lines += [
+        f"setting {index}: {_given_up(rows[index])}" for index in order if "given_up" in rows[index]
+    ]
     lines += [f"setting {index}: {told}" for index in order for told in told_diverged(rows[index])]
     return "\n".join([*lines, f"results in {path / 'results.csv'}, figure {figure}"])
 
@@ -161,7 +190,9 @@ def _given_up(row: dict[str, Any]) -> str:
 def _key(row: dict[str, Any], rank: str) -> tuple[float, ...]:
     """Small is good: settings of which no seed diverged first, then the chosen quantity, then the others."""
     steps = row["interaction_efficiency"]["timesteps"] or float("inf")
-    success, deterministic = (-(_mean(row, kind, "success_rate") or 0.0) for kind in ("stochastic", "deterministic"))
+    success, deterministic = (
+        -(_mean(row, kind, "success_rate") or 0.0) for kind in ("stochastic", "deterministic")
+    )
     area = -float(np.mean(np.nan_to_num(np.array(row["curve"]["success_rate"], float))))
     quantities = {
         "steps": (steps, area, success),
@@ -175,15 +206,24 @@ def _flat(row: dict[str, Any], swept: Sequence[str]) -> dict[str, Any]:
     each = row["interaction_efficiency"]["per_seed"]
     known = _known(row, "stochastic", "success_rate")
     return {
-        **{name: json.dumps(row[name]) if isinstance(row[name], (list, dict)) else row[name] for name in swept},
+        **{
+            name: json.dumps(row[name]) if isinstance(row[name], (list, dict)) else row[name]
+            for name in swept
+        },
         "80 % after": row["interaction_efficiency"]["timesteps"],
         "seeds at 80 %": f"{sum(step is not None for step in each)}/{len(each)}",
-        "training": round(float(np.mean(np.nan_to_num(np.array(row["training_success"], float)))), 4),
+        "training": round(
+            float(np.mean(np.nan_to_num(np.array(row["training_success"], float)))), 4
+        ),
         "stochastic": _mean(row, "stochastic", "success_rate", 4),
         "worst": None if not known else round(min(known), 4),
         "deterministic": _mean(row, "deterministic", "success_rate", 4),
         "length": _mean(row, "deterministic", "episode_length", 1),
-        **({"violating": _mean(row, "deterministic", "episode_safety_violation_rate", 5)} if _measured(row) else {}),
+        **(
+            {"violating": _mean(row, "deterministic", "episode_safety_violation_rate", 5)}
+            if _measured(row)
+            else {}
+        ),
         **({"diverged": len(row["diverged"])} if "diverged" in row else {}),
     }
 

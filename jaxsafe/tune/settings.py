@@ -64,7 +64,9 @@ def pop_sweep(arguments: Arguments) -> dict[str, list[Any] | Span]:
     return {key.removeprefix(PREFIX): _choices(key, arguments.options.pop(key)) for key in names}
 
 
-def settings(arguments: Arguments, sweep: Mapping[str, list[Any] | Span], samples: int | None, draw: int) -> list[Setting]:
+def settings(
+    arguments: Arguments, sweep: Mapping[str, list[Any] | Span], samples: int | None, draw: int
+) -> list[Setting]:
     """Every setting of a grid, or `samples` random ones.
 
     Args:
@@ -79,16 +81,22 @@ def settings(arguments: Arguments, sweep: Mapping[str, list[Any] | Span], sample
     """
     for name in sweep:
         if name in COMMON:
-            raise ConfigError(f"{PREFIX}{name}: must be the same in all settings; give {name}=… instead")
+            raise ConfigError(
+                f"{PREFIX}{name}: must be the same in all settings; give {name}=… instead"
+            )
         if name in arguments.options:
             raise ConfigError(f"{PREFIX}{name}: {name} is given as well; leave one out")
     if samples is None:
         for name, values in sweep.items():
             if isinstance(values, Span):
-                raise ConfigError(f"{PREFIX}{name}: a range needs samples=N, the number of settings to draw")
+                raise ConfigError(
+                    f"{PREFIX}{name}: a range needs samples=N, the number of settings to draw"
+                )
         count = math.prod(map(len, sweep.values()))
         if count > MAX_SETTINGS:
-            raise ConfigError(f"sweep: expected at most {MAX_SETTINGS:,} settings, found {count:,}; samples=N draws some")
+            raise ConfigError(
+                f"sweep: expected at most {MAX_SETTINGS:,} settings, found {count:,}; samples=N draws some"
+            )
         points = list(itertools.product(*sweep.values()))
     else:
         generator = np.random.default_rng(draw)
@@ -123,15 +131,23 @@ def _choices(key: str, value: Any) -> list[Any] | Span:
         return value
     match = _RANGE.fullmatch(value) if isinstance(value, str) else None
     if match is None:
-        raise ConfigError(f"{key}: expected a list [a,b,…], uniform(low,high) or log(low,high), found {show(value)}")
+        raise ConfigError(
+            f"{key}: expected a list [a,b,…], uniform(low,high) or log(low,high), found {show(value)}"
+        )
     try:
         low, high = float(match[2]), float(match[3])
     except ValueError:
-        raise ConfigError(f"{key}: expected two numbers in the brackets, found {show(value)}") from None
+        raise ConfigError(
+            f"{key}: expected two numbers in the brackets, found {show(value)}"
+        ) from None
     if not low < high or (match[1] == "log" and low <= 0.0) or not math.isfinite(high - low):
         raise ConfigError(f"{key}: expected low < high, for log above 0, found {show(value)}")
     return Span(low, high, match[1] == "log")
 
 
 def _draw(values: list[Any] | Span, generator: np.random.Generator) -> Any:
-    return values.draw(generator) if isinstance(values, Span) else values[generator.integers(len(values))]
+    return (
+        values.draw(generator)
+        if isinstance(values, Span)
+        else values[generator.integers(len(values))]
+    )

@@ -56,7 +56,9 @@ class Checkpoints:
 
         self._ocp = ocp
         self.directory = (run / "checkpoints").absolute()
-        options = ocp.CheckpointManagerOptions(create=create, enable_async_checkpointing=False, read_only=not create)
+        options = ocp.CheckpointManagerOptions(
+            create=create, enable_async_checkpointing=False, read_only=not create
+        )
         if create:
             self._recover()
         if create or self.directory.is_dir():
@@ -84,7 +86,9 @@ class Checkpoints:
                 place.rename(before)
             processes.meet("moved aside")
             self._manager.reload()
-        args = ocp.args.Composite(state=ocp.args.StandardSave(state), facts=ocp.args.JsonSave(facts))
+        args = ocp.args.Composite(
+            state=ocp.args.StandardSave(state), facts=ocp.args.JsonSave(facts)
+        )
         reason = ""
         with _silence() as complaints:
             try:
@@ -92,7 +96,10 @@ class Checkpoints:
             except (OSError, ValueError, RuntimeError) as error:
                 if jax.process_count() > 1 and "os_error_code" not in str(error):
                     raise  # by the loss of another process, perhaps
-                reason = str(error).strip().rpartition(": ")[2].partition(" [")[0][:MAX_REASON] or type(error).__name__
+                reason = (
+                    str(error).strip().rpartition(": ")[2].partition(" [")[0][:MAX_REASON]
+                    or type(error).__name__
+                )
             if reason:
                 _ignore_late_complaints()
                 _settle(complaints)
@@ -102,7 +109,9 @@ class Checkpoints:
             else:
                 shutil.rmtree(before, ignore_errors=True)
         if reason:
-            raise ConfigError(f"{place}: checkpoint cannot be written: {reason}; make room, then resume")
+            raise ConfigError(
+                f"{place}: checkpoint cannot be written: {reason}; make room, then resume"
+            )
 
     def _recover(self) -> None:
         """In one process take back what was not finished; the others wait."""
@@ -138,9 +147,15 @@ class Checkpoints:
         Raises:
             ConfigError: there is none at this step, or it is broken, damaged or of another run.
         """
-        facts, place, now = self.facts(step), self.directory / str(step), jnp.result_type(float).name
+        facts, place, now = (
+            self.facts(step),
+            self.directory / str(step),
+            jnp.result_type(float).name,
+        )
         if facts.get(PRECISION, now) != now:
-            raise ConfigError(f"{place}: checkpoint was written in {facts[PRECISION]}, this process computes in {now}")
+            raise ConfigError(
+                f"{place}: checkpoint was written in {facts[PRECISION]}, this process computes in {now}"
+            )
         abstract = jax.tree.map(_empty, like)
         state = self._read(step, state=self._ocp.args.StandardRestore(abstract))["state"]
         for (path, found), wanted in zip(
@@ -153,7 +168,9 @@ class Checkpoints:
                 )
         digest = facts.pop(DIGEST, None)
         if (digest is not None or PRECISION in facts) and digest != _digest(state, facts):
-            raise ConfigError(f"{place}: checkpoint is damaged: its content is not what was written")
+            raise ConfigError(
+                f"{place}: checkpoint is damaged: its content is not what was written"
+            )
         return jax.tree.map(_as, state, like)
 
     def _read(self, step: int, **args: Any) -> Any:
@@ -201,7 +218,9 @@ def _ignore_late_complaints() -> None:
             previous(what)
 
     sys.unraisablehook = hook
-    logging.getLogger("asyncio").addFilter(lambda record: "never retrieved" not in record.getMessage())
+    logging.getLogger("asyncio").addFilter(
+        lambda record: "never retrieved" not in record.getMessage()
+    )
 
 
 def _settle(complaints: io.StringIO) -> None:

@@ -43,13 +43,19 @@ def check_order(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         place = f"{path}, row {index + 1}"
         if row.keys() != rows[0].keys():
             different = ", ".join(sorted(row.keys() ^ rows[0].keys()))
-            raise ConfigError(f"{place}: expected the columns of the first row, they differ in {different}")
+            raise ConfigError(
+                f"{place}: expected the columns of the first row, they differ in {different}"
+            )
         first = rows[index - index % len(seeds)]  # of the same update
         if row["seed"] != seeds[index % len(seeds)] or row["step"] != first["step"]:
             wanted = f"seed {seeds[index % len(seeds)]} at step {first['step']}"
-            raise ConfigError(f"{place}: expected {wanted}, found seed {row['seed']} at step {row['step']}")
+            raise ConfigError(
+                f"{place}: expected {wanted}, found seed {row['seed']} at step {row['step']}"
+            )
         if first is row and index and row["step"] <= rows[index - 1]["step"]:
-            raise ConfigError(f"{place}: expected a step after {rows[index - 1]['step']}, found {row['step']}")
+            raise ConfigError(
+                f"{place}: expected a step after {rows[index - 1]['step']}, found {row['step']}"
+            )
 
 
 def filter_name(env: Environment) -> str:
@@ -76,14 +82,20 @@ class ProgressLog:
         self._jsonl, self._csv = run / "progress.jsonl", run / "progress.csv"
         self.rows = [row for row in read_progress(run) if row["step"] <= resume_step]
         if len(self.rows) != expected:
-            raise ConfigError(f"{self._jsonl}: expected {expected} rows up to step {resume_step}, found {len(self.rows)}")
+            raise ConfigError(
+                f"{self._jsonl}: expected {expected} rows up to step {resume_step}, found {len(self.rows)}"
+            )
         if self._jsonl.exists():
             write_rows(self._jsonl, self.rows)
         if self.rows:
             write_csv(self._csv, self.rows)
         else:
             self._csv.unlink(missing_ok=True)
-        self._board = tensorboard_writer()(str(run / "tensorboard"), purge_step=resume_step + 1) if tensorboard else None
+        self._board = (
+            tensorboard_writer()(str(run / "tensorboard"), purge_step=resume_step + 1)
+            if tensorboard
+            else None
+        )
 
     def write(self, rows: list[dict[str, Any]]) -> None:
         """Add rows to all logs.
@@ -102,7 +114,9 @@ class ProgressLog:
         append_csv(self._csv, rows)
         for row in rows if self._board else ():
             for name in [
-                key for key, value in row.items() if key not in ("seed", "step", "diverged") and value is not None
+                key
+                for key, value in row.items()
+                if key not in ("seed", "step", "diverged") and value is not None
             ]:
                 self._board.add_scalar(f"{name}/seed_{row['seed']}", row[name], row["step"])  # type: ignore[union-attr]
 
@@ -118,7 +132,9 @@ class ProgressLog:
         return steps, values.reshape(len(steps), -1)
 
 
-def progress_rows(env: Environment, curves: dict[str, np.ndarray], seed: int, batch_size: int, wall_s: float) -> list[dict]:
+def progress_rows(
+    env: Environment, curves: dict[str, np.ndarray], seed: int, batch_size: int, wall_s: float
+) -> list[dict]:
     """Rows from the arrays [seeds, updates] that a chunk returns, update after update."""
     num_seeds, num_updates = curves["count"].shape
     known = (curves["count"] > 0) & ~curves["diverged"]
@@ -130,7 +146,10 @@ def progress_rows(env: Environment, curves: dict[str, np.ndarray], seed: int, ba
             "wall_s": round(wall_s, 3),
             "episodes": int(curves["count"][i, j]),
             "cost": int(curves["cost"][i, j]),
-            **{name: float(f"{curves[name][i, j]:.6g}") if known[i, j] else None for name in measured},
+            **{
+                name: float(f"{curves[name][i, j]:.6g}") if known[i, j] else None
+                for name in measured
+            },
             "diverged": bool(curves["diverged"][i, j]),
         }
         for j in range(num_updates)
@@ -149,7 +168,11 @@ def columns(env: Environment) -> list[str]:
         *(["violating_share", "episode_cost"] if measured["has_constraints"] else []),
         *(["intervention_share"] if measured["has_rta"] else []),
     ]
-    return [*first, *(f"outcome/{name}" for name in env.outcomes[1:]), *(f"reward/{term.name}" for term in env.reward)]
+    return [
+        *first,
+        *(f"outcome/{name}" for name in env.outcomes[1:]),
+        *(f"reward/{term.name}" for term in env.reward),
+    ]
 
 
 class Display:
@@ -162,7 +185,9 @@ class Display:
         if sys.stderr.isatty():
             from tqdm import tqdm
 
-            self._bar = tqdm(total=steps, initial=done, unit=" steps", unit_scale=True, dynamic_ncols=True)
+            self._bar = tqdm(
+                total=steps, initial=done, unit=" steps", unit_scale=True, dynamic_ncols=True
+            )
             self._bar.set_postfix_str("compiling")
 
     def start(self) -> None:
@@ -174,7 +199,9 @@ class Display:
     def show(self, step: int, rows: list[dict[str, Any]]) -> None:
         """Show the state after `step` steps, from the latest row of each seed."""
         means = {name: _mean([row[name] for row in rows]) for name in ("success_rate", "return")}
-        facts = f"success {_text(means['success_rate'], '.1%')}, return {_text(means['return'], '.2f')}"
+        facts = (
+            f"success {_text(means['success_rate'], '.1%')}, return {_text(means['return'], '.2f')}"
+        )
         if diverged := sum(row["diverged"] for row in rows):
             facts += f", {diverged} of {len(rows)} seeds diverged and left out"
         if self._bar is not None:
@@ -217,8 +244,12 @@ def tensorboard_writer() -> Any:
     try:
         from tensorboardX import SummaryWriter
     except ImportError:
-        raise ConfigError(f"tensorboard: tensorboardX is not installed; {install('tensorboard')}") from None
+        raise ConfigError(
+            f"tensorboard: tensorboardX is not installed; {install('tensorboard')}"
+        ) from None
     except Exception as error:  # an old one beside a new protobuf
         reason = next(iter(str(error).splitlines()), "")
-        raise ConfigError(f"tensorboard: tensorboardX cannot be imported: {type(error).__name__}: {reason}") from None
+        raise ConfigError(
+            f"tensorboard: tensorboardX cannot be imported: {type(error).__name__}: {reason}"
+        ) from None
     return SummaryWriter

@@ -41,15 +41,21 @@ class TrainConfig(Component):
 
     preset: str = "features"
     algorithm: Literal["ppo", "ppo_lagrangian"] = "ppo"
-    cost_limit: Annotated[Dimensionless, Positive] | None = None  # of ppo_lagrangian: violating steps per episode
+    cost_limit: Annotated[Dimensionless, Positive] | None = (
+        None  # of ppo_lagrangian: violating steps per episode
+    )
     seeds: Annotated[int, Range(1, largest=MAX_SEEDS)] = 1
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0  # the first; seeds=10 is seed … seed + 9
-    devices_per_seed: Count | None = None  # that share its environments; None: as many as there are, while each has work
+    devices_per_seed: Count | None = (
+        None  # that share its environments; None: as many as there are, while each has work
+    )
     steps: Steps = 500_000
     actions: Literal["continuous", "discrete"] | None = None  # None: as the environment says
     variant: Literal["paper", "released"] | None = None  # None: paper
     rta: str | None = None  # None: as the environment says; default, or another preset of the task
-    rta_training: Literal["punished", "unpunished", "corrected"] | None = None  # None: punished, where there is a filter
+    rta_training: Literal["punished", "unpunished", "corrected"] | None = (
+        None  # None: punished, where there is a filter
+    )
     out: str | None = None  # None: a new directory in runs/
     eval_every: Steps | None = None  # steps; None: a tenth of the run
     eval_episodes: Count = 100  # of each evaluation during training
@@ -75,7 +81,11 @@ class TrainConfig(Component):
 
     def every(self, steps: int | None) -> int:
         """An interval in updates; a tenth of the run without one."""
-        return -(-self.num_updates // 10) if steps is None else max(1, round(steps / self.ppo.batch_size))
+        return (
+            -(-self.num_updates // 10)
+            if steps is None
+            else max(1, round(steps / self.ppo.batch_size))
+        )
 
 
 def resolve_all(arguments: Arguments) -> list[tuple[TrainConfig, Environment, str]]:
@@ -110,7 +120,10 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
         if name in arguments.options:
             raise ConfigError(f"{name}: name one of its options, for instance {name}.{example}=…")
     config = TrainConfig()
-    for path, value in arguments.options.items():  # first, so that a misspelt option is told before a slow start
+    for (
+        path,
+        value,
+    ) in arguments.options.items():  # first, so that a misspelt option is told before a slow start
         config = set_path(config, path, value, to_value)
     env = make(task, actions=config.actions, variant=config.variant, rta=config.rta)
     told = config.rta_training or ("punished" if env.rta is not None else None)
@@ -119,7 +132,10 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
     env = override(env, overrides)
     require_success(env)
     config = normalise(TrainConfig())
-    for path, value in {**recipe(task, arguments.options.get("preset")), **arguments.options}.items():
+    for path, value in {
+        **recipe(task, arguments.options.get("preset")),
+        **arguments.options,
+    }.items():
         config = set_path(config, path, value, to_value)
     config = config.replace(rta_training=told)
     if told == "corrected":
@@ -137,34 +153,49 @@ def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
             f" samples of a minibatch, found {config.devices_per_seed}"
         )
     if config.ppo.batch_size >= 2**31:
-        raise ConfigError(f"ppo.num_envs × ppo.num_steps: expected less than 2³¹, found {config.ppo.batch_size:,}")
+        raise ConfigError(
+            f"ppo.num_envs × ppo.num_steps: expected less than 2³¹, found {config.ppo.batch_size:,}"
+        )
     if config.num_updates >= 2**31:
         raise ConfigError(
             f"steps: expected less than 2³¹ updates of {config.ppo.batch_size:,}, found {config.steps:,} steps"
         )
     if len(config.agent.hidden) > MAX_LAYERS:
-        raise ConfigError(f"agent.hidden: expected at most {MAX_LAYERS} layers, found {len(config.agent.hidden)}")
+        raise ConfigError(
+            f"agent.hidden: expected at most {MAX_LAYERS} layers, found {len(config.agent.hidden)}"
+        )
     if float(config.ppo.horizon_growth) < 1.0 - float(config.ppo.gamma):
         raise ConfigError(
             f"ppo.horizon_growth: expected at least 1 − ppo.gamma = {1.0 - float(config.ppo.gamma):.3g}, or the discount"
             f" factor falls below 0; found {float(config.ppo.horizon_growth):g}"
         )
     if config.ppo.learning_rate_decay == "exponential" and not config.ppo.final_learning_rate > 0.0:
-        raise ConfigError("ppo.final_learning_rate: expected a number > 0 for an exponential decay, found 0")
+        raise ConfigError(
+            "ppo.final_learning_rate: expected a number > 0 for an exponential decay, found 0"
+        )
     if config.seed + config.seeds > 2**31:
-        raise ConfigError(f"seeds: seed + seeds must not exceed 2³¹, found {config.seed} + {config.seeds}")
+        raise ConfigError(
+            f"seeds: seed + seeds must not exceed 2³¹, found {config.seed} + {config.seeds}"
+        )
     if config.tensorboard:
         tensorboard_writer()
     if jnp.size(config.agent.log_std) not in (1, env.action_size):
         count, found = env.action_size, jnp.size(config.agent.log_std)
-        raise ConfigError(f"agent.log_std: expected one number or {count}, one for each action, found {found}")
+        raise ConfigError(
+            f"agent.log_std: expected one number or {count}, one for each action, found {found}"
+        )
     observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
-    jax.eval_shape(lambda o: config.agent.inputs(env, o), observation)  # refuses features that this task cannot have
+    jax.eval_shape(
+        lambda o: config.agent.inputs(env, o), observation
+    )  # refuses features that this task cannot have
     return config, env, short_name(task)
 
 
 def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfig:
-    for path, instead in (("agent.cost_critic", "algorithm=ppo_lagrangian"), ("ppo.cost_limit", "cost_limit=N")):
+    for path, instead in (
+        ("agent.cost_critic", "algorithm=ppo_lagrangian"),
+        ("ppo.cost_limit", "cost_limit=N"),
+    ):
         if path in given:
             raise ConfigError(f"{path}: follows from the algorithm; give {instead}")
     if config.algorithm == "ppo":
@@ -175,18 +206,29 @@ def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfi
             raise ConfigError("cost_limit: plain PPO has none; add algorithm=ppo_lagrangian")
         return config
     if config.cost_limit is None:
-        raise ConfigError("cost_limit: missing; the violating steps that an episode may have, for instance cost_limit=5")
+        raise ConfigError(
+            "cost_limit: missing; the violating steps that an episode may have, for instance cost_limit=5"
+        )
     if float(config.ppo.gamma) >= 1.0:
-        raise ConfigError(f"ppo.gamma: expected less than 1 with algorithm=ppo_lagrangian, found {float(config.ppo.gamma)}")
-    agent, ppo = config.agent.replace(cost_critic=True), config.ppo.replace(cost_limit=config.cost_limit)
+        raise ConfigError(
+            f"ppo.gamma: expected less than 1 with algorithm=ppo_lagrangian, found {float(config.ppo.gamma)}"
+        )
+    agent, ppo = (
+        config.agent.replace(cost_critic=True),
+        config.ppo.replace(cost_limit=config.cost_limit),
+    )
     return config.replace(agent=agent, ppo=ppo)
 
 
 def _check_rta(config: TrainConfig, env: Environment) -> None:
     if config.rta_training is not None and env.rta is None:
-        raise ConfigError(f"rta_training: {config.rta_training!r} needs run time assurance, for instance rta=default")
+        raise ConfigError(
+            f"rta_training: {config.rta_training!r} needs run time assurance, for instance rta=default"
+        )
     if config.ppo.learns_from == "actual" and env.num_action_points:
-        raise ConfigError("ppo.learns_from: the actual control is no choice of discrete actions; use actions=continuous")
+        raise ConfigError(
+            "ppo.learns_from: the actual control is no choice of discrete actions; use actions=continuous"
+        )
 
 
 def recipe(task: str, preset: str | None) -> dict[str, Any]:
@@ -196,10 +238,16 @@ def recipe(task: str, preset: str | None) -> dict[str, Any]:
         ConfigError: the preset is not in the file.
     """
     registered = TASKS.get(task.rpartition(":")[2])
-    known = yaml12.read(configs() / registered.recipe) if registered and registered.recipe else {"plain": {}}
+    known = (
+        yaml12.read(configs() / registered.recipe)
+        if registered and registered.recipe
+        else {"plain": {}}
+    )
     name = preset if preset is not None else ("features" if "features" in known else "plain")
     if name not in known:
-        raise ConfigError(f"preset: unknown preset {show(name)}; choose from {nearest(name, known)}")
+        raise ConfigError(
+            f"preset: unknown preset {show(name)}; choose from {nearest(name, known)}"
+        )
     return {"preset": name, **_flatten(known[name] or {})}
 
 
@@ -213,14 +261,20 @@ def configs() -> Path:
     for path in (package / "configs", package.parent / "configs"):
         if path.is_dir():
             return path
-    raise ConfigError(f"preset: no recipes in {package / 'configs'}; install the package unpacked, as pip does")
+    raise ConfigError(
+        f"preset: no recipes in {package / 'configs'}; install the package unpacked, as pip does"
+    )
 
 
 def usage() -> str:
     """Every option with its default and what it takes."""
     lines = ["usage: python -m jaxsafe.train env=TASK [key=value …]      or      resume=RUN", ""]
-    lines += ["  distributed=true, beside either: this is one of several processes that srun or mpirun started"]
-    lines += ["  env=TASK, env=FILE.yaml, or env=all for the five tasks one after another, then evaluated"]
+    lines += [
+        "  distributed=true, beside either: this is one of several processes that srun or mpirun started"
+    ]
+    lines += [
+        "  env=TASK, env=FILE.yaml, or env=all for the five tasks one after another, then evaluated"
+    ]
     lines += ["  env.PATH=VALUE changes it, for instance env.reward.delta_v.scale=-0.02", ""]
     for section, cls in (("", TrainConfig), ("agent.", Agent), ("ppo.", PPO)):
         for name, field in fields(cls).items():
@@ -233,5 +287,9 @@ def usage() -> str:
 def _flatten(tree: Mapping[str, Any], place: str = "") -> dict[str, Any]:
     flat: dict[str, Any] = {}
     for key, value in tree.items():
-        flat |= _flatten(value, f"{place}{key}.") if isinstance(value, Mapping) else {f"{place}{key}": value}
+        flat |= (
+            _flatten(value, f"{place}{key}.")
+            if isinstance(value, Mapping)
+            else {f"{place}{key}": value}
+        )
     return flat

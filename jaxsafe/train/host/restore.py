@@ -30,7 +30,10 @@ def structure(env: Environment, config: TrainConfig) -> dict[str, Any]:
     state = jax.eval_shape(seeds, jax.random.split(jax.random.key(0), config.seeds))
     return {
         "state": state,
-        "best": {"params": state.average, "success": jax.ShapeDtypeStruct((config.seeds,), jnp.float32)},
+        "best": {
+            "params": state.average,
+            "success": jax.ShapeDtypeStruct((config.seeds,), jnp.float32),
+        },
     }
 
 
@@ -56,7 +59,9 @@ def made_from(env: Environment, config: TrainConfig) -> dict[str, Any]:
     return content
 
 
-def restore(checkpoints: Checkpoints, step: int, env: Environment, config: TrainConfig) -> tuple[Any, dict[str, Any]]:
+def restore(
+    checkpoints: Checkpoints, step: int, env: Environment, config: TrainConfig
+) -> tuple[Any, dict[str, Any]]:
     """Read a checkpoint of this environment and configuration: its arrays and its facts.
 
     Raises:
@@ -72,7 +77,9 @@ def restore(checkpoints: Checkpoints, step: int, env: Environment, config: Train
                 f" {before}; put that back, or begin a new run"
             )
     if facts["updates"] * config.ppo.batch_size != step:
-        raise ConfigError(f"{place}: updates: expected those of {step} steps, found {facts['updates']}")
+        raise ConfigError(
+            f"{place}: updates: expected those of {step} steps, found {facts['updates']}"
+        )
     return checkpoints.restore(step, structure(env, config)), facts
 
 
@@ -92,7 +99,9 @@ def _difference(before: Any, now: Any, place: str = "") -> tuple[str, Any, Any]:
     return "", None, None
 
 
-def load_params(mapper: SeedMapper, run: Path, config: TrainConfig, env: Environment, which: str) -> tuple[Params, int]:
+def load_params(
+    mapper: SeedMapper, run: Path, config: TrainConfig, env: Environment, which: str
+) -> tuple[Params, int]:
     """The networks of every seed from a checkpoint, `last`, `best` or a step, and the step of that checkpoint.
 
     Raises:
@@ -106,4 +115,6 @@ def load_params(mapper: SeedMapper, run: Path, config: TrainConfig, env: Environ
         raise ConfigError(f"checkpoint: found {which!r}; choose from {nearest(which, choices)}")
     step = int(which) if which.isdecimal() else checkpoints.steps[-1]
     content, _ = restore(checkpoints, step, env, config)
-    return mapper.place(content["best"]["params"] if which == "best" else content["state"].average), step
+    return mapper.place(
+        content["best"]["params"] if which == "best" else content["state"].average
+    ), step

@@ -11,7 +11,18 @@ from jaxsafe.environment import Environment
 from jaxsafe.evaluate.evaluator import KINDS, given_up, metrics_per_seed
 from jaxsafe.metrics import ENOUGH_SEEDS, Episode, interaction_efficiency, over_seeds, with_interval
 from jaxsafe.storage.files import read_json, write_json
-from jaxsafe.storage.forms import AMOUNT, COUNT, NULL, NUMBER, OTHERS, SHARE, TEXT, Kind, check, numbers
+from jaxsafe.storage.forms import (
+    AMOUNT,
+    COUNT,
+    NULL,
+    NUMBER,
+    OTHERS,
+    SHARE,
+    TEXT,
+    Kind,
+    check,
+    numbers,
+)
 from jaxsafe.storage.provenance import versions
 from jaxsafe.storage.text_table import columns
 from jaxsafe.train.host.log import filter_name, headline
@@ -35,7 +46,15 @@ _ROWS = (
 _METRICS = {
     **{name: AMOUNT for name, *_ in _ROWS},
     "average_return": NUMBER,
-    **dict.fromkeys(("success_rate", "safety_violation_rate", "episode_safety_violation_rate", "intervention_rate"), SHARE),
+    **dict.fromkeys(
+        (
+            "success_rate",
+            "safety_violation_rate",
+            "episode_safety_violation_rate",
+            "intervention_rate",
+        ),
+        SHARE,
+    ),
 }
 """The form of the values of each metric that every evaluation has."""
 
@@ -48,17 +67,23 @@ def finish(training: Training) -> dict[str, Any]:
     for seed, params in enumerate(training.params(), start=config.seed):
         if seed not in training.diverged:
             about = {"env": name, "preset": config.preset, "seed": seed, "step": training.step}
-            save_policy(training.run / "policy" / f"seed_{seed}.npz", env, config.agent, params, about)
+            save_policy(
+                training.run / "policy" / f"seed_{seed}.npz", env, config.agent, params, about
+            )
     left_out = [seed - config.seed for seed in training.diverged]
     results = {
         **facts(config, env, name),
         "steps": training.step,
         "wall_s": round(training.clock.seconds, 2),
         "compile_s": round(training.compile_s, 2),
-        "training_computation_time": training.log.rows[-1]["wall_s"],  # [s] to the last update, and all before it
+        "training_computation_time": training.log.rows[-1][
+            "wall_s"
+        ],  # [s] to the last update, and all before it
         "versions": versions(),
         "interaction_efficiency": _efficiency(training),
-        "training_cost": over_sound_seeds(training.log.curve("cost")[1][-1].tolist(), left_out),  # violating steps
+        "training_cost": over_sound_seeds(
+            training.log.curve("cost")[1][-1].tolist(), left_out
+        ),  # violating steps
         "evaluation": evaluation(env, episodes, left_out),
         **given_up(env, episodes),
         **diverged_seeds(training.diverged),
@@ -69,11 +94,18 @@ def finish(training: Training) -> dict[str, Any]:
 
 def facts(config: TrainConfig, env: Environment, name: str) -> dict[str, Any]:
     """What every result says about the run that it belongs to."""
-    how = {"env": name, "preset": config.preset, "algorithm": config.algorithm, "rta": filter_name(env)}
+    how = {
+        "env": name,
+        "preset": config.preset,
+        "algorithm": config.algorithm,
+        "rta": filter_name(env),
+    }
     return {**how, "seeds": config.seeds, "seed": config.seed}
 
 
-def evaluation(env: Environment, episodes: dict[str, Episode], left_out: Collection[int] = ()) -> dict[str, Any]:
+def evaluation(
+    env: Environment, episodes: dict[str, Episode], left_out: Collection[int] = ()
+) -> dict[str, Any]:
     """Return the metrics of each kind of evaluation. Seeds whose place is in `left_out` have None and are in no average."""
     each = {kind: metrics_per_seed(env, one) for kind, one in episodes.items()}
     return {
@@ -104,16 +136,30 @@ def table(results: dict[str, Any], path: Path) -> str:
     for name, label, unit in _ROWS:
         if all(one[name]["mean"] is not None for one in found.values()):
             rows.append([label, *(_cell(one[name], unit) for one in found.values())])
-    rows.append(["worst seed, success rate", *(percent(least([one["success_rate"]]), 1) for one in found.values())])
+    rows.append(
+        [
+            "worst seed, success rate",
+            *(percent(least([one["success_rate"]]), 1) for one in found.values()),
+        ]
+    )
     lines += [*columns(rows), *told_diverged(results)]
     if "given_up" in results:
         counts, limit = results["given_up"], results["given_up"]["after_steps"]
         told = ", ".join(f"{counts[kind]:,} {kind}" for kind in found)
-        lines.append(f"episodes still running after {limit:,} steps, given up and counted as failures: {told}")
+        lines.append(
+            f"episodes still running after {limit:,} steps, given up and counted as failures: {told}"
+        )
     if "interaction_efficiency" in results:
         steps = results["interaction_efficiency"]["timesteps"]
-        lines += ["", f"80 % training success after {steps:,} steps" if steps else "80 % training success not reached"]
-        lines += [f"{results['wall_s']:.1f} s in total, {results['compile_s']:.1f} s of it compiling the training"]
+        lines += [
+            "",
+            f"80 % training success after {steps:,} steps"
+            if steps
+            else "80 % training success not reached",
+        ]
+        lines += [
+            f"{results['wall_s']:.1f} s in total, {results['compile_s']:.1f} s of it compiling the training"
+        ]
     return "\n".join([*lines, f"results in {path}"])
 
 
@@ -136,7 +182,11 @@ def check_results(results: Any, place: str, training: bool) -> None:
         place: of the results, for the message.
         training: whether they are those of a training.
     """
-    check(results, {"seeds": COUNT, "seed": COUNT, "steps": COUNT, "evaluation": {OTHERS: {OTHERS: {}}}}, place)
+    check(
+        results,
+        {"seeds": COUNT, "seed": COUNT, "steps": COUNT, "evaluation": {OTHERS: {OTHERS: {}}}},
+        place,
+    )
     seeds = results["seeds"]
     for kind, metrics in results["evaluation"].items():
         for name, values in _METRICS.items():
@@ -146,12 +196,17 @@ def check_results(results: Any, place: str, training: bool) -> None:
             "evaluation": {kind: {} for kind in KINDS},
             "wall_s": AMOUNT,
             "compile_s": AMOUNT,
-            "interaction_efficiency": {"timesteps": COUNT | NULL, "per_seed": numbers(seeds, COUNT | NULL)},
+            "interaction_efficiency": {
+                "timesteps": COUNT | NULL,
+                "per_seed": numbers(seeds, COUNT | NULL),
+            },
             "training_cost": _metric(seeds, AMOUNT),
             "versions": {"device": TEXT, OTHERS: TEXT | NULL},
         }
         check(results, form, place)
-    check(results.get("diverged", []), [{"seed": COUNT, "step": COUNT | NULL}], f"{place}: diverged")
+    check(
+        results.get("diverged", []), [{"seed": COUNT, "step": COUNT | NULL}], f"{place}: diverged"
+    )
 
 
 def _metric(seeds: int, kind: Kind) -> dict[str, Any]:
@@ -172,7 +227,10 @@ def summary(runs: Mapping[str, Path]) -> str:
         results = read_results(run / "results.json")
         found = [results["evaluation"][kind] for kind in ("stochastic", "deterministic")]
         success = [one["success_rate"] for one in found]
-        reached, cost = results["interaction_efficiency"]["timesteps"], found[0]["episode_cost"]["mean"]
+        reached, cost = (
+            results["interaction_efficiency"]["timesteps"],
+            found[0]["episode_cost"]["mean"],
+        )
         diverged += [f"{name}: {line}" for line in told_diverged(results)]
         rows.append(
             (
@@ -196,13 +254,18 @@ def told_diverged(results: Mapping[str, Any]) -> list[str]:
     diverged = results.get("diverged", [])
     if not diverged:
         return []
-    steps = ", ".join(f"{one['seed']}" + (f" by step {one['step']:,}" if one["step"] else "") for one in diverged)
+    steps = ", ".join(
+        f"{one['seed']}" + (f" by step {one['step']:,}" if one["step"] else "") for one in diverged
+    )
     return [f"DIVERGED, and left out of the averages: seed{'s' * (len(diverged) > 1)} {steps}"]
 
 
 def least(metrics: Sequence[Mapping[str, Any]]) -> float | None:
     """Return the worst seed's value of several metrics, of those seeds that have one."""
-    return min((value for metric in metrics for value in metric["per_seed"] if value is not None), default=None)
+    return min(
+        (value for metric in metrics for value in metric["per_seed"] if value is not None),
+        default=None,
+    )
 
 
 def percent(value: float | None, digits: int) -> str:

@@ -31,7 +31,9 @@ def create(config: TrainConfig, env: Environment, name: str) -> Path:
     path = make(config.out, Path("runs"), name)
     content = {"env": name, **described(config, env), "commit": commit(), "versions": versions()}
     module = user_module(name)
-    if module:  # where the run is read, it registers the task, so that its filters are known by name
+    if (
+        module
+    ):  # where the run is read, it registers the task, so that its filters are known by name
         environment = content["environment"]
         content["environment"] = {"imports": [], **environment}
         content["environment"]["imports"] = sorted({module, *environment.get("imports", [])})
@@ -63,7 +65,9 @@ def runs(path: Path) -> list[Path]:
     if (path / "config.yaml").is_file() or not inside:
         return [path]
     order = [*TASKS]
-    return sorted(inside, key=lambda run: order.index(run.name) if run.name in order else len(order))
+    return sorted(
+        inside, key=lambda run: order.index(run.name) if run.name in order else len(order)
+    )
 
 
 def make(out: str | None, parent: Path, name: str) -> Path:
@@ -75,12 +79,22 @@ def make(out: str | None, parent: Path, name: str) -> Path:
         ConfigError: `out` already holds something, or cannot be written.
     """
     if os.sep == "/" and "\\" in os.path.abspath(out or parent / name):
-        raise ConfigError(f"out: expected a path without \\, which checkpoints take for /, found {out or parent / name}")
+        raise ConfigError(
+            f"out: expected a path without \\, which checkpoints take for /, found {out or parent / name}"
+        )
     try:
         path = Path(out) if out else _next_free(parent, name)
-        if path.exists() and (not path.is_dir() or any(file.suffix != ".part" for file in path.iterdir())):
-            advice = f"continue it with resume={path}" if (path / "config.yaml").exists() else "choose an empty one"
-            raise ConfigError(f"out: {path} already holds something and is never overwritten; {advice}")
+        if path.exists() and (
+            not path.is_dir() or any(file.suffix != ".part" for file in path.iterdir())
+        ):
+            advice = (
+                f"continue it with resume={path}"
+                if (path / "config.yaml").exists()
+                else "choose an empty one"
+            )
+            raise ConfigError(
+                f"out: {path} already holds something and is never overwritten; {advice}"
+            )
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"out: cannot write {error.filename}: {error.strerror}") from None
@@ -94,9 +108,15 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
         ConfigError: there is no run; `option` is what the user called it.
     """
     if not (path / "config.yaml").is_file():
-        beside = [str(found.parent) for found in path.parent.glob("*/config.yaml")] if path.parent.is_dir() else []
+        beside = (
+            [str(found.parent) for found in path.parent.glob("*/config.yaml")]
+            if path.parent.is_dir()
+            else []
+        )
         choice = f"; choose from {nearest(path, sorted(beside))}" if beside else ""
-        raise ConfigError(f"{option}: no run in {str(path)!r} (a directory with config.yaml){choice}")
+        raise ConfigError(
+            f"{option}: no run in {str(path)!r} (a directory with config.yaml){choice}"
+        )
     content, place = read_content(path), f"{path / 'config.yaml'}: "
     config = normalise(to_component(content["training"], TrainConfig, f"{place}training"))
     env = jaxsafe.config.from_data(content["environment"], f"{place}environment")
@@ -120,7 +140,9 @@ def read_content(path: Path) -> dict[str, Any]:
 
 def discard_unused(path: Path) -> None:
     """Remove a directory to which nothing has come since it was made: what failed before it began is no run."""
-    if all(found.is_dir() or found.name in ("config.yaml", "sweep.yaml") for found in path.rglob("*")):
+    if all(
+        found.is_dir() or found.name in ("config.yaml", "sweep.yaml") for found in path.rglob("*")
+    ):
         shutil.rmtree(path, ignore_errors=True)
 
 

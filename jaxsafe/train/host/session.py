@@ -60,7 +60,13 @@ class Training:
     """One run: all seeds of one configuration."""
 
     def __init__(
-        self, config: TrainConfig, env: Environment, name: str, run: Path, clock: Clock, checkpoints: Path | None = None
+        self,
+        config: TrainConfig,
+        env: Environment,
+        name: str,
+        run: Path,
+        clock: Clock,
+        checkpoints: Path | None = None,
     ) -> None:
         """Say what to train, as yet without compiling anything.
 
@@ -76,12 +82,16 @@ class Training:
         self.mapper = SeedMapper(config.seeds, config.shares)
         self.shared = self.mapper.replicate((env, config.agent, config.ppo))
         intervals = (config.every(config.eval_every), config.every(config.checkpoint_every))
-        self.chunk = max(1, min(config.num_updates // 50, 100_000 // config.ppo.batch_size, *intervals))
+        self.chunk = max(
+            1, min(config.num_updates // 50, 100_000 // config.ppo.batch_size, *intervals)
+        )
         self.evaluator = Evaluator(self.mapper, env, config.agent)
         self.checkpoints = Checkpoints(checkpoints or run, create=True)
         self.compile_s = 0.0
         self.updates = 0
-        self.diverged: dict[int, int] = {}  # by seed, the step after which its networks or returns were not finite
+        self.diverged: dict[
+            int, int
+        ] = {}  # by seed, the step after which its networks or returns were not finite
         self._prepared = False
 
     def prepare(self) -> None:
@@ -91,7 +101,9 @@ class Training:
         with self.clock, without_collection():
             self._begin()
         self._keep_copies()
-        self.log = ProgressLog(self.run, self.step, self.updates * self.config.seeds, self.config.tensorboard)
+        self.log = ProgressLog(
+            self.run, self.step, self.updates * self.config.seeds, self.config.tensorboard
+        )
         for name in ("eval.jsonl", "episodes.jsonl"):
             keep_rows(self.run / name, self._known, {"step": COUNT})
         self.diverged = {}
@@ -122,14 +134,18 @@ class Training:
                 before, (self.state, curves) = self.updates, self.advance(self.shared, self.state)
                 self.updates = min(before + self.chunk, self.config.num_updates)
                 self._write_progress(curves, self.updates - before, display)
-                if self.updates < self.config.num_updates and self._due(before, self.config.eval_every):
+                if self.updates < self.config.num_updates and self._due(
+                    before, self.config.eval_every
+                ):
                     self._evaluate()
                 elif self._early_due():
                     self._record(1, final=False)
                 stopping = processes.anyone(stop.requested)
                 if self._due(before, self.config.checkpoint_every) or stopping:
                     self._save()
-            stopping = stopping or processes.anyone(stop.requested)  # it may have come with the last of them
+            stopping = stopping or processes.anyone(
+                stop.requested
+            )  # it may have come with the last of them
         display.close()
         self.log.close()
         return not stopping
@@ -157,7 +173,9 @@ class Training:
     def _begin(self) -> None:
         """Have the state, fresh or restored, while all programs are compiled side by side."""
         content = structure(self.env, self.config)
-        each = memory.size(content) // self.config.seeds * self.mapper.padded // self.mapper.mesh.size
+        each = (
+            memory.size(content) // self.config.seeds * self.mapper.padded // self.mapper.mesh.size
+        )
         memory.require(each, self.mapper.num_local_devices, memory.OPTIONS, memory.COMPILING)
         begin, keys = time.monotonic(), self.mapper.keys(self.config.seed)
         fresh, advance = programs(self.mapper, self.chunk, self.config.num_updates)
@@ -169,7 +187,9 @@ class Training:
             self.state = fresh(self.shared, keys)
             never = self.mapper.place(np.full(self.config.seeds, -1.0, np.float32))
             self.best = {"params": self.state.average, "success": never}
-        if self.config.every(self.config.eval_every) < self.config.num_updates:  # else it can wait for the cores
+        if (
+            self.config.every(self.config.eval_every) < self.config.num_updates
+        ):  # else it can wait for the cores
             self.evaluator.prepare(like.average)
         self.compile_s += time.monotonic() - begin
 
@@ -178,14 +198,23 @@ class Training:
         steps = self.checkpoints.steps
         rows = Counter(row["step"] for row in read_progress(self.run))
         done = {step: sum(count for at, count in rows.items() if at <= step) for step in steps}
-        covered = [step for step in steps if done[step] == step // self.config.ppo.batch_size * self.config.seeds]
-        newest = max(covered, default=steps[-1])  # without one, the log is refused when it is opened
+        covered = [
+            step
+            for step in steps
+            if done[step] == step // self.config.ppo.batch_size * self.config.seeds
+        ]
+        newest = max(
+            covered, default=steps[-1]
+        )  # without one, the log is refused when it is opened
         if newest != steps[-1]:
             print(
                 f"{self.run / 'progress.jsonl'} ends before the checkpoint of step {steps[-1]:,}: going on from {newest:,}"
             )
         content, facts = restore(self.checkpoints, newest, self.env, self.config)
-        self.state, self.best = self.mapper.place(content["state"], STATE), self.mapper.place(content["best"])
+        self.state, self.best = (
+            self.mapper.place(content["state"], STATE),
+            self.mapper.place(content["best"]),
+        )
         self.updates, self.compile_s = facts["updates"], facts["compile_s"]
         self.clock.spent += facts["wall_s"]
 
@@ -195,7 +224,9 @@ class Training:
         due = (self.updates // interval + 1) * interval
         reached = -(-due // self.chunk) * self.chunk * self.config.ppo.batch_size
         if any(row["step"] > reached for row in read_progress(self.run)):
-            print(f"checkpoints after step {self.step:,} are missing: going on from there, the longer logs kept as *.bak")
+            print(
+                f"checkpoints after step {self.step:,} are missing: going on from there, the longer logs kept as *.bak"
+            )
             for log in self.run.glob("*.jsonl"):
                 shutil.copy(log, log.with_suffix(".jsonl.bak"))
 
@@ -204,12 +235,19 @@ class Training:
         begin, compiled = time.monotonic(), self.advance.compiled()
         self.compile_s += time.monotonic() - begin
         has = memory.size(self.state) // self.mapper.mesh.size  # which is there already
-        memory.require(memory.footprint(compiled) - has, self.mapper.num_local_devices, memory.OPTIONS, memory.RUNNING)
+        memory.require(
+            memory.footprint(compiled) - has,
+            self.mapper.num_local_devices,
+            memory.OPTIONS,
+            memory.RUNNING,
+        )
 
     def _due(self, before: int, every: int | None) -> bool:
         """Whether a chunk that began at update `before` passed a multiple of the interval or the end."""
         interval = self.config.every(every)
-        return self.updates // interval > before // interval or self.updates == self.config.num_updates
+        return (
+            self.updates // interval > before // interval or self.updates == self.config.num_updates
+        )
 
     def _early_due(self) -> bool:
         """Whether to log an episode to see early learning: after 0, 1, 2, 4, … chunks, if evaluations come later."""
@@ -222,11 +260,15 @@ class Training:
 
     def _write_progress(self, curves: dict[str, jax.Array], count: int, display: Display) -> None:
         host = {name: value[:, :count] for name, value in self.mapper.gather(curves).items()}
-        rows = progress_rows(self.env, host, self.config.seed, self.config.ppo.batch_size, self.clock.seconds)
+        rows = progress_rows(
+            self.env, host, self.config.seed, self.config.ppo.batch_size, self.clock.seconds
+        )
         self.log.write(rows)
         for seed in self._find_diverged(rows):
             step = self.diverged[seed]
-            display.tell(f"seed {seed} has diverged by step {step:,}: networks or returns are not finite. It is stopped")
+            display.tell(
+                f"seed {seed} has diverged by step {step:,}: networks or returns are not finite. It is stopped"
+            )
         display.show(self.step, rows[-self.config.seeds :])
 
     def _find_diverged(self, rows: list[dict[str, Any]]) -> list[int]:
@@ -248,21 +290,36 @@ class Training:
     def _run_episodes(self, kind: str, num_episodes: int, final: bool) -> Episode:
         self.evaluator.prepare(self.state.average)
         deterministic = kind == "deterministic"
-        episodes = self.evaluator.run(self.state.average, num_episodes, EVALUATION_SEED, deterministic)
-        rows = episode_rows(self.env, episodes, self.config.seed, step=self.step, kind=kind, final=final)
-        append_rows(self.run / "eval.jsonl", (row for row in rows if row["seed"] not in self.diverged))
+        episodes = self.evaluator.run(
+            self.state.average, num_episodes, EVALUATION_SEED, deterministic
+        )
+        rows = episode_rows(
+            self.env, episodes, self.config.seed, step=self.step, kind=kind, final=final
+        )
+        append_rows(
+            self.run / "eval.jsonl", (row for row in rows if row["seed"] not in self.diverged)
+        )
         return episodes
 
     def _record(self, num_episodes: int, final: bool) -> None:
         """Log some episodes of the first seed that has not diverged step by step."""
-        index = next((i for i in range(self.config.seeds) if self.config.seed + i not in self.diverged), None)
+        index = next(
+            (i for i in range(self.config.seeds) if self.config.seed + i not in self.diverged), None
+        )
         if index is None:
             return
         count = -(-num_episodes // self.config.log_every)
         recorded = self.evaluator.record(self.params()[index], count, EVALUATION_SEED)
-        facts = {"step": self.step, "seed": self.config.seed + index, "kind": "deterministic", "final": final}
+        facts = {
+            "step": self.step,
+            "seed": self.config.seed + index,
+            "kind": "deterministic",
+            "final": final,
+        }
         for number, rows in enumerate(recorded):
-            append_rows(self.run / "episodes.jsonl", ({**facts, "episode": number, **row} for row in rows))
+            append_rows(
+                self.run / "episodes.jsonl", ({**facts, "episode": number, **row} for row in rows)
+            )
 
     def _save(self) -> None:
         for log in self.run.glob("*.jsonl"):
@@ -273,7 +330,9 @@ class Training:
             "compile_s": self.compile_s,
             "made_from": made_from(self.env, self.config),
         }
-        self.checkpoints.save(self.step, self.mapper.gather({"state": self.state, "best": self.best}), facts)
+        self.checkpoints.save(
+            self.step, self.mapper.gather({"state": self.state, "best": self.best}), facts
+        )
 
 
 @jax.jit
