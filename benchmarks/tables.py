@@ -409,7 +409,8 @@ def accelerator_numbers(found: Found) -> str:
     """How many tests passed."""
     counts = next((row for row in found["parts"]["numbers"]["rows"] if "test" not in row), {})
     kinds = ("passed", "failed", "error", "skipped")
-    return markdown(["tests of numbers on the accelerator", *kinds], [["", *(str(counts.get(kind, 0)) for kind in kinds)]])
+    cells = [str(counts.get(kind, 0)) for kind in kinds]
+    return markdown(["tests of numbers on the accelerator", *kinds], [[found["device"], *cells]])
 
 
 def accelerator_environments(found: Found) -> str:
@@ -464,6 +465,27 @@ def accelerator_filters(found: Found) -> str:
     return markdown(["filter calls/s on the accelerator", "filter", *heads, *PROGRAM], lines)
 
 
+def accelerator_goals(found: Found) -> str:
+    """What was aimed for on one GPU and what is reached; bold: not reached."""
+    parts = {name: part["rows"] for name, part in found["parts"].items()}
+    largest = max(row["environments"] for row in parts["environments"])
+    rates = {row["task"]: row["steps_per_s"] / 1e6 for row in parts["environments"] if row["environments"] == largest}
+    samples = {(row["peer"], row["environments"], row["seeds"]): row["samples_per_s"] for row in parts["ppo"]}
+    ratios = [rate / samples["rejax", *of] for (peer, *of), rate in samples.items() if peer == "jaxsafe"]
+    seconds = sum(row["seconds"] for row in parts["learning"])
+    rows = [
+        (
+            f"every task, {largest:,} environments, million steps/s",
+            "≥ 500",
+            _reached([rates[task] for task in TASKS], 500.0),
+        ),
+        (f"docking3d, {largest:,} environments, million steps/s", "≥ 2,000", _reached([rates["docking3d"]], 2000.0)),
+        ("PPO samples, jaxsafe / rejax", "≥ 3", _reached(ratios, 3.0)),
+        ("five tasks × ten seeds to 95 %, one after the other, s", "≤ 60", _reached([seconds], 60.0, most=True)),
+    ]
+    return markdown(["goal on the accelerator", "aimed for", "reached"], rows)
+
+
 PROGRAM = ("compile [s]", "memory [MiB]")
 """Columns of `_program`."""
 
@@ -484,6 +506,12 @@ TABLES: Sequence[tuple[str, Callable[[Found], str], str]] = (
     ("five_tasks", five_tasks, "docs/performance.md"),
     ("learning", learning, "docs/performance.md"),
     ("", goals, "docs/performance.md"),
+    ("accelerator", accelerator_goals, "docs/performance.md"),
+    ("accelerator", accelerator_environments, "docs/performance.md"),
+    ("accelerator", accelerator_ppo, "docs/performance.md"),
+    ("accelerator", accelerator_learning, "docs/performance.md"),
+    ("accelerator", accelerator_filters, "docs/performance.md"),
+    ("accelerator", accelerator_numbers, "docs/performance.md"),
     ("scaling", scaling, "docs/scaling.md"),
     ("scaling", projection, "docs/scaling.md"),
     ("memory", memory, "docs/scaling.md"),
@@ -584,9 +612,9 @@ def _three(value: float) -> str:
 
 
 def _scale(rate: float) -> str:
-    """Of calls a second: in millions or thousands, to two digits or three."""
+    """Calls a second in millions or thousands, with two or three digits."""
     scaled, unit = (rate / 1e6, "M") if rate >= 1e6 else (rate / 1e3, "k")
-    return f"{scaled:.2g} {unit}" if unit == "M" else f"{scaled:.3g} {unit}"
+    return f"{scaled:.{2 if scaled < 100 else 3}g} {unit}" if unit == "M" else f"{scaled:.3g} {unit}"
 
 
 if __name__ == "__main__":

@@ -150,7 +150,7 @@ class Dubins3D(Platform, type="dubins3d"):
         spans = pieces([time_to_limit(*each, dt) for each in ramps if each[1] is not None], dt)
 
         # A loop, not four copies: it keeps what it computed for one piece, where XLA would compute it again for each use.
-        # On a GPU as well: with four copies a step of rejoin3d took 18 % longer.
+        # On a GPU four copies took half as long again with a million environments, and less time with fewer.
         still = jnp.zeros_like(state.heading)
         start = (state.heading, still, still, still)
         (heading, *moved), _ = jax.lax.scan(lambda carry, span: (self._fly(ramps, carry, span), None), start, spans)
