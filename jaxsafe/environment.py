@@ -30,7 +30,18 @@ from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.initializers import uniform
 from jaxsafe.simulation.platform import Platform, placed
 from jaxsafe.transition import advance, update_statuses
-from jaxsafe.types import Info, Key, Memory, Number, ParameterPath, PlatformName, RTAInfo, Sim, State, TimeStep
+from jaxsafe.types import (
+    Info,
+    Key,
+    Memory,
+    Number,
+    ParameterPath,
+    PlatformName,
+    RTAInfo,
+    Sim,
+    State,
+    TimeStep,
+)
 
 Parameters = Mapping[str, Float[Array, ""]]
 

@@ -12,7 +12,14 @@ from scipy.linalg import expm, expm_frechet
 
 from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.controllers import Actuator, Continuous
-from jaxsafe.simulation.cwh import MEAN_MOTION, Anchor, Spacecraft, SpacecraftState, cwh_acceleration, cwh_flow
+from jaxsafe.simulation.cwh import (
+    MEAN_MOTION,
+    Anchor,
+    Spacecraft,
+    SpacecraftState,
+    cwh_acceleration,
+    cwh_flow,
+)
 
 PERIOD = 2.0 * math.pi / MEAN_MOTION
 

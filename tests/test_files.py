@@ -4,7 +4,15 @@ from pathlib import Path
 import pytest
 
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.storage.files import append_csv, append_rows, keep_rows, read_json, read_rows, write_json, write_text
+from jaxsafe.storage.files import (
+    append_csv,
+    append_rows,
+    keep_rows,
+    read_json,
+    read_rows,
+    write_json,
+    write_text,
+)
 from jaxsafe.storage.forms import COUNT, MAYBE, OTHERS, numbers
 
 

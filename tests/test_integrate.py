@@ -10,7 +10,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxsafe.simulation.integrate import NODES, PARTIAL_WEIGHTS, WEIGHTS, pieces, ramp, sine_ratios, time_to_limit
+from jaxsafe.simulation.integrate import (
+    NODES,
+    PARTIAL_WEIGHTS,
+    WEIGHTS,
+    pieces,
+    ramp,
+    sine_ratios,
+    time_to_limit,
+)
 
 LIMITS = np.array([200.0, 400.0])
 EDGES = [0.0, 1e-300, 1e-12, 1e-6, 1e-3, 0.1, 0.5, 1.0 - 1e-12, 1.0, 1.0 + 1e-12, 1.5, 2.0, 2.0 + 1e-12, 3.0, 10.0, 100.0]

@@ -8,7 +8,17 @@ from jaxsafe.agents.agent import Agent
 from jaxsafe.environment import Environment
 from jaxsafe.schema.component import normalise
 from jaxsafe.train import ppo as ppo_module
-from jaxsafe.train.ppo import PPO, TrainState, collect, discount, dual_ascent, gae, init, learning_rate, update
+from jaxsafe.train.ppo import (
+    PPO,
+    TrainState,
+    collect,
+    discount,
+    dual_ascent,
+    gae,
+    init,
+    learning_rate,
+    update,
+)
 from jaxsafe.types import Sim
 
 AGENT = normalise(Agent(hidden=(16,)))

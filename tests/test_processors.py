@@ -13,7 +13,13 @@ from hypothesis import strategies as st
 import jaxsafe
 from jaxsafe.environment import Environment
 from jaxsafe.processors.constraint import Separation, SpeedLimit
-from jaxsafe.processors.observation import Observation, Observe, ObserveAngle, ObserveRegion, ObserveStatus
+from jaxsafe.processors.observation import (
+    Observation,
+    Observe,
+    ObserveAngle,
+    ObserveRegion,
+    ObserveStatus,
+)
 from jaxsafe.processors.reward import (
     DeltaVCost,
     DistanceChange,
@@ -23,7 +29,15 @@ from jaxsafe.processors.reward import (
     VelocityConstraint,
     WhileIn,
 )
-from jaxsafe.processors.status import DeltaV, Distance, InRegion, RegionDistance, Speed, TimeHeld, VelocityLimit
+from jaxsafe.processors.status import (
+    DeltaV,
+    Distance,
+    InRegion,
+    RegionDistance,
+    Speed,
+    TimeHeld,
+    VelocityLimit,
+)
 from jaxsafe.processors.terminal import Crashed, Docked, Held, Holds, Timeout, TooClose, TooFar
 from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.cwh import SpacecraftState

@@ -121,9 +121,10 @@ class _Graph:
         names |= {
             var: self.constant(value) for var, value in zip(jaxpr.constvars, consts, strict=True)
         }
-        read = lambda atom: (
-            self.constant(atom.val) if isinstance(atom, core.Literal) else names[atom]
-        )  # noqa: E731
+
+        def read(atom: Any) -> str:
+            return self.constant(atom.val) if isinstance(atom, core.Literal) else names[atom]
+
         for equation in jaxpr.eqns:
             results = self._equation(equation, [read(atom) for atom in equation.invars])
             names |= dict(zip(equation.outvars, results, strict=True))

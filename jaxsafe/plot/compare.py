@@ -10,7 +10,15 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from jaxsafe.metrics import ENOUGH_EPISODES, ENOUGH_SEEDS, bootstrap_interval
-from jaxsafe.plot.figures import ALWAYS, AXES, CURVES, curve_table, panel_grid, set_axes, without_diverged
+from jaxsafe.plot.figures import (
+    ALWAYS,
+    AXES,
+    CURVES,
+    curve_table,
+    panel_grid,
+    set_axes,
+    without_diverged,
+)
 from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, plain
 
 LOOKS = tuple(product(("-", "--"), (BLUE, ORANGE, GREEN, "#CC79A7", GREY, "#E69F00", "#56B4E9")))

@@ -10,7 +10,17 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, control_unit, labelled, length_unit, margin_unit, plain
+from jaxsafe.plot.style import (
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    control_unit,
+    labelled,
+    length_unit,
+    margin_unit,
+    plain,
+)
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment

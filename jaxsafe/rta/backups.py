@@ -15,7 +15,13 @@ from jaxsafe.processors.status import Distance
 from jaxsafe.rta.asif import linear, speed_ball
 from jaxsafe.rta.filter import BackupController, CertifiedRTA, Faults, TerminalSet
 from jaxsafe.rta.projection import project_box_ball
-from jaxsafe.rta.speed_limit import LARGEST_TURN, SpeedLimitFacts, distance_and_speed, off_centre, speed_limit_facts
+from jaxsafe.rta.speed_limit import (
+    LARGEST_TURN,
+    SpeedLimitFacts,
+    distance_and_speed,
+    off_centre,
+    speed_limit_facts,
+)
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.controllers import Uncontrolled
 from jaxsafe.simulation.cwh import MEAN_MOTION, Spacecraft

@@ -15,7 +15,15 @@ from jaxsafe.rta.projection import within
 from jaxsafe.rta.speed_limit import speed_limit_facts
 from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.simulation.geometry import safe_norm
-from jaxsafe.transition import Others, advance, bounds, commanded, later_sim, others_later, smallest_margin
+from jaxsafe.transition import (
+    Others,
+    advance,
+    bounds,
+    commanded,
+    later_sim,
+    others_later,
+    smallest_margin,
+)
 from jaxsafe.types import ConstraintName, Number, Record, RTAInfo, Sim
 
 if TYPE_CHECKING:

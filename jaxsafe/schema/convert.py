@@ -12,7 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxsafe.schema.component import ANY, Component, Field, Kind, Range, choices, fields, normalise, unwrap_optional
+from jaxsafe.schema.component import (
+    ANY,
+    Component,
+    Field,
+    Kind,
+    Range,
+    choices,
+    fields,
+    normalise,
+    unwrap_optional,
+)
 from jaxsafe.schema.component import field as field_of
 from jaxsafe.schema.dotted_paths import join
 from jaxsafe.schema.errors import ConfigError, nearest, show

@@ -16,7 +16,17 @@ from jaxtyping import Array, Float
 
 from jaxsafe.schema.component import ANY, Component, Range, Unit
 from jaxsafe.simulation.geometry import direction, safe_norm
-from jaxsafe.types import Key, MetresPerSecond, Number, PerSecond, Place, PlatformName, Reach, Sim, Turn
+from jaxsafe.types import (
+    Key,
+    MetresPerSecond,
+    Number,
+    PerSecond,
+    Place,
+    PlatformName,
+    Reach,
+    Sim,
+    Turn,
+)
 
 TWO_PI = 2.0 * jnp.pi
 
