@@ -1,0 +1,117 @@
+"""Everything that a part of your own needs, in one import: bases, annotations and helpers.
+
+    from jaxsafe.parts import MetresPerSecond, PlatformName, Status
+
+A part is a subclass of a base with annotated fields and one or two pure methods; docs/extend.md and
+docs/extend_rta.md show each kind.
+"""
+
+from jaxsafe.environment import Environment
+from jaxsafe.envs.task import Task, register
+from jaxsafe.processors.constraint import Constraint
+from jaxsafe.processors.observation import Observation
+from jaxsafe.processors.reward import Bound, Reward
+from jaxsafe.processors.status import Status
+from jaxsafe.processors.terminal import Terminal
+from jaxsafe.rta.filter import RTA, BackupController, CertifiedRTA, Faults, RTAMemory, TerminalSet
+from jaxsafe.schema.component import ANY, Component, Range, Refers, Unit
+from jaxsafe.schema.errors import ConfigError
+from jaxsafe.simulation.controllers import (
+    Actuator,
+    AgentController,
+    Continuous,
+    Controller,
+    Discrete,
+)
+from jaxsafe.simulation.geometry import Offset, Region, direction, rotation, safe_norm, to_body
+from jaxsafe.simulation.initializers import Direction, Initializer
+from jaxsafe.simulation.platform import Platform
+from jaxsafe.simulation.scripted import Command, Scripted
+from jaxsafe.types import (
+    AnyStatusName,
+    ConstraintName,
+    Dimensionless,
+    FlagName,
+    Key,
+    Kilograms,
+    Length,
+    MetresPerSecond,
+    Newtons,
+    Number,
+    OutcomeName,
+    PerSecond,
+    PlatformName,
+    Positive,
+    Radians,
+    RadiansPerSecond,
+    Record,
+    RegionName,
+    RegionState,
+    RTAInfo,
+    Seconds,
+    Sim,
+    StatusName,
+)
+
+__all__ = [
+    "ANY",
+    "RTA",
+    "Actuator",
+    "AgentController",
+    "AnyStatusName",
+    "BackupController",
+    "Bound",
+    "CertifiedRTA",
+    "Command",
+    "Component",
+    "ConfigError",
+    "Constraint",
+    "ConstraintName",
+    "Continuous",
+    "Controller",
+    "Dimensionless",
+    "Direction",
+    "Discrete",
+    "Environment",
+    "Faults",
+    "FlagName",
+    "Initializer",
+    "Key",
+    "Kilograms",
+    "Length",
+    "MetresPerSecond",
+    "Newtons",
+    "Number",
+    "Observation",
+    "Offset",
+    "OutcomeName",
+    "PerSecond",
+    "Platform",
+    "PlatformName",
+    "Positive",
+    "RTAInfo",
+    "RTAMemory",
+    "Radians",
+    "RadiansPerSecond",
+    "Range",
+    "Record",
+    "Refers",
+    "Region",
+    "RegionName",
+    "RegionState",
+    "Reward",
+    "Scripted",
+    "Seconds",
+    "Sim",
+    "Status",
+    "StatusName",
+    "Task",
+    "Terminal",
+    "TerminalSet",
+    "Unit",
+    "direction",
+    "register",
+    "rotation",
+    "safe_norm",
+    "to_body",
+]
