@@ -182,7 +182,7 @@ def seen(item: Observation, label: str) -> str:
 
 
 def parts(env: jaxsafe.Environment, section: str, length: str) -> Iterator[tuple[str, ...]]:
-    """A row for each part of a section: the first line of its class's docstring, and its numbers."""
+    """A row for each part of a section: the docstring of its class, and its numbers."""
     for part in getattr(env, section):
         yield f"`{section}.{part.name}`", f"`{part.type_name}`", summary(part), settings(part, length)
     if section == "terminal":
@@ -192,8 +192,8 @@ def parts(env: jaxsafe.Environment, section: str, length: str) -> Iterator[tuple
 
 
 def summary(component: Component) -> str:
-    """The first paragraph of a component's docstring."""
-    return " ".join(inspect.cleandoc(type(component).__doc__ or "").split("\n\n")[0].split())
+    """The docstring of a component in one line."""
+    return " ".join(inspect.cleandoc(type(component).__doc__ or "").split())
 
 
 def settings(component: Component, length: str, only: Iterable[str] = (), physical: str = "") -> str:

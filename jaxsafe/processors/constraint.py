@@ -1,4 +1,7 @@
-"""Safety constraints h ≥ 0, evaluated at every step for `cost`, `margins` and the safety metrics of Section 5."""
+"""Safety constraints h ≥ 0.
+
+They are evaluated at every step for `cost`, for `margins` and for the safety metrics of Section 5.
+"""
 
 from __future__ import annotations
 
@@ -11,23 +14,29 @@ from jaxsafe.types import Extent, Length, Sim, StatusName
 
 
 class Constraint(Component):
-    """A signed margin h, safe where h ≥ 0, and the limit of which a violation is a share."""
+    """A signed margin h, which is safe where h ≥ 0, and a limit.
+
+    The severity of a violation is −h as a share of the limit.
+    """
 
     name: str
     between: ClassVar[bool] = False
-    """Whether h can fall far below 0 between two safe instants; then filters bound it on the way, `Status.on_the_way`."""
+    """Whether h can fall far below 0 between two safe instants.
+
+    If so, filters bound h also between the instants, with `Status.on_the_way`.
+    """
 
     def margin(self, sim: Sim) -> Float[Array, ""]:
-        """Return h, in the units of the limit."""
+        """Return h in the unit of the limit."""
         raise NotImplementedError
 
     def limit(self, sim: Sim) -> Float[Array, ""]:
-        """Return the limit at this step, positive."""
+        """Return the limit at this step, which is positive."""
         raise NotImplementedError
 
 
 class SpeedLimit(Constraint, type="speed_limit"):
-    """h = v_limit − ‖v‖ [m/s], Eqs. (14), (17)."""
+    """The margin h = v_limit − ‖v‖ [m/s], Eqs. (14), (17)."""
 
     speed: StatusName
     velocity_limit: StatusName
@@ -40,7 +49,7 @@ class SpeedLimit(Constraint, type="speed_limit"):
 
 
 class Separation(Constraint, type="separation"):
-    """h = distance − minimum, Eqs. (8), (11)."""
+    """The margin h = distance − minimum, Eqs. (8), (11)."""
 
     between: ClassVar[bool] = True
     distance: StatusName

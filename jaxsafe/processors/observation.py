@@ -1,4 +1,7 @@
-"""Observations (Tables 5 and 6): each is divided by its constants and clipped; together they are one vector."""
+"""Observations (Tables 5 and 6).
+
+Each is divided by its scale and clipped. Together they are one vector.
+"""
 
 from __future__ import annotations
 
@@ -13,39 +16,49 @@ from jaxsafe.simulation.geometry import direction, mag_norm, to_body
 from jaxsafe.types import AnyStatusName, Number, PlatformName, RegionName, Sim
 
 Scale = Annotated[Number, Unit("as observed", length=ANY), Range(nonzero=True, smallest=1e-12)]
-Limit = Annotated[Number, Unit("1", length=2), Range(infinite=True)]
+"""One divisor for all elements of an observation, or one for each."""
+
+Clip = Annotated[Number, Unit("1", length=2), Range(infinite=True)]
+"""Lowest and highest value of an observation after scaling."""
 
 
 class Observation(Processor):
-    """Base of all observations: `measure` in physical units; scale and clip are the same for all.
+    """Base of all observations.
 
-    The scale is one divisor for all elements or one for each.
+    A subclass writes `measure`, which returns a vector in physical units. The vector is then
+    divided by `scale`, which is one divisor for all elements or one for each, and clipped to
+    `clip`.
     """
 
     scale: Scale = 1.0
-    clip: Limit | None = None
+    clip: Clip | None = None
 
     def measure(self, memory: Any, sim: Sim) -> Float[Array, " k"]:
         """Return the observed vector in physical units, shape (k,)."""
         raise NotImplementedError
 
     def labels(self, sim: Sim) -> tuple[str, ...]:
-        """Name each of the k elements."""
+        """Return a name for each of the k elements."""
         size = self.measure(self.init(sim), sim).size
-        return tuple(f"{self.name}.{axis}" for axis in _axes(size)) if size > 1 else (self.name,)
+        if size <= 1:
+            return (self.name,)
+        return tuple(f"{self.name}.{axis}" for axis in _axis_names(size))
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, " k"]:
         measured = self.measure(memory, sim)
         if jnp.shape(self.scale) not in ((), measured.shape):
-            raise ValueError(f"scale: expected 1 or {measured.size} numbers, found {jnp.size(self.scale)}")
+            raise ValueError(
+                f"scale: expected 1 or {measured.size} numbers, found {jnp.size(self.scale)}"
+            )
         scaled = measured / self.scale
         return scaled if self.clip is None else jnp.clip(scaled, self.clip[0], self.clip[1])
 
 
 class VectorObservation(Observation):
-    """Base of observed vectors: in which platform's body frame, None for the global one, and in which form.
+    """Base of observed vectors, given in a frame and in a form.
 
-    `rectangular` is the components; `magnorm` is the magnitude and the direction, Eq. (21).
+    `frame` names the platform whose body frame is used. None stands for the global frame. The form
+    `rectangular` is the components, and `magnorm` is the magnitude and the direction, Eq. (21).
     """
 
     frame: PlatformName | None = None
@@ -65,11 +78,14 @@ class VectorObservation(Observation):
         if self.form == "rectangular":
             return super().labels(sim)
         size = self.measure((), sim).size - 1
-        return (f"{self.name}.magnitude", *(f"{self.name}.{axis}" for axis in _axes(size)))
+        return (f"{self.name}.magnitude", *(f"{self.name}.{axis}" for axis in _axis_names(size)))
 
 
 class Observe(VectorObservation, type="observe"):
-    """A quantity of a platform: a field of its state, or its velocity; relative to another platform if one is named."""
+    """A quantity of a platform: a field of its state, or its velocity.
+
+    With `relative_to` the same quantity of that platform is subtracted.
+    """
 
     of: PlatformName
     what: str
@@ -77,7 +93,9 @@ class Observe(VectorObservation, type="observe"):
 
     def vector(self, sim: Sim) -> Float[Array, " d"]:
         own = getattr(sim.platforms[self.of], self.what)
-        return own if self.relative_to is None else own - getattr(sim.platforms[self.relative_to], self.what)
+        if self.relative_to is None:
+            return own
+        return own - getattr(sim.platforms[self.relative_to], self.what)
 
 
 class ObserveRegion(VectorObservation, type="observe_region"):
@@ -88,11 +106,13 @@ class ObserveRegion(VectorObservation, type="observe_region"):
 
     def vector(self, sim: Sim) -> Float[Array, " d"]:
         centre = sim.regions[self.region].position
-        return centre if self.relative_to is None else centre - sim.platforms[self.relative_to].position
+        if self.relative_to is None:
+            return centre
+        return centre - sim.platforms[self.relative_to].position
 
 
 class ObserveAngle(Observation, type="observe_angle"):
-    """An angle θ of a platform's state as [cos θ, sin θ], which does not jump at ±π."""
+    """An angle θ of a platform's state, given as [cos θ, sin θ], which does not jump at ±π."""
 
     of: PlatformName
     what: str
@@ -105,7 +125,7 @@ class ObserveAngle(Observation, type="observe_angle"):
 
 
 class ObserveStatus(Observation, type="observe_status"):
-    """A status, as a number."""
+    """The value of a status, as a number."""
 
     status: AnyStatusName
 
@@ -113,5 +133,5 @@ class ObserveStatus(Observation, type="observe_status"):
         return jnp.atleast_1d(jnp.asarray(sim.status[self.status], jnp.result_type(float)))
 
 
-def _axes(size: int) -> list[str]:
+def _axis_names(size: int) -> list[str]:
     return list("xyz"[:size]) if size <= 3 else [str(index) for index in range(size)]

@@ -1,4 +1,7 @@
-"""The processor state machine of Fig. 11: memory that `increment` moves once a step and `process` only reads."""
+"""The processor state machine of Fig. 11.
+
+A processor has a memory. `increment` moves it once a step, and `process` only reads it.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from jaxsafe.types import Number, Sim
 
 
 class Processor(Component):
-    """Base of statuses, rewards and observations. Stateless ones write `process` only."""
+    """Base of statuses, rewards and observations. A part without memory writes `process` only."""
 
     many_kinds: ClassVar[bool] = True
     name: str
@@ -19,9 +22,17 @@ class Processor(Component):
         return ()
 
     def increment(self, memory: Any, sim: Sim, dt: Number) -> Any:
-        """Return the memory after a step that led to `sim`; called exactly once a step, never at reset."""
+        """Return the memory after a step that led to `sim`.
+
+        It is called exactly once a step and never at reset.
+
+        Args:
+            memory: the memory before the step.
+            sim: the simulation after the step.
+            dt: length of the step [s].
+        """
         return memory
 
     def process(self, memory: Any, sim: Sim) -> Any:
-        """Return the output; changes nothing."""
+        """Return the output and change nothing."""
         raise NotImplementedError

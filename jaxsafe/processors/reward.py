@@ -1,4 +1,7 @@
-"""Reward terms (Tables 7 and 8); the reward of a step is their sum. All terms are 0 at reset."""
+"""Reward terms (Tables 7 and 8).
+
+The reward of a step is the sum of its terms. At reset all terms are 0.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +26,14 @@ from jaxsafe.types import (
 )
 
 Pay = Annotated[Number, Unit("1"), Range(largest=1e12)]
-"""A part of a reward: the squares of its sums over episodes are finite in single precision."""
+"""A part of a reward, so limited that squares of its sums over episodes are finite in float32."""
+
 PerMetrePerSecond = Annotated[Number, Unit("s/m"), Range(largest=1e12)]
+"""A part of a reward for each metre per second."""
 
 
 class Bound(Component):
-    """Ends the episode with `outcome` once the term's sum over the episode is below `below`."""
+    """End of the episode with `outcome` once the sum of a reward term so far is below `below`."""
 
     below: Pay
     outcome: str
@@ -36,7 +41,7 @@ class Bound(Component):
 
 
 class Reward(Processor):
-    """Base of all reward terms; any term may carry a bound."""
+    """Base of all reward terms. Any term may carry a bound."""
 
     bound: Bound | None = None
 
@@ -49,7 +54,10 @@ class Potential(Record):
 
 
 class DistanceChange(Reward, type="distance_change"):
-    """Change of an exponential potential of a distance: scale·(e^(−a d_t) − e^(−a d_(t−1))), a = ln 2 / half_distance."""
+    """Change of an exponential potential of a distance d over a step.
+
+    It is scale·(e^(−a d_t) − e^(−a d_(t−1))) with a = ln 2 / half_distance.
+    """
 
     distance: StatusName
     half_distance: Annotated[Length, Extent]
@@ -57,11 +65,11 @@ class DistanceChange(Reward, type="distance_change"):
 
     def init(self, sim: Sim) -> Potential:
         current = self._potential(sim)
-        return Potential(current, jnp.zeros_like(current))
+        return Potential(current=current, change=jnp.zeros_like(current))
 
     def increment(self, memory: Potential, sim: Sim, dt: Number) -> Potential:
         current = self._potential(sim)
-        return Potential(current, current - memory.current)
+        return Potential(current=current, change=current - memory.current)
 
     def process(self, memory: Potential, sim: Sim) -> Float[Array, ""]:
         return memory.change
@@ -73,16 +81,17 @@ class DistanceChange(Reward, type="distance_change"):
 class Stay(Record):
     """Memory of `WhileIn`."""
 
-    inside: Bool[Array, ""]
-    paid: Float[Array, ""]  # since the last refund
-    value: Float[Array, ""]
+    inside: Bool[Array, ""]  # whether the status is true
+    paid: Float[Array, ""]  # sum since the status was last false
+    value: Float[Array, ""]  # the reward of this step
 
 
 class WhileIn(Reward, type="while_in"):
-    """A reward for each step on which a boolean status is true; when it turns false, minus all of them, Table 7.
+    """A reward for each step on which a boolean status is true, Table 7.
 
-    So the sum over an episode is never negative and coming and going pays nothing. With `both_samples` the status must also
-    have been true one step before.
+    When the status turns false, all that was paid since it turned true is taken back. So the sum
+    over an episode is never negative, and coming and going pays nothing. With `both_samples` the
+    status must also have been true one step before.
     """
 
     status: FlagName
@@ -90,13 +99,17 @@ class WhileIn(Reward, type="while_in"):
     both_samples: bool = False
 
     def init(self, sim: Sim) -> Stay:
-        return Stay(sim.status[self.status], jnp.zeros_like(self.value), jnp.zeros_like(self.value))
+        return Stay(
+            inside=sim.status[self.status],
+            paid=jnp.zeros_like(self.value),
+            value=jnp.zeros_like(self.value),
+        )
 
     def increment(self, memory: Stay, sim: Sim, dt: Number) -> Stay:
         inside = sim.status[self.status]
         earned = jnp.where(memory.inside, self.value, 0.0) if self.both_samples else self.value
         value = jnp.where(inside, earned, 0.0 - memory.paid)
-        return Stay(inside, memory.paid + value, value)
+        return Stay(inside=inside, paid=memory.paid + value, value=value)
 
     def process(self, memory: Stay, sim: Sim) -> Float[Array, ""]:
         return memory.value
@@ -105,14 +118,15 @@ class WhileIn(Reward, type="while_in"):
 class Arrival(Record):
     """Memory of `FirstTime`."""
 
-    before: Bool[Array, ""]
-    now: Bool[Array, ""]
+    before: Bool[Array, ""]  # whether the status has been true in this episode, this step included
+    now: Bool[Array, ""]  # whether it is true for the first time on this step
 
 
 class FirstTime(Reward, type="first_time"):
-    """A reward on the step on which a boolean status is true for the first time in the episode, Table 7.
+    """A reward on the first step of the episode on which a boolean status is true, Table 7.
 
-    Without `count_start` a start in which it is true already is paid on the first step.
+    A start in which the status is true already counts as the first time, so nothing is paid later.
+    Without `count_start` it does not count, and the first step is paid.
     """
 
     status: FlagName
@@ -121,18 +135,18 @@ class FirstTime(Reward, type="first_time"):
 
     def init(self, sim: Sim) -> Arrival:
         held = sim.status[self.status] & self.count_start
-        return Arrival(held, jnp.zeros_like(held))
+        return Arrival(before=held, now=jnp.zeros_like(held))
 
     def increment(self, memory: Arrival, sim: Sim, dt: Number) -> Arrival:
         held = sim.status[self.status]
-        return Arrival(memory.before | held, held & ~memory.before)
+        return Arrival(before=memory.before | held, now=held & ~memory.before)
 
     def process(self, memory: Arrival, sim: Sim) -> Float[Array, ""]:
         return jnp.where(memory.now, self.value, 0.0)
 
 
 class VelocityConstraint(Reward, type="velocity_constraint"):
-    """offset + scale·(‖v‖ − v_limit) on a step with ‖v‖ > v_limit, else 0, Table 8."""
+    """The term offset + scale·(‖v‖ − v_limit) on a step with ‖v‖ > v_limit, else 0, Table 8."""
 
     speed: StatusName
     velocity_limit: StatusName
@@ -145,7 +159,10 @@ class VelocityConstraint(Reward, type="velocity_constraint"):
 
 
 class DeltaVCost(Reward, type="delta_v"):
-    """scale·‖u/m‖Δt, Table 8; the control is the one that acted, after run time assurance."""
+    """The term scale·‖u/m‖Δt, Table 8.
+
+    The control u is the one that acted, after run time assurance.
+    """
 
     delta_v: StatusName
     scale: PerMetrePerSecond = -0.01
@@ -155,7 +172,10 @@ class DeltaVCost(Reward, type="delta_v"):
 
 
 class Intervention(Reward, type="intervention"):
-    """A constant on every step on which run time assurance changed the control: what a policy pays for leaning on it."""
+    """A constant on every step on which run time assurance changed the control.
+
+    A policy pays it for leaning on run time assurance.
+    """
 
     scale: Pay = -0.01
 
@@ -164,7 +184,10 @@ class Intervention(Reward, type="intervention"):
 
 
 class Success(Reward, type="success"):
-    """value − t/t_max when the episode ends with `outcome`: sooner is better."""
+    """The term value − t/t_max on the step that ends the episode with `outcome`.
+
+    Here t_max is `time_scale`. An earlier success pays more.
+    """
 
     outcome: OutcomeName
     time_scale: Annotated[Number, Unit("s"), Range(0.0, open_low=True, smallest=1e-6)]
@@ -175,9 +198,12 @@ class Success(Reward, type="success"):
 
 
 class Failure(Reward, type="failure"):
-    """A constant for each way to fail, by outcome name."""
+    """A constant for each way in which an episode may fail, by outcome name."""
 
     values: Mapping[OutcomeName, Pay]
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
-        return jnp.sum(jnp.stack([jnp.where(sim.ended[outcome], value, 0.0) for outcome, value in self.values.items()]))
+        terms = [
+            jnp.where(sim.ended[outcome], value, 0.0) for outcome, value in self.values.items()
+        ]
+        return jnp.sum(jnp.stack(terms))

@@ -1,4 +1,7 @@
-"""Statuses: named facts about the simulated world, computed in order, so a later one may use an earlier one."""
+"""Statuses: named facts about the simulated world.
+
+They are computed in order, so a later status may use an earlier one.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,11 @@ class Status(Processor):
     """Base of all statuses."""
 
     def on_the_way(self, env: Environment, before: Sim, sim: Sim) -> Any:
-        """Return the output over the step from `before` to `sim`: for distances a lower bound, else that of `sim`."""
+        """Return the output over the step from `before` to `sim`.
+
+        For distances it is a lower bound on the way between the two. For other statuses it is the
+        output at `sim`.
+        """
         return self.process(self.init(sim), sim)
 
 
@@ -54,7 +61,7 @@ class Distance(Status, type="distance"):
 
 
 class RegionDistance(Status, type="region_distance"):
-    """Distance of a platform from the centre of a region."""
+    """Distance of a platform to the centre of a region."""
 
     of: PlatformName
     region: RegionName
@@ -63,7 +70,7 @@ class RegionDistance(Status, type="region_distance"):
         return safe_norm(self._apart(sim))
 
     def on_the_way(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, ""]:
-        bend = _bend(env, before, sim, self.of)  # a region is taken to move straight on
+        bend = _bend(env, before, sim, self.of)  # the region is assumed to move on a straight line
         return closest_approach(self._apart(before), self._apart(sim)) - bend
 
     def _apart(self, sim: Sim) -> Float[Array, " d"]:
@@ -83,27 +90,32 @@ class InRegion(Status, type="in_region"):
 class Hold(Record):
     """Memory of `TimeHeld`."""
 
-    held: Bool[Array, ""]
-    steps: Int[Array, ""]  # since it became true
-    time: Float[Array, ""]
+    held: Bool[Array, ""]  # whether the status is true
+    steps: Int[Array, ""]  # since the status became true
+    time: Float[Array, ""]  # the same in s
 
 
 class TimeHeld(Status, type="time_held"):
-    """Seconds since a boolean status became true, 0 while it is false.
+    """Time [s] since a boolean status became true, 0 while the status is false.
 
-    With `first_sample` the step on which it becomes true counts already, but never the sample at reset.
+    With `first_sample` the step on which the status becomes true counts already. The sample at
+    reset never counts.
     """
 
     status: FlagName
     first_sample: bool = False
 
     def init(self, sim: Sim) -> Hold:
-        return Hold(jnp.asarray(sim.status[self.status]), jnp.zeros((), jnp.int32), jnp.zeros_like(sim.time))
+        return Hold(
+            held=jnp.asarray(sim.status[self.status]),
+            steps=jnp.zeros((), jnp.int32),
+            time=jnp.zeros_like(sim.time),
+        )
 
     def increment(self, memory: Hold, sim: Sim, dt: Number) -> Hold:
         held = sim.status[self.status]
         steps = jnp.where(held & (memory.held | self.first_sample), memory.steps + 1, 0)
-        return Hold(held, steps, steps.astype(memory.time.dtype) * dt)
+        return Hold(held=held, steps=steps, time=steps.astype(memory.time.dtype) * dt)
 
     def process(self, memory: Hold, sim: Sim) -> Float[Array, ""]:
         return memory.time
@@ -119,7 +131,11 @@ class Speed(Status, type="speed"):
 
 
 class VelocityLimit(Status, type="velocity_limit"):
-    """Distance-dependent speed limit ν₀ + ν₁‖r‖, Eqs. (14), (17); it grows from a distance `constant_to` on."""
+    """Speed limit ν₀ + ν₁‖r‖ [m/s], which grows with a distance ‖r‖, Eqs. (14), (17).
+
+    With `constant_to` only the part of the distance beyond it counts, so the limit is ν₀ up to
+    there.
+    """
 
     distance: StatusName
     floor: Annotated[MetresPerSecond, Range(0.0, largest=1e9)]
@@ -128,15 +144,22 @@ class VelocityLimit(Status, type="velocity_limit"):
 
     def problem(self) -> str | None:
         if self.floor == 0.0 and (self.slope == 0.0 or self.constant_to > 0.0):
-            return "expected a limit above 0 away from the centre: a floor, or a slope that begins there"
+            return (
+                "expected a limit above 0 away from the centre: a floor,"
+                " or a slope that begins there"
+            )
         return None
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
-        return self.floor + self.slope * jnp.maximum(sim.status[self.distance] - self.constant_to, 0.0)
+        distance = sim.status[self.distance]
+        return self.floor + self.slope * jnp.maximum(distance - self.constant_to, 0.0)
 
 
 class DeltaV(Status, type="delta_v"):
-    """Velocity change bought with thrust in the last step, ‖u/m‖Δt, 0 at reset; u is the control that acted."""
+    """Velocity change ‖u/m‖Δt [m/s] by the thrust of the last step, 0 at reset.
+
+    The control u is the one that acted, after run time assurance.
+    """
 
     of: PlatformName
     norm: Literal["l1", "l2"] = "l2"
@@ -147,5 +170,6 @@ class DeltaV(Status, type="delta_v"):
 
 
 def _bend(env: Environment, before: Sim, sim: Sim, name: str) -> Float[Array, ""]:
-    """How far a platform's path may leave the straight line between two instants."""
-    return env.platform(name).bend(before.platforms[name], sim.platforms[name], sim.time - before.time)
+    """Return how far a platform's path may leave the straight line between two instants."""
+    duration = sim.time - before.time
+    return env.platform(name).bend(before.platforms[name], sim.platforms[name], duration)

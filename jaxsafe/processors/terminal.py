@@ -1,4 +1,7 @@
-"""Ends of an episode (Tables 9 and 10): the first condition that holds, in the listed order, is the outcome."""
+"""Ends of an episode (Tables 9 and 10).
+
+The first condition that holds, in the listed order, is the outcome.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +21,12 @@ Ends = Literal["terminated", "truncated"]
 class Terminal(Component):
     """A condition that ends the episode with the outcome it is named after.
 
-    `ends` says what the end means for learning: `terminated`, nothing follows (in the paper a timeout too is a failure), or
-    `truncated`, the episode is merely cut and the value of its last state still counts. A condition that stands `apart`
-    neither hides those after it nor is hidden by those before it, so that its reward and another's may fall on one step.
+    `ends` says what the end means for learning. After `terminated` nothing follows. In the paper a
+    timeout is a failure of this kind too. After `truncated` the episode is merely cut, and the
+    value of its last state still counts.
+
+    A condition that stands `apart` neither hides the conditions after it nor is hidden by those
+    before it. So its reward and that of another condition may fall on one step.
     """
 
     name: str
@@ -28,34 +34,38 @@ class Terminal(Component):
     apart: bool = False
 
     def reached(self, sim: Sim) -> Bool[Array, ""]:
-        """Whether the condition holds."""
+        """Return whether the condition holds."""
         raise NotImplementedError
 
 
 class Docked(Terminal, type="docked"):
-    """Inside the docking region at no more than the speed limit, Table 10."""
+    """The agent is inside the docking region and not faster than the speed limit, Table 10."""
 
     in_docking: FlagName
     speed: StatusName
     velocity_limit: StatusName
 
     def reached(self, sim: Sim) -> Bool[Array, ""]:
-        return sim.status[self.in_docking] & (sim.status[self.speed] <= sim.status[self.velocity_limit])
+        return sim.status[self.in_docking] & (
+            sim.status[self.speed] <= sim.status[self.velocity_limit]
+        )
 
 
 class Crashed(Terminal, type="crashed"):
-    """Inside the docking region above the speed limit, Table 10."""
+    """The agent is inside the docking region and faster than the speed limit, Table 10."""
 
     in_docking: FlagName
     speed: StatusName
     velocity_limit: StatusName
 
     def reached(self, sim: Sim) -> Bool[Array, ""]:
-        return sim.status[self.in_docking] & (sim.status[self.speed] > sim.status[self.velocity_limit])
+        return sim.status[self.in_docking] & (
+            sim.status[self.speed] > sim.status[self.velocity_limit]
+        )
 
 
 class TooFar(Terminal, type="too_far"):
-    """A distance above a limit; `inclusive`: at it already."""
+    """A distance is above a limit. If `inclusive`, the limit itself counts as too far."""
 
     distance: StatusName
     limit: Annotated[Length, Range(0.0, open_low=True, infinite=True)]
@@ -67,7 +77,7 @@ class TooFar(Terminal, type="too_far"):
 
 
 class TooClose(Terminal, type="too_close"):
-    """A distance below a limit; `inclusive`: at it already."""
+    """A distance is below a limit. If `inclusive`, the limit itself counts as too close."""
 
     distance: StatusName
     limit: Annotated[Length, Reach]
@@ -79,7 +89,10 @@ class TooClose(Terminal, type="too_close"):
 
 
 class Held(Terminal, type="held"):
-    """A time, such as that in the rejoin region, of at least `duration`, Eqs. (7), (10); not `inclusive`: of more."""
+    """A time, such as the one in the rejoin region, is at least `duration`, Eqs. (7), (10).
+
+    If not `inclusive`, it must be longer than `duration`.
+    """
 
     time: StatusName
     duration: Seconds
@@ -91,7 +104,7 @@ class Held(Terminal, type="held"):
 
 
 class Holds(Terminal, type="holds"):
-    """A boolean status that is true, for instance being in a keep-out zone."""
+    """A boolean status is true, for instance one that says that the agent is in a keep-out zone."""
 
     status: FlagName
 
@@ -100,7 +113,7 @@ class Holds(Terminal, type="holds"):
 
 
 class Timeout(Terminal, type="timeout"):
-    """More than `limit` seconds since the start: t > t_max."""
+    """More than `limit` seconds have passed since the start: t > t_max."""
 
     limit: Seconds
 

@@ -1,7 +1,8 @@
-"""From the agent's action to named controls in physical units (Section 4 "Platforms", Appendix "Environment Platforms").
+"""Controllers: the way from the agent's action to named controls in physical units.
 
-Controls are named, never positional, between here and the dynamics. Actions are positional, in the order in which the
-actuators are listed.
+They are described in Section 4 "Platforms" and in the appendix "Environment Platforms". Between a
+controller and the dynamics, controls are named and never positional. Actions are positional, in the
+order in which the actuators are listed.
 """
 
 from __future__ import annotations
@@ -16,15 +17,19 @@ from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.types import Control, Number, Sim
 
 Bound = Annotated[Number, Unit("physical"), Control]
+"""A limit of a control, in the unit of that control."""
+
 Controls = Mapping[str, Float[Array, ""]]
+"""Controls in physical units, by name."""
 
 
 class Actuator(Component):
     """One named input of a platform and its limits, in physical units.
 
-    Continuous actions in [−1, 1] are clipped and mapped affinely to [low, high], or, `zero_centred`, piecewise linearly so
-    that 0 stays 0; with `rescale` off they are physical already and only clipped. Discrete actions choose one of `points`
-    values spaced equally from low to high, both included.
+    Continuous actions in [−1, 1] are clipped and mapped affinely to [low, high]. With
+    `zero_centred` the map is piecewise linear, so that 0 stays 0. Without `rescale` actions are
+    physical already and are only clipped. Discrete actions choose one of `points` values, spaced
+    equally from low to high, both included.
     """
 
     name: str
@@ -35,10 +40,14 @@ class Actuator(Component):
     zero_centred: bool = False
 
     def problem(self) -> str | None:
-        return None if self.low <= self.high else f"expected low ≤ high, found {self.low:g} and {self.high:g}"
+        return (
+            None
+            if self.low <= self.high
+            else f"expected low ≤ high, found {self.low:g} and {self.high:g}"
+        )
 
     def from_continuous(self, action: Float[Array, ""]) -> Float[Array, ""]:
-        """Map an action to the physical control."""
+        """Return the physical control of an action."""
         if not self.rescale:
             return jnp.clip(action, self.low, self.high)
         share = jnp.clip(action, -1.0, 1.0)
@@ -47,7 +56,7 @@ class Actuator(Component):
         return self.low + (share + 1.0) * (self.high - self.low) / 2.0
 
     def to_continuous(self, control: Float[Array, ""]) -> Float[Array, ""]:
-        """Map a physical control within the limits to the action that gives it."""
+        """Return the action that gives a physical control within the limits."""
         if not self.rescale:
             return control
         if self.zero_centred:
@@ -57,40 +66,45 @@ class Actuator(Component):
         return 2.0 * (control - self.low) / jnp.where(width > 0.0, width, 1.0) - 1.0
 
     def from_discrete(self, index: Array) -> Float[Array, ""]:
-        """Map an index in 0 … points − 1 (clipped) to the physical control."""
+        """Return the physical control of an index, which is clipped to 0 … points − 1."""
         share = jnp.clip(index, 0, self.points - 1).astype(self.low.dtype) / (self.points - 1)
         return self.low + share * (self.high - self.low)
 
 
 class Controller(Component):
-    """The source of a platform's desired controls: an agent's actions, a script, or nothing at all."""
+    """Source of a platform's desired controls: an agent's actions, a script, or nothing at all."""
 
     takes_actions: ClassVar[bool] = False
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The controls that it gives; for an agent's in the order of the action."""
+        """Names of the controls that it gives. Those of an agent are in the order of the action."""
         return ()
 
     @property
     def points(self) -> tuple[int, ...]:
-        """Number of choices of each actuator; empty if actions are continuous."""
+        """Number of choices of each actuator. It is empty if actions are continuous."""
         return ()
 
     def control(self, action: Array, sim: Sim) -> Controls:
-        """Return the desired controls by name, from the agent's action or from the simulation before the step."""
+        """Return the desired controls by name.
+
+        Args:
+            action: the agent's action. Controllers that take no actions ignore it.
+            sim: the simulation before the step.
+        """
         raise NotImplementedError
 
 
 class Uncontrolled(Controller, type="uncontrolled"):
-    """All controls are 0: the chief, or an aircraft that flies on as it started."""
+    """No control: all are 0, as for the chief or for an aircraft that flies on as it started."""
 
     def control(self, action: Array, sim: Sim) -> Controls:
         return {}
 
 
 class AgentController(Controller):
-    """An agent's actions, one element per actuator."""
+    """Base of controllers that turn an agent's action into controls, one element per actuator."""
 
     takes_actions: ClassVar[bool] = True
     actuators: tuple[Actuator, ...]
@@ -101,22 +115,35 @@ class AgentController(Controller):
 
 
 class Continuous(AgentController, type="continuous"):
-    """An agent whose action is one number in [−1, 1] per actuator, shape (actuators,)."""
+    """Controller of an agent whose action has shape (actuators,), each a number in [−1, 1]."""
 
     def control(self, action: Float[Array, " actuators"], sim: Sim) -> Controls:
-        return {actuator.name: actuator.from_continuous(action[i]) for i, actuator in enumerate(self.actuators)}
+        return {
+            actuator.name: actuator.from_continuous(action[i])
+            for i, actuator in enumerate(self.actuators)
+        }
 
     def action(self, control: Float[Array, " actuators"]) -> Float[Array, " actuators"]:
-        """Return the action that gives a control within the limits, physical units in action order."""
-        return jnp.stack([actuator.to_continuous(control[i]) for i, actuator in enumerate(self.actuators)])
+        """Return the action that gives a control.
+
+        Args:
+            control: controls within the limits, in physical units and action order, shape
+                (actuators,).
+        """
+        return jnp.stack(
+            [actuator.to_continuous(control[i]) for i, actuator in enumerate(self.actuators)]
+        )
 
 
 class Discrete(AgentController, type="discrete"):
-    """An agent whose action is one index per actuator, int, shape (actuators,)."""
+    """Controller of an agent whose action has shape (actuators,), each an integer index."""
 
     @property
     def points(self) -> tuple[int, ...]:
         return tuple(actuator.points for actuator in self.actuators)
 
     def control(self, action: Array, sim: Sim) -> Controls:
-        return {actuator.name: actuator.from_discrete(action[i]) for i, actuator in enumerate(self.actuators)}
+        return {
+            actuator.name: actuator.from_discrete(action[i])
+            for i, actuator in enumerate(self.actuators)
+        }

@@ -1,6 +1,7 @@
-"""Spacecraft in Hill's frame: Clohessy-Wiltshire motion, Eqs. (12), (16); x points away from the Earth, y along the orbit.
+"""Spacecraft in Hill's frame: Clohessy-Wiltshire motion, Eqs. (12), (16).
 
-The thrust is constant over a step, so the step is exact: the linear equations are solved in closed form (zero-order hold).
+The x axis points away from the Earth and the y axis along the orbit. The thrust is constant over a
+step (zero-order hold), so the linear equations are solved in closed form and the step is exact.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ MASS = 12.0
 """Mass m of the deputy [kg], Table 4."""
 
 MeanMotion = Annotated[RadiansPerSecond, Range(largest=10.0)]
+"""Mean motion of an orbit [rad/s]."""
 
 
 class SpacecraftState(Record):
@@ -30,11 +32,13 @@ class SpacecraftState(Record):
 
     position: Annotated[Float[Array, " d"], Unit("m")]  # r
     velocity: Annotated[Float[Array, " d"], Unit("m/s")]  # v
-    delta_v: Annotated[Float[Array, " d"], Unit("m/s")]  # velocity change F Δt / m bought with thrust in the last step
+    delta_v: Annotated[
+        Float[Array, " d"], Unit("m/s")
+    ]  # F Δt / m, the velocity change by the thrust of the last step
 
     @property
     def heading(self) -> Float[Array, ""]:
-        """A point mass keeps the axes of Hill's frame: 0."""
+        """Heading 0, because a point mass keeps the axes of Hill's frame."""
         return jnp.zeros_like(self.position[..., 0])
 
     @property
@@ -45,20 +49,28 @@ class SpacecraftState(Record):
 
 
 class Anchor(Platform, type="anchor"):
-    """A spacecraft at rest at the origin of Hill's frame, which is an equilibrium of Eqs. (12), (16): the chief."""
+    """A spacecraft at rest at the origin of Hill's frame, such as the chief.
+
+    The origin is an equilibrium of Eqs. (12), (16).
+    """
 
     def rest(self) -> SpacecraftState:
-        return SpacecraftState(*3 * (jnp.zeros(self.dimension, jnp.result_type(float)),))
+        zeros = jnp.zeros(self.dimension, jnp.result_type(float))
+        return SpacecraftState(position=zeros, velocity=zeros, delta_v=zeros)
 
     def step(self, state: SpacecraftState, controls: Controls, dt: Seconds) -> SpacecraftState:
         return state
 
     def derivative(self, state: SpacecraftState, controls: Controls) -> SpacecraftState:
-        return SpacecraftState(*3 * (jnp.zeros_like(state.position),))
+        zeros = jnp.zeros_like(state.position)
+        return SpacecraftState(position=zeros, velocity=zeros, delta_v=zeros)
 
 
 class Spacecraft(Anchor, type="spacecraft"):
-    """A point mass with one thruster pair per axis: `thrust_x`, `thrust_y` and, in space, `thrust_z` [N]."""
+    """A point mass with one thruster pair per axis.
+
+    Its controls are `thrust_x`, `thrust_y` and, in space, `thrust_z` [N].
+    """
 
     mass: Kilograms = MASS
     mean_motion: MeanMotion = MEAN_MOTION
@@ -68,19 +80,32 @@ class Spacecraft(Anchor, type="spacecraft"):
         return tuple(f"thrust_{axis}" for axis in "xyz"[: self.dimension])
 
     def step(self, state: SpacecraftState, controls: Controls, dt: Seconds) -> SpacecraftState:
-        """Advance by the exact solution for constant thrust."""
-        acceleration = jnp.stack([controls.get(name, 0.0) for name in self.inputs]) / self.mass
-        position, velocity = cwh_flow(state.position, state.velocity, acceleration, self.mean_motion, dt)
-        return SpacecraftState(position, velocity, acceleration * dt)
+        """Return the state after `dt` seconds: the exact solution for constant thrust."""
+        thrust = self._thrust_acceleration(controls)
+        position, velocity = cwh_flow(
+            r=state.position, v=state.velocity, a=thrust, n=self.mean_motion, t=dt
+        )
+        return SpacecraftState(position=position, velocity=velocity, delta_v=thrust * dt)
 
     def derivative(self, state: SpacecraftState, controls: Controls) -> SpacecraftState:
-        push = jnp.stack([controls.get(name, 0.0) for name in self.inputs]) / self.mass
-        rate = cwh_acceleration(state.position, state.velocity, push, self.mean_motion)
-        return SpacecraftState(state.velocity, rate, jnp.zeros_like(rate))
+        thrust = self._thrust_acceleration(controls)
+        acceleration = cwh_acceleration(
+            r=state.position, v=state.velocity, a=thrust, n=self.mean_motion
+        )
+        return SpacecraftState(
+            position=state.velocity,
+            velocity=acceleration,
+            delta_v=jnp.zeros_like(acceleration),
+        )
+
+    def _thrust_acceleration(self, controls: Controls) -> Float[Array, " d"]:
+        return jnp.stack([controls.get(name, 0.0) for name in self.inputs]) / self.mass
 
 
-def cwh_acceleration(r: Float[Array, " d"], v: Float[Array, " d"], a: Float[Array, " d"], n: Number) -> Float[Array, " d"]:
-    """Relative acceleration in Hill's frame, Eqs. (12), (16).
+def cwh_acceleration(
+    r: Float[Array, " d"], v: Float[Array, " d"], a: Float[Array, " d"], n: Number
+) -> Float[Array, " d"]:
+    """Return the relative acceleration in Hill's frame, Eqs. (12), (16).
 
     ẍ = 2nẏ + 3n²x + aₓ,  ÿ = −2nẋ + a_y,  z̈ = −n²z + a_z
 
@@ -100,28 +125,53 @@ def cwh_acceleration(r: Float[Array, " d"], v: Float[Array, " d"], a: Float[Arra
 def cwh_flow(
     r: Float[Array, " d"], v: Float[Array, " d"], a: Float[Array, " d"], n: Number, t: Number
 ) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
-    """Position and velocity after a time t under constant thrust acceleration: the solution of Eqs. (12), (16).
+    """Return position and velocity after a time t under constant thrust, solving Eqs. (12), (16).
 
-    With τ = nt and the entire functions s₁ = sin τ/τ, c₂ = (1 − cos τ)/τ², s₃ = (τ − sin τ)/τ³, every coefficient is a
-    product without cancellation, so that float32 keeps its precision at τ = 0.001 and n = 0 is the double integrator.
-    Arguments as in `cwh_acceleration`, t in seconds.
+    With τ = nt and the entire functions s₁ = sin τ/τ, c₂ = (1 − cos τ)/τ² and s₃ = (τ − sin τ)/τ³,
+    every coefficient is a product without cancellation. So float32 keeps its precision at τ =
+    0.001, and n = 0 gives the double integrator.
+
+    Args:
+        r: position [m], shape (d,), d = 2 or 3.
+        v: velocity [m/s], shape (d,).
+        a: thrust acceleration F/m [m/s²], shape (d,).
+        n: mean motion [rad/s].
+        t: time [s].
+
+    Returns:
+        Position [m] and velocity [m/s], each of shape (d,).
     """
     tau = n * t
     s1, c2, s3 = sine_ratios(tau)
     half = 2.0 * tau * c2  # 2(1 − cos τ)/τ
     third = 2.0 * tau * s3 * t * t  # 2(τ − sin τ)/n²
-    sine, versine = tau * s1, tau * tau * c2  # sin τ, 1 − cos τ
-    x, y, vx, vy, ax, ay = r[0], r[1], v[0], v[1], a[0], a[1]
+    sine = tau * s1  # sin τ
+    versine = tau * tau * c2  # 1 − cos τ
+    x, y = r[0], r[1]
+    vx, vy = v[0], v[1]
+    ax, ay = a[0], a[1]
     position = [
         x + 3.0 * versine * x + t * s1 * vx + t * half * vy + t * t * c2 * ax + third * ay,
-        y - 6.0 * tau**3 * s3 * x - t * half * vx + t * (4.0 * s1 - 3.0) * vy - third * ax + t * t * (4.0 * c2 - 1.5) * ay,
+        y
+        - 6.0 * tau**3 * s3 * x
+        - t * half * vx
+        + t * (4.0 * s1 - 3.0) * vy
+        - third * ax
+        + t * t * (4.0 * c2 - 1.5) * ay,
     ]
     velocity = [
         vx + 3.0 * n * sine * x - versine * vx + 2.0 * sine * vy + t * s1 * ax + t * half * ay,
-        vy - 6.0 * n * versine * x - 2.0 * sine * vx - 4.0 * versine * vy - t * half * ax + t * (4.0 * s1 - 3.0) * ay,
+        vy
+        - 6.0 * n * versine * x
+        - 2.0 * sine * vx
+        - 4.0 * versine * vy
+        - t * half * ax
+        + t * (4.0 * s1 - 3.0) * ay,
     ]
     if r.shape[0] == 3:
-        z, vz, az = r[2], v[2], a[2]
+        z = r[2]
+        vz = v[2]
+        az = a[2]
         position.append(z - versine * z + t * s1 * vz + t * t * c2 * az)
         velocity.append(vz - n * sine * z - versine * vz + t * s1 * az)
     return jnp.stack(position), jnp.stack(velocity)

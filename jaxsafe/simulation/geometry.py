@@ -1,4 +1,7 @@
-"""Norms with safe gradients, directions, rotations, and the regions that tasks refer to (Section 4, Tables 3 and 4)."""
+"""Norms with safe gradients, directions, rotations, and regions.
+
+Regions are described in Section 4 and in Tables 3 and 4.
+"""
 
 from __future__ import annotations
 
@@ -15,18 +18,18 @@ from jaxsafe.types import Length, Number, Place, PlatformName, Radians, Reach, R
 
 
 def safe_norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
-    """Euclidean norm ‖v‖ whose gradient at v = 0 is 0 instead of NaN.
+    """Return the Euclidean norm ‖v‖, whose gradient at v = 0 is 0 instead of NaN.
 
-    Double where: the root must not see 0 in either branch, because `where` multiplies the untaken branch's infinite
-    derivative by zero.
+    The function uses two `where`. The root must not see 0 even in the branch that is not taken,
+    because `where` multiplies that branch's infinite derivative by zero.
     """
     squared = jnp.sum(vector * vector, axis=-1)
-    zero = squared == 0.0  # what is not a number stays so
+    zero = squared == 0.0  # false for NaN, so that NaN stays NaN
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
 
 
 def closest_approach(before: Float[Array, " d"], after: Float[Array, " d"]) -> Float[Array, ""]:
-    """Smallest norm on the straight way between two vectors."""
+    """Return the smallest norm on the straight line between two vectors."""
     change = after - before
     squared = jnp.sum(change * change)
     share = jnp.clip(-jnp.sum(before * change) / jnp.where(squared > 0.0, squared, 1.0), 0.0, 1.0)
@@ -34,13 +37,23 @@ def closest_approach(before: Float[Array, " d"], after: Float[Array, " d"]) -> F
 
 
 def mag_norm(vector: Float[Array, " d"]) -> Float[Array, " d+1"]:
-    """Magnitude and direction [‖v‖, v/‖v‖], Eq. (21); all 0 at v = 0, where it has no direction."""
+    """Return magnitude and direction [‖v‖, v/‖v‖], Eq. (21).
+
+    At v = 0, which has no direction, all elements are 0.
+    """
     magnitude = safe_norm(vector)
     return jnp.concatenate([magnitude[None], vector / jnp.where(magnitude > 0.0, magnitude, 1.0)])
 
 
-def direction(azimuth: Float[Array, "*n"], polar: Float[Array, "*n"] | None = None) -> Float[Array, "*n d"]:
-    """Unit vector at an azimuth from x [rad], in the plane; with a polar angle from z [rad], in space."""
+def direction(
+    azimuth: Float[Array, "*n"], polar: Float[Array, "*n"] | None = None
+) -> Float[Array, "*n d"]:
+    """Return the unit vector of an azimuth and, in space, a polar angle.
+
+    Args:
+        azimuth: angle from the x axis towards the y axis [rad].
+        polar: angle from the z axis [rad]. None gives a vector in the plane.
+    """
     y, x = sin_cos(azimuth)
     if polar is None:
         return jnp.stack([x, y], axis=-1)
@@ -48,15 +61,24 @@ def direction(azimuth: Float[Array, "*n"], polar: Float[Array, "*n"] | None = No
     return jnp.stack([level * x, level * y, z], axis=-1)
 
 
-def rotation(yaw: Float[Array, "*n"], pitch: Number | None = None, roll: Number | None = None) -> Float[Array, "*n d d"]:
-    """Rotation from a body frame to the global one by ZYX Euler angles [rad], R_z(ψ)·R_y(γ)·R_x(φ); in the plane R_z alone.
+def rotation(
+    yaw: Float[Array, "*n"], pitch: Number | None = None, roll: Number | None = None
+) -> Float[Array, "*n d d"]:
+    """Return the rotation matrix from a body frame to the global frame.
 
-    Its first column, the body's x axis, is (cos ψ cos γ, sin ψ cos γ, −sin γ).
+    In space it is R_z(ψ)·R_y(γ)·R_x(φ), in ZYX Euler angles. Its first column, the body's x axis,
+    is (cos ψ cos γ, sin ψ cos γ, −sin γ). In the plane it is the 2 × 2 matrix of R_z(ψ).
+
+    Args:
+        yaw: ψ [rad].
+        pitch: γ [rad]. None gives the matrix in the plane.
+        roll: φ [rad]. None gives the matrix in the plane.
     """
     s, c = sin_cos(yaw)
     if pitch is None or roll is None:
         return jnp.stack([jnp.stack([c, -s], axis=-1), jnp.stack([s, c], axis=-1)], axis=-2)
-    (sp, cp), (sr, cr) = sin_cos(pitch), sin_cos(roll)
+    sp, cp = sin_cos(pitch)
+    sr, cr = sin_cos(roll)
     rows = [
         [c * cp, c * sp * sr - s * cr, c * sp * cr + s * sr],
         [s * cp, s * sp * sr + c * cr, s * sp * cr - c * sr],
@@ -66,18 +88,29 @@ def rotation(yaw: Float[Array, "*n"], pitch: Number | None = None, roll: Number 
 
 
 def to_body(orientation: Float[Array, "d d"], vector: Float[Array, " d"]) -> Float[Array, " d"]:
-    """Components of a vector in the body frame, Rᵀv.
+    """Return the components of a vector in the body frame, Rᵀv.
 
-    Written out: a matrix product may be computed in reduced precision on accelerators, and a reduction keeps XLA from
-    working on many vectors at a time.
+    Args:
+        orientation: R, the rotation from the body frame to the global frame, shape (d, d).
+        vector: v in the global frame, shape (d,).
+
+    Raises:
+        ValueError: the shapes do not match.
     """
     if vector.shape != orientation.shape[:1]:
-        raise ValueError(f"expected a vector of {orientation.shape[0]} components to turn, found shape {vector.shape}")
-    return functools.reduce(jnp.add, [row * element for row, element in zip(orientation, vector, strict=True)])
+        raise ValueError(
+            f"expected a vector of {orientation.shape[0]} components to turn,"
+            f" found shape {vector.shape}"
+        )
+    # The sums are written out for two reasons. Accelerators may compute a matrix product in reduced
+    # precision, and a reduction keeps XLA from working on many vectors at a time.
+    return functools.reduce(
+        jnp.add, [row * element for row, element in zip(orientation, vector, strict=True)]
+    )
 
 
 class Offset(Component):
-    """Where a region's centre is, seen from the platform it is on."""
+    """Position of a region's centre relative to the platform that carries the region."""
 
     def vector(self, platform: Any) -> Float[Array, " d"]:
         """Return the offset in the global frame, given the platform's state."""
@@ -85,7 +118,10 @@ class Offset(Component):
 
 
 class Aspect(Offset, type="aspect"):
-    """ρ (cos(ψ + π + θ), sin(ψ + π + θ)), Eq. (6): behind the platform, θ from its tail, turning with it."""
+    """Offset ρ (cos(ψ + π + θ), sin(ψ + π + θ)), Eq. (6), behind a platform with heading ψ.
+
+    θ is the angle from the platform's tail. The offset turns with the platform.
+    """
 
     distance: Annotated[Length, Reach]
     angle: Annotated[Radians, Turn]
@@ -96,7 +132,7 @@ class Aspect(Offset, type="aspect"):
 
 
 class Displacement(Offset, type="displacement"):
-    """A constant vector along the axes of the global frame."""
+    """Constant offset along the axes of the global frame."""
 
     by: Annotated[Number, Unit("m or ft", length=0), Place]
 
@@ -105,28 +141,41 @@ class Displacement(Offset, type="displacement"):
 
 
 class Region(Component):
-    """A part of space attached to a platform; a pure function of the platforms, recomputed at every step."""
+    """A part of space attached to a platform.
+
+    It is a pure function of the platforms and is recomputed at every step.
+    """
 
     dimensions: ClassVar[tuple[int, ...]] = (2, 3)
-    """The dimensions of space in which it means what its name says."""
+    """Dimensions of space in which the region is what its name says."""
     name: str
     on: PlatformName
     offset: Offset | None = None  # None: centred on the platform
 
     def contains(self, offset: Float[Array, " d"]) -> Bool[Array, ""]:
-        """Whether a point, given by its offset from the region's centre, is inside."""
+        """Return whether a point is inside, given its offset from the region's centre."""
         raise NotImplementedError
 
     def place(self, platforms: Mapping[str, Any]) -> RegionState:
-        """Centre of the region, and which of the other platforms are inside."""
+        """Return where the region is and which of the other platforms are inside.
+
+        Args:
+            platforms: the states of all platforms, by name.
+
+        Raises:
+            ValueError: the offset has another dimension than the platform's position.
+        """
         centre = platforms[self.on].position
         if self.offset is not None:
             offset = self.offset.vector(platforms[self.on])
             if offset.shape != centre.shape:
-                raise ValueError(f"expected an offset of {centre.size} numbers, found {offset.size}")
+                raise ValueError(
+                    f"expected an offset of {centre.size} numbers, found {offset.size}"
+                )
             centre = centre + offset
         others = {name: other for name, other in platforms.items() if name != self.on}
-        return RegionState(centre, {name: self.contains(other.position - centre) for name, other in others.items()})
+        inside = {name: self.contains(other.position - centre) for name, other in others.items()}
+        return RegionState(position=centre, inside=inside)
 
 
 class Sphere(Region, type="sphere"):
@@ -145,7 +194,7 @@ class Circle(Sphere, type="circle"):
 
 
 class Cylinder(Region, type="cylinder"):
-    """All points within `radius` of the centre in x and y, and within half the `height` in z, Eq. (10)."""
+    """All points within `radius` of the centre in x and y and half the `height` in z, Eq. (10)."""
 
     dimensions: ClassVar[tuple[int, ...]] = (3,)
     radius: Annotated[Length, Reach]

@@ -1,7 +1,8 @@
-"""Random starts: each initializer draws one field of a platform's state (Section 4 "Initialization", Tables 3 and 4).
+"""Random starts: each initializer draws one field of a platform's state.
 
-Initializers run in the order in which they are listed, platform after platform, so a later one may refer to a field drawn
-earlier or to an earlier platform.
+They are described in Section 4 "Initialization" and in Tables 3 and 4. Initializers run in the
+order in which they are listed, platform after platform. So a later one may refer to a field that is
+drawn earlier or to an earlier platform.
 """
 
 from __future__ import annotations
@@ -37,24 +38,33 @@ Shares = Annotated[Number, Unit("1", length=2), Range(0.0, largest=1e3)]
 
 
 class Initializer(Component):
-    """Draws the state field that it is named after."""
+    """Base of initializers. Each draws the state field that it is named after."""
 
     name: str
 
     def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Array:
-        """Return the field's value, given this platform's fields drawn so far and the platforms placed so far."""
+        """Return a value of the field.
+
+        Args:
+            key: a typed PRNG key.
+            drawn: this platform's fields that are drawn so far, by name.
+            sim: the simulation with the platforms that are placed so far.
+        """
         raise NotImplementedError
 
 
 class Direction(Component):
-    """A random direction: azimuth and, in space, polar angle, each uniform (not uniform on the sphere)."""
+    """A random direction whose azimuth and, in space, polar angle are each uniform.
+
+    In space it is therefore not uniform on the sphere.
+    """
 
     azimuth: Angles = (0.0, TWO_PI)
     polar: Angles | None = None
 
     @property
     def intervals(self) -> tuple[Float[Array, " 2"], ...]:
-        """Of its angles: one in the plane, two in space."""
+        """Intervals of the angles: one in the plane, two in space."""
         return (self.azimuth,) if self.polar is None else (self.azimuth, self.polar)
 
 
@@ -68,18 +78,25 @@ class Fixed(Initializer, type="fixed"):
 
 
 class Uniform(Initializer, type="uniform"):
-    """Uniform between bounds, independently in each component: the paper's generic initializer."""
+    """A value drawn uniformly between bounds, independently in each component.
+
+    This is the paper's generic initializer.
+    """
 
     low: Annotated[Number, Unit("physical", length=ANY), Place]
     high: Annotated[Number, Unit("physical", length=ANY), Place]
 
     def problem(self) -> str | None:
-        if self.low.shape != self.high.shape or not np.all(np.asarray(self.low) <= np.asarray(self.high)):
+        if self.low.shape != self.high.shape or not np.all(
+            np.asarray(self.low) <= np.asarray(self.high)
+        ):
             return f"expected low ≤ high, found {self.low.tolist()} and {self.high.tolist()}"
         return None
 
     def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Array:
-        return self.low + (self.high - self.low) * jax.random.uniform(key, self.low.shape, self.low.dtype)
+        return self.low + (self.high - self.low) * jax.random.uniform(
+            key, self.low.shape, self.low.dtype
+        )
 
 
 class AtDistance(Initializer, type="at_distance"):
@@ -95,7 +112,10 @@ class AtDistance(Initializer, type="at_distance"):
 
 
 class AroundAtAltitude(Initializer, type="around_at_altitude"):
-    """A position at a random horizontal distance and azimuth from another platform, at a random altitude z of its own."""
+    """A position at a random horizontal distance and azimuth from another platform.
+
+    Its altitude z is random and does not depend on the other platform.
+    """
 
     about: PlatformName
     distance: Distances
@@ -104,11 +124,16 @@ class AroundAtAltitude(Initializer, type="around_at_altitude"):
 
     def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Float[Array, " 3"]:
         distance, azimuth, altitude = uniform(key, self.distance, self.azimuth, self.altitude)
-        return jnp.append(sim.platforms[self.about].position[:2] + distance * direction(azimuth), altitude)
+        return jnp.append(
+            sim.platforms[self.about].position[:2] + distance * direction(azimuth), altitude
+        )
 
 
 class BelowSpeedLimit(Initializer, type="below_speed_limit"):
-    """A velocity in a random direction with a speed uniform in shares × (ν₀ + ν₁‖r‖), Eq. (14), r drawn before."""
+    """A velocity in a random direction, at a uniform share of the limit ν₀ + ν₁‖r‖, Eq. (14).
+
+    The position r, relative to the platform `about`, is the one drawn before.
+    """
 
     about: PlatformName
     floor: Annotated[MetresPerSecond, Range(0.0, largest=1e9)]
@@ -118,11 +143,16 @@ class BelowSpeedLimit(Initializer, type="below_speed_limit"):
 
     def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Float[Array, " d"]:
         share, *angles = uniform(key, self.share, *self.direction.intervals)
-        limit = self.floor + self.slope * safe_norm(drawn["position"] - sim.platforms[self.about].position)
+        limit = self.floor + self.slope * safe_norm(
+            drawn["position"] - sim.platforms[self.about].position
+        )
         return limit * share * direction(*angles)
 
 
 def uniform(key: Key, *intervals: Float[Array, " 2"]) -> Float[Array, " n"]:
-    """A number uniform in [low, high] for each interval, all from one draw: every draw compiles to a loop of its own."""
+    """Return a number drawn uniformly from each interval [low, high].
+
+    All numbers come from one draw, because every draw compiles to a loop of its own.
+    """
     low, high = jnp.stack(intervals, axis=-1)
     return low + (high - low) * jax.random.uniform(key, low.shape, low.dtype)

@@ -17,7 +17,7 @@ from jaxsafe.simulation.trig import wrap
 from jaxsafe.types import Kilograms, Number, Record, Seconds
 
 RATE_LIMIT = jnp.pi / 90.0
-"""Fastest turn [rad/s], Table 4: 2°/s."""
+"""Highest attitude rate [rad/s], Table 4: 2°/s."""
 
 
 class OrientedState(Record):
@@ -25,13 +25,17 @@ class OrientedState(Record):
 
     position: Annotated[Float[Array, " 2"], Unit("m")]  # r
     velocity: Annotated[Float[Array, " 2"], Unit("m/s")]  # v
-    delta_v: Annotated[Float[Array, " 1"], Unit("m/s")]  # velocity change F Δt / m bought with thrust in the last step
-    attitude: Annotated[Float[Array, ""], Unit("rad")]  # θ from x to the body's x axis, in [−π, π)
+    delta_v: Annotated[
+        Float[Array, " 1"], Unit("m/s")
+    ]  # F Δt / m, the velocity change by the thrust of the last step
+    attitude: Annotated[
+        Float[Array, ""], Unit("rad")
+    ]  # θ from the x axis to the body's x axis, in [−π, π)
     attitude_rate: Annotated[Float[Array, ""], Unit("rad/s")]  # θ̇
 
     @property
     def heading(self) -> Float[Array, ""]:
-        """The attitude."""
+        """Heading of the body's x axis: the attitude."""
         return self.attitude
 
     @property
@@ -41,15 +45,18 @@ class OrientedState(Record):
 
 
 class OrientedSpacecraft(Platform, type="oriented_spacecraft"):
-    """A planar spacecraft with `thrust` [N] along its body axis and an `attitude_acceleration` [rad/s²], Eq. (20).
+    """A spacecraft in the plane that turns, Eq. (20).
 
-    The reaction wheel's −D ψ̇/I_zz is commanded directly as θ̈.
+    Its controls are `thrust` [N] along the body axis and `attitude_acceleration` [rad/s²].
+    The term −D ψ̇/I_zz of the reaction wheel is commanded directly, as θ̈.
     """
 
     dimension: Annotated[int, Range(2, 2)] = 2
     mass: Kilograms = MASS
     mean_motion: MeanMotion = MEAN_MOTION
-    attitude_rate_limits: Annotated[Number, Unit("rad/s", length=2), Range(largest=1e6, infinite=True)] = (
+    attitude_rate_limits: Annotated[
+        Number, Unit("rad/s", length=2), Range(largest=1e6, infinite=True)
+    ] = (
         -RATE_LIMIT,
         RATE_LIMIT,
     )
@@ -60,42 +67,77 @@ class OrientedSpacecraft(Platform, type="oriented_spacecraft"):
 
     def rest(self) -> OrientedState:
         zero = jnp.zeros((), jnp.result_type(float))
-        planar = jnp.zeros(2, zero.dtype)
-        return OrientedState(planar, planar, zero[None], zero, zero)
+        zeros = jnp.zeros(2, zero.dtype)
+        return OrientedState(
+            position=zeros,
+            velocity=zeros,
+            delta_v=zero[None],
+            attitude=zero,
+            attitude_rate=zero,
+        )
 
     def settle(self, state: OrientedState) -> OrientedState:
         return state.replace(attitude=wrapped(state.attitude))
 
     def step(self, state: OrientedState, controls: Controls, dt: Seconds) -> OrientedState:
-        """Advance by the exact flow of Eq. (12) and, for the turning thrust, quadrature of its impulse responses."""
-        limits, turn = self.attitude_rate_limits, controls.get("attitude_acceleration", 0.0)
-        start = ramp(state.attitude_rate, 0.0, limits, 0.0)
-        final = ramp(start, turn, limits, dt)
+        """Return the state after `dt` seconds.
+
+        The motion without thrust is the exact flow of Eq. (12). To it the step adds the responses
+        to the turning thrust: the thrust is a sum of impulses at the nodes of a quadrature, and the
+        flow carries each impulse to the end of the step.
+        """
+        limits = self.attitude_rate_limits
+        turn = controls.get("attitude_acceleration", 0.0)
+        first_rate = ramp(state.attitude_rate, 0.0, limits, 0.0)
+        final_rate = ramp(first_rate, turn, limits, dt)
         thrust = controls.get("thrust", 0.0) / self.mass
 
-        still, attitude = jnp.zeros_like(state.position), state.attitude
-        position, velocity = cwh_flow(state.position, state.velocity, still, self.mean_motion, dt)
-        stop = time_to_limit(start, turn, limits, dt)
-        for begin, length, rate, acceleration in ((0.0, stop, start, turn), (stop, dt - stop, final, 0.0)):
+        zeros = jnp.zeros_like(state.position)
+        attitude = state.attitude
+        position, velocity = cwh_flow(
+            r=state.position, v=state.velocity, a=zeros, n=self.mean_motion, t=dt
+        )
+        stop = time_to_limit(first_rate, turn, limits, dt)
+        for begin, length, rate, acceleration in (
+            (0.0, stop, first_rate, turn),
+            (stop, dt - stop, final_rate, 0.0),
+        ):
             for node, weight in zip(NODES, WEIGHTS, strict=True):
-                after = node * length
-                angle = attitude + rate * after + acceleration * after**2 / 2.0
-                kick = thrust * weight * length * direction(angle)
-                pushed = cwh_flow(still, kick, still, self.mean_motion, dt - begin - after)
-                position, velocity = position + pushed[0], velocity + pushed[1]
+                elapsed = node * length
+                angle = attitude + rate * elapsed + acceleration * elapsed**2 / 2.0
+                impulse = thrust * weight * length * direction(angle)
+                response = cwh_flow(
+                    r=zeros, v=impulse, a=zeros, n=self.mean_motion, t=dt - begin - elapsed
+                )
+                position = position + response[0]
+                velocity = velocity + response[1]
             attitude = attitude + length * (rate + acceleration * length / 2.0)
-        return OrientedState(position, velocity, (thrust * dt)[None], wrapped(attitude), final)
+        return OrientedState(
+            position=position,
+            velocity=velocity,
+            delta_v=(thrust * dt)[None],
+            attitude=wrapped(attitude),
+            attitude_rate=final_rate,
+        )
 
     def derivative(self, state: OrientedState, controls: Controls) -> OrientedState:
-        """Eq. (20) within the limits of the attitude rate."""
-        push = controls.get("thrust", 0.0) / self.mass * direction(state.attitude)
-        rate = cwh_acceleration(state.position, state.velocity, push, self.mean_motion)
-        turn = jnp.asarray(controls.get("attitude_acceleration", 0.0), rate.dtype)
-        return OrientedState(state.velocity, rate, jnp.zeros_like(state.delta_v), state.attitude_rate, turn)
+        """Return the right-hand side of Eq. (20), which holds within the attitude rate limits."""
+        thrust = controls.get("thrust", 0.0) / self.mass * direction(state.attitude)
+        acceleration = cwh_acceleration(
+            r=state.position, v=state.velocity, a=thrust, n=self.mean_motion
+        )
+        turn = jnp.asarray(controls.get("attitude_acceleration", 0.0), acceleration.dtype)
+        return OrientedState(
+            position=state.velocity,
+            velocity=acceleration,
+            delta_v=jnp.zeros_like(state.delta_v),
+            attitude=state.attitude_rate,
+            attitude_rate=turn,
+        )
 
 
 def wrapped(angle: Float[Array, ""]) -> Float[Array, ""]:
-    """The angle in [−π, π); one that lies there is not touched by rounding."""
+    """Return the angle in [−π, π). An angle that lies there already keeps all its bits."""
     turned = wrap(angle, -jnp.pi, 2.0 * jnp.pi)
     turned = jnp.where(turned < jnp.pi, turned, -jnp.pi)
     return jnp.where((angle >= -jnp.pi) & (angle < jnp.pi), angle, turned)

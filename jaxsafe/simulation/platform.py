@@ -1,4 +1,7 @@
-"""What every simulated vehicle has in common: a name, a start, a controller, and a state with position and velocity."""
+"""The base of all simulated vehicles.
+
+A vehicle has a name, a start, a controller, and a state with position and velocity.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +32,12 @@ class Platform(Component):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """The controls that `step` takes, by name; one that is not given is 0."""
+        """Names of the controls that `step` takes. A control that is not given is 0."""
         return ()
 
     @property
     def random_fields(self) -> tuple[str, ...]:
-        """The state fields that `start` draws."""
+        """Names of the state fields that `start` draws."""
         return tuple(initializer.name for initializer in self.start)
 
     def rest(self) -> Any:
@@ -42,81 +45,123 @@ class Platform(Component):
         raise NotImplementedError
 
     def quantities(self) -> tuple[str, ...]:
-        """What of its state can be observed: the fields, and what follows from them."""
+        """Return the names of what can be observed: fields of the state and its properties."""
         state = self.rest()
         derived = [name for name, value in vars(type(state)).items() if isinstance(value, property)]
         return tuple(name for name in (*vars(state), *derived) if name not in ("orientation",))
 
     def settle(self, state: Any) -> Any:
-        """Return the start as `step` would leave it, for instance with its angles wrapped."""
+        """Return a start as `step` would leave it, for instance with its angles wrapped."""
         return state
 
     def step(self, state: Any, controls: Controls, dt: Seconds) -> Any:
-        """Return the state after `dt` seconds with the controls held constant."""
+        """Return the state after `dt` seconds with the controls held constant.
+
+        Args:
+            state: the state record before the step.
+            controls: controls in physical units, by name.
+            dt: length of the step [s].
+        """
         raise NotImplementedError
 
     def step_within_limits(self, state: Any, controls: Controls, dt: Seconds) -> Any:
-        """`step` for controls under which no state reaches a limit before the end, which may be cheaper to compute."""
+        """Return the state after `dt` seconds, as `step` does, for a step that reaches no limit.
+
+        The caller promises that no state reaches a limit before the end of the step. So the result
+        may be cheaper to compute.
+        """
         return self.step(state, controls, dt)
 
     def held(self, state: Any, controls: Controls, dt: Seconds) -> Controls:
-        """Return controls that do over a part of a step what the given ones do over all of it, `dt` seconds."""
+        """Return controls for a part of a step.
+
+        They act in that part as the given controls act in the whole step.
+
+        Args:
+            state: the state record before the step.
+            controls: controls of the whole step in physical units, by name.
+            dt: length of the whole step [s].
+        """
         return controls
 
     def bend(self, before: Any, after: Any, dt: Seconds) -> Float[Array, ""]:
-        """Return how far the path may leave the straight line between the states before and after a step.
+        """Return how far the path may leave the straight line from `before` to `after`.
 
-        It is ‖Δv‖Δt/8 at a constant acceleration, and up to 32/27 of that where it stops on the way, at a limit.
+        These are the states before and after a step of `dt` seconds. At a constant acceleration it
+        leaves the line by ‖Δv‖Δt/8. If the acceleration stops within the step, at a limit, it is up
+        to 32/27 of that.
         """
-        return 0.15 * safe_norm(after.velocity - before.velocity) * dt
+        return 0.15 * safe_norm(after.velocity - before.velocity) * dt  # 0.15 ≥ 1/8 · 32/27 = 0.148
 
     def derivative(self, state: Any, controls: Controls) -> Any:
-        """Return the time derivative of the state, a record like it: f(x) + g(x)u, Eq. (3)."""
+        """Return the time derivative f(x) + g(x)u, Eq. (3), as a record of the state's class."""
         raise NotImplementedError
 
     def reset(self, key: Key, sim: Sim) -> Any:
-        """Draw a random start, given the platforms placed so far."""
+        """Draw a random start, given the platforms that are placed so far.
+
+        Raises:
+            ConfigError: an initializer draws a value of another shape than its field has.
+        """
         drawn: dict[str, Array] = {}
         rest = self.rest()
-        for initializer, key_i in zip(self.start, jax.random.split(key, max(len(self.start), 1)), strict=False):
-            drawn[initializer.name] = value = initializer.draw(key_i, drawn, sim)
+        keys = jax.random.split(key, max(len(self.start), 1))
+        for initializer, key_i in zip(self.start, keys, strict=False):
+            value = initializer.draw(key_i, drawn, sim)
+            drawn[initializer.name] = value
             expected = getattr(rest, initializer.name).shape
             if value.shape != expected:
                 raise ConfigError(
-                    f"platforms.{self.name}.start.{initializer.name}: expected shape {expected}, found {value.shape}"
+                    f"platforms.{self.name}.start.{initializer.name}: expected shape {expected},"
+                    f" found {value.shape}"
                 )
         return self.settle(rest.replace(**drawn))
 
     def place(self, values: Mapping[str, Any] | Record) -> Any:
-        """Return the state with chosen fields, for a start that the user gives.
+        """Return the state for a start that the user gives.
+
+        Args:
+            values: a state record, or values of its fields by name. Fields that are not given are
+                as in `rest`.
 
         Raises:
-            ConfigError: a field is unknown, a random one is missing, or a value has another shape or is not a number.
+            ConfigError: a field is unknown, a random field is missing, or a value has another shape
+                or is not a finite number.
         """
         values = vars(values) if isinstance(values, Record) else values
         if not isinstance(values, Mapping):
-            raise ConfigError(f"reset_to: {self.name}: expected fields by name, found {show(values)}")
+            raise ConfigError(
+                f"reset_to: {self.name}: expected fields by name, found {show(values)}"
+            )
         rest = self.rest()
         for name in values:
             if name not in vars(rest):
                 raise ConfigError(
-                    f"reset_to: {self.name} has no field {show(name)}; choose from {nearest(name, vars(rest))}"
+                    f"reset_to: {self.name} has no field {show(name)};"
+                    f" choose from {nearest(name, vars(rest))}"
                 )
         for name in self.random_fields:
             if name not in values:
-                raise ConfigError(f"reset_to: {self.name}.{name} is missing: it is random at reset, so give it")
-        given = {name: placed(f"{self.name}.{name}", value, getattr(rest, name)) for name, value in values.items()}
+                raise ConfigError(
+                    f"reset_to: {self.name}.{name} is missing: it is random at reset, so give it"
+                )
+        given = {
+            name: placed(f"{self.name}.{name}", value, getattr(rest, name))
+            for name, value in values.items()
+        }
         return self.settle(rest.replace(**given))
 
 
 def placed(name: str, value: Any, like: Array) -> Array:
-    """A value that the user gives to `reset_to`, in the shape and type of `like`.
+    """Return a value that the user gives to `reset_to` as an array of the shape and type of `like`.
 
     Raises:
-        ConfigError: it has another shape or is not finite numbers.
+        ConfigError: the value has another shape or is not finite numbers.
     """
     try:
-        with np.errstate(over="ignore"):  # beyond the largest float32 is infinite, and refused below
+        with np.errstate(
+            over="ignore"
+        ):  # a number beyond the largest float32 becomes infinite and is refused below
             array = jnp.asarray(value, like.dtype)
     except (TypeError, ValueError, OverflowError):
         raise ConfigError(f"reset_to: {name}: expected numbers, found {show(value)}") from None

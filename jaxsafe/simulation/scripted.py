@@ -1,4 +1,7 @@
-"""Platforms that follow a script, such as the lead: one command for each control that is not 0 (Section 3, Fig. 9)."""
+"""Scripts for platforms such as the lead (Section 3, Fig. 9).
+
+A script is one command for each control that is not 0.
+"""
 
 from __future__ import annotations
 
@@ -16,21 +19,21 @@ from jaxsafe.types import Control, Number, Radians, Sim, Turn
 
 
 class Command(Component):
-    """The control that it is named after, as a function of the simulation at the beginning of the step."""
+    """Base of commands. Each gives the control that it is named after."""
 
     name: str
 
     def value(self, sim: Sim) -> Float[Array, ""]:
-        """Return the control in physical units, held over the step."""
+        """Return the control in physical units. It is held over the step that begins at `sim`."""
         raise NotImplementedError
 
     def extremes(self) -> tuple[Number, Number]:
-        """Return the smallest and the largest control there can be at any time; infinite where that is not known."""
+        """Return the smallest and the largest control at any time, infinite if not known."""
         return -jnp.inf, jnp.inf
 
 
 class Scripted(Controller, type="scripted"):
-    """Follows its commands; controls without one are 0."""
+    """A controller that follows its commands. Controls without a command are 0."""
 
     commands: tuple[Command, ...] = ()
 
@@ -43,7 +46,7 @@ class Scripted(Controller, type="scripted"):
 
 
 class Constant(Command, type="constant"):
-    """The same value at all times; `randomize` it to draw it for each episode."""
+    """The same value at all times. List it under `randomize` to draw it for each episode."""
 
     at: Bound
 
@@ -55,17 +58,22 @@ class Constant(Command, type="constant"):
 
 
 class Schedule(Command, type="schedule"):
-    """Piecewise constant: `values[k]` from `times[k]` until the next time, 0 before the first."""
+    """A piecewise constant value: `values[k]` from `times[k]` until the next time.
+
+    It is 0 before the first time.
+    """
 
     times: Annotated[Number, Unit("s", length=0)]
     values: Annotated[Number, Unit("physical", length=0), Control]
 
     def problem(self) -> str | None:
         if self.times.shape != self.values.shape or not self.times.size:
-            return f"expected as many values as times, found {self.values.size} and {self.times.size}"
-        return (
-            None if np.all(np.diff(self.times) > 0.0) else f"expected times in ascending order, found {self.times.tolist()}"
-        )
+            return (
+                f"expected as many values as times, found {self.values.size} and {self.times.size}"
+            )
+        if not np.all(np.diff(self.times) > 0.0):
+            return f"expected times in ascending order, found {self.times.tolist()}"
+        return None
 
     def value(self, sim: Sim) -> Float[Array, ""]:
         steps = jnp.diff(self.values, prepend=0.0)
@@ -76,7 +84,7 @@ class Schedule(Command, type="schedule"):
 
 
 class Sinusoid(Command, type="sinusoid"):
-    """Weaving: amplitude · sin(2π t/period + phase)."""
+    """A weaving value: amplitude · sin(2π t/period + phase)."""
 
     amplitude: Bound
     period: Annotated[Number, Unit("s"), Range(0.0, open_low=True, smallest=1e-6)]
