@@ -308,7 +308,6 @@ def learning(request: Request) -> Iterator[dict[str, Any]]:
     import jax
     import numpy as np
 
-    from jaxsafe.config.arguments import Arguments
     from jaxsafe.devices.seed_mapper import SeedMapper, claim_cores
     from jaxsafe.train.host.options import configs, resolve
     from jaxsafe.train.train import STATE, programs
@@ -316,7 +315,7 @@ def learning(request: Request) -> Iterator[dict[str, Any]]:
     claim_cores()
 
     def prepare(task: str, preset: str) -> Any:
-        config, env, _ = resolve(Arguments.parse([f"env={task}", f"preset={preset}", f"seeds={request.seeds}"]))
+        config, env, _ = resolve({"env": task, "preset": preset, "seeds": request.seeds})
         mapper = SeedMapper(config.seeds, config.shares)
         shared, keys = mapper.replicate((env, config.agent, config.ppo)), mapper.keys(config.seed)
         fresh, advance = programs(mapper, 1, config.num_updates)

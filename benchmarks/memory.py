@@ -50,13 +50,12 @@ def probe(task: str, num_envs: int) -> dict[str, int]:
     claim_cores()
     import jax
 
-    from jaxsafe.config.arguments import Arguments
     from jaxsafe.devices import memory
     from jaxsafe.train.host.options import resolve
     from jaxsafe.train.train import programs
 
-    words = [f"env={task}", f"ppo.num_envs={num_envs}", f"ppo.num_steps={NUM_STEPS}", "ppo.num_epochs=1"]
-    config, env, _ = resolve(Arguments.parse(words))
+    sizes = {"ppo.num_envs": num_envs, "ppo.num_steps": NUM_STEPS, "ppo.num_epochs": 1}
+    config, env, _ = resolve({"env": task, **sizes})
     mapper = SeedMapper(1)
     shared = mapper.replicate((env, config.agent, config.ppo))
     fresh, two = programs(mapper, 2, 2)

@@ -93,12 +93,11 @@ def our_programs(task: str, seeds: int, updates: int, num_envs: int = NUM_ENVS) 
 
 def settings(task: str, num_envs: int = NUM_ENVS) -> tuple[Any, Any]:
     """The configuration of our PPO, and the environment."""
-    from jaxsafe.config.arguments import Arguments
     from jaxsafe.train.host.options import resolve
 
     sizes = {"num_envs": num_envs, "num_steps": NUM_STEPS, "num_epochs": NUM_EPOCHS, "num_minibatches": NUM_MINIBATCHES}
-    words = [f"env={task}", "preset=plain", f"agent.hidden={list(HIDDEN)}", f"steps={10 * UPDATES * num_envs * NUM_STEPS}"]
-    config, env, _ = resolve(Arguments.parse([*words, *(f"ppo.{key}={value}" for key, value in sizes.items())]))
+    options = {"env": task, "preset": "plain", "agent.hidden": [*HIDDEN], "steps": 10 * UPDATES * num_envs * NUM_STEPS}
+    config, env, _ = resolve({**options, **{f"ppo.{name}": size for name, size in sizes.items()}})
     return config, env
 
 

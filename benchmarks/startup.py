@@ -103,7 +103,6 @@ def _jaxsafe(task: str, rta: str, tick: Callable[[], None]) -> None:
     import jax.numpy as jnp
 
     import jaxsafe
-    from jaxsafe.config.arguments import Arguments
     from jaxsafe.devices.seed_mapper import SeedMapper, claim_cores
     from jaxsafe.rollout import reset_batch, step_or_reset_batch
     from jaxsafe.train.host.options import resolve
@@ -119,7 +118,7 @@ def _jaxsafe(task: str, rta: str, tick: Callable[[], None]) -> None:
     tick()
     step.compile()
     tick()
-    config, env, _ = resolve(Arguments.parse([f"env={task}", f"rta={rta}", "seeds=10"]))
+    config, env, _ = resolve({"env": task, "rta": rta, "seeds": 10})
     mapper = SeedMapper(config.seeds, config.shares)
     shared = mapper.replicate((env, config.agent, config.ppo))
     fresh, advance = programs(mapper, 10, config.num_updates)

@@ -1,5 +1,7 @@
 """Aerospace SafeRL benchmarks as pure JAX functions."""
 
+from typing import TYPE_CHECKING
+
 import jaxsafe.address_space
 import jaxsafe.quiet  # noqa: F401 before anything imports jaxlib
 from jaxsafe.agents.policy_file import load_policy
@@ -9,10 +11,17 @@ from jaxsafe.envs import make
 from jaxsafe.rollout import rollout
 from jaxsafe.schema.errors import ConfigError
 
+if TYPE_CHECKING:
+    from jaxsafe.evaluate.evaluate import evaluate
+    from jaxsafe.train.train import train
+else:
+    from jaxsafe import evaluate, train  # packages that can be called
+
 __all__ = [
     "ConfigError",
     "Environment",
     "dump",
+    "evaluate",
     "load",
     "load_policy",
     "make",
@@ -21,4 +30,5 @@ __all__ = [
     "reset_to",
     "rollout",
     "step",
+    "train",
 ]

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import jaxsafe
-from jaxsafe.config.arguments import Arguments
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.train.host.options import resolve
@@ -57,7 +56,7 @@ def core(env: jaxsafe.Environment, key: jax.Array, num_envs: int) -> Any:
 
 def learn(words: dict[str, Any], key: jax.Array, run: Callable[..., Any]) -> Any:
     """Two updates, and an evaluation of what they learn."""
-    config, env, _ = resolve(Arguments({"env": "docking2d", **SMALL, **words}))
+    config, env, _ = resolve({"env": "docking2d", **SMALL, **words})
     shared = env, config.agent, config.ppo
     keys = jax.random.split(key)
 

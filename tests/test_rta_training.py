@@ -25,7 +25,7 @@ FAST = {"deputy": {"position": [100.0, 0.0], "velocity": [0.0, 0.405]}}
 
 
 def resolved(*words: str) -> tuple[TrainConfig, jaxsafe.Environment]:
-    return resolve(Arguments.parse(["env=docking2d", *words]))[:2]
+    return resolve(Arguments.parse(["env=docking2d", *words]).options)[:2]
 
 
 def collected(learns_from: str) -> Transition:

@@ -36,7 +36,8 @@ def main(argv: Sequence[str]) -> int:
     rest = [word for word in argv if word.partition("=")[0] in arguments.options]
     rest = rest if "seeds" in arguments.options else [f"seeds={SEEDS}", *rest]
     items = plan(tasks, kinds, rest)
-    episodes = [resolve(Arguments.parse(item.words))[0].episodes for item in items]  # errors before anything is done
+    # errors before anything is done
+    episodes = [resolve(Arguments.parse(item.words).options)[0].episodes for item in items]
     command = f"python benchmarks/baselines {shlex.join(argv)}".rstrip()
     try:
         for item, count in zip(items, episodes, strict=True):

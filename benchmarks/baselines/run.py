@@ -73,7 +73,7 @@ def answers(options: Sequence[str], results: Mapping[str, Any]) -> bool:
 
 def options_of(item: Item) -> dict[str, Any]:
     """Every option of its training and of its environment as `config.yaml` has them, but for the place of the run."""
-    config, env, _ = resolve(Arguments.parse([*item.words]))
+    config, env, _ = resolve(Arguments.parse(item.words).options)
     found = described(config, env)
     found["training"].pop("out")
     return found

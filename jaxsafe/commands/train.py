@@ -38,7 +38,7 @@ def main(argv: Sequence[str]) -> int:
         processes.join()
     resume = arguments.pop_text("resume")
     if resume is None:
-        resolved = resolve_all(arguments)
+        resolved = resolve_all(arguments.options)
         path = Path(processes.from_leader(lambda: str(run_directory.create_all(resolved))))
     else:
         arguments.refuse_rest(["resume", "distributed"])

@@ -93,7 +93,7 @@ class SeedMapper:
         def shard(shared: Any, local: Any) -> Any:
             if not self.one_by_one:
                 return jax.vmap(function, in_axes=(None, 0))(shared, local)
-            each = partial(jax.lax.map, lambda one: _isolated(function)(shared, one))
+            each = partial(jax.lax.map, lambda one: isolated(function)(shared, one))
             if pairs and len(jax.tree.leaves(local)[0]) == 1:
                 pair = jax.tree.map(lambda x: jnp.repeat(x, 2, axis=0), local)
                 return jax.tree.map(lambda x: x[:1], each(pair))
@@ -164,10 +164,13 @@ def _spread(x: Any, sharding: NamedSharding) -> jax.Array:
     return jax.make_array_from_callback(host.shape, sharding, lambda index: host[index])
 
 
-def _isolated(function: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
-    """Keep the compiler from fusing a seed's program with its surroundings, so that its bits do not depend on them."""
+def isolated(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Keep the compiler from fusing a seed's program with its surroundings, so that its bits do not depend on them.
 
-    def isolated(shared: Any, one: Any) -> Any:
-        return jax.lax.optimization_barrier(function(*jax.lax.optimization_barrier((shared, one))))
+    The first two arguments are arrays, further ones are static.
+    """
 
-    return isolated
+    def alone(shared: Any, one: Any, *static: Any) -> Any:
+        return jax.lax.optimization_barrier(function(*jax.lax.optimization_barrier((shared, one)), *static))
+
+    return alone

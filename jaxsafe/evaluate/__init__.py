@@ -1,1 +1,9 @@
-"""Whole episodes of policies and their metrics, and the adversaries that a filter is evaluated against."""
+"""Whole episodes of policies and their metrics, and the adversaries that a filter is evaluated against.
+
+`jaxsafe.evaluate(env, policy, key, num_episodes)` returns the metrics of a policy, see
+`jaxsafe.evaluate.evaluate.evaluate`.
+"""
+
+from jaxsafe.schema.callable_package import make_callable
+
+make_callable(__name__, "jaxsafe.evaluate.evaluate")

@@ -106,7 +106,7 @@ def settings(
     found = []
     for point in points:
         changes = dict(zip(sweep, point, strict=True))
-        config, env, _ = resolve(Arguments({**arguments.options, **changes}))
+        config, env, _ = resolve({**arguments.options, **changes})
         found.append(Setting(changes, config, env))
     return found
 

@@ -88,32 +88,38 @@ class TrainConfig(Component):
         )
 
 
-def resolve_all(arguments: Arguments) -> list[tuple[TrainConfig, Environment, str]]:
-    """What `resolve` returns, with `env=all` for each of the five tasks.
+def resolve_all(options: Mapping[str, Any]) -> list[tuple[TrainConfig, Environment, str]]:
+    """Return what `resolve` returns; with `env=all`, for each task.
 
     Raises:
-        ConfigError: as `resolve`, with the task in front where the same options do not fit all five.
+        ConfigError: as `resolve`, with the task in front where the same options do not fit all tasks.
     """
-    if arguments.options.get("env") != "all":
-        return [resolve(arguments)]
-    found = []
+    if options.get("env") != "all":
+        return [resolve(options)]
+    resolved = []
     for task in TASKS:
         try:
-            found.append(resolve(Arguments({**arguments.options, "env": task})))
+            resolved.append(resolve({**options, "env": task}))
         except ConfigError as error:
             raise ConfigError(f"env=all: {task}: {error}") from None
-    return found
+    return resolved
 
 
-def resolve(arguments: Arguments) -> tuple[TrainConfig, Environment, str]:
-    """The complete configuration, the environment and its name, from a command line.
+def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
+    """Return the complete configuration of a training, its environment, and the environment's name.
 
-    Later wins: defaults, the recipe `configs/<env>.yaml` for the preset, the command line.
+    Later wins: defaults, the task's recipe for the preset, the options.
+
+    Args:
+        options: those of `python -m jaxsafe.train` by name, for instance
+            `{"env": "docking3d", "seeds": 10, "ppo.gamma": 0.99, "env.reward.delta_v.scale": -0.02}`.
 
     Raises:
         ConfigError: naming the option, what was found and what is allowed.
     """
-    task, overrides = arguments.pop_text("env"), arguments.pop_overrides()
+    arguments = Arguments(dict(options))
+    task = arguments.pop_text("env")
+    overrides = arguments.pop_overrides()
     if task is None:
         raise ConfigError("env: missing; for instance env=docking3d")
     for name, example in (("agent", "hidden"), ("ppo", "gamma")):
