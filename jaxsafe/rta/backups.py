@@ -35,30 +35,40 @@ Aircraft = Dubins2D | Dubins3D
 
 
 class Brake(BackupController, type="brake"):
-    """Thrust that brings the velocity to 0 at the end of the step, or as near as the bounds allow (dead beat)."""
+    """Thrust that brings the velocity to 0 at the end of the step (dead beat).
+
+    Where the bounds do not allow that, the thrust brings it as near to 0 as they do.
+    """
 
     def control(self, env: Environment, sim: Sim, later: Others) -> Float[Array, " m"]:
-        plant, names = env.agent_platform, env.action_names
+        plant = env.agent_platform
+        names = env.action_names
 
-        def velocity(u: Float[Array, " m"]) -> Array:
-            return plant.step(sim.platforms[env.agent], dict(zip(names, u, strict=True)), env.dt).velocity
+        def velocity_after(u: Float[Array, " m"]) -> Array:
+            controls = dict(zip(names, u, strict=True))
+            return plant.step(sim.platforms[env.agent], controls, env.dt).velocity
 
-        drift, pushed = linear(velocity, jnp.zeros(len(names), env.dt.dtype))
-        return -jnp.sum(pushed * drift[None], axis=-1) / jnp.max(jnp.sum(pushed * pushed, axis=-1))
+        drift, gain = linear(velocity_after, jnp.zeros(len(names), env.dt.dtype))
+        return -jnp.sum(gain * drift[None], axis=-1) / jnp.max(jnp.sum(gain * gain, axis=-1))
 
     def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         if rta.terminal is not None and type(rta.terminal) is not Slow:
-            return {}
+            return {}  # the proof is then that of the other terminal set
         return brake_faults(env, sim, rta)
 
 
 class AlignAndBrake(BackupController, type="align_and_brake"):
-    """Turns the thrust axis along the velocity and brakes, for an oriented spacecraft.
+    """A turn of the thrust axis along the velocity, then braking, for an oriented spacecraft.
 
-    The attitude follows the rate sign(e) √(1.6 α abs(e)) for the error e between ±body axis and velocity, α the bound of
-    the wheel. While abs(e) > `aligned` the thrust is the smallest that keeps the speed limit with twice the `margin`, which
-    holds the boundary while the craft turns; then it nulls the velocity along the body. Where no thrust keeps the limit, it
-    brakes, but not while abs(e) > `steep`: thrust so far across the velocity turns it away as fast as the body follows.
+    Let e be the angle from the nearer end of the body axis to the velocity, and α the bound of the
+    wheel. The attitude follows the rate sign(e) √(1.6 α abs(e)).
+
+    While abs(e) > `aligned` the thrust is the smallest that keeps the speed limit with twice the
+    `margin`. That holds the boundary while the spacecraft turns. Where no thrust keeps the limit,
+    it brakes as well as the bounds allow. Then abs(e) > `steep` is an exception, and the thrust is
+    0: thrust so far across the velocity turns the velocity away as fast as the body follows.
+
+    Once abs(e) is at most `aligned`, the thrust nulls the velocity along the body.
     """
 
     constraint: ConstraintName
@@ -75,9 +85,18 @@ class AlignAndBrake(BackupController, type="align_and_brake"):
         rate = jnp.sign(error) * jnp.minimum(ceiling, _safe_sqrt(1.6 * high[1] * jnp.abs(error)))
         turn = jnp.clip((rate - state.attitude_rate) / env.dt, low[1], high[1])
 
-        margin = 2.0 * self.kept_margin(env)
-        ball = speed_ball(env, sim, jnp.stack([jnp.zeros_like(turn), turn]), self.constraint, margin, free=1)
-        hold, feasible = project_box_ball(jnp.zeros(1, turn.dtype), low[:1], high[:1], *ball)
+        margin = 2.0 * self.least_kept(env)
+        beta, p, k = speed_ball(
+            env,
+            sim,
+            control=jnp.stack([jnp.zeros_like(turn), turn]),
+            name=self.constraint,
+            margin=margin,
+            free=1,
+        )
+        hold, feasible = project_box_ball(
+            u=jnp.zeros(1, turn.dtype), low=low[:1], high=high[:1], beta=beta, p=p, k=k
+        )
         hold = jnp.where(feasible | (jnp.abs(error) <= self.steep), hold[0], 0.0)
         along = jnp.sum(state.velocity * direction(state.attitude))
         brake = -along * plant.mass / env.dt
@@ -85,20 +104,24 @@ class AlignAndBrake(BackupController, type="align_and_brake"):
 
     def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         if rta.terminal is not None and type(rta.terminal) is not AlignedOrSlow:
-            return {}
-        return align_and_brake_faults(env, sim, rta, self)
+            return {}  # the proof is then that of the other terminal set
+        return align_and_brake_faults(env, sim, rta, backup=self)
 
     def duration(self, env: Environment) -> Number:
-        """A reversal of the spin, and the turn out of the angles beyond 75°."""
+        """Return 12 s: a reversal of the spin and the turn out of the angles beyond 75°."""
         return 12.0 + jnp.zeros_like(env.dt)
 
-    def kept_margin(self, env: Environment) -> Number:
+    def least_kept(self, env: Environment) -> Number:
+        """Return `margin`, or more if the speed limit needs more near the chief [m/s]."""
         facts = speed_limit_facts(env, self.constraint)
         return self.margin if facts is None else jnp.maximum(self.margin, facts.least_margin)
 
 
 class Slow(TerminalSet, type="slow"):
-    """Hardly any speed: below a speed limit everywhere, and a brake that can stop within a few steps keeps it so."""
+    """States with hardly any speed.
+
+    They are below a speed limit everywhere. A brake that can stop within a few steps keeps them so.
+    """
 
     speed: Annotated[Number, Unit("m/s"), Positive]
 
@@ -106,62 +129,75 @@ class Slow(TerminalSet, type="slow"):
         return safe_norm(sim.platforms[env.agent].velocity) <= self.speed
 
     def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
-        return slow_faults(env, rta, self, Brake)
+        return slow_faults(env, rta, terminal=self, keeper=Brake)
 
 
 class AlignedOrSlow(TerminalSet, type="aligned_or_slow"):
-    """The thrust axis within `angle` of the velocity, so that braking has authority, or hardly any speed."""
+    """States with the thrust axis within `angle` of the velocity, or with hardly any speed.
+
+    Within the angle braking has authority.
+    """
 
     angle: Annotated[Radians, Positive]
     speed: Annotated[Number, Unit("m/s"), Positive]
 
     def contains(self, env: Environment, sim: Sim) -> Bool[Array, ""]:
         state = sim.platforms[env.agent]
-        return (jnp.abs(misalignment(state)) <= self.angle) | (safe_norm(state.velocity) <= self.speed)
+        return (jnp.abs(misalignment(state)) <= self.angle) | (
+            safe_norm(state.velocity) <= self.speed
+        )
 
     def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
-        return aligned_or_slow_faults(env, sim, rta, self, AlignAndBrake)
+        return aligned_or_slow_faults(env, sim, rta, terminal=self, keeper=AlignAndBrake)
 
 
 class MatchVelocity(BackupController, type="match_velocity"):
-    """Turns one way to the lead's heading and takes its speed; then the relative position stays as it is.
+    """A turn one way to the lead's heading, at the lead's speed.
 
-    In the plane it takes the heading and the speed that the lead will have after the step. In space it banks by
-    tan φ = v ω/g for the turn ω = 0.25 e + ψ̇_lead of the present heading error e, and climbs or dives at the steepest angle
-    while the error is large, abs(e) above 0.45 rad, less so down to 0.15 rad, then flies the lead's angle.
+    Afterwards the relative position stays as it is.
 
-    Rounding moves two aircraft of equal velocity, far from the origin by 0.01 ft a step. So where it is closer than
-    `clearance` it takes the lead's velocity plus w = 0.1 s⁻¹ (`clearance` − ‖r‖) r/‖r‖, to first order.
+    In the plane it takes the heading and the speed that the lead will have after the step. In space
+    it banks by tan φ = v ω/g for the turn ω = 0.25 e + ψ̇_lead, where e is the present heading
+    error. It climbs or dives at the steepest angle while abs(e) is above 0.45 rad, less steeply
+    down to 0.15 rad, and then flies the lead's angle.
+
+    Far from the origin, rounding moves two aircraft of equal velocity by up to 0.01 ft a step. So
+    where the agent is closer than `clearance`, it takes the lead's velocity plus
+    w = 0.1 s⁻¹ (`clearance` − ‖r‖) r/‖r‖, to first order.
     """
 
     lead: PlatformName
     clearance: Annotated[Length, Range(0.0)]
     turn: Literal["left", "right"]
-    climb: Literal["up", "down"] | None = None  # in space
+    climb: Literal["up", "down"] | None = None  # None in the plane
     dead_zone: Annotated[Radians, Range(0.0)] = 0.2
     within_limits: ClassVar[bool] = True
 
     def control(self, env: Environment, sim: Sim, later: Others) -> Float[Array, " m"]:
-        own, lead, ahead = sim.platforms[env.agent], sim.platforms[self.lead], later[self.lead]
+        own = sim.platforms[env.agent]
+        lead = sim.platforms[self.lead]
+        lead_after = later[self.lead]
+        plant = cast(Aircraft, env.agent_platform)
         sign = 1.0 if self.turn == "left" else -1.0
         away = self._away(own.position - lead.position)
-        level = jnp.sum(lead.velocity[:2] ** 2)
+        level_squared = jnp.sum(lead.velocity[:2] ** 2)
         faster = jnp.sum(away * lead.velocity) / lead.speed
-        goal = ahead.heading if self.climb is None else lead.heading
-        goal += (lead.velocity[0] * away[1] - lead.velocity[1] * away[0]) / level
+        goal = lead_after.heading if self.climb is None else lead.heading
+        goal += (lead.velocity[0] * away[1] - lead.velocity[1] * away[0]) / level_squared
         error = sign * wrap(sign * (goal - own.heading), -self.dead_zone, 2.0 * jnp.pi)
-        speed = jnp.clip(ahead.speed + faster, *cast(Aircraft, env.agent_platform).speed_limits)
-        wanted = {"acceleration": (speed - own.speed) / env.dt}
+        speed = jnp.clip(lead_after.speed + faster, plant.speed_limits[0], plant.speed_limits[1])
+        controls = {"acceleration": (speed - own.speed) / env.dt}
         if self.climb is None:
-            wanted["heading_rate"] = error / env.dt
+            controls["heading_rate"] = error / env.dt
         else:
-            steeper = (faster * lead.velocity[2] / lead.speed - away[2]) / jnp.sqrt(level)
-            turning = (ahead.heading - lead.heading) / env.dt
-            wanted |= self._in_space(env, own, error, turning, ahead.flight_path_angle + steeper)
-        return jnp.stack([wanted[name] for name in env.action_names])
+            steeper = (faster * lead.velocity[2] / lead.speed - away[2]) / jnp.sqrt(level_squared)
+            lead_turn = (lead_after.heading - lead.heading) / env.dt
+            angle = lead_after.flight_path_angle + steeper
+            controls |= self._in_space(env, own, error=error, lead_turn=lead_turn, angle=angle)
+        return jnp.stack([controls[name] for name in env.action_names])
 
     def duration(self, env: Environment) -> Number:
-        """A full turn, and in space the roll that begins it."""
+        """Return the time [s] of a full turn and, in space, of the roll that begins it."""
         if self.climb is None:
             return (2.0 * jnp.pi - self.dead_zone) / _authority(env, "heading_rate") + 2.0 * env.dt
         plant = cast(Dubins3D, env.agent_platform)
@@ -171,16 +207,33 @@ class MatchVelocity(BackupController, type="match_velocity"):
 
     def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         if rta.terminal is None:
-            return {"match_velocity keeps no separation by itself: give a horizon and a terminal set": jnp.ones((), bool)}
+            fault = (
+                "match_velocity keeps no separation by itself: give a horizon and a terminal set"
+            )
+            return {fault: jnp.ones((), bool)}
         return {}
 
     def _away(self, apart: Float[Array, " d"]) -> Float[Array, " d"]:
+        """Return w, the velocity away from the lead where the agent is too close."""
         distance = safe_norm(apart)
-        return 0.1 * jnp.maximum(self.clearance - distance, 0.0) * apart / jnp.maximum(distance, 1.0)
+        return (
+            0.1 * jnp.maximum(self.clearance - distance, 0.0) * apart / jnp.maximum(distance, 1.0)
+        )
 
-    def _in_space(self, env: Environment, own: Any, error: Array, turning: Array, angle: Array) -> dict[str, Array]:
+    def _in_space(
+        self, env: Environment, own: Any, error: Array, lead_turn: Array, angle: Array
+    ) -> dict[str, Array]:
+        """Return the controls of roll and climb in space.
+
+        Args:
+            env: the environment.
+            own: the agent's state.
+            error: the heading error e [rad].
+            lead_turn: the lead's heading rate ψ̇_lead [rad/s].
+            angle: the flight path angle to fly once the error is small [rad].
+        """
         plant = cast(Dubins3D, env.agent_platform)
-        bank = arctan(own.speed * (0.25 * error + turning) / plant.gravity)
+        bank = arctan(own.speed * (0.25 * error + lead_turn) / plant.gravity)
         bank = jnp.clip(bank, plant.roll_limits[0], plant.roll_limits[1])
         lowest, highest = plant.flight_path_angle_limits
         steep = lowest if self.climb == "up" else highest  # ż = −v sin γ
@@ -194,9 +247,11 @@ class MatchVelocity(BackupController, type="match_velocity"):
 
 
 class VelocityMatched(TerminalSet, type="velocity_matched"):
-    """Relative speed below `tolerance` and, with `drift` seconds of it, still at least `clearance` apart.
+    """States in which two aircraft have nearly the same velocity and are far enough apart.
 
-    Where turning is a state, `lag` seconds of the relative acceleration count as relative speed.
+    The relative speed is below `tolerance`. After `drift` seconds at that speed the aircraft are
+    still at least `clearance` apart. In space, where the turn follows from the state, `lag` seconds
+    of the relative acceleration count as relative speed.
     """
 
     of: PlatformName
@@ -207,18 +262,23 @@ class VelocityMatched(TerminalSet, type="velocity_matched"):
     lag: Annotated[Number, Unit("s"), Range(0.0)] = 0.0
 
     def contains(self, env: Environment, sim: Sim) -> Bool[Array, ""]:
-        one, other = sim.platforms[self.of], sim.platforms[self.to]
-        accelerating = _acceleration(env, sim, self.of) - _acceleration(env, sim, self.to)
-        relative = safe_norm(one.velocity - other.velocity) + self.lag * safe_norm(accelerating)
-        apart = safe_norm(one.position - other.position)
-        return (relative < self._tolerance(env)) & (apart >= self.clearance + self.drift * relative)
+        of = sim.platforms[self.of]
+        to = sim.platforms[self.to]
+        acceleration = _acceleration(env, sim, self.of) - _acceleration(env, sim, self.to)
+        speed = safe_norm(of.velocity - to.velocity) + self.lag * safe_norm(acceleration)
+        distance = safe_norm(of.position - to.position)
+        return (speed < self._tolerance(env)) & (distance >= self.clearance + self.drift * speed)
 
     def _tolerance(self, env: Environment) -> Number:
-        """`tolerance`, or in space what the proof and the rates of the actuators allow, if that is less."""
+        """Return `tolerance`, or less if in space the proof or the actuators allow only less.
+
+        The bounds are those of Proposition 7 in docs/rta.md.
+        """
         plant = env.agent_platform
         if type(plant) is not Dubins3D:
             return self.tolerance
-        slowest, dt = plant.speed_limits[0], env.dt
+        slowest = plant.speed_limits[0]
+        dt = env.dt
         allowed = [
             0.02 * slowest,
             0.13 * plant.gravity,
@@ -229,19 +289,26 @@ class VelocityMatched(TerminalSet, type="velocity_matched"):
         return functools.reduce(jnp.minimum, allowed, self.tolerance)
 
     def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
-        return velocity_matched_faults(env, sim, rta, self, MatchVelocity)
+        return velocity_matched_faults(env, sim, rta, terminal=self, keeper=MatchVelocity)
 
 
 def _acceleration(env: Environment, sim: Sim, name: str) -> Float[Array, " d"]:
-    """v̇ of a platform, the agent's without control."""
-    platform, state = env.platform(name), sim.platforms[name]
+    """Return the acceleration v̇ of a platform. That of the agent is without control."""
+    platform = env.platform(name)
+    state = sim.platforms[name]
     controls = {} if name == env.agent else undirected(platform, sim)
-    return jax.jvp(lambda state: state.velocity, (state,), (platform.derivative(state, controls),))[1]
+    derivative = platform.derivative(state, controls)
+    return jax.jvp(lambda state: state.velocity, (state,), (derivative,))[1]
 
 
 def misalignment(state: Any) -> Float[Array, ""]:
-    """Angle from the nearer end of the body's axis to the velocity, in [−π/2, π/2); 0 at rest."""
-    course = jnp.arctan2(state.velocity[1], jnp.where(safe_norm(state.velocity) > 0.0, state.velocity[0], 1.0))
+    """Return the angle from the nearer end of the body's axis to the velocity, in [−π/2, π/2).
+
+    It is 0 at rest.
+    """
+    course = jnp.arctan2(
+        state.velocity[1], jnp.where(safe_norm(state.velocity) > 0.0, state.velocity[0], 1.0)
+    )
     return wrap(course - state.attitude, -jnp.pi / 2, jnp.pi)
 
 
@@ -251,8 +318,11 @@ def _safe_sqrt(x: Array) -> Array:
 
 
 def _authority(env: Environment, name: str) -> Any:
-    """The largest value of a control that is there in both directions; 0 without such an actuator."""
-    actuators = {one.name: one for one in env.actuators}
+    """Return the largest value that a control can take in both directions.
+
+    It is 0 without such an actuator.
+    """
+    actuators = {actuator.name: actuator for actuator in env.actuators}
     if name not in actuators:
         return jnp.zeros_like(env.dt)
     return jnp.maximum(jnp.minimum(-actuators[name].low, actuators[name].high), 0.0)
