@@ -1,1 +1,1 @@
-"""Whole episodes of policies and their metrics, and the adversaries that a filter is evaluated against."""
+"""Evaluation: whole episodes of policies and their metrics, and adversaries that try a filter."""
