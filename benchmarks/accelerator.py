@@ -1,21 +1,26 @@
-"""What is a GPU worth to jaxsafe? Everything that one is needed for, measured by one command within ten minutes.
+"""Measure what a GPU is worth to jaxsafe, by one command within ten minutes.
 
-The parts, the most important first. Each is a process of its own with a share of the time; what a part does not use goes to
-those after it, and what it has no time for is named in the results and on standard error.
+Each part is a process of its own with a share of the time. The most important part comes first.
+What a part does not use goes to those after it. What there was no time for is named in the results
+and on standard error.
 
-- `numbers`: tests of numbers on this device. Recorded steps and episodes in double precision, laws of the tasks, run time
-  assurance, and a training that goes on from a checkpoint.
-- `environments`: steps a second of the five tasks and of gymnax's Pendulum-v1, with random actions and automatic reset.
-- `ppo`: samples a second of PPO with the settings of `ppo.py`, beside rejax where it runs and `usual_ppo.py`.
-- `learning`: seconds until ten seeds of each task have 95 % success in training, by the recipe with the most environments.
+- `numbers`: tests of numbers on this device: recorded steps and episodes in double precision, laws
+  of the tasks, run time assurance, and a training that goes on from a checkpoint.
+- `environments`: steps a second of the five tasks and of gymnax's Pendulum-v1, with random actions
+  and automatic reset.
+- `ppo`: samples a second of PPO with the settings of `ppo.py`, beside `usual_ppo.py` and, where it
+  runs, rejax.
+- `learning`: seconds until ten seeds of each task have 95 % success in training, by the recipe with
+  the most environments.
 - `filters`: calls a second of the filters of `make(…, rta=…)`.
 
-Every row also has the seconds that its programs took to compile, beside those of other rows on as many threads as there are
-cores, and the memory that they need. Rows are written to `benchmarks/results/accelerator.json` as they are found, so a run
-that is stopped keeps what it has. On a CPU the sizes are small and say little; they are there so that the script is tested.
+Every row also has the memory that its programs need and the seconds that they took to compile,
+several side by side. Rows are written to `benchmarks/results/accelerator.json` as they are found,
+so a run that is stopped keeps what it has. On a CPU the sizes are small and say little. They are
+there so that the script is tested.
 
-    python benchmarks/accelerator.py [minutes=10] [parts=numbers,environments,…] [tasks=docking3d,…] [sizes=1,1024,…]
-        [seeds=10] [repeats=3] [out=FILE]
+    python benchmarks/accelerator.py [minutes=10] [parts=numbers,environments,…]
+        [tasks=docking3d,…] [sizes=1,1024,…] [seeds=10] [repeats=3] [out=FILE]
 
 `sizes` are the numbers of environments of `environments`.
 """
@@ -71,7 +76,7 @@ FEWER_STEPS_FROM = 2**17
 """With so many environments a quarter of the steps take long enough to be measured."""
 
 COMPILING = 0.75
-"""The share of what is left of a part's time after which programs that are not compiled yet are skipped."""
+"""The share of a part's time that its programs may take to compile; later ones are skipped."""
 
 GRACE = 5.0
 """Seconds beyond its time after which a part is ended."""
@@ -97,7 +102,7 @@ TESTS = (
 """Those of `numbers`, the most telling first."""
 
 WORKERS = 8
-"""Processes that run tests side by side, where pytest-xdist is installed and there are as many cores."""
+"""Processes that run tests side by side, where there are as many cores and pytest-xdist."""
 
 
 class Request(NamedTuple):
@@ -119,7 +124,9 @@ class Job(NamedTuple):
     """One row to be measured."""
 
     row: dict[str, Any]
-    prepare: Callable[[], Any]  # compiles on a thread; the function that is measured, which takes a number to begin from
+    prepare: Callable[
+        [], Any
+    ]  # compiles on a thread; the function that is measured, which takes a number to begin from
     measure: Callable[[Any, Request], dict[str, Any]]  # what a row says beside that
 
 
@@ -135,7 +142,10 @@ def main() -> None:
         out=str(OUT),
         seconds="",
     )
-    chosen, tasks = several("parts", options["parts"], PARTS), several("tasks", options["tasks"], TASKS)
+    chosen, tasks = (
+        several("parts", options["parts"], PARTS),
+        several("tasks", options["tasks"], TASKS),
+    )
     if "probe" in options:
         probe(options, tasks)
         return
@@ -168,13 +178,23 @@ def main() -> None:
         print(f"{table}\n")
 
 
-def rows_of(name: str, options: dict[str, str], seconds: float, environment: dict[str, str]) -> Iterator[dict[str, Any]]:
-    """Run a part in a process of its own, and return its rows as it prints them; a last row says why it ended early."""
+def rows_of(
+    name: str, options: dict[str, str], seconds: float, environment: dict[str, str]
+) -> Iterator[dict[str, Any]]:
+    """Run a part in a process of its own and yield its rows as it prints them.
+
+    Where the part ended early, a last row says why.
+    """
     asked = [f"{key}={options[key]}" for key in ("tasks", "sizes", "seeds", "repeats")]
     command = [sys.executable, __file__, f"probe={name}", f"seconds={seconds}", *asked]
     with tempfile.TemporaryFile("w+") as errors:
         with subprocess.Popen(
-            command, stdout=subprocess.PIPE, stderr=errors, text=True, start_new_session=True, env=environment
+            command,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+            text=True,
+            start_new_session=True,
+            env=environment,
         ) as process:
             overdue = threading.Timer(seconds + GRACE, os.killpg, (process.pid, signal.SIGKILL))
             overdue.start()
@@ -204,22 +224,49 @@ def probe(options: dict[str, str], tasks: Sequence[str]) -> None:
 
 def numbers(request: Request) -> Iterator[dict[str, Any]]:
     """Test by test, whether it passed."""
-    command = [sys.executable, "-m", "pytest", "-v", "--tb=short", "-rN", "-p", "no:cacheprovider", "-p", "no:benchmark"]
-    command += ["-W", "default", *TESTS]  # what other versions of packages warn of is no question of numbers
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-v",
+        "--tb=short",
+        "-rN",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:benchmark",
+    ]
+    command += [
+        "-W",
+        "default",
+        *TESTS,
+    ]  # what other versions of packages warn of is no question of numbers
     workers = min(WORKERS, usable_cores())
     if workers > 2 and importlib.util.find_spec("xdist"):
         command += [f"-n{workers}", f"--maxprocesses={workers}"]
-    environment = {**os.environ, "XLA_PYTHON_CLIENT_PREALLOCATE": "false", "XLA_FLAGS": os.environ.get("XLA_FLAGS", " ")}
+    environment = {
+        **os.environ,
+        "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
+        "XLA_FLAGS": os.environ.get("XLA_FLAGS", " "),
+    }
     counts: dict[str, int] = {}
     with subprocess.Popen(
-        command, cwd=HERE.parent, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        command,
+        cwd=HERE.parent,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
         start_new_session=True,
-    ) as process:  # fmt: skip
+    ) as process:
         overdue = threading.Timer(max(request.left, 0.0), os.killpg, (process.pid, signal.SIGKILL))
         overdue.start()
         for line in process.stdout or ():
             print(line, end="", file=sys.stderr)
-            outcome, name = re.search(r"\b(PASSED|FAILED|ERROR|SKIPPED)\b", line), re.search(r"tests/\S+::\S+", line)
+            outcome, name = (
+                re.search(r"\b(PASSED|FAILED|ERROR|SKIPPED)\b", line),
+                re.search(r"tests/\S+::\S+", line),
+            )
             if outcome and name:
                 counts[outcome.group()] = counts.get(outcome.group(), 0) + 1
                 if outcome.group() in ("FAILED", "ERROR"):
@@ -237,7 +284,9 @@ def environments(request: Request) -> Iterator[dict[str, Any]]:
 
     import jaxsafe
 
-    runs: dict[str, Any] = {task: partial(peers.episode_steps, jaxsafe.make(task)) for task in request.tasks}
+    runs: dict[str, Any] = {
+        task: partial(peers.episode_steps, jaxsafe.make(task)) for task in request.tasks
+    }
     try:
         runs[PEER] = peers.gymnax_steps("Pendulum-v1")
     except ImportError as error:
@@ -249,14 +298,23 @@ def environments(request: Request) -> Iterator[dict[str, Any]]:
 
     def measure(built: Built, request: Request, size: int, steps: int) -> dict[str, Any]:
         seconds = timed(lambda seed: built.program(jax.random.key(seed)), request.repeats)
-        return {"steps_per_s": size * steps / statistics.median(seconds), "s_per_step": statistics.median(seconds) / steps}
+        return {
+            "steps_per_s": size * steps / statistics.median(seconds),
+            "s_per_step": statistics.median(seconds) / steps,
+        }
 
     jobs = []
     for size in sorted(request.sizes, reverse=True):
         steps = STEPS if size < FEWER_STEPS_FROM else STEPS // 4
         for name, run in runs.items():
             row = {"task": name, "environments": size}
-            jobs.append(Job(row, partial(prepare, run, size, steps), partial(measure, size=size, steps=steps)))
+            jobs.append(
+                Job(
+                    row,
+                    partial(prepare, run, size, steps),
+                    partial(measure, size=size, steps=steps),
+                )
+            )
     yield from measured(jobs, request)
 
 
@@ -268,7 +326,9 @@ def ppo(request: Request) -> Iterator[dict[str, Any]]:
     task = "docking2d" if "docking2d" in request.tasks else request.tasks[0]
 
     def ours(seeds: int, num_envs: int) -> Any:
-        fresh, advance, keys, shared = settings.our_programs(task, seeds, settings.UPDATES, num_envs)
+        fresh, advance, keys, shared = settings.our_programs(
+            task, seeds, settings.UPDATES, num_envs
+        )
         like = jax.eval_shape(fresh, shared, keys)
         built = Built(advance.lower(shared, like).compile)
         state = fresh(shared, keys)
@@ -299,7 +359,9 @@ def ppo(request: Request) -> Iterator[dict[str, Any]]:
                 continue
             row = {"peer": peer, "task": task, "seeds": seeds, "environments": num_envs}
             samples = seeds * settings.UPDATES * num_envs * settings.NUM_STEPS
-            jobs.append(Job(row, partial(prepare, seeds, num_envs), partial(measure, samples=samples)))
+            jobs.append(
+                Job(row, partial(prepare, seeds, num_envs), partial(measure, samples=samples))
+            )
     yield from measured(jobs, request)
 
 
@@ -319,7 +381,9 @@ def learning(request: Request) -> Iterator[dict[str, Any]]:
         mapper = SeedMapper(config.seeds, config.shares)
         shared, keys = mapper.replicate((env, config.agent, config.ppo)), mapper.keys(config.seed)
         fresh, advance = programs(mapper, 1, config.num_updates)
-        built = Built(advance.lower(shared, mapper.like(jax.eval_shape(fresh, shared, keys), STATE)).compile)
+        built = Built(
+            advance.lower(shared, mapper.like(jax.eval_shape(fresh, shared, keys), STATE)).compile
+        )
         start = fresh(shared, keys)
         jax.block_until_ready(built.program(shared, start))  # the first call also loads the program
         built.config = config
@@ -333,9 +397,13 @@ def learning(request: Request) -> Iterator[dict[str, Any]]:
             state, curves = built.call(state)
             rates = np.asarray(curves["success_rate"])[: config.seeds, -1]
             updates, mean, seconds = updates + 1, float(rates.mean()), time.monotonic() - begin
-            reached = [at if at is not None or rate < LEVEL else seconds for at, rate in zip(reached, rates, strict=True)]
+            reached = [
+                at if at is not None or rate < LEVEL else seconds
+                for at, rate in zip(reached, rates, strict=True)
+            ]
         return {
-            "environments": config.ppo.num_envs, "reached": mean >= LEVEL, "success": mean, "seconds": seconds,
+            "environments": config.ppo.num_envs, "reached": mean >= LEVEL,
+            "success": mean, "seconds": seconds,
             "each_seed": reached, "steps": updates * config.ppo.batch_size,
             "samples_per_s": config.seeds * updates * config.ppo.batch_size / max(seconds, 1e-9),
         }  # fmt: skip
@@ -343,7 +411,13 @@ def learning(request: Request) -> Iterator[dict[str, Any]]:
     jobs = []
     for task in request.tasks:
         preset = largest(configs() / f"{task}.yaml")
-        jobs.append(Job({"task": task, "preset": preset, "seeds": request.seeds}, partial(prepare, task, preset), measure))
+        jobs.append(
+            Job(
+                {"task": task, "preset": preset, "seeds": request.seeds},
+                partial(prepare, task, preset),
+                measure,
+            )
+        )
     yield from measured(jobs, request)
 
 
@@ -371,14 +445,22 @@ def filters(request: Request) -> Iterator[dict[str, Any]]:
             statistics.median(timed(lambda _, index=index: built.call(index), 5 * request.repeats))
             for index in range(len(batches))
         ]
-        return {"calls_per_s": {str(batch): batch / each for batch, each in zip(batches, seconds, strict=True)}}
+        return {
+            "calls_per_s": {
+                str(batch): batch / each for batch, each in zip(batches, seconds, strict=True)
+            }
+        }
 
     jobs = []
-    named = {task: [name for name in TASKS[task].filters if name != "default"] for task in request.tasks}
+    named = {
+        task: [name for name in TASKS[task].filters if name != "default"] for task in request.tasks
+    }
     for turn in zip_longest(*named.values()):  # the first of each task is its default
         for task, preset in zip(named, turn, strict=True):
             if preset:
-                jobs.append(Job({"task": task, "filter": preset}, partial(prepare, task, preset), measure))
+                jobs.append(
+                    Job({"task": task, "filter": preset}, partial(prepare, task, preset), measure)
+                )
     yield from measured(jobs, request, len(request.tasks))
 
 
@@ -390,7 +472,7 @@ def sizes_here() -> Sizes:
 
 
 class Built:
-    """One or more compiled programs, what compiling took, the memory of the last one, and how to call them."""
+    """Compiled programs, what compiling took, the memory of the last one, and how to call them."""
 
     call: Callable[[Any], Any]
     config: Any = None
@@ -400,7 +482,10 @@ class Built:
         begin, found = time.monotonic(), compile_()
         self.programs = found if isinstance(found, list) else [found]
         self.compile_s = time.monotonic() - begin
-        sizes = [getattr(program.memory_analysis(), "temp_size_in_bytes", None) for program in self.programs]
+        sizes = [
+            getattr(program.memory_analysis(), "temp_size_in_bytes", None)
+            for program in self.programs
+        ]
         self.temporary = sizes[-1]
 
     @property
@@ -414,11 +499,14 @@ class Built:
         return self
 
 
-def measured(jobs: Sequence[Job], request: Request, size: int = sys.maxsize) -> Iterator[dict[str, Any]]:
-    """Compile some jobs side by side, at most two a core, then measure them one after another; then the next ones.
+def measured(
+    jobs: Sequence[Job], request: Request, size: int = sys.maxsize
+) -> Iterator[dict[str, Any]]:
+    """Compile some jobs side by side, at most two a core, then measure them one after another.
 
-    Nothing is measured while something compiles. Where the time is too short for another round like the one before, the
-    rest is skipped.
+    The next jobs follow in the same way, so nothing is measured while something compiles. Where the
+    time is too short for another round like the one before, the rest is skipped. Rows are marked
+    that were measured although some program of their round was still compiling.
     """
     size, longest = min(size, 2 * usable_cores()), 0.0
     for first in range(0, len(jobs), size):
@@ -438,7 +526,9 @@ def measured(jobs: Sequence[Job], request: Request, size: int = sys.maxsize) -> 
             elif request.left <= 0.0:
                 yield {"skipped": f"{named(job)}: out of time"}
             else:
-                yield row_of(job, future.result(), request) | ({"beside_compilation": True} if compiling else {})
+                yield row_of(job, future.result(), request) | (
+                    {"beside_compilation": True} if compiling else {}
+                )
         longest = max(longest, time.monotonic() - begin)
         if compiling:
             yield from ({"skipped": f"{named(job)}: out of time"} for job in jobs[first + size :])
@@ -451,7 +541,12 @@ def row_of(job: Job, built: Built, request: Request) -> dict[str, Any]:
         found = job.measure(built, request)
     except Exception as error:
         return {"skipped": f"{named(job)}: {type(error).__name__}: {str(error)[:300]}"}
-    return {**job.row, **found, "compile_s": round(built.compile_s, 1), "temporary_bytes": built.temporary}
+    return {
+        **job.row,
+        **found,
+        "compile_s": round(built.compile_s, 1),
+        "temporary_bytes": built.temporary,
+    }
 
 
 def named(job: Job) -> str:

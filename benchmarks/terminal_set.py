@@ -9,7 +9,7 @@ may reach under every course within the bound, and the cells are followed until 
 - the steps until the axis is within `angle`, from any angle and spin, and then until it is within `aligned`,
 - the distance up to which the weaker thrust holds the limit at that largest angle, against gravity and the shrinking limit.
 
-`docs/rta.md` has the proof that these are steps of; `jaxsafe/rta/backups.py` keeps the numbers.
+`docs/rta.md` has the proof that these are steps of; `jaxsafe/rta/proofs.py` keeps the numbers.
 
     python benchmarks/terminal_set.py [angle=75] [dt=1] [cells=1440]
 """

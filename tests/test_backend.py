@@ -25,7 +25,8 @@ def as_accelerated(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
 
 def same(one: Any, other: Any) -> bool:
     return jax.tree.structure(one) == jax.tree.structure(other) and all(
-        np.array_equal(a, b) for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+        np.array_equal(a, b)
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
     )
 
 
@@ -44,7 +45,9 @@ def test_a_packed_scan_returns_what_a_scan_returns() -> None:
     assert same(scan_packed(step, start, xs), jax.lax.scan(step, start, xs))
 
 
-def test_a_packed_tree_is_a_vector_on_an_accelerator_alone(as_accelerated: Callable[[Any], None]) -> None:
+def test_a_packed_tree_is_a_vector_on_an_accelerator_alone(
+    as_accelerated: Callable[[Any], None],
+) -> None:
     tree = {"kernel": jnp.ones((2, 3)), "bias": jnp.zeros(3)}
     pack, unpack = packing(tree)
     assert pack(tree) is tree
@@ -61,7 +64,9 @@ def test_an_accelerator_draws_the_same_starts(as_accelerated: Callable[[Any], No
     action = jnp.zeros((autoreset.LARGE, env.action_size))
 
     def following(_: None) -> Any:
-        return jax.lax.scan(lambda s, key: (step_or_reset_batch(env, s, action, key)[0][0], None), state, keys)[0]
+        return jax.lax.scan(
+            lambda s, key: (step_or_reset_batch(env, s, action, key)[0][0], None), state, keys
+        )[0]
 
     keys = jax.random.split(jax.random.key(1), 8)
     expected = jax.jit(following)(None).sim.platforms["deputy"].position
@@ -81,12 +86,15 @@ def test_an_accelerator_learns_the_same(as_accelerated: Callable[[Any], None]) -
     for module in (backend, ppo, shuffle):
         as_accelerated(module)
     found = jax.jit(lambda state: ppo.update(env, agent, hyper, 4, state))(start)
-    for one, other in zip(jax.tree.leaves(found.params), jax.tree.leaves(expected.params), strict=True):
+    for one, other in zip(
+        jax.tree.leaves(found.params), jax.tree.leaves(expected.params), strict=True
+    ):
         np.testing.assert_allclose(one, other, atol=1e-5)
 
 
 @pytest.mark.parametrize(
-    ("plugin", "platforms", "disabled"), [(None, "", True), (object(), "", False), (object(), "cpu", True)]
+    ("plugin", "platforms", "disabled"),
+    [(None, "", True), (object(), "", False), (object(), "cpu", True)],
 )
 def test_llvm_keeps_its_expensive_passes_for_an_accelerator(
     monkeypatch: pytest.MonkeyPatch, plugin: object, platforms: str, disabled: bool

@@ -23,7 +23,7 @@ from jaxsafe.processors.status import Status
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.convert import to_component, to_data
 from jaxsafe.schema.errors import ConfigWarning, show
-from jaxsafe.schema.user_modules import allowed, import_modules, modules
+from jaxsafe.schema.user_modules import import_modules, imports_allowed, modules
 from jaxsafe.schema.yaml12 import parse, write
 from jaxsafe.simulation.cwh import Spacecraft
 from jaxsafe.simulation.scripted import Schedule, Scripted
@@ -714,7 +714,7 @@ def test_a_module_that_cannot_be_imported_is_told_in_one_line(
 
 def test_imports_can_be_refused(tree: dict[str, Any], directory: Path) -> None:
     (directory / "evil_of_test.py").write_text("open('ran', 'w')")
-    with allowed(False):
+    with imports_allowed(False):
         found = fault_in(tree | {"imports": ["evil_of_test"]})
         assert re.search(r"imports: names \['evil_of_test'\], whose code would run; imports=false refuses that$", found)
         load(write(tree | {"imports": []}))

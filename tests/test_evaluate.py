@@ -109,7 +109,7 @@ class Idle:
 def test_recorded_episodes_are_those_that_were_evaluated(
     timeout: float, piece: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(seeds_module, "PIECE", piece)
+    monkeypatch.setattr(seeds_module, "RECORDED_STEPS_PER_CALL", piece)
     ends = {"terminal.timeout.limit": timeout, "terminal.distance.limit": 150.2 if timeout > 30.0 else 40e3}
     env = jaxsafe.make("docking2d", {**ends, "deputy.start.position.distance": [150.0, 150.0]})
     monkeypatch.setattr(episodes_module, "MAX_STEPS", 40)

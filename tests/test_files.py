@@ -13,7 +13,7 @@ from jaxsafe.storage.files import (
     write_json,
     write_text,
 )
-from jaxsafe.storage.forms import COUNT, MAYBE, OTHERS, numbers
+from jaxsafe.storage.forms import COUNT, NUMBER_OR_NULL, OTHERS, numbers
 
 
 def test_a_last_line_cut_short_by_a_kill_is_not_a_row(tmp_path: Path) -> None:
@@ -54,7 +54,7 @@ def test_a_row_of_another_form_is_told_with_its_line_and_place(tmp_path: Path, r
     log = tmp_path / "log.jsonl"
     log.write_text('{"step": 0, "at": [], "more": [1, null]}\n' + json.dumps(row) + "\n")
     with pytest.raises(ConfigError, match=rf"log\.jsonl, line 2: not a row of this log: {found}"):
-        read_rows(log, {"step": COUNT, "at": [{OTHERS: MAYBE}], "more": numbers(2)})
+        read_rows(log, {"step": COUNT, "at": [{OTHERS: NUMBER_OR_NULL}], "more": numbers(2)})
 
 
 @pytest.mark.parametrize(

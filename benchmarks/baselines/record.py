@@ -11,7 +11,7 @@ from baselines.plan import Item
 from baselines.run import FILM_FILE, answers, options_of
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import finite, read_csv, read_json, write_bytes, write_csv, write_json
-from jaxsafe.storage.forms import MAYBE, NULL, OTHERS, TEXT, check
+from jaxsafe.storage.forms import NULL, NUMBER_OR_NULL, OTHERS, TEXT, check
 from jaxsafe.train.host.log import NEEDS, check_order, read_progress
 from jaxsafe.train.host.results import check_results, read_results
 from jaxsafe.train.host.run_directory import read_content
@@ -90,7 +90,7 @@ def _record(item: Item, found: dict[str, Any], path: Path) -> Record:
     for name, results in found["evaluations"].items():
         check_results(results, f"{path}: evaluations.{name}", training=False)
     table = path.with_suffix(".csv")
-    curves = read_csv(table, {**dict.fromkeys(CURVES, MAYBE), **NEEDS})
+    curves = read_csv(table, {**dict.fromkeys(CURVES, NUMBER_OR_NULL), **NEEDS})
     check_order(curves, table)
     if not curves:
         raise ConfigError(f"{table}: expected a row for every update, found none")

@@ -57,7 +57,7 @@ def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tu
         for word in argv:
             (flags if word.partition("=")[0] == "imports" else words).append(word)
         allowed = Arguments.parse(flags).pop_flag("imports") is not False
-        with user_modules.allowed(allowed), _warnings_in_one_line():
+        with user_modules.imports_allowed(allowed), _warnings_in_one_line():
             return main(words) or 0, True
     except ConfigError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)

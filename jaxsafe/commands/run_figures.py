@@ -14,7 +14,17 @@ from jaxsafe.plot.interventions import interventions, most_altered
 from jaxsafe.plot.style import kept_out, length_unit, save
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import read_rows
-from jaxsafe.storage.forms import ANYTHING, COUNT, FLAG, MAYBE, NUMBER, OTHERS, TEXT, check, numbers
+from jaxsafe.storage.forms import (
+    ANYTHING,
+    COUNT,
+    FLAG,
+    NUMBER,
+    NUMBER_OR_NULL,
+    OTHERS,
+    TEXT,
+    check,
+    numbers,
+)
 from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.log import filter_name, headline, read_progress
 
@@ -111,7 +121,7 @@ def _row_form(env: Environment, names: Sequence[str], rows: Rows) -> dict[str, A
         "final": FLAG,
         "episode": COUNT,
         "platforms": {
-            name: place | ({"heading": MAYBE} if headed and name == names[0] else {})
+            name: place | ({"heading": NUMBER_OR_NULL} if headed and name == names[0] else {})
             for name in names
         },
         "status": {},
@@ -121,17 +131,17 @@ def _row_form(env: Environment, names: Sequence[str], rows: Rows) -> dict[str, A
     if any(
         isinstance(row.get("status"), Mapping) and shown <= row["status"].keys() for row in rows
     ):
-        form["status"] = dict.fromkeys(sorted(shown), MAYBE)
+        form["status"] = dict.fromkeys(sorted(shown), NUMBER_OR_NULL)
     if "regions" in known:
         form["regions"] = {OTHERS: place}
     if "rta" in known:
-        actuators = dict.fromkeys(env.action_names, MAYBE)
+        actuators = dict.fromkeys(env.action_names, NUMBER_OR_NULL)
         form |= {
             "t": NUMBER,
             "control_desired": actuators,
             "control_actual": actuators,
-            "margins": {constraint.name: MAYBE for constraint in env.constraints},
-            "rta": {"intervening": FLAG, "predicted_margin": MAYBE},
+            "margins": {constraint.name: NUMBER_OR_NULL for constraint in env.constraints},
+            "rta": {"intervening": FLAG, "predicted_margin": NUMBER_OR_NULL},
             "outcome": TEXT,
         }
     return form

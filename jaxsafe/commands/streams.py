@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from jaxsafe.schema.errors import ALLOWED, CONTROLS
+from jaxsafe.schema.errors import CONTROL_ESCAPES, TEXT_CONTROLS
 
 
 class LastingStream:
@@ -22,7 +22,9 @@ class LastingStream:
     def __init__(self, stream: Any, allowed: str = "") -> None:
         """Wrap a stream, to which these control characters may be written too."""
         self._stream = stream
-        self._controls = CONTROLS | ALLOWED | {ord(letter): letter for letter in allowed}
+        self._controls = (
+            CONTROL_ESCAPES | TEXT_CONTROLS | {ord(letter): letter for letter in allowed}
+        )
         self.error: OSError | None = None
 
     def write(self, text: str) -> int:

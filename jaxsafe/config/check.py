@@ -17,7 +17,7 @@ from jaxsafe.processors.observation import Observe, ObserveAngle
 from jaxsafe.schema.component import ANY, Component, choices, fields
 from jaxsafe.schema.convert import expects, to_value
 from jaxsafe.schema.dotted_paths import join, references, set_path
-from jaxsafe.schema.errors import ConfigError, nearest, show, told
+from jaxsafe.schema.errors import ConfigError, nearest, show, summarise_error
 from jaxsafe.schema.user_modules import modules
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.platform import Platform
@@ -98,7 +98,7 @@ def _problems(component: Component, place: str) -> Iterator[tuple[str, str]]:
             raise
         except Exception as error:
             raise ConfigError(
-                f"{place}: cannot be checked: {told(error, modules(component))}"
+                f"{place}: cannot be checked: {summarise_error(error, modules(component))}"
             ) from error
     if problem:
         yield place, problem
@@ -262,7 +262,7 @@ def _check_kinds(env: Environment) -> None:
 
     try:
         found = jax.eval_shape(statuses, env)
-    except Exception:  # told with its place when all is traced
+    except Exception:  # reported with its place when all is traced
         return
     for section in _SECTIONS:
         for part in getattr(env, section):
@@ -278,7 +278,7 @@ def _check_kinds(env: Environment) -> None:
 
 
 def _check_tracing(env: Environment) -> None:
-    """Trace one reset and one step, so that what does not fit together is told here, with its place."""
+    """Trace one reset and one step, so that what does not fit together is reported here, with its place."""
 
     def episode(env: Environment) -> Any:
         start, first = reset(env, jax.random.key(0))
@@ -294,7 +294,9 @@ def _check_tracing(env: Environment) -> None:
         place = next(
             (note.removeprefix("in ") for note in notes if note.startswith("in ")), "environment"
         )
-        raise ConfigError(f"{place}: cannot be computed: {told(error, modules(env))}") from error
+        raise ConfigError(
+            f"{place}: cannot be computed: {summarise_error(error, modules(env))}"
+        ) from error
     memory, later = vars(begin[0].memory), vars(after[0].memory)
     for section in ("status", "reward", "observation"):
         for name, first in memory[section].items():

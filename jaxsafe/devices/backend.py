@@ -1,4 +1,4 @@
-"""Which kind of device programs are compiled for, where what is fast on one kind is slow on the other."""
+"""What programs do otherwise on an accelerator, where fewer kernels are faster."""
 
 from __future__ import annotations
 
@@ -13,17 +13,20 @@ from jax.flatten_util import ravel_pytree
 def accelerated() -> bool:
     """Return whether this process computes on a GPU or another accelerator.
 
-    A CPU runs a loop at little cost and gains from what it skips. An accelerator spends some microseconds on every kernel
-    and waits for the host wherever a program branches. So it gains from few kernels, even if they compute more.
+    A CPU runs a loop at little cost and gains from what it skips. An accelerator spends a
+    microsecond or more on every kernel and waits for the host wherever a program branches. So it
+    gains from few kernels, even if they compute more.
     """
     return jax.default_backend() != "cpu"
 
 
-def scan_packed(function: Callable[[Any, Any], tuple[Any, Any]], start: Any, xs: Any) -> tuple[Any, Any]:
+def scan_packed(
+    function: Callable[[Any, Any], tuple[Any, Any]], start: Any, xs: Any
+) -> tuple[Any, Any]:
     """Return what `jax.lax.scan` returns, whose outputs are written by fewer kernels.
 
-    A kernel for each array writes what a step returns into the stack. So arrays of the same shape and type are stacked
-    together.
+    A kernel for each array writes what a step returns into the stack. So arrays of the same shape
+    and type are stacked together.
     """
     shapes = jax.eval_shape(lambda: function(start, jax.tree.map(lambda x: x[0], xs))[1])
     leaves, structure = jax.tree.flatten(shapes)
@@ -38,15 +41,18 @@ def scan_packed(function: Callable[[Any, Any], tuple[Any, Any]], start: Any, xs:
 
     end, stacks = jax.lax.scan(packed, start, xs)
     found = {
-        index: stack[:, i] for group, stack in zip(groups.values(), stacks, strict=True) for i, index in enumerate(group)
+        index: stack[:, i]
+        for group, stack in zip(groups.values(), stacks, strict=True)
+        for i, index in enumerate(group)
     }
     return end, jax.tree.unflatten(structure, [found[index] for index in range(len(leaves))])
 
 
 def packing(tree: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """Return a function that makes one vector of a tree shaped like this one, and its inverse. On a CPU both do nothing.
+    """Return a function that makes one vector of a tree shaped like this one, and its inverse.
 
-    An operation on all parameters is one kernel for the vector, and a kernel for each array of the tree.
+    An operation on all parameters is one kernel for the vector, and a kernel for each array of the
+    tree. On a CPU both functions do nothing.
     """
     if not accelerated():
         return (lambda tree: tree), (lambda tree: tree)

@@ -1,4 +1,4 @@
-"""Whole episodes of policies and their metrics, and the adversaries that a filter is evaluated against.
+"""Evaluation: whole episodes of policies and their metrics, and adversaries that try a filter.
 
 `jaxsafe.evaluate(env, policy, key, num_episodes)` returns the metrics of a policy, see
 `jaxsafe.evaluate.evaluate.evaluate`.

@@ -1,4 +1,7 @@
-"""Policies that try to leave the safe set: they see the whole state and command extreme controls."""
+"""Policies that try to leave the safe set.
+
+They see the whole state and command extreme controls.
+"""
 
 from __future__ import annotations
 
@@ -20,23 +23,25 @@ if TYPE_CHECKING:
     from jaxsafe.environment import Environment
 
 Adversary = Callable[[Any, Sim, Key], Float[Array, " m"]]
-"""`adversary(env, sim, key)`: a control in physical units."""
+"""A function `adversary(env, sim, key)` that returns a control in physical units."""
 
 
 def uniform(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Any control."""
+    """Return a control that is uniform between its bounds."""
     low, high = bounds(env)
     return low + (high - low) * jax.random.uniform(key, low.shape)
 
 
 def bang_bang(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Every actuator at one of its bounds."""
-    low, high = bounds(env)
-    return jnp.where(jax.random.bernoulli(key, shape=low.shape), low, high)
+    """Return a control with every actuator at one of its bounds, at random."""
+    return _random_bounds(env, key)
 
 
 def greedy(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """The control that lowers the smallest h after the step most steeply; a random one where it has no influence."""
+    """Return the control that lowers the smallest h after the step most steeply.
+
+    Where the control has no influence it is random.
+    """
 
     def h(u: Float[Array, " m"]) -> Float[Array, ""]:
         return smallest_margin(env, advance(env, sim, u))
@@ -45,30 +50,34 @@ def greedy(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
 
 
 def inward(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Towards the other platform: pursuit, ramming from behind."""
+    """Return a control towards the other platform: pursuit, ramming from behind."""
     return _towards(env, sim, _to_target(env, sim), key)
 
 
 def outward(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Away from the other platform."""
+    """Return a control away from the other platform."""
     return _towards(env, sim, -_to_target(env, sim), key)
 
 
 def sideways(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Across the velocity, which bends the path without changing the speed at first."""
+    """Return a control across the velocity. It bends the path, and at first the speed stays."""
     velocity = sim.platforms[env.agent].velocity
     across = jnp.stack([-velocity[1], velocity[0], *jnp.zeros(velocity.size - 2)])
     return _towards(env, sim, across, key)
 
 
 def accelerate(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Along the velocity."""
+    """Return a control along the velocity."""
     return _towards(env, sim, sim.platforms[env.agent].velocity, key)
 
 
 def intercept(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Towards the point at which the other platform can be met at the present speed."""
-    own, other = sim.platforms[env.agent], _target(env, sim)
+    """Return a control towards the point where the agent can meet the other platform.
+
+    The agent is taken to keep its speed, and the other platform its velocity.
+    """
+    own = sim.platforms[env.agent]
+    other = _target(env, sim)
     ahead = other.position - own.position
     speed = jnp.maximum(safe_norm(own.velocity), 1e-3)
     time = safe_norm(ahead) / speed
@@ -78,8 +87,12 @@ def intercept(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
 
 
 def head_on(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Gets 2 500 ft or m ahead of the other platform first, then turns on it."""
-    own, other = sim.platforms[env.agent], _target(env, sim)
+    """Return a control that leads 2500 ft or m ahead of the other platform and then back onto it.
+
+    The agent turns back once it is 1500 ft or m ahead.
+    """
+    own = sim.platforms[env.agent]
+    other = _target(env, sim)
     course = other.velocity / jnp.maximum(safe_norm(other.velocity), 1e-3)
     ahead = jnp.sum((own.position - other.position) * course)
     aim = jnp.where(ahead > 1500.0, 0.0, 2500.0) * course + other.position
@@ -87,19 +100,25 @@ def head_on(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
 
 
 def there_and_back(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Away from the other platform for three quarters of the longest episode, or half of the way allowed, then back."""
+    """Return a control that leads away from the other platform and then back.
+
+    The agent turns back after three quarters of the longest episode, or at half of the largest
+    distance that is allowed.
+    """
     way = _to_target(env, sim)
     end = time_limit(env)
     back = jnp.zeros((), bool) if end is None else sim.time > 0.75 * end
-    for limit in [one.limit for one in env.terminal if isinstance(one, TooFar)]:
-        back = back | (safe_norm(way) > 0.5 * limit)
+    for condition in env.terminal:
+        if isinstance(condition, TooFar):
+            back = back | (safe_norm(way) > 0.5 * condition.limit)
     return _towards(env, sim, jnp.where(back, way, -way), key)
 
 
 def drain(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Of the controls at the bounds and in the middle, the one that a filter certifies with the least h on the way.
+    """Return the control that a filter certifies with the least h on the way.
 
-    Without a filter that certifies, the one of the least h after the step.
+    Controls with every actuator at a bound or in the middle are compared. Without a filter that
+    certifies, it is the control with the least h after the step.
     """
     low, high = bounds(env)
     shares = jnp.array(list(itertools.product((0.0, 0.5, 1.0), repeat=low.shape[0])))
@@ -117,8 +136,8 @@ def drain(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
 
 
 ADVERSARIES: dict[str, Adversary] = {
-    each.__name__: each
-    for each in (
+    adversary.__name__: adversary
+    for adversary in (
         uniform,
         bang_bang,
         greedy,
@@ -132,11 +151,17 @@ ADVERSARIES: dict[str, Adversary] = {
         drain,
     )
 }
-"""By name."""
+"""All adversaries by name."""
+
+
+def _random_bounds(env: Environment, key: Key) -> Float[Array, " m"]:
+    low, high = bounds(env)
+    return jnp.where(jax.random.bernoulli(key, shape=low.shape), low, high)
 
 
 def _target(env: Environment, sim: Sim) -> Any:
-    return sim.platforms[next(platform.name for platform in env.platforms if platform.name != env.agent)]
+    others = [platform.name for platform in env.platforms if platform.name != env.agent]
+    return sim.platforms[others[0]]
 
 
 def _to_target(env: Environment, sim: Sim) -> Float[Array, " d"]:
@@ -144,7 +169,7 @@ def _to_target(env: Environment, sim: Sim) -> Float[Array, " d"]:
 
 
 def _towards(env: Environment, sim: Sim, aim: Float[Array, " d"], key: Key) -> Float[Array, " m"]:
-    """The control that turns the velocity over the next steps most towards a direction."""
+    """Return the control that turns the velocity of the next steps most towards a direction."""
     aim = aim / jnp.maximum(safe_norm(aim), 1e-6)
 
     def along(u: Float[Array, " m"]) -> Float[Array, ""]:
@@ -154,8 +179,14 @@ def _towards(env: Environment, sim: Sim, aim: Float[Array, " d"], key: Key) -> F
     return _steer(env, along, 1.0, key)
 
 
-def _steer(env: Environment, value: Callable[[Array], Array], sign: float, key: Key) -> Float[Array, " m"]:
-    """Every actuator at the bound that its derivative favours; where there is none, at random."""
+def _steer(
+    env: Environment, value: Callable[[Array], Array], sign: float, key: Key
+) -> Float[Array, " m"]:
+    """Return a control with every actuator at the bound that increases `sign` · `value`.
+
+    Where an actuator has no influence its bound is random.
+    """
     low, high = bounds(env)
     slope = sign * jax.grad(value)((low + high) / 2.0)
-    return jnp.where(slope == 0.0, bang_bang(env, None, key), jnp.where(slope > 0.0, high, low))  # type: ignore[arg-type]
+    favoured = jnp.where(slope > 0.0, high, low)
+    return jnp.where(slope == 0.0, _random_bounds(env, key), favoured)

@@ -1,4 +1,4 @@
-"""Evaluating the policies of all seeds of a run at once, from the same starts, into rows and metrics."""
+"""Evaluation of the policies of all seeds of a run at once, from the same starts."""
 
 from __future__ import annotations
 
@@ -17,119 +17,169 @@ from jaxsafe.metrics import METRICS, Episode, measures, summarise
 from jaxsafe.rollout import Policy
 from jaxsafe.types import Key, State, TimeStep
 
-BATCH = 100
-"""Episodes that run side by side; the noise of a batch is drawn together, so this number is part of the results."""
+EPISODES_PER_BATCH = 100
+"""Number of episodes that run side by side.
 
-RECORDED = 10
-"""Episodes recorded at a time, at least: one compiled program serves the evaluations during and after training."""
+The noise of a batch is drawn together, so this number is part of the results.
+"""
 
-PIECE = 256
-"""Steps recorded at a time: what a recording holds follows from how long its episodes are, not from any limit."""
+MIN_RECORDED_EPISODES = 10
+"""Least number of episodes that are recorded at a time.
+
+So one compiled program serves the evaluations during and after training.
+"""
+
+RECORDED_STEPS_PER_CALL = 256
+"""Number of steps that are recorded at a time.
+
+So the size of a recording follows from the length of its episodes, not from any limit.
+"""
 
 MAX_RECORDED_STEPS = 25_000
-"""A recording ends here, if its episode has not ended before: beyond it, logs and figures would take GiB.
+"""Length of a recording at which it ends, even if its episode has not ended.
 
-Every task at a tenth of its time step is still recorded whole."""
+Longer logs and figures would take GiB. Every task at a tenth of its time step is still recorded
+whole.
+"""
 
 EVALUATION_SEED = 0
-"""The seed of the evaluations during and after training; `python -m jaxsafe.evaluate seed=…` chooses others."""
+"""Seed of the evaluations during and after training.
+
+`python -m jaxsafe.evaluate seed=…` chooses others.
+"""
 
 KINDS = ("stochastic", "deterministic")
+"""Kinds of evaluation: a policy draws its actions, or takes the mode of their distribution."""
 
 
 class Recorder(NamedTuple):
     """Two compiled functions that record some episodes of one policy."""
 
-    begin: Callable[..., Any]  # of a key: the position and the starts
-    go_on: Callable[..., Any]  # of parameters, key, `deterministic` and a position: the next, and `PIECE` steps
+    begin: Callable[..., Any]  # takes a key, returns the position and the starts
+    # takes parameters, key, `deterministic` and position; returns the next position and the steps
+    go_on: Callable[..., Any]
 
 
 class Acting(Protocol):
-    """What evaluation asks of an agent."""
+    """An agent, as far as an evaluation uses it."""
 
     def policy(self, env: Environment, params: Any, deterministic: Any) -> Policy:
-        """As `Agent.policy`."""
+        """Return a policy, as `Agent.policy` does."""
         ...
 
 
 class Evaluator:
-    """Compiled once; runs whole batches of episodes for every seed."""
+    """Runs whole batches of episodes for every seed, with programs that are compiled once."""
 
     def __init__(self, mapper: SeedMapper, env: Environment, agent: Acting) -> None:
-        """Evaluate in `env`."""
-        self.mapper, self.env, self.agent = mapper, env, agent
+        """Prepare to evaluate policies of `agent` in `env`, the seeds being mapped by `mapper`."""
+        self.mapper = mapper
+        self.env = env
+        self.agent = agent
         self._shared = mapper.replicate((env, agent))
         self._run = mapper.map(self._one_seed)
         self._recorders: dict[int, Recorder] = {}
 
     def prepare(self, params: Params) -> None:
-        """Compile while other work goes on; `params` are those of `run`, or as `SeedMapper.like` describes them.
+        """Compile the programs while other work goes on. A second call does nothing.
 
-        The second call does nothing.
+        Args:
+            params: the parameters that `run` takes, or what `SeedMapper.like` says of them.
         """
         if isinstance(self._run, Ahead):
             return
-        key, deterministic = jax.random.key(0), np.asarray(True)
+        key = jax.random.key(0)
+        deterministic = np.asarray(True)
         self._run = Ahead(self._run, self._arguments(key, deterministic), params)
-        one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), params)
-        begin, go_on = self._recorder(RECORDED)
+        params_of_seed = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), params)
+        begin, go_on = self._recorder(MIN_RECORDED_EPISODES)
         position, _ = jax.eval_shape(begin, key)
-        self._recorders[RECORDED] = Recorder(Ahead(begin, key), Ahead(go_on, one, key, deterministic, position))
+        self._recorders[MIN_RECORDED_EPISODES] = Recorder(
+            begin=Ahead(begin, key),
+            go_on=Ahead(go_on, params_of_seed, key, deterministic, position),
+        )
 
     def run(self, params: Params, num_episodes: int, seed: int, deterministic: bool) -> Episode:
-        """Episodes of every seed's policy: each field [seeds, num_episodes], on the host."""
+        """Run episodes of every seed's policy.
 
-        def batch(key: Key) -> Episode:
-            return self.mapper.gather(self._run(self._arguments(key, np.asarray(deterministic)), params))
+        Args:
+            params: the parameters of every seed's policy, each array with an axis of seeds in
+                front.
+            num_episodes: the number of episodes for each seed.
+            seed: the seed of the evaluation.
+            deterministic: whether the policies take the mode of their actions.
 
-        return in_batches(batch, num_episodes, seed)
+        Returns:
+            Sums over each episode on the host. Every field has the shape [seeds, num_episodes].
+        """
+
+        def run_batch(key: Key) -> Episode:
+            arguments = self._arguments(key, np.asarray(deterministic))
+            return self.mapper.gather(self._run(arguments, params))
+
+        return in_batches(run_batch, num_episodes, seed)
 
     def record(
         self, params: Params, num_episodes: int, seed: int, deterministic: bool = True
     ) -> Iterator[Iterator[dict[str, Any]]]:
-        """Every step of the first episodes that `run` runs with one seed's parameters, as rows for a log."""
+        """Yield the first episodes that `run` runs, each as rows for a log, one per step.
+
+        Args:
+            params: the parameters of one seed's policy.
+            num_episodes: the number of episodes.
+            seed: the seed of the evaluation.
+            deterministic: whether the policy takes the mode of its actions.
+        """
         for state, timestep in self.episodes(params, num_episodes, seed, deterministic):
             yield (_step_row(self.env, state, timestep, t) for t in range(len(timestep.reward)))
 
     def episodes(
         self, params: Params, num_episodes: int, seed: int, deterministic: bool = True
     ) -> Iterator[tuple[State, TimeStep]]:
-        """States and time steps, [steps + 1], of each of the episodes that `record` describes.
+        """Yield states and time steps, each [steps + 1], of the episodes that `record` describes.
 
-        At most `MAX_RECORDED_STEPS` steps of each.
+        At most `MAX_RECORDED_STEPS` steps of each episode are yielded.
         """
-        for batch, key in enumerate(batch_keys(seed, -(-num_episodes // BATCH))):
-            yield from self._episodes(params, key, np.asarray(deterministic), min(BATCH, num_episodes - batch * BATCH))
+        num_batches = -(-num_episodes // EPISODES_PER_BATCH)
+        for batch, key in enumerate(batch_keys(seed, num_batches)):
+            count = min(EPISODES_PER_BATCH, num_episodes - batch * EPISODES_PER_BATCH)
+            yield from self._episodes(params, key, np.asarray(deterministic), count)
 
-    def _episodes(self, params: Params, key: Key, deterministic: Any, count: int) -> Iterator[tuple[State, TimeStep]]:
-        """The first `count` episodes of a batch; of each only what it lasts is kept."""
-        begin, go_on = self._recorder(max(count, RECORDED))
+    def _episodes(
+        self, params: Params, key: Key, deterministic: Any, count: int
+    ) -> Iterator[tuple[State, TimeStep]]:
+        """Yield the first `count` episodes of a batch, each up to its end."""
+        begin, go_on = self._recorder(max(count, MIN_RECORDED_EPISODES))
         position, first = begin(key)
-        pieces = [[jax.tree.map(lambda x, i=i: np.asarray(x)[i : i + 1], first)] for i in range(count)]
-        left = [*range(count)]
+        pieces = [
+            [jax.tree.map(lambda x, i=i: np.asarray(x)[i : i + 1], first)] for i in range(count)
+        ]
+        running = [*range(count)]
         limit = min(max_steps(self.env), MAX_RECORDED_STEPS)
-        for before in range(0, limit, PIECE):
+        for before in range(0, limit, RECORDED_STEPS_PER_CALL):
             position, recorded = go_on(params, key, deterministic, position)
             recorded = jax.tree.map(np.asarray, recorded)
-            ended = {i: np.flatnonzero(recorded[1].done[:, i]) for i in left}
-            for i in left:
-                size = min(ended[i][0] + 1 if ended[i].size else PIECE, limit - before)
+            ends = {i: np.flatnonzero(recorded[1].done[:, i]) for i in running}
+            for i in running:
+                size = ends[i][0] + 1 if ends[i].size else RECORDED_STEPS_PER_CALL
+                size = min(size, limit - before)
                 pieces[i].append(jax.tree.map(lambda x, i=i, n=size: x[:n, i].copy(), recorded))
-            left = [i for i in left if not ended[i].size]
-            if not left:
+            running = [i for i in running if not ends[i].size]
+            if not running:
                 break
-        for parts in pieces:
-            yield jax.tree.map(lambda *x: np.concatenate(x), *parts)
+        for episode in pieces:
+            yield jax.tree.map(lambda *x: np.concatenate(x), *episode)
 
     def _one_seed(self, shared: tuple, params: Params) -> Episode:
         env, agent, key, deterministic = shared
-        return run_episodes(env, agent.policy(env, params, deterministic), key, BATCH)
+        policy = agent.policy(env, params, deterministic)
+        return run_episodes(env, policy, key, EPISODES_PER_BATCH)
 
     def _arguments(self, key: Key, deterministic: Any) -> tuple:
         return *self._shared, *self.mapper.replicate((key, deterministic))
 
     def _recorder(self, num_episodes: int) -> Recorder:
-        """Compiled once for each number of episodes."""
+        """Return the recorder of a number of episodes. It is compiled once."""
         if num_episodes not in self._recorders:
 
             def begin(key: Key) -> Any:
@@ -137,26 +187,54 @@ class Evaluator:
 
             def go_on(params: Params, key: Key, deterministic: Any, position: Any) -> Any:
                 policy = self.agent.policy(self.env, params, deterministic)
-                return record_steps(self.env, policy, key, position, PIECE)
+                return record_steps(
+                    self.env,
+                    policy=policy,
+                    key=key,
+                    position=position,
+                    num_steps=RECORDED_STEPS_PER_CALL,
+                )
 
-            self._recorders[num_episodes] = Recorder(jax.jit(begin), jax.jit(go_on))
+            self._recorders[num_episodes] = Recorder(begin=jax.jit(begin), go_on=jax.jit(go_on))
         return self._recorders[num_episodes]
 
 
 def in_batches(run: Callable[[Key], Episode], num_episodes: int, seed: int) -> Episode:
-    """Join the episodes of as many batches as that takes: each field [seeds, num_episodes]."""
-    batches = [run(key) for key in batch_keys(seed, -(-num_episodes // BATCH))]
+    """Run as many batches as needed and join their episodes.
+
+    Args:
+        run: runs a batch with a key. Each field of its result is [seeds, EPISODES_PER_BATCH].
+        num_episodes: the number of episodes.
+        seed: the seed of the evaluation.
+
+    Returns:
+        The first episodes of these batches. Each field is [seeds, num_episodes].
+    """
+    num_batches = -(-num_episodes // EPISODES_PER_BATCH)
+    batches = [run(key) for key in batch_keys(seed, num_batches)]
     return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :num_episodes], *batches)
 
 
 def batch_keys(seed: int, batches: int) -> Iterator[Key]:
-    """The evaluation keys: they depend on the evaluation seed only, never on the training seed."""
+    """Return a key for each batch.
+
+    The keys depend on the seed of the evaluation only and never on the seed of a training.
+    """
     base = jax.random.key(seed)
     return (jax.random.fold_in(base, index) for index in range(batches))
 
 
-def episode_rows(env: Environment, episodes: Episode, first_seed: int, **common: Any) -> list[dict[str, Any]]:
-    """A row for each episode of each seed, for `eval.jsonl`."""
+def episode_rows(
+    env: Environment, episodes: Episode, first_seed: int, **common: Any
+) -> list[dict[str, Any]]:
+    """Return a row for each episode of each seed, for `eval.jsonl`.
+
+    Args:
+        env: the environment.
+        episodes: sums over the episodes, each field [seeds, episodes].
+        first_seed: the training seed of the first policy.
+        **common: entries that all rows have.
+    """
     success = env.success
     measured = measures(env)
     needs = {
@@ -178,7 +256,9 @@ def episode_rows(env: Environment, episodes: Episode, first_seed: int, **common:
             "outcome": env.outcomes[outcomes[seed, index]],
             "success": bool(outcomes[seed, index] == success),
             **{
-                name.removeprefix("episode_"): None if name in unmeasured else _short(column[seed][index])
+                name.removeprefix("episode_"): None
+                if name in unmeasured
+                else _short(column[seed][index])
                 for name, column in columns.items()
             },
         }
@@ -188,36 +268,44 @@ def episode_rows(env: Environment, episodes: Episode, first_seed: int, **common:
 
 
 def given_up(env: Environment, kinds: Mapping[str, Episode]) -> dict[str, Any]:
-    """Return how many episodes of each kind had not ended when they were given up, and after how many steps.
+    """Return how many episodes of each kind were given up, and after how many steps.
 
-    They count as failures. Empty if all have ended.
+    Episodes that are given up count as failures. The result is empty if all have ended.
     """
-    counts = {kind: int(np.sum(np.asarray(episodes.outcome) == 0)) for kind, episodes in kinds.items()}
+    counts = {
+        kind: int(np.sum(np.asarray(episodes.outcome) == 0)) for kind, episodes in kinds.items()
+    }
     return {"given_up": {"after_steps": max_steps(env), **counts}} if any(counts.values()) else {}
 
 
 def metrics_per_seed(env: Environment, episodes: Episode) -> dict[str, list[float | None]]:
-    """Every metric of Section 5 for each seed, from sums [seeds, episodes]."""
+    """Return every metric of Section 5 for each seed, from sums of shape [seeds, episodes]."""
     measured = measures(env)
-    seeds = range(np.asarray(episodes.outcome).shape[0])
-    each = [summarise(jax.tree.map(lambda x, i=i: x[i], episodes), env.success, **measured) for i in seeds]
-    return {name: [one[name] for one in each] for name in METRICS}
+    num_seeds = np.asarray(episodes.outcome).shape[0]
+    of_seeds = [jax.tree.map(lambda x, i=i: x[i], episodes) for i in range(num_seeds)]
+    metrics = [summarise(of_seed, env.success, **measured) for of_seed in of_seeds]
+    return {name: [of_seed[name] for of_seed in metrics] for name in METRICS}
 
 
 def _step_row(env: Environment, state: Any, timestep: Any, t: int) -> dict[str, Any]:
+    """Return step t of an episode as a row for a log."""
     info = timestep.info
-    assurance = {} if info.rta is None else {"intervening": info.intervening, **vars(info.rta)}
+    rta = {} if info.rta is None else {"intervening": info.intervening, **vars(info.rta)}
     pick = lambda tree: {name: _plain(value[t]) for name, value in tree.items()}  # noqa: E731
     sim = state.sim
     return {
         "t": _plain(sim.time[t]),
-        "platforms": {name: pick(vars(one)) for name, one in sim.platforms.items()},
-        "regions": {name: {"position": _plain(one.position[t])} for name, one in sim.regions.items()},
-        "control_desired": dict(zip(env.action_names, _plain(info.control_desired[t]), strict=True)),
+        "platforms": {name: pick(vars(platform)) for name, platform in sim.platforms.items()},
+        "regions": {
+            name: {"position": _plain(region.position[t])} for name, region in sim.regions.items()
+        },
+        "control_desired": dict(
+            zip(env.action_names, _plain(info.control_desired[t]), strict=True)
+        ),
         "control_actual": dict(zip(env.action_names, _plain(info.control_actual[t]), strict=True)),
         "status": pick(info.status),
         "margins": pick(info.margins),
-        **({"rta": pick(assurance)} if assurance else {}),
+        **({"rta": pick(rta)} if rta else {}),
         "reward_terms": pick(info.reward_terms),
         "reward": _plain(timestep.reward[t]),
         "outcome": env.outcomes[int(info.outcome[t])],

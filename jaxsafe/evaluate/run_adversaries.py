@@ -1,7 +1,8 @@
-"""Adversaries at work on an environment, with or without a filter, and what is counted while they are.
+"""Runs of adversaries against an environment, with or without a filter, and what is counted.
 
-Violations are counted at the samples, and inside the steps by moving the platforms to `PARTS` instants of each with the
-control held, separations also between two of them. A margin or a state that is not a number is a violation.
+Violations are counted at the samples. They are also counted inside the steps: the platforms are
+moved to `INSTANTS_PER_STEP` instants of each step with the control held, and separations are
+checked between two instants as well. A margin or a state that is not a number is a violation.
 """
 
 from __future__ import annotations
@@ -25,50 +26,74 @@ from jaxsafe.simulation.controllers import Continuous
 from jaxsafe.transition import bounds, commanded, smallest_margin
 from jaxsafe.types import Key, Number, Sim, State, TimeStep
 
-PARTS = 8
-KNOTS, HOLD = 8, 8
-"""Controls of a sequence that the search optimises, and for how many steps each is held."""
+INSTANTS_PER_STEP = 8
+"""Number of instants of a step at which violations inside it are looked for."""
 
-POPULATION = 64
-ELITE = 8
-ROUNDS = 8
 SEARCH = "search"
+"""Name of the adversary that searches sequences of controls by the cross-entropy method."""
+
+SEARCH_CONTROLS = 8
+"""Number of controls of a sequence that the search optimises."""
+
+SEARCH_HOLD_STEPS = 8
+"""Number of steps for which each control of a sequence is held."""
+
+SEARCH_POPULATION = 64
+"""Number of sequences in each round of the search."""
+
+SEARCH_ELITE = 8
+"""Number of the best sequences that the next round is drawn from."""
+
+SEARCH_ROUNDS = 8
+"""Number of rounds of the search from each start."""
 
 _EVENTS = ("violating", "violating_inside", "intervening", "uncertified", "infeasible")
-_ADDED = (*_EVENTS, "steps", "ended", "correction", "unsafe_starts")
+_SUMMED = (*_EVENTS, "steps", "ended", "correction", "unsafe_starts")
 _LOWEST = ("lowest", "lowest_inside")
+
 Counts = dict[str, Float[Array, " n"]]
+"""Sums over the steps, and lowest margins, of each environment of a batch."""
 
 
-def attack(env: Environment, name: str, num_steps: int, num_lanes: int, key: Key) -> dict[str, Any]:
-    """Let one adversary act.
+def attack(env: Environment, name: str, num_steps: int, num_envs: int, key: Key) -> dict[str, Any]:
+    """Let one adversary act and return what was counted.
 
     Args:
         env: the environment, with or without run time assurance.
-        name: one of `adversaries.ADVERSARIES`, or `search`: the cross-entropy method on sequences of `KNOTS` controls, each
-            held for `HOLD` steps, from random starts, which minimises the smallest h on the way against the filter.
-        num_steps: steps in each lane, `longest_episode` for whole ones; the search divides all of them into its sequences.
-        num_lanes: episodes side by side.
+        name: one of `adversaries.ADVERSARIES`, or `search`. The search starts from random starts
+            and minimises the smallest h on the way against the filter. It is the cross-entropy
+            method on sequences of `SEARCH_CONTROLS` controls, each held for `SEARCH_HOLD_STEPS`
+            steps.
+        num_steps: the number of steps in each environment. `longest_episode` gives whole episodes.
+            The search divides all steps into its sequences.
+        num_envs: the number of environments that run side by side.
         key: a typed PRNG key.
 
     Returns:
-        Plain numbers: steps, episodes, violations, worst margins, interventions, mean correction, unsafe starts. Episodes
-        are those that ended, or, where some lane has none that did, the first parts of one in each lane. Where nothing was
-        violated, the share of episodes with a violation is below `violation_bound` with 95 % confidence, by the rule of
-        three. It is None after a violation, and for the search, whose episodes do not depend on chance alone.
+        Plain numbers: steps, episodes, violations, worst margins, interventions, mean correction
+        and unsafe starts. Episodes are those that ended. If in some environment none has ended,
+        they are the first parts of one episode in each environment. If nothing was violated, the
+        share of episodes with a violation is below `violation_bound` with 95 % confidence, by the
+        rule of three. The bound is None after a violation. It is also None for the search, whose
+        episodes do not depend on chance alone.
     """
     physical = _with_physical_actions(env)
     if name == SEARCH:
-        starts = max(1, round(num_steps * num_lanes / (KNOTS * HOLD * POPULATION * ROUNDS)))
-        counts, begun = _search(physical, starts, key), starts * POPULATION * ROUNDS
-        whole, episodes = False, begun
+        steps_per_sequence = SEARCH_CONTROLS * SEARCH_HOLD_STEPS
+        sequences_per_start = SEARCH_POPULATION * SEARCH_ROUNDS
+        starts = max(1, round(num_steps * num_envs / (steps_per_sequence * sequences_per_start)))
+        counts = _search(physical, starts, key)
+        begun = starts * sequences_per_start
+        whole = False
+        episodes = begun
     else:
-        counts = _follow(physical, name, num_steps, num_lanes, key)
+        counts = _follow(physical, name, num_steps, num_envs, key)
         ended = int(np.sum(counts["ended"]))
-        whole, begun = bool(np.all(counts["ended"] > 0)), num_lanes + ended
-        episodes = ended if whole else num_lanes
-    found = {one: np.asarray(value, float) for one, value in counts.items()}
-    total = {one: found[one].sum() for one in _ADDED}
+        begun = num_envs + ended
+        whole = bool(np.all(counts["ended"] > 0))
+        episodes = ended if whole else num_envs
+    values = {entry: np.asarray(value, float) for entry, value in counts.items()}
+    total = {entry: values[entry].sum() for entry in _SUMMED}
     steps = int(total["steps"])
     clean = not (total["violating"] or total["violating_inside"])
     return {
@@ -77,8 +102,8 @@ def attack(env: Environment, name: str, num_steps: int, num_lanes: int, key: Key
         "episodes": episodes,
         "violating_steps": int(total["violating"]),
         "violating_steps_inside": int(total["violating_inside"]),
-        "worst_margin": _finite_or_none(found["lowest"].min()),
-        "worst_margin_inside": _finite_or_none(found["lowest_inside"].min()),
+        "worst_margin": _finite_or_none(values["lowest"].min()),
+        "worst_margin_inside": _finite_or_none(values["lowest_inside"].min()),
         "intervention_rate": float(total["intervening"] / steps),
         "mean_correction": float(total["correction"] / steps),
         "uncertified_steps": int(total["uncertified"]),
@@ -90,7 +115,9 @@ def attack(env: Environment, name: str, num_steps: int, num_lanes: int, key: Key
 
 
 def longest_episode(env: Environment) -> int:
-    """Return the number of steps after which every episode has ended by its time limit, also where that is random.
+    """Return the number of steps after which every episode has ended by its time limit.
+
+    A time limit or a length of a step that is random counts with its worst value.
 
     Raises:
         ConfigError: the task has no time limit.
@@ -99,79 +126,123 @@ def longest_episode(env: Environment) -> int:
     limit = time_limit(high)
     if limit is None:
         raise ConfigError("steps: the task has no time limit, so give the number of steps")
-    return math.ceil(float(limit) / float(low.dt)) + 2  # a timeout needs t > limit, and limit / dt may round down
+    # Two more: a timeout needs t > limit, and limit / dt may round down.
+    return math.ceil(float(limit) / float(low.dt)) + 2
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2, 3))
-def _follow(env: Environment, name: str, num_steps: int, num_lanes: int, key: Key) -> Counts:
-    """A policy from the task's own starts; episodes begin anew where they end."""
+def _follow(env: Environment, name: str, num_steps: int, num_envs: int, key: Key) -> Counts:
+    """Run an adversary from the task's own starts. An episode begins anew where one ends."""
+    adversary = ADVERSARIES[name]
 
-    def one(carry: tuple[State, Counts], key: Key) -> tuple[tuple[State, Counts], None]:
+    def act(state: State, key: Key) -> Float[Array, " m"]:
+        return adversary(drawn(env, state.parameters), state.sim, key)
+
+    def replace_ended(done: Array, fresh: State, state: State) -> State:
+        return jax.tree.map(lambda a, b: jnp.where(done, a, b), fresh, state)
+
+    def one_step(carry: tuple[State, Counts], key: Key) -> tuple[tuple[State, Counts], None]:
         state, counts = carry
         key_act, key_reset = jax.random.split(key)
-        keys = jax.random.split(key_act, num_lanes)
-        controls = jax.vmap(lambda state, key: ADVERSARIES[name](drawn(env, state.parameters), state.sim, key))(state, keys)
+        keys = jax.random.split(key_act, num_envs)
+        controls = jax.vmap(act)(state, keys)
         after, done, facts = _step(env, state, controls)
-        fresh, first = reset_batch(env, key_reset, num_lanes)
+        fresh, first = reset_batch(env, key_reset, num_envs)
         facts["unsafe_starts"] = done & _unsafe(first)
-        following = jax.vmap(lambda over, *pair: jax.tree.map(lambda a, b: jnp.where(over, a, b), *pair))(
-            done, fresh, after
-        )
-        return (following, _add(counts, facts)), None
+        return (jax.vmap(replace_ended)(done, fresh, after), _add(counts, facts)), None
 
     key_start, key_run = jax.random.split(key)
-    state, first = reset_batch(env, key_start, num_lanes)
-    counts = {**_nothing(num_lanes), "unsafe_starts": _unsafe(first).astype(jnp.float32)}
-    return jax.lax.scan(one, (state, counts), jax.random.split(key_run, num_steps))[0][1]
+    state, first = reset_batch(env, key_start, num_envs)
+    counts = {**_empty_counts(num_envs), "unsafe_starts": _unsafe(first).astype(jnp.float32)}
+    keys = jax.random.split(key_run, num_steps)
+    (_, counts), _ = jax.lax.scan(one_step, (state, counts), keys)
+    return counts
 
 
 @functools.partial(jax.jit, static_argnums=1)
 def _search(env: Environment, num_starts: int, key: Key) -> Counts:
-    """The cross-entropy method, one start after another; what follows the end of an episode is not counted."""
-    low, high = bounds(env)
-    middle, half = (high + low) / 2.0, (high - low) / 2.0
+    """Search by the cross-entropy method from one start after another.
 
-    def sequences(state: State, controls: Float[Array, "t p m"]) -> Counts:
-        def one(carry: tuple[State, Array, Counts], control: Array) -> tuple[tuple[State, Array, Counts], None]:
+    Steps after the end of an episode are not counted.
+    """
+    low, high = bounds(env)
+    middle = (high + low) / 2.0
+    half = (high - low) / 2.0
+
+    def run(state: State, controls: Float[Array, "t p m"]) -> Counts:
+        """Run all sequences of a population from one state."""
+
+        def one_step(
+            carry: tuple[State, Array, Counts], control: Array
+        ) -> tuple[tuple[State, Array, Counts], None]:
             state, running, counts = carry
             after, done, facts = _step(env, state, control)
-            unseen = {name: jnp.where(running, value, jnp.inf if name in _LOWEST else 0.0) for name, value in facts.items()}
-            return (after, running & ~done, _add(counts, unseen)), None
+            counted = {
+                name: jnp.where(running, value, jnp.inf if name in _LOWEST else 0.0)
+                for name, value in facts.items()
+            }
+            return (after, running & ~done, _add(counts, counted)), None
 
-        states = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (POPULATION, *leaf.shape)), state)
-        start = (states, jnp.ones(POPULATION, bool), _nothing(POPULATION))
-        return jax.lax.scan(one, start, controls)[0][2]
+        states = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(leaf, (SEARCH_POPULATION, *leaf.shape)), state
+        )
+        start = (states, jnp.ones(SEARCH_POPULATION, bool), _empty_counts(SEARCH_POPULATION))
+        (_, _, counts), _ = jax.lax.scan(one_step, start, controls)
+        return counts
 
-    def improve(carry: tuple[Array, Array], key: Key, state: State) -> tuple[tuple[Array, Array], Counts]:
+    def improve(
+        carry: tuple[Array, Array], key: Key, state: State
+    ) -> tuple[tuple[Array, Array], Counts]:
+        """Draw a population about a mean and return mean and spread of its best sequences."""
         mean, spread = carry
-        drawn = mean + spread * jax.random.normal(key, (POPULATION, *mean.shape))
-        controls = middle + half * jnp.clip(drawn, -1.0, 1.0)
-        counts = sequences(state, jnp.repeat(jnp.moveaxis(controls, 0, 1), HOLD, axis=0))
-        best = drawn[jnp.argsort(counts["lowest_inside"])[:ELITE]]
+        population = mean + spread * jax.random.normal(key, (SEARCH_POPULATION, *mean.shape))
+        controls = middle + half * jnp.clip(population, -1.0, 1.0)
+        held = jnp.repeat(jnp.moveaxis(controls, 0, 1), SEARCH_HOLD_STEPS, axis=0)
+        counts = run(state, held)
+        best = population[jnp.argsort(counts["lowest_inside"])[:SEARCH_ELITE]]
+        # The spread keeps a least value, so that the search does not stop at what it has found.
         return (jnp.mean(best, axis=0), jnp.std(best, axis=0) + 0.05), counts
 
-    def one_start(key: Key) -> Counts:
+    def search_from_start(key: Key) -> Counts:
         key_start, key_search = jax.random.split(key)
         state, first = jax.tree.map(lambda leaf: leaf[0], reset_batch(env, key_start, 1))
-        begin = jnp.zeros((KNOTS, low.shape[0])), jnp.full((KNOTS, low.shape[0]), 2.0)
-        improved = functools.partial(improve, state=state)
-        _, counts = jax.lax.scan(improved, begin, jax.random.split(key_search, ROUNDS))
-        counts = {name: jnp.min(value) if name in _LOWEST else jnp.sum(value) for name, value in counts.items()}
-        return counts | {"unsafe_starts": _unsafe(first) * float(POPULATION * ROUNDS)}
+        shape = (SEARCH_CONTROLS, low.shape[0])
+        begin = (jnp.zeros(shape), jnp.full(shape, 2.0))
+        keys = jax.random.split(key_search, SEARCH_ROUNDS)
+        _, counts = jax.lax.scan(functools.partial(improve, state=state), begin, keys)
+        counts = {
+            name: jnp.min(value) if name in _LOWEST else jnp.sum(value)
+            for name, value in counts.items()
+        }
+        begun = float(SEARCH_POPULATION * SEARCH_ROUNDS)
+        return counts | {"unsafe_starts": _unsafe(first) * begun}
 
-    return jax.lax.map(one_start, jax.random.split(key, num_starts))
+    return jax.lax.map(search_from_start, jax.random.split(key, num_starts))
 
 
-def _step(env: Environment, state: State, controls: Float[Array, "n m"]) -> tuple[State, Array, Counts]:
-    """One step of all lanes: the states after it, which episodes ended, and what happened."""
+def _step(
+    env: Environment, state: State, controls: Float[Array, "n m"]
+) -> tuple[State, Array, Counts]:
+    """Step a batch of environments.
+
+    Returns:
+        The states after the step, which episodes ended, and what is counted.
+    """
     after, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, state, controls)
-    info, zero = timestep.info, jnp.zeros_like(timestep.reward)
-    lowest = jax.vmap(lambda state: smallest_margin(drawn(env, state.parameters), state.sim))(after)
-    inside = jax.vmap(lambda state, control: _inside(drawn(env, state.parameters), state.sim, control))(
-        state, info.control_actual
-    )
+    info = timestep.info
+    zero = jnp.zeros_like(timestep.reward)
+
+    def lowest_at(state: State) -> Float[Array, ""]:
+        return smallest_margin(drawn(env, state.parameters), state.sim)
+
+    def lowest_inside(state: State, control: Float[Array, " m"]) -> Float[Array, ""]:
+        return _inside(drawn(env, state.parameters), state.sim, control)
+
+    lowest = jax.vmap(lowest_at)(after)
+    inside = jax.vmap(lowest_inside)(state, info.control_actual)
     finite = jax.vmap(_finite)(after)
-    lowest, inside = (jnp.where(jnp.isnan(one), -jnp.inf, one) for one in (lowest, inside))
+    lowest = jnp.where(jnp.isnan(lowest), -jnp.inf, lowest)
+    inside = jnp.where(jnp.isnan(inside), -jnp.inf, inside)
     facts = {
         "steps": zero + 1.0,
         "violating": ~(lowest >= 0.0) | ~finite,
@@ -189,50 +260,66 @@ def _step(env: Environment, state: State, controls: Float[Array, "n m"]) -> tupl
 
 
 def _inside(env: Environment, before: Sim, control: Float[Array, " m"]) -> Float[Array, ""]:
-    """The smallest h within a step."""
+    """Return the smallest h within a step."""
     before = before.replace(regions={}, status={})
-    later = jax.vmap(lambda share: within_step(env, before, control, share))(jnp.arange(1, PARTS + 1) / PARTS)
-    earlier = jax.tree.map(lambda start, way: jnp.concatenate([start[None], way[:-1]]), before, later)
+    shares = jnp.arange(1, INSTANTS_PER_STEP + 1) / INSTANTS_PER_STEP
+    later = jax.vmap(lambda share: within_step(env, before, control, share))(shares)
+    earlier = jax.tree.map(
+        lambda first, instants: jnp.concatenate([first[None], instants[:-1]]), before, later
+    )
     return jnp.min(jax.vmap(lambda a, b: smallest_margin(env, b, a))(earlier, later))
 
 
 def within_step(env: Environment, before: Sim, control: Float[Array, " m"], share: Number) -> Sim:
-    """The simulation after a share of a step, all controls being those of the whole step."""
+    """Return the simulation after a share of a step.
+
+    All controls are those of the whole step.
+
+    Args:
+        env: the environment.
+        before: the simulation before the step.
+        control: the agent's control in physical units and action order, shape (m,).
+        share: the share of the step, in [0, 1].
+    """
     platforms = {}
     for platform in env.platforms:
         state = before.platforms[platform.name]
         controls = platform.held(state, commanded(env, platform, before, control), env.dt)
         platforms[platform.name] = platform.step(state, controls, env.dt * share)
-    return before.replace(time=before.time + env.dt * share, platforms=platforms, regions={}, status={})
+    time = before.time + env.dt * share
+    return before.replace(time=time, platforms=platforms, regions={}, status={})
 
 
 def _finite(state: State) -> Array:
-    return functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state.sim.platforms)])
+    leaves = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(state.sim.platforms)]
+    return functools.reduce(jnp.logical_and, leaves)
 
 
 def _finite_or_none(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _nothing(num_lanes: int) -> Counts:
-    counts: Counts = {name: jnp.zeros(num_lanes) for name in _ADDED}
-    return counts | {name: jnp.full(num_lanes, jnp.inf) for name in _LOWEST}
+def _empty_counts(num_envs: int) -> Counts:
+    counts: Counts = {name: jnp.zeros(num_envs) for name in _SUMMED}
+    return counts | {name: jnp.full(num_envs, jnp.inf) for name in _LOWEST}
 
 
 def _add(counts: Counts, facts: Counts) -> Counts:
+    """Return the counts with those of one more step."""
     return {
-        name: jnp.minimum(value, facts[name]) if name in _LOWEST else value + facts[name] for name, value in counts.items()
+        name: jnp.minimum(value, facts[name]) if name in _LOWEST else value + facts[name]
+        for name, value in counts.items()
     }
 
 
 def _unsafe(first: TimeStep) -> Array:
-    """Which starts are outside the safe set, as far as is known."""
+    """Return which starts are outside the safe set, as far as is known."""
     if first.info.rta is not None:
         return ~first.info.rta.certified
     return ~(jnp.min(jnp.stack(list(first.info.margins.values())), axis=0) >= 0.0)
 
 
 def _with_physical_actions(env: Environment) -> Environment:
-    """The environment with the agent's actions in physical units."""
-    actuators = tuple(one.replace(rescale=False) for one in env.actuators)
+    """Return the environment with the agent's actions in physical units."""
+    actuators = tuple(actuator.replace(rescale=False) for actuator in env.actuators)
     return set_path(env, f"{env.agent}.controller", Continuous(actuators=actuators))

@@ -122,6 +122,9 @@ class Timeout(Terminal, type="timeout"):
 
 
 def time_limit(env: Any) -> Number | None:
-    """Return the seconds after which the first timeout of an environment ends an episode, None if it has no timeout."""
-    limits = [one.limit for one in env.terminal if isinstance(one, Timeout)]
+    """Return the time [s] after which an environment's first timeout ends an episode.
+
+    It is None if the environment has no timeout.
+    """
+    limits = [condition.limit for condition in env.terminal if isinstance(condition, Timeout)]
     return functools.reduce(jnp.minimum, limits) if limits else None

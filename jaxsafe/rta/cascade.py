@@ -1,4 +1,4 @@
-"""Filters one after another."""
+"""A filter that consists of several filters in sequence."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ class Stage(Component):
 
 
 class CascadeMemory(Record):
-    """What the stages remember."""
+    """Memory of a cascade."""
 
-    intervening: Bool[Array, ""]
-    stages: tuple[Any, ...]
+    intervening: Bool[Array, ""]  # whether the stages together changed the control of the last step
+    stages: tuple[Any, ...]  # the memory of each stage
 
 
 class Cascade(RTA, type="cascade"):
-    """Filters one after another: what one lets pass the next takes for desired, and the last has the last word.
+    """Filters in sequence: the control that one passes is the desired control of the next.
 
-    A certificate of one stage is void where a later one intervenes. Constraints that must hold together belong into one
-    filter, which predicts them together; a cascade is for different methods in order of importance.
+    The last filter has the last word. A certificate of one stage is void where a later stage
+    intervenes. Constraints that must hold together belong into one filter, which predicts them
+    together. A cascade is for different methods in order of importance.
     """
 
     stages: tuple[Stage, ...]
@@ -44,37 +45,46 @@ class Cascade(RTA, type="cascade"):
 
     def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
         return {
-            f"{stage.name}: {fault}": found
+            f"{stage.name}: {fault}": applies
             for stage in self.stages
-            for fault, found in stage.rta.unsuited(env, sim).items()
+            for fault, applies in stage.rta.unsuited(env, sim).items()
         }
 
     def begin(self, env: Environment, sim: Sim) -> tuple[CascadeMemory, RTAInfo]:
         memories, infos = zip(*(stage.rta.begin(env, sim) for stage in self.stages), strict=True)
-        return CascadeMemory(jnp.zeros((), bool), memories), _together(infos, jnp.ones_like(infos[-1].certified))
+        memory = CascadeMemory(intervening=jnp.zeros((), bool), stages=memories)
+        return memory, _combined(infos, jnp.ones_like(infos[-1].certified))
 
     def filter(
         self, env: Environment, sim: Sim, memory: CascadeMemory, desired: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], CascadeMemory, RTAInfo]:
-        control, memories, infos = desired, [], []
+        control = desired
+        memories = []
+        infos = []
         valid = jnp.ones((), bool)
-        for stage, own in zip(self.stages, memory.stages, strict=True):
-            control, own, info = stage.rta.filter(env, sim, own, control)
-            valid = (valid & ~own.intervening) | (len(memories) == 0)
-            memories.append(own)
+        for stage, stage_memory in zip(self.stages, memory.stages, strict=True):
+            control, stage_memory, info = stage.rta.filter(env, sim, stage_memory, control)
+            valid = (valid & ~stage_memory.intervening) | (len(memories) == 0)
+            memories.append(stage_memory)
             infos.append(info)
         wanted, finite = admissible(env, desired)
         correction = safe_norm(control - wanted)
-        info = _together(infos, valid).replace(correction=correction)
-        return control, CascadeMemory((correction > 0.0) | ~finite, tuple(memories)), info
+        info = _combined(infos, valid).replace(correction=correction)
+        intervening = (correction > 0.0) | ~finite
+        return control, CascadeMemory(intervening=intervening, stages=tuple(memories)), info
 
 
-def _together(infos: Any, valid: Bool[Array, ""]) -> RTAInfo:
-    """What all stages say; `valid` tells whether the earlier certificates still count."""
+def _combined(infos: Any, valid: Bool[Array, ""]) -> RTAInfo:
+    """Return the facts about all stages together.
+
+    Args:
+        infos: the facts about each stage, in order.
+        valid: whether the certificates of earlier stages still count.
+    """
     last = infos[-1]
-    every = jnp.all(jnp.stack([info.certified for info in infos]))
+    all_certified = jnp.all(jnp.stack([info.certified for info in infos]))
     return last.replace(
         feasible=jnp.all(jnp.stack([info.feasible for info in infos])),
-        certified=every & valid,
+        certified=all_certified & valid,
         predicted_margin=jnp.min(jnp.stack([info.predicted_margin for info in infos])),
     )

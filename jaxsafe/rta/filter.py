@@ -1,4 +1,7 @@
-"""Between desired and actual control: the rule that carries every guarantee is propose, certify, else back up."""
+"""The base of filters between desired and actual control.
+
+One rule carries every guarantee: propose, certify, else back up.
+"""
 
 from __future__ import annotations
 
@@ -30,20 +33,30 @@ if TYPE_CHECKING:
     from jaxsafe.environment import Environment
 
 Margin = Annotated[Number, Unit("as the constraint"), Range(0.0)]
+"""A value of h, in the unit of the constraint."""
 
 Faults = dict[str, Bool[Array, ""]]
-"""Why a proof does not hold, each with whether that is so at a state."""
+"""Reasons why a proof does not hold, in words, each with whether it applies at a given state."""
 
 
 class RTA(Component):
-    """A filter between desired and actual control (Section 2, Fig. 2): pure, with its memory in the state."""
+    """A filter between desired and actual control (Section 2, Fig. 2).
+
+    It is pure. What it remembers is part of the environment's state.
+    """
 
     def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
-        """What would make the filter useless, each with whether it is so at a state; asked once, when it is built."""
+        """Return reasons why the filter would be useless, each with whether it applies at a state.
+
+        They are asked for once, when the filter is built.
+        """
         return {}
 
     def begin(self, env: Environment, sim: Sim) -> tuple[Any, RTAInfo]:
-        """Return the memory at the start of an episode, a record with `intervening`, and the facts about the start."""
+        """Return the memory at the start of an episode and the facts about the start.
+
+        The memory is a record that has a field `intervening`.
+        """
         raise NotImplementedError
 
     def filter(
@@ -54,42 +67,50 @@ class RTA(Component):
         Args:
             env: the environment, with the numbers of this episode.
             sim: the simulation before the step.
-            memory: of the last step.
-            desired: the agent's control in physical units, action order; what is not a number is never passed on.
+            memory: the memory after the last step.
+            desired: the agent's control in physical units and action order. Elements that are not
+                numbers are never passed on.
         """
         raise NotImplementedError
 
 
 class RTAMemory(Record):
-    """What a filter remembers."""
+    """Memory of a filter."""
 
-    intervening: Bool[Array, ""]
+    intervening: Bool[Array, ""]  # whether it changed the control of the last step
     backup_index: Int[Array, ""]  # the backup controller that the last certificate is about
-    certified: Bool[Array, ""]  # whether following it is known to be safe
-    ahead: Mapping[str, Any]  # the platforms at the end of that certificate's horizon; empty without a horizon
+    certified: Bool[Array, ""]  # whether following that backup controller is known to be safe
+    ahead: Mapping[str, Any]  # platforms at the end of the certificate's horizon; empty without one
 
 
 class BackupController(Component):
-    """A control that keeps safe or leads to where it does; named, as several may stand side by side."""
+    """A control law that keeps the agent safe, or leads it to states in which it does.
+
+    It has a name, because a filter may have several.
+    """
 
     name: str
     within_limits: ClassVar[bool] = False
-    """Whether no state of the plant reaches a limit before the end of a step, which makes prediction cheaper."""
+    """Whether no state of the plant reaches a limit before the end of a step.
+
+    Prediction is then cheaper.
+    """
 
     def control(self, env: Environment, sim: Sim, later: Others) -> Float[Array, " m"]:
-        """Return the control in physical units, action order; the filter clips it.
+        """Return the control in physical units and action order. The filter clips it.
 
         Args:
             env: the environment.
             sim: the simulation before the step.
-            later: the other platforms' states after it, by name.
+            later: the other platforms' states after the step, by name.
         """
         raise NotImplementedError
 
     def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
-        """Return what is missing at a state for the proof that this controller keeps the constraints; nothing by default.
+        """Return reasons why this controller is not proved to keep the constraints.
 
-        Where anything is missing the filter certifies nothing. A filter that lacks it at all of a few starts is refused.
+        There are none by default. At a state where a reason applies, the filter certifies nothing.
+        A filter is refused when it is built if a reason applies at every one of a few starts.
 
         Args:
             env: the environment, with the numbers of this episode.
@@ -99,45 +120,54 @@ class BackupController(Component):
         return {}
 
     def duration(self, env: Environment) -> Number:
-        """Return the time it may take to the terminal set [s]; 0 where that is not known."""
+        """Return the longest time [s] to the terminal set, 0 where that is not known."""
         return jnp.zeros_like(env.dt)
 
 
 class TerminalSet(Component):
-    """States from which the backup controller stays safe for ever: where a certificate may end."""
+    """Set of states from which the backup controllers stay safe for ever.
+
+    A certificate may end in it.
+    """
 
     def contains(self, env: Environment, sim: Sim) -> Bool[Array, ""]:
-        """Whether the state is in the set."""
+        """Return whether a state is in the set."""
         raise NotImplementedError
 
     def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
-        """Return what is missing at a state for the proof of this set, as `BackupController.faults` does."""
+        """Return reasons why the set is not proved safe, as `BackupController.faults` does."""
         return {}
 
 
 class Paths(Record):
-    """What becomes of a state under each backup controller."""
+    """Predicted ways from one state, one for each backup controller."""
 
     least: Float[Array, " backups"]  # smallest h on the way
-    certified: Bool[Array, " backups"]  # whether it keeps the margin, ends in the terminal set, and its proof holds
-    ahead: Mapping[str, Any]  # the platforms at the end, with an axis of backups in front; empty without a horizon
+    certified: Bool[Array, " backups"]  # whether all but the margin holds: terminal set and proof
+    ahead: Mapping[str, Any]  # platforms at the end, [backups, ...]; empty without a horizon
 
     @property
     def values(self) -> Float[Array, " backups"]:
-        """The smallest h of those that are certified but for the margin, −∞ of the others."""
+        """Smallest h on each way, −∞ where the way proves nothing whatever its h."""
         return jnp.where(self.certified, self.least, -jnp.inf)
 
 
 class CertifiedRTA(RTA):
-    """A filter that lets a control pass only after predicting with the plant's own map that it is safe.
+    """A filter that passes a control only if a prediction with the plant's own map shows it safe.
 
-    A control is certified if after the step every constraint keeps its `margin`, h ≥ margin, and, with a `horizon`, also on
-    the way of a backup controller from there over that many steps, which must end in the `terminal` set. What the proof of
-    the backup controller or the set assumes of the environment's numbers is checked as well. What is not certified is
-    replaced by the backup controller of the last certificate, which is renewed while it acts. Where that fails, or nothing
-    was certified yet, the backup controllers compete: the first that is certified acts, and until then the one of the
-    largest h on its way. After an intervention control returns to the agent only with `release` on top of the margin.
-    Without `enforce` a feasible proposal acts whatever the prediction says, as filters of the literature do: to compare.
+    A control is certified if every constraint keeps its `margin`, h ≥ margin, after the step. With
+    a `horizon` the constraints must also keep it while a backup controller acts for that many steps
+    from there, and the last state must lie in the `terminal` set. The filter also checks what the
+    proofs of the backup controller and of the set assume of the environment's numbers.
+
+    A control that is not certified is replaced by the backup controller of the last certificate.
+    The certificate is renewed while that controller acts. If renewing fails, or nothing has been
+    certified yet, the backup controllers compete. The first one that is certified acts. Until then
+    the one with the largest h on its way acts.
+
+    After an intervention, control returns to the agent only with `release` on top of the margin.
+    Without `enforce` a feasible proposal acts whatever the prediction says. That is how filters of
+    the literature work, and it serves to compare.
     """
 
     constraints: tuple[ConstraintName, ...]
@@ -160,79 +190,101 @@ class CertifiedRTA(RTA):
     def propose(
         self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
-        """Return the control to certify, and whether it meets the filter's own constraints.
+        """Return the control to certify and whether it meets the filter's own constraints.
 
         Args:
             env: the environment.
             sim: the simulation before the step.
             desired: the agent's control, within its bounds.
-            backup: what acts if the proposal is not certified, within the bounds.
+            backup: the control that acts if the proposal is not certified, within its bounds.
         """
         raise NotImplementedError
 
     def required_margin(self, env: Environment) -> Number:
-        """Return the h to keep at samples: `margin`, or more where a constraint would be broken inside a step.
+        """Return the h to keep at samples.
 
-        For speed limits that depends on the length of a step, see docs/rta.md; separations are bounded within the step.
+        It is `margin`, or more where h could otherwise fall below 0 between two samples. For speed
+        limits that depends on the length of a step, see docs/rta.md. Separations are bounded within
+        the step instead.
         """
         facts = [speed_limit_facts(env, name) for name in self.constraints]
-        return functools.reduce(jnp.maximum, [one.least_margin for one in facts if one], self.margin)
+        least_margins = [limit.least_margin for limit in facts if limit]
+        return functools.reduce(jnp.maximum, least_margins, self.margin)
 
     def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
         if not self.enforce:
             return {}
-        found = dict(self.terminal.faults(env, sim, self)) if self.terminal else {}
+        faults = dict(self.terminal.faults(env, sim, self)) if self.terminal else {}
         for backup in self.backups:
-            found |= backup.faults(env, sim, self)
+            faults |= backup.faults(env, sim, self)
             if self.horizon:
-                fault = f"{self.horizon} steps of the horizon are too short for backup controller {backup.name!r}"
-                found[fault] = self.horizon * env.dt < backup.duration(env)
-        return found
+                too_short = (
+                    f"{self.horizon} steps of the horizon are too short"
+                    f" for backup controller {backup.name!r}"
+                )
+                faults[too_short] = self.horizon * env.dt < backup.duration(env)
+        return faults
 
     def begin(self, env: Environment, sim: Sim) -> tuple[RTAMemory, RTAInfo]:
-        """Memory with the backup controller that is safest from the start."""
+        """Return the memory at the start of an episode and the facts about the start.
+
+        The memory holds the backup controller that is safest from there.
+        """
         paths = self.follow(env, sim, sim)
-        best, no, yes = self._best(env, paths), jnp.zeros((), bool), jnp.ones((), bool)
+        best = self._best(env, paths)
         memory = RTAMemory(
-            intervening=no,
+            intervening=jnp.zeros((), bool),
             backup_index=best,
             certified=paths.values[best] >= self.required_margin(env),
-            ahead=_chosen(paths.ahead, best),
+            ahead=_selected(paths.ahead, best),
         )
-        return memory, RTAInfo(jnp.zeros_like(sim.time), yes, memory.certified, self.lowest(env, sim, sim), best)
+        info = RTAInfo(
+            correction=jnp.zeros_like(sim.time),
+            feasible=jnp.ones((), bool),
+            certified=memory.certified,
+            predicted_margin=self.lowest(env, sim, sim),
+            backup_index=best,
+        )
+        return memory, info
 
     def filter(
         self, env: Environment, sim: Sim, memory: RTAMemory, desired: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], RTAMemory, RTAInfo]:
-        """Propose, certify, else back up."""
+        """Propose a control, certify it, else back up. Arguments and results are those of `RTA`."""
         wanted, finite = admissible(env, desired)
         later = others_later(env, sim)
         backup = self._backup(env, sim, memory, later)
         proposal, feasible = self.propose(env, sim, wanted, backup)
 
-        # A certificate with a horizon is dear, and one a step is made. From a state that is certified it is the proposal's.
-        # From another the backup acts whatever is proposed, and it is the backup's.
-        known = memory.certified if self.enforce and self.horizon else jnp.ones((), bool)
-        after, backed = advance(env, sim, proposal, later), advance(env, sim, backup, later)
-        paths = self.follow(env, sim, _where(known, after, backed))
-        best, required = self._best(env, paths), self.required_margin(env)
+        # A certificate with a horizon takes many predicted steps, so only one is made per step.
+        # From a certified state it is a certificate of the proposal. From any other state the
+        # backup acts whatever is proposed, so it is one of the backup.
+        certified_before = memory.certified if self.enforce and self.horizon else jnp.ones((), bool)
+        after_proposal = advance(env, sim, proposal, later)
+        after_backup = advance(env, sim, backup, later)
+        paths = self.follow(env, sim, _where(certified_before, after_proposal, after_backup))
+        best = self._best(env, paths)
+        required = self.required_margin(env)
         safe = paths.values[best] >= required + jnp.where(memory.intervening, self.release, 0.0)
-        passes = finite & known & (safe if self.enforce else feasible)
+        passes = finite & certified_before & (safe if self.enforce else feasible)
 
-        fallback = self.lowest(env, sim, backed)
-        fresh = passes | ~known
+        backup_margin = self.lowest(env, sim, after_backup)
+        new_certificate = passes | ~certified_before
         if self.horizon:
-            kept, ahead = self._renew(env, sim, memory, backed, fallback)
-            kept = jnp.where(known, kept, paths.values[best] >= required)
-            ahead = _where(fresh, _chosen(paths.ahead, best), ahead)
+            backup_certified, ahead = self._renew(env, sim, memory, after_backup, backup_margin)
+            backup_certified = jnp.where(
+                certified_before, backup_certified, paths.values[best] >= required
+            )
+            ahead = _where(new_certificate, _selected(paths.ahead, best), ahead)
         else:
-            kept, ahead = self.follow(env, sim, backed).values[0] >= required, {}
+            backup_certified = self.follow(env, sim, after_backup).values[0] >= required
+            ahead = {}
         actual = jnp.where(passes, proposal, backup)
         correction = jnp.where(jnp.isfinite(desired), actual - wanted, actual)
-        certified = jnp.where(passes, safe, kept)
+        certified = jnp.where(passes, safe, backup_certified)
         memory = RTAMemory(
             intervening=jnp.any(correction != 0.0) | ~finite,
-            backup_index=jnp.where(fresh, best, memory.backup_index),
+            backup_index=jnp.where(new_certificate, best, memory.backup_index),
             certified=certified,
             ahead=ahead,
         )
@@ -240,124 +292,188 @@ class CertifiedRTA(RTA):
             correction=safe_norm(correction),
             feasible=feasible,
             certified=certified,
-            predicted_margin=jnp.where(passes, self.lowest(env, sim, after), fallback),
+            predicted_margin=jnp.where(
+                passes, self.lowest(env, sim, after_proposal), backup_margin
+            ),
             backup_index=memory.backup_index,
         )
         return actual, memory, info
 
     def lowest(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, ""]:
-        """Return the smallest h of the constraints at `sim` and, for separations, on the way from `before`."""
+        """Return the smallest h of the constraints at `sim`.
+
+        For separations it is the smallest h on the way from `before`, one step earlier.
+        """
         return smallest_margin(env, sim, before, self.constraints)
 
     def certify(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, " backups"]:
-        """Return for each backup controller the smallest h on its way from `sim`, −∞ if that proves nothing.
+        """Return for each backup controller the smallest h on its way from `sim`.
 
-        It proves nothing where the way ends outside the terminal set, or where the proof of the controller or of the set
-        does not hold for the numbers of the environment.
+        It is −∞ for a way that proves nothing. Such a way ends outside the terminal set, or the
+        proof of the controller or of the set does not hold for the numbers of the environment.
+
+        Args:
+            env: the environment, with the numbers of this episode.
+            before: the simulation one step before `sim`.
+            sim: the simulation from which the backup controllers act.
         """
         return self.follow(env, before, sim).values
 
     def follow(self, env: Environment, before: Sim, sim: Sim) -> Paths:
-        """Return what becomes of `sim`, one step after `before`, under each backup controller."""
+        """Return the predicted way of each backup controller from `sim`.
+
+        Args:
+            env: the environment, with the numbers of this episode.
+            before: the simulation one step before `sim`.
+            sim: the simulation from which the backup controllers act.
+        """
         first = self.lowest(env, before, sim)
-        holds = jnp.stack([_none(backup.faults(env, sim, self)) for backup in self.backups]) & _finite(sim)
+        faultless = [_none(backup.faults(env, sim, self)) for backup in self.backups]
+        proved = jnp.stack(faultless) & _finite(sim)
         if self.terminal is None:
-            return Paths(least=first[None], certified=holds & jnp.isfinite(first), ahead={})
-        together = [[one] for one in self.backups] if others_react(env, sim) else [self.backups]
-        least, ends = zip(*(self._follow(env, backups, first, sim) for backups in together), strict=True)
-        ends = [end for several in ends for end in several]
-        reached = jnp.stack([self._ended(env, end) for end in ends])
+            return Paths(least=first[None], certified=proved & jnp.isfinite(first), ahead={})
+        # The other platforms are predicted once for all backup controllers, unless they react to
+        # what the agent does.
+        groups = [[backup] for backup in self.backups] if others_react(env, sim) else [self.backups]
+        predicted = [self._follow(env, backups, first, sim) for backups in groups]
+        least, group_ends = zip(*predicted, strict=True)
+        ends = [end for ends in group_ends for end in ends]
+        reached = jnp.stack([self._may_end(env, end) for end in ends])
         platforms = [end.platforms for end in ends]
         ahead = jax.tree.map(lambda *leaves: jnp.stack(leaves), *platforms)
-        return Paths(least=jnp.concatenate(least), certified=reached & holds, ahead=ahead)
+        return Paths(least=jnp.concatenate(least), certified=reached & proved, ahead=ahead)
 
     def _follow(
-        self, env: Environment, backups: Sequence[BackupController], first: Float[Array, ""], sim: Sim
+        self,
+        env: Environment,
+        backups: Sequence[BackupController],
+        first: Float[Array, ""],
+        sim: Sim,
     ) -> tuple[Float[Array, " backups"], list[Sim]]:
-        """The smallest h, and the end, for backup controllers among whom the other platforms move alike.
+        """Return the smallest h on the way, and the last simulation, of each backup controller.
 
-        These are predicted once.
+        Args:
+            env: the environment.
+            backups: backup controllers under which the other platforms move alike. The other
+                platforms are predicted once.
+            first: the smallest h at `sim`.
+            sim: the simulation from which the backup controllers act.
         """
         low, high = bounds(env)
         plant = env.agent_platform
 
-        def placed(sim: Sim, own: Any) -> Sim:
-            return sim.replace(platforms={**sim.platforms, env.agent: own})
+        def with_agent(sim: Sim, agent_state: Any) -> Sim:
+            return sim.replace(platforms={**sim.platforms, env.agent: agent_state})
 
-        def one(carry: tuple[Sim, list[Any], list[Array]]) -> tuple[Sim, list[Any], list[Array]]:
-            sim, crafts, least = carry
+        def one_step(
+            carry: tuple[Sim, list[Any], list[Array]],
+        ) -> tuple[Sim, list[Any], list[Array]]:
+            sim, agent_states, least = carry
             later = others_later(env, sim)
-            after = later_sim(env, sim, {**later, env.agent: crafts[0]})
+            after = later_sim(env, sim, {**later, env.agent: agent_states[0]})
             for i, backup in enumerate(backups):
-                before = placed(sim, crafts[i])
+                before = with_agent(sim, agent_states[i])
                 control = jnp.clip(backup.control(env, before, later), low, high)
                 move = plant.step_within_limits if backup.within_limits else plant.step
-                crafts[i] = move(crafts[i], commanded(env, plant, before, control), env.dt)
-                least[i] = jnp.minimum(least[i], self.lowest(env, before, placed(after, crafts[i])))
-            return placed(after, crafts[0]), crafts, least
+                agent_states[i] = move(
+                    agent_states[i], commanded(env, plant, before, control), env.dt
+                )
+                lowest = self.lowest(env, before, with_agent(after, agent_states[i]))
+                least[i] = jnp.minimum(least[i], lowest)
+            return with_agent(after, agent_states[0]), agent_states, least
 
         sim = sim.replace(regions={}, status={})
         start = (sim, [sim.platforms[env.agent]] * len(backups), [first] * len(backups))
-        last, crafts, least = repeat(one, start, self.horizon)
-        return jnp.stack(least), [placed(last, own) for own in crafts]
+        last, agent_states, least = repeat(one_step, start, self.horizon)
+        return jnp.stack(least), [with_agent(last, agent_state) for agent_state in agent_states]
 
-    def _ended(self, env: Environment, end: Sim) -> Bool[Array, ""]:
-        """Whether a certificate may end in a state."""
+    def _may_end(self, env: Environment, end: Sim) -> Bool[Array, ""]:
+        """Return whether a certificate may end in a state."""
         assert self.terminal is not None
-        return self.terminal.contains(env, end) & _none(self.terminal.faults(env, end, self)) & _finite(end)
+        inside = self.terminal.contains(env, end)
+        return inside & _none(self.terminal.faults(env, end, self)) & _finite(end)
 
     def _renew(
-        self, env: Environment, sim: Sim, memory: RTAMemory, backed: Sim, fallback: Float[Array, ""]
+        self,
+        env: Environment,
+        sim: Sim,
+        memory: RTAMemory,
+        after_backup: Sim,
+        backup_margin: Float[Array, ""],
     ) -> tuple[Bool[Array, ""], Mapping[str, Any]]:
-        """The certificate of the state after a step of backing up, and the end of its horizon.
+        """Return whether the state after a step of the backup is certified, and its horizon's end.
 
-        All but the last of its steps are those of the certificate before it, so only that one is predicted.
+        All steps of the new certificate but the last are steps of the one before it. So only the
+        last step is predicted.
+
+        Args:
+            env: the environment.
+            sim: the simulation before the step.
+            memory: the memory before the step.
+            after_backup: the simulation after a step of the backup controller.
+            backup_margin: the smallest h on that step.
         """
-        end = sim.replace(time=sim.time + self.horizon * env.dt, platforms=memory.ahead, regions={}, status={})
+        end_time = sim.time + self.horizon * env.dt
+        end = sim.replace(time=end_time, platforms=memory.ahead, regions={}, status={})
         later = others_later(env, end)
-        further = advance(env, end, self._backup(env, end, memory, later), later)
-        holds = jnp.stack([_none(backup.faults(env, backed, self)) for backup in self.backups])[memory.backup_index]
-        keeps = (self.lowest(env, end, further) >= self.required_margin(env)) & (fallback >= 0.0)
-        renewed = memory.certified & keeps & self._ended(env, further) & holds & _finite(backed)
-        return renewed, jax.lax.stop_gradient(further.platforms)
+        new_end = advance(env, end, self._backup(env, end, memory, later), later)
+        faultless = [_none(backup.faults(env, after_backup, self)) for backup in self.backups]
+        proved = jnp.stack(faultless)[memory.backup_index]
+        last_step_keeps = self.lowest(env, end, new_end) >= self.required_margin(env)
+        keeps = last_step_keeps & (backup_margin >= 0.0)
+        renewed = memory.certified & keeps & self._may_end(env, new_end)
+        renewed = renewed & proved & _finite(after_backup)
+        return renewed, jax.lax.stop_gradient(new_end.platforms)
 
     def _best(self, env: Environment, paths: Paths) -> Int[Array, ""]:
-        """The backup controller of the largest h on its way, among those that are certified if there are any."""
+        """Return the index of the backup controller with the largest h on its way.
+
+        Only certified ones are compared if there are any.
+        """
         certified = paths.values >= self.required_margin(env)
         compared = jnp.where(jnp.any(certified), paths.values, paths.least)
         return jnp.argmax(jnp.where(jnp.isnan(compared), -jnp.inf, compared)).astype(jnp.int32)
 
-    def _backup(self, env: Environment, sim: Sim, memory: RTAMemory, later: Others) -> Float[Array, " m"]:
-        each = jnp.stack([backup.control(env, sim, later) for backup in self.backups])
-        chosen = each[memory.backup_index] if len(self.backups) > 1 else each[0]
+    def _backup(
+        self, env: Environment, sim: Sim, memory: RTAMemory, later: Others
+    ) -> Float[Array, " m"]:
+        controls = jnp.stack([backup.control(env, sim, later) for backup in self.backups])
+        chosen = controls[memory.backup_index] if len(self.backups) > 1 else controls[0]
         return admissible(env, chosen)[0]
 
 
-def admissible(env: Environment, control: Float[Array, " m"]) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
-    """The control within its bounds, 0 for what is not a number, and whether all of it was finite."""
+def admissible(
+    env: Environment, control: Float[Array, " m"]
+) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
+    """Return the control within its bounds and whether all elements are finite.
+
+    Elements that are not finite become 0 before they are brought within the bounds.
+    """
     low, high = bounds(env)
     finite = jnp.isfinite(control)
     return within(jnp.where(finite, control, 0.0), low, high), jnp.all(finite)
 
 
 def repeated(parts: Sequence[Any]) -> str | None:
-    """What is wrong if two parts have the same name."""
-    names = [one.name for one in parts]
+    """Return what is wrong if two parts have the same name, else None."""
+    names = [part.name for part in parts]
     twice = next((name for name in names if names.count(name) > 1), None)
     return f"the name {twice!r} is there twice" if twice else None
 
 
 def _none(faults: Faults) -> Bool[Array, ""]:
+    """Return whether none of the faults applies."""
     return ~functools.reduce(jnp.logical_or, faults.values(), jnp.zeros((), bool))
 
 
 def _finite(sim: Sim) -> Bool[Array, ""]:
-    return functools.reduce(jnp.logical_and, [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(sim.platforms)])
+    leaves = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(sim.platforms)]
+    return functools.reduce(jnp.logical_and, leaves)
 
 
 def _where(condition: Bool[Array, ""], this: Any, other: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), this, other)
 
 
-def _chosen(ahead: Mapping[str, Any], index: Int[Array, ""]) -> Mapping[str, Any]:
+def _selected(ahead: Mapping[str, Any], index: Int[Array, ""]) -> Mapping[str, Any]:
     return jax.lax.stop_gradient(jax.tree.map(lambda leaf: leaf[index], ahead))

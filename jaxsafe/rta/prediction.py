@@ -1,4 +1,4 @@
-"""Prediction over many steps, and what it assumes of the other platforms."""
+"""Prediction over many steps, and whether the other platforms react to what the agent does."""
 
 from __future__ import annotations
 
@@ -19,36 +19,45 @@ T = TypeVar("T")
 
 
 def others_react(env: Environment, sim: Sim) -> bool:
-    """Whether any other platform looks at the agent's state, so that it moves otherwise after other controls.
+    """Return whether any other platform looks at the agent's state.
 
-    Found by tracing, so it costs nothing at run time: what looks at a mapped state is mapped itself.
+    If so, other platforms move differently after other controls of the agent. The answer is found
+    by tracing, so it costs nothing at run time: whatever looks at a mapped state is mapped itself.
     """
 
-    def later(own: Any) -> Others:
-        return others_later(env, sim.replace(platforms={**sim.platforms, env.agent: own}, regions={}, status={}))
+    def later(agent_state: Any) -> Others:
+        platforms = {**sim.platforms, env.agent: agent_state}
+        return others_later(env, sim.replace(platforms=platforms, regions={}, status={}))
 
-    two = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), sim.platforms[env.agent])
+    two_states = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), sim.platforms[env.agent])
     try:
-        jax.eval_shape(jax.vmap(later, out_axes=None), two)
-    except ValueError:
+        jax.eval_shape(jax.vmap(later, out_axes=None), two_states)
+    except ValueError:  # an output is mapped, but `out_axes` says that none is
         return True
     return False
 
 
 def repeat(function: Callable[[T], T], start: T, count: int) -> T:
-    """A function applied over and over.
+    """Return the result of applying a function `count` times.
 
-    Between two applications every number is a variable of its own. A batch of them is then contiguous, while in a batch of
-    vectors XLA interleaves their elements and computes one at a time: for aircraft several times slower.
+    Between two applications every number is a variable of its own, so a batch of each is
+    contiguous. In a batch of vectors XLA would interleave their elements and compute one at a time,
+    which is several times slower for aircraft.
     """
     leaves, tree = jax.tree.flatten(start)
     shapes = [leaf.shape for leaf in leaves]
 
-    def apart(whole: T) -> list[list[Array]]:
-        return [list(leaf.reshape(-1)) for leaf in jax.tree.leaves(whole)]
+    def split(value: T) -> list[list[Array]]:
+        return [list(leaf.reshape(-1)) for leaf in jax.tree.leaves(value)]
 
-    def together(parts: list[list[Array]]) -> T:
-        return jax.tree.unflatten(tree, [jnp.stack(part).reshape(shape) for part, shape in zip(parts, shapes, strict=True)])
+    def join(numbers: list[list[Array]]) -> T:
+        joined = [
+            jnp.stack(part).reshape(shape) for part, shape in zip(numbers, shapes, strict=True)
+        ]
+        return jax.tree.unflatten(tree, joined)
 
-    parts, _ = jax.lax.scan(lambda parts, _: (apart(function(together(parts))), None), apart(start), length=count)
-    return together(parts)
+    def apply(numbers: list[list[Array]], _: None) -> tuple[list[list[Array]], None]:
+        return split(function(join(numbers))), None
+
+    numbers, _ = jax.lax.scan(apply, split(start), length=count)
+    return join(numbers)

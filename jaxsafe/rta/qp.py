@@ -1,8 +1,9 @@
-"""The nearest control within bounds and under a few linear constraints, exactly, by trying every set of active constraints.
+"""The exact nearest control within bounds and under a few linear constraints.
 
-Each element of the control is free or rests on one of its bounds, and each constraint is active or not. For a few of both
-there are few such patterns; all are solved side by side by elimination of as many unknowns as there are constraints, at a
-fixed cost, without iteration or start, and the derivative is that of the active set.
+Each element of the control is free or rests on one of its bounds, and each constraint is active or
+not. For a few of both there are few such patterns. All patterns are solved side by side, by
+elimination of as many unknowns as there are constraints. So the cost is fixed, there is no
+iteration and no start, and the derivative is that of the active set.
 """
 
 from __future__ import annotations
@@ -29,74 +30,107 @@ def nearest_control(
     slack: Number | None = None,
     tolerance: Number | None = None,
 ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
-    """Nearest control, argmin ‖w − u‖² + σ‖s‖² subject to rows·w + s ≥ offsets, s ≥ 0 and low ≤ w ≤ high.
+    """Return the nearest control argmin ‖w − u‖² + σ‖s‖².
 
-    Without a `slack` σ, s = 0. For a pattern with free elements F and active rows S, w_F = u_F + A_SFᵀλ, where
-    (A_SF A_SFᵀ + I/σ) λ = b_S − A_S w⁰ and w⁰ is u on F and the bounds elsewhere. No admissible pattern gives less than the
-    optimum, which is one of them, so the best is the solution, and no signs of multipliers need to be checked. There are
-    3ᵐ 2ᶜ patterns at most.
+    It is subject to rows·w + s ≥ offsets, s ≥ 0 and low ≤ w ≤ high. Without a `slack` σ, s = 0.
+
+    For a pattern with free elements F and active rows S the solution is w_F = u_F + A_SFᵀλ, where
+    (A_SF A_SFᵀ + I/σ) λ = b_S − A_S w⁰, and w⁰ is u on F and the bounds elsewhere. The optimum is
+    the solution of one of the patterns, and no admissible pattern gives less. So the best pattern
+    is the solution, and no signs of multipliers need to be checked. There are 3ᵐ 2ᶜ patterns at
+    most.
 
     Args:
         u: the desired control, shape (m,).
         low: lower bounds, finite, shape (m,).
         high: upper bounds, finite, shape (m,).
-        rows: the constraints' normals A, shape (c, m).
-        offsets: their right-hand sides b, shape (c,).
-        slack: cost σ > 0 of missing a constraint; None: none may be missed.
-        tolerance: by which a row of unit length counts as met; None: 30 times the rounding unit, 4e-6 in float32.
+        rows: normals A of the constraints, shape (c, m).
+        offsets: right-hand sides b of the constraints, shape (c,).
+        slack: cost σ > 0 of missing a constraint. With None no constraint may be missed.
+        tolerance: by how much a row of unit length may be missed and still count as met. None
+            stands for 30 times the rounding unit, which is 4e-6 in float32.
 
     Returns:
-        The solution, and whether there is one without slack; where not, u within its bounds. With slack there always is,
-        and the second says whether each row by itself can be met.
+        The solution and a flag. Without slack the flag says whether there is a solution. If there
+        is none, the first is u within its bounds. With slack there always is a solution, and the
+        flag says whether each row by itself can be met.
     """
     count, size = rows.shape
     squared = jnp.sum(rows * rows, axis=-1)
-    scale = jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0))  # a row of zeros has no derivative of its length
-    rows, offsets = rows / scale[:, None], offsets / scale
+    scale = jnp.sqrt(
+        jnp.where(squared > 0.0, squared, 1.0)
+    )  # the length of a row of zeros has no derivative
+    rows = rows / scale[:, None]
+    offsets = offsets / scale
     cost = None if slack is None else slack * scale**2
     allowed = 30.0 * float(jnp.finfo(u.dtype).eps) if tolerance is None else tolerance
 
-    # Vectors and matrices are lists over their elements, each an array over the patterns: SIMD runs along the long axis.
+    # Vectors and matrices are lists of their elements. Each element is an array over the patterns,
+    # because SIMD runs along the long axis.
     sides, actives = _patterns(size, count, soft=slack is not None)
-    begin = [jnp.where(side == 0, u[k], jnp.where(side < 0, low[k], high[k])) for k, side in enumerate(sides)]
-    reach = [[jnp.where(side == 0, row[k], 0.0) for k, side in enumerate(sides)] for row in rows]
+    w0 = [
+        jnp.where(side == 0, u[k], jnp.where(side < 0, low[k], high[k]))
+        for k, side in enumerate(sides)
+    ]
+    free_rows = [
+        [jnp.where(side == 0, row[k], 0.0) for k, side in enumerate(sides)] for row in rows
+    ]
     gram = [
-        [jnp.where(p & q, _dot(some, row), 0.0) for row, q in zip(rows, actives, strict=True)]
-        for some, p in zip(reach, actives, strict=True)
+        [
+            jnp.where(active & other_active, _dot(free_row, row), 0.0)
+            for row, other_active in zip(rows, actives, strict=True)
+        ]
+        for free_row, active in zip(free_rows, actives, strict=True)
     ]
     for i, active in enumerate(actives):
         gram[i][i] = jnp.where(active, gram[i][i] + (0.0 if cost is None else 1.0 / cost[i]), 1.0)
-    gap = [jnp.where(active, offsets[i] - _dot(begin, rows[i]), 0.0) for i, active in enumerate(actives)]
+    gap = [
+        jnp.where(active, offsets[i] - _dot(w0, rows[i]), 0.0) for i, active in enumerate(actives)
+    ]
     multipliers, regular = _solve(gram, gap)
-    w = [within(begin[k] + _dot(multipliers, [some[k] for some in reach]), low[k], high[k]) for k in range(size)]
+    w = [
+        within(w0[k] + _dot(multipliers, [row[k] for row in free_rows]), low[k], high[k])
+        for k in range(size)
+    ]
 
     missing = [jnp.maximum(offsets[i] - _dot(w, rows[i]), 0.0) for i in range(count)]
     value = sum((w[k] - u[k]) ** 2 for k in range(size))
     if cost is None:
-        valid = functools.reduce(jnp.logical_and, [one <= allowed for one in missing], regular)
+        met = [amount <= allowed for amount in missing]
+        valid = functools.reduce(jnp.logical_and, met, regular)
         feasible = jnp.any(valid)
     else:
-        valid, value = regular, value + sum(cost[i] * missing[i] ** 2 for i in range(count))
-        feasible = jnp.all(jnp.sum(jnp.where(rows > 0.0, rows * high, rows * low), axis=-1) >= offsets)
+        valid = regular
+        value = value + sum(cost[i] * missing[i] ** 2 for i in range(count))
+        highest = jnp.sum(jnp.where(rows > 0.0, rows * high, rows * low), axis=-1)
+        feasible = jnp.all(highest >= offsets)
     best = jnp.argmin(jnp.where(valid, value, jnp.inf))
-    # On a bound several patterns give u itself, and the first of them holds it there; u has its own derivative.
+    # If u is on a bound, several patterns give u itself. The first of them holds it on the bound
+    # and so has no derivative there. Therefore u is taken with its own derivative.
     unaltered = jnp.all(jnp.sum(rows * u, axis=-1) >= offsets) & jnp.all((u >= low) & (u <= high))
-    chosen = jnp.where(unaltered, u, jnp.stack([one[best] for one in w]))
+    chosen = jnp.where(unaltered, u, jnp.stack([element[best] for element in w]))
     return jnp.where(jnp.any(valid), chosen, within(u, low, high)), feasible
 
 
 def _patterns(size: int, count: int, *, soft: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Every element's side, −1 low, 0 free, 1 high, and every row's activity.
+    """Return for each pattern the side of every element and whether each row is active.
 
-    At most as many rows as free elements can be active without depending on each other; with slack all can.
+    A side is −1 for the low bound, 0 for a free element and 1 for the high bound. Without slack, no
+    more rows than free elements can be active without depending on each other. With slack (`soft`)
+    all rows can.
+
+    Returns:
+        Sides of shape (size, patterns) and activity of shape (count, patterns).
     """
-    both = [
+    patterns = [
         (side, active)
         for side in itertools.product((-1, 0, 1), repeat=size)
         for active in itertools.product((False, True), repeat=count)
         if soft or sum(active) <= side.count(0)
     ]
-    return np.array([side for side, _ in both]).T, np.array([active for _, active in both]).T
+    sides = np.array([side for side, _ in patterns]).T
+    actives = np.array([active for _, active in patterns]).T
+    return sides, actives
 
 
 def _dot(left: Sequence[Any], right: Any) -> Any:
@@ -104,9 +138,10 @@ def _dot(left: Sequence[Any], right: Any) -> Any:
 
 
 def _solve(gram: list[list[Array]], right: list[Array]) -> tuple[list[Array], Bool[Array, " p"]]:
-    """Solutions of small symmetric positive systems by elimination, and which of them are regular.
+    """Return the solutions of small symmetric positive systems and which of them are regular.
 
-    A pivot is the squared distance of a unit row from the span of those before it.
+    They are solved by elimination. A pivot is the squared distance of a unit row from the span of
+    the rows before it, so a small pivot means that the rows depend on each other.
     """
     size = len(right)
     regular = jnp.ones(right[0].shape, bool)

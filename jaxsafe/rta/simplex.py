@@ -1,4 +1,4 @@
-"""Simplex filters, Eq. (1): the desired control or the backup control, and a mixture of both."""
+"""Simplex filters, Eq. (1): either the desired or the backup control acts, or a mixture of both."""
 
 from __future__ import annotations
 
@@ -29,10 +29,11 @@ class Simplex(CertifiedRTA, type="simplex"):
 
 
 class Blend(CertifiedRTA, type="blend"):
-    """The largest share θ of the desired control that is certified: u = u_backup + θ (u_des − u_backup).
+    """The mixture u = u_backup + θ (u_des − u_backup) with the largest share θ that is certified.
 
-    θ is one of `parts` equal shares up to 1, each predicted by itself; without any the backup control acts. It needs no
-    derivative and no structure of the plant, and corrects less than Simplex.
+    θ is one of `parts` equal shares up to 1. Each is predicted by itself. If none is certified, the
+    backup control acts. This filter needs no derivative and no structure of the plant, and it
+    corrects less than Simplex.
     """
 
     parts: Annotated[int, Range(1, 64)] = 8
@@ -42,60 +43,83 @@ class Blend(CertifiedRTA, type="blend"):
     ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
         shares = jnp.arange(1, self.parts + 1, dtype=desired.dtype) / self.parts
         mixed = backup + shares[:, None] * (desired - backup)
-        mixed = mixed.at[-1].set(desired)  # to the last bit
+        mixed = mixed.at[-1].set(desired)  # the sum above may differ from it in the last bit
         values = jax.vmap(lambda u: jnp.max(self.certify(env, sim, advance(env, sim, u))))(mixed)
-        passes = values >= self.required_margin(env)
-        largest = self.parts - 1 - jnp.argmax(passes[::-1])
-        return jnp.where(jnp.any(passes), mixed[largest], backup), jnp.any(passes)
+        certified = values >= self.required_margin(env)
+        largest = self.parts - 1 - jnp.argmax(certified[::-1])
+        return jnp.where(jnp.any(certified), mixed[largest], backup), jnp.any(certified)
 
 
 class CollisionSimplex(RTA, type="collision_simplex"):
-    """The collision filter of the released 2D rejoin code, decision for decision; it does not prevent every collision.
+    """The collision filter of the released 2D rejoin code.
 
-    It predicts, at `points` instants over the next `window`, the distance between the agent turning at `turn_rate` away
-    from the other's side and the other keeping its present rates. At `engage` or closer that turn acts, without
-    acceleration, until the distance is above `release`. The desired control is never looked at.
+    It takes the same decisions as that code, and it does not prevent every collision.
+
+    The filter predicts the distance between the two aircraft at `points` instants over the next
+    `window` seconds. In the prediction the agent turns at `turn_rate`, away from the side on which
+    the other aircraft is, and the other one keeps its present rates. If the smallest distance is at
+    most `engage`, that turn acts, without acceleration, until the smallest distance is above
+    `release`. The filter never looks at the desired control.
     """
 
     other: PlatformName
     window: Annotated[Number, Unit("s"), Range(0.0, open_low=True, largest=1e4)] = 11.0
     points: Annotated[int, Range(2, largest=10_000)] = 111
-    turn_rate: Annotated[RadiansPerSecond, Range(0.0, open_low=True, largest=1e3)] = math.radians(6.0)
+    turn_rate: Annotated[RadiansPerSecond, Range(0.0, open_low=True, largest=1e3)] = math.radians(
+        6.0
+    )
     engage: Annotated[Length, Positive] = 200.0
     release: Annotated[Length, Positive] = 250.0
 
     def begin(self, env: Environment, sim: Sim) -> tuple[RTAMemory, RTAInfo]:
-        no, zero = jnp.zeros((), bool), jnp.zeros((), jnp.int32)
+        false = jnp.zeros((), bool)
+        index = jnp.zeros((), jnp.int32)
         nearest, _ = self._predict(env, sim)
-        info = RTAInfo(jnp.zeros_like(sim.time), ~no, no, nearest - self.engage, zero)
-        return RTAMemory(intervening=no, backup_index=zero, certified=no, ahead={}), info
+        info = RTAInfo(
+            correction=jnp.zeros_like(sim.time),
+            feasible=~false,
+            certified=false,
+            predicted_margin=nearest - self.engage,
+            backup_index=index,
+        )
+        memory = RTAMemory(intervening=false, backup_index=index, certified=false, ahead={})
+        return memory, info
 
     def filter(
         self, env: Environment, sim: Sim, memory: RTAMemory, desired: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], RTAMemory, RTAInfo]:
         wanted, finite = admissible(env, desired)
         nearest, turn = self._predict(env, sim)
-        on = ~(nearest > jnp.where(memory.intervening, self.release, self.engage))  # also where it is not a number
+        threshold = jnp.where(memory.intervening, self.release, self.engage)
+        engaged = ~(nearest > threshold)  # also where `nearest` is NaN
         controls = {"heading_rate": turn, "acceleration": jnp.zeros_like(turn)}
         backup = admissible(env, jnp.stack([controls[name] for name in env.action_names]))[0]
-        actual = jnp.where(on, backup, wanted)
-        memory = memory.replace(intervening=on)
-        correction = safe_norm(actual - wanted)
-        return actual, memory, RTAInfo(correction, finite, jnp.zeros((), bool), nearest - self.engage, memory.backup_index)
+        actual = jnp.where(engaged, backup, wanted)
+        memory = memory.replace(intervening=engaged)
+        info = RTAInfo(
+            correction=safe_norm(actual - wanted),
+            feasible=finite,
+            certified=jnp.zeros((), bool),
+            predicted_margin=nearest - self.engage,
+            backup_index=memory.backup_index,
+        )
+        return actual, memory, info
 
     def _predict(self, env: Environment, sim: Sim) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Smallest distance on the backup's way, and the turn that it makes."""
-        own, other = sim.platforms[env.agent], sim.platforms[self.other]
-        rate = undirected(env.platform(self.other), sim).get("heading_rate", jnp.zeros_like(sim.time))
+        """Return the smallest predicted distance and the heading rate of the backup's turn."""
+        own = sim.platforms[env.agent]
+        other = sim.platforms[self.other]
+        other_controls = undirected(env.platform(self.other), sim)
+        other_turn = other_controls.get("heading_rate", jnp.zeros_like(sim.time))
         bearing = to_body(own.orientation, other.position - own.position)
         turn = jnp.where(bearing[1] >= 0.0, -self.turn_rate, self.turn_rate)
         times = jnp.linspace(0.0, 1.0, self.points) * self.window
-        gap = _arc(own, turn, times) - _arc(other, rate, times)
+        gap = _arc(own, turn, times) - _arc(other, other_turn, times)
         return jnp.min(safe_norm(gap)), turn
 
 
 def _arc(state: Any, rate: Float[Array, ""], times: Float[Array, " n"]) -> Float[Array, "n 2"]:
-    """Positions in the plane at constant speed and heading rate."""
+    """Return the positions in the plane at some times, at constant speed and heading rate."""
     half = rate * times / 2.0
     chord = state.speed * times * jnp.sinc(half / jnp.pi)
     return state.position[None] + chord[:, None] * direction(state.heading + half)

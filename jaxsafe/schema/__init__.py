@@ -1,1 +1,4 @@
-"""Components and their fields, dotted paths into them, and how they are read and written. Nothing here knows a task."""
+"""Components and their fields, dotted paths into them, and how they are read and written.
+
+Nothing in this package knows a task.
+"""

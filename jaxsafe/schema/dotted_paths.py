@@ -1,7 +1,8 @@
-"""Dotted paths into components: `reward.delta_v.scale`, `deputy.mass`, `deputy.controller.actuators.thrust_x.low`.
+"""Dotted paths into components, such as `reward.delta_v.scale` or `deputy.mass`.
 
-A path walks through field names and the names of the parts in a list; at the start it may also name a part of the
-component's `shorthand` field, a platform of an environment.
+A path walks through field names and the names of the parts in a list, for instance
+`deputy.controller.actuators.thrust_x.low`. At the start it may also name a part of the component's
+`shorthand` field, which in an environment is a platform.
 """
 
 from __future__ import annotations
@@ -14,26 +15,34 @@ from jaxsafe.schema.component import Component, Field, Refers, fields
 from jaxsafe.schema.errors import ConfigError, nearest, show
 
 Convert = Callable[[Any, Field, str], Any]
-"""`convert(value, field, place)`: the value that the field takes, or a ConfigError that names the place."""
+"""`convert(value, field, place)` returns the value that the field takes.
+
+It raises a ConfigError that names the place if the field does not take the value.
+"""
 
 
 def join(place: str, name: str) -> str:
-    """`place.name`; either alone where the other is empty."""
+    """Return `place.name`, or one of the two alone where the other is empty."""
     return f"{place}.{name}" if place and name else place or name
 
 
 def as_given(value: Any, field: Field, place: str) -> Any:
-    """A `Convert` that checks nothing."""
+    """Return the value unchanged: the `Convert` that checks nothing."""
     return value
 
 
 def get_path(component: Any, path: str) -> Any:
-    """Return the value at a dotted path, which must lead somewhere. Of named parts it is the names, as `set_path` takes."""
+    """Return the value at a dotted path, which must lead somewhere.
+
+    Where the path leads to a list of named parts, their names are returned. `set_path` takes such a
+    list of names.
+    """
     value = component
     for name in path.split("."):
         if value is component and name not in fields(type(component)):
             value = getattr(component, component.shorthand)
-        value = value[_index(value, name, path)] if isinstance(value, tuple) else getattr(value, name)
+        is_list = isinstance(value, tuple)
+        value = value[_index(value, name, path)] if is_list else getattr(value, name)
     named = isinstance(value, tuple) and all(hasattr(part, "name") for part in value)
     return [part.name for part in value] if named else value
 
@@ -41,49 +50,71 @@ def get_path(component: Any, path: str) -> Any:
 def set_path(component: Any, path: str, value: Any, convert: Convert = as_given) -> Any:
     """Return the component with the value at one dotted path replaced.
 
-    Where the path leads to a list of named parts, a list of names picks them, in the new order.
+    Where the path leads to a list of named parts, a list of names picks parts in the new order.
 
     Raises:
         ConfigError: the path leads nowhere, or `convert` refuses the value.
     """
-    return _set(component, path.split("."), value, convert, "")
+    return _set(component, path.split("."), value, convert, place="")
 
 
 def _set(component: Any, path: list[str], value: Any, convert: Convert, place: str) -> Any:
-    head, rest = path[0], path[1:]
+    """Do what `set_path` does for a component that stands at `place`."""
+    head = path[0]
+    rest = path[1:]
     table = fields(type(component))
     parts = getattr(component, component.shorthand) if component.shorthand and not place else ()
     names = [part.name for part in parts]
     if head not in table and head in names:
-        return component.replace(**{component.shorthand: _set_item(parts, path, value, convert, place)})
+        return component.replace(
+            **{component.shorthand: _set_item(parts, path, value, convert, place)}
+        )
     if head not in table:
-        raise ConfigError(f"{join(place, head)}: unknown field {show(head)}; choose from {nearest(head, [*table, *names])}")
-    here, inner = join(place, head), getattr(component, head)
+        raise ConfigError(
+            f"{join(place, head)}: unknown field {show(head)}; "
+            f"choose from {nearest(head, [*table, *names])}"
+        )
+    field_place = join(place, head)
+    content = getattr(component, head)
     if not rest:
-        picked = _pick(inner, value, here) if _are_names(inner, value) else convert(value, table[head], here)
-        return component.replace(**{head: picked})
-    if isinstance(inner, Component):
-        return component.replace(**{head: _set(inner, rest, value, convert, here)})
-    if isinstance(inner, tuple):
-        return component.replace(**{head: _set_item(inner, rest, value, convert, here)})
-    if isinstance(inner, Mapping) and len(rest) == 1:
-        if rest[0] not in inner:
-            raise ConfigError(f"{here}: unknown name {show(rest[0])}; choose from {nearest(rest[0], inner)}")
-        return component.replace(**{head: convert({**inner, rest[0]: value}, table[head], here)})
-    raise ConfigError(f"{join(here, rest[0])}: {here} has no fields" + (" because it is not set" if inner is None else ""))
+        if _are_names(content, value):
+            return component.replace(**{head: _pick(content, value, field_place)})
+        return component.replace(**{head: convert(value, table[head], field_place)})
+    if isinstance(content, Component):
+        return component.replace(**{head: _set(content, rest, value, convert, field_place)})
+    if isinstance(content, tuple):
+        return component.replace(**{head: _set_item(content, rest, value, convert, field_place)})
+    if isinstance(content, Mapping) and len(rest) == 1:
+        if rest[0] not in content:
+            raise ConfigError(
+                f"{field_place}: unknown name {show(rest[0])}; "
+                f"choose from {nearest(rest[0], content)}"
+            )
+        entries = {**content, rest[0]: value}
+        return component.replace(**{head: convert(entries, table[head], field_place)})
+    reason = " because it is not set" if content is None else ""
+    raise ConfigError(f"{join(field_place, rest[0])}: {field_place} has no fields{reason}")
 
 
 def _set_item(items: tuple, path: list[str], value: Any, convert: Convert, place: str) -> tuple:
+    """Return the items with the value at a path replaced, which begins with the name of an item."""
     index = _index(items, path[0], place)
+    item_place = join(place, path[0])
     if len(path) == 1:
-        raise ConfigError(f"{join(place, path[0])}: name one of its fields: {', '.join(fields(type(items[index])))}")
-    changed = _set(items[index], path[1:], value, convert, join(place, path[0]))
+        raise ConfigError(
+            f"{item_place}: name one of its fields: {', '.join(fields(type(items[index])))}"
+        )
+    changed = _set(items[index], path[1:], value, convert, item_place)
     return (*items[:index], changed, *items[index + 1 :])
 
 
-def _are_names(inner: Any, value: Any) -> bool:
-    named = isinstance(inner, tuple) and inner and all(hasattr(part, "name") for part in inner)
-    return bool(named and value and isinstance(value, (list, tuple)) and all(isinstance(one, str) for one in value))
+def _are_names(content: Any, value: Any) -> bool:
+    """Return whether a field holds named parts and the value for it is a list of names."""
+    named = (
+        isinstance(content, tuple) and content and all(hasattr(part, "name") for part in content)
+    )
+    listed = isinstance(value, (list, tuple)) and value
+    return bool(named and listed and all(isinstance(name, str) for name in value))
 
 
 def _pick(items: tuple, names: Sequence[str], place: str) -> tuple:
@@ -93,31 +124,47 @@ def _pick(items: tuple, names: Sequence[str], place: str) -> tuple:
 def _index(items: tuple, name: str, place: str) -> int:
     names = [getattr(item, "name", str(index)) for index, item in enumerate(items)]
     if name not in names:
-        raise ConfigError(f"{join(place, name)}: unknown name {show(name)}; choose from {nearest(name, names)}")
+        raise ConfigError(
+            f"{join(place, name)}: unknown name {show(name)}; choose from {nearest(name, names)}"
+        )
     return names.index(name)
 
 
 def references(component: Component, place: str) -> Iterator[tuple[str, Refers, str]]:
-    """Yield each name of another part that a component has: the place of the name, what it refers to, and the name."""
+    """Yield each name by which a component refers to another part.
+
+    Yields:
+        The place where the name stands, what it refers to, and the name.
+    """
     for name, field in fields(type(component)).items():
-        value, here = getattr(component, name), join(place, name)
-        for refers, one in [(field.refers, value)] if field.refers else _listed(field.hint, value):
-            if isinstance(one, str):
-                yield here, refers, one
+        value = getattr(component, name)
+        field_place = join(place, name)
+        marked = [(field.refers, value)] if field.refers else _marked_items(field.hint, value)
+        for refers, content in marked:
+            if isinstance(content, str):
+                yield field_place, refers, content
         if isinstance(value, Mapping):
-            yield from ((here, refers, key) for refers in _key_refers(field.hint) for key in value)
+            for refers in _item_references(field.hint):
+                for key in value:
+                    yield field_place, refers, key
         for inner in value if isinstance(value, tuple) else (value,):
             if isinstance(inner, Component):
-                yield from references(inner, join(here, getattr(inner, "name", "")))
+                yield from references(inner, join(field_place, getattr(inner, "name", "")))
 
 
-def _listed(hint: Any, value: Any) -> list[tuple[Refers, Any]]:
-    """The names in a `tuple[Annotated[str, Refers(…)], …]`, each with what it refers to."""
-    return [(refers, one) for refers in _key_refers(hint) for one in value] if isinstance(value, tuple) else []
+def _marked_items(hint: Any, value: Any) -> list[tuple[Refers, Any]]:
+    """Return the names in a `tuple[Annotated[str, Refers(…)], …]`, each with what it refers to."""
+    if not isinstance(value, tuple):
+        return []
+    return [(refers, item) for refers in _item_references(hint) for item in value]
 
 
-def _key_refers(hint: Any) -> list[Refers]:
-    """What the keys of `Mapping[Annotated[str, Refers(…)], …]`, or the elements of such a tuple, refer to."""
-    key = next(iter(typing.get_args(hint)), None)
-    marks = typing.get_args(key)[1:] if typing.get_origin(key) is Annotated else ()
+def _item_references(hint: Any) -> list[Refers]:
+    """Return what the items of a tuple or the keys of a mapping refer to.
+
+    They are those of an annotation `tuple[Annotated[str, Refers(…)], …]` or
+    `Mapping[Annotated[str, Refers(…)], …]`.
+    """
+    item = next(iter(typing.get_args(hint)), None)
+    marks = typing.get_args(item)[1:] if typing.get_origin(item) is Annotated else ()
     return [mark for mark in marks if isinstance(mark, Refers)]

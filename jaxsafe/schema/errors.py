@@ -1,4 +1,7 @@
-"""Errors that a user's input can cause: one line that names the place, what was found and what is allowed."""
+"""Errors that a user's input can cause.
+
+Each is one line that names the place, what was found and what is allowed.
+"""
 
 from __future__ import annotations
 
@@ -10,23 +13,32 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-CONTROLS = {code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0))}
-"""How control characters are spelt out."""
+CONTROL_ESCAPES = {code: f"\\x{code:02x}" for code in (*range(0x20), *range(0x7F, 0xA0))}
+"""How control characters are spelt out, as a table for `str.translate`."""
 
-ALLOWED = {ord(letter): letter for letter in "\n\t"}
-"""Control characters that are part of a text."""
+TEXT_CONTROLS = {ord(letter): letter for letter in "\n\t"}
+"""Control characters that belong to a text and stay as they are, as a table for `str.translate`."""
+
+MAX_PRINTED_BITS = 10_000
+"""A longer whole number is not printed, because Python refuses to write more than 4300 digits."""
 
 
 class ConfigError(ValueError):
-    """A value from outside is wrong: a misspelt name, a wrong type, a number out of range, a broken file."""
+    """A value from outside is wrong.
+
+    It may be a misspelt name, a wrong type, a number out of range or a broken file.
+    """
 
 
 class ConfigWarning(UserWarning):
-    """What a user asked for is possible and probably not all that was meant."""
+    """What a user asked for is possible, but it is probably not all that was meant."""
 
 
 def show(value: object, most: int = 60) -> str:
-    """Return what `repr` does, cut to `most` letters. Nothing beyond those is looked at: a value may be very large."""
+    """Return what `repr` returns, cut to `most` letters.
+
+    A value may be very large, so nothing of it is looked at beyond those letters.
+    """
     text = ""
     for piece in _pieces(value, most):
         text += piece
@@ -36,7 +48,7 @@ def show(value: object, most: int = 60) -> str:
 
 
 def _pieces(value: object, most: int) -> Iterator[str]:
-    """Yield the text of a value bit by bit, each bit at least one letter."""
+    """Yield the text of a value piece by piece. Each piece has at least one letter."""
     if type(value) in (list, tuple, dict):
         opening, closing = {list: "[]", tuple: "()", dict: "{}"}[type(value)]
         yield opening
@@ -50,27 +62,28 @@ def _pieces(value: object, most: int) -> Iterator[str]:
         yield "," + closing if isinstance(value, tuple) and len(value) == 1 else closing
     elif isinstance(value, str):
         yield repr(value[: most + 1])
-    elif isinstance(value, int) and value.bit_length() > 10_000:  # Python refuses to write more than 4300 digits
+    elif isinstance(value, int) and value.bit_length() > MAX_PRINTED_BITS:
         yield "a number of thousands of digits"
     else:
         yield repr(value)
 
 
 def printable(text: str) -> str:
-    """Return a text with its control characters spelt out, and what is no Unicode replaced."""
-    return text.translate(CONTROLS | ALLOWED).encode(errors="replace").decode()
+    """Return a text with its control characters spelt out and what is not Unicode replaced."""
+    return text.translate(CONTROL_ESCAPES | TEXT_CONTROLS).encode(errors="replace").decode()
 
 
 def nearest(found: object, allowed: Iterable[object]) -> str:
-    """The allowed names as a list in words, with the nearest match to what was found: `a, b, c. Did you mean 'b'?`."""
+    """List the allowed names, then the one nearest to `found`: `a, b, c. Did you mean 'b'?`."""
     names = [str(name) for name in allowed]
-    close = difflib.get_close_matches(found if isinstance(found, str) else show(found), names, n=1, cutoff=0.5)
-    return ", ".join(names) + (f". Did you mean {close[0]!r}?" if close else "")
+    word = found if isinstance(found, str) else show(found)
+    matches = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
+    return ", ".join(names) + (f". Did you mean {matches[0]!r}?" if matches else "")
 
 
 @contextmanager
 def part(*path: str) -> Iterator[None]:
-    """Notes on an error which part of an environment it comes from; runs while tracing only."""
+    """Note on an error which part of an environment it comes from. This runs only while tracing."""
     try:
         yield
     except Exception as error:
@@ -78,25 +91,30 @@ def part(*path: str) -> Iterator[None]:
         raise
 
 
-def told(error: BaseException, modules: Collection[str] = ()) -> str:
-    """Return kind and first line of an error, and where in the user's own code it arose: `TypeError: … (mine.py, line 3)`.
+def summarise_error(error: BaseException, modules: Collection[str] = ()) -> str:
+    """Return kind and first line of an error, and where in the user's own code it arose.
 
     Args:
-        error: as it was caught.
+        error: the error as it was caught.
         modules: names of the user's modules, which may be installed like a library.
+
+    Returns:
+        A text like `TypeError: … (mine.py, line 3)`. The file is left out where no code of the user
+        was running, and for a SyntaxError, which names its file itself.
     """
     reason = next(iter(str(error).splitlines()), "")[:200]
     frames = traceback.walk_tb(error.__traceback__)
     own = [(frame.f_code.co_filename, line) for frame, line in frames if _is_own(frame, modules)]
-    if not own or isinstance(error, SyntaxError):  # which names its file itself
+    if not own or isinstance(error, SyntaxError):
         return f"{type(error).__name__}: {reason}"
     path, line = own[-1]
-    near = os.path.relpath(path)
-    return f"{type(error).__name__}: {reason} ({path if near.startswith('..') else near}, line {line})"
+    relative = os.path.relpath(path)
+    file = path if relative.startswith("..") else relative
+    return f"{type(error).__name__}: {reason} ({file}, line {line})"
 
 
 def _is_own(frame: FrameType, modules: Collection[str]) -> bool:
-    """Return whether this is neither jaxsafe nor another library nor Python itself."""
+    """Return whether a frame runs neither jaxsafe nor another library nor Python itself."""
     roots = {name.partition(".")[0] for name in modules}
     if frame.f_globals.get("__name__", "").partition(".")[0] in roots:
         return True
@@ -108,8 +126,8 @@ def _is_own(frame: FrameType, modules: Collection[str]) -> bool:
     return not path.startswith(("<", *(os.path.join(library, "") for library in libraries)))
 
 
-def install(extra: str) -> str:
-    """Say how to install an extra. jaxsafe is on no package index, so that only a clone of it has them."""
+def install_hint(extra: str) -> str:
+    """Say how to install an extra. Only a clone has extras: jaxsafe is on no package index."""
     return f"in a clone of jaxsafe: pip install '.[{extra}]'"
 
 
@@ -118,7 +136,10 @@ class MissingError(ConfigError, ImportError):
 
 
 def missing(error: ImportError, package: str, extra: str) -> ImportError:
-    """What to raise where a package of an extra fails to import; if it is installed but broken, its own error."""
+    """Return the error to raise where a package of an extra fails to import.
+
+    If the package is installed but broken, this is the error that it raised itself.
+    """
     if (error.name or "").partition(".")[0] != package:
         return error
-    return MissingError(f"{package} is not installed; {install(extra)}")
+    return MissingError(f"{package} is not installed; {install_hint(extra)}")

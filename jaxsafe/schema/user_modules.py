@@ -1,4 +1,7 @@
-"""Components of a user's own package in YAML: the modules that define them, to import before the rest is read."""
+"""Modules in which a user defines components.
+
+A YAML file names such modules, so that they are imported before the rest of it is read.
+"""
 
 from __future__ import annotations
 
@@ -12,43 +15,46 @@ from typing import Any
 
 from jaxsafe.schema.component import Component, fields
 from jaxsafe.schema.dotted_paths import join
-from jaxsafe.schema.errors import ConfigError, show, told
+from jaxsafe.schema.errors import ConfigError, show, summarise_error
 
-_allowed: ContextVar[bool] = ContextVar("allowed", default=True)
+_imports_allowed: ContextVar[bool] = ContextVar("imports_allowed", default=True)
 
 
 @contextmanager
-def allowed(whether: bool) -> Iterator[None]:
-    """Say whether files may name modules to import, which runs their code."""
-    token = _allowed.set(whether)
+def imports_allowed(allowed: bool) -> Iterator[None]:
+    """Set whether files may name modules to import. Importing a module runs its code."""
+    token = _imports_allowed.set(allowed)
     try:
         yield
     finally:
-        _allowed.reset(token)
+        _imports_allowed.reset(token)
 
 
 def modules(component: Component) -> list[str]:
-    """The modules outside jaxsafe that define parts of a component, in order of first use."""
+    """Return the modules outside jaxsafe that define parts of a component, by first use."""
     module = type(component).__module__
-    found = [] if module.split(".")[0] == "jaxsafe" else [module]
-    for name in fields(type(component)):
-        value = getattr(component, name)
+    names = [] if module.split(".")[0] == "jaxsafe" else [module]
+    for field_name in fields(type(component)):
+        value = getattr(component, field_name)
         for inner in value if isinstance(value, tuple) else (value,):
-            found += modules(inner) if isinstance(inner, Component) else []
-    return list(dict.fromkeys(found))
+            names += modules(inner) if isinstance(inner, Component) else []
+    return list(dict.fromkeys(names))
 
 
 def import_modules(names: Any, place: str) -> None:
-    """Import modules, from the current directory too.
+    """Import modules. The current directory is searched too.
 
     Raises:
-        ConfigError: `names` is not a list of names, or a module cannot be imported or must not be.
+        ConfigError: `names` is not a list of names, a module cannot be imported, or imports are not
+            allowed.
     """
-    here = join(place, "imports")
+    place = join(place, "imports")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ConfigError(f"{here}: expected a list of modules, found {show(names)}")
-    if names and not _allowed.get():
-        raise ConfigError(f"{here}: names {show(names)}, whose code would run; imports=false refuses that")
+        raise ConfigError(f"{place}: expected a list of modules, found {show(names)}")
+    if names and not _imports_allowed.get():
+        raise ConfigError(
+            f"{place}: names {show(names)}, whose code would run; imports=false refuses that"
+        )
     if os.getcwd() not in sys.path and "" not in sys.path:
         sys.path.append(os.getcwd())
     for name in names:
@@ -57,4 +63,5 @@ def import_modules(names: Any, place: str) -> None:
         except ConfigError:
             raise
         except (Exception, SystemExit) as error:
-            raise ConfigError(f"{here}: cannot import {show(name)}: {told(error, [name])}") from error
+            reason = summarise_error(error, [name])
+            raise ConfigError(f"{place}: cannot import {show(name)}: {reason}") from error

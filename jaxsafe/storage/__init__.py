@@ -1,1 +1,1 @@
-"""Files that a kill cannot spoil, what their content must look like, and what a result was made by."""
+"""Files that a kill cannot spoil, the form of their content, and what a result was made by."""

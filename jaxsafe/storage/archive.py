@@ -1,4 +1,7 @@
-"""Arrays in .npz files of strangers: nothing is read before its name, type and size are known, and nothing runs."""
+"""Arrays in .npz files that come from strangers.
+
+No array is read before its name, type and size are known, and nothing in the file is run.
+"""
 
 from __future__ import annotations
 
@@ -14,12 +17,21 @@ from numpy.lib import format as npy
 
 from jaxsafe.schema.errors import ConfigError
 
-MAX_BYTES = 2**28
-"""Bytes that an array may have, 256 MiB: 67 million weights. A few compressed bytes can claim to be terabytes."""
+MAX_ARRAY_BYTES = 2**28
+"""The largest size of an array: 256 MiB, or 67 million weights.
+
+There is a limit because a few compressed bytes can claim to be terabytes.
+"""
+
+_HEADER_READERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+"""How the header of an array is read, by the version of its format."""
 
 
 class Archive:
-    """The arrays of an open .npz file by name. What is wrong with the file may raise anything, see `open_archive`."""
+    """The arrays of an open .npz file by name.
+
+    A file that is damaged may raise anything, which `open_archive` turns into a ConfigError.
+    """
 
     def __init__(self, file: zipfile.ZipFile) -> None:
         """Look at the names only."""
@@ -29,29 +41,32 @@ class Archive:
     def describe(self, name: str) -> tuple[tuple[int, ...], np.dtype]:
         """Return shape and type of an array without reading it."""
         with self._file.open(f"{name}.npy") as member:
-            shape, _, dtype = _header(member)
+            shape, _, dtype = _read_header(member)
         return shape, dtype
 
     def read(self, name: str) -> np.ndarray:
         """Return an array of numbers or text."""
         with self._file.open(f"{name}.npy") as member:
-            shape, fortran_order, dtype = _header(member)
+            shape, fortran_order, dtype = _read_header(member)
             size = math.prod(shape) * dtype.itemsize
-            if dtype.kind not in "fiubU" or size > MAX_BYTES:
-                raise ValueError(f"{name} is no array of at most {MAX_BYTES} bytes")
+            if dtype.kind not in "fiubU" or size > MAX_ARRAY_BYTES:
+                raise ValueError(f"{name} is no array of at most {MAX_ARRAY_BYTES} bytes")
             content = member.read(size)
-            if len(content) != size or member.read(1):  # at the end of a member its checksum is compared
+            if len(content) != size or member.read(1):  # reading to the end compares the checksum
                 raise ValueError(f"{name} has not the size that it claims")
         return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran_order else "C")
 
 
 @contextmanager
 def open_archive(path: str | os.PathLike, wrong: str) -> Iterator[Archive]:
-    """Open an .npz file; whatever goes wrong while it is read is a ConfigError.
+    """Open an .npz file.
 
     Args:
-        path: of the file.
-        wrong: what the message says of a file that can be opened and is damaged or no .npz.
+        path: the file.
+        wrong: the message for a file that can be opened but is damaged or not an .npz file.
+
+    Raises:
+        ConfigError: anything goes wrong while the file is read.
     """
     try:
         with zipfile.ZipFile(path) as file:
@@ -64,7 +79,7 @@ def open_archive(path: str | os.PathLike, wrong: str) -> Iterator[Archive]:
         raise ConfigError(f"{path}: {wrong}") from None
 
 
-def _header(member: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Return shape, order and type of the array that begins here."""
-    read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-    return read[npy.read_magic(member)](member)
+def _read_header(member: Any) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Return shape, whether the order is Fortran's, and type of the array that begins here."""
+    version = npy.read_magic(member)
+    return _HEADER_READERS[version](member)

@@ -1,4 +1,7 @@
-"""Files that a kill cannot spoil: whole files appear at once, logs grow by whole lines and can be cut back to a step."""
+"""Files that a kill cannot spoil.
+
+A whole file appears at once. A log grows by whole lines and can be cut back to the rows of a step.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +25,10 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """As `write_text`, for bytes."""
+    """Replace a file by a complete new one of these bytes, or leave it as it was."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
-    with _named(path), open(part, "wb") as file:
+    with _naming_file(path), open(part, "wb") as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
@@ -33,13 +36,13 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write an indented JSON file; NaN and infinity become null."""
+    """Write an indented JSON file. NaN and infinity become null."""
     write_text(path, json.dumps(finite(value), indent=2, allow_nan=False) + "\n")
 
 
 @contextlib.contextmanager
-def _named(path: Path) -> Iterator[None]:
-    """Let an error of writing, which knows no file, name the file."""
+def _naming_file(path: Path) -> Iterator[None]:
+    """Put the name of the file into an error of writing, which does not have it."""
     try:
         yield
     except OSError as error:
@@ -51,11 +54,11 @@ def parse_json(text: str | bytes, infinite: bool = False) -> Any:
     """Return the value of a JSON text.
 
     Args:
-        text: to read.
-        infinite: whether `NaN` and `Infinity` are numbers, which JSON has not.
+        text: the text to read.
+        infinite: whether to read `NaN` and `Infinity` as numbers. JSON itself has neither.
 
     Raises:
-        ValueError: it is none, or holds too many lists and mappings inside each other.
+        ValueError: the text is not JSON, or holds too many lists and mappings inside each other.
     """
     try:
         value = json.loads(text, parse_constant=None if infinite else _refuse)
@@ -70,7 +73,7 @@ def read_json(path: Path, form: Any = ANYTHING) -> Any:
     """Read a JSON file of a form.
 
     Raises:
-        ConfigError: it is missing, broken, or of another form.
+        ConfigError: the file is missing, broken, or of another form.
     """
     try:
         value = parse_json(path.read_text(encoding="utf-8"))
@@ -83,18 +86,20 @@ def read_json(path: Path, form: Any = ANYTHING) -> Any:
 
 
 def append_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
-    """Add a line of JSON for each row."""
-    with _named(path), open(path, "a", encoding="utf-8") as file:
-        file.writelines(map(_line, rows))
+    """Add a line of JSON for each row to a log."""
+    with _naming_file(path), open(path, "a", encoding="utf-8") as file:
+        file.writelines(map(_to_line, rows))
 
 
 def write_rows(path: Path, rows: Iterable[Mapping[str, Any]]) -> None:
     """Replace a log by these rows, or leave it as it was."""
-    write_text(path, "".join(map(_line, rows)))
+    write_text(path, "".join(map(_to_line, rows)))
 
 
 def read_rows(path: Path, form: Any = ANYTHING) -> list[dict[str, Any]]:
-    """Return the rows of a log, none if there is no file. A last line that a kill cut short is not a row.
+    """Return the rows of a log, or none if there is no file.
+
+    A last line that a kill cut short is not a row.
 
     Raises:
         ConfigError: another line is broken, or a row has not this form.
@@ -109,18 +114,29 @@ def read_rows(path: Path, form: Any = ANYTHING) -> list[dict[str, Any]]:
         place = f"{path}, line {number}"
         try:
             row = parse_json(line)
-        except ValueError:  # of JSON or of UTF-8
+        except ValueError:  # the line is not JSON or not UTF-8
             if number < len(lines):
                 raise ConfigError(f"{place}: not a line of JSON") from None
             continue
-        for part in ({}, form):
-            check(row, part, f"{place}: not a row of this log")
+        for required in ({}, form):  # any row is a mapping
+            check(row, required, f"{place}: not a row of this log")
         rows.append(row)
     return rows
 
 
-def keep_rows(path: Path, keep: Callable[[dict[str, Any]], bool], form: Any = ANYTHING) -> list[dict[str, Any]]:
-    """Cut a log back to the rows to keep, and return them; errors as in `read_rows`."""
+def keep_rows(
+    path: Path, keep: Callable[[dict[str, Any]], bool], form: Any = ANYTHING
+) -> list[dict[str, Any]]:
+    """Cut a log back to the rows to keep, and return them.
+
+    Args:
+        path: the log.
+        keep: whether to keep a row.
+        form: the form of a row.
+
+    Raises:
+        ConfigError: a line is broken, or a row has not this form; see `read_rows`.
+    """
     rows = [row for row in read_rows(path, form) if keep(row)]
     if path.exists():
         write_rows(path, rows)
@@ -134,38 +150,40 @@ def sync(path: Path) -> None:
 
 
 def append_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
-    """Add rows to a CSV file, with the header if it is new."""
+    """Add rows to a CSV file. A new file begins with a header."""
     new = not path.exists()
-    with _named(path), open(path, "a", encoding="utf-8", newline="") as file:
-        file.write(_csv(rows, header=new))
+    with _naming_file(path), open(path, "a", encoding="utf-8", newline="") as file:
+        file.write(_to_csv(rows, header=new))
 
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write a whole CSV file of at least one row."""
-    write_text(path, _csv(rows, header=True))
+    write_text(path, _to_csv(rows, header=True))
 
 
 def read_csv(path: Path, form: Any = ANYTHING) -> list[dict[str, Any]]:
-    """Read the rows of a CSV file: numbers where the text is one, None where there is none.
+    """Read the rows of a CSV file.
+
+    A text that is a number becomes a number, and an empty one becomes None.
 
     Raises:
-        ConfigError: it cannot be read, or a row has not this form.
+        ConfigError: the file cannot be read, or a row has not this form.
     """
     try:
         text = path.read_text(encoding="utf-8")
-        found = list(csv.DictReader(io.StringIO(text, newline=""), restkey="more"))
+        text_rows = list(csv.DictReader(io.StringIO(text, newline=""), restkey="more"))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except (ValueError, csv.Error):
         raise ConfigError(f"{path}: not a CSV file") from None
-    rows = [{name: _number(value) for name, value in row.items()} for row in found]
+    rows = [{name: _from_text(value) for name, value in row.items()} for row in text_rows]
     for number, row in enumerate(rows, start=1):
         check(row, form, f"{path}, row {number}")
     return rows
 
 
 def finite(value: Any) -> Any:
-    """The same data with every NaN and infinity as None."""
+    """Return the same data with None in place of every NaN and infinity."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, Mapping):
@@ -173,8 +191,8 @@ def finite(value: Any) -> Any:
     return [finite(item) for item in value] if isinstance(value, (list, tuple)) else value
 
 
-def _number(text: Any) -> Any:
-    """Return the number that a text is, None for an empty one, and else the text."""
+def _from_text(text: Any) -> Any:
+    """Return the number that a text stands for, None for an empty text, and else the text."""
     for kind in (int, float):
         with contextlib.suppress(TypeError, ValueError):
             return kind(text)
@@ -185,11 +203,11 @@ def _refuse(constant: str) -> None:
     raise ValueError(f"{constant} is not JSON")
 
 
-def _line(row: Mapping[str, Any]) -> str:
+def _to_line(row: Mapping[str, Any]) -> str:
     return json.dumps(finite(row), allow_nan=False) + "\n"
 
 
-def _csv(rows: Sequence[Mapping[str, Any]], header: bool) -> str:
+def _to_csv(rows: Sequence[Mapping[str, Any]], header: bool) -> str:
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, fieldnames=list(rows[0]), lineterminator="\n")
     if header:

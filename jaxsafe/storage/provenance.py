@@ -9,51 +9,70 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("jaxsafe", "jax", "jaxlib", "numpy", "optax", "orbax-checkpoint")
-"""Those whose version can change a result."""
+RECORDED_PACKAGES = ("jaxsafe", "jax", "jaxlib", "numpy", "optax", "orbax-checkpoint")
+"""Packages whose versions are recorded, because they can change a result."""
 
 
 def versions() -> dict[str, Any]:
-    """What ran: package and library versions, Python, the kind and number of devices, and the processor of the host."""
+    """Return what a result depends on besides its options.
+
+    Returns:
+        The versions of packages and of Python, the number and kind of devices, and the processor of
+        the host.
+    """
     import jax
 
-    found = {name: importlib.metadata.version(name) for name in PACKAGES}
+    devices = jax.devices()
     return {
-        **found,
+        **{name: importlib.metadata.version(name) for name in RECORDED_PACKAGES},
         "python": platform.python_version(),
-        "device": f"{len(jax.devices())} × {jax.devices()[0].device_kind}",
+        "device": f"{len(devices)} × {devices[0].device_kind}",
         "processor": processor(),
     }
 
 
 def processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
-    """The model of this host's processor: results agree to the last bit only between processors of one kind.
+    """Return the model of this host's processor.
 
-    With family and model, where they are known: a hypervisor may give many the same name.
+    Results agree to the last bit only between processors of one kind. Family and model numbers are
+    included where they are known, because a hypervisor may give many processors the same name.
     """
     try:
         lines = cpuinfo.read_text(encoding="utf-8").partition("\n\n")[0].splitlines()
     except OSError:
         lines = []
-    found = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
-    if "model name" not in found:
+    properties = {}
+    for line in lines:
+        name, _, value = line.partition(":")
+        properties[name.strip()] = value.strip()
+    if "model name" not in properties:
         return platform.processor()
-    numbers = [f"{name.removeprefix('cpu ')} {found[name]}" for name in ("cpu family", "model") if name in found]
-    return ", ".join([found["model name"], *numbers])
+    words = [properties["model name"]]
+    for name, label in (("cpu family", "family"), ("model", "model")):
+        if name in properties:
+            words.append(f"{label} {properties[name]}")
+    return ", ".join(words)
 
 
 def commit() -> str | None:
-    """Of the checkout that this runs in, if it does, and whether code or a recipe (not a policy) is not that commit's."""
+    """Return the commit of the checkout this runs in, or None outside one.
+
+    The commit is marked if code or recipes differ from it. Policy files may differ.
+    """
     git = shutil.which("git")
     if git is None:
         return None
     package = Path(__file__).resolve().parent.parent
-    ours = [git, "-C", str(package), "ls-files", "--error-unmatch", "types.py"]
-    if subprocess.run(ours, capture_output=True, check=False).returncode:
+    in_package = [git, "-C", str(package)]
+    is_tracked = [*in_package, "ls-files", "--error-unmatch", "types.py"]
+    if subprocess.run(is_tracked, capture_output=True, check=False).returncode:
         return None  # installed somewhere inside another repository
-    code = [str(path) for path in (package, package.parent / "configs") if path.is_dir()] + [":(exclude)*.npz"]
-    found, changes = (
-        subprocess.run([git, "-C", str(package), *words], capture_output=True, text=True, check=False).stdout.strip()
-        for words in (["rev-parse", "HEAD"], ["status", "--porcelain", "--", *code])
-    )
-    return f"{found[:12]} with changes" if found and changes else found[:12] or None
+
+    def output(*words: str) -> str:
+        command = [*in_package, *words]
+        return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+    sources = [str(path) for path in (package, package.parent / "configs") if path.is_dir()]
+    name = output("rev-parse", "HEAD")[:12]
+    changes = output("status", "--porcelain", "--", *sources, ":(exclude)*.npz")
+    return f"{name} with changes" if name and changes else name or None

@@ -6,7 +6,15 @@ from collections.abc import Sequence
 
 
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a table. Each column is as wide as its longest cell; the first stands to the left."""
+    """Return the lines of a table.
+
+    Each column is as wide as its longest cell. The first column is aligned to the left, the others
+    to the right.
+    """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = [[f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)] for row in rows]
-    return ["  ".join([f"{row[0]:{widths[0]}}", *line[1:]]).rstrip() for row, line in zip(rows, lines, strict=True)]
+    lines = []
+    for row in rows:
+        cells = [f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True)]
+        cells[0] = f"{row[0]:{widths[0]}}"
+        lines.append("  ".join(cells).rstrip())
+    return lines

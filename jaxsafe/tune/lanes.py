@@ -14,7 +14,7 @@ from jaxsafe.devices import memory
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.evaluate.evaluator import (
-    BATCH,
+    EPISODES_PER_BATCH,
     EVALUATION_SEED,
     KINDS,
     given_up,
@@ -152,4 +152,4 @@ class Lanes:
 
 def _one_evaluation(shared: tuple, one: tuple[Any, Any]) -> Episode:
     (key, deterministic), ((env, agent, _), params) = shared, one
-    return run_episodes(env, agent.policy(env, params, deterministic), key, BATCH)
+    return run_episodes(env, agent.policy(env, params, deterministic), key, EPISODES_PER_BATCH)

@@ -12,15 +12,15 @@ import numpy as np
 
 from jaxsafe.environment import Environment
 from jaxsafe.metrics import measures
-from jaxsafe.schema.errors import ConfigError, install
+from jaxsafe.schema.errors import ConfigError, install_hint
 from jaxsafe.storage.files import append_csv, append_rows, read_rows, write_csv, write_rows
-from jaxsafe.storage.forms import COUNT, FLAG, MAYBE, NUMBER, OTHERS
+from jaxsafe.storage.forms import COUNT, FLAG, NUMBER, NUMBER_OR_NULL, OTHERS
 
 NEEDS = {
     **dict.fromkeys(("seed", "step", "episodes", "cost"), COUNT),
     "wall_s": NUMBER,
-    **dict.fromkeys(("success_rate", "return", "length"), MAYBE),
-    OTHERS: MAYBE | FLAG,
+    **dict.fromkeys(("success_rate", "return", "length"), NUMBER_OR_NULL),
+    OTHERS: NUMBER_OR_NULL | FLAG,
 }
 """The form of every row of the progress log: columns that all have, and what the others hold."""
 
@@ -245,7 +245,7 @@ def tensorboard_writer() -> Any:
         from tensorboardX import SummaryWriter
     except ImportError:
         raise ConfigError(
-            f"tensorboard: tensorboardX is not installed; {install('tensorboard')}"
+            f"tensorboard: tensorboardX is not installed; {install_hint('tensorboard')}"
         ) from None
     except Exception as error:  # an old one beside a new protobuf
         reason = next(iter(str(error).splitlines()), "")
