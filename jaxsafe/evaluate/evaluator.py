@@ -130,7 +130,9 @@ class Evaluator:
             seed: the seed of the evaluation.
             deterministic: whether the policy takes the mode of its actions.
         """
-        for state, timestep in self.episodes(params, num_episodes, seed, deterministic):
+        for state, timestep in self.episodes(
+            params, num_episodes, seed=seed, deterministic=deterministic
+        ):
             yield (_step_row(self.env, state, timestep, t) for t in range(len(timestep.reward)))
 
     def episodes(
@@ -143,7 +145,9 @@ class Evaluator:
         num_batches = -(-num_episodes // EPISODES_PER_BATCH)
         for batch, key in enumerate(batch_keys(seed, num_batches)):
             count = min(EPISODES_PER_BATCH, num_episodes - batch * EPISODES_PER_BATCH)
-            yield from self._episodes(params, key, np.asarray(deterministic), count)
+            yield from self._episodes(
+                params, key, deterministic=np.asarray(deterministic), count=count
+            )
 
     def _episodes(
         self, params: Params, key: Key, deterministic: Any, count: int

@@ -61,7 +61,7 @@ def animate(env: Environment, episode: tuple[State, TimeStep], path: Path, title
         title: the title, to which time and outcome are added.
     """
     states, timesteps = episode
-    scene = Scene(env, states.sim, timesteps.info.margins, title)
+    scene = Scene(env, sim=states.sim, margins=timesteps.info.margins, title=title)
     last = len(states.sim.time) - 1
     steps = np.unique(np.linspace(0, last, min(MAX_FRAMES, last + 1)).round().astype(int))
     images = [Image.fromarray(scene.draw(step)) for step in steps]

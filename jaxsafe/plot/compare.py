@@ -89,7 +89,7 @@ def compare_curves(
                 panel.fill_between(
                     at, *bootstrap_interval(values), color=colour, alpha=0.2, linewidth=0
                 )
-        set_axes(panel, label, quantity, name)
+        set_axes(panel, label=label, quantity=quantity, name=name)
         if logarithmic:
             panel.set_xscale("log")
         panel.margins(x=0.0)
@@ -135,7 +135,7 @@ def seed_curves(
             panel.plot(
                 at, factor * curve, line, color=colour, linewidth=1.0, alpha=0.7, zorder=layer
             )
-        set_axes(panel, label, quantity, name)
+        set_axes(panel, label=label, quantity=quantity, name=name)
         panel.set_title(
             f"{plain(run)}: {_named(failed[run], values.shape[1])} failed", fontsize="medium"
         )

@@ -67,7 +67,7 @@ def training_curves(rows: Sequence[Mapping[str, Any]], x: str, title: str) -> Fi
     for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
         at, values = curve_table(rows, column, name)
         _curve(panel, at, factor * values)
-        set_axes(panel, label, quantity, name)
+        set_axes(panel, label=label, quantity=quantity, name=name)
     if panels[0].get_legend_handles_labels()[0]:
         panels[0].legend(loc="best", fontsize="small", frameon=False)
     figure.suptitle(f"{plain(title)}\nthe last 100 training episodes{left_out}", fontsize="medium")

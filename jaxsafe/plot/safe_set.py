@@ -165,7 +165,7 @@ def draw(
     low, high = y or plane.y_ends
     across = np.linspace(left, right, points)
     up = np.linspace(low, high, points)
-    surveys = {name: survey(env, start, across, up) for name, start in plane.panels.items()}
+    surveys = {name: survey(env, start, x=across, y=up) for name, start in plane.panels.items()}
     finite = np.concatenate([H[np.isfinite(H)] for H, _ in surveys.values()])
     depth = max(-finite.min(initial=0.0), 1e-3)
     scale = TwoSlopeNorm(0.0, -depth, np.clip(finite.max(initial=0.0), depth, 4.0 * depth))
