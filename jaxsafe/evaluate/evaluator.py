@@ -55,9 +55,8 @@ KINDS = ("stochastic", "deterministic")
 class Recorder(NamedTuple):
     """Two compiled functions that record some episodes of one policy."""
 
-    begin: Callable[..., Any]  # takes a key, returns the position and the starts
-    # takes parameters, key, `deterministic` and position; returns the next position and the steps
-    go_on: Callable[..., Any]
+    begin: Callable[..., Any]  # (key) -> (position, starts)
+    go_on: Callable[..., Any]  # (parameters, key, deterministic, position) -> (position, steps)
 
 
 class Acting(Protocol):
