@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxsafe.agents.agent import Params
-from jaxsafe.devices.background_compile import Ahead
+from jaxsafe.devices.background_compile import CompiledInBackground
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.episodes import begin_recording, max_steps, record_steps, run_episodes
@@ -85,17 +85,17 @@ class Evaluator:
         Args:
             params: the parameters that `run` takes, or what `SeedMapper.like` says of them.
         """
-        if isinstance(self._run, Ahead):
+        if isinstance(self._run, CompiledInBackground):
             return
         key = jax.random.key(0)
         deterministic = np.asarray(True)
-        self._run = Ahead(self._run, self._arguments(key, deterministic), params)
+        self._run = CompiledInBackground(self._run, self._arguments(key, deterministic), params)
         params_of_seed = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), params)
         begin, go_on = self._recorder(MIN_RECORDED_EPISODES)
         position, _ = jax.eval_shape(begin, key)
         self._recorders[MIN_RECORDED_EPISODES] = Recorder(
-            begin=Ahead(begin, key),
-            go_on=Ahead(go_on, params_of_seed, key, deterministic, position),
+            begin=CompiledInBackground(begin, key),
+            go_on=CompiledInBackground(go_on, params_of_seed, key, deterministic, position),
         )
 
     def run(self, params: Params, num_episodes: int, seed: int, deterministic: bool) -> Episode:

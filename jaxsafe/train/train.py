@@ -8,12 +8,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.devices.seed_mapper import LANES, SEEDS, SeedMapper
+from jaxsafe.devices.seed_mapper import SPLIT_BY_ENV, SPLIT_BY_SEED, SeedMapper
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.train import ppo, recent_episodes
 from jaxsafe.train.ppo import TrainState
 
-STATE = ppo.over_devices(SEEDS, LANES)
+STATE = ppo.over_devices(SPLIT_BY_SEED, SPLIT_BY_ENV)
 """How the training states of all seeds lie on the devices."""
 
 
@@ -32,8 +32,8 @@ def programs(mapper: SeedMapper, length: int, limit: int) -> tuple[Any, Any]:
     def advance(shared: tuple, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         return chunk(shared, state, length, limit, mapper.shard)
 
-    fresh = mapper.map(partial(begin, shard=mapper.shard), returned=STATE, pairs=True)
-    return fresh, mapper.map(advance, STATE, (STATE, SEEDS))
+    fresh = mapper.map(partial(begin, shard=mapper.shard), out_specs=STATE, as_pair=True)
+    return fresh, mapper.map(advance, in_specs=STATE, out_specs=(STATE, SPLIT_BY_SEED))
 
 
 def begin(shared: tuple, key: jax.Array, shard: Shard = WHOLE) -> TrainState:
