@@ -172,9 +172,7 @@ class Info(Record):
     control_desired: Float[Array, " actuators"]
     control_actual: Float[Array, " actuators"]  # what the plant received, after run time assurance
     intervening: Bool[Array, ""]  # whether run time assurance changed the control
-    margins: Mapping[
-        str, Float[Array, ""]
-    ]  # signed h(x) of every safety constraint, safe where ≥ 0
+    margins: Mapping[str, Float[Array, ""]]  # signed h(x) of each constraint, safe where ≥ 0
     # max(0, −h) as a share of the constraint's limit; 1 where h is not a number.
     severity: Mapping[str, Float[Array, ""]]
     rta: RTAInfo | None  # None without run time assurance
