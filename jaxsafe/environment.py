@@ -1,7 +1,10 @@
-"""The generic environment: `reset` and `step` as pure functions, in the order of Figs. 8, 9 and 11 of the paper.
+"""The generic environment: `reset` and `step` as pure functions.
 
-Nothing here knows a task. An `Environment` is the pytree of its own parameters, so `jax.jit(jaxsafe.step)` traces every
-number of it: changing them compiles nothing anew, and `vmap` over environments sweeps them.
+They follow the order of Figs. 8, 9 and 11 of the paper.
+
+Nothing here knows a task. An `Environment` is the pytree of its own parameters, so
+`jax.jit(jaxsafe.step)` traces every number of it. Changing a number compiles nothing anew, and
+`vmap` over environments sweeps numbers.
 """
 
 from __future__ import annotations
@@ -44,6 +47,7 @@ from jaxsafe.types import (
 )
 
 Parameters = Mapping[str, Float[Array, ""]]
+"""Numbers of an environment that are drawn for an episode, by dotted path."""
 
 SUCCESS = "success"
 """The outcome that success rates count."""
@@ -55,7 +59,8 @@ DIVERGED = "diverged"
 class Environment(Component):
     """A task: platforms and regions, and the processors that give their state a meaning.
 
-    `randomize` names numbers of the environment by dotted path with the interval from which each episode draws them.
+    `randomize` names numbers of the environment by dotted path, each with the interval from which
+    every episode draws it.
     """
 
     shorthand: ClassVar[str | None] = "platforms"
@@ -69,21 +74,21 @@ class Environment(Component):
     terminal: tuple[Terminal, ...]
     reward: tuple[Reward, ...]
     observation: tuple[Observation, ...]
-    randomize: Mapping[ParameterPath, Annotated[Number, Unit("physical", length=2)]] = dataclasses.field(
-        default_factory=dict
+    randomize: Mapping[ParameterPath, Annotated[Number, Unit("physical", length=2)]] = (
+        dataclasses.field(default_factory=dict)
     )
     rta: RTA | None = None
 
     def reset(self, key: Key) -> tuple[State, TimeStep]:
-        """Same as `jaxsafe.reset(env, key)`."""
+        """Draw a random start of an episode: `jaxsafe.reset(env, key)`."""
         return reset(self, key)
 
     def step(self, state: State, action: Array) -> tuple[State, TimeStep]:
-        """Same as `jaxsafe.step(env, state, action)`."""
+        """Advance one time step: `jaxsafe.step(env, state, action)`."""
         return step(self, state, action)
 
     def platform(self, name: str) -> Platform:
-        """A platform by name."""
+        """Return a platform by name."""
         return next(platform for platform in self.platforms if platform.name == name)
 
     @property
@@ -93,33 +98,40 @@ class Environment(Component):
 
     @property
     def outcomes(self) -> tuple[str, ...]:
-        """What `info.outcome` indexes: `running`, terminal conditions and reward bounds in their order, and `diverged`."""
+        """The names that `info.outcome` indexes.
+
+        They are `running`, the terminal conditions in their order, the outcomes of bounded reward
+        terms in their order, and `diverged`.
+        """
         bounds = [term.bound.outcome for term in self.reward if term.bound]
         return ("running", *(condition.name for condition in self.terminal), *bounds, DIVERGED)
 
     @property
     def success(self) -> int:
-        """The index of the outcome `success`; −1, which nothing ends with, where the task has none."""
+        """The index of the outcome `success`, or −1 if the task has none. Nothing ends with −1."""
         return self.outcomes.index(SUCCESS) if SUCCESS in self.outcomes else -1
 
     @property
     def actuators(self) -> tuple[Actuator, ...]:
-        """The actuators, in the order of the action; empty where the agent's controller lists none."""
+        """The actuators in the order of the action. Empty if the agent's controller lists none."""
         return getattr(self.agent_platform.controller, "actuators", ())
 
     @property
     def action_names(self) -> tuple[str, ...]:
-        """The actuators, in the order of the action."""
+        """The names of the actuators in the order of the action."""
         return self.agent_platform.controller.names
 
     @property
     def action_size(self) -> int:
-        """Number of elements of an action."""
+        """The number of elements of an action."""
         return len(self.action_names)
 
     @property
     def num_action_points(self) -> tuple[int, ...]:
-        """Number of choices of each element of a discrete action; `()` if actions are continuous."""
+        """The number of choices for each element of a discrete action.
+
+        It is `()` if actions are continuous.
+        """
         return self.agent_platform.controller.points
 
     @functools.cached_property  # asked for often, and each answer traces a reset
@@ -127,22 +139,24 @@ class Environment(Component):
         """A name for each element of the observation."""
         names: list[str] = []
 
-        def probe(key: Key) -> None:
+        def append_names(key: Key) -> None:
             sim = reset(self, key)[0].sim
             names.extend(label for item in self.observation for label in item.labels(sim))
 
-        jax.eval_shape(probe, jax.random.key(0))
+        jax.eval_shape(append_names, jax.random.key(0))
         return tuple(names)
 
     @property
     def observation_size(self) -> int:
-        """Number of elements of the observation."""
+        """The number of elements of the observation."""
         return len(self.observation_names)
 
     @property
     def _ends(self) -> dict[str, str]:
+        """How an episode ends, `terminated` or `truncated`, by outcome."""
         bounds = {term.bound.outcome: term.bound.ends for term in self.reward if term.bound}
-        return {condition.name: condition.ends for condition in self.terminal} | bounds | {DIVERGED: "terminated"}
+        conditions = {condition.name: condition.ends for condition in self.terminal}
+        return conditions | bounds | {DIVERGED: "terminated"}
 
 
 def require_success(env: Environment) -> None:
@@ -154,7 +168,8 @@ def require_success(env: Environment) -> None:
     if env.success < 0:
         found = ", ".join(env.outcomes[1:-1])
         raise ConfigError(
-            f"terminal: no outcome is called {SUCCESS!r}, so nothing would count as one; call the goal so, among {found}"
+            f"terminal: no outcome is called {SUCCESS!r}, so nothing would count as one; "
+            f"call the goal so, among {found}"
         )
 
 
@@ -166,85 +181,132 @@ def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:
         key: a typed PRNG key, `jax.random.key(seed)`.
 
     Returns:
-        The state and the first time step: reward and cost as of no step taken, `terminated` and `truncated` False.
+        The state and the first time step. Its reward and cost are those of no step taken, and
+        `terminated` and `truncated` are False.
     """
     parameters = _draw_parameters(env, key)
     env = drawn(env, parameters)
-    sim = _blank(env)
-    for platform, key_i in zip(env.platforms, jax.random.split(key, len(env.platforms)), strict=True):
+    sim = _empty_sim(env)
+    platform_keys = jax.random.split(key, len(env.platforms))
+    for platform, platform_key in zip(env.platforms, platform_keys, strict=True):
         with part("platforms", platform.name):
-            sim = sim.replace(platforms={**sim.platforms, platform.name: platform.reset(key_i, sim)})
-    return _with_own_buffers(_begin(env, sim, parameters), beside=env)
+            platform_state = platform.reset(platform_key, sim)
+            sim = sim.replace(platforms={**sim.platforms, platform.name: platform_state})
+    return _with_own_buffers(_begin(env, sim, parameters), others=env)
 
 
 def reset_to(
-    env: Environment, start: Mapping[str, Mapping[str, Any]], parameters: Mapping[str, Any] | None = None
+    env: Environment,
+    start: Mapping[str, Mapping[str, Any]],
+    parameters: Mapping[str, Any] | None = None,
 ) -> tuple[State, TimeStep]:
-    """Start an episode from chosen platform states: `{"deputy": {"position": [100, 0, 0], "velocity": [0, 0.1, 0]}}`.
+    """Start an episode from chosen platform states.
+
+    An example of a start is `{"deputy": {"position": [100, 0, 0], "velocity": [0, 0.1, 0]}}`.
 
     Args:
         env: the environment.
-        start: by platform name, by state field; every field that is random at reset must be given.
-        parameters: by dotted path, the numbers that `env.randomize` draws; all of them must be given.
+        start: the fields of states, by platform name and field name. Every field that is random at
+            reset must be given.
+        parameters: the numbers that `env.randomize` draws, by dotted path. All of them must be
+            given.
+
+    Returns:
+        The state and the first time step, as `reset` returns them.
 
     Raises:
-        ConfigError: a platform, field or parameter is unknown, or a random one is missing or has another shape.
+        ConfigError: a platform, field or parameter is unknown, or a random one is missing or has
+            another shape.
     """
-    for what, value in (("platforms", start), ("parameters", {} if parameters is None else parameters)):
-        if not isinstance(value, Mapping):
-            raise ConfigError(f"reset_to: expected {what} by name, found {show(value)}")
+    arguments = {"platforms": start, "parameters": {} if parameters is None else parameters}
+    for label, argument in arguments.items():
+        if not isinstance(argument, Mapping):
+            raise ConfigError(f"reset_to: expected {label} by name, found {show(argument)}")
     parameters = _chosen_parameters(env, parameters or {})
     env = drawn(env, parameters)
     known = {platform.name: platform for platform in env.platforms}
     for name in start:
         if name not in known:
-            raise ConfigError(f"reset_to: unknown platform {show(name)}; choose from {nearest(name, known)}")
+            raise ConfigError(
+                f"reset_to: unknown platform {show(name)}; choose from {nearest(name, known)}"
+            )
     platforms = {name: platform.place(start.get(name, {})) for name, platform in known.items()}
-    return _with_own_buffers(_begin(env, _blank(env).replace(platforms=platforms), parameters), beside=(env, start))
+    sim = _empty_sim(env).replace(platforms=platforms)
+    return _with_own_buffers(_begin(env, sim, parameters), others=(env, start))
 
 
 def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep]:
-    """Advance one time step. Never resets by itself, and never looks at an earlier outcome.
+    """Advance one time step.
+
+    A step never resets by itself, and never looks at an earlier outcome.
 
     Args:
         env: the environment.
-        state: as returned by `reset` or `step`.
-        action: float in [−1, 1], shape (action_size,), clipped; or, with discrete actions, int indices of that shape,
-            clipped to 0 … points − 1.
+        state: the state that `reset` or `step` returned.
+        action: floats in [−1, 1] of shape (action_size,), which are clipped. Discrete actions are
+            int indices of the same shape, clipped to 0 … points − 1.
 
     Returns:
-        The next state and the time step that led there.
+        The next state, and the time step that led there.
 
     Raises:
-        ConfigError: the action has another shape, or is not whole numbers where actions are discrete.
+        ConfigError: the action has another shape, or is not whole numbers where actions are
+            discrete.
     """
     env = drawn(env, state.parameters)
     action = _checked(env, action)
     controls = env.agent_platform.controller.control(action, state.sim)
     desired = jnp.stack([controls[name] for name in env.action_names])
-    actual, rta_memory, assurance = _assure(env, state, desired)
+    actual, rta_memory, rta_info = _filtered(env, state, desired)
     platforms = advance(env, state.sim, actual).platforms
     num_steps = state.num_steps + 1
-    sim = _blank(env).replace(time=num_steps.astype(env.dt.dtype) * env.dt, platforms=platforms)
-    sim = sim.replace(intervening=jnp.zeros((), bool) if assurance is None else rta_memory.intervening)
+    sim = _empty_sim(env).replace(time=num_steps.astype(env.dt.dtype) * env.dt, platforms=platforms)
+    intervening = jnp.zeros((), bool) if rta_info is None else rta_memory.intervening
+    sim = sim.replace(intervening=intervening)
 
     sim, status_memory = update_statuses(env, sim, state.memory.status)
-    sim = _terminal(env, sim)
+    sim = _update_ended(env, sim)
     sim, reward_memory, terms, totals = _rewards(env, sim, state)
     observation, observation_memory = _observations(env, sim, state.memory.observation)
 
-    memory = Memory(status_memory, reward_memory, observation_memory, rta_memory)
-    info = _info(env, sim, terms, totals, desired, actual, assurance)
-    timestep = _time_step(env, sim, observation, jnp.asarray(sum(terms.values())), info)
-    return State(sim, memory, totals, num_steps, state.parameters), timestep
+    info = _info(
+        env,
+        sim,
+        terms=terms,
+        totals=totals,
+        desired=desired,
+        actual=actual,
+        rta_info=rta_info,
+    )
+    timestep = _time_step(
+        env, sim, observation=observation, reward=jnp.asarray(sum(terms.values())), info=info
+    )
+    memory = Memory(
+        status=status_memory,
+        reward=reward_memory,
+        observation=observation_memory,
+        rta=rta_memory,
+    )
+    state = State(
+        sim=sim,
+        memory=memory,
+        reward_totals=totals,
+        num_steps=num_steps,
+        parameters=state.parameters,
+    )
+    return state, timestep
 
 
-def _with_own_buffers(started: tuple[State, TimeStep], beside: Any) -> tuple[State, TimeStep]:
-    """Copy arrays that stand in several places, or `beside` the state, so that the state may be donated.
+def _with_own_buffers(started: tuple[State, TimeStep], others: Any) -> tuple[State, TimeStep]:
+    """Copy arrays that stand in several places, so that the state may be donated.
 
-    A compiled reset returns an array for each place by itself.
+    A compiled reset returns an array of its own for each place.
+
+    Args:
+        started: a state and its time step. None of their arrays may stand there twice.
+        others: a tree whose arrays must not stand in `started` either.
     """
-    seen = {id(leaf) for leaf in jax.tree.leaves(beside)}
+    seen = {id(leaf) for leaf in jax.tree.leaves(others)}
 
     def own(leaf: Any) -> Any:
         shared = id(leaf) in seen and not isinstance(leaf, Tracer)
@@ -255,47 +317,65 @@ def _with_own_buffers(started: tuple[State, TimeStep], beside: Any) -> tuple[Sta
 
 
 def _draw_parameters(env: Environment, key: Key) -> Parameters:
-    """Numbers for one episode, from a key of their own so that platforms start alike with and without them."""
+    """Draw the random numbers of the environment for one episode.
+
+    They have a key of their own, so that platforms start alike with and without them.
+    """
     if not env.randomize:
         return {}
-    paths = sorted(env.randomize)  # which number a path gets must not depend on the order in which they were written
-    drawn = uniform(jax.random.fold_in(key, len(env.platforms)), *(env.randomize[path] for path in paths))
-    return dict(zip(paths, drawn, strict=True))
+    # Which number a path gets must not depend on the order in which the paths were written.
+    paths = sorted(env.randomize)
+    own_key = jax.random.fold_in(key, len(env.platforms))
+    numbers = uniform(own_key, *(env.randomize[path] for path in paths))
+    return dict(zip(paths, numbers, strict=True))
 
 
 def _chosen_parameters(env: Environment, parameters: Mapping[str, Any]) -> Parameters:
+    """Check the numbers that a user chose in place of random ones, and convert them."""
     for path in parameters:
         if path not in env.randomize:
             known = nearest(path, env.randomize) or "none"
-            raise ConfigError(f"reset_to: parameter {show(path)} is not random; choose from {known}")
+            raise ConfigError(
+                f"reset_to: parameter {show(path)} is not random; choose from {known}"
+            )
     for path in env.randomize:
         if path not in parameters:
-            raise ConfigError(f"reset_to: parameter {path!r} is missing: it is random at reset, so give it")
+            raise ConfigError(
+                f"reset_to: parameter {path!r} is missing: it is random at reset, so give it"
+            )
     return {path: placed(f"parameter {path}", parameters[path], env.dt) for path in env.randomize}
 
 
 def drawn(env: Environment, parameters: Parameters) -> Environment:
-    """The environment with what an episode has drawn of it, `state.parameters`."""
+    """Return the environment with the numbers that an episode has drawn, `state.parameters`."""
     for path, value in parameters.items():
         env = set_path(env, path, value)
     return env
 
 
 def extremes(env: Environment) -> tuple[Environment, Environment]:
-    """Return the environment with the least and with the greatest value of each number that is random."""
-    low, high = ({path: interval[i] for path, interval in env.randomize.items()} for i in (0, 1))
+    """Return the environment with the least and with the greatest value of every random number."""
+    low = {path: interval[0] for path, interval in env.randomize.items()}
+    high = {path: interval[1] for path, interval in env.randomize.items()}
     return drawn(env, low), drawn(env, high)
 
 
-def _blank(env: Environment) -> Sim:
-    never = {name: jnp.zeros((), bool) for name in env.outcomes[1:]}
-    return Sim(jnp.zeros_like(env.dt), {}, {}, {}, never, jnp.zeros((), bool))
+def _empty_sim(env: Environment) -> Sim:
+    """Return a simulation at time 0 without platforms, in which nothing has ended."""
+    return Sim(
+        time=jnp.zeros_like(env.dt),
+        platforms={},
+        regions={},
+        status={},
+        ended={name: jnp.zeros((), bool) for name in env.outcomes[1:]},
+        intervening=jnp.zeros((), bool),
+    )
 
 
 def _begin(env: Environment, sim: Sim, parameters: Parameters) -> tuple[State, TimeStep]:
     """Initialise all processors from placed platforms: `init` and `process`, no `increment`."""
     sim, status_memory = update_statuses(env, sim, None)
-    ended = _terminal(env, sim)
+    ended = _update_ended(env, sim)
     observation, observation_memory = _observations(env, sim, None)
     reward_memory = {}
     for term in env.reward:
@@ -303,39 +383,68 @@ def _begin(env: Environment, sim: Sim, parameters: Parameters) -> tuple[State, T
             reward_memory[term.name] = term.init(sim)
     zero = jnp.zeros((), observation.dtype)
     terms = {term.name: zero for term in env.reward}
-    rta_memory, assurance = (), None
+    rta_memory = ()
+    rta_info = None
     if env.rta is not None:
         with part("rta"):
-            rta_memory, assurance = env.rta.begin(env, sim)
-    still = jnp.zeros(env.action_size, observation.dtype)
-    info = _info(env, ended, terms, terms, still, still, assurance)
-    memory = Memory(status_memory, reward_memory, observation_memory, rta_memory)
-    state = State(ended, memory, terms, jnp.zeros((), jnp.int32), parameters)
-    timestep = _time_step(env, sim, observation, zero, info)  # `sim` ended nothing: the first step is always taken
+            rta_memory, rta_info = env.rta.begin(env, sim)
+    no_control = jnp.zeros(env.action_size, observation.dtype)
+    info = _info(
+        env,
+        ended,
+        terms=terms,
+        totals=terms,
+        desired=no_control,
+        actual=no_control,
+        rta_info=rta_info,
+    )
+    memory = Memory(
+        status=status_memory,
+        reward=reward_memory,
+        observation=observation_memory,
+        rta=rta_memory,
+    )
+    state = State(
+        sim=ended,
+        memory=memory,
+        reward_totals=terms,
+        num_steps=jnp.zeros((), jnp.int32),
+        parameters=parameters,
+    )
+    # In `sim` nothing has ended, because the first step is always taken.
+    timestep = _time_step(env, sim, observation=observation, reward=zero, info=info)
     return state, timestep.replace(cost=zero)
 
 
 def _checked(env: Environment, action: Array) -> Array:
-    """Shapes and types are known while tracing; JAX itself would clamp an index out of range and say nothing."""
+    """Check the shape and the type of an action, which are known while tracing.
+
+    JAX itself would clamp an index out of range and say nothing.
+    """
     action = jnp.asarray(action)
     if action.shape != (env.action_size,):
+        names = ", ".join(env.action_names)
         raise ConfigError(
-            f"action: expected shape {(env.action_size,)} ({', '.join(env.action_names)}), found {action.shape}"
+            f"action: expected shape {(env.action_size,)} ({names}), found {action.shape}"
         )
     if env.num_action_points and not jnp.issubdtype(action.dtype, jnp.integer):
         raise ConfigError(
-            f"action: expected whole numbers, indices of {env.num_action_points} points, found {action.dtype}"
+            f"action: expected whole numbers, indices of {env.num_action_points} points, "
+            f"found {action.dtype}"
         )
     return action
 
 
-def _terminal(env: Environment, sim: Sim) -> Sim:
-    """The first condition that holds ends the episode; those that stand apart end it beside the others.
+def _update_ended(env: Environment, sim: Sim) -> Sim:
+    """Return the simulation with what ended the episode.
 
-    A state that is not finite ends it before all of them: no comparison with such numbers means anything.
+    The first terminal condition that holds ends it. Conditions that stand apart end it beside the
+    others. A state that is not finite ends it before all of them, because no comparison with such
+    numbers means anything.
     """
     diverged = _diverged(env, sim)
-    ended, over = {DIVERGED: diverged}, diverged
+    ended = {DIVERGED: diverged}
+    over = diverged
     for condition in env.terminal:
         with part("terminal", condition.name):
             reached = condition.reached(sim)
@@ -345,22 +454,31 @@ def _terminal(env: Environment, sim: Sim) -> Sim:
 
 
 def _diverged(env: Environment, sim: Sim) -> Bool[Array, ""]:
-    """Whether the state is not finite, or a status that ends or judges the episode is not a number.
+    """Return whether the state is not finite, or a status that ends or judges the episode is NaN.
 
-    Of the other platforms the position is looked at: whatever else of them is not finite shows there a step later. To look
-    at each number by itself, or at statuses that nothing needs, cost up to a third of a step.
+    Of the platforms other than the agent's only the position is looked at, because whatever else of
+    them is not finite shows there a step later. To look at each number by itself, or at statuses
+    that nothing needs, cost up to a third of a step.
     """
-    positions = [sim.platforms[platform.name].position for platform in env.platforms if platform.name != env.agent]
+    positions = [
+        sim.platforms[platform.name].position
+        for platform in env.platforms
+        if platform.name != env.agent
+    ]
     numbers = [*positions, *filter(_is_float, jax.tree.leaves(sim.platforms[env.agent]))]
     finite = jnp.isfinite(jnp.concatenate([jnp.ravel(number) for number in numbers]))
-    judged = [sim.status[name] for name in _judging(env)]
+    judged = [sim.status[name] for name in _judging_statuses(env)]
     return ~jnp.all(finite) | _any(jnp.isnan(value) for value in judged if _is_float(value))
 
 
-def _judging(env: Environment) -> list[str]:
-    """The statuses that terminal conditions and constraints name."""
-    found = (reference for item in (*env.terminal, *env.constraints) for reference in references(item, ""))
-    return list(dict.fromkeys(name for _, refers, name in found if refers.section == "status"))
+def _judging_statuses(env: Environment) -> list[str]:
+    """Return the names of the statuses to which terminal conditions and constraints refer."""
+    names = []
+    for judge in (*env.terminal, *env.constraints):
+        for _, refers, name in references(judge, ""):
+            if refers.section == "status":
+                names.append(name)
+    return list(dict.fromkeys(names))
 
 
 def _is_float(value: Array) -> bool:
@@ -368,34 +486,60 @@ def _is_float(value: Array) -> bool:
 
 
 def _rewards(env: Environment, sim: Sim, state: State) -> tuple[Sim, dict, dict, dict]:
-    """Reward terms in order; a bounded term may end the episode, and the terms after it see that."""
-    memories, terms, totals = {}, {}, {}
+    """Compute the reward terms in order.
+
+    A bounded term may end the episode, and the terms after it see that.
+
+    Returns:
+        The simulation with what ended the episode, and by name the memories of the terms, their
+        values on this step, and their totals in this episode.
+    """
+    memories = {}
+    terms = {}
+    totals = {}
     for term in env.reward:
         with part("reward", term.name):
-            memories[term.name] = own = term.increment(state.memory.reward[term.name], sim, env.dt)
-            terms[term.name] = value = term.process(own, sim)
-            totals[term.name] = total = state.reward_totals[term.name] + value
+            memory = term.increment(state.memory.reward[term.name], sim, env.dt)
+            value = term.process(memory, sim)
+            total = state.reward_totals[term.name] + value
+        memories[term.name] = memory
+        terms[term.name] = value
+        totals[term.name] = total
         if term.bound:
             apart = {condition.name for condition in env.terminal if condition.apart}
             over = _any(ended for name, ended in sim.ended.items() if name not in apart)
-            sim = sim.replace(ended={**sim.ended, term.bound.outcome: (total < term.bound.below) & ~over})
+            below = (total < term.bound.below) & ~over
+            sim = sim.replace(ended={**sim.ended, term.bound.outcome: below})
     return sim, memories, terms, totals
 
 
 def _observations(
     env: Environment, sim: Sim, memory: Mapping[str, Any] | None
 ) -> tuple[Float[Array, " observation"], dict[str, Any]]:
-    memories, parts = {}, []
+    """Return the observation, and what its parts remember by name.
+
+    Args:
+        env: the environment.
+        sim: the simulation.
+        memory: what the parts remember from the step before. None at the start of an episode.
+    """
+    memories = {}
+    values = []
     for item in env.observation:
         with part("observation", item.name):
-            own = item.init(sim) if memory is None else item.increment(memory[item.name], sim, env.dt)
-            parts.append(item.process(own, sim))
+            own = (
+                item.init(sim) if memory is None else item.increment(memory[item.name], sim, env.dt)
+            )
+            values.append(item.process(own, sim))
         memories[item.name] = own
-    return jnp.concatenate(parts), memories
+    return jnp.concatenate(values), memories
 
 
-def _assure(env: Environment, state: State, desired: Array) -> tuple[Array, Any, RTAInfo | None]:
-    """The control that acts: the desired one, or what run time assurance makes of it."""
+def _filtered(env: Environment, state: State, desired: Array) -> tuple[Array, Any, RTAInfo | None]:
+    """Return the control that acts, and memory and info of run time assurance.
+
+    Without run time assurance the desired control acts.
+    """
     if env.rta is None:
         return desired, (), None
     with part("rta"):
@@ -403,26 +547,56 @@ def _assure(env: Environment, state: State, desired: Array) -> tuple[Array, Any,
 
 
 def _info(
-    env: Environment, sim: Sim, terms: dict, totals: dict, desired: Array, actual: Array, assurance: RTAInfo | None
+    env: Environment,
+    sim: Sim,
+    *,
+    terms: dict,
+    totals: dict,
+    desired: Array,
+    actual: Array,
+    rta_info: RTAInfo | None,
 ) -> Info:
     outcome = jnp.zeros((), jnp.int32)
     for index, name in reversed(list(enumerate(env.outcomes))[1:]):
         outcome = jnp.where(sim.ended[name], index, outcome)
-    margins, severity = {}, {}
+    margins = {}
+    severity = {}
     for constraint in env.constraints:
         with part("constraints", constraint.name):
-            margins[constraint.name] = margin = constraint.margin(sim)
+            margin = constraint.margin(sim)
             excess = jnp.maximum(-margin, 0.0) / constraint.limit(sim)
-            known = jnp.where(jnp.isfinite(excess), excess, 1.0)  # a margin that is not a number lacks the whole limit
+            # A margin that is not a number lacks the whole limit.
+            known = jnp.where(jnp.isfinite(excess), excess, 1.0)
+            margins[constraint.name] = margin
             severity[constraint.name] = jnp.where(margin >= 0.0, 0.0, known)
-    return Info(outcome, sim.status, terms, totals, desired, actual, sim.intervening, margins, severity, assurance)
+    return Info(
+        outcome=outcome,
+        status=sim.status,
+        reward_terms=terms,
+        reward_totals=totals,
+        control_desired=desired,
+        control_actual=actual,
+        intervening=sim.intervening,
+        margins=margins,
+        severity=severity,
+        rta=rta_info,
+    )
 
 
-def _time_step(env: Environment, sim: Sim, observation: Array, reward: Array, info: Info) -> TimeStep:
+def _time_step(
+    env: Environment, sim: Sim, *, observation: Array, reward: Array, info: Info
+) -> TimeStep:
     violated = sim.ended[DIVERGED] | _any(~(margin >= 0.0) for margin in info.margins.values())
-    kinds = ("terminated", "truncated")
-    terminated, truncated = (_any(sim.ended[name] for name, how in env._ends.items() if how == kind) for kind in kinds)
-    return TimeStep(observation, reward, violated.astype(observation.dtype), terminated, truncated, info)
+    terminated = _any(sim.ended[name] for name, ends in env._ends.items() if ends == "terminated")
+    truncated = _any(sim.ended[name] for name, ends in env._ends.items() if ends == "truncated")
+    return TimeStep(
+        observation=observation,
+        reward=reward,
+        cost=violated.astype(observation.dtype),
+        terminated=terminated,
+        truncated=truncated,
+        info=info,
+    )
 
 
 def _any(flags: Iterable[Array]) -> Array:

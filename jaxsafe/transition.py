@@ -1,7 +1,7 @@
-"""How the world moves by one step, and how a state is judged. The environment and its filters both stand on this.
+"""How the world moves by one step, and how a state is judged.
 
-A filter predicts with the functions that the environment steps with, so a certificate speaks about the very state that the
-step will reach.
+The environment steps with these functions, and its filters predict with them. So a certificate
+speaks about the very state that the step will reach.
 """
 
 from __future__ import annotations
@@ -25,26 +25,33 @@ Others = Mapping[str, Any]
 """The states of all platforms but the agent's, by name."""
 
 
-def advance(env: Environment, sim: Sim, control: Float[Array, " m"], later: Others | None = None) -> Sim:
-    """Return the simulation one step later.
+def advance(
+    env: Environment, sim: Sim, control: Float[Array, " m"], later: Others | None = None
+) -> Sim:
+    """Return the simulation one step later. All platforms move at once.
 
-    All platforms move at once. Regions and statuses are left out.
+    Regions and statuses are left out.
 
     Args:
         env: the environment.
         sim: the simulation before the step.
         control: the agent's control in physical units, in action order.
-        later: the other platforms after the step, where `others_later` has already found them.
+        later: the other platforms after the step, if `others_later` has already computed them.
     """
     platforms = {**(others_later(env, sim) if later is None else later)}
     plant = env.agent_platform
     with part("platforms", plant.name):
-        platforms[env.agent] = plant.step(sim.platforms[env.agent], commanded(env, plant, sim, control), env.dt)
+        platforms[env.agent] = plant.step(
+            sim.platforms[env.agent], commanded(env, plant, sim, control), env.dt
+        )
     return later_sim(env, sim, platforms)
 
 
 def later_sim(env: Environment, sim: Sim, platforms: Others) -> Sim:
-    """Return the simulation one step later, given its platforms then. Its time is a whole number of steps."""
+    """Return the simulation one step later, given its platforms then.
+
+    A time close to a whole number of steps is rounded to it. Regions and statuses are left out.
+    """
     time = sim.time + env.dt
     whole = jnp.round(time / env.dt) * env.dt
     time = jnp.where(jnp.abs(time - whole) < 1e-3 * env.dt, whole, time)
@@ -52,24 +59,39 @@ def later_sim(env: Environment, sim: Sim, platforms: Others) -> Sim:
 
 
 def others_later(env: Environment, sim: Sim) -> Others:
-    """Return the platforms that are not the agent's one step later. No control of this step can change them."""
+    """Return all platforms but the agent's one step later.
+
+    No control of this step can change them.
+    """
     later = {}
     for platform in env.platforms:
         if platform.name != env.agent:
             with part("platforms", platform.name):
-                later[platform.name] = platform.step(sim.platforms[platform.name], undirected(platform, sim), env.dt)
+                later[platform.name] = platform.step(
+                    sim.platforms[platform.name], undirected(platform, sim), env.dt
+                )
     return later
 
 
-def commanded(env: Environment, platform: Platform, sim: Sim, control: Float[Array, " m"]) -> Controls:
-    """Return the controls of a platform. The agent's are given; the others follow their controllers."""
+def commanded(
+    env: Environment, platform: Platform, sim: Sim, control: Float[Array, " m"]
+) -> Controls:
+    """Return the controls of a platform by name.
+
+    Args:
+        env: the environment.
+        platform: the platform.
+        sim: the simulation.
+        control: the agent's control in physical units, in action order. The other platforms follow
+            their own controllers.
+    """
     if platform.name == env.agent:
         return dict(zip(env.action_names, control, strict=True))
     return undirected(platform, sim)
 
 
 def undirected(platform: Platform, sim: Sim) -> Controls:
-    """Return the controls of a platform that is not the agent. No action reaches it."""
+    """Return the controls, by name, of a platform that is not the agent's. No action reaches it."""
     return platform.controller.control(jnp.zeros(0), sim)
 
 
@@ -82,13 +104,18 @@ def place_regions(env: Environment, sim: Sim) -> Sim:
     return sim.replace(regions=regions)
 
 
-def update_statuses(env: Environment, sim: Sim, memory: Mapping[str, Any] | None) -> tuple[Sim, dict[str, Any]]:
-    """Place the regions, then compute the statuses in order. Each status sees only those before it.
+def update_statuses(
+    env: Environment, sim: Sim, memory: Mapping[str, Any] | None
+) -> tuple[Sim, dict[str, Any]]:
+    """Place the regions, then compute the statuses in order.
+
+    Each status sees only those before it.
 
     Args:
         env: the environment.
         sim: the simulation, with its platforms.
-        memory: what the statuses remember from the step before, by name. None at the start of an episode.
+        memory: what the statuses remember from the step before, by name. None at the start of an
+            episode.
 
     Returns:
         The simulation with regions and statuses, and what the statuses remember now.
@@ -97,20 +124,26 @@ def update_statuses(env: Environment, sim: Sim, memory: Mapping[str, Any] | None
     memories = {}
     for status in env.status:
         with part("status", status.name):
-            own = status.init(sim) if memory is None else status.increment(memory[status.name], sim, env.dt)
+            own = (
+                status.init(sim)
+                if memory is None
+                else status.increment(memory[status.name], sim, env.dt)
+            )
             sim = sim.replace(status={**sim.status, status.name: status.process(own, sim)})
         memories[status.name] = own
     return sim, memories
 
 
 def judge(env: Environment, sim: Sim, before: Sim | None = None) -> Sim:
-    """Return the simulation with regions and statuses from its platforms alone. No status remembers anything.
+    """Return the simulation with regions and statuses that follow from its platforms alone.
+
+    No status remembers anything.
 
     Args:
         env: the environment.
         sim: the simulation to judge.
-        before: the simulation one step earlier. If it is given, distances are lower bounds on the way from there, so that
-            nothing slips through between two instants.
+        before: the simulation one step earlier. If it is given, distances are lower bounds on the
+            way from there, so that nothing slips through between two instants.
     """
     if before is None:
         return update_statuses(env, sim.replace(status={}), None)[0]
@@ -123,25 +156,30 @@ def judge(env: Environment, sim: Sim, before: Sim | None = None) -> Sim:
 
 def constraint(env: Environment, name: str) -> Constraint:
     """Return a safety constraint by name."""
-    return next(one for one in env.constraints if one.name == name)
+    return next(constraint for constraint in env.constraints if constraint.name == name)
 
 
 def smallest_margin(
     env: Environment, sim: Sim, before: Sim | None = None, names: Collection[str] | None = None
 ) -> Float[Array, ""]:
-    """Return the smallest h of some safety constraints.
+    """Return the smallest margin h of some safety constraints.
 
     Args:
         env: the environment.
         sim: the simulation.
-        before: the simulation one step earlier. If it is given, constraints that can be broken between two instants
-            (`Constraint.between`) count with a lower bound on the way from there.
-        names: of the constraints. None stands for all.
+        before: the simulation one step earlier. If it is given, constraints that can be broken
+            between two instants (`Constraint.between`) count with a lower bound on the way from
+            there.
+        names: names of the constraints. None stands for all.
     """
     now = judge(env, sim)
-    way = now if before is None else judge(env, sim, before)
-    chosen = [one for one in env.constraints if names is None or one.name in names]
-    return jnp.min(jnp.stack([one.margin(way if one.between else now) for one in chosen]))
+    on_the_way = now if before is None else judge(env, sim, before)
+    margins = [
+        constraint.margin(on_the_way if constraint.between else now)
+        for constraint in env.constraints
+        if names is None or constraint.name in names
+    ]
+    return jnp.min(jnp.stack(margins))
 
 
 def bounds(env: Environment) -> tuple[Float[Array, " m"], Float[Array, " m"]]:

@@ -27,8 +27,8 @@ def test_a_training_that_would_not_fit_is_refused_before_it_starts(tmp_path: Pat
 
 @pytest.mark.parametrize("command", [main, tune])
 def test_the_batch_of_an_update_is_counted(command: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "COMPILING", 0)
-    monkeypatch.setattr(memory, "RUNNING", 0)
+    monkeypatch.setattr(memory, "COMPILE_BYTES", 0)
+    monkeypatch.setattr(memory, "RUN_BYTES", 0)
     monkeypatch.setattr(memory, "available", lambda: 4 * 2**20)  # enough for the state, not for the update
     sizes = ["ppo.num_envs=1024", "ppo.num_steps=32", "ppo.num_minibatches=8", "steps=65536", "agent.hidden=[8]"]
     words = ["env=docking2d", "seeds=1", f"out={tmp_path / 'run'}", *sizes]
@@ -69,8 +69,8 @@ def resident(which):
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(1024 * int(line.split()[1]) for line in lines if line.startswith(which))
 
-def require(needed, devices, what, beside=0):
-    found.append((resident("VmRSS"), needed * devices + beside))
+def require(needed, devices, options, once=0):
+    found.append((resident("VmRSS"), needed * devices + once))
 
 found = []
 memory.require = require
@@ -93,12 +93,12 @@ def test_a_training_takes_no_more_than_was_predicted(task: str, tmp_path: Path) 
     )
     taken, predicted, later, predicted_later = map(int, done.stdout.split()[-4:])
     assert 0.5 * predicted < taken <= predicted
-    assert later <= predicted_later <= later + memory.RUNNING
+    assert later <= predicted_later <= later + memory.RUN_BYTES
 
 
 def test_processes_of_one_machine_share_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "available", lambda: 10 * memory.GIB)
-    monkeypatch.setattr(processes, "beside", lambda: 4)
+    monkeypatch.setattr(processes, "count_on_this_machine", lambda: 4)
     with pytest.raises(ConfigError, match=r"x: this training needs 16.0 GiB of memory, 10.0 GiB are free"):
         memory.require(2 * memory.GIB, 2, "x")
 
@@ -108,14 +108,14 @@ def test_limits_of_control_groups_are_known(
     version: int, path: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     controllers = {2: "", 1: "memory"}[version]
-    _, limit, used, cache = memory.GROUPS[controllers]
+    files = memory.CONTROL_GROUPS[controllers]
     for group, most, now in (("", "max", 900), ("job", "1000", 700), ("job/step", "2000", 600)):
         place = tmp_path / group
         place.mkdir(exist_ok=True)
-        (place / limit).write_text(f"{most}\n")
-        (place / used).write_text(f"{now}\n")
-        (place / "memory.stat").write_text(f"{cache} 50\nother 7\n")
-    monkeypatch.setitem(memory.GROUPS, controllers, (str(tmp_path), limit, used, cache))
+        (place / files.limit).write_text(f"{most}\n")
+        (place / files.used).write_text(f"{now}\n")
+        (place / "memory.stat").write_text(f"{files.cache} 50\nother 7\n")
+    monkeypatch.setitem(memory.CONTROL_GROUPS, controllers, files._replace(root=str(tmp_path)))
     lines = memory._lines
     own = ["3:cpu:/x", f"{2 - version}:{controllers}:{path}"]
     monkeypatch.setattr(memory, "_lines", lambda name: own if name == "/proc/self/cgroup" else lines(name))
@@ -144,7 +144,7 @@ def test_devices_of_one_machine_share_its_memory(monkeypatch: pytest.MonkeyPatch
 
 def test_every_process_refuses_what_does_not_fit_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "available", lambda: 10 * memory.GIB)
-    monkeypatch.setattr(processes, "anyone", lambda _: True)
+    monkeypatch.setattr(processes, "any_process", lambda _: True)
     with pytest.raises(ConfigError, match=r"x: this training needs 2.0 GiB of memory, another process has less"):
         memory.require(memory.GIB, 2, "x")
 

@@ -33,7 +33,7 @@ def seeds(first: int, count: int, share: int = 1, updates: int = UPDATES) -> Tra
     def train_shared(shared: tuple, key: jax.Array) -> TrainState:
         return train(shared, key, updates, mapper.shard)
 
-    state = mapper.map(train_shared, returned=STATE)(mapper.replicate((ENV, AGENT, HYPER)), mapper.keys(first))
+    state = mapper.map(train_shared, out_specs=STATE)(mapper.replicate((ENV, AGENT, HYPER)), mapper.keys(first))
     return mapper.gather(state)
 
 
@@ -99,9 +99,9 @@ def test_seeds_are_spread_over_devices_and_padded() -> None:
 
 
 def test_devices_share_a_seed_where_there_are_more_than_seeds() -> None:
-    assert SeedMapper(1, (1, 2)).mesh.shape == {"seeds": 1, "lanes": 2}
-    assert SeedMapper(2, (1, 2)).mesh.shape == {"seeds": 2, "lanes": 1}
+    assert SeedMapper(1, (1, 2)).mesh.shape == {"seeds": 1, "envs": 2}
+    assert SeedMapper(2, (1, 2)).mesh.shape == {"seeds": 2, "envs": 1}
     assert SeedMapper(1, (1,)).mesh.size == 1
-    assert SeedMapper(3, (2,)).mesh.shape == {"seeds": 1, "lanes": 2}
+    assert SeedMapper(3, (2,)).mesh.shape == {"seeds": 1, "envs": 2}
     with pytest.raises(ConfigError, match=r"^devices_per_seed: found 4, there are 2 devices$"):
         SeedMapper(1, (4,))

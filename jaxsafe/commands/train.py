@@ -45,7 +45,7 @@ def main(argv: Sequence[str]) -> int:
         path = Path(resume)
     runs = run_directory.runs(path)
     try:
-        with processes.loss_told(
+        with processes.reporting_lost_process(
             f"go on with: python -m jaxsafe.train distributed=true resume={path}"
         ):
             try:

@@ -1,1 +1,4 @@
-"""The devices and processes that share the work: seeds mapped over them, batches split among them, programs compiled."""
+"""The devices and processes that share the work of a training.
+
+Seeds are mapped over them, batches are split among them, and programs are compiled for them.
+"""

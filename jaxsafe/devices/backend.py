@@ -23,10 +23,10 @@ def accelerated() -> bool:
 def scan_packed(
     function: Callable[[Any, Any], tuple[Any, Any]], start: Any, xs: Any
 ) -> tuple[Any, Any]:
-    """Return what `jax.lax.scan` returns, whose outputs are written by fewer kernels.
+    """Return what `jax.lax.scan` returns, and write the outputs with fewer kernels.
 
-    A kernel for each array writes what a step returns into the stack. So arrays of the same shape
-    and type are stacked together.
+    `jax.lax.scan` has a kernel for each array that a step returns, which writes it into the stack.
+    Here arrays of the same shape and type are stacked together.
     """
     shapes = jax.eval_shape(lambda: function(start, jax.tree.map(lambda x: x[0], xs))[1])
     leaves, structure = jax.tree.flatten(shapes)
@@ -40,19 +40,18 @@ def scan_packed(
         return carry, [jnp.stack([flat[index] for index in group]) for group in groups.values()]
 
     end, stacks = jax.lax.scan(packed, start, xs)
-    found = {
-        index: stack[:, i]
-        for group, stack in zip(groups.values(), stacks, strict=True)
-        for i, index in enumerate(group)
-    }
-    return end, jax.tree.unflatten(structure, [found[index] for index in range(len(leaves))])
+    outputs = {}
+    for group, stack in zip(groups.values(), stacks, strict=True):
+        for position, index in enumerate(group):
+            outputs[index] = stack[:, position]
+    return end, jax.tree.unflatten(structure, [outputs[index] for index in range(len(leaves))])
 
 
 def packing(tree: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
     """Return a function that makes one vector of a tree shaped like this one, and its inverse.
 
-    An operation on all parameters is one kernel for the vector, and a kernel for each array of the
-    tree. On a CPU both functions do nothing.
+    An operation on all parameters is one kernel for the vector, but a kernel for each array of the
+    tree. On a CPU both functions return their argument.
     """
     if not accelerated():
         return (lambda tree: tree), (lambda tree: tree)

@@ -11,34 +11,48 @@ from typing import Any
 
 import jax
 
-THREADS = 4
-"""How many programs are compiled at a time, as many as a training has: the compiler does little in parallel by itself."""
+NUM_THREADS = 4
+"""How many programs are compiled at a time, as many as a training has.
+
+The compiler does little in parallel by itself.
+"""
 
 
-class Ahead:
-    """A jitted function whose arguments always have the same shapes: traced at once, compiled before it is first called."""
+class CompiledInBackground:
+    """A jitted function whose arguments always have the same shapes.
+
+    It is traced at once and compiled before it is first called.
+    """
 
     def __init__(self, function: Any, *arguments: Any) -> None:
-        """Begin to compile `function`; `arguments` are as those of the calls, or their shapes, types and shardings."""
+        """Begin to compile a function.
+
+        Args:
+            function: the jitted function.
+            arguments: arguments like those of the calls, or their shapes, types and shardings.
+        """
         self._compiled = _threads().submit(function.lower(*arguments).compile)
 
     def __call__(self, *arguments: Any) -> Any:
-        """Call it, once it is compiled."""
+        """Call the function once it is compiled."""
         return self.compiled()(*arguments)
 
     def compiled(self) -> jax.stages.Compiled:
-        """Wait for the program."""
+        """Wait for the program and return it."""
         return self._compiled.result()
 
 
 @cache
 def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(THREADS, "compile")
+    return ThreadPoolExecutor(NUM_THREADS, "compile")
 
 
 @contextmanager
 def without_collection() -> Iterator[None]:
-    """Hold garbage collection while programs are traced: none of that is garbage, and looking costs a tenth of the time."""
+    """Suspend garbage collection while programs are traced.
+
+    Tracing leaves no garbage, and looking for it costs a tenth of the time.
+    """
     gc.disable()
     try:
         yield

@@ -7,7 +7,10 @@ from pathlib import Path
 
 
 def enable_compilation_cache() -> None:
-    """Keep compiled programs between runs, unless the user chose a place or none; the second start is then quick."""
+    """Keep compiled programs between runs, so that the second start is quick.
+
+    The place that the user chose for them stays, and so does the choice to keep none.
+    """
     import jax
 
     if getattr(jax.config, "jax_compilation_cache_dir", None) is None:
@@ -15,7 +18,7 @@ def enable_compilation_cache() -> None:
             base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
             (base / "jaxsafe").mkdir(parents=True, exist_ok=True)
         except (OSError, RuntimeError):
-            return  # a home that cannot be written, or none at all, costs time and nothing else
+            return  # a home that is missing or cannot be written costs time and nothing else
         jax.config.update("jax_compilation_cache_dir", str(base / "jaxsafe"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

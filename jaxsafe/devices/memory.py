@@ -1,9 +1,9 @@
-"""Whether a training fits into memory, told before it starts."""
+"""Whether a training fits into memory, decided before it starts."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -18,71 +18,122 @@ except ImportError:  # Windows
 
 GIB = 2**30
 
-OPTIONS = "ppo.num_envs, ppo.num_steps, seeds"
+MEMORY_OPTIONS = "ppo.num_envs, ppo.num_steps, seeds"
 """Options to name when a training does not fit into memory."""
 
-COMPILING = 1450 * 2**20
-"""Bytes that each process takes while the programs of a training are compiled. Resident memory rose by 1.12 GB for
-docking2d, 1.29 GB with its filter, and 1.41 GB for rejoin3d. Not counted: it rose by 1.86 GB for
-rejoin3d with 16,384 environments, and by 2.01 GB with its filter."""
+COMPILE_BYTES = 1450 * 2**20
+"""Bytes that each process takes while the programs of a training are compiled.
 
-RUNNING = 320 * 2**20
-"""Bytes that each process takes besides the buffers of the update: code, small programs of evaluations, logs, figures.
-Resident memory rose by 250 MB for docking2d after the update had been compiled."""
+Resident memory rose by 1.12 GB for docking2d, 1.29 GB with its filter, and 1.41 GB for rejoin3d.
+Not covered: it rose by 1.86 GB for rejoin3d with 16,384 environments, and by 2.01 GB with its
+filter.
+"""
 
-GROUPS = {
-    "": ("/sys/fs/cgroup", "memory.max", "memory.current", "inactive_file"),
-    "memory": ("/sys/fs/cgroup/memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+RUN_BYTES = 320 * 2**20
+"""Bytes that each process takes besides the buffers of the update.
+
+They are for code, small programs of evaluations, logs and figures. Resident memory rose by 250 MB
+for docking2d after the update had been compiled.
+"""
+
+
+class ControlGroupFiles(NamedTuple):
+    """Where control groups are, and which of their files say what they leave of the memory."""
+
+    root: str
+    limit: str  # file with the limit [bytes]
+    used: str  # file with the use [bytes], caches included
+    cache: str  # row of `memory.stat` with the caches that can be dropped [bytes]
+
+
+CONTROL_GROUPS = {
+    "": ControlGroupFiles(
+        root="/sys/fs/cgroup",
+        limit="memory.max",
+        used="memory.current",
+        cache="inactive_file",
+    ),
+    "memory": ControlGroupFiles(
+        root="/sys/fs/cgroup/memory",
+        limit="memory.limit_in_bytes",
+        used="memory.usage_in_bytes",
+        cache="total_inactive_file",
+    ),
 }
-"""By controllers as in /proc/self/cgroup, version 2 and 1: where groups are, and what says limit, use and cache."""
+"""Files of control groups, version 2 and 1, by their controllers in /proc/self/cgroup."""
 
 
 def size(shapes: Any) -> int:
-    """Bytes of all arrays of a tree, or of their shapes."""
-    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(jax.eval_shape(_raw, shapes)))
+    """Return the bytes of all arrays of a tree of arrays or of their shapes."""
+    shapes = jax.eval_shape(_keys_as_words, shapes)
+    return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(shapes))
 
 
 def footprint(compiled: jax.stages.Compiled) -> int:
-    """Bytes that a compiled program needs on each of its devices, what it is given included; 0 where that is not known."""
-    found = compiled.memory_analysis()
-    return 0 if found is None else int(
-        found.argument_size_in_bytes + found.output_size_in_bytes + found.temp_size_in_bytes - found.alias_size_in_bytes
-    )  # fmt: skip
+    """Return the bytes that a compiled program needs on each of its devices.
+
+    Its arguments are included. The result is 0 where the need is not known.
+    """
+    analysis = compiled.memory_analysis()
+    if analysis is None:
+        return 0
+    return int(
+        analysis.argument_size_in_bytes
+        + analysis.output_size_in_bytes
+        + analysis.temp_size_in_bytes
+        - analysis.alias_size_in_bytes
+    )
 
 
-def require(needed: int, devices: int, what: str, beside: int = 0) -> None:
-    """Refuse what does not fit, in every process if it does not in one.
+def require(needed: int, devices: int, options: str, once: int = 0) -> None:
+    """Refuse a training that does not fit into memory.
+
+    If it does not fit in one process, all processes refuse it. CPU devices of all processes on a
+    machine share its memory.
 
     Args:
         needed: bytes on each device.
-        devices: how many of this process take part.
-        what: the options that decide it.
-        beside: bytes that this process takes once, whatever the number of devices: `COMPILING` or `RUNNING`. They are in
-            the memory of the machine, so an accelerator does not need to have them.
+        devices: number of devices of this process that take part.
+        options: names of the options that decide how much is needed.
+        once: bytes that this process takes once, whatever the number of devices: `COMPILE_BYTES` or
+            `RUN_BYTES`. They are in the memory of the machine, so an accelerator does not need to
+            have them.
 
     Raises:
-        ConfigError: the devices do not have as much left; CPU devices of all processes on a machine share what it has.
+        ConfigError: the devices do not have as much memory left.
     """
     free = available()
-    on_cpu = jax.local_devices()[0].platform == "cpu"
-    total = (needed * devices + beside) * processes.beside() if on_cpu else needed
+    total = needed
+    if jax.local_devices()[0].platform == "cpu":
+        total = (needed * devices + once) * processes.count_on_this_machine()
     short = free is not None and total > free
-    if processes.anyone(short):
-        found = f"{free / GIB:,.1f} GiB are free" if free is not None and short else "another process has less"
-        raise ConfigError(f"{what}: this training needs {total / GIB:,.1f} GiB of memory, {found}")
+    if processes.any_process(short):
+        reason = "another process has less"
+        if free is not None and short:
+            reason = f"{free / GIB:,.1f} GiB are free"
+        raise ConfigError(
+            f"{options}: this training needs {total / GIB:,.1f} GiB of memory, {reason}"
+        )
 
 
 def available() -> int | None:
-    """Bytes free on an accelerator, or on this machine within the limits of container and process; None if nobody tells."""
+    """Return the bytes that are free, or None if that is not known.
+
+    For an accelerator it is the memory of one device. Otherwise it is what is free on this machine
+    within the limits of container and process.
+    """
     device = jax.local_devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats() or {}
-        return stats["bytes_limit"] - stats.get("bytes_in_use", 0) if "bytes_limit" in stats else None
+        if "bytes_limit" not in stats:
+            return None
+        return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
     known = [free for free in (_machine(), _container(), _process()) if free is not None]
     return min(known) if known else None
 
 
 def _machine() -> int | None:
+    """Return the bytes that are free on this machine."""
     for line in _lines("/proc/meminfo"):
         if line.startswith("MemAvailable:"):
             return 1024 * int(line.split()[1])
@@ -90,37 +141,46 @@ def _machine() -> int | None:
 
 
 def _process() -> int | None:
-    """What `ulimit -v` leaves this process."""
+    """Return the bytes that `ulimit -v` leaves this process."""
     if resource is None:
         return None
-    most, _ = resource.getrlimit(resource.RLIMIT_AS)
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     pages = [int(line.split()[0]) for line in _lines("/proc/self/statm")]
-    if most == resource.RLIM_INFINITY or not pages:
+    if limit == resource.RLIM_INFINITY or not pages:
         return None
-    return max(0, most - pages[0] * resource.getpagesize())
+    return max(0, limit - pages[0] * resource.getpagesize())
 
 
 def _container() -> int | None:
-    """What the control groups of this process leave it, version 1 or 2: the least of its own and of those around it."""
+    """Return the bytes that the control groups of this process leave it, of version 1 or 2.
+
+    It is the least of what its own group and the groups around that one leave.
+    """
     known = []
     for line in _lines("/proc/self/cgroup"):
         _, controllers, path = line.split(":", 2)
-        if controllers not in GROUPS:
+        if controllers not in CONTROL_GROUPS:
             continue
-        root, limit, used, cache = GROUPS[controllers]
-        group = Path(path.lstrip("/"))
-        for inner in (group, *group.parents):  # of a container, the file system may show only the root
-            known.append(_left(Path(root) / inner, limit, used, cache))
-    return min((free for free in known if free is not None), default=None)
+        files = CONTROL_GROUPS[controllers]
+        own = Path(path.lstrip("/"))
+        for group in (own, *own.parents):  # a container's file system may show only the root
+            free = _group(Path(files.root) / group, files)
+            if free is not None:
+                known.append(free)
+    return min(known, default=None)
 
 
-def _left(group: Path, limit: str, used: str, cache: str) -> int | None:
-    """The limit of a control group, less what is used and not a cache that can be dropped."""
-    most, now = ("".join(_lines(str(group / name))).strip() for name in (limit, used))
-    if not (most.isdigit() and now.isdigit()):
+def _group(path: Path, files: ControlGroupFiles) -> int | None:
+    """Return what is left of the limit of a group. A cache that can be dropped counts as free."""
+    limit = "".join(_lines(str(path / files.limit))).strip()
+    used = "".join(_lines(str(path / files.used))).strip()
+    if not (limit.isdigit() and used.isdigit()):
         return None
-    dropped = [int(line.split()[1]) for line in _lines(str(group / "memory.stat")) if line.startswith(f"{cache} ")]
-    return int(most) - int(now) + sum(dropped)
+    rows = [
+        line for line in _lines(str(path / "memory.stat")) if line.startswith(f"{files.cache} ")
+    ]
+    caches = [int(row.split()[1]) for row in rows]
+    return int(limit) - int(used) + sum(caches)
 
 
 def _lines(path: str) -> list[str]:
@@ -130,6 +190,6 @@ def _lines(path: str) -> list[str]:
         return []
 
 
-def _raw(tree: Any) -> Any:
-    """Keys as the words that they are."""
+def _keys_as_words(tree: Any) -> Any:
+    """Return a tree with PRNG keys replaced by the words of which they consist."""
     return jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, tree)

@@ -1,6 +1,7 @@
 """Several processes, on one machine or on many, that train the seeds of one run together.
 
-Each runs the same program on its own devices; process 0 writes the run directory, all of them its checkpoints.
+Each process runs the same program on its own devices. Process 0 writes the run directory, and all
+processes write its checkpoints.
 """
 
 from __future__ import annotations
@@ -28,15 +29,20 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-LONGEST = 4096
-"""Of what process 0 tells the others, in bytes."""
+MAX_MESSAGE_BYTES = 4096
+"""Size of what process 0 tells the others: a path or the text of an error. Longer ones are cut."""
 
-_LOST = re.compile("gloo|nccl|heartbeat|coordination|unavailable|deadline", re.IGNORECASE)
-"""In what collectives raise when one of the others has gone."""
+MAX_REASON_LETTERS = 200
+"""How much of the first line of a library's error is told."""
+
+_LOST_PROCESS = re.compile("gloo|nccl|heartbeat|coordination|unavailable|deadline", re.IGNORECASE)
+"""What the errors contain that collectives raise when another process has ended."""
 
 
 def join() -> None:
-    """Find the other processes, by the environment of Slurm, Open MPI or another launcher that JAX knows.
+    """Find the other processes.
+
+    They are found by the environment of Slurm, Open MPI or another launcher that JAX knows.
 
     Raises:
         ConfigError: there is no such launcher, or not all processes came.
@@ -44,52 +50,61 @@ def join() -> None:
     try:
         jax.distributed.initialize()
     except (RuntimeError, ValueError) as error:
-        reason = (str(error).splitlines() or [""])[0]
-        raise ConfigError(f"distributed: start the processes by srun or mpirun: {reason[:200]}") from None
+        reason = _first_line(error)
+        raise ConfigError(f"distributed: start the processes by srun or mpirun: {reason}") from None
 
 
 def leads() -> bool:
-    """Whether this is process 0, or the only one."""
+    """Return whether this is process 0, or the only process."""
     return jax.process_index() == 0
 
 
 def from_leader(decide: Callable[[], str]) -> str:
-    """What process 0 decides, in every process.
+    """Return in every process what process 0 decides.
+
+    Args:
+        decide: a function that only process 0 calls.
 
     Raises:
-        ConfigError: in every process, if process 0 could not.
+        ConfigError: `decide` raised it in process 0. It is raised in every process.
     """
     if jax.process_count() == 1:
         return decide()
     from jax.experimental.multihost_utils import broadcast_one_to_all
 
-    failed, text = False, ""
+    failed = False
+    text = ""
     if leads():
         try:
             text = decide()
         except ConfigError as error:
-            failed, text = True, str(error)
-    words = np.zeros(LONGEST, np.uint8)
-    content = text.encode()[: LONGEST - 1]
-    words[0], words[1 : 1 + len(content)] = failed, np.frombuffer(content, np.uint8)
-    found = np.asarray(broadcast_one_to_all(words))
-    text = found[1:].tobytes().rstrip(b"\0").decode(errors="replace")
-    if found[0]:
+            failed = True
+            text = str(error)
+    message = np.zeros(MAX_MESSAGE_BYTES, np.uint8)
+    content = text.encode()[: MAX_MESSAGE_BYTES - 1]
+    message[0] = failed
+    message[1 : 1 + len(content)] = np.frombuffer(content, np.uint8)
+    received = np.asarray(broadcast_one_to_all(message))
+    text = received[1:].tobytes().rstrip(b"\0").decode(errors="replace")
+    if received[0]:
         raise ConfigError(text)
     return text
 
 
-def anyone(wants: bool) -> bool:
-    """Whether this holds in some process: what all of them must do together is decided so."""
+def any_process(flag: bool) -> bool:
+    """Return in every process whether the flag is set in some process.
+
+    This is how the processes decide what all of them must do together.
+    """
     if jax.process_count() == 1:
-        return wants
+        return flag
     from jax.experimental.multihost_utils import process_allgather
 
-    return bool(np.any(process_allgather(np.asarray(wants))))
+    return bool(np.any(process_allgather(np.asarray(flag))))
 
 
-def beside() -> int:
-    """How many processes of this run are on this machine, this one included."""
+def count_on_this_machine() -> int:
+    """Return how many processes of this run are on this machine, this process included."""
     if jax.process_count() == 1:
         return 1
     from jax.experimental.multihost_utils import process_allgather
@@ -99,7 +114,10 @@ def beside() -> int:
 
 
 def gather(x: Any) -> np.ndarray:
-    """An array, or the words of keys, on the host of every process, wherever its parts are."""
+    """Return an array on the host of every process, wherever its parts are.
+
+    PRNG keys become the words of which they consist.
+    """
     if is_key(x):
         x = jax.random.key_data(x)
     if x.is_fully_addressable:
@@ -111,53 +129,79 @@ def gather(x: Any) -> np.ndarray:
 
 @contextlib.contextmanager
 def own_files(run: Path) -> Iterator[Path]:
-    """The run directory, which process 0 alone writes; the others have a copy of its logs to go on from, and print nothing.
+    """Give each process a directory for the files of a run.
+
+    Process 0 gets the run directory itself, which it alone writes. Every other process gets a copy
+    of its logs to go on from, and prints nothing.
 
     Raises:
-        ConfigError: in every process, if another command writes this run already.
+        ConfigError: another command already writes this run. It is raised in every process.
     """
     with contextlib.ExitStack() as held:
         from_leader(lambda: held.enter_context(_locked(run)))
         if leads():
-            meet("copied")
+            wait_for_all("copied")
             yield run
             return
-    with tempfile.TemporaryDirectory() as place, open(os.devnull, "w") as nowhere, contextlib.redirect_stdout(nowhere):
+    with (
+        tempfile.TemporaryDirectory() as copy,
+        open(os.devnull, "w") as nowhere,
+        contextlib.redirect_stdout(nowhere),
+    ):
         for file in run.iterdir():
             if file.is_file():
-                shutil.copy(file, place)
-        meet("copied")
-        yield Path(place)
+                shutil.copy(file, copy)
+        wait_for_all("copied")
+        yield Path(copy)
 
 
 @contextlib.contextmanager
 def _locked(run: Path) -> Iterator[str]:
-    """Hold the run, where the system has locks; this one goes with the process. Gives an empty text."""
+    """Hold a lock on a run, where the system has locks. The lock goes with the process.
+
+    Yields:
+        An empty text, because `from_leader` takes a text.
+
+    Raises:
+        ConfigError: another command holds the lock.
+    """
     with contextlib.ExitStack() as files:
         try:
             if fcntl:
-                fcntl.flock(files.enter_context(open(run / "config.yaml", "rb+")), fcntl.LOCK_EX | fcntl.LOCK_NB)
+                file = files.enter_context(open(run / "config.yaml", "rb+"))
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ConfigError(f"{run}: another command is at work on this run; wait for its end, or stop it") from None
-        except OSError:  # a file system without locks, or no such run, which is told elsewhere
+            raise ConfigError(
+                f"{run}: another command is at work on this run; wait for its end, or stop it"
+            ) from None
+        except OSError:  # a file system without locks, or no such run, which is reported elsewhere
             pass
         yield ""
 
 
 @contextlib.contextmanager
-def loss_told(advice: str) -> Iterator[None]:
-    """What fails because another process has gone becomes a ConfigError with this advice."""
+def reporting_lost_process(advice: str) -> Iterator[None]:
+    """Turn an error that comes from the loss of another process into a ConfigError.
+
+    Args:
+        advice: what the user can do, for the message.
+
+    Raises:
+        ConfigError: another process of this run has ended.
+    """
     try:
         yield
     except (jax.errors.JaxRuntimeError, ValueError) as error:
-        if jax.process_count() == 1 or not _LOST.search(str(error)):
+        if jax.process_count() == 1 or not _LOST_PROCESS.search(str(error)):
             raise
-        reason = (str(error).splitlines() or [""])[0][:200]
-        raise ConfigError(f"distributed: another process of this run has ended ({reason}); {advice}") from None
+        reason = _first_line(error)
+        raise ConfigError(
+            f"distributed: another process of this run has ended ({reason}); {advice}"
+        ) from None
 
 
-def meet(name: str) -> None:
-    """Wait until all processes are here."""
+def wait_for_all(name: str) -> None:
+    """Wait until all processes have come to the barrier of this name."""
     if jax.process_count() > 1:
         from jax.experimental.multihost_utils import sync_global_devices
 
@@ -165,5 +209,9 @@ def meet(name: str) -> None:
 
 
 def in_main_thread() -> bool:
-    """Return whether this is the main thread, the only one that may say what a signal does."""
+    """Return whether this is the main thread, the only one that may set what a signal does."""
     return threading.current_thread() is threading.main_thread()
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).splitlines() or [""])[0][:MAX_REASON_LETTERS]

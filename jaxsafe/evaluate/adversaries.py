@@ -46,7 +46,7 @@ def greedy(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     def h(u: Float[Array, " m"]) -> Float[Array, ""]:
         return smallest_margin(env, advance(env, sim, u))
 
-    return _steer(env, h, -1.0, key)
+    return _steer(env, h, sign=-1.0, key=key)
 
 
 def inward(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
@@ -176,7 +176,7 @@ def _towards(env: Environment, sim: Sim, aim: Float[Array, " d"], key: Key) -> F
         later = advance(env, sim, u)
         return jnp.sum(aim * advance(env, later, jnp.zeros_like(u)).platforms[env.agent].velocity)
 
-    return _steer(env, along, 1.0, key)
+    return _steer(env, along, sign=1.0, key=key)
 
 
 def _steer(

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxsafe.agents.agent import Params
-from jaxsafe.devices.background_compile import Ahead
+from jaxsafe.devices.background_compile import CompiledInBackground
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.episodes import begin_recording, max_steps, record_steps, run_episodes
@@ -55,9 +55,8 @@ KINDS = ("stochastic", "deterministic")
 class Recorder(NamedTuple):
     """Two compiled functions that record some episodes of one policy."""
 
-    begin: Callable[..., Any]  # takes a key, returns the position and the starts
-    # takes parameters, key, `deterministic` and position; returns the next position and the steps
-    go_on: Callable[..., Any]
+    begin: Callable[..., Any]  # (key) -> (position, starts)
+    go_on: Callable[..., Any]  # (parameters, key, deterministic, position) -> (position, steps)
 
 
 class Acting(Protocol):
@@ -86,17 +85,17 @@ class Evaluator:
         Args:
             params: the parameters that `run` takes, or what `SeedMapper.like` says of them.
         """
-        if isinstance(self._run, Ahead):
+        if isinstance(self._run, CompiledInBackground):
             return
         key = jax.random.key(0)
         deterministic = np.asarray(True)
-        self._run = Ahead(self._run, self._arguments(key, deterministic), params)
+        self._run = CompiledInBackground(self._run, self._arguments(key, deterministic), params)
         params_of_seed = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), params)
         begin, go_on = self._recorder(MIN_RECORDED_EPISODES)
         position, _ = jax.eval_shape(begin, key)
         self._recorders[MIN_RECORDED_EPISODES] = Recorder(
-            begin=Ahead(begin, key),
-            go_on=Ahead(go_on, params_of_seed, key, deterministic, position),
+            begin=CompiledInBackground(begin, key),
+            go_on=CompiledInBackground(go_on, params_of_seed, key, deterministic, position),
         )
 
     def run(self, params: Params, num_episodes: int, seed: int, deterministic: bool) -> Episode:
@@ -130,7 +129,9 @@ class Evaluator:
             seed: the seed of the evaluation.
             deterministic: whether the policy takes the mode of its actions.
         """
-        for state, timestep in self.episodes(params, num_episodes, seed, deterministic):
+        for state, timestep in self.episodes(
+            params, num_episodes, seed=seed, deterministic=deterministic
+        ):
             yield (_step_row(self.env, state, timestep, t) for t in range(len(timestep.reward)))
 
     def episodes(
@@ -143,7 +144,9 @@ class Evaluator:
         num_batches = -(-num_episodes // EPISODES_PER_BATCH)
         for batch, key in enumerate(batch_keys(seed, num_batches)):
             count = min(EPISODES_PER_BATCH, num_episodes - batch * EPISODES_PER_BATCH)
-            yield from self._episodes(params, key, np.asarray(deterministic), count)
+            yield from self._episodes(
+                params, key, deterministic=np.asarray(deterministic), count=count
+            )
 
     def _episodes(
         self, params: Params, key: Key, deterministic: Any, count: int

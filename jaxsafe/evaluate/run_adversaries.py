@@ -71,8 +71,8 @@ def attack(env: Environment, name: str, num_steps: int, num_envs: int, key: Key)
 
     Returns:
         Plain numbers: steps, episodes, violations, worst margins, interventions, mean correction
-        and unsafe starts. Episodes are those that ended. If in some environment none has ended,
-        they are the first parts of one episode in each environment. If nothing was violated, the
+        and unsafe starts. Episodes are those that ended. If none has ended in some environment, the
+        first part of one episode in each environment counts instead. If nothing was violated, the
         share of episodes with a violation is below `violation_bound` with 95 % confidence, by the
         rule of three. The bound is None after a violation. It is also None for the search, whose
         episodes do not depend on chance alone.

@@ -1,1 +1,1 @@
-"""The paper's figures from the log files of a run."""
+"""Figures of the paper, from the log files of a run, and animations of episodes."""

@@ -1,4 +1,4 @@
-"""What all figures share: colours that are safe for colour-blind readers, and how a figure is saved."""
+"""Colours, labels, units and patches that all figures share, and how a figure is saved."""
 
 from __future__ import annotations
 
@@ -22,55 +22,79 @@ if TYPE_CHECKING:
     from jaxsafe.environment import Environment
 
 ZERO_WIDTH_SPACE = "\u200b"
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#8A8A8A"  # Okabe-Ito, safe for colour-blind readers
+
+# Colours of Okabe and Ito, which colour-blind readers can tell apart.
+BLUE = "#0072B2"
+ORANGE = "#D55E00"
+GREEN = "#009E73"
+GREY = "#8A8A8A"
 
 
 def length_unit(env: Environment) -> str | None:
-    """The unit of positions: m or ft; None if the platform does not say."""
+    """Return the unit of positions, m or ft, or None if the platform does not say."""
     return units(type(env.agent_platform.rest())).get("position")
 
 
 def control_unit(name: str, length: str | None) -> str | None:
-    """The unit of a control by the words in its name, given that of lengths; None if it is not known."""
-    known = {"thrust": "N", "rate": "rad/s", "attitude_acceleration": "rad/s²", "acceleration": f"{length}/s²"}
-    return next((unit for word, unit in known.items() if word in name), None)
+    """Return the unit of a control by the words in its name, or None if it is not known.
+
+    Args:
+        name: the name of the control.
+        length: the unit of lengths.
+    """
+    units_by_word = {
+        "thrust": "N",
+        "rate": "rad/s",
+        "attitude_acceleration": "rad/s²",
+        "acceleration": f"{length}/s²",
+    }
+    return next((unit for word, unit in units_by_word.items() if word in name), None)
 
 
 def margin_unit(constraint: Any, length: str | None) -> str | None:
-    """The unit of a constraint's h, given that of positions; None if it is not known."""
+    """Return the unit of a constraint's h, or None if it is not known.
+
+    Args:
+        constraint: the constraint.
+        length: the unit of positions.
+    """
     if length is None:
         return None
-    known = {SpeedLimit: f"{length}/s", Separation: length}
-    return next((unit for kind, unit in known.items() if isinstance(constraint, kind)), None)
+    units_by_class = {SpeedLimit: f"{length}/s", Separation: length}
+    return next((unit for cls, unit in units_by_class.items() if isinstance(constraint, cls)), None)
 
 
 def plain(text: object) -> str:
-    """Return a text of the user as a figure shows it letter by letter, for titles and labels.
+    """Return a user's text so that a title or label shows it letter by letter.
 
-    Matplotlib reads `$…$` as a formula, and leaves out of legends what begins with `_`.
+    Matplotlib reads `$…$` as a formula, and legends leave out names that begin with `_`.
     """
     shown = printable(str(text)).replace("$", r"\$")
     return f"{ZERO_WIDTH_SPACE}{shown}" if shown.startswith("_") else shown
 
 
 def labelled(quantity: str, unit: str | None) -> str:
-    """The label of an axis."""
+    """Return the label of an axis."""
     return f"{quantity} [{unit}]" if unit else quantity
 
 
 def kept_out(env: Environment) -> set[str]:
-    """Return the names of the regions to stay out of: a constraint or a failure watches them, and no success does."""
+    """Return the names of the regions that the agent must stay out of.
+
+    A constraint or a failure watches such a region, and no success does.
+    """
     status = {part.name: part for part in env.status}
 
     def watched(parts: Iterable[Any]) -> set[str]:
-        found = set()
+        regions = set()
         for part in parts:
             for _, refers, name in references(part, ""):
                 if refers.section == "regions":
-                    found.add(name)
+                    regions.add(name)
                 elif refers.section == "status":
-                    found |= watched([status[name]])  # which refers to those before it only
-        return found
+                    # This ends, because a status refers only to earlier ones.
+                    regions |= watched([status[name]])
+        return regions
 
     goals = [part for part in env.terminal if part.name == SUCCESS]
     failures = [part for part in env.terminal if part.name != SUCCESS]
@@ -78,34 +102,44 @@ def kept_out(env: Environment) -> set[str]:
 
 
 def region_patch(region: Any, from_the_side: bool, forbidden: bool = False) -> Any:
-    """The area of a region around the origin, seen from above or from the side, where one with a height is a rectangle."""
+    """Return a patch of a region around the origin, seen from above or from the side.
+
+    Seen from the side, a region with a height is a rectangle.
+    """
     style = {"color": ORANGE if forbidden else GREEN, "alpha": 0.35, "linewidth": 0}
     if from_the_side and hasattr(region, "height"):
-        size = (2.0 * float(region.radius), float(region.height))
-        return Rectangle((-size[0] / 2.0, -size[1] / 2.0), *size, **style)
+        width = 2.0 * float(region.radius)
+        height = float(region.height)
+        return Rectangle((-width / 2.0, -height / 2.0), width, height, **style)
     return Circle((0.0, 0.0), float(getattr(region, "radius", 0.0)), **style)
 
 
 def centre_patch(patch: Any, centre: np.ndarray) -> None:
-    """Move what `region_patch` made; centre [2]."""
+    """Move a patch of `region_patch` to a centre, shape (2,)."""
+    x = float(centre[0])
+    y = float(centre[1])
     if isinstance(patch, Circle):
-        patch.set_center((float(centre[0]), float(centre[1])))
+        patch.set_center((x, y))
     else:
-        patch.set_xy((float(centre[0]) - patch.get_width() / 2.0, float(centre[1]) - patch.get_height() / 2.0))
+        patch.set_xy((x - patch.get_width() / 2.0, y - patch.get_height() / 2.0))
 
 
 def save(figure: Figure, path: Path) -> Path:
-    """Write a figure as a file of the kind that its name says, PNG if none, and return its path.
+    """Write a figure to a file and return the path.
+
+    The ending of the path says the format. It is PNG without an ending.
 
     Raises:
-        ConfigError: there is no such kind.
+        ConfigError: the format is not known.
     """
-    kind, known = path.suffix[1:] or "png", figure.canvas.get_supported_filetypes()
-    if kind not in known:
-        raise ConfigError(f"out: cannot draw {path.name}; choose from .{', .'.join(sorted(known))}")
+    file_format = path.suffix[1:] or "png"
+    known_formats = figure.canvas.get_supported_filetypes()
+    if file_format not in known_formats:
+        choices = ", .".join(sorted(known_formats))
+        raise ConfigError(f"out: cannot draw {path.name}; choose from .{choices}")
     for panel in figure.axes:
         panel.spines[["top", "right"]].set_visible(False)
     buffer = io.BytesIO()
-    figure.savefig(buffer, dpi=150, format=kind)
+    figure.savefig(buffer, dpi=150, format=file_format)
     write_bytes(path, buffer.getvalue())
     return path

@@ -65,8 +65,8 @@ class AlignAndBrake(BackupController, type="align_and_brake"):
 
     While abs(e) > `aligned` the thrust is the smallest that keeps the speed limit with twice the
     `margin`. That holds the boundary while the spacecraft turns. Where no thrust keeps the limit,
-    it brakes as well as the bounds allow. Then abs(e) > `steep` is an exception, and the thrust is
-    0: thrust so far across the velocity turns the velocity away as fast as the body follows.
+    it brakes as well as the bounds allow, but not while abs(e) > `steep`. Thrust so far across the
+    velocity would turn the velocity away as fast as the body follows.
 
     Once abs(e) is at most `aligned`, the thrust nulls the velocity along the body.
     """
@@ -161,8 +161,8 @@ class MatchVelocity(BackupController, type="match_velocity"):
     error. It climbs or dives at the steepest angle while abs(e) is above 0.45 rad, less steeply
     down to 0.15 rad, and then flies the lead's angle.
 
-    Far from the origin, rounding moves two aircraft of equal velocity by up to 0.01 ft a step. So
-    where the agent is closer than `clearance`, it takes the lead's velocity plus
+    Far from the origin, rounding moves two aircraft of equal velocity closer or apart by 0.01 ft a
+    step. So where the agent is closer than `clearance`, it takes the lead's velocity plus
     w = 0.1 s⁻¹ (`clearance` − ‖r‖) r/‖r‖, to first order.
     """
 

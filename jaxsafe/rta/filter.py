@@ -253,15 +253,15 @@ class CertifiedRTA(RTA):
         """Propose a control, certify it, else back up. Arguments and results are those of `RTA`."""
         wanted, finite = admissible(env, desired)
         later = others_later(env, sim)
-        backup = self._backup(env, sim, memory, later)
+        backup = self._backup(env, sim, memory=memory, later=later)
         proposal, feasible = self.propose(env, sim, wanted, backup)
 
         # A certificate with a horizon takes many predicted steps, so only one is made per step.
         # From a certified state it is a certificate of the proposal. From any other state the
         # backup acts whatever is proposed, so it is one of the backup.
         certified_before = memory.certified if self.enforce and self.horizon else jnp.ones((), bool)
-        after_proposal = advance(env, sim, proposal, later)
-        after_backup = advance(env, sim, backup, later)
+        after_proposal = advance(env, sim, proposal, later=later)
+        after_backup = advance(env, sim, backup, later=later)
         paths = self.follow(env, sim, _where(certified_before, after_proposal, after_backup))
         best = self._best(env, paths)
         required = self.required_margin(env)
@@ -271,7 +271,9 @@ class CertifiedRTA(RTA):
         backup_margin = self.lowest(env, sim, after_backup)
         new_certificate = passes | ~certified_before
         if self.horizon:
-            backup_certified, ahead = self._renew(env, sim, memory, after_backup, backup_margin)
+            backup_certified, ahead = self._renew(
+                env, sim, memory=memory, after_backup=after_backup, backup_margin=backup_margin
+            )
             backup_certified = jnp.where(
                 certified_before, backup_certified, paths.values[best] >= required
             )
@@ -304,7 +306,7 @@ class CertifiedRTA(RTA):
 
         For separations it is the smallest h on the way from `before`, one step earlier.
         """
-        return smallest_margin(env, sim, before, self.constraints)
+        return smallest_margin(env, sim, before=before, names=self.constraints)
 
     def certify(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, " backups"]:
         """Return for each backup controller the smallest h on its way from `sim`.
@@ -335,7 +337,7 @@ class CertifiedRTA(RTA):
         # The other platforms are predicted once for all backup controllers, unless they react to
         # what the agent does.
         groups = [[backup] for backup in self.backups] if others_react(env, sim) else [self.backups]
-        predicted = [self._follow(env, backups, first, sim) for backups in groups]
+        predicted = [self._follow(env, backups, first=first, sim=sim) for backups in groups]
         least, group_ends = zip(*predicted, strict=True)
         ends = [end for ends in group_ends for end in ends]
         reached = jnp.stack([self._may_end(env, end) for end in ends])
@@ -416,7 +418,8 @@ class CertifiedRTA(RTA):
         end_time = sim.time + self.horizon * env.dt
         end = sim.replace(time=end_time, platforms=memory.ahead, regions={}, status={})
         later = others_later(env, end)
-        new_end = advance(env, end, self._backup(env, end, memory, later), later)
+        control = self._backup(env, end, memory=memory, later=later)
+        new_end = advance(env, end, control, later=later)
         faultless = [_none(backup.faults(env, after_backup, self)) for backup in self.backups]
         proved = jnp.stack(faultless)[memory.backup_index]
         last_step_keeps = self.lowest(env, end, new_end) >= self.required_margin(env)

@@ -94,9 +94,9 @@ class Dubins2D(Platform, type="dubins2d"):
             return self.step_within_limits(state, controls, dt)
         turn = controls.get("heading_rate", 0.0)
         acceleration = controls["acceleration"]
-        speed = ramp(state.speed, 0.0, self.speed_limits, 0.0)
-        final_speed = ramp(speed, acceleration, self.speed_limits, dt)
-        stop = time_to_limit(speed, acceleration, self.speed_limits, dt)
+        speed = ramp(state.speed, rate=0.0, limits=self.speed_limits, t=0.0)
+        final_speed = ramp(speed, rate=acceleration, limits=self.speed_limits, t=dt)
+        stop = time_to_limit(speed, rate=acceleration, limits=self.speed_limits, dt=dt)
         moved = _arc(
             heading=state.heading, speed=speed, turn=turn, acceleration=acceleration, t=stop
         )
@@ -119,9 +119,9 @@ class Dubins2D(Platform, type="dubins2d"):
         """Return the state after `dt` seconds, as `step` does, but with a single arc."""
         turn = controls.get("heading_rate", 0.0)
         acceleration = controls.get("acceleration", 0.0)
-        speed = ramp(state.speed, 0.0, self.speed_limits, 0.0)
+        speed = ramp(state.speed, rate=0.0, limits=self.speed_limits, t=0.0)
         moved = _arc(heading=state.heading, speed=speed, turn=turn, acceleration=acceleration, t=dt)
-        final_speed = ramp(speed, acceleration, self.speed_limits, dt)
+        final_speed = ramp(speed, rate=acceleration, limits=self.speed_limits, t=dt)
         return Dubins2DState(
             position=state.position + moved,
             heading=state.heading + turn * dt,
@@ -209,7 +209,7 @@ class Dubins3D(Platform, type="dubins3d"):
         start = (state.heading, still, still, still)
         one_piece = lambda carry, span: (self._fly(ramps, carry, span), None)  # noqa: E731
         (heading, *moved), _ = jax.lax.scan(one_piece, start, spans)
-        return self._arrived(state, ramps, dt, heading, moved)
+        return self._arrived(state, ramps, dt, heading=heading, moved=moved)
 
     def step_within_limits(
         self, state: Dubins3DState, controls: Controls, dt: Seconds
@@ -217,7 +217,7 @@ class Dubins3D(Platform, type="dubins3d"):
         """Return the state after `dt` seconds, as `step` does, but from a single piece."""
         ramps = self._ramps(state, controls, dt)
         heading, *moved = self._fly(ramps, (state.heading, 0.0, 0.0, 0.0), (jnp.zeros_like(dt), dt))
-        return self._arrived(state, ramps, dt, heading, moved)
+        return self._arrived(state, ramps, dt, heading=heading, moved=moved)
 
     def _ramps(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Ramps:
         """Return the ramps of roll, flight path angle and speed.
@@ -233,7 +233,9 @@ class Dubins3D(Platform, type="dubins3d"):
             ),
             (state.speed, controls.get("acceleration"), self.speed_limits),
         ]
-        return [(ramp(x, 0.0, limits, 0.0), rate, limits) for x, rate, limits in ramps]
+        return [
+            (ramp(x, rate=0.0, limits=limits, t=0.0), rate, limits) for x, rate, limits in ramps
+        ]
 
     def _fly(
         self, ramps: Ramps, before: tuple[Any, ...], span: tuple[Array, Array]

@@ -88,8 +88,8 @@ class OrientedSpacecraft(Platform, type="oriented_spacecraft"):
         """
         limits = self.attitude_rate_limits
         turn = controls.get("attitude_acceleration", 0.0)
-        first_rate = ramp(state.attitude_rate, 0.0, limits, 0.0)
-        final_rate = ramp(first_rate, turn, limits, dt)
+        first_rate = ramp(state.attitude_rate, rate=0.0, limits=limits, t=0.0)
+        final_rate = ramp(first_rate, rate=turn, limits=limits, t=dt)
         thrust = controls.get("thrust", 0.0) / self.mass
 
         zeros = jnp.zeros_like(state.position)
@@ -97,7 +97,7 @@ class OrientedSpacecraft(Platform, type="oriented_spacecraft"):
         position, velocity = cwh_flow(
             r=state.position, v=state.velocity, a=zeros, n=self.mean_motion, t=dt
         )
-        stop = time_to_limit(first_rate, turn, limits, dt)
+        stop = time_to_limit(first_rate, rate=turn, limits=limits, dt=dt)
         for begin, length, rate, acceleration in (
             (0.0, stop, first_rate, turn),
             (stop, dt - stop, final_rate, 0.0),

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.agents.agent import Agent
-from jaxsafe.devices.seed_mapper import LANES, SEEDS, SeedMapper, isolated
+from jaxsafe.devices.seed_mapper import SPLIT_BY_ENV, SPLIT_BY_SEED, SeedMapper, isolated
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment
 from jaxsafe.schema.component import normalise
@@ -18,7 +18,7 @@ from jaxsafe.train import ppo, recent_episodes
 from jaxsafe.train.ppo import PPO, TrainState
 from jaxsafe.types import Key
 
-STATE = ppo.over_devices(SEEDS, LANES)
+STATE = ppo.over_devices(SPLIT_BY_SEED, SPLIT_BY_ENV)
 """How the training states of all seeds lie on the devices."""
 
 
@@ -92,8 +92,8 @@ def programs(mapper: SeedMapper, length: int, limit: int) -> tuple[Any, Any]:
     def advance(shared: tuple, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
         return chunk(shared, state, length, limit, mapper.shard)
 
-    fresh = mapper.map(partial(begin, shard=mapper.shard), returned=STATE, pairs=True)
-    return fresh, mapper.map(advance, STATE, (STATE, SEEDS))
+    fresh = mapper.map(partial(begin, shard=mapper.shard), out_specs=STATE, as_pair=True)
+    return fresh, mapper.map(advance, in_specs=STATE, out_specs=(STATE, SPLIT_BY_SEED))
 
 
 def begin(shared: tuple, key: jax.Array, shard: Shard = WHOLE) -> TrainState:

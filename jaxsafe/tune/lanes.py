@@ -98,13 +98,15 @@ class Lanes:
         """The program of some updates, refused before there is a state if either needs more memory than there is."""
         like = self.mapper.like(jax.eval_shape(self._init, (), (lanes, keys)))
         state = memory.size(like) // self.mapper.mesh.size
-        memory.require(state, self.mapper.num_local_devices, memory.OPTIONS, memory.COMPILING)
+        memory.require(
+            state, self.mapper.num_local_devices, memory.MEMORY_OPTIONS, memory.COMPILE_BYTES
+        )
         compiled = self.mapper.map(self._one_chunk).lower((), (lanes, like)).compile()
         memory.require(
             memory.footprint(compiled),
             self.mapper.num_local_devices,
-            memory.OPTIONS,
-            memory.RUNNING,
+            memory.MEMORY_OPTIONS,
+            memory.RUN_BYTES,
         )
         return compiled
 

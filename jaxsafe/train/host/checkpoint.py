@@ -84,7 +84,7 @@ class Checkpoints:
         if step in self.steps:
             if processes.leads():
                 place.rename(before)
-            processes.meet("moved aside")
+            processes.wait_for_all("moved aside")
             self._manager.reload()
         args = ocp.args.Composite(
             state=ocp.args.StandardSave(state), facts=ocp.args.JsonSave(facts)
@@ -117,7 +117,7 @@ class Checkpoints:
         """In one process take back what was not finished; the others wait."""
         if processes.leads():
             self._take_back()
-        processes.meet("taken back")
+        processes.wait_for_all("taken back")
 
     def _take_back(self) -> None:
         """Take a checkpoint back whose successor of the same step was never written, and remove what is left of that."""

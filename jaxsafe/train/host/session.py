@@ -21,7 +21,7 @@ import numpy as np
 
 from jaxsafe.autoreset import choose
 from jaxsafe.devices import memory, processes
-from jaxsafe.devices.background_compile import Ahead, without_collection
+from jaxsafe.devices.background_compile import CompiledInBackground, without_collection
 from jaxsafe.devices.processes import in_main_thread
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
@@ -140,10 +140,10 @@ class Training:
                     self._evaluate()
                 elif self._early_due():
                     self._record(1, final=False)
-                stopping = processes.anyone(stop.requested)
+                stopping = processes.any_process(stop.requested)
                 if self._due(before, self.config.checkpoint_every) or stopping:
                     self._save()
-            stopping = stopping or processes.anyone(
+            stopping = stopping or processes.any_process(
                 stop.requested
             )  # it may have come with the last of them
         display.close()
@@ -176,11 +176,13 @@ class Training:
         each = (
             memory.size(content) // self.config.seeds * self.mapper.padded // self.mapper.mesh.size
         )
-        memory.require(each, self.mapper.num_local_devices, memory.OPTIONS, memory.COMPILING)
+        memory.require(
+            each, self.mapper.num_local_devices, memory.MEMORY_OPTIONS, memory.COMPILE_BYTES
+        )
         begin, keys = time.monotonic(), self.mapper.keys(self.config.seed)
         fresh, advance = programs(self.mapper, self.chunk, self.config.num_updates)
         like = self.mapper.like(jax.eval_shape(fresh, self.shared, keys), STATE)
-        self.advance = Ahead(advance, self.shared, like)  # the longest first
+        self.advance = CompiledInBackground(advance, self.shared, like)  # the longest first
         if self.checkpoints.steps:
             self._restore()
         else:
@@ -238,8 +240,8 @@ class Training:
         memory.require(
             memory.footprint(compiled) - has,
             self.mapper.num_local_devices,
-            memory.OPTIONS,
-            memory.RUNNING,
+            memory.MEMORY_OPTIONS,
+            memory.RUN_BYTES,
         )
 
     def _due(self, before: int, every: int | None) -> bool:
