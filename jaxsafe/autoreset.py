@@ -1,4 +1,8 @@
-"""New starts for those lanes of a batch whose episodes ended, at a cost that follows their number."""
+"""New starts for the environments of a batch whose episodes ended.
+
+The cost follows the number of these environments. An environment's index is its place on the axis
+of the batch.
+"""
 
 from __future__ import annotations
 
@@ -13,101 +17,153 @@ from jaxtyping import Array, Bool, Int, UInt32
 from jaxsafe.devices.backend import accelerated
 
 Tree = TypeVar("Tree")
+
 Draw = Callable[[Any, Array], Tree]
+"""`draw(parameters, indices)` returns the starts of the environments with these indices."""
 
-LARGE = 256
-"""From so many lanes on, starts are drawn for those that need one; below, for all if any does."""
+SPARSE_RESETS_FROM = 256
+"""Size of a batch from which on starts are drawn only for the environments that need one.
 
-SHARE = 128
-"""Of a large batch, one lane in so many gets its start at a time, …"""
+In a smaller batch they are drawn for all environments if any needs one.
+"""
 
-LEAST = 16
-"""… and so many at least."""
+RESETS_PER_ROUND = 1 / 128
+"""Share of a large batch that gets its starts at a time. On most steps one round is enough."""
 
-BITS = 32
-"""Lanes whose flags share a word."""
+MIN_RESETS_PER_ROUND = 16
+"""The least number of environments that get their starts at a time."""
+
+FLAGS_PER_WORD = 32
+"""Number of environments whose flags share a word."""
 
 
-def renew(where: Bool[Array, " n"], draw: Draw[Tree], parameters: Any, old: Tree, axis: Literal[0, -1] = 0) -> Tree:
-    """`old`, its lanes where `where` holds replaced by `draw(parameters, lanes)`; lanes are the first axis, or the last.
+def renew(
+    where: Bool[Array, " n"],
+    draw: Draw[Tree],
+    parameters: Any,
+    old: Tree,
+    axis: Literal[0, -1] = 0,
+) -> Tree:
+    """Return a batch in which some environments are replaced by new starts.
 
-    Drawing a start costs many times a step. With few lanes most steps end no episode, with many most end a few. What `draw`
-    closes over has no derivative; what is in `parameters` has.
+    Drawing a start costs many times a step. In a small batch most steps end no episode, in a large
+    batch most steps end a few.
 
-    An accelerator draws a start for every lane: the draws become part of the kernels of the step. A step of docking3d is 23
-    kernels that way. With a branch and a loop, which wait for the host, it was 65 to 90.
+    An accelerator draws a start for every environment, and the draws become part of the kernels of
+    the step. A step of docking3d is 23 kernels that way. With a branch and a loop, which wait for
+    the host, it was 65 to 90.
+
+    Args:
+        where: which environments to replace.
+        draw: `draw(parameters, indices)` returns starts. What it closes over has no derivative.
+        parameters: what the starts depend on. It has a derivative.
+        old: the batch.
+        axis: the axis of the environments in all leaves, the first or the last.
     """
     if accelerated():
-        return _every(draw, axis, where, parameters, old)
-    if where.shape[0] >= LARGE:
-        return _renew_some(draw, axis, where, parameters, old)
-    return jax.lax.cond(jnp.any(where), lambda: _every(draw, axis, where, parameters, old), lambda: old)
+        return _renew_by_definition(draw, axis, where, parameters, old)
+    if where.shape[0] >= SPARSE_RESETS_FROM:
+        return _renew_in_rounds(draw, axis, where, parameters, old)
+    return jax.lax.cond(
+        jnp.any(where),
+        lambda: _renew_by_definition(draw, axis, where, parameters, old),
+        lambda: old,
+    )
 
 
 def choose(where: Array, fresh: Tree, old: Tree, axis: Literal[0, -1] = 0) -> Tree:
-    """One of two trees lane by lane; `where` has the leading axes of all their leaves, or with `axis=-1` the last."""
+    """Return a batch with the environments of `fresh` where `where` holds, and else those of `old`.
 
-    def one(a: Array, b: Array) -> Array:
-        inner = a.ndim - where.ndim if axis == 0 else 0
-        return jnp.where(where.reshape(where.shape + (1,) * inner), a, b)
+    The axes of `where` are the leading axes of all leaves, or the last axis with `axis=-1`.
+    """
 
-    return jax.tree.map(one, fresh, old)
+    def choose_leaf(fresh_leaf: Array, old_leaf: Array) -> Array:
+        inner = fresh_leaf.ndim - where.ndim if axis == 0 else 0
+        return jnp.where(where.reshape(where.shape + (1,) * inner), fresh_leaf, old_leaf)
+
+    return jax.tree.map(choose_leaf, fresh, old)
 
 
-def _every(draw: Draw[Tree], axis: Literal[0, -1], where: Array, parameters: Any, old: Tree) -> Tree:
-    """The definition: a draw for each lane."""
+def _renew_by_definition(
+    draw: Draw[Tree], axis: Literal[0, -1], where: Array, parameters: Any, old: Tree
+) -> Tree:
+    """Draw a start for every environment, and keep those that are needed."""
     return choose(where, draw(parameters, jnp.arange(where.shape[0])), old, axis)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0, 1))
-def _renew_some(draw: Draw[Tree], axis: Literal[0, -1], where: Array, parameters: Any, old: Tree) -> Tree:
-    """The same, one lane in `SHARE` at a time until all have theirs; mostly that is once."""
+def _renew_in_rounds(
+    draw: Draw[Tree], axis: Literal[0, -1], where: Array, parameters: Any, old: Tree
+) -> Tree:
+    """Draw starts for a share of the batch at a time, until all that need one have theirs."""
     size = where.shape[0]
-    number = max(LEAST, size // SHARE)
-    flags = _packed(where)
+    number = max(MIN_RESETS_PER_ROUND, int(size * RESETS_PER_ROUND))
+    flags = _pack(where)
 
-    def some(turn: Array | int, old: Tree) -> Tree:
-        lanes = _lanes(flags, turn * number + jnp.arange(number), size)
-        place = lanes if axis == 0 else (..., lanes)
-        return jax.tree.map(lambda x, new: x.at[place].set(new, mode="drop"), old, draw(parameters, lanes))
+    def renew_round(index: Array | int, batch: Tree) -> Tree:
+        indices = _indices(flags, index * number + jnp.arange(number), size)
+        place = indices if axis == 0 else (..., indices)
+        starts = draw(parameters, indices)
+        return jax.tree.map(lambda x, new: x.at[place].set(new, mode="drop"), batch, starts)
 
-    turns = (flags.ends[-1] + number - 1) // number
-    once = some(0, old)  # outside the loop, which copies all it carries
-    return jax.lax.cond(turns > 1, lambda: jax.lax.fori_loop(1, turns, some, once), lambda: once)
+    num_rounds = (flags.ends[-1] + number - 1) // number
+    once = renew_round(0, old)  # outside the loop, because a loop copies all that it carries
+    return jax.lax.cond(
+        num_rounds > 1,
+        lambda: jax.lax.fori_loop(1, num_rounds, renew_round, once),
+        lambda: once,
+    )
 
 
-@_renew_some.defjvp
+@_renew_in_rounds.defjvp
 def _(draw: Draw[Tree], axis: Literal[0, -1], primals: tuple, tangents: tuple) -> tuple[Tree, Tree]:
-    """A loop of unknown length has no reverse; the definition has."""
-    return jax.jvp(functools.partial(_every, draw, axis), primals, tangents)
+    """Take the derivative of the definition, because a loop of unknown length has no reverse."""
+    return jax.jvp(functools.partial(_renew_by_definition, draw, axis), primals, tangents)
 
 
 class Flags(NamedTuple):
-    """The flags of all lanes, `BITS` to a word: bit *b* of word *w* is lane *w* + *b* × words."""
+    """The flags of all environments, `FLAGS_PER_WORD` to a word.
+
+    Bit *b* of word *w* is the flag of environment *w* + *b* × words.
+    """
 
     words: UInt32[Array, " words"]
-    ends: Int[Array, " words"]  # how many are set up to and with this word
+    ends: Int[Array, " words"]  # number of flags that are set in this word and those before it
 
 
-def _packed(where: Bool[Array, " n"]) -> Flags:
-    """Halves laid over each other: that vectorises. A sum over bits, or `jnp.nonzero`, is a loop of scalars on a CPU."""
-    words = jnp.pad(where, (0, -where.shape[0] % BITS)).reshape(BITS, -1).astype(jnp.uint32)
+def _pack(where: Bool[Array, " n"]) -> Flags:
+    """Pack flags into words by laying one half of them over the other, again and again.
+
+    This vectorises. A sum over bits, or `jnp.nonzero`, is a loop of scalars on a CPU.
+    """
+    padded = jnp.pad(where, (0, -where.shape[0] % FLAGS_PER_WORD))
+    words = padded.reshape(FLAGS_PER_WORD, -1).astype(jnp.uint32)
     while (half := words.shape[0] // 2) > 0:
         words = words[:half] | (words[half:] << half)
-    ends, shift = jax.lax.population_count(words[0]).astype(jnp.int32), 1
+    ends = jax.lax.population_count(words[0]).astype(jnp.int32)
+    shift = 1
     while shift < ends.shape[0]:
-        ends, shift = ends + jnp.pad(ends[:-shift], (shift, 0)), 2 * shift
-    return Flags(words[0], ends)
+        ends = ends + jnp.pad(ends[:-shift], (shift, 0))
+        shift = 2 * shift
+    return Flags(words=words[0], ends=ends)
 
 
-def _lanes(flags: Flags, rank: Int[Array, " k"], size: int) -> Int[Array, " k"]:
-    """The lanes with the first, second, … flag that is set, for `rank` 0, 1, …; `size`, which is none, beyond the last."""
-    count = flags.ends.shape[0]
+def _indices(flags: Flags, rank: Int[Array, " k"], size: int) -> Int[Array, " k"]:
+    """Return the indices of environments whose flag is set, by their rank among these.
+
+    Args:
+        flags: the flags of the batch.
+        rank: 0 for the first environment whose flag is set, 1 for the second, and so on.
+        size: size of the batch. It is returned for ranks beyond the last, and is no environment's
+            index.
+    """
+    num_words = flags.ends.shape[0]
     word = jnp.searchsorted(flags.ends, rank, side="right", method="scan_unrolled")
-    here = jnp.minimum(word, count - 1)
-    bits = flags.words[here]
-    before = flags.ends[here] - jax.lax.population_count(bits).astype(jnp.int32)
-    upto = (jnp.uint32(2) << jnp.arange(BITS, dtype=jnp.uint32)) - 1  # bits 0 … b; the last overflows to all
+    existing = jnp.minimum(word, num_words - 1)
+    bits = flags.words[existing]
+    before = flags.ends[existing] - jax.lax.population_count(bits).astype(jnp.int32)
+    # Bits 0 … b of a word, for every b. The last one overflows to all bits.
+    upto = (jnp.uint32(2) << jnp.arange(FLAGS_PER_WORD, dtype=jnp.uint32)) - 1
     seen = jax.lax.population_count(bits[:, None] & upto[None]).astype(jnp.int32)
     bit = jnp.sum(seen <= (rank - before)[:, None], axis=1)
-    return jnp.where(word < count, here + bit * count, size)
+    return jnp.where(word < num_words, existing + bit * num_words, size)

@@ -1,9 +1,10 @@
 """The metrics of Section 5 of the paper, from running sums over any stream of time steps.
 
-`accumulate` follows one episode step by step; `summarise` turns finished episodes into the paper's metrics.
-`episode_cost`, the violating steps of an episode, is not the paper's but what constrained RL calls cost.
-The paper defines the safety violation rate as the share of tests *without* a violation and calls lower better; here it is
-the share with one.
+`accumulate` follows one episode step by step, and `summarise` turns finished episodes into metrics.
+
+Two of them differ from the paper. `episode_cost`, the number of violating steps of an episode, is
+what constrained RL calls cost. The safety violation rate is the share of tests with a violation;
+the paper defines it as the share *without* one and calls lower better.
 """
 
 from __future__ import annotations
@@ -45,13 +46,25 @@ SAFETY_METRICS = (
 """The metrics that only an environment with safety constraints has."""
 
 ENOUGH_EPISODES = 20
-"""Training episodes that a seed must have finished before its success rate counts for interaction efficiency."""
+"""Training episodes that a seed must finish before its success rate counts in Table 2."""
 
 ENOUGH_SEEDS = 3
-"""Below this an interval over seeds would say nothing: resampling one seed has no spread, and two give their own values."""
+"""The least number of seeds for which an interval over seeds says something.
 
-ROUNDING = 1e-6
-"""Of success rates and their averages: what is so close below a threshold has reached it."""
+Resampling one seed has no spread, and two seeds give their own values.
+"""
+
+RATE_TOLERANCE = 1e-6
+"""A success rate, or an average of rates, this close below a threshold has reached it.
+
+Rates and their averages are rounded.
+"""
+
+MIN_STEPS = 1e-9
+"""Steps are at least this where something is divided by them: without any step the result is 0."""
+
+NUM_RESAMPLES = 2000
+"""Number of bootstrap samples."""
 
 
 class Episode(Record):
@@ -61,7 +74,7 @@ class Episode(Record):
     length: Int[Array, ""]  # steps
     outcome: Int[Array, ""]  # index into `env.outcomes`, 0 while running
     delta_v: Float[Array, ""]  # Σ ‖u/m‖₂ Δt [m/s], 0 where the task has no Δv
-    delta_v_l1: Float[Array, ""]  # Σ ‖u/m‖₁ Δt [m/s]
+    delta_v_l1: Float[Array, ""]  # Σ ‖u/m‖₁ Δt [m/s], 0 where the task has no Δv
     violating_steps: Int[Array, ""]  # steps with h < 0
     severity_sum: Float[Array, ""]  # Σ max(0, −h)/limit
     severity_max: Float[Array, ""]
@@ -70,32 +83,44 @@ class Episode(Record):
 
 
 def begin(timestep: TimeStep) -> Episode:
-    """Sums at the start of an episode: all zero, in the shapes of `timestep`."""
-    zero, count = jnp.zeros_like(timestep.reward), jnp.zeros(timestep.reward.shape, jnp.int32)
-    totals = jax.tree.map(jnp.zeros_like, timestep.info.reward_totals)
-    return Episode(zero, count, count, zero, zero, count, zero, zero, count, totals)
+    """Return the sums at the start of an episode: all zero, in the shapes of `timestep`."""
+    zero = jnp.zeros_like(timestep.reward)
+    count = jnp.zeros(timestep.reward.shape, jnp.int32)
+    return Episode(
+        episode_return=zero,
+        length=count,
+        outcome=count,
+        delta_v=zero,
+        delta_v_l1=zero,
+        violating_steps=count,
+        severity_sum=zero,
+        severity_max=zero,
+        interventions=count,
+        reward_totals=jax.tree.map(jnp.zeros_like, timestep.info.reward_totals),
+    )
 
 
 def accumulate(episode: Episode, timestep: TimeStep) -> Episode:
-    """Add one step."""
+    """Add one time step to the sums of an episode."""
     info = timestep.info
-    severity = jnp.max(jnp.stack([*info.severity.values(), jnp.zeros_like(timestep.reward)]), axis=0)
+    no_severity = jnp.zeros_like(timestep.reward)
+    severity = jnp.max(jnp.stack([*info.severity.values(), no_severity]), axis=0)
     return Episode(
-        episode.episode_return + timestep.reward,
-        episode.length + 1,
-        info.outcome,
-        episode.delta_v + info.status.get("delta_v", 0.0),
-        episode.delta_v_l1 + info.status.get("delta_v_l1", 0.0),
-        episode.violating_steps + (timestep.cost > 0.0).astype(jnp.int32),
-        episode.severity_sum + severity,
-        jnp.maximum(episode.severity_max, severity),
-        episode.interventions + info.intervening.astype(jnp.int32),
-        info.reward_totals,
+        episode_return=episode.episode_return + timestep.reward,
+        length=episode.length + 1,
+        outcome=info.outcome,
+        delta_v=episode.delta_v + info.status.get("delta_v", 0.0),
+        delta_v_l1=episode.delta_v_l1 + info.status.get("delta_v_l1", 0.0),
+        violating_steps=episode.violating_steps + (timestep.cost > 0.0).astype(jnp.int32),
+        severity_sum=episode.severity_sum + severity,
+        severity_max=jnp.maximum(episode.severity_max, severity),
+        interventions=episode.interventions + info.intervening.astype(jnp.int32),
+        reward_totals=info.reward_totals,
     )
 
 
 def measures(env: Environment) -> dict[str, bool]:
-    """Return what an environment measures, as `summarise` asks for it."""
+    """Return what an environment measures, as keyword arguments of `summarise`."""
     statuses = {status.name for status in env.status}
     return {
         "has_delta_v": "delta_v" in statuses,
@@ -113,35 +138,47 @@ def summarise(
     has_delta_v_l1: bool | None = None,
     has_constraints: bool = True,
 ) -> dict[str, float | None]:
-    """The metrics over a set of finished episodes. What the environment does not measure is None, never 0.
+    """Return the metrics over a set of finished episodes.
+
+    What the environment does not measure is None, never 0.
 
     Args:
         episodes: sums of the episodes, each field of shape (episodes,).
-        success: index of the outcome that counts as success; below 0 there is none.
-        has_delta_v: whether the environment has the status `delta_v`, from which control usage comes.
+        success: index of the outcome that counts as success. A negative index means that there is
+            none.
+        has_delta_v: whether the environment has the status `delta_v`, from which control usage
+            comes.
         has_rta: whether there was run time assurance, whose interventions are counted.
-        has_delta_v_l1: whether the environment has the status `delta_v_l1`; None is as `has_delta_v`.
-        has_constraints: whether the environment has safety constraints, whose violations are counted.
+        has_delta_v_l1: whether the environment has the status `delta_v_l1`. None means that it has
+            it if it has `delta_v`.
+        has_constraints: whether the environment has safety constraints, whose violations are
+            counted.
 
     Returns:
-        Every name of `METRICS`: rates as fractions in [0, 1], Δv in m/s, length in steps, severity as a share of the limit
-        (mean over violating steps, 0 if there is none). A figure that is not finite is None too.
+        A value for every name of `METRICS`. Rates are fractions in [0, 1], Δv is in m/s, length in
+        steps. Severity is a share of the limit; its mean is over violating steps, and 0 if there
+        are none. A value that is not finite is None too.
     """
-    mean = {name: float(np.mean(value)) for name, value in vars(episodes).items() if name != "reward_totals"}
-    violating, steps = mean["violating_steps"], mean["length"]
-    found = {
+    mean = {
+        name: float(np.mean(value))
+        for name, value in vars(episodes).items()
+        if name != "reward_totals"
+    }
+    violating = mean["violating_steps"]
+    steps = mean["length"]
+    values = {
         "average_return": mean["episode_return"],
         "episode_length": steps,
         "success_rate": float(np.mean(np.asarray(episodes.outcome) == success)),
         "control_usage": mean["delta_v"],
         "control_usage_l1": mean["delta_v_l1"],
         "safety_violation_rate": float(np.mean(np.asarray(episodes.violating_steps) > 0)),
-        "episode_safety_violation_rate": violating / max(steps, 1e-9),
+        "episode_safety_violation_rate": violating / max(steps, MIN_STEPS),
         "episode_cost": violating,
         "episode_violation_severity_mean": mean["severity_sum"] / violating if violating else 0.0,
         "episode_violation_severity_max": float(np.max(episodes.severity_max)),
-        "mean_reward": mean["episode_return"] / max(steps, 1e-9),
-        "intervention_rate": mean["interventions"] / max(steps, 1e-9),
+        "mean_reward": mean["episode_return"] / max(steps, MIN_STEPS),
+        "intervention_rate": mean["interventions"] / max(steps, MIN_STEPS),
     }
     measured = {
         "success_rate": success >= 0,
@@ -150,23 +187,32 @@ def summarise(
         "intervention_rate": has_rta,
         **dict.fromkeys(SAFETY_METRICS, has_constraints),
     }
-    return {name: value if measured.get(name, True) and np.isfinite(value) else None for name, value in found.items()}
+    return {
+        name: value if measured.get(name, True) and np.isfinite(value) else None
+        for name, value in values.items()
+    }
 
 
 def interaction_efficiency(
-    steps: np.ndarray, success: np.ndarray, episodes: np.ndarray, threshold: float = 0.8, at_least: int = ENOUGH_EPISODES
+    steps: np.ndarray,
+    success: np.ndarray,
+    episodes: np.ndarray,
+    threshold: float = 0.8,
+    at_least: int = ENOUGH_EPISODES,
 ) -> dict[str, Any]:
-    """First environment step (per seed) at which success in training reaches a threshold, Table 2.
+    """Return the first environment step at which success in training reaches a threshold, Table 2.
 
     Args:
         steps: environment steps taken by each seed, shape (updates,).
-        success: success rate of each seed over its last 100 finished episodes, shape (updates, seeds).
+        success: success rate of each seed over its last 100 finished episodes, shape (updates,
+            seeds).
         episodes: number of episodes that each seed has finished, shape (updates, seeds).
-        threshold: the success rate to reach, on the average over seeds.
-        at_least: episodes that a seed must have finished before its rate counts.
+        threshold: the success rate to reach, as an average over seeds.
+        at_least: number of episodes that a seed must have finished before its rate counts.
 
     Returns:
-        `timesteps` for the seed-averaged curve and `per_seed` for each curve; None where never reached.
+        `timesteps`, the steps of each seed until the average over seeds reaches the threshold, and
+        `per_seed`, the steps until each seed reaches it. They are None where it is never reached.
     """
 
     def first(reached: np.ndarray) -> int | None:
@@ -174,62 +220,89 @@ def interaction_efficiency(
 
     enough = episodes >= at_least
     rate = np.where(enough, np.nan_to_num(np.asarray(success, float)), 0.0)
-    threshold -= ROUNDING
-    together = enough.all(axis=1) & (rate.mean(axis=1) >= threshold)
+    threshold -= RATE_TOLERANCE
+    average_reached = enough.all(axis=1) & (rate.mean(axis=1) >= threshold)
+    reached = enough & (rate >= threshold)
     return {
-        "timesteps": first(together),
-        "per_seed": [first(enough[:, i] & (rate[:, i] >= threshold)) for i in range(rate.shape[1])],
+        "timesteps": first(average_reached),
+        "per_seed": [first(reached[:, seed]) for seed in range(rate.shape[1])],
     }
 
 
 def over_seeds(per_seed: list[float | None]) -> dict[str, Any]:
-    """Mean, 95 % percentile-bootstrap interval over seeds, interquartile mean, and the values themselves.
+    """Return mean, interquartile mean and interval of one value for each seed, and the values.
 
-    The interval of fewer than `ENOUGH_SEEDS` is None.
+    The interval is the 95 % percentile-bootstrap interval over seeds. It is None for fewer than
+    `ENOUGH_SEEDS`. Without a value for every seed, all but the values are None.
     """
     if any(value is None for value in per_seed):
         return {"mean": None, "ci95": None, "iqm": None, "per_seed": per_seed}
     from scipy.stats import trim_mean
 
     values = np.asarray(per_seed, float)
+    interval = None
+    if len(values) >= ENOUGH_SEEDS:
+        interval = bootstrap_interval(values[None])[:, 0].tolist()
     return {
         "mean": float(values.mean()),
-        "ci95": bootstrap_interval(values[None])[:, 0].tolist() if len(values) >= ENOUGH_SEEDS else None,
+        "ci95": interval,
         "iqm": float(trim_mean(values, 0.25)),
         "per_seed": [float(value) for value in values],
     }
 
 
-def stratified_iqm(scores: Sequence[Sequence[float]], resamples: int = 2000) -> dict[str, Any]:
-    """Interquartile mean over all runs of all tasks, with its 95 % stratified-bootstrap interval.
+def stratified_iqm(
+    scores: Sequence[Sequence[float]], resamples: int = NUM_RESAMPLES
+) -> dict[str, Any]:
+    """Return the interquartile mean over all runs of all tasks, with its 95 % bootstrap interval.
 
-    The mean of the middle half of all scores, where each task's runs are resampled among themselves (Agarwal et al. 2021).
-    The interval is None where a task has fewer than `ENOUGH_SEEDS` runs.
+    The interquartile mean is the mean of the middle half of all scores. The bootstrap is
+    stratified: each task's runs are resampled among themselves (Agarwal et al. 2021). The interval
+    is None where a task has fewer than `ENOUGH_SEEDS` runs.
 
     Args:
-        scores: a sequence of scores, one for each run, for each task.
-        resamples: bootstrap samples.
+        scores: for each task, a sequence of the scores of its runs.
+        resamples: number of bootstrap samples.
     """
     from scipy.stats import trim_mean
 
-    generator, tasks = np.random.default_rng(0), [np.asarray(one, float) for one in scores]
-    drawn = [one[generator.integers(len(one), size=(resamples, len(one)))] for one in tasks]
-    spread = trim_mean(np.concatenate(drawn, axis=1), 0.25, axis=1)
-    return {
-        "iqm": float(trim_mean(np.concatenate(tasks), 0.25)),
-        "ci95": np.percentile(spread, [2.5, 97.5]).tolist() if min(map(len, tasks)) >= ENOUGH_SEEDS else None,
-    }
+    generator = np.random.default_rng(0)
+    tasks = [np.asarray(task_scores, float) for task_scores in scores]
+    drawn = [
+        task_scores[generator.integers(len(task_scores), size=(resamples, len(task_scores)))]
+        for task_scores in tasks
+    ]
+    interval = None
+    if min(map(len, tasks)) >= ENOUGH_SEEDS:
+        means = trim_mean(np.concatenate(drawn, axis=1), 0.25, axis=1)
+        interval = np.percentile(means, [2.5, 97.5]).tolist()
+    return {"iqm": float(trim_mean(np.concatenate(tasks), 0.25)), "ci95": interval}
 
 
 def with_interval(value: float, interval: Sequence[float] | None, form: str) -> str:
-    """Return a number, and the interval that it lies in if there is one, as text: `0.5 [0.4, 0.6]`."""
+    """Return a number as text, with the interval in which it lies if there is one.
+
+    Args:
+        value: the number.
+        interval: its lowest and highest value, or None.
+        form: a format for numbers, such as `.1f`, with which the text is `0.5 [0.4, 0.6]`.
+    """
     if interval is None:
         return format(value, form)
     low, high = interval
     return f"{value:{form}} [{low:{form}}, {high:{form}}]"
 
 
-def bootstrap_interval(values: np.ndarray, resamples: int = 2000) -> np.ndarray:
-    """95 % percentile-bootstrap interval of the mean over the last axis: (rows, seeds) to (2, rows)."""
-    draws = np.random.default_rng(0).integers(values.shape[-1], size=(resamples, values.shape[-1]))
+def bootstrap_interval(values: np.ndarray, resamples: int = NUM_RESAMPLES) -> np.ndarray:
+    """Return the 95 % percentile-bootstrap interval of the mean over the last axis.
+
+    Args:
+        values: shape (rows, seeds).
+        resamples: number of bootstrap samples.
+
+    Returns:
+        The lowest and the highest value of each row, shape (2, rows).
+    """
+    num_seeds = values.shape[-1]
+    draws = np.random.default_rng(0).integers(num_seeds, size=(resamples, num_seeds))
     return np.percentile(values[:, draws].mean(axis=-1), [2.5, 97.5], axis=-1)

@@ -1,4 +1,4 @@
-"""Running episodes back to back: automatic reset, batches of environments, and scans over time."""
+"""Episodes that run back to back: automatic reset, batches of environments, and scans over time."""
 
 from __future__ import annotations
 
@@ -17,21 +17,24 @@ from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.types import Key, State, TimeStep
 
 Policy = Callable[[Key, Array], Array]
-"""`policy(key, observation) -> action`, batched where the observations are."""
+"""`policy(key, observation)` returns an action. Both are batched if the environments are."""
 
 
-def rollout(env: Environment, policy: Policy, key: Key, num_steps: int, num_envs: int | None = None) -> TimeStep:
-    """Run a policy for a number of steps; every finished episode is followed by a fresh random start.
+def rollout(
+    env: Environment, policy: Policy, key: Key, num_steps: int, num_envs: int | None = None
+) -> TimeStep:
+    """Run a policy for a number of steps. A fresh random start follows every finished episode.
 
-    The time step that ends an episode holds the episode's true last observation; the policy acts next on the observation
-    of the new start, which is not part of the result.
+    The time step that ends an episode holds the episode's true last observation. The policy acts
+    next on the observation of the new start, which is not part of the result.
 
     Args:
         env: the environment.
-        policy: `policy(key, observation) -> action`; with `num_envs` it sees and returns a leading axis of that size.
+        policy: `policy(key, observation)` returns an action. With `num_envs` both have a leading
+            axis of that size.
         key: a typed PRNG key.
-        num_steps: steps to take in each environment.
-        num_envs: number of environments run side by side; None is one, without a batch axis.
+        num_steps: number of steps in each environment.
+        num_envs: number of environments side by side. None is one environment without a batch axis.
 
     Returns:
         The time steps, stacked [num_steps] or [num_steps, num_envs].
@@ -43,7 +46,10 @@ def rollout(env: Environment, policy: Policy, key: Key, num_steps: int, num_envs
     if num_envs is not None:
         _require_count("num_envs", num_envs, least=1)
     key_start, key_run = jax.random.split(key)
-    carry = reset(env, key_start) if num_envs is None else reset_batch(env, key_start, num_envs, axis=-1)
+    if num_envs is None:
+        state, timestep = reset(env, key_start)
+    else:
+        state, timestep = reset_batch(env, key_start, num_envs, axis=-1)
 
     def one_step(carry: tuple[State, Array], key: Key) -> tuple[tuple[State, Array], TimeStep]:
         state, observation = carry
@@ -53,32 +59,52 @@ def rollout(env: Environment, policy: Policy, key: Key, num_steps: int, num_envs
         action = policy(key_policy, observation.T).T
         return step_or_reset_batch(env, state, action, key_reset, axis=-1)
 
-    _, timesteps = jax.lax.scan(one_step, (carry[0], carry[1].observation), jax.random.split(key_run, num_steps))
-    return timesteps if num_envs is None else jax.tree.map(lambda x: jnp.moveaxis(x, -1, 1), timesteps)
+    start = (state, timestep.observation)
+    _, timesteps = jax.lax.scan(one_step, start, jax.random.split(key_run, num_steps))
+    if num_envs is None:
+        return timesteps
+    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 1), timesteps)
 
 
 def _require_count(name: str, value: Any, least: int) -> None:
-    """Refuse what is no whole number, or too small; XLA would say so in many lines, or run no environment at all."""
+    """Refuse what is not a whole number or is too small.
+
+    XLA would say so in many lines, or run no environment at all.
+    """
     try:
         enough = operator.index(value) >= least
     except TypeError:
         enough = False
     if not enough:
-        raise ConfigError(f"rollout: {name}: expected a whole number ≥ {least}, found {show(value)}")
+        raise ConfigError(
+            f"rollout: {name}: expected a whole number ≥ {least}, found {show(value)}"
+        )
 
 
-def step_or_reset(env: Environment, state: State, action: Array, key: Key) -> tuple[tuple[State, Array], TimeStep]:
-    """One step; where it ends the episode, the next state is a fresh start.
+def step_or_reset(
+    env: Environment, state: State, action: Array, key: Key
+) -> tuple[tuple[State, Array], TimeStep]:
+    """Take one step. Where it ends the episode, the next state is a fresh start.
+
+    Args:
+        env: the environment.
+        state: the state before the step.
+        action: the action, as `step` takes it.
+        key: a typed PRNG key for the start.
 
     Returns:
-        The next state with the observation to act on, and the time step taken, with the observation it led to.
+        The next state with the observation to act on, and the time step that was taken, with the
+        observation to which it led.
     """
     state, timestep = step(env, state, action)
     return restarted(env, state, timestep, key), timestep
 
 
 def restarted(env: Environment, state: State, timestep: TimeStep, key: Key) -> tuple[State, Array]:
-    """State and observation to go on from: a fresh start where the time step ended the episode."""
+    """Return the state and the observation to go on from after a time step.
+
+    They are those of a fresh start where the time step ended the episode.
+    """
     fresh_state, fresh = reset(env, key)
     return choose(timestep.done, (fresh_state, fresh.observation), (state, timestep.observation))
 
@@ -86,14 +112,24 @@ def restarted(env: Environment, state: State, timestep: TimeStep, key: Key) -> t
 def reset_batch(
     env: Environment, key: Key, num_envs: int, shard: Shard = WHOLE, axis: Literal[0, -1] = 0
 ) -> tuple[State, TimeStep]:
-    """Independent random starts, [num_envs], of which a shard has its part; `axis` as in `step_or_reset_batch`."""
+    """Draw independent random starts of a batch of environments.
+
+    Args:
+        env: the environment.
+        key: a typed PRNG key.
+        num_envs: number of environments in the whole batch.
+        shard: the part of the batch that this device has. Only its starts are returned.
+        axis: the axis of the environments in all leaves, the first or the last.
+    """
     size = num_envs // shard.count
     return _starts(env, key, shard.first(size) + jnp.arange(size), axis)
 
 
-def _starts(env: Environment, key: Key, lanes: Int[Array, " n"], axis: int) -> tuple[State, TimeStep]:
-    """The starts of some lanes, each from a key of its own."""
-    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, lanes)
+def _starts(
+    env: Environment, key: Key, indices: Int[Array, " n"], axis: int
+) -> tuple[State, TimeStep]:
+    """Draw the starts of the environments with these indices, each from a key of its own."""
+    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, indices)
     return jax.vmap(reset, in_axes=(None, 0), out_axes=axis)(env, keys)
 
 
@@ -106,25 +142,44 @@ def step_or_reset_batch(
     shard: Shard = WHOLE,
     axis: Literal[0, -1] = 0,
 ) -> tuple[tuple[State, Array], TimeStep]:
-    """`step_or_reset` for a batch, [num_envs]; starts are drawn only where episodes end.
+    """Take one step in a batch of environments, and draw starts only where episodes end.
 
-    An episode still running after `max_episode_steps` is truncated, without an outcome. With `axis=-1` the environments are
-    the last axis of everything that goes in and comes out, [3, num_envs] for a position; a CPU steps many faster so.
+    Args:
+        env: the environment.
+        state: the states before the step.
+        action: the actions.
+        key: a typed PRNG key for the starts.
+        max_episode_steps: number of steps after which an episode that is still running is
+            truncated, without an outcome.
+        shard: the part of the batch that this device has.
+        axis: the axis of the environments in everything that goes in and comes out. With −1 it is
+            the last one, [3, num_envs] for a position, and a CPU steps many environments faster.
+
+    Returns:
+        What `step_or_reset` returns, for each environment.
     """
     state, timestep = jax.vmap(step, in_axes=(None, axis, axis), out_axes=axis)(env, state, action)
     timestep = cut_short(state, timestep, max_episode_steps)
     first = shard.first(action.shape[axis])
 
-    def draw(parameters: tuple[Environment, Key, Array], lanes: Array) -> tuple[State, Array]:
+    def draw(parameters: tuple[Environment, Key, Array], indices: Array) -> tuple[State, Array]:
         env, key, first = parameters
-        fresh_state, fresh = _starts(env, key, first + lanes, axis)
+        fresh_state, fresh = _starts(env, key, first + indices, axis)
         return fresh_state, fresh.observation
 
-    return renew(timestep.done, draw, (env, key, first), (state, timestep.observation), axis), timestep
+    carry = renew(
+        timestep.done,
+        draw,
+        parameters=(env, key, first),
+        old=(state, timestep.observation),
+        axis=axis,
+    )
+    return carry, timestep
 
 
 def cut_short(state: State, timestep: TimeStep, max_episode_steps: Array | float) -> TimeStep:
-    """The time step, truncated if its episode is still running after `max_episode_steps`."""
+    """Return the time step, truncated if its episode still runs after `max_episode_steps` steps."""
     number = jnp.result_type(float)
-    cut = ~timestep.done & (state.num_steps.astype(number) >= jnp.asarray(max_episode_steps, number))
+    steps = state.num_steps.astype(number)
+    cut = ~timestep.done & (steps >= jnp.asarray(max_episode_steps, number))
     return timestep.replace(truncated=timestep.truncated | cut)

@@ -60,8 +60,8 @@ def test_a_packed_tree_is_a_vector_on_an_accelerator_alone(
 
 def test_an_accelerator_draws_the_same_starts(as_accelerated: Callable[[Any], None]) -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 3.0})
-    state, _ = reset_batch(env, jax.random.key(0), autoreset.LARGE)
-    action = jnp.zeros((autoreset.LARGE, env.action_size))
+    state, _ = reset_batch(env, jax.random.key(0), autoreset.SPARSE_RESETS_FROM)
+    action = jnp.zeros((autoreset.SPARSE_RESETS_FROM, env.action_size))
 
     def following(_: None) -> Any:
         return jax.lax.scan(

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import jaxsafe
-from jaxsafe.autoreset import LARGE, LEAST, SHARE, renew
+from jaxsafe.autoreset import MIN_RESETS_PER_ROUND, RESETS_PER_ROUND, SPARSE_RESETS_FROM, renew
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 
-SIZES = (24, LARGE, 1000, 1031)  # few, many, no power of two, a prime
+SIZES = (24, SPARSE_RESETS_FROM, 1000, 1031)  # few, many, no power of two, a prime
 
 
 @pytest.mark.parametrize("axis", [0, -1])
@@ -28,7 +28,7 @@ def test_lanes_are_renewed_alike_however_many_they_are(size: int, axis: Literal[
     old = {"a": turned(jnp.zeros((size, 3))), "b": jnp.arange(size)}
     lanes, program = np.arange(size), jax.jit(renew, static_argnums=(1, 4))
     order = np.random.default_rng(0).permutation(size)
-    chunk = max(LEAST, size // SHARE)
+    chunk = max(MIN_RESETS_PER_ROUND, int(size * RESETS_PER_ROUND))
     for chosen in (order[:0], order[:1], order[:chunk], order[: chunk + 1], lanes[-chunk:], lanes):
         where = np.isin(lanes, chosen)
         found = program(jnp.asarray(where), draw, jnp.ones(()), old, axis)
@@ -38,7 +38,7 @@ def test_lanes_are_renewed_alike_however_many_they_are(size: int, axis: Literal[
         np.testing.assert_array_equal(found["b"], np.where(where, -lanes, lanes))
 
 
-@pytest.mark.parametrize("num_envs", [16, LARGE])
+@pytest.mark.parametrize("num_envs", [16, SPARSE_RESETS_FROM])
 def test_gradients_reach_the_starts_of_batches_of_any_size(num_envs: int) -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 1.0})
     state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(0), num_envs)

@@ -1,4 +1,4 @@
-"""Where compiled programs are kept between runs."""
+"""The directory in which compiled programs are kept between runs."""
 
 from __future__ import annotations
 

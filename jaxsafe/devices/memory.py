@@ -1,4 +1,4 @@
-"""Whether a training fits into memory, decided before it starts."""
+"""Memory that a training needs and finds: one that does not fit is refused before it starts."""
 
 from __future__ import annotations
 

@@ -30,13 +30,13 @@ except ImportError:  # Windows
     fcntl = None
 
 MAX_MESSAGE_BYTES = 4096
-"""Size of what process 0 tells the others: a path or the text of an error. Longer ones are cut."""
+"""Size of what process 0 sends to the others: a path or an error's text. Longer ones are cut."""
 
 MAX_REASON_LETTERS = 200
-"""How much of the first line of a library's error is told."""
+"""How much of the first line of a library's error is repeated in ours."""
 
 _LOST_PROCESS = re.compile("gloo|nccl|heartbeat|coordination|unavailable|deadline", re.IGNORECASE)
-"""What the errors contain that collectives raise when another process has ended."""
+"""Words in the errors that collectives raise when another process has ended."""
 
 
 def join() -> None:
@@ -201,7 +201,7 @@ def reporting_lost_process(advice: str) -> Iterator[None]:
 
 
 def wait_for_all(name: str) -> None:
-    """Wait until all processes have come to the barrier of this name."""
+    """Wait until all processes have reached the barrier with this name."""
     if jax.process_count() > 1:
         from jax.experimental.multihost_utils import sync_global_devices
 

@@ -103,7 +103,7 @@ class Refers:
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """What its annotation says about one field of a component."""
+    """Description of one field of a component, which follows from its annotation."""
 
     name: str
     hint: Any

@@ -130,7 +130,15 @@ def _choose_class(entries: dict, base: type[Kind], place: str) -> tuple[type[Kin
 
 
 def _to_structure(value: Any, hint: Any, field: Field, place: str) -> Any:
-    """Convert a value that is not a number with a unit, by an annotation inside that of `field`."""
+    """Convert a value that has no unit.
+
+    Args:
+        value: the value.
+        hint: the annotation of the value: that of the field, or of an item where the field is a
+            list.
+        field: the field, for error messages.
+        place: where the value stands.
+    """
     optional = _is_optional(hint)
     hint = _bare(hint)
     origin = typing.get_origin(hint)

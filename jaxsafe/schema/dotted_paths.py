@@ -97,7 +97,7 @@ def _set(component: Any, path: list[str], value: Any, convert: Convert, place: s
 
 
 def _set_item(items: tuple, path: list[str], value: Any, convert: Convert, place: str) -> tuple:
-    """Return the items with the value at a path replaced, which begins with the name of an item."""
+    """Return the items with one value replaced. Its path begins with the name of an item."""
     index = _index(items, path[0], place)
     item_place = join(place, path[0])
     if len(path) == 1:

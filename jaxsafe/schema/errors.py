@@ -83,7 +83,7 @@ def nearest(found: object, allowed: Iterable[object]) -> str:
 
 @contextmanager
 def part(*path: str) -> Iterator[None]:
-    """Note on an error which part of an environment it comes from. This runs only while tracing."""
+    """Add a note to an error: the part of an environment it comes from. Runs only while tracing."""
     try:
         yield
     except Exception as error:

@@ -34,7 +34,7 @@ class Archive:
     """
 
     def __init__(self, file: zipfile.ZipFile) -> None:
-        """Look at the names only."""
+        """Read only the names of the arrays."""
         self._file = file
         self.names = [name.removesuffix(".npy") for name in file.namelist()]
 

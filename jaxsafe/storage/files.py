@@ -42,7 +42,7 @@ def write_json(path: Path, value: Any) -> None:
 
 @contextlib.contextmanager
 def _naming_file(path: Path) -> Iterator[None]:
-    """Put the name of the file into an error of writing, which does not have it."""
+    """Add the name of the file to an error of writing, which lacks it."""
     try:
         yield
     except OSError as error:
