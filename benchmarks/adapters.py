@@ -47,7 +47,9 @@ def main() -> None:
     task, repeats = options["task"], int(options["repeats"])
     numbers = [int(number) for number in options["envs"].split(",")]
     here = about()
-    results = [{"envs": number, **measure(peers(task, number), number, repeats)} for number in numbers]
+    results = [
+        {"envs": number, **measure(peers(task, number), number, repeats)} for number in numbers
+    ]
     OUT.parent.mkdir(exist_ok=True)
     content = {**here, "gymnasium": gym.__version__, "task": task, "runs": results}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
@@ -82,7 +84,10 @@ def pure(task: str, number: int) -> Step:
     env = jaxsafe.make(task)
     step = jax.jit(step_or_reset_batch)
     state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(0), number)
-    action, key = np.random.default_rng(0).uniform(-1, 1, (number, env.action_size)).astype(np.float32), jax.random.key(1)
+    action, key = (
+        np.random.default_rng(0).uniform(-1, 1, (number, env.action_size)).astype(np.float32),
+        jax.random.key(1),
+    )
 
     def one() -> Any:
         nonlocal state
@@ -127,7 +132,10 @@ def gymnax_env(task: str, number: int) -> Step:
     env = importlib.import_module("jaxsafe.adapters.gymnax").GymnaxEnv(task)
     params, keys = env.default_params, jax.random.split(jax.random.key(0), number)
     _, state = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
-    step, action = jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None))), jnp.zeros((number, env.env.action_size))
+    step, action = (
+        jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None))),
+        jnp.zeros((number, env.env.action_size)),
+    )
 
     def one() -> Any:
         nonlocal state
@@ -180,7 +188,9 @@ def measure(found: dict[str, Step], number: int, repeats: int) -> dict[str, Any]
                 step()
             rates[name].append(number * counts[name] / (time.perf_counter() - begin))
     return {
-        "steps_per_s": {name: round(statistics.median(values), 1) for name, values in rates.items()},
+        "steps_per_s": {
+            name: round(statistics.median(values), 1) for name, values in rates.items()
+        },
         "slowest": {name: round(min(values), 1) for name, values in rates.items()},
         "fastest": {name: round(max(values), 1) for name, values in rates.items()},
         "first_step_s": {name: round(value, 2) for name, value in first.items()},

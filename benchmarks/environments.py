@@ -56,7 +56,9 @@ def main() -> None:
     from machine import about
 
     here = about()
-    python = {library: interpreter(library) for library in {name.partition(":")[0] for name in names}}
+    python = {
+        library: interpreter(library) for library in {name.partition(":")[0] for name in names}
+    }
     results = []
     for num in lanes:
         for name in names:
@@ -64,19 +66,32 @@ def main() -> None:
             found = probe(__file__, request, 1, python[name.partition(":")[0]])
             results.append({"task": name, "lanes": num, **found})
             print(f"{name} × {num:,}: {found['steps_per_s']:,.0f}", file=sys.stderr)
-    content = {**here, "peers": versions(python), "pinned_to": 1, "released_steps_per_s": RELEASED, "runs": results}
+    content = {
+        **here,
+        "peers": versions(python),
+        "pinned_to": 1,
+        "released_steps_per_s": RELEASED,
+        "runs": results,
+    }
     OUT.write_text(json.dumps(content, indent=1) + "\n")
     print(tables.environments(content))
 
 
-def task(name: str, num_envs: int, repeats: int, one_action: bool = False, reset: bool = True) -> dict[str, Any]:
+def task(
+    name: str, num_envs: int, repeats: int, one_action: bool = False, reset: bool = True
+) -> dict[str, Any]:
     """One of the five."""
     run = functools.partial(episode_steps, jaxsafe.make(name), one_action=one_action, reset=reset)
     return compiled(run, num_envs, repeats)
 
 
 def episode_steps(
-    env: jaxsafe.Environment, key: jax.Array, num_envs: int, num_steps: int, one_action: bool = False, reset: bool = True
+    env: jaxsafe.Environment,
+    key: jax.Array,
+    num_envs: int,
+    num_steps: int,
+    one_action: bool = False,
+    reset: bool = True,
 ) -> jax.Array:
     """Steps with random actions; the sum of rewards, costs and of what a policy would see, so that none is left out."""
     state, timestep = reset_batch(env, key, num_envs, axis=-1)
@@ -89,11 +104,15 @@ def episode_steps(
         if reset:
             carry, timestep = step_or_reset_batch(env, carry[0], action, key_reset, axis=-1)
         else:
-            state, timestep = jax.vmap(jaxsafe.step, in_axes=(None, -1, -1), out_axes=-1)(env, carry[0], action)
+            state, timestep = jax.vmap(jaxsafe.step, in_axes=(None, -1, -1), out_axes=-1)(
+                env, carry[0], action
+            )
             carry = (state, timestep.observation)
         return carry, jnp.sum(timestep.reward) + jnp.sum(timestep.cost) + jnp.sum(carry[1])
 
-    return jnp.sum(jax.lax.scan(one, (state, timestep.observation), jax.random.split(key, num_steps))[1])
+    return jnp.sum(
+        jax.lax.scan(one, (state, timestep.observation), jax.random.split(key, num_steps))[1]
+    )
 
 
 def usual_way(num_envs: int, repeats: int) -> dict[str, Any]:
@@ -105,7 +124,9 @@ def usual_way(num_envs: int, repeats: int) -> dict[str, Any]:
             key_action, key_step = jax.random.split(key)
             action = jax.random.uniform(key_action, (num_envs, env.action_size), minval=-1.0)
             keys = jax.random.split(key_step, num_envs)
-            (state, observation), timestep = jax.vmap(step_or_reset, in_axes=(None, 0, 0, 0))(env, carry, action, keys)
+            (state, observation), timestep = jax.vmap(step_or_reset, in_axes=(None, 0, 0, 0))(
+                env, carry, action, keys
+            )
             return state, jnp.sum(timestep.reward) + jnp.sum(timestep.cost) + jnp.sum(observation)
 
         state, _ = jax.vmap(jaxsafe.reset, in_axes=(None, 0))(env, jax.random.split(key, num_envs))
@@ -127,7 +148,9 @@ def gymnax_steps(name: str, one_action: bool = False) -> Callable[[jax.Array, in
     def draw(key: jax.Array, num_envs: int) -> jax.Array:
         if hasattr(space, "n"):
             return jax.random.randint(key, (num_envs,), 0, space.n)
-        return jax.random.uniform(key, (num_envs, *space.shape), minval=space.low, maxval=space.high)
+        return jax.random.uniform(
+            key, (num_envs, *space.shape), minval=space.low, maxval=space.high
+        )
 
     def run(key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
         first = draw(key, num_envs)
@@ -136,7 +159,9 @@ def gymnax_steps(name: str, one_action: bool = False) -> Callable[[jax.Array, in
             key_action, key_step = jax.random.split(key)
             action = first if one_action else draw(key_action, num_envs)
             keys = jax.random.split(key_step, num_envs)
-            observation, state, reward, *_ = jax.vmap(env.step, in_axes=(0, 0, 0, None))(keys, state, action, params)
+            observation, state, reward, *_ = jax.vmap(env.step, in_axes=(0, 0, 0, None))(
+                keys, state, action, params
+            )
             return state, jnp.sum(reward) + jnp.sum(observation)
 
         _, state = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(key, num_envs), params)
@@ -147,11 +172,15 @@ def gymnax_steps(name: str, one_action: bool = False) -> Callable[[jax.Array, in
 
 def brax(num_envs: int, repeats: int) -> dict[str, Any]:
     """Brax's inverted pendulum by its spring method, in its own wrappers."""
-    env = importlib.import_module("brax.envs").create("inverted_pendulum", backend="spring", batch_size=num_envs)
+    env = importlib.import_module("brax.envs").create(
+        "inverted_pendulum", backend="spring", batch_size=num_envs
+    )
 
     def run(key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
         def one(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
-            state = env.step(state, jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0))
+            state = env.step(
+                state, jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0)
+            )
             return state, jnp.sum(state.reward) + jnp.sum(state.obs)
 
         return jnp.sum(jax.lax.scan(one, env.reset(key), jax.random.split(key, num_steps))[1])
@@ -169,17 +198,23 @@ def gymnasium(num_envs: int, repeats: int) -> dict[str, Any]:
 
 def envpool(num_envs: int, repeats: int) -> dict[str, Any]:
     """CartPole of EnvPool, in C++."""
-    env = importlib.import_module("envpool").make("CartPole-v1", env_type="gymnasium", num_envs=num_envs, num_threads=1)
+    env = importlib.import_module("envpool").make(
+        "CartPole-v1", env_type="gymnasium", num_envs=num_envs, num_threads=1
+    )
     env.reset()
     action = np.ones(num_envs, np.int32)
     return called(lambda: env.step(action), num_envs, repeats)
 
 
-def compiled(run: Callable, num_envs: int, repeats: int, num_steps: int = NUM_STEPS) -> dict[str, Any]:
+def compiled(
+    run: Callable, num_envs: int, repeats: int, num_steps: int = NUM_STEPS
+) -> dict[str, Any]:
     """Compile once, then time; each lane makes so many steps, 200 times as many if it is the only one."""
     num_steps *= 200 if num_envs == 1 else 1
     begin = time.perf_counter()
-    program = jax.jit(run, static_argnums=(1, 2)).lower(jax.random.key(0), num_envs, num_steps).compile()
+    program = (
+        jax.jit(run, static_argnums=(1, 2)).lower(jax.random.key(0), num_envs, num_steps).compile()
+    )
     compile_s = time.perf_counter() - begin
     seconds = []
     for seed in range(repeats + 1):
@@ -217,7 +252,9 @@ RUNS: dict[str, Callable[[int, int], dict[str, Any]]] = {
     "docking3d:one_action": functools.partial(task, "docking3d", one_action=True),
     "docking3d:no_reset": functools.partial(task, "docking3d", one_action=True, reset=False),
     "docking3d:usual_way": usual_way,
-    **{f"gymnax:{name}": functools.partial(gymnax, name) for name in ("Pendulum-v1", "CartPole-v1")},
+    **{
+        f"gymnax:{name}": functools.partial(gymnax, name) for name in ("Pendulum-v1", "CartPole-v1")
+    },
     "gymnax:Pendulum-v1:one_action": functools.partial(gymnax, "Pendulum-v1", one_action=True),
     "brax:inverted_pendulum": brax,
     "gymnasium:CartPole-v1": gymnasium,

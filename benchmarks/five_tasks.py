@@ -53,9 +53,16 @@ def together(asked: Sequence[str]) -> dict[str, Any]:
     """All five by one command: when the last of them is learnt."""
     with tempfile.TemporaryDirectory() as place:
         runs = {task: Path(place, "all", task) for task in TASKS}
-        whole, sizes = watched(["env=all", *asked, f"out={place}/all"], runs.values(), Path(place, "cache"))
+        whole, sizes = watched(
+            ["env=all", *asked, f"out={place}/all"], runs.values(), Path(place, "cache")
+        )
         at = [when(run, sizes) for run in runs.values()]
-        return {"learnt": max(numbers) if (numbers := all_known(at)) else None, "each": at, "whole": whole, **found(runs)}
+        return {
+            "learnt": max(numbers) if (numbers := all_known(at)) else None,
+            "each": at,
+            "whole": whole,
+            **found(runs),
+        }
 
 
 def apart(asked: Sequence[str]) -> dict[str, Any]:
@@ -63,19 +70,35 @@ def apart(asked: Sequence[str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as place:
         runs = {task: Path(place, task) for task in TASKS}
         cache = Path(place, "cache")
-        whole = sum(watched([f"env={task}", *asked, f"out={run}"], [run], cache)[0] for task, run in runs.items())
+        whole = sum(
+            watched([f"env={task}", *asked, f"out={run}"], [run], cache)[0]
+            for task, run in runs.items()
+        )
         at = [wall_to(LEVEL, read_rows(run / "progress.jsonl")) for run in runs.values()]
-        return {"learnt": sum(numbers) if (numbers := all_known(at)) else None, "each": at, "whole": whole, **found(runs)}
+        return {
+            "learnt": sum(numbers) if (numbers := all_known(at)) else None,
+            "each": at,
+            "whole": whole,
+            **found(runs),
+        }
 
 
-def watched(asked: Sequence[str], runs: Iterable[Path], cache: Path) -> tuple[float, list[tuple[float, dict[Path, int]]]]:
+def watched(
+    asked: Sequence[str], runs: Iterable[Path], cache: Path
+) -> tuple[float, list[tuple[float, dict[Path, int]]]]:
     """The seconds that a training command takes, and on the way how long the progress logs of its runs are, in bytes."""
-    environment = {key: value for key, value in os.environ.items() if key not in CACHE} | {"XDG_CACHE_HOME": str(cache)}
+    environment = {key: value for key, value in os.environ.items() if key not in CACHE} | {
+        "XDG_CACHE_HOME": str(cache)
+    }
     logs = [run / "progress.jsonl" for run in runs]
     began, sizes = time.monotonic(), []
-    process = subprocess.Popen([sys.executable, "-m", "jaxsafe.train", *asked], env=environment, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "jaxsafe.train", *asked], env=environment, stdout=subprocess.DEVNULL
+    )
     while process.poll() is None:
-        sizes.append((time.monotonic() - began, {log: log.stat().st_size for log in logs if log.exists()}))
+        sizes.append(
+            (time.monotonic() - began, {log: log.stat().st_size for log in logs if log.exists()})
+        )
         time.sleep(POLL)
     if process.returncode:
         sys.exit(f"{' '.join(asked)}: the training did not end")
@@ -90,15 +113,23 @@ def when(run: Path, sizes: Sequence[tuple[float, dict[Path, int]]]) -> float | N
     if reached is None:
         return None
     lines = log.read_bytes().splitlines(keepends=True)
-    needed = sum(len(line) for line, row in zip(lines, rows, strict=True) if row["wall_s"] <= reached)
+    needed = sum(
+        len(line) for line, row in zip(lines, rows, strict=True) if row["wall_s"] <= reached
+    )
     return next(at for at, size in sizes if size.get(log, 0) >= needed)
 
 
 def found(runs: dict[str, Path]) -> dict[str, Any]:
     """Of the evaluation after training: success with sampled actions, the mean over seeds, and which seeds failed."""
     results = {task: read_json(run / "results.json") for task, run in runs.items()}
-    success = {task: one["evaluation"]["stochastic"]["success_rate"]["mean"] for task, one in results.items()}
-    return {"success": success, "failed": {task: failed_seeds(one) for task, one in results.items()}}
+    success = {
+        task: one["evaluation"]["stochastic"]["success_rate"]["mean"]
+        for task, one in results.items()
+    }
+    return {
+        "success": success,
+        "failed": {task: failed_seeds(one) for task, one in results.items()},
+    }
 
 
 def all_known(values: Sequence[float | None]) -> list[float]:

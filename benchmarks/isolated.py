@@ -59,7 +59,9 @@ def interpreter(name: str) -> str:
     if not python.exists():
         try:
             subprocess.run([sys.executable, "-m", "venv", place], check=True)
-            subprocess.run([python, "-m", "pip", "install", "-q", "-e", HERE.parent, *PEERS[name]], check=True)
+            subprocess.run(
+                [python, "-m", "pip", "install", "-q", "-e", HERE.parent, *PEERS[name]], check=True
+            )
         except BaseException:
             shutil.rmtree(place, ignore_errors=True)  # the next run builds it again
             raise
@@ -73,23 +75,44 @@ def versions(names: Iterable[str]) -> dict[str, dict[str, str]]:
     found = {}
     for name in sorted(set(names) & set(PEERS)):
         wanted = [re.split("[=<>]", word)[0] for word in PEERS[name] if not word.startswith("-")]
-        command = [interpreter(name), "-c", ask, *wanted, "jax", "jaxlib", "numpy", "gymnasium", "torch"]
-        found[name] = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+        command = [
+            interpreter(name),
+            "-c",
+            ask,
+            *wanted,
+            "jax",
+            "jaxlib",
+            "numpy",
+            "gymnasium",
+            "torch",
+        ]
+        found[name] = json.loads(
+            subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        )
     return found
 
 
 def probe(
-    script: str, request: Sequence[str], cores: int | None = None, python: str = sys.executable, cache: Path | None = None
+    script: str,
+    request: Sequence[str],
+    cores: int | None = None,
+    python: str = sys.executable,
+    cache: Path | None = None,
 ) -> Any:
     """What a script prints last, as JSON, when it runs with such words pinned to some cores, or on all.
 
     `cache` keeps what JAX compiles, however small; without it nothing is kept.
     """
-    command, environment = [python, script, *request], {key: value for key, value in os.environ.items() if key not in CACHE}
+    command, environment = (
+        [python, script, *request],
+        {key: value for key, value in os.environ.items() if key not in CACHE},
+    )
     if cache:
         environment |= dict(zip(CACHE, (str(cache), "0", "-1"), strict=True))
     before = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, sorted(before)[:cores])  # a child has that of the thread which starts it
+    os.sched_setaffinity(
+        0, sorted(before)[:cores]
+    )  # a child has that of the thread which starts it
     try:
         ran = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     finally:

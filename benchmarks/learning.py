@@ -36,7 +36,11 @@ def main() -> None:
 
     here, tasks = about(), several("tasks", options["tasks"], TASKS)
     rows = [
-        {"task": task, "variant": name, **probe(__file__, [f"probe={name}", f"tasks={task}", *seeds])}
+        {
+            "task": task,
+            "variant": name,
+            **probe(__file__, [f"probe={name}", f"tasks={task}", *seeds]),
+        }
         for task in tasks
         for name in VARIANTS
     ]
@@ -67,7 +71,10 @@ def trained(variant: str, asked: list[str]) -> dict[str, Any]:
     keep = ("success_rate", "episode_length")
     return {
         "steps_to_80": results["interaction_efficiency"]["timesteps"],
-        "evaluation": {kind: {name: found[name] for name in keep} for kind, found in results["evaluation"].items()},
+        "evaluation": {
+            kind: {name: found[name] for name in keep}
+            for kind, found in results["evaluation"].items()
+        },
     }
 
 

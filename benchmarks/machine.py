@@ -18,7 +18,9 @@ def about() -> dict[str, Any]:
     """Commit, versions, device and number of cores that may be used; to be asked before what is measured begins."""
     return {
         "commit": _git("rev-parse", "HEAD"),
-        "changed": bool(_git("status", "--porcelain", "--", "jaxsafe", "benchmarks/*.py", "configs")),
+        "changed": bool(
+            _git("status", "--porcelain", "--", "jaxsafe", "benchmarks/*.py", "configs")
+        ),
         "python": platform.python_version(),
         "jax": jax.__version__,
         "jaxlib": version("jaxlib"),

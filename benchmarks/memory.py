@@ -37,7 +37,13 @@ def main() -> None:
     rows = []
     for task in tasks:
         for size in sizes:
-            rows.append({"task": task, "num_envs": size, **apart(__file__, [f"probe={task}", f"num_envs={size}"])})
+            rows.append(
+                {
+                    "task": task,
+                    "num_envs": size,
+                    **apart(__file__, [f"probe={task}", f"num_envs={size}"]),
+                }
+            )
     content = {**here, "num_steps": NUM_STEPS, "runs": rows}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
     print(memory(content))
@@ -62,7 +68,9 @@ def probe(task: str, num_envs: int) -> dict[str, int]:
     state = fresh(shared, mapper.keys(0))
     advance = two.lower(shared, state).compile()
     lanes = memory.size((state.env_state, state.observation, state.episode))
-    Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew: compiling is not what is measured
+    Path("/proc/self/clear_refs").write_text(
+        "5"
+    )  # the peak begins anew: compiling is not what is measured
     before = resident("VmRSS")
     jax.block_until_ready(advance(shared, state))
     return {

@@ -51,9 +51,17 @@ def main() -> None:
     for _ in range(repeats):
         for name, count in found:
             found[name, count].append(
-                probe(__file__, [f"probe={name}", f"task={task}"], count, python.get(name, sys.executable))
+                probe(
+                    __file__,
+                    [f"probe={name}", f"task={task}"],
+                    count,
+                    python.get(name, sys.executable),
+                )
             )
-    rows = [{"peer": name, "cores": count, "samples_per_s": rates} for (name, count), rates in found.items()]
+    rows = [
+        {"peer": name, "cores": count, "samples_per_s": rates}
+        for (name, count), rates in found.items()
+    ]
     OUT.parent.mkdir(exist_ok=True)
     content = {**here, "peers": versions(python), "task": task, "repeats": repeats, "runs": rows}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
@@ -80,7 +88,9 @@ def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
     return seeds * UPDATES * BATCH / (time.perf_counter() - start)
 
 
-def our_programs(task: str, seeds: int, updates: int, num_envs: int = NUM_ENVS) -> tuple[Any, Any, Any, Any]:
+def our_programs(
+    task: str, seeds: int, updates: int, num_envs: int = NUM_ENVS
+) -> tuple[Any, Any, Any, Any]:
     """The fresh state and some updates of our PPO, and what both take: keys, and what all seeds share."""
     from jaxsafe.devices.seed_mapper import SeedMapper
     from jaxsafe.train.train import programs
@@ -95,8 +105,18 @@ def settings(task: str, num_envs: int = NUM_ENVS) -> tuple[Any, Any]:
     """The configuration of our PPO, and the environment."""
     from jaxsafe.train.host.options import resolve
 
-    sizes = {"num_envs": num_envs, "num_steps": NUM_STEPS, "num_epochs": NUM_EPOCHS, "num_minibatches": NUM_MINIBATCHES}
-    options = {"env": task, "preset": "plain", "agent.hidden": [*HIDDEN], "steps": 10 * UPDATES * num_envs * NUM_STEPS}
+    sizes = {
+        "num_envs": num_envs,
+        "num_steps": NUM_STEPS,
+        "num_epochs": NUM_EPOCHS,
+        "num_minibatches": NUM_MINIBATCHES,
+    }
+    options = {
+        "env": task,
+        "preset": "plain",
+        "agent.hidden": [*HIDDEN],
+        "steps": 10 * UPDATES * num_envs * NUM_STEPS,
+    }
     config, env, _ = resolve({**options, **{f"ppo.{name}": size for name, size in sizes.items()}})
     return config, env
 
@@ -114,13 +134,19 @@ def networks_only(task: str) -> float:
     config, env = settings(task)
     agent, hyper = config.agent, config.ppo
     normal = lambda *shape: jax.random.normal(jax.random.key(len(shape)), (BATCH, *shape))  # noqa: E731
-    batch = ppo.Batch(normal(env.observation_size), {}, normal(env.action_size), normal(), normal(), normal())
+    batch = ppo.Batch(
+        normal(env.observation_size), {}, normal(env.action_size), normal(), normal(), normal()
+    )
     chunks = jax.tree.map(lambda x: x.reshape(NUM_MINIBATCHES, -1, ppo.CHUNK, *x.shape[1:]), batch)
 
     def forwards(params: Any, part: ppo.Batch) -> Any:
         """The actor once, as in a step, and the critic twice, of a state and of the next."""
         action = agent.distribution(env, params, part.inputs).mode()
-        return action.sum(), agent.value(params, part.inputs), agent.value(params, part.inputs + 1.0)
+        return (
+            action.sum(),
+            agent.value(params, part.inputs),
+            agent.value(params, part.inputs + 1.0),
+        )
 
     def minibatch(carry: Any, parts: ppo.Batch) -> tuple[Any, None]:
         params, optimizer = carry
@@ -133,8 +159,12 @@ def networks_only(task: str) -> float:
         return (jax.tree.map(lambda p, s: p - 1e-4 * s, params, step), optimizer), None
 
     def update(carry: Any, _: None) -> tuple[Any, Any]:
-        seen = jax.lax.map(lambda parts: jax.lax.map(lambda part: forwards(carry[0], part), parts), chunks)
-        carry, _ = jax.lax.scan(lambda carry, _: jax.lax.scan(minibatch, carry, chunks), carry, None, NUM_EPOCHS)
+        seen = jax.lax.map(
+            lambda parts: jax.lax.map(lambda part: forwards(carry[0], part), parts), chunks
+        )
+        carry, _ = jax.lax.scan(
+            lambda carry, _: jax.lax.scan(minibatch, carry, chunks), carry, None, NUM_EPOCHS
+        )
         return carry, jax.tree.map(jnp.sum, seen)
 
     params = agent.init(jax.random.key(0), env)
@@ -158,8 +188,13 @@ def usual_program(task: str, num_envs: int = NUM_ENVS) -> tuple[Callable, Callab
     import jaxsafe
 
     env = jaxsafe.make(task)
-    update = lambda carry, _: (usual_ppo.update(env, NUM_STEPS, NUM_EPOCHS, NUM_MINIBATCHES, carry), None)  # noqa: E731
-    return lambda carry: jax.lax.scan(update, carry, None, UPDATES), partial(usual_ppo.init, env, HIDDEN, num_envs)
+
+    def update(carry: Any, _: None) -> tuple[Any, None]:
+        return usual_ppo.update(env, NUM_STEPS, NUM_EPOCHS, NUM_MINIBATCHES, carry), None
+
+    return lambda carry: jax.lax.scan(update, carry, None, UPDATES), partial(
+        usual_ppo.init, env, HIDDEN, num_envs
+    )
 
 
 def timed(run: Callable, start: Any) -> float:
@@ -207,7 +242,10 @@ def brax(task: str) -> float:
     mend_brax()
     seen = []
     networks = partial(
-        make_ppo_networks, activation=tanh, policy_hidden_layer_sizes=HIDDEN, value_hidden_layer_sizes=HIDDEN
+        make_ppo_networks,
+        activation=tanh,
+        policy_hidden_layer_sizes=HIDDEN,
+        value_hidden_layer_sizes=HIDDEN,
     )
     ppo.train(
         BraxEnv(task), 2 * UPDATES * BATCH, wrap_env_fn=wrap, episode_length=2000, num_envs=NUM_ENVS, num_evals=3,

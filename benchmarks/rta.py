@@ -44,7 +44,13 @@ BATCH = 4096
 
 def main() -> None:
     """Run, write, print."""
-    parts = {"calls": calls, "qp": programs, "change": changes, "starts": starts, "training": training}
+    parts = {
+        "calls": calls,
+        "qp": programs,
+        "change": changes,
+        "starts": starts,
+        "training": training,
+    }
     options = words(repeats="7", parts=",".join(parts))
     repeats, chosen = int(options["repeats"]), several("parts", options["parts"], parts)
     known = json.loads(OUT.read_text()) if OUT.exists() else {}
@@ -52,7 +58,10 @@ def main() -> None:
         here = about()
         rows = parts[name](repeats)
         known[name] = {**here, "rows": rows}
-        print(f"\n{name}\n" + markdown(list(rows[0]), ([_short(value) for value in row.values()] for row in rows)))
+        print(
+            f"\n{name}\n"
+            + markdown(list(rows[0]), ([_short(value) for value in row.values()] for row in rows))
+        )
         OUT.parent.mkdir(exist_ok=True)
         OUT.write_text(json.dumps(known, indent=1) + "\n")
 
@@ -77,7 +86,14 @@ def calls(repeats: int) -> list[dict[str, Any]]:
         for preset in (name for name in presets if name != "default"):
             env = jaxsafe.make(task, rta=preset)
             seconds, first = timed(functools.partial(filter_batch, env, *met(env)), repeats)
-            rows.append({"task": task, "filter": preset, "calls_per_s": BATCH / seconds, "compile_s": first - seconds})
+            rows.append(
+                {
+                    "task": task,
+                    "filter": preset,
+                    "calls_per_s": BATCH / seconds,
+                    "compile_s": first - seconds,
+                }
+            )
             print(rows[-1], flush=True)
     return rows + cbfpy_calls(repeats) + run_time_assurance_calls(repeats)
 
@@ -135,7 +151,11 @@ def run_time_assurance_calls(repeats: int) -> list[dict[str, Any]]:
             rta.filter_control(state, 1.0, control)
 
     seconds, first = timed(run, repeats)
-    row = {"task": "docking2d", "filter": "run-time-assurance, one at a time", "calls_per_s": len(states) / seconds}
+    row = {
+        "task": "docking2d",
+        "filter": "run-time-assurance, one at a time",
+        "calls_per_s": len(states) / seconds,
+    }
     return [row | {"compile_s": first - seconds}]
 
 
@@ -167,7 +187,14 @@ def cbfpy_calls(repeats: int) -> list[dict[str, Any]]:
     z, desired = docking_states()
     batched = jax.jit(jax.vmap(cbf.safety_filter))
     seconds, first = timed(lambda: batched(z, desired), repeats)
-    return [{"task": "docking2d", "filter": "cbfpy, batched", "calls_per_s": BATCH / seconds, "compile_s": first - seconds}]
+    return [
+        {
+            "task": "docking2d",
+            "filter": "cbfpy, batched",
+            "calls_per_s": BATCH / seconds,
+            "compile_s": first - seconds,
+        }
+    ]
 
 
 def programs(repeats: int) -> list[dict[str, Any]]:
@@ -206,7 +233,14 @@ def changes(repeats: int) -> list[dict[str, Any]]:
             for policy in ("uniform", "bang_bang"):
                 row = attack(jaxsafe.make(task, rta=preset), policy, 1000, 128, jax.random.key(0))
                 names = ("violating_steps", "intervention_rate", "mean_correction", "worst_margin")
-                rows.append({"task": task, "filter": preset, "actions": policy, **{name: row[name] for name in names}})
+                rows.append(
+                    {
+                        "task": task,
+                        "filter": preset,
+                        "actions": policy,
+                        **{name: row[name] for name in names},
+                    }
+                )
     return rows
 
 
@@ -222,10 +256,14 @@ def starts(repeats: int) -> list[dict[str, Any]]:
     @jax.jit
     def margins(env: jaxsafe.Environment, lost: Any, action: jax.Array) -> jax.Array:
         each = jax.vmap(jaxsafe.step, in_axes=(None, 0, None))
-        return jax.lax.scan(lambda state, _: each(env, state, action), lost, length=400)[1].info.margins["velocity_limit"]
+        return jax.lax.scan(lambda state, _: each(env, state, action), lost, length=400)[
+            1
+        ].info.margins["velocity_limit"]
 
     for share in (1.0, 0.99):
-        env = jaxsafe.make("docking2d_oriented", {"deputy.start.velocity.share": [0.0, share]}, rta="default")
+        env = jaxsafe.make(
+            "docking2d_oriented", {"deputy.start.velocity.share": [0.0, share]}, rta="default"
+        )
         lost = uncertified(env)
         for name, value in (("coasting", 0.0), ("full thrust and turn", 1.0)):
             h = np.asarray(margins(env, lost, jnp.full(env.action_size, value)))

@@ -51,11 +51,15 @@ def main() -> None:
     cores = 1 << (usable_cores().bit_length() - 1)
     if cores == 1:
         sys.exit("scaling.py: expected two cores or more, found one")
-    found: dict[tuple[str, int], list[float]] = {(name, count): [] for name in PROBES for count in (1, cores)}
+    found: dict[tuple[str, int], list[float]] = {
+        (name, count): [] for name in PROBES for count in (1, cores)
+    }
     for _ in range(repeats):
         for name, count in found:
             found[name, count].append(probe(__file__, [f"probe={name}", f"task={task}"], count))
-    rows = [{"what": name, "cores": count, "per_s": rates} for (name, count), rates in found.items()]
+    rows = [
+        {"what": name, "cores": count, "per_s": rates} for (name, count), rates in found.items()
+    ]
     rates = {key: statistics.median(values) for key, values in found.items()}
     projected = projection(rates, cores)
     content = {**here, "task": task, "repeats": repeats, "runs": rows, "projection": projected}
@@ -74,7 +78,12 @@ def projection(rates: dict[tuple[str, int], float], cores: int) -> list[dict[str
         seconds = ppo.BATCH / busy / count + exchange * math.log2(count)
         rate = seeds * ppo.BATCH / seconds
         rows.append(
-            {"shared": count, "seeds": seeds, "samples_per_s": rate, "efficiency": rate * update / ppo.BATCH / DEVICES}
+            {
+                "shared": count,
+                "seeds": seeds,
+                "samples_per_s": rate,
+                "efficiency": rate * update / ppo.BATCH / DEVICES,
+            }
         )
     return rows
 
@@ -110,7 +119,11 @@ def one_each(task: str) -> float:
     return ppo.ours(task, seeds=len(os.sched_getaffinity(0)))
 
 
-STEPS, ONE_EACH, SHARING = "environment steps, 4,096 a core", "samples, a seed for each core", "samples, one seed"
+STEPS, ONE_EACH, SHARING = (
+    "environment steps, 4,096 a core",
+    "samples, a seed for each core",
+    "samples, one seed",
+)
 PROBES = {STEPS: steps, ONE_EACH: one_each, SHARING: ppo.ours}
 
 if __name__ == "__main__":

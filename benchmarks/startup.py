@@ -55,7 +55,11 @@ def main() -> None:
     rows = [measured(name, rta, repeats) for name, rta in chosen]
     rows.append(measured("Pendulum-v1", "gymnax", repeats, interpreter("gymnax")))
     first = [first_result(name, name, repeats) for name in FIRST]
-    profiles = [first_result(name, f"profile {name}", repeats) for name in FIRST if name.startswith("jaxsafe")]
+    profiles = [
+        first_result(name, f"profile {name}", repeats)
+        for name in FIRST
+        if name.startswith("jaxsafe")
+    ]
     content = {
         **here,
         "peers": versions(["gymnax", "rejax"]),
@@ -84,7 +88,11 @@ def first_result(name: str, word: str, repeats: int) -> dict[str, Any]:
 def measured(name: str, rta: str, repeats: int, python: str = sys.executable) -> dict[str, Any]:
     """Medians over fresh processes."""
     found = [apart(__file__, [f"probe={name},{rta}"], python=python) for _ in range(repeats)]
-    return {"name": name, "rta": rta, "seconds": [round(statistics.median(one), 3) for one in zip(*found, strict=True)]}
+    return {
+        "name": name,
+        "rta": rta,
+        "seconds": [round(statistics.median(one), 3) for one in zip(*found, strict=True)],
+    }
 
 
 def probe(name: str, rta: str) -> list[float]:
@@ -123,7 +131,9 @@ def _jaxsafe(task: str, rta: str, tick: Callable[[], None]) -> None:
     shared = mapper.replicate((env, config.agent, config.ppo))
     fresh, advance = programs(mapper, 10, config.num_updates)
     fresh = fresh.lower(shared, mapper.keys(0))
-    updates = advance.lower(shared, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), fresh.out_info))
+    updates = advance.lower(
+        shared, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), fresh.out_info)
+    )
     tick()
     fresh.compile()
     updates.compile()
@@ -190,13 +200,23 @@ def profile(result: Callable[[], Any]) -> dict[str, float]:
         jax.profiler.stop_trace()
         [file] = Path(place).rglob("*.xplane.pb")
         planes = jax.profiler.ProfileData.from_file(str(file)).planes
-        events = [(event.name, event.duration_ns) for plane in planes for line in plane.lines for event in line.events]
+        events = [
+            (event.name, event.duration_ns)
+            for plane in planes
+            for line in plane.lines
+            for event in line.events
+        ]
     stages = [*EVENTS.values()]
-    spent = [_covered([span for span in spans if span[0] in stages[i:]]) for i in range(len(stages))]
+    spent = [
+        _covered([span for span in spans if span[0] in stages[i:]]) for i in range(len(stages))
+    ]
     found = {name: spent[i] - sum(spent[i + 1 : i + 2]) for i, name in enumerate(EVENTS)}
     found |= {"import of JAX": imported - start, "the rest": ended - began - spent[0]}
     found["whole"] = sum(found.values())
-    found |= {part: sum(ns for name, ns in events if name in regions) / 1e9 for part, regions in REGIONS.items()}
+    found |= {
+        part: sum(ns for name, ns in events if name in regions) / 1e9
+        for part, regions in REGIONS.items()
+    }
     return {name: round(value, 3) for name, value in found.items()}
 
 
@@ -230,7 +250,9 @@ def gymnax_step() -> None:
     keys = jax.random.split(jax.random.key(0), LANES)
     _, state = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
     action = jnp.zeros((LANES, 1))
-    jax.block_until_ready(jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))(keys, state, action, params))
+    jax.block_until_ready(
+        jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))(keys, state, action, params)
+    )
 
 
 def our_update() -> None:

@@ -71,7 +71,17 @@ ADAPTERS = {
 DOCKING_FIRST = sorted(TASKS, key=lambda task: task.startswith("rejoin"))
 """As docs/rta.md has the tasks."""
 
-PARTS = ("whole", "import of JAX", "trace", "lower", "compile", "the rest", "XLA's passes", "emitters", "LLVM")
+PARTS = (
+    "whole",
+    "import of JAX",
+    "trace",
+    "lower",
+    "compile",
+    "the rest",
+    "XLA's passes",
+    "emitters",
+    "LLVM",
+)
 FILTERS = {
     "cbfpy, batched": "cbfpy 0.1.0, `vmap`",
     "run-time-assurance, one at a time": "run-time-assurance 1.18.6, one call at a time",
@@ -92,7 +102,11 @@ def environments(found: Found, names: Iterable[str] = tuple(ENVIRONMENTS)) -> st
     heads = ["million steps/s at … environments", *(f"{number:,}" for number in lanes)]
     shown = [name for name in names if (name, lanes[0]) in rates]
     return markdown(
-        heads, ([ENVIRONMENTS[name], *(_three(rates[name, number] / 1e6) for number in lanes)] for name in shown)
+        heads,
+        (
+            [ENVIRONMENTS[name], *(_three(rates[name, number] / 1e6) for number in lanes)]
+            for name in shown
+        ),
     )
 
 
@@ -109,7 +123,13 @@ def ppo(found: Found) -> str:
     shown = [name for name in PPO if (name, 1) in rates]
     return markdown(
         heads,
-        ([PPO[name], *(f"{rates[name, n] / 1e3:.0f}" if (name, n) in rates else "–" for n in cores)] for name in shown),
+        (
+            [
+                PPO[name],
+                *(f"{rates[name, n] / 1e3:.0f}" if (name, n) in rates else "–" for n in cores),
+            ]
+            for name in shown
+        ),
     )
 
 
@@ -129,7 +149,10 @@ def startup_first(found: Found) -> str:
     return markdown(
         ["s", "cold", "warm"],
         (
-            [row["name"].replace(" ", ", "), *(f"{statistics.median(row[kind]):.2g}" for kind in ("cold", "warm"))]
+            [
+                row["name"].replace(" ", ", "),
+                *(f"{statistics.median(row[kind]):.2g}" for kind in ("cold", "warm")),
+            ]
             for row in found["first"]
         ),
     )
@@ -152,7 +175,15 @@ def five_tasks(found: Found) -> str:
     rows = []
     for way, label in labels.items():
         each = [[run[way][name] for run in found["runs"]] for name in ("learnt", "whole")]
-        rows.append([label, *("never" if None in values else f"{statistics.median(values):.0f}" for values in each)])
+        rows.append(
+            [
+                label,
+                *(
+                    "never" if None in values else f"{statistics.median(values):.0f}"
+                    for values in each
+                ),
+            ]
+        )
     return markdown(["s", "all learnt after", "whole, with evaluations and figures"], rows)
 
 
@@ -172,7 +203,15 @@ def learning(found: Found) -> str:
             _interval(modes["episode_length"], 1.0, 1),
         ])  # fmt: skip
     return markdown(
-        ["", "80 % in training after", "success, stochastic [%]", "deterministic", "worst seed", "length [s]"], rows
+        [
+            "",
+            "80 % in training after",
+            "success, stochastic [%]",
+            "deterministic",
+            "worst seed",
+            "length [s]",
+        ],
+        rows,
     )
 
 
@@ -183,7 +222,10 @@ def scaling(found: Found) -> str:
     rows = []
     for name in dict.fromkeys(name for name, _ in rates):
         one, all_ = rates[name, 1], rates[name, cores]
-        cells = [f"{rate / 1e6:.1f} million" if "environment" in name else f"{rate / 1e3:,.0f},000" for rate in (one, all_)]
+        cells = [
+            f"{rate / 1e6:.1f} million" if "environment" in name else f"{rate / 1e3:,.0f},000"
+            for rate in (one, all_)
+        ]
         rows.append([_scaled(name), *cells, f"{all_ / one:.2f}"])
     return markdown([f"{found['task']}, a second", "1 core", f"{cores} cores", "ratio"], rows)
 
@@ -269,7 +311,10 @@ def programs(found: Found) -> str:
         ["variables", *(str(row["variables"]) for row in rows)],
         [
             ["solutions/s", *(_scale(row["solutions_per_s"]) for row in rows)],
-            ["error, 99 of 100", *(f"{row['error_99_percent']:.0e}".replace("e-0", "e-") for row in rows)],
+            [
+                "error, 99 of 100",
+                *(f"{row['error_99_percent']:.0e}".replace("e-0", "e-") for row in rows),
+            ],
         ],
     )
 
@@ -281,7 +326,9 @@ def filter_cost(found: Found) -> str:
         filters.setdefault(row["task"], []).append((row["filter"], row["ratio"]))
     names = [", ".join(f"`{name}`" for name, _ in each) for each in filters.values()]
     ratios = [", ".join(f"{ratio:.2f}" for _, ratio in each) for each in filters.values()]
-    return markdown(["", *filters], [["filter", *names], ["wall time, without a filter = 1", *ratios]])
+    return markdown(
+        ["", *filters], [["filter", *names], ["wall time, without a filter = 1", *ratios]]
+    )
 
 
 def adversaries(_: Found) -> str:
@@ -301,7 +348,11 @@ def adversaries(_: Found) -> str:
 
 def filtered_training(_: Found) -> str:
     """Policies trained without and with a filter, by their modes, of the records of the report."""
-    labels = {"features": "no filter", "rta": "`rta=default`", "unpunished": "and `rta_training=unpunished`"}
+    labels = {
+        "features": "no filter",
+        "rta": "`rta=default`",
+        "unpunished": "and `rta_training=unpunished`",
+    }
     rows = []
     for task in DOCKING_FIRST:
         for kind, label in labels.items():
@@ -323,7 +374,9 @@ def filtered_training(_: Found) -> str:
                 f"{100 * alone['success_rate']['mean']:.4g}%", _share(alone["episode_safety_violation_rate"]),
             ]  # fmt: skip
     heads = "task | option | 80 % in training after | violations in training | success | violating steps | length [steps]"
-    return markdown(f"{heads} | steps altered | alone: success | alone: violating steps".split(" | "), rows)
+    return markdown(
+        f"{heads} | steps altered | alone: success | alone: violating steps".split(" | "), rows
+    )
 
 
 def readme_results(_: Found) -> str:
@@ -343,30 +396,53 @@ def readme_results(_: Found) -> str:
 def goals(_: Found) -> str:
     """Ratios that were aimed for before any of it was written, and those of four files of results; bold: not reached."""
     names = ("environments", "ppo", "scaling", "startup")
-    found = {name: json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")) for name in names}
-    steps, samples, scaled = _steps(found["environments"]), _samples(found["ppo"]), _rates(found["scaling"])
+    found = {
+        name: json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")) for name in names
+    }
+    steps, samples, scaled = (
+        _steps(found["environments"]),
+        _samples(found["ppo"]),
+        _rates(found["scaling"]),
+    )
     many, all_ = sorted({lanes for _, lanes in steps})[1:], max(count for _, count in samples)
     slow, fast = sorted(found["environments"]["released_steps_per_s"])
     first = {
-        row["name"]: {kind: statistics.median(row[kind]) for kind in ("cold", "warm")} for row in found["startup"]["first"]
+        row["name"]: {kind: statistics.median(row[kind]) for kind in ("cold", "warm")}
+        for row in found["startup"]["first"]
     }
 
     def pendulum(names: Iterable[str], goal: float, way: str = "") -> str:
-        return _reached([steps[name + way, lanes] / steps[PENDULUM + way, lanes] for name in names for lanes in many], goal)
+        return _reached(
+            [
+                steps[name + way, lanes] / steps[PENDULUM + way, lanes]
+                for name in names
+                for lanes in many
+            ],
+            goal,
+        )
 
     def released(names: Iterable[str], goal: float) -> str:
         rates = [steps[name, lanes] for name in names for lanes in many]
         return f"{_reached([rate / fast for rate in rates], goal)}; {_reached([rate / slow for rate in rates], goal)}"
 
     def started(what: str, peer: str, kind: str, goal: float) -> str:
-        return _reached([first[f"jaxsafe {what}"][kind] / first[f"{peer} {what}"][kind]], goal, most=True)
+        return _reached(
+            [first[f"jaxsafe {what}"][kind] / first[f"{peer} {what}"][kind]], goal, most=True
+        )
 
-    one, ten = ({n: samples[name, n] for n in (1, all_)} for name in ("jaxsafe", "jaxsafe, ten seeds"))
+    one, ten = (
+        {n: samples[name, n] for n in (1, all_)} for name in ("jaxsafe", "jaxsafe, ten seeds")
+    )
     environment = next(name for name, _ in scaled if "environment" in name)
     cores = scaled[environment, max(count for _, count in scaled)] / scaled[environment, 1]
     outside = 1 - one[1] / samples["networks only", 1]
     rows = [
-        ("docking3d / Pendulum-v1, environment steps, one core, 1,024 to 16,384", "≥ 3", "≥ 5", pendulum(["docking3d"], 3)),
+        (
+            "docking3d / Pendulum-v1, environment steps, one core, 1,024 to 16,384",
+            "≥ 3",
+            "≥ 5",
+            pendulum(["docking3d"], 3),
+        ),
         ("the same, one action", "≥ 6", "≥ 10", pendulum(["docking3d"], 6, ":one_action")),
         ("every task / Pendulum-v1", "≥ 0.5", "≥ 1", pendulum(TASKS, 0.5)),
         (
@@ -377,7 +453,12 @@ def goals(_: Found) -> str:
         ),
         ("every task / released code, the same", "≥ 2,000", "≥ 5,000", released(TASKS, 2_000)),
         ("environment steps, all cores / one", "≥ 1.6", "≥ 1.9", _reached([cores], 1.6)),
-        ("PPO samples, jaxsafe / rejax, all cores", "≥ 1.5", "≥ 2.5", _reached([one[all_] / samples["rejax", all_]], 1.5)),
+        (
+            "PPO samples, jaxsafe / rejax, all cores",
+            "≥ 1.5",
+            "≥ 2.5",
+            _reached([one[all_] / samples["rejax", all_]], 1.5),
+        ),
         ("PPO, all cores / one, one seed", "≥ 1.3", "≥ 1.8", _reached([one[all_] / one[1]], 1.3)),
         (
             "ten seeds on all cores / one on one, time",
@@ -385,10 +466,30 @@ def goals(_: Found) -> str:
             "≤ 5.3",
             _reached([10 * one[1] / ten[all_]], 6.5, most=True),
         ),
-        ("PPO outside networks and Adam, share of time", "≤ 0.15", "≤ 0.08", _reached([outside], 0.15, most=True)),
-        ("import and first step / gymnax, compiled before", "≤ 0.6", "≤ 0.4", started("step", "gymnax", "warm", 0.6)),
-        ("import and first update / rejax, compiled before", "≤ 0.4", "≤ 0.25", started("update", "rejax", "warm", 0.4)),
-        ("the same, nothing compiled before", "≤ 0.8", "≤ 0.55", started("update", "rejax", "cold", 0.8)),
+        (
+            "PPO outside networks and Adam, share of time",
+            "≤ 0.15",
+            "≤ 0.08",
+            _reached([outside], 0.15, most=True),
+        ),
+        (
+            "import and first step / gymnax, compiled before",
+            "≤ 0.6",
+            "≤ 0.4",
+            started("step", "gymnax", "warm", 0.6),
+        ),
+        (
+            "import and first update / rejax, compiled before",
+            "≤ 0.4",
+            "≤ 0.25",
+            started("update", "rejax", "warm", 0.4),
+        ),
+        (
+            "the same, nothing compiled before",
+            "≤ 0.8",
+            "≤ 0.55",
+            started("update", "rejax", "cold", 0.8),
+        ),
     ]
     return markdown(["ratio", "goal", "more", "reached"], rows)
 
@@ -402,7 +503,9 @@ def accelerator_tables(found: Found) -> list[str]:
         "learning": accelerator_learning,
         "filters": accelerator_filters,
     }
-    return [make(found) for part, make in makers.items() if found["parts"].get(part, {}).get("rows")]
+    return [
+        make(found) for part, make in makers.items() if found["parts"].get(part, {}).get("rows")
+    ]
 
 
 def accelerator_numbers(found: Found) -> str:
@@ -420,10 +523,15 @@ def accelerator_environments(found: Found) -> str:
     rates = {(row["task"], row["environments"]): _three(row["steps_per_s"] / 1e6) for row in rows}
     lines = []
     for task in sorted({row["task"] for row in rows}, key=list(ENVIRONMENTS).index):
-        largest = max((row for row in rows if row["task"] == task), key=lambda row: row["environments"])
+        largest = max(
+            (row for row in rows if row["task"] == task), key=lambda row: row["environments"]
+        )
         cells = [rates.get((task, size), "–") for size in sizes]
         lines.append([ENVIRONMENTS[task], *cells, *_program(largest)])
-    heads = ["million steps/s on the accelerator at … environments", *(f"{size:,}" for size in sizes)]
+    heads = [
+        "million steps/s on the accelerator at … environments",
+        *(f"{size:,}" for size in sizes),
+    ]
     return markdown([*heads, *PROGRAM], lines)
 
 
@@ -434,10 +542,15 @@ def accelerator_ppo(found: Found) -> str:
     lines = []
     for peer in dict.fromkeys(row["peer"] for row in rows):
         mine = {(row["environments"], row["seeds"]): row for row in rows if row["peer"] == peer}
-        cells = [_three(mine[column]["samples_per_s"] / 1e6) if column in mine else "–" for column in columns]
+        cells = [
+            _three(mine[column]["samples_per_s"] / 1e6) if column in mine else "–"
+            for column in columns
+        ]
         lines.append([peer, *cells, *_program(next(iter(mine.values())))])
     heads = [f"{seeds} seed{'s' * (seeds > 1)} × {size:,}" for size, seeds in columns]
-    return markdown(["million samples/s on the accelerator, seeds × environments", *heads, *PROGRAM], lines)
+    return markdown(
+        ["million samples/s on the accelerator, seeds × environments", *heads, *PROGRAM], lines
+    )
 
 
 def accelerator_learning(found: Found) -> str:
@@ -450,7 +563,13 @@ def accelerator_learning(found: Found) -> str:
             f"{row['seconds']:.2g}" if row["reached"] else f"not in {row['seconds']:.0f}",
             f"{row['steps']:,}", f"{_three(row['samples_per_s'] / 1e6)}", f"{len(each)}", *_program(row),
         ])  # fmt: skip
-    heads = ["95 % in training on the accelerator", "seeds × environments", "s", "steps a seed", "million samples/s"]
+    heads = [
+        "95 % in training on the accelerator",
+        "seeds × environments",
+        "s",
+        "steps a seed",
+        "million samples/s",
+    ]
     return markdown([*heads, "seeds at 95 % by then", *PROGRAM], lines)
 
 
@@ -458,7 +577,12 @@ def accelerator_filters(found: Found) -> str:
     """Calls a second, medians."""
     rows = found["parts"]["filters"]["rows"]
     lines = [
-        [row["task"], f"`{row['filter']}`", *(_scale(rate) for rate in row["calls_per_s"].values()), *_program(row)]
+        [
+            row["task"],
+            f"`{row['filter']}`",
+            *(_scale(rate) for rate in row["calls_per_s"].values()),
+            *_program(row),
+        ]
         for row in rows
     ]
     heads = [f"{int(batch):,} states" for batch in rows[0]["calls_per_s"]]
@@ -469,9 +593,18 @@ def accelerator_goals(found: Found) -> str:
     """What was aimed for on one GPU and what is reached; bold: not reached."""
     parts = {name: part["rows"] for name, part in found["parts"].items()}
     largest = max(row["environments"] for row in parts["environments"])
-    rates = {row["task"]: row["steps_per_s"] / 1e6 for row in parts["environments"] if row["environments"] == largest}
-    samples = {(row["peer"], row["environments"], row["seeds"]): row["samples_per_s"] for row in parts["ppo"]}
-    ratios = [rate / samples["rejax", *of] for (peer, *of), rate in samples.items() if peer == "jaxsafe"]
+    rates = {
+        row["task"]: row["steps_per_s"] / 1e6
+        for row in parts["environments"]
+        if row["environments"] == largest
+    }
+    samples = {
+        (row["peer"], row["environments"], row["seeds"]): row["samples_per_s"]
+        for row in parts["ppo"]
+    }
+    ratios = [
+        rate / samples["rejax", *of] for (peer, *of), rate in samples.items() if peer == "jaxsafe"
+    ]
     seconds = sum(row["seconds"] for row in parts["learning"])
     rows = [
         (
@@ -479,9 +612,17 @@ def accelerator_goals(found: Found) -> str:
             "≥ 500",
             _reached([rates[task] for task in TASKS], 500.0),
         ),
-        (f"docking3d, {largest:,} environments, million steps/s", "≥ 2,000", _reached([rates["docking3d"]], 2000.0)),
+        (
+            f"docking3d, {largest:,} environments, million steps/s",
+            "≥ 2,000",
+            _reached([rates["docking3d"]], 2000.0),
+        ),
         ("PPO samples, jaxsafe / rejax", "≥ 3", _reached(ratios, 3.0)),
-        ("five tasks × ten seeds to 95 %, one after the other, s", "≤ 60", _reached([seconds], 60.0, most=True)),
+        (
+            "five tasks × ten seeds to 95 %, one after the other, s",
+            "≤ 60",
+            _reached([seconds], 60.0, most=True),
+        ),
     ]
     return markdown(["goal on the accelerator", "aimed for", "reached"], rows)
 
@@ -568,7 +709,10 @@ def _steps(found: Found) -> dict[tuple[str, int], float]:
 
 
 def _samples(found: Found) -> dict[tuple[str, int], float]:
-    return {(run["peer"], run["cores"]): statistics.median(run["samples_per_s"]) for run in found["runs"]}
+    return {
+        (run["peer"], run["cores"]): statistics.median(run["samples_per_s"])
+        for run in found["runs"]
+    }
 
 
 def _rates(found: Found) -> dict[tuple[str, int], float]:
@@ -577,7 +721,11 @@ def _rates(found: Found) -> dict[tuple[str, int], float]:
 
 def _scaled(name: str) -> str:
     """What the page calls a row of `scaling.py`."""
-    return name if "environment" in name else f"PPO {name}{'' if 'each' in name else ' that both share'}"
+    return (
+        name
+        if "environment" in name
+        else f"PPO {name}{'' if 'each' in name else ' that both share'}"
+    )
 
 
 def _reached(values: Sequence[float], goal: float, most: bool = False) -> str:
@@ -585,7 +733,10 @@ def _reached(values: Sequence[float], goal: float, most: bool = False) -> str:
 
     def shown(value: float) -> str:
         digits = 0 if value >= 100 else 2 if value < 2 else 1
-        while (round(value, digits) > goal, round(value, digits) < goal) != (value > goal, value < goal):
+        while (round(value, digits) > goal, round(value, digits) < goal) != (
+            value > goal,
+            value < goal,
+        ):
             digits += 1  # else it would look as if it were on the other side
         text = f"{value:,.{digits}f}"
         return f"**{text}**" if (value > goal if most else value < goal) else text
@@ -614,7 +765,9 @@ def _three(value: float) -> str:
 def _scale(rate: float) -> str:
     """Calls a second in millions or thousands, with two or three digits."""
     scaled, unit = (rate / 1e6, "M") if rate >= 1e6 else (rate / 1e3, "k")
-    return f"{scaled:.{2 if scaled < 100 else 3}g} {unit}" if unit == "M" else f"{scaled:.3g} {unit}"
+    return (
+        f"{scaled:.{2 if scaled < 100 else 3}g} {unit}" if unit == "M" else f"{scaled:.3g} {unit}"
+    )
 
 
 if __name__ == "__main__":

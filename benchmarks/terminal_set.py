@@ -75,13 +75,17 @@ class Proof:
 
     def needed(self, first: bool) -> float:
         """What thrust must take off in a step so that the limit is kept with twice the margin, as a share of the speed."""
-        return SLACK * (2.0 * self.n * self.dt + first * self.margin / (self.floor - 2.0 * self.margin))
+        return SLACK * (
+            2.0 * self.n * self.dt + first * self.margin / (self.floor - 2.0 * self.margin)
+        )
 
     def thrust_turn(self, error: np.ndarray, first: bool) -> np.ndarray:
         """How far the least thrust that holds the limit turns the course in a step; infinite where none holds it."""
         error = np.radians(np.minimum(error, 90.0))
         sine, cosine = np.sin(error), np.maximum(np.cos(error), 1e-9)
-        root = cosine**2 - 2.0 * self.needed(first) * sine**2  # thrust across the velocity lengthens it
+        root = (
+            cosine**2 - 2.0 * self.needed(first) * sine**2
+        )  # thrust across the velocity lengthens it
         push = SLACK * (cosine - np.sqrt(np.maximum(root, 0.0))) / np.maximum(sine, 1e-9) ** 2
         turn = np.degrees(np.arctan2(push * sine, 1.0 - push * cosine))
         return np.where((root > 0.0) & (error > 1e-3), turn, np.where(error > 1e-3, np.inf, 0.0))
@@ -115,15 +119,24 @@ class Proof:
         least = self.low - (self.faster + fastest) / 2.0 * self.dt - course
         most = self.high - (self.slower + slowest) / 2.0 * self.dt + course
         step = 2.0 * self.spin / self.num[1]
-        columns = np.floor((np.stack([slowest, fastest]) + self.spin) / step + [[[-1e-9]], [[1e-9]]]).astype(int)
+        columns = np.floor(
+            (np.stack([slowest, fastest]) + self.spin) / step + [[[-1e-9]], [[1e-9]]]
+        ).astype(int)
         columns = np.clip(columns, 0, self.num[1] - 1)
         rows = np.floor((np.stack([least, most]) + 90.0) / self.width + [[[-1e-9]], [[1e-9]]])
         rows = np.clip(rows, -self.num[0], 2 * self.num[0] - 1).astype(int)
-        marks = np.zeros((3 * self.num[0] + 1, self.num[1] + 1), int)  # corners of rectangles; their sums fill them
+        marks = np.zeros(
+            (3 * self.num[0] + 1, self.num[1] + 1), int
+        )  # corners of rectangles; their sums fill them
         chosen = np.nonzero(cells)
         first, last = (side[chosen] + self.num[0] for side in rows)
         left, right = (side[chosen] for side in columns)
-        for row, column, sign in ((first, left, 1), (last + 1, left, -1), (first, right + 1, -1), (last + 1, right + 1, 1)):
+        for row, column, sign in (
+            (first, left, 1),
+            (last + 1, left, -1),
+            (first, right + 1, -1),
+            (last + 1, right + 1, 1),
+        ):
             np.add.at(marks, (row, column), sign)
         filled = marks.cumsum(axis=0).cumsum(axis=1)[:-1, :-1] > 0
         below, same, above = filled.reshape(3, *self.num)
@@ -136,7 +149,11 @@ class Proof:
 
     def closure(self) -> np.ndarray | None:
         """The cells that are ever reached from `angle` or less at any spin; None if the axis escapes."""
-        begin, aligned, first = self.within(self.angle), self.within(self.aligned), self.course(first=True)
+        begin, aligned, first = (
+            self.within(self.angle),
+            self.within(self.aligned),
+            self.course(first=True),
+        )
         known = begin | np.logical_or(*self.image(begin & ~aligned, first))
         fresh, later = known & ~aligned, self.course(first=False)
         while fresh.any():
@@ -153,7 +170,10 @@ class Proof:
 
     def steps(self, begin: np.ndarray, goal: float, course: np.ndarray | float) -> int | None:
         """The steps until all cells have been within an angle, if the nearer end changes `FLIPS` times; None if never."""
-        goals, layers = self.within(goal), [begin, *(np.zeros(self.num, bool) for _ in range(FLIPS))]
+        goals, layers = (
+            self.within(goal),
+            [begin, *(np.zeros(self.num, bool) for _ in range(FLIPS))],
+        )
         for count in range(MOST_STEPS):
             layers = [cells & ~goals for cells in layers]
             if not any(cells.any() for cells in layers):
@@ -165,7 +185,9 @@ class Proof:
     def hold(self, largest: float) -> float:
         """The distance up to which the weaker thrust holds the limit at the largest angle."""
         angle = math.radians(largest + self.spin * self.dt + 1.0)
-        spare = self.weakest * math.cos(angle) / SLACK - self.margin / self.dt - self.slope * self.floor
+        spare = (
+            self.weakest * math.cos(angle) / SLACK - self.margin / self.dt - self.slope * self.floor
+        )
         return spare / max(3.0 * self.n**2, self.slope**2)
 
     def lines(self) -> list[str]:
@@ -174,8 +196,15 @@ class Proof:
         if known is None or swing > self.angle:
             return [f"not proved: from {self.angle:g}° the angle may escape (swing {swing:.1f}°)"]
         largest = self.largest(known)
-        every, drift, later = np.ones(self.num, bool), self.gravity(LOW_SHARE), self.course(first=False)
-        turned, within = self.steps(every, self.angle, drift), self.steps(known, self.aligned, later)
+        every, drift, later = (
+            np.ones(self.num, bool),
+            self.gravity(LOW_SHARE),
+            self.course(first=False),
+        )
+        turned, within = (
+            self.steps(every, self.angle, drift),
+            self.steps(known, self.aligned, later),
+        )
         return [
             f"dt {self.dt:g} s, margin {self.margin:g} m/s, wheel {self.wheel:g}°/s², spin {self.spin:g}°/s",
             f"from {self.angle:g}° at any spin: never above {largest:.2f}°; braking swings it to {swing:.1f}° at most",

@@ -18,7 +18,14 @@ from jaxtyping import Array
 import jaxsafe
 from jaxsafe.rollout import step_or_reset
 
-GAMMA, LAMBDA, CLIP, VALUE_COEFFICIENT, LEARNING_RATE, MAX_GRAD_NORM = 0.99, 0.95, 0.2, 0.5, 3e-4, 0.5
+GAMMA, LAMBDA, CLIP, VALUE_COEFFICIENT, LEARNING_RATE, MAX_GRAD_NORM = (
+    0.99,
+    0.95,
+    0.2,
+    0.5,
+    3e-4,
+    0.5,
+)
 
 
 class Sample(NamedTuple):
@@ -40,25 +47,43 @@ def init(env: jaxsafe.Environment, hidden: Sequence[int], num_envs: int, key: Ar
         "critic": _layers(key_critic, [env.observation_size, *hidden, 1], 1.0),
         "log_std": jnp.zeros(env.action_size),
     }
-    state, timestep = jax.vmap(jaxsafe.reset, in_axes=(None, 0))(env, jax.random.split(key_reset, num_envs))
+    state, timestep = jax.vmap(jaxsafe.reset, in_axes=(None, 0))(
+        env, jax.random.split(key_reset, num_envs)
+    )
     return params, _OPTIMIZER.init(params), state, timestep.observation, key
 
 
-def update(env: jaxsafe.Environment, num_steps: int, num_epochs: int, num_minibatches: int, carry: Any) -> Any:
+def update(
+    env: jaxsafe.Environment, num_steps: int, num_epochs: int, num_minibatches: int, carry: Any
+) -> Any:
     """One batch and what is learnt from it."""
     params, optimizer, state, observation, key = carry
 
     def step(carry: Any, _: None) -> tuple[Any, Sample]:
         state, observation, key = carry
         key, key_act, key_step = jax.random.split(key, 3)
-        mean, value = _network(params["actor"], observation), _network(params["critic"], observation)[:, 0]
+        mean, value = (
+            _network(params["actor"], observation),
+            _network(params["critic"], observation)[:, 0],
+        )
         action = mean + jnp.exp(params["log_std"]) * jax.random.normal(key_act, mean.shape)
         keys = jax.random.split(key_step, len(observation))
-        (state, following), timestep = jax.vmap(step_or_reset, in_axes=(None, 0, 0, 0))(env, state, action, keys)
-        sample = Sample(observation, action, _log_prob(params, mean, action), value, timestep.reward, timestep.done)
+        (state, following), timestep = jax.vmap(step_or_reset, in_axes=(None, 0, 0, 0))(
+            env, state, action, keys
+        )
+        sample = Sample(
+            observation,
+            action,
+            _log_prob(params, mean, action),
+            value,
+            timestep.reward,
+            timestep.done,
+        )
         return (state, following, key), sample
 
-    (state, observation, key), samples = jax.lax.scan(step, (state, observation, key), None, num_steps)
+    (state, observation, key), samples = jax.lax.scan(
+        step, (state, observation, key), None, num_steps
+    )
     last = _network(params["critic"], observation)[:, 0]
 
     def backward(carry: tuple[Array, Array], sample: Sample) -> tuple[tuple[Array, Array], Array]:
@@ -119,4 +144,6 @@ def _log_prob(params: Any, mean: Array, action: Array) -> Array:
     return jnp.sum(-0.5 * z * z - params["log_std"] - 0.5 * jnp.log(2 * jnp.pi), axis=-1)
 
 
-_OPTIMIZER = optax.chain(optax.clip_by_global_norm(MAX_GRAD_NORM), optax.adam(LEARNING_RATE, eps=1e-5))
+_OPTIMIZER = optax.chain(
+    optax.clip_by_global_norm(MAX_GRAD_NORM), optax.adam(LEARNING_RATE, eps=1e-5)
+)

@@ -28,7 +28,10 @@ add_module_names = False
 def setup(app: Any) -> None:
     """Links that hold in the repository hold on the site: the README, one folder up, is its first page."""
     app.connect("include-read", lambda _app, _path, _page, content: _each(content, _in_docs))
-    app.connect("source-read", lambda _app, page, content: _each(content, functools.partial(_to_first_page, page)))
+    app.connect(
+        "source-read",
+        lambda _app, page, content: _each(content, functools.partial(_to_first_page, page)),
+    )
 
 
 def _each(content: list[str], change: Callable[[str], str]) -> None:
@@ -42,4 +45,6 @@ def _in_docs(readme: str) -> str:
 
 def _to_first_page(page: str, text: str) -> str:
     up = "../" * page.count("/")
-    return text.replace(f"]({up}../README.md", f"]({up}index.md").replace("](../tests/golden/R", "](path:../tests/golden/R")
+    return text.replace(f"]({up}../README.md", f"]({up}index.md").replace(
+        "](../tests/golden/R", "](path:../tests/golden/R"
+    )

@@ -40,7 +40,8 @@ def draw(task: str) -> Figure:
 def episode(env: Any, seed: int, pace: float) -> tuple[Any, str]:
     """The simulation at each step from a random start to the end, stacked, and the outcome."""
     lows, highs = (
-        jnp.stack([getattr(one, end) for one in env.agent_platform.controller.actuators]) for end in ("low", "high")
+        jnp.stack([getattr(one, end) for one in env.agent_platform.controller.actuators])
+        for end in ("low", "high")
     )
     steer = steer_spacecraft if env.agent == "deputy" else steer_aircraft
     centred = jnp.array([one.zero_centred for one in env.agent_platform.controller.actuators])
@@ -52,11 +53,13 @@ def episode(env: Any, seed: int, pace: float) -> tuple[Any, str]:
         after, timestep = jaxsafe.step(env, state, jnp.clip(action, -1.0, 1.0))
         return after, (state.sim, timestep.info.outcome)
 
-    sims, outcome = jax.jit(lambda key: jax.lax.scan(one_step, jaxsafe.reset(env, key)[0], None, 3002))(
-        jax.random.key(seed)
-    )[1]
+    sims, outcome = jax.jit(
+        lambda key: jax.lax.scan(one_step, jaxsafe.reset(env, key)[0], None, 3002)
+    )(jax.random.key(seed))[1]
     last = int(np.argmax(np.asarray(outcome) > 0))
-    return jax.tree.map(lambda leaf: np.asarray(leaf[: last + 2]), sims), env.outcomes[int(outcome[last])]
+    return jax.tree.map(lambda leaf: np.asarray(leaf[: last + 2]), sims), env.outcomes[
+        int(outcome[last])
+    ]
 
 
 def steer_spacecraft(env: Any, sim: Any, pace: float) -> dict[str, Any]:
@@ -71,7 +74,10 @@ def steer_spacecraft(env: Any, sim: Any, pace: float) -> dict[str, Any]:
     error = jnp.arctan(across / (thrust @ axis + 1e-6))  # either end of the body may push
     still = jnp.linalg.norm(thrust) < 0.1
     turn = jnp.where(still, 0.0, 0.1 * error) - deputy.attitude_rate
-    return {"thrust": jnp.where(jnp.abs(error) < 0.3, thrust @ axis, 0.0), "attitude_acceleration": turn}
+    return {
+        "thrust": jnp.where(jnp.abs(error) < 0.3, thrust @ axis, 0.0),
+        "attitude_acceleration": turn,
+    }
 
 
 def steer_aircraft(env: Any, sim: Any, pace: float) -> dict[str, Any]:
@@ -102,7 +108,9 @@ def draw_docking(env: Any, episodes: list[tuple[Any, str]]) -> Figure:
     limit = next(status for status in env.status if status.name == "velocity_limit")
     if zoom is None:
         azimuth, polar = np.mgrid[0 : 2 * np.pi : 25j, 0 : np.pi : 13j]
-        ball = np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+        ball = np.stack(
+            [np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]
+        )
         for r in (near, far):
             left.plot_surface(*(r * ball), color=BLUE, linewidth=0, alpha=0.08)
         left.set(zlabel="z [m]", **{f"{axis}ticks": (-100, 0, 100) for axis in "xyz"})
@@ -121,10 +129,25 @@ def draw_docking(env: Any, episodes: list[tuple[Any, str]]) -> Figure:
             zoom.plot(*deputy.position.T, color=colour, linewidth=1.4)
         if hasattr(deputy, "attitude"):
             every = slice(0, None, 40)
-            body = deputy.position[every], 14.0 * np.stack([np.cos(deputy.attitude), np.sin(deputy.attitude)], 1)[every]
-            left.quiver(*body[0].T, *body[1].T, color=colour, angles="xy", scale_units="xy", scale=1.0, width=0.004)
-        right.plot(status["docking_distance"], status["speed"], color=colour, linewidth=1.6, label=outcome)
-        right.plot(status["docking_distance"][0], status["speed"][0], "o", color=colour, markersize=5)
+            body = (
+                deputy.position[every],
+                14.0 * np.stack([np.cos(deputy.attitude), np.sin(deputy.attitude)], 1)[every],
+            )
+            left.quiver(
+                *body[0].T,
+                *body[1].T,
+                color=colour,
+                angles="xy",
+                scale_units="xy",
+                scale=1.0,
+                width=0.004,
+            )
+        right.plot(
+            status["docking_distance"], status["speed"], color=colour, linewidth=1.6, label=outcome
+        )
+        right.plot(
+            status["docking_distance"][0], status["speed"][0], "o", color=colour, markersize=5
+        )
     left.plot(*np.zeros((env.platforms[0].dimension, 1)), "*", color="black", markersize=11)
     left.set(xlabel="x [m]", ylabel="y [m]")
 
@@ -133,11 +156,20 @@ def draw_docking(env: Any, episodes: list[tuple[Any, str]]) -> Figure:
     right.plot(r, speed, color=ORANGE, linewidth=1.8)
     right.fill_between(r, speed, 1.0, color=ORANGE, alpha=0.12, linewidth=0)
     start = np.array([near, far])
-    right.fill_between(start, 0.0, float(limit.floor) + float(limit.slope) * start, color=BLUE, alpha=0.15, linewidth=0)
+    right.fill_between(
+        start,
+        0.0,
+        float(limit.floor) + float(limit.slope) * start,
+        color=BLUE,
+        alpha=0.15,
+        linewidth=0,
+    )
     right.text(0.04 * far, 0.4, "above the speed limit", color=ORANGE)
     right.text(far - 1.0, 0.012, "start", color=BLUE, ha="right")
     right.legend(loc="lower left", frameon=False, title="outcome")
-    right.set(xlim=(0, 1.1 * far), ylim=(0, 0.6), xlabel="distance to the chief [m]", ylabel="speed [m/s]")
+    right.set(
+        xlim=(0, 1.1 * far), ylim=(0, 0.6), xlabel="distance to the chief [m]", ylabel="speed [m/s]"
+    )
     return figure
 
 
@@ -146,20 +178,35 @@ def draw_rejoin(env: Any, episodes: list[tuple[Any, str]]) -> Figure:
     spatial = env.platforms[0].dimension == 3
     figure = Figure(figsize=(14 if spatial else 11, 4.6), layout="constrained")
     ground, close, *height = figure.subplots(1, 3 if spatial else 2)
-    low, high = (np.asarray(getattr(env.platforms[0].start[0], end))[:2] / 1e3 for end in ("low", "high"))
+    low, high = (
+        np.asarray(getattr(env.platforms[0].start[0], end))[:2] / 1e3 for end in ("low", "high")
+    )
     near, far = np.asarray(env.platforms[1].start[0].distance) / 1e3
     region = env.regions[0]
     ground.add_patch(
-        Rectangle((low[0], low[1]), *(high - low), color=GREY, alpha=0.25, linewidth=0, label="start of the lead")
+        Rectangle(
+            (low[0], low[1]),
+            *(high - low),
+            color=GREY,
+            alpha=0.25,
+            linewidth=0,
+            label="start of the lead",
+        )
     )
     for index, (colour, (sim, outcome)) in enumerate(zip(PALETTE, episodes, strict=False)):
         lead, wingman = (sim.platforms[name] for name in ("lead", "wingman"))
         if not index:
-            ring = Annulus(lead.position[0, :2] / 1e3, far, far - near, color=colour, alpha=0.12, linewidth=0)
+            ring = Annulus(
+                lead.position[0, :2] / 1e3, far, far - near, color=colour, alpha=0.12, linewidth=0
+            )
             ring.set_label("start of this wingman, given the start of its lead")
             ground.add_patch(ring)
         ground.plot(
-            *lead.position[:, :2].T / 1e3, color=GREY, linewidth=1.6, linestyle="--", label="lead" if index else None
+            *lead.position[:, :2].T / 1e3,
+            color=GREY,
+            linewidth=1.6,
+            linestyle="--",
+            label="lead" if index else None,
         )
         ground.plot(*lead.position[:1, :2].T / 1e3, "s", color=GREY, markersize=5)
         ground.plot(*lead.position[-1:, :2].T / 1e3, "x", color=GREY, markersize=6)
@@ -169,11 +216,22 @@ def draw_rejoin(env: Any, episodes: list[tuple[Any, str]]) -> Figure:
         c, s = np.cos(lead.heading), np.sin(lead.heading)
         close.plot(c * x + s * y, c * y - s * x, color=colour, linewidth=1.6, label=outcome)
         for axes in height:
-            axes.plot(sim.time, (wingman.position - lead.position)[:, 2], color=colour, linewidth=1.6)
+            axes.plot(
+                sim.time, (wingman.position - lead.position)[:, 2], color=colour, linewidth=1.6
+            )
     angle = np.pi + float(region.offset.angle)
     centre = float(region.offset.distance) * np.array([np.cos(angle), np.sin(angle)])
-    close.add_patch(Circle((centre[0], centre[1]), float(region.radius), color=GREEN, alpha=0.3, linewidth=0))
-    close.text(centre[0] - float(region.radius) - 20, centre[1], "rejoin region", color=GREEN, ha="right", va="center")
+    close.add_patch(
+        Circle((centre[0], centre[1]), float(region.radius), color=GREEN, alpha=0.3, linewidth=0)
+    )
+    close.text(
+        centre[0] - float(region.radius) - 20,
+        centre[1],
+        "rejoin region",
+        color=GREEN,
+        ha="right",
+        va="center",
+    )
     crash = float(env.constraints[0].minimum)
     close.add_patch(Circle((0, 0), crash, color=ORANGE, alpha=0.35, linewidth=0))
     close.text(0, crash + 20, "crash", color=ORANGE, ha="center")
@@ -189,8 +247,12 @@ def draw_rejoin(env: Any, episodes: list[tuple[Any, str]]) -> Figure:
         title="seen from the lead, which flies to the right",
     )
     close.set(xlabel="ahead of the lead [ft]", ylabel="to its left [ft]")
-    figure.legend(*ground.get_legend_handles_labels(), loc="outside lower left", ncols=3, frameon=False)
+    figure.legend(
+        *ground.get_legend_handles_labels(), loc="outside lower left", ncols=3, frameon=False
+    )
     for axes in height:
-        axes.axhspan(-float(region.height) / 2, float(region.height) / 2, color=GREEN, alpha=0.3, linewidth=0)
+        axes.axhspan(
+            -float(region.height) / 2, float(region.height) / 2, color=GREEN, alpha=0.3, linewidth=0
+        )
         axes.set(xlabel="time [s]", ylabel="altitude over that of the lead [ft]", title="altitude")
     return figure

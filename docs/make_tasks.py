@@ -56,14 +56,22 @@ CAPTION = {
 
 SECTIONS = (
     ("Regions", "", "regions"),
-    ("Statuses", "Facts about the state, computed in this order; those below may use those above.", "status"),
+    (
+        "Statuses",
+        "Facts about the state, computed in this order; those below may use those above.",
+        "status",
+    ),
     ("Rewards", "The reward of a step is the sum of these terms.", "reward"),
     (
         "Ends of an episode",
         "The first condition that holds is the outcome; a bound of a reward term comes last.",
         "terminal",
     ),
-    ("Safety constraints", "Safe where h ≥ 0; `cost` is 1 on a step on which one is violated.", "constraints"),
+    (
+        "Safety constraints",
+        "Safe where h ≥ 0; `cost` is 1 on a step on which one is violated.",
+        "constraints",
+    ),
 )
 """Heading, explanation and field of the sections that list parts."""
 
@@ -86,13 +94,19 @@ def page(task: str) -> str:
         *(block for platform in env.platforms for block in platform_blocks(platform, length)),
         "## Actions",
         f"Continuous actions lie in [−1, 1]; with `jaxsafe.make({task!r}, actions='discrete')` they are indices of points.",
-        table(("index", "actuator", "unit", "low", "high", "[−1, 1] maps to", "points"), actions(env)),
+        table(
+            ("index", "actuator", "unit", "low", "high", "[−1, 1] maps to", "points"), actions(env)
+        ),
         "## Observation",
         "Each element is divided by its divisor and then clipped.",
         table(("index", "element", "what it is", "divisor", "clip"), observation(env)),
     ]
     for title, about, section in SECTIONS:
-        blocks += [f"## {title}", about, table(("path", "type", "what it is", "numbers"), parts(env, section, length))]
+        blocks += [
+            f"## {title}",
+            about,
+            table(("path", "type", "what it is", "numbers"), parts(env, section, length)),
+        ]
     return "\n\n".join(wrapped(block) for block in blocks if block) + "\n"
 
 
@@ -107,7 +121,9 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     """A Markdown table."""
     lines = [list(head), *map(list, rows)]
     lines.insert(1, ["---"] * len(lines[0]))
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+    return "\n".join(
+        "| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines
+    )
 
 
 def platform_blocks(platform: Platform, length: str) -> Iterator[str]:
@@ -123,13 +139,22 @@ def platform_blocks(platform: Platform, length: str) -> Iterator[str]:
     def begin(name: str, unit: str) -> tuple[str, ...]:
         if name not in start:
             return "", "the same in every episode", number(np.unique(getattr(rest, name)).squeeze())
-        return f"`{start[name].type_name}`", summary(start[name]), settings(start[name], length, physical=unit)
+        return (
+            f"`{start[name].type_name}`",
+            summary(start[name]),
+            settings(start[name], length, physical=unit),
+        )
 
-    rows = ((f"`{name}`", unit, str(size), *begin(name, unit)) for name, unit, size in state_fields(platform))
+    rows = (
+        (f"`{name}`", unit, str(size), *begin(name, unit))
+        for name, unit, size in state_fields(platform)
+    )
     yield table(("state", "unit", "size", "start", "how it is drawn", "numbers"), rows)
     commands = getattr(platform.controller, "commands", ())
     if commands:
-        script = "; ".join(f"`{one.name}` {one.type_name} {settings(one, length)}" for one in commands)
+        script = "; ".join(
+            f"`{one.name}` {one.type_name} {settings(one, length)}" for one in commands
+        )
         yield f"It follows a script: {script}."
 
 
@@ -145,7 +170,15 @@ def actions(env: jaxsafe.Environment) -> Iterator[tuple[str, ...]]:
         unit = control_unit(one.name, length_unit(env))
         assert unit, f"no unit is known for {one.name}"
         mapped = "[low, 0] and [0, high], so that 0 stays 0" if one.zero_centred else "[low, high]"
-        yield str(index), f"`{one.name}`", unit, number(one.low), number(one.high), mapped, str(one.points)
+        yield (
+            str(index),
+            f"`{one.name}`",
+            unit,
+            number(one.low),
+            number(one.high),
+            mapped,
+            str(one.points),
+        )
 
 
 def observation(env: jaxsafe.Environment) -> list[tuple[str, ...]]:
@@ -175,7 +208,9 @@ def seen(item: Observation, label: str) -> str:
         return f"status `{item.status}`"  # type: ignore[attr-defined]
     of, what = (item.of, item.what) if isinstance(item, Observe) else (item.region, "position")
     relative = f" relative to `{item.relative_to}`" if item.relative_to else ""
-    turned = f", in the body frame of `{item.frame}`" if item.frame and element != "magnitude" else ""
+    turned = (
+        f", in the body frame of `{item.frame}`" if item.frame and element != "magnitude" else ""
+    )
     piece = "magnitude of " if element == "magnitude" else f"{element} of " if element else ""
     unit = "the direction of " if item.form == "magnorm" and element != "magnitude" else ""
     return f"{piece}{unit}the `{what}` of `{of}`{relative}{turned}"
@@ -184,11 +219,21 @@ def seen(item: Observation, label: str) -> str:
 def parts(env: jaxsafe.Environment, section: str, length: str) -> Iterator[tuple[str, ...]]:
     """A row for each part of a section: the docstring of its class, and its numbers."""
     for part in getattr(env, section):
-        yield f"`{section}.{part.name}`", f"`{part.type_name}`", summary(part), settings(part, length)
+        yield (
+            f"`{section}.{part.name}`",
+            f"`{part.type_name}`",
+            summary(part),
+            settings(part, length),
+        )
     if section == "terminal":
         for term in env.reward:
             if term.bound:
-                yield f"`reward.{term.name}.bound`", "", summary(term.bound), settings(term.bound, length)
+                yield (
+                    f"`reward.{term.name}.bound`",
+                    "",
+                    summary(term.bound),
+                    settings(term.bound, length),
+                )
 
 
 def summary(component: Component) -> str:
@@ -196,23 +241,33 @@ def summary(component: Component) -> str:
     return " ".join(inspect.cleandoc(type(component).__doc__ or "").split())
 
 
-def settings(component: Component, length: str, only: Iterable[str] = (), physical: str = "") -> str:
+def settings(
+    component: Component, length: str, only: Iterable[str] = (), physical: str = ""
+) -> str:
     """The fields of a component in words, with units; what is not set is left out, and what a base class sets."""
     units = {"m or ft": length, "physical": physical, "1": "", "as observed": ""}
     found = []
     for name, field in fields(type(component)).items():
         value = getattr(component, name)
-        inherited = name not in type(component).__annotations__ and field.static and value == field.default
+        inherited = (
+            name not in type(component).__annotations__ and field.static and value == field.default
+        )
         if name == "name" or value is None or inherited or (only and name not in only):
             continue
         if field.unit:
-            found.append(f"{name} {number(value)} {units.get(field.unit.symbol, field.unit.symbol)}".strip())
+            found.append(
+                f"{name} {number(value)} {units.get(field.unit.symbol, field.unit.symbol)}".strip()
+            )
         elif isinstance(value, Component):
-            found.append(f"{name} ({', '.join(filter(None, (value.type_name, settings(value, length))))})")
+            found.append(
+                f"{name} ({', '.join(filter(None, (value.type_name, settings(value, length))))})"
+            )
         elif isinstance(value, dict):
             found += [f"{key} {number(item)}" for key, item in value.items()]
         else:
-            found.append(f"{name} {str(value).lower() if isinstance(value, bool) else f'`{value}`'}")
+            found.append(
+                f"{name} {str(value).lower() if isinstance(value, bool) else f'`{value}`'}"
+            )
     return ", ".join(found)
 
 
@@ -222,7 +277,11 @@ def number(value: Any) -> str:
         return "[" + ", ".join(map(number, value)) + "]"
     scalar = np.float32(value)
     share = Fraction(float(scalar) / np.pi).limit_denominator(180)
-    if share and abs(float(share) * np.pi / float(scalar) - 1.0) < 1e-6 and share.denominator * abs(share.numerator) < 400:
+    if (
+        share
+        and abs(float(share) * np.pi / float(scalar) - 1.0) < 1e-6
+        and share.denominator * abs(share.numerator) < 400
+    ):
         top = {1: "π", -1: "-π"}.get(share.numerator, f"{share.numerator}π")
         text = top if share.denominator == 1 else f"{top}/{share.denominator}"
     else:

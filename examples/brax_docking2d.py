@@ -26,10 +26,17 @@ def train(algorithm: str, scale: float = 1.0) -> dict[str, Any]:
 
     def progress(step: int, metrics: dict[str, Any]) -> None:
         seen.append(metrics)
-        facts = {name: float(metrics[f"eval/episode_{name}"]) for name in ("reward", "success", "cost")}
+        facts = {
+            name: float(metrics[f"eval/episode_{name}"]) for name in ("reward", "success", "cost")
+        }
         print(f"{step:>10,}", *(f"{name} {value:.2f}" for name, value in facts.items()), flush=True)
 
-    common = {"wrap_env_fn": wrap, "episode_length": 2000, "num_eval_envs": 64, "progress_fn": progress}
+    common = {
+        "wrap_env_fn": wrap,
+        "episode_length": 2000,
+        "num_eval_envs": 64,
+        "progress_fn": progress,
+    }
     if algorithm == "ppo":
         networks = partial(
             make_ppo_networks, distribution_type="normal", noise_std_type="log", init_noise_std=0.5, activation=tanh,

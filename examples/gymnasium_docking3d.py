@@ -14,13 +14,21 @@ import jaxsafe
 
 def fly(rta: str = "none", num_envs: int = 64) -> dict[str, float]:
     """Share of successes and of episodes with a violation, of one episode in each environment."""
-    env = gym.make_vec("jaxsafe/Docking3D-v0", num_envs=num_envs, autoreset_mode="SameStep", rta=rta)
+    env = gym.make_vec(
+        "jaxsafe/Docking3D-v0", num_envs=num_envs, autoreset_mode="SameStep", rta=rta
+    )
     policy, key = jax.jit(jaxsafe.load_policy("docking3d")), jax.random.key(0)
     observation, _ = env.reset(seed=0)
-    running, success, violated = np.ones(num_envs, bool), np.zeros(num_envs, bool), np.zeros(num_envs, bool)
+    running, success, violated = (
+        np.ones(num_envs, bool),
+        np.zeros(num_envs, bool),
+        np.zeros(num_envs, bool),
+    )
     while running.any():
         key, key_now = jax.random.split(key)
-        observation, _, terminated, truncated, info = env.step(np.asarray(policy(key_now, observation)))
+        observation, _, terminated, truncated, info = env.step(
+            np.asarray(policy(key_now, observation))
+        )
         done = terminated | truncated
         ended = info.get("final_info", info)  # a lane that starts anew tells of its last step there
         success |= running & done & ended["is_success"]

@@ -17,7 +17,9 @@ import torch
 
 from jaxsafe.adapters.safety_gymnasium import SafetyEnv
 
-sys.modules.setdefault("safety_gymnasium", types.ModuleType("safety_gymnasium"))  # OmniSafe imports it for its own tasks
+sys.modules.setdefault(
+    "safety_gymnasium", types.ModuleType("safety_gymnasium")
+)  # OmniSafe imports it for its own tasks
 import omnisafe  # noqa: E402
 from omnisafe.envs.core import CMDP, env_register  # noqa: E402
 
@@ -32,7 +34,9 @@ class Docking(CMDP):
     def __init__(self, env_id: str, num_envs: int = 1, device: str = "cpu", **options: Any) -> None:
         """Make as many environments; one has no batch axis, and OmniSafe resets it."""
         super().__init__(env_id)
-        self._env = SafetyEnv(env_id.removeprefix("jaxsafe-"), num_envs if num_envs > 1 else None, **options)
+        self._env = SafetyEnv(
+            env_id.removeprefix("jaxsafe-"), num_envs if num_envs > 1 else None, **options
+        )
         self.need_auto_reset_wrapper = num_envs == 1
         self._num_envs, self._device, self._metadata = num_envs, device, self._env.metadata
         self._action_space = self._env.single_action_space
@@ -50,7 +54,9 @@ class Docking(CMDP):
             info["final_observation"] = self._tensor(info["final_observation"])
         return *(self._tensor(x) for x in found), info
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[torch.Tensor, dict]:
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[torch.Tensor, dict]:
         """Start every lane."""
         observation, info = self._env.reset(seed=seed, options=options)
         return self._tensor(observation), info

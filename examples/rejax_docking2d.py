@@ -31,4 +31,9 @@ def train(steps: int = 500_000) -> tuple[jax.Array, jax.Array]:
 if __name__ == "__main__":
     lengths, returns = train(*map(int, sys.argv[1:]))
     for length, found in zip(lengths.mean(axis=-1).T, returns.mean(axis=-1).T, strict=True):
-        print("return of each seed", *(f"{x:6.2f}" for x in found), "  length", *(f"{x:6.0f}" for x in length))
+        print(
+            "return of each seed",
+            *(f"{x:6.2f}" for x in found),
+            "  length",
+            *(f"{x:6.0f}" for x in length),
+        )

@@ -53,7 +53,9 @@ def success_rate(model: PPO, deterministic: bool, episodes: int = 100) -> float:
     env.seed(1000)
     observation, successes = env.reset(), np.full(episodes, np.nan)
     while np.isnan(successes).any():
-        observation, _, done, infos = env.step(model.predict(observation, deterministic=deterministic)[0])
+        observation, _, done, infos = env.step(
+            model.predict(observation, deterministic=deterministic)[0]
+        )
         for lane in np.flatnonzero(done & np.isnan(successes)):
             successes[lane] = infos[lane]["is_success"]
     return float(successes.mean())
@@ -61,4 +63,10 @@ def success_rate(model: PPO, deterministic: bool, episodes: int = 100) -> float:
 
 if __name__ == "__main__":
     model = train(*map(int, sys.argv[1:]))
-    print(*(f"success, {kind}: {success_rate(model, kind == 'modes'):.0%}" for kind in ("sampled", "modes")), sep="\n")
+    print(
+        *(
+            f"success, {kind}: {success_rate(model, kind == 'modes'):.0%}"
+            for kind in ("sampled", "modes")
+        ),
+        sep="\n",
+    )

@@ -32,7 +32,13 @@ def shortage() -> str | None:
 
 def is_shortage(error: BaseException) -> bool:
     """Return whether an error says that there is not enough memory: Python's own, JAX's, or that of a library to load."""
-    signs = ("RESOURCE_EXHAUSTED", "Out of memory", "failed to map segment", "Cannot allocate memory", "bad_alloc")
+    signs = (
+        "RESOURCE_EXHAUSTED",
+        "Out of memory",
+        "failed to map segment",
+        "Cannot allocate memory",
+        "bad_alloc",
+    )
     return isinstance(error, MemoryError) or any(sign in str(error) for sign in signs)
 
 

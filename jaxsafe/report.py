@@ -3,4 +3,6 @@
 import sys
 
 if __name__ == "__main__":
-    sys.exit("error: jaxsafe.report: in a clone of jaxsafe, python benchmarks/baselines trains, evaluates and reports")
+    sys.exit(
+        "error: jaxsafe.report: in a clone of jaxsafe, python benchmarks/baselines trains, evaluates and reports"
+    )

@@ -15,13 +15,20 @@ import pytest
 from jaxsafe.devices.seed_mapper import accelerator_installed, claim_cores
 
 emitter = " --xla_cpu_use_fusion_emitters=false" * version("jaxlib").startswith("0.10.")
-os.environ.setdefault("XLA_FLAGS", f"--xla_force_host_platform_device_count=2 --xla_backend_optimization_level=1{emitter}")
+os.environ.setdefault(
+    "XLA_FLAGS",
+    f"--xla_force_host_platform_device_count=2 --xla_backend_optimization_level=1{emitter}",
+)
 claim_cores()
 
 import jax  # noqa: E402
 
-_cache = Path(os.environ.get("JAXSAFE_TEST_CACHE", Path(__file__).parent.parent / ".pytest_cache" / "jax"))
-if accelerator_installed():  # XLA tunes programs by measuring them, and those of another process may round otherwise
+_cache = Path(
+    os.environ.get("JAXSAFE_TEST_CACHE", Path(__file__).parent.parent / ".pytest_cache" / "jax")
+)
+if (
+    accelerator_installed()
+):  # XLA tunes programs by measuring them, and those of another process may round otherwise
     _cache /= os.environ.get("PYTEST_XDIST_WORKER", "main")
 jax.config.update("jax_compilation_cache_dir", str(_cache))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)

@@ -80,7 +80,11 @@ class Allowed(Status):
 
 
 def probe(
-    reward: Reward, steps: int = 1, ends: str = "terminated", discrete: bool = False, most: float | None = None
+    reward: Reward,
+    steps: int = 1,
+    ends: str = "terminated",
+    discrete: bool = False,
+    most: float | None = None,
 ) -> Environment:
     """An episode of `steps` steps at a random sign; to push harder than `most` costs."""
     actuators = (Actuator(name="push", low=-1.0, high=1.0, points=5),)
@@ -88,10 +92,16 @@ def probe(
     return build(
         Environment(
             agent="point",
-            platforms=(Point(name="point", dimension=1, start=(Sign(name="position"),), controller=controller),),
+            platforms=(
+                Point(
+                    name="point", dimension=1, start=(Sign(name="position"),), controller=controller
+                ),
+            ),
             terminal=(Timeout(name="timeout", limit=steps - 0.5, ends=ends),),  # type: ignore[arg-type]
             status=() if most is None else (Hard(name="hard"), Allowed(name="allowed", most=most)),
-            constraints=() if most is None else (SpeedLimit(name="push", speed="hard", velocity_limit="allowed"),),
+            constraints=()
+            if most is None
+            else (SpeedLimit(name="push", speed="hard", velocity_limit="allowed"),),
             reward=(reward,),
             observation=(Observe(name="position", of="point", what="position"),),
         )

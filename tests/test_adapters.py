@@ -17,13 +17,18 @@ from jaxsafe.schema.errors import missing
         ("jaxsafe.export.onnx", "onnx", "export"),
     ],
 )
-def test_a_missing_package_names_its_extra(module: str, blocked: str, extra: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_package_names_its_extra(
+    module: str, blocked: str, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, blocked, None)
     monkeypatch.delitem(sys.modules, module, raising=False)
     package = blocked.partition(".")[0]
     with pytest.raises(ImportError) as raised:
         importlib.import_module(module)
-    assert str(raised.value) == f"{package} is not installed; in a clone of jaxsafe: pip install '.[{extra}]'"
+    assert (
+        str(raised.value)
+        == f"{package} is not installed; in a clone of jaxsafe: pip install '.[{extra}]'"
+    )
 
 
 def test_a_broken_package_says_what_is_wrong_with_it() -> None:
@@ -50,5 +55,9 @@ PHYSICAL = {f"{THRUST_X}.rescale": False, f"{THRUST_X}.low": -3.0, f"{THRUST_X}.
 def test_actions_are_bounded_by_the_actuators_that_do_not_rescale() -> None:
     assert action_bounds(make("docking2d")) == ([-1.0, -1.0], [1.0, 1.0])
     assert action_bounds(make("docking2d", PHYSICAL)) == ([-3.0, -1.0], [0.5, 1.0])
-    drawn = make("docking2d", PHYSICAL, randomize={f"{THRUST_X}.low": [-4.0, -2.0], f"{THRUST_X}.high": [0.25, 2.0]})
+    drawn = make(
+        "docking2d",
+        PHYSICAL,
+        randomize={f"{THRUST_X}.low": [-4.0, -2.0], f"{THRUST_X}.high": [0.25, 2.0]},
+    )
     assert action_bounds(drawn) == ([-4.0, -1.0], [2.0, 1.0])

@@ -20,8 +20,12 @@ def test_the_gaussian_agrees_with_scipy() -> None:
     policy = Gaussian(mean=mean, log_std=log_std)
     action = policy.sample(jax.random.key(1))
     reference = scipy.stats.norm(np.asarray(mean), np.exp(np.asarray(log_std)))
-    np.testing.assert_allclose(policy.log_prob(action), reference.logpdf(np.asarray(action)).sum(-1), rtol=1e-5)
-    np.testing.assert_allclose(policy.entropy(), np.broadcast_to(reference.entropy(), (5, 3)).sum(-1), rtol=1e-5)
+    np.testing.assert_allclose(
+        policy.log_prob(action), reference.logpdf(np.asarray(action)).sum(-1), rtol=1e-5
+    )
+    np.testing.assert_allclose(
+        policy.entropy(), np.broadcast_to(reference.entropy(), (5, 3)).sum(-1), rtol=1e-5
+    )
     np.testing.assert_array_equal(policy.mode(), mean)
 
 
@@ -37,16 +41,22 @@ def test_the_factored_categorical_agrees_with_the_product_of_its_factors() -> No
     first, second = jax.nn.softmax(logits[:, :2]), jax.nn.softmax(logits[:, 2:])
     action = policy.sample(jax.random.key(1))
     rows = np.arange(6)
-    expected = np.log(np.asarray(first)[rows, action[:, 0]] * np.asarray(second)[rows, action[:, 1]])
+    expected = np.log(
+        np.asarray(first)[rows, action[:, 0]] * np.asarray(second)[rows, action[:, 1]]
+    )
     np.testing.assert_allclose(policy.log_prob(action), expected, rtol=1e-5)
-    entropy = scipy.stats.entropy(np.asarray(first), axis=1) + scipy.stats.entropy(np.asarray(second), axis=1)
+    entropy = scipy.stats.entropy(np.asarray(first), axis=1) + scipy.stats.entropy(
+        np.asarray(second), axis=1
+    )
     np.testing.assert_allclose(policy.entropy(), entropy, rtol=1e-5)
     np.testing.assert_array_equal(policy.mode()[:, 1], jnp.argmax(logits[:, 2:], axis=1))
 
 
 def test_categorical_samples_have_the_stated_frequencies() -> None:
     logits = jnp.tile(jnp.log(jnp.array([0.2, 0.3, 0.5])), (6000, 1))
-    counts = np.bincount(np.asarray(Categorical(logits=logits, points=(3,)).sample(KEY))[:, 0], minlength=3)
+    counts = np.bincount(
+        np.asarray(Categorical(logits=logits, points=(3,)).sample(KEY))[:, 0], minlength=3
+    )
     assert scipy.stats.chisquare(counts, 6000 * np.array([0.2, 0.3, 0.5])).pvalue > 0.001
 
 
@@ -59,19 +69,27 @@ def test_an_untrained_policy_is_centred_and_as_wide_as_configured(actions: str) 
     actions_drawn = jax.vmap(lambda key: agent.act(env, params, key, timestep.observation, False))(
         jax.random.split(KEY, 2000)
     )
-    pushes = np.asarray(actions_drawn) / 5.0 - 1.0 if actions == "discrete" else np.asarray(actions_drawn)
+    pushes = (
+        np.asarray(actions_drawn) / 5.0 - 1.0
+        if actions == "discrete"
+        else np.asarray(actions_drawn)
+    )
     assert abs(pushes.mean()) < 0.05
     assert pushes.std() == pytest.approx(0.3, abs=0.02)
 
 
 def test_a_smaller_log_std_sharpens_the_choice_of_its_actuator_and_leaves_the_mode() -> None:
-    env = jaxsafe.make("docking2d", {"deputy.controller.actuators.thrust_x.points": 5}, actions="discrete")
+    env = jaxsafe.make(
+        "docking2d", {"deputy.controller.actuators.thrust_x.points": 5}, actions="discrete"
+    )
     agent = normalise(Agent(prior_std=0.4))
     params = agent.init(KEY, env)
     params = {**params, "actor": jax.tree.map(lambda x: 20.0 * x, params["actor"])}
     inputs = jax.random.normal(jax.random.key(1), (50, 6))
     wide = agent.distribution(env, params, inputs)
-    narrow = agent.distribution(env, {**params, "log_std": params["log_std"] - jnp.array([0.0, 0.5])}, inputs)
+    narrow = agent.distribution(
+        env, {**params, "log_std": params["log_std"] - jnp.array([0.0, 0.5])}, inputs
+    )
     np.testing.assert_array_equal(wide.mode(), narrow.mode())
     assert isinstance(wide, Categorical)
     assert isinstance(narrow, Categorical)
@@ -87,11 +105,15 @@ def test_the_critic_sees_the_totals_in_any_order_and_the_actor_does_not() -> Non
     totals = {term.name: jnp.array(float(i)) for i, term in enumerate(env.reward)}
     np.testing.assert_array_equal(blind.critic_inputs(inputs, totals), inputs)
     seen = seeing.critic_inputs(inputs, totals)
-    np.testing.assert_array_equal(seen, seeing.critic_inputs(inputs, dict(reversed(totals.items()))))
+    np.testing.assert_array_equal(
+        seen, seeing.critic_inputs(inputs, dict(reversed(totals.items())))
+    )
     np.testing.assert_array_equal(np.sort(seen[6:]), np.arange(len(env.reward)))
     shapes = jax.tree.map(jnp.shape, [normalise(agent).init(KEY, env) for agent in (blind, seeing)])
     assert shapes[0]["actor"] == shapes[1]["actor"]
-    assert shapes[1]["critic"][0]["kernel"][0] == shapes[0]["critic"][0]["kernel"][0] + len(env.reward)
+    assert shapes[1]["critic"][0]["kernel"][0] == shapes[0]["critic"][0]["kernel"][0] + len(
+        env.reward
+    )
 
 
 def test_networks_of_many_seeds_are_orthogonalised_one_by_one_with_the_same_numbers() -> None:
@@ -114,7 +136,9 @@ def test_networks_of_many_seeds_are_orthogonalised_one_by_one_with_the_same_numb
 def _inner(jaxpr: Any) -> Iterator[Any]:
     yield jaxpr
     for equation in jaxpr.eqns:
-        for value in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")):
+        for value in jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda x: hasattr(x, "eqns")
+        ):
             inner = getattr(value, "jaxpr", value)
             if hasattr(inner, "eqns"):
                 yield from _inner(inner)

@@ -17,7 +17,9 @@ def recorded(env: jaxsafe.Environment, steps: int) -> Any:
     key = jax.random.key(0)
     position, start = jax.jit(begin_recording, static_argnums=2)(env, key, 1)
     _, later = jax.jit(record_steps, static_argnums=(1, 4))(env, policy, key, position, steps)
-    return jax.tree.map(lambda x, y: np.concatenate([np.asarray(x), np.asarray(y)[:, 0]]), start, later)
+    return jax.tree.map(
+        lambda x, y: np.concatenate([np.asarray(x), np.asarray(y)[:, 0]]), start, later
+    )
 
 
 @pytest.mark.parametrize(("task", "maps"), [("docking2d_oriented", 1), ("rejoin3d", 2)])
@@ -41,7 +43,9 @@ def test_a_scene_shows_the_agent_where_it_is(task: str, maps: int) -> None:
 def test_names_and_titles_are_drawn_letter_by_letter() -> None:
     env = jaxsafe.make("docking2d")
     regions = tuple(region.replace(name="$\\frac{$") for region in env.regions)
-    status = tuple(one.replace(region="$\\frac{$") if hasattr(one, "region") else one for one in env.status)
+    status = tuple(
+        one.replace(region="$\\frac{$") if hasattr(one, "region") else one for one in env.status
+    )
     constraints = tuple(one.replace(name="_$\\frac{$") for one in env.constraints)
     env = jaxsafe.config.build(env.replace(regions=regions, status=status, constraints=constraints))
     states, timesteps = recorded(env, 2)

@@ -15,7 +15,8 @@ def imports(tree: ast.Module) -> Iterator[str]:
     skipped = {
         id(inner)
         for node in ast.walk(tree)
-        if isinstance(node, ast.If) and ("TYPE_CHECKING" in ast.dump(node.test) or "__main__" in ast.dump(node.test))
+        if isinstance(node, ast.If)
+        and ("TYPE_CHECKING" in ast.dump(node.test) or "__main__" in ast.dump(node.test))
         for inner in ast.walk(node)
     }
     for node in ast.walk(tree):
@@ -35,7 +36,9 @@ def rooms() -> dict[str, set[str]]:
     for file in PACKAGE.rglob("*.py"):
         room = file.relative_to(PACKAGE).with_suffix("").parts[0]
         names = [name.split(".") for name in imports(ast.parse(file.read_text(encoding="utf-8")))]
-        found.setdefault(room, set()).update(name[1] for name in names if name[0] == "jaxsafe" and len(name) > 1)
+        found.setdefault(room, set()).update(
+            name[1] for name in names if name[0] == "jaxsafe" and len(name) > 1
+        )
         found[room].discard(room)
     return {room: others for room, others in found.items() if room != FACE}
 

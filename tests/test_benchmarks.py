@@ -21,12 +21,25 @@ def tables(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_the_tables_of_the_pages_are_current(tables: ModuleType) -> None:
-    stale = [str(page) for page, text in tables.pages().items() if text != page.read_text(encoding="utf-8")]
+    stale = [
+        str(page)
+        for page, text in tables.pages().items()
+        if text != page.read_text(encoding="utf-8")
+    ]
     assert stale == [], "run benchmarks/tables.py"
 
 
 def test_another_result_makes_another_table(tables: ModuleType) -> None:
-    rows = [{"task": "docking2d", "num_envs": 64, "lane": 200, "seed": 2048, "predicted": 2**20, "measured": 3 * 2**20}]
+    rows = [
+        {
+            "task": "docking2d",
+            "num_envs": 64,
+            "lane": 200,
+            "seed": 2048,
+            "predicted": 2**20,
+            "measured": 3 * 2**20,
+        }
+    ]
     assert tables.memory({"num_steps": 32, "runs": rows}).splitlines() == [
         "| predicted / measured | an environment | a seed without them | 64 × 32 |",
         "|---|---|---|---|",
@@ -34,9 +47,16 @@ def test_another_result_makes_another_table(tables: ModuleType) -> None:
     ]
 
 
-def test_a_page_without_the_table_is_named(tables: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tables, "TABLES", [("memory", lambda _: "| a | b |\n|---|---|", "docs/scaling.md")])
-    with pytest.raises(ValueError, match=r"docs/scaling.md: found 0 tables that begin with \| a \| b \|; expected one"):
+def test_a_page_without_the_table_is_named(
+    tables: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        tables, "TABLES", [("memory", lambda _: "| a | b |\n|---|---|", "docs/scaling.md")]
+    )
+    with pytest.raises(
+        ValueError,
+        match=r"docs/scaling.md: found 0 tables that begin with \| a \| b \|; expected one",
+    ):
         tables.pages()
 
 
@@ -50,7 +70,9 @@ def test_a_page_without_the_table_is_named(tables: ModuleType, monkeypatch: pyte
         ([12345.0], 20_000, False, "**12,345**"),
     ],
 )
-def test_a_missed_goal_is_bold(tables: ModuleType, values: list[float], goal: float, most: bool, text: str) -> None:
+def test_a_missed_goal_is_bold(
+    tables: ModuleType, values: list[float], goal: float, most: bool, text: str
+) -> None:
     assert tables._reached(values, goal, most) == text
 
 
@@ -69,16 +91,30 @@ def test_the_accelerator_script_measures_and_says_what_it_skips(
     accelerator: ModuleType, tables: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "accelerator.json"
-    words = ["minutes=3", "parts=environments", "tasks=docking2d", "sizes=1,8", "repeats=1", f"out={out}"]
+    words = [
+        "minutes=3",
+        "parts=environments",
+        "tasks=docking2d",
+        "sizes=1,8",
+        "repeats=1",
+        f"out={out}",
+    ]
     monkeypatch.setattr(sys, "argv", ["accelerator.py", *words])
     accelerator.main()
     content = json.loads(out.read_text())
     found = content["parts"]["environments"]
-    measured = {row["environments"]: row["steps_per_s"] for row in found["rows"] if row["task"] == "docking2d"}
+    measured = {
+        row["environments"]: row["steps_per_s"]
+        for row in found["rows"]
+        if row["task"] == "docking2d"
+    }
     assert set(measured) == {1, 8}
     assert all(rate > 0 for rate in measured.values())
     assert all("Pendulum" in reason for reason in found["skipped"])
-    assert any(line.startswith("| docking2d |") for line in tables.accelerator_environments(content).splitlines())
+    assert any(
+        line.startswith("| docking2d |")
+        for line in tables.accelerator_environments(content).splitlines()
+    )
 
 
 def test_what_the_accelerator_script_has_no_time_for_is_named(
@@ -86,7 +122,9 @@ def test_what_the_accelerator_script_has_no_time_for_is_named(
 ) -> None:
     out = tmp_path / "accelerator.json"
     monkeypatch.setattr(accelerator, "GRACE", 0.0)
-    monkeypatch.setattr(sys, "argv", ["accelerator.py", "minutes=0", "parts=learning", f"out={out}"])
+    monkeypatch.setattr(
+        sys, "argv", ["accelerator.py", "minutes=0", "parts=learning", f"out={out}"]
+    )
     accelerator.main()
     assert json.loads(out.read_text())["parts"]["learning"] == {
         "seconds": pytest.approx(0.0, abs=30.0),

@@ -56,10 +56,20 @@ def test_episodes_may_be_cut(brax: Any) -> None:
     assert state.done.tolist() == state.info["truncation"].tolist() == [1.0, 1.0]
 
 
-FACTS = ("cost", "success", "reward_success", "reward_failure", "reward_distance_change", "sum_reward", "length")
+FACTS = (
+    "cost",
+    "success",
+    "reward_success",
+    "reward_failure",
+    "reward_distance_change",
+    "sum_reward",
+    "length",
+)
 
 
-def flown(brax: Any, action_repeat: int, start: Any, episode_length: int = 1000) -> tuple[Any, dict[str, float]]:
+def flown(
+    brax: Any, action_repeat: int, start: Any, episode_length: int = 1000
+) -> tuple[Any, dict[str, float]]:
     """The last state of an episode that drifts from a start, and the sums over it by Brax's count and by ours."""
     env = brax.wrap(brax.BraxEnv("docking2d"), episode_length, action_repeat)
     state = env.reset(jax.random.split(jax.random.PRNGKey(0), 1))
@@ -87,20 +97,40 @@ def flown(brax: Any, action_repeat: int, start: Any, episode_length: int = 1000)
 @pytest.mark.parametrize(
     ("start", "episode_length", "reward", "cost", "steps"),
     [
-        pytest.param({"position": [0.7, 0.0], "velocity": [-0.1, 0.0]}, 1000, 2.0, 0.0, 3.0, id="docked"),
-        pytest.param({"position": [3.1, 0.0], "velocity": [-0.6, 0.0]}, 1000, -1.0, 5.0, 5.0, id="crashed"),
-        pytest.param({"position": [80.0, 0.0], "velocity": [-0.6, 0.0]}, 3, 0.0, 3.0, 3.0, id="cut"),
+        pytest.param(
+            {"position": [0.7, 0.0], "velocity": [-0.1, 0.0]}, 1000, 2.0, 0.0, 3.0, id="docked"
+        ),
+        pytest.param(
+            {"position": [3.1, 0.0], "velocity": [-0.6, 0.0]}, 1000, -1.0, 5.0, 5.0, id="crashed"
+        ),
+        pytest.param(
+            {"position": [80.0, 0.0], "velocity": [-0.6, 0.0]}, 3, 0.0, 3.0, 3.0, id="cut"
+        ),
     ],
 )
 def test_nothing_counts_after_an_episode_ends_inside_a_repeated_action(
-    brax: Any, action_repeat: int, start: Any, episode_length: int, reward: float, cost: float, steps: float
+    brax: Any,
+    action_repeat: int,
+    start: Any,
+    episode_length: int,
+    reward: float,
+    cost: float,
+    steps: float,
 ) -> None:
     state, facts = flown(brax, action_repeat, start, episode_length)
     once, expected = flown(brax, 1, start, episode_length)
     assert facts == pytest.approx(expected, abs=1e-6)
-    assert (facts["sum_reward"], facts["cost"], facts["length"]) == (pytest.approx(reward, abs=0.1), cost, steps)
+    assert (facts["sum_reward"], facts["cost"], facts["length"]) == (
+        pytest.approx(reward, abs=0.1),
+        cost,
+        steps,
+    )
     assert state.done.tolist() == once.done.tolist() == [1.0]
-    assert state.info["truncation"].tolist() == once.info["truncation"].tolist() == [float(episode_length == 3)]
+    assert (
+        state.info["truncation"].tolist()
+        == once.info["truncation"].tolist()
+        == [float(episode_length == 3)]
+    )
 
 
 @pytest.mark.parametrize("action_repeat", [1, 3])
@@ -118,7 +148,9 @@ def test_a_return_has_a_gradient(brax: Any) -> None:
     start = env.reset(jax.random.key(0))
 
     def total(action: jax.Array) -> jax.Array:
-        return jax.lax.scan(lambda s, _: ((n := env.step(s, action)), n.reward), start, None, length=20)[1].sum()
+        return jax.lax.scan(
+            lambda s, _: ((n := env.step(s, action)), n.reward), start, None, length=20
+        )[1].sum()
 
     gradient = jax.grad(total)(jnp.array([0.1, 0.1]))
     assert np.isfinite(gradient).all()
@@ -129,7 +161,10 @@ def test_mistakes_are_named(brax: Any) -> None:
     with pytest.raises(ConfigError, match="actions: Brax's agents need continuous actions"):
         brax.BraxEnv("docking2d", actions="discrete")
     physical = {"wingman.controller.actuators.acceleration.rescale": False}
-    with pytest.raises(ConfigError, match=r"actuator acceleration: Brax's agents act in \[-1, 1\], found \[-96.5, 96.5\]"):
+    with pytest.raises(
+        ConfigError,
+        match=r"actuator acceleration: Brax's agents act in \[-1, 1\], found \[-96.5, 96.5\]",
+    ):
         brax.BraxEnv("rejoin2d", physical)
     with pytest.raises(ConfigError, match="action_repeat: expected a whole number ≥ 1, found 0"):
         brax.wrap(brax.BraxEnv("docking2d"), action_repeat=0)

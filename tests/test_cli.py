@@ -34,7 +34,9 @@ from jaxsafe.tune import lanes
 
 
 @pytest.fixture
-def fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
+def fails(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> Callable[..., str]:
     """Run a command in an empty directory; it must leave with code 2 and one line on standard error, which is returned."""
     monkeypatch.chdir(tmp_path)
 
@@ -100,21 +102,30 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
         (["env=docking3d", "out=/proc/nowhere"], "out: cannot write /proc/nowhere"),
     ],
 )  # fmt: skip
-def test_bad_options_of_train_are_told_in_one_line(fails: Callable[..., str], words: list[str], message: str) -> None:
+def test_bad_options_of_train_are_told_in_one_line(
+    fails: Callable[..., str], words: list[str], message: str
+) -> None:
     assert message in fails(train, *words)
     assert list(Path.cwd().rglob("*")) == []  # and nothing was begun
 
 
 def test_numbers_in_exponent_form_are_numbers(fails: Callable[..., str]) -> None:
     assert "found -1000000" in fails(train, "env=docking3d", "steps=-1e6")
-    assert "steps: expected a whole number ≥ 1, found 0.0003" in fails(train, "env=docking3d", "steps=3e-4")
+    assert "steps: expected a whole number ≥ 1, found 0.0003" in fails(
+        train, "env=docking3d", "steps=3e-4"
+    )
 
 
-def test_a_directory_that_holds_something_is_never_overwritten(fails: Callable[..., str], tmp_path: Path) -> None:
+def test_a_directory_that_holds_something_is_never_overwritten(
+    fails: Callable[..., str], tmp_path: Path
+) -> None:
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.yaml").write_text("precious")
     message = fails(train, "env=docking3d", "out=run")
-    assert "out: run already holds something and is never overwritten; continue it with resume=run" in message
+    assert (
+        "out: run already holds something and is never overwritten; continue it with resume=run"
+        in message
+    )
     assert (tmp_path / "run" / "config.yaml").read_text() == "precious"
 
 
@@ -135,14 +146,18 @@ def test_what_fails_before_anything_comes_of_it_leaves_no_directory(
 
 
 @pytest.mark.skipif(os.sep != "/", reason="there a backslash is a slash")
-def test_a_directory_that_checkpoints_would_not_find_is_refused(fails: Callable[..., str], tmp_path: Path) -> None:
+def test_a_directory_that_checkpoints_would_not_find_is_refused(
+    fails: Callable[..., str], tmp_path: Path
+) -> None:
     assert r"out: expected a path without \, which checkpoints take for /, found a\b" in fails(
         train, "env=docking2d", r"out=a\b"
     )
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_unwritable_output_is_told_in_one_line(fails: Callable[..., str], tmp_path: Path) -> None:
+def test_an_unwritable_output_is_told_in_one_line(
+    fails: Callable[..., str], tmp_path: Path
+) -> None:
     (tmp_path / "file").write_text("")
     assert "out: cannot write" in fails(train, "env=docking3d", "out=file/run")
 
@@ -153,45 +168,67 @@ def test_an_unwritable_output_is_told_in_one_line(fails: Callable[..., str], tmp
         ([], "run: missing"),
         (["run=runs/x"], "run: no run in 'runs/x'"),
         (["run=runs/x", "episodes=0"], "episodes: expected a whole number ≥ 1, found 0"),
-        (["run=runs/x", "deterministic=maybe"], "deterministic: expected true or false, found 'maybe'"),
+        (
+            ["run=runs/x", "deterministic=maybe"],
+            "deterministic: expected true or false, found 'maybe'",
+        ),
         (["run=pretrained/x"], "policy: 'pretrained/x' is no .npz file and not pretrained"),
         (["run=x.npz"], "x.npz: cannot be read: No such file or directory"),
         (["run=runs/x", "render=mp4"], "render: found 'mp4'; choose from gif"),
         (["run=runs/x", "episods=5"], "episods: unknown option; choose from"),
     ],
 )
-def test_bad_options_of_evaluate_are_told_in_one_line(fails: Callable[..., str], words: list[str], message: str) -> None:
+def test_bad_options_of_evaluate_are_told_in_one_line(
+    fails: Callable[..., str], words: list[str], message: str
+) -> None:
     assert message in fails(evaluate, *(words or ["seed=1"]))
 
 
 def test_bad_options_of_plot_are_told_in_one_line(fails: Callable[..., str]) -> None:
     assert "run: no run in 'x'" in fails(plot, "run=x")
-    assert "x: unknown axis 'stps'; choose from steps, wall. Did you mean 'steps'?" in fails(plot, "run=x", "x=stps")
+    assert "x: unknown axis 'stps'; choose from steps, wall. Did you mean 'steps'?" in fails(
+        plot, "run=x", "x=stps"
+    )
 
 
 def test_bad_options_of_config_are_told_in_one_line(fails: Callable[..., str]) -> None:
     assert "Did you mean 'docking2d'?" in fails(config, "docking2")
 
 
-def test_a_stranger_s_run_imports_nothing_where_that_is_refused(fails: Callable[..., str], tmp_path: Path) -> None:
+def test_a_stranger_s_run_imports_nothing_where_that_is_refused(
+    fails: Callable[..., str], tmp_path: Path
+) -> None:
     run = tmp_path / "run"
     run.mkdir()
     (tmp_path / "evil_of_cli.py").write_text("open('ran', 'w')")
     content = {"env": "docking2d", "training": {}, "environment": {"imports": ["evil_of_cli"]}}
     (run / "config.yaml").write_text(yaml12.write(content))
-    for module, words in ((train, ["resume=run"]), (evaluate, ["run=run"]), (plot, ["run=run"]), (export, ["run=run"])):
-        assert "whose code would run; imports=false refuses that" in fails(module, *words, "imports=false")
+    for module, words in (
+        (train, ["resume=run"]),
+        (evaluate, ["run=run"]),
+        (plot, ["run=run"]),
+        (export, ["run=run"]),
+    ):
+        assert "whose code would run; imports=false refuses that" in fails(
+            module, *words, "imports=false"
+        )
     assert not (tmp_path / "ran").exists()
     assert "imports: expected true or false, found 'no'" in fails(plot, "run=run", "imports=no")
 
 
-def test_a_broken_run_configuration_is_told_in_one_line(fails: Callable[..., str], tmp_path: Path) -> None:
+def test_a_broken_run_configuration_is_told_in_one_line(
+    fails: Callable[..., str], tmp_path: Path
+) -> None:
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "config.yaml").write_text("env: docking2d\ntraining: {sedes: 3}\nenvironment: {}\n")
+    (tmp_path / "run" / "config.yaml").write_text(
+        "env: docking2d\ntraining: {sedes: 3}\nenvironment: {}\n"
+    )
     assert "config.yaml: training: unknown field 'sedes'" in fails(evaluate, "run=run")
     (tmp_path / "run" / "config.yaml").write_text("env: [\n")
     assert "not valid YAML" in fails(train, "resume=run")
-    (tmp_path / "run" / "config.yaml").write_text("env: !!python/object/apply:os.system ['touch hacked']\n")
+    (tmp_path / "run" / "config.yaml").write_text(
+        "env: !!python/object/apply:os.system ['touch hacked']\n"
+    )
     assert "not valid YAML" in fails(train, "resume=run")
     assert not (tmp_path / "hacked").exists()
 
@@ -215,7 +252,12 @@ def test_policy_files_cannot_run_code_and_broken_ones_are_told_in_one_line(tmp_p
         read_policy(tmp_path / "none.npz")
 
 
-def rewritten(source: Path, target: Path, change: Callable[[dict], object], compression: int = zipfile.ZIP_STORED) -> Path:
+def rewritten(
+    source: Path,
+    target: Path,
+    change: Callable[[dict], object],
+    compression: int = zipfile.ZIP_STORED,
+) -> Path:
     """A policy file with another header."""
     with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", compression) as new:
         for name in old.namelist():
@@ -233,12 +275,27 @@ def rewritten(source: Path, target: Path, change: Callable[[dict], object], comp
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda header: header.update(seed="x"), "header: seed: expected a whole number ≥ 0, found 'x'"),
-        (lambda header: header.update(step=None), "header: step: expected a whole number ≥ 0, found None"),
+        (
+            lambda header: header.update(seed="x"),
+            "header: seed: expected a whole number ≥ 0, found 'x'",
+        ),
+        (
+            lambda header: header.update(step=None),
+            "header: step: expected a whole number ≥ 0, found None",
+        ),
         (lambda header: header.update(env=[1]), r"header: env: expected text, found \[1\]"),
-        (lambda header: header["agent"].update(hidden=[1e30]), r"agent\.hidden\.\[0\]: expected .*, found 1e\+30"),
-        (lambda header: header["agent"].update(hidden=[8] * 10**4), "agent.hidden: expected at most 64 layers"),
-        (lambda header: header["agent"].update(hidden=[9]), r"expected numbers of shape \(9,\), found float32 of shape"),
+        (
+            lambda header: header["agent"].update(hidden=[1e30]),
+            r"agent\.hidden\.\[0\]: expected .*, found 1e\+30",
+        ),
+        (
+            lambda header: header["agent"].update(hidden=[8] * 10**4),
+            "agent.hidden: expected at most 64 layers",
+        ),
+        (
+            lambda header: header["agent"].update(hidden=[9]),
+            r"expected numbers of shape \(9,\), found float32 of shape",
+        ),
         (lambda header: header["agent"].update(log_std=[0.0] * 7), "agent"),
         (lambda header: "[" * 10**5, "not a policy file"),
         (lambda header: "null", "expected format 'jaxsafe policy 1'"),
@@ -253,7 +310,9 @@ def test_the_header_of_a_policy_file_is_checked(
     assert "\n" not in str(caught.value)
 
 
-def test_a_damaged_policy_file_is_told_and_what_is_not_asked_for_is_not_read(tmp_path: Path, whole: Path) -> None:
+def test_a_damaged_policy_file_is_told_and_what_is_not_asked_for_is_not_read(
+    tmp_path: Path, whole: Path
+) -> None:
     source, path, draw = whole / "policy" / "seed_0.npz", tmp_path / "x.npz", random.Random(0)
     expected = read_policy(source)
     rewritten(source, path, lambda header: None, zipfile.ZIP_DEFLATED)
@@ -272,7 +331,10 @@ def test_a_damaged_policy_file_is_told_and_what_is_not_asked_for_is_not_read(tmp
     with pytest.raises(ConfigError, match="not a policy file"):
         read_policy(path)
     path.write_bytes(content)
-    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as file, file.open("more.npy", "w", force_zip64=True) as more:
+    with (
+        zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as file,
+        file.open("more.npy", "w", force_zip64=True) as more,
+    ):
         for _ in range(64):
             more.write(bytes(2**20))
     tracemalloc.start()
@@ -281,12 +343,20 @@ def test_a_damaged_policy_file_is_told_and_what_is_not_asked_for_is_not_read(tmp
     tracemalloc.stop()
 
 
-def test_a_package_without_its_files_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_without_its_files_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(policy_module, "_PRETRAINED", tmp_path / "x.zip" / "pretrained")
-    with pytest.raises(ConfigError, match=r"policy: no policies in .*x\.zip.*; install the package unpacked"):
+    with pytest.raises(
+        ConfigError, match=r"policy: no policies in .*x\.zip.*; install the package unpacked"
+    ):
         read_policy(policy_module.find_policy("docking2d"))
-    monkeypatch.setattr(config_module, "__file__", str(tmp_path / "x.zip" / "jaxsafe" / "train" / "config.py"))
-    with pytest.raises(ConfigError, match=r"preset: no recipes in .*x\.zip.*; install the package unpacked"):
+    monkeypatch.setattr(
+        config_module, "__file__", str(tmp_path / "x.zip" / "jaxsafe" / "train" / "config.py")
+    )
+    with pytest.raises(
+        ConfigError, match=r"preset: no recipes in .*x\.zip.*; install the package unpacked"
+    ):
         config_module.recipe("docking2d", None)
 
 
@@ -296,7 +366,10 @@ def test_a_path_may_begin_with_the_home_directory(monkeypatch: pytest.MonkeyPatc
     assert arguments.options == {
         "out": "/home/me/x", "run": ["/home/me/a", "b/~", "./~"], "env": "/home/me/mine.yaml", "rta": "~x",
     }  # fmt: skip
-    with pytest.raises(ConfigError, match=r"^resume: no home directory for '~nobody-of-that-name/x'; write \./~nobody"):
+    with pytest.raises(
+        ConfigError,
+        match=r"^resume: no home directory for '~nobody-of-that-name/x'; write \./~nobody",
+    ):
         Arguments.parse(["resume=~nobody-of-that-name/x"])
 
 
@@ -307,7 +380,9 @@ def test_columns_of_a_table_never_touch() -> None:
 
 
 @pytest.mark.parametrize("module", ["train", "evaluate", "plot", "config"])
-def test_help_names_the_options(module: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_help_names_the_options(
+    module: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     command = {"train": train, "evaluate": evaluate, "plot": plot, "config": config}[module]
     monkeypatch.setattr(sys, "argv", ["jaxsafe", "--help"])
     with pytest.raises(SystemExit) as exit_info:
@@ -325,20 +400,30 @@ def test_import_draws_in_only_what_the_core_needs() -> None:
 
 def test_a_platform_of_jax_that_is_not_there_is_told_in_one_line() -> None:
     command = [sys.executable, "-m", "jaxsafe.config", "docking2d"]
-    found = subprocess.run(command, env={**os.environ, "JAX_PLATFORMS": "rocm"}, capture_output=True, text=True)
+    found = subprocess.run(
+        command, env={**os.environ, "JAX_PLATFORMS": "rocm"}, capture_output=True, text=True
+    )
     assert (found.returncode, found.stdout) == (2, "")
-    assert found.stderr == "error: JAX_PLATFORMS: no device of 'rocm' can be used here; leave it out, or choose cpu\n"
+    assert (
+        found.stderr
+        == "error: JAX_PLATFORMS: no device of 'rocm' can be used here; leave it out, or choose cpu\n"
+    )
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="ulimit -v means something on Linux")
 @pytest.mark.parametrize("kilobytes", [400_000, 1_500_000])
 @pytest.mark.parametrize(
-    "command", ["train env=docking2d", "evaluate run=pretrained/docking2d", "rta.falsify env=docking2d"]
+    "command",
+    ["train env=docking2d", "evaluate run=pretrained/docking2d", "rta.falsify env=docking2d"],
 )
-def test_too_little_address_space_is_told_in_one_line(command: str, kilobytes: int, tmp_path: Path) -> None:
+def test_too_little_address_space_is_told_in_one_line(
+    command: str, kilobytes: int, tmp_path: Path
+) -> None:
     script = f"ulimit -v {kilobytes}; exec {sys.executable} -m jaxsafe.{command}"
     environment = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parent.parent)}
-    found = subprocess.run(["bash", "-c", script], env=environment, cwd=tmp_path, capture_output=True, text=True)
+    found = subprocess.run(
+        ["bash", "-c", script], env=environment, cwd=tmp_path, capture_output=True, text=True
+    )
     assert (found.returncode, found.stdout) == (2, "")
     assert found.stderr == (
         f"error: memory is short: ulimit -v leaves {kilobytes / 2**20:.1f} GiB of address space, a command needs 2.0 GiB\n"
@@ -367,7 +452,9 @@ def test_memory_that_is_short_is_told_in_one_line(
     assert capsys.readouterr().err == f"error: memory is short: {str(error) or 'MemoryError'}\n"
 
 
-def test_an_error_that_has_to_do_with_something_else_is_raised(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_that_has_to_do_with_something_else_is_raised(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def main(argv: Sequence[str]) -> int:
         raise ImportError("No module named 'mine'")
 
@@ -378,9 +465,18 @@ def test_an_error_that_has_to_do_with_something_else_is_raised(monkeypatch: pyte
 
 
 def test_paths_are_taken_as_typed() -> None:
-    words = ["out=my run #3", "run=a: b", "resume='x'", "runs=true", "policies=007", "env=my # task.yaml"]
+    words = [
+        "out=my run #3",
+        "run=a: b",
+        "resume='x'",
+        "runs=true",
+        "policies=007",
+        "env=my # task.yaml",
+    ]
     arguments = Arguments.parse(words)
-    assert [arguments.pop_text(word.partition("=")[0]) for word in words] == [word.partition("=")[2] for word in words]
+    assert [arguments.pop_text(word.partition("=")[0]) for word in words] == [
+        word.partition("=")[2] for word in words
+    ]
     assert Arguments.parse(["run=[2024.10, 007, true]"]).pop("run") == ["2024.10", "007", "true"]
     assert Arguments.parse(["out="]).pop("out", "") is None
 
@@ -433,6 +529,8 @@ def test_a_warning_is_one_line_and_the_command_goes_on(
         cli.run(config.main, config.usage)
     captured = capsys.readouterr()
     assert exit_info.value.code == 0
-    assert captured.err.startswith("warning: terminal.timeout.limit changes alone: reward.success.time_scale, which was")
+    assert captured.err.startswith(
+        "warning: terminal.timeout.limit changes alone: reward.success.time_scale, which was"
+    )
     assert captured.err.count("\n") == 1
     assert "limit: 50.0" in captured.out

@@ -15,8 +15,13 @@ from jaxsafe.simulation.clock import later, reached
 from jaxsafe.simulation.scripted import Schedule
 from jaxsafe.types import Sim
 
-USUAL = [Decimal(hundredths) / 100 for hundredths in (1, 2, 3, 4, 5, 10, 15, 20, 25, 30, 40, 60, 70, 75, 90, 100, 150, 500)]
-COUNTS = np.array([1, 2, 3, 5, 7, 10, 25, 50, 99, 100, 333, 1000, 1500, 3000, 9999, 100_000, 1_000_000])
+USUAL = [
+    Decimal(hundredths) / 100
+    for hundredths in (1, 2, 3, 4, 5, 10, 15, 20, 25, 30, 40, 60, 70, 75, 90, 100, 150, 500)
+]
+COUNTS = np.array(
+    [1, 2, 3, 5, 7, 10, 25, 50, 99, 100, 333, 1000, 1500, 3000, 9999, 100_000, 1_000_000]
+)
 
 
 def at(time: Any) -> Sim:
@@ -26,14 +31,19 @@ def at(time: Any) -> Sim:
 @pytest.mark.parametrize("dt", USUAL, ids=str)
 def test_a_limit_of_whole_steps_is_met_on_that_step(dt: Decimal) -> None:
     limits = jnp.asarray([float(dt * int(count)) for count in COUNTS], jnp.float32)
-    times = {offset: jnp.float32(float(dt)) * (COUNTS + offset).astype(np.float32) for offset in (-1, 0, 1)}
+    times = {
+        offset: jnp.float32(float(dt)) * (COUNTS + offset).astype(np.float32)
+        for offset in (-1, 0, 1)
+    }
     assert not later(times[0], limits).any()
     assert later(times[1], limits).all()
     assert reached(times[0], limits).all()
     assert not reached(times[-1], limits).any()
 
 
-@pytest.mark.parametrize(("dt", "seconds", "steps"), [(0.3, 15.0, 50), (0.6, 30.0, 50), (0.02, 0.2, 10), (0.1, 0.7, 7)])
+@pytest.mark.parametrize(
+    ("dt", "seconds", "steps"), [(0.3, 15.0, 50), (0.6, 30.0, 50), (0.02, 0.2, 10), (0.1, 0.7, 7)]
+)
 def test_timeouts_holds_and_schedules_count_steps(dt: float, seconds: float, steps: int) -> None:
     timeout = normalise(Timeout(name="timeout", limit=seconds))
     held = normalise(Held(name="held", time="held", duration=seconds))

@@ -106,22 +106,34 @@ def test_a_range_may_leave_out_zero_alone() -> None:
     assert -2.0 not in Range(-1.0, 1.0, nonzero=True)
 
 
-@pytest.mark.parametrize("value", [3, -2.0, [1.0], [1, -2, 3], (4.0, 5.0), np.arange(1.0, 4.0), jnp.ones(2)])
+@pytest.mark.parametrize(
+    "value", [3, -2.0, [1.0], [1, -2, 3], (4.0, 5.0), np.arange(1.0, 4.0), jnp.ones(2)]
+)
 def test_a_unit_of_any_length_takes_a_number_or_a_list(value: Any) -> None:
     read = to_value(value, fields(Whole)["scale"], "scale")
     assert read.dtype == jnp.float32
     np.testing.assert_array_equal(read, np.asarray(value, np.float32))
 
 
-@pytest.mark.parametrize("value", [0, [1.0, 0.0], [[1.0]], [True], ["a"], None, float("nan"), [1.0, None]])
+@pytest.mark.parametrize(
+    "value", [0, [1.0, 0.0], [[1.0]], [True], ["a"], None, float("nan"), [1.0, None]]
+)
 def test_a_unit_of_any_length_refuses_zeros_tables_and_words(value: Any) -> None:
-    with pytest.raises(ConfigError, match=r"^scale: expected a number or a list of numbers in m other than 0, found "):
+    with pytest.raises(
+        ConfigError,
+        match=r"^scale: expected a number or a list of numbers in m other than 0, found ",
+    ):
         to_value(value, fields(Whole)["scale"], "scale")
 
 
 @pytest.mark.parametrize(
     ("length", "words"),
-    [(None, "a number"), (2, "a list [low, high]"), (0, "a list of numbers"), (ANY, "a number or a list of numbers")],
+    [
+        (None, "a number"),
+        (2, "a list [low, high]"),
+        (0, "a list of numbers"),
+        (ANY, "a number or a list of numbers"),
+    ],
 )
 def test_a_field_says_in_words_what_it_takes(length: int | None, words: str) -> None:
     field = dataclasses.replace(fields(Whole)["scale"], unit=Unit("ft", length), range=None)
@@ -129,8 +141,17 @@ def test_a_field_says_in_words_what_it_takes(length: int | None, words: str) -> 
 
 
 def test_numbers_are_the_leaves(whole: Whole) -> None:
-    leaves = {jax.tree_util.keystr(path): leaf for path, leaf in jax.tree_util.tree_leaves_with_path(whole)}
-    expected = {".length": 1.0, ".table['a']": 1.0, ".table['b']": 2.0, ".part.size": 1.0, ".parts[0].size": 3.0}
+    leaves = {
+        jax.tree_util.keystr(path): leaf
+        for path, leaf in jax.tree_util.tree_leaves_with_path(whole)
+    }
+    expected = {
+        ".length": 1.0,
+        ".table['a']": 1.0,
+        ".table['b']": 2.0,
+        ".part.size": 1.0,
+        ".parts[0].size": 3.0,
+    }
     expected |= {".parts[1].size": 4.0, ".parts[1].extra": 2.0, ".scale": 1.0}
     assert set(leaves) == {*expected, ".interval"}
     assert all(leaves[path] == value for path, value in expected.items())
@@ -234,7 +255,9 @@ def test_a_class_never_runs_the_program_compiled_for_another() -> None:
         return type(f"Numbered{index}", (Part,), {"value": value})
 
     value = jax.jit(lambda part: part.value())
-    assert [float(value(normalise(make_class(index)(name="x", size=0.0)))) for index in range(30)] == list(range(30))
+    assert [
+        float(value(normalise(make_class(index)(name="x", size=0.0)))) for index in range(30)
+    ] == list(range(30))
 
 
 def test_vmap_over_a_leaf_gives_a_batch_of_components() -> None:
@@ -260,9 +283,13 @@ def test_a_component_has_no_problem_unless_it_says_so(whole: Whole) -> None:
     assert Ordered(name="x", size=2.0).problem() is None
 
 
-def define(base: type[Component], name: str, type_name: str, module: str = __name__) -> type[Component]:
+def define(
+    base: type[Component], name: str, type_name: str, module: str = __name__
+) -> type[Component]:
     """Define a subclass as a module of that name would."""
-    return types.new_class(name, (base,), {"type": type_name}, lambda body: body.update(__module__=module))
+    return types.new_class(
+        name, (base,), {"type": type_name}, lambda body: body.update(__module__=module)
+    )
 
 
 @pytest.fixture
@@ -274,7 +301,10 @@ def kind() -> type[Component]:
 
 
 def test_a_taken_type_name_is_refused_and_both_classes_are_named(kind: type[Component]) -> None:
-    with pytest.raises(ConfigError, match=r"^type 'taken' of elsewhere\.Mine: taken by .*\.Taken; choose another name$"):
+    with pytest.raises(
+        ConfigError,
+        match=r"^type 'taken' of elsewhere\.Mine: taken by .*\.Taken; choose another name$",
+    ):
         define(kind, "Mine", "taken", module="elsewhere")
     with pytest.raises(ConfigError, match="taken by"):
         define(kind, "Other", "taken")
@@ -282,7 +312,9 @@ def test_a_taken_type_name_is_refused_and_both_classes_are_named(kind: type[Comp
         define(kind, "Taken", "taken", module="elsewhere")
 
 
-def test_a_taken_type_name_is_refused_below_another_class_of_the_kind(kind: type[Component]) -> None:
+def test_a_taken_type_name_is_refused_below_another_class_of_the_kind(
+    kind: type[Component],
+) -> None:
     named = define(kind, "Named", "named")
     before = choices(kind)
     with pytest.raises(ConfigError, match="taken by") as caught:
@@ -291,7 +323,9 @@ def test_a_taken_type_name_is_refused_below_another_class_of_the_kind(kind: type
     del caught
 
 
-def test_a_taken_type_name_is_refused_below_an_unnamed_class_of_the_kind(kind: type[Component]) -> None:
+def test_a_taken_type_name_is_refused_below_an_unnamed_class_of_the_kind(
+    kind: type[Component],
+) -> None:
     middle = types.new_class("Middle", (kind,))
     with pytest.raises(ConfigError, match="taken by"):
         define(middle, "Mine", "taken")
@@ -327,7 +361,13 @@ def test_mappings_are_sorted_by_name_when_a_component_is_built() -> None:
 
 def test_a_range_says_which_magnitudes_single_precision_can_compute_with() -> None:
     mass = Range(0.0, open_low=True, smallest=1e-3, largest=1e6)
-    assert [mass.carries(value) for value in (0.0, 1e-4, 1e-3, -1e6, 2e6)] == [True, False, True, True, False]
+    assert [mass.carries(value) for value in (0.0, 1e-4, 1e-3, -1e6, 2e6)] == [
+        True,
+        False,
+        True,
+        True,
+        False,
+    ]
     assert mass.magnitudes == "of a magnitude from 0.001 to 1e+06"
     assert Range(largest=10_000).magnitudes == "of a magnitude up to 10,000"
     assert Range(smallest=0.5).magnitudes == "of a magnitude from 0.5 on"
@@ -338,23 +378,45 @@ def test_a_range_says_which_magnitudes_single_precision_can_compute_with() -> No
 @pytest.mark.parametrize(
     ("annotation", "value", "message"),
     [
-        (Annotated[Any, Unit("m")], float("inf"), "^x: expected a number in m that is finite, found inf$"),
-        (Annotated[Any, Unit("m")], 1e39, "^x: expected a number in m that is finite, found 1e[+]39$"),
+        (
+            Annotated[Any, Unit("m")],
+            float("inf"),
+            "^x: expected a number in m that is finite, found inf$",
+        ),
+        (
+            Annotated[Any, Unit("m")],
+            1e39,
+            "^x: expected a number in m that is finite, found 1e[+]39$",
+        ),
         (Annotated[Any, Unit("m", length=0)], [1.0, -1e39], "that is finite"),
-        (Annotated[Any, Unit("m"), Range(largest=5.0)], -6, "^x: expected a number in m of a magnitude up to 5, found -6$"),
-        (Annotated[Any, Unit("m"), Range(0.0, smallest=2.0)], 1, "in m ≥ 0 of a magnitude from 2 on, found 1$"),
+        (
+            Annotated[Any, Unit("m"), Range(largest=5.0)],
+            -6,
+            "^x: expected a number in m of a magnitude up to 5, found -6$",
+        ),
+        (
+            Annotated[Any, Unit("m"), Range(0.0, smallest=2.0)],
+            1,
+            "in m ≥ 0 of a magnitude from 2 on, found 1$",
+        ),
         (Annotated[Any, Unit("m"), Range(infinite=True)], 1e39, "that is finite, found 1e[+]39$"),
         (
             Annotated[Any, Unit("m", length=2), Range(infinite=True)],
             [np.inf, np.inf],
             "low < high where a bound is infinite",
         ),
-        (Annotated[int, Range(1, largest=9)], 10, "^x: expected a whole number ≥ 1 of a magnitude up to 9, found 10$"),
+        (
+            Annotated[int, Range(1, largest=9)],
+            10,
+            "^x: expected a whole number ≥ 1 of a magnitude up to 9, found 10$",
+        ),
         (Annotated[int, Range(1, largest=9)], 1e300, "found 1e[+]300$"),
         (Annotated[int, Range(1, largest=9)], 10**4000, "found a number of thousands of digits$"),
     ],
 )
-def test_a_number_that_single_precision_cannot_hold_is_refused(annotation: Any, value: Any, message: str) -> None:
+def test_a_number_that_single_precision_cannot_hold_is_refused(
+    annotation: Any, value: Any, message: str
+) -> None:
     with pytest.raises(ConfigError, match=message):
         to_value(value, field("x", annotation), "x")
 

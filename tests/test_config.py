@@ -85,25 +85,36 @@ def mappings(tree: Any) -> Iterator[dict[str, Any]]:
     """Every mapping in plain data."""
     if isinstance(tree, dict):
         yield tree
-    for inner in tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ():
+    for inner in (
+        tree.values() if isinstance(tree, dict) else tree if isinstance(tree, list) else ()
+    ):
         yield from mappings(inner)
 
 
 # What is written reads back
 
 
-@pytest.mark.parametrize(("actions", "variant"), [("continuous", "paper"), ("discrete", "released")])
+@pytest.mark.parametrize(
+    ("actions", "variant"), [("continuous", "paper"), ("discrete", "released")]
+)
 @pytest.mark.parametrize("task", TASKS)
 def test_loading_a_dump_gives_the_same_environment(task: str, actions: Any, variant: Any) -> None:
     env = jaxsafe.make(task, actions=actions, variant=variant)
     again = load(dump(env))
     assert again == env
     assert dump(again) == dump(env)
-    assert jax.tree.map(lambda leaf: leaf.dtype, again) == jax.tree.map(lambda leaf: leaf.dtype, env)
+    assert jax.tree.map(lambda leaf: leaf.dtype, again) == jax.tree.map(
+        lambda leaf: leaf.dtype, env
+    )
 
 
 def test_loading_a_dump_keeps_overrides_and_awkward_numbers(env: Environment) -> None:
-    changes = {"deputy.mass": 1 / 3, "reward.delta_v.scale": -1e-30, "terminal.distance.limit": 1e30, "dt": 7.0e-5}
+    changes = {
+        "deputy.mass": 1 / 3,
+        "reward.delta_v.scale": -1e-30,
+        "terminal.distance.limit": 1e30,
+        "dt": 7.0e-5,
+    }
     changes |= {"observation.position.clip": [-1, 1], "terminal.timeout.ends": "truncated"}
     changed = jaxsafe.override(env, changes)
     assert load(dump(changed)) == changed
@@ -122,7 +133,9 @@ def test_a_dump_holds_shortest_decimals(env: Environment) -> None:
     assert "scale: -0.01" in dump(env)
 
 
-def test_an_environment_is_read_from_a_file_and_then_overridden(env: Environment, tmp_path: Path) -> None:
+def test_an_environment_is_read_from_a_file_and_then_overridden(
+    env: Environment, tmp_path: Path
+) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text(dump(env))
     assert load(path) == env
@@ -142,7 +155,9 @@ def test_a_component_of_the_user_is_usable_from_yaml(tree: dict[str, Any]) -> No
     tree["observation"].append({"type": "observe_status", "name": "energy", "status": "energy"})
     env = load(write(tree))
     assert load(dump(env)) == env
-    _, timestep = jaxsafe.reset_to(env, {"deputy": {"position": [100.0, 0.0], "velocity": [0.3, 0.4]}})
+    _, timestep = jaxsafe.reset_to(
+        env, {"deputy": {"position": [100.0, 0.0], "velocity": [0.3, 0.4]}}
+    )
     assert timestep.info.status["energy"] == pytest.approx(0.25)
     assert timestep.observation[-1] == pytest.approx(0.25)
 
@@ -187,7 +202,9 @@ def test_overrides_reach_fields_of_fields_of_lists_and_of_mappings(env: Environm
 
 
 def test_an_override_with_the_value_it_has_changes_nothing(env: Environment) -> None:
-    assert jaxsafe.override(env, {"deputy.mass": 12, "reward.delta_v.scale": np.float64(-0.01)}) == env
+    assert (
+        jaxsafe.override(env, {"deputy.mass": 12, "reward.delta_v.scale": np.float64(-0.01)}) == env
+    )
     assert jaxsafe.override(env, {}) == env
 
 
@@ -204,7 +221,9 @@ def test_a_list_of_names_keeps_those_parts_in_that_order(env: Environment) -> No
 def test_a_component_is_taken_as_it_is_written(env: Environment) -> None:
     written = Failure(name="failure", values={"crash": -1, "distance": -2.0})
     read = {"type": "failure", "name": "failure", "values": {"crash": -1, "distance": -2.0}}
-    as_component, as_data = (jaxsafe.override(env, {"reward": [*env.reward[:4], one]}) for one in (written, read))
+    as_component, as_data = (
+        jaxsafe.override(env, {"reward": [*env.reward[:4], one]}) for one in (written, read)
+    )
     assert as_component == as_data
     assert {type(leaf) for leaf in jax.tree.leaves(as_component)} == {type(env.dt)}
 
@@ -217,18 +236,36 @@ def test_a_component_with_a_problem_is_refused_in_one_line(env: Environment) -> 
 
 
 def test_make_with_overrides_is_override_of_make(env: Environment) -> None:
-    assert jaxsafe.make("docking2d", {"deputy.mass": 9}) == jaxsafe.override(env, {"deputy.mass": 9})
+    assert jaxsafe.make("docking2d", {"deputy.mass": 9}) == jaxsafe.override(
+        env, {"deputy.mass": 9}
+    )
 
 
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        ("reward.delta_v.scal", 1, r"reward\.delta_v\.scal: unknown field 'scal'.* Did you mean 'scale'\?"),
-        ("reward.delta.scale", 1, r"reward\.delta: unknown name 'delta'.*success.* Did you mean 'delta_v'\?"),
+        (
+            "reward.delta_v.scal",
+            1,
+            r"reward\.delta_v\.scal: unknown field 'scal'.* Did you mean 'scale'\?",
+        ),
+        (
+            "reward.delta.scale",
+            1,
+            r"reward\.delta: unknown name 'delta'.*success.* Did you mean 'delta_v'\?",
+        ),
         ("rewards.delta_v.scale", 1, r"rewards: unknown field 'rewards'.* Did you mean 'reward'\?"),
         ("deputi.mass", 1, r"deputi: unknown field 'deputi'.* Did you mean 'deputy'\?"),
-        ("deputy.start.positon.distance", 1, r"deputy\.start\.positon: unknown name.* Did you mean 'position'\?"),
-        ("reward.failure.values.crsh", 1, r"reward\.failure\.values: unknown name 'crsh'.* Did you mean 'crash'\?"),
+        (
+            "deputy.start.positon.distance",
+            1,
+            r"deputy\.start\.positon: unknown name.* Did you mean 'position'\?",
+        ),
+        (
+            "reward.failure.values.crsh",
+            1,
+            r"reward\.failure\.values: unknown name 'crsh'.* Did you mean 'crash'\?",
+        ),
         ("", 1, r"unknown field ''; choose from agent"),
         ("reward..scale", 1, r"reward: unknown name ''"),
         ("agent.x", 1, r"agent\.x: agent has no fields"),
@@ -248,31 +285,107 @@ def test_make_with_overrides_is_override_of_make(env: Environment) -> None:
         ("deputy.mass", [1.0], r"deputy\.mass: expected a number .*, found \[1\.0\]"),
         ("deputy.mass", {"kg": 12}, r"deputy\.mass: expected a number .*, found \{'kg': 12\}"),
         ("deputy.mass", 1j, r"deputy\.mass: expected a number .*, found 1j"),
-        ("deputy.start.position.distance", [3, 1], r"distance: expected low ≤ high, found \[3, 1\]"),
-        ("deputy.start.position.distance", [1, 2, 3], r"expected a list \[low, high\] in m or ft ≥ 0, found \[1, 2, 3\]"),
-        ("deputy.start.position.distance", [-1, 1], r"expected a list \[low, high\] in m or ft ≥ 0, found \[-1, 1\]"),
-        ("deputy.start.position.distance", [False, True], r"expected a list \[low, high\].*found \[False, True\]"),
-        ("deputy.start.position.distance", ["1", "2"], r"expected a list \[low, high\].*found \['1', '2'\]"),
-        ("deputy.start.position.distance", 3, r"expected a list \[low, high\] in m or ft ≥ 0, found 3"),
+        (
+            "deputy.start.position.distance",
+            [3, 1],
+            r"distance: expected low ≤ high, found \[3, 1\]",
+        ),
+        (
+            "deputy.start.position.distance",
+            [1, 2, 3],
+            r"expected a list \[low, high\] in m or ft ≥ 0, found \[1, 2, 3\]",
+        ),
+        (
+            "deputy.start.position.distance",
+            [-1, 1],
+            r"expected a list \[low, high\] in m or ft ≥ 0, found \[-1, 1\]",
+        ),
+        (
+            "deputy.start.position.distance",
+            [False, True],
+            r"expected a list \[low, high\].*found \[False, True\]",
+        ),
+        (
+            "deputy.start.position.distance",
+            ["1", "2"],
+            r"expected a list \[low, high\].*found \['1', '2'\]",
+        ),
+        (
+            "deputy.start.position.distance",
+            3,
+            r"expected a list \[low, high\] in m or ft ≥ 0, found 3",
+        ),
         ("deputy.controller.actuators.thrust_x.points", 1, r"expected a whole number ≥ 2, found 1"),
-        ("deputy.controller.actuators.thrust_x.points", 3.5, r"expected a whole number ≥ 2, found 3\.5"),
-        ("deputy.controller.actuators.thrust_x.points", True, r"expected a whole number ≥ 2, found True"),
+        (
+            "deputy.controller.actuators.thrust_x.points",
+            3.5,
+            r"expected a whole number ≥ 2, found 3\.5",
+        ),
+        (
+            "deputy.controller.actuators.thrust_x.points",
+            True,
+            r"expected a whole number ≥ 2, found True",
+        ),
         ("deputy.controller.actuators.thrust_x.rescale", 1, r"expected true or false, found 1"),
-        ("deputy.controller.actuators.thrust_x.low", 2, r"thrust_x: expected low ≤ high, found 2 and 1"),
+        (
+            "deputy.controller.actuators.thrust_x.low",
+            2,
+            r"thrust_x: expected low ≤ high, found 2 and 1",
+        ),
         ("deputy.dimension", 4, r"deputy\.dimension: expected a whole number in \[2, 3\], found 4"),
-        ("terminal.timeout.ends", "truncate", r"ends: found 'truncate'; choose from .* Did you mean 'truncated'\?"),
+        (
+            "terminal.timeout.ends",
+            "truncate",
+            r"ends: found 'truncate'; choose from .* Did you mean 'truncated'\?",
+        ),
         ("status.delta_v.norm", "l3", r"norm: found 'l3'; choose from l1, l2"),
-        ("status.speed.of", "chef", r"status\.speed\.of: nothing is called 'chef'.* Did you mean 'chief'\?"),
-        ("reward.failure.values", {"crsh": -1}, r"nothing is called 'crsh'.* Did you mean 'crash'\?"),
-        ("reward.velocity_constraint.bound", None, r"nothing is called 'velocity'; choose from success, crash"),
-        ("reward.success.outcome", "sucess", r"nothing is called 'sucess'.* Did you mean 'success'\?"),
+        (
+            "status.speed.of",
+            "chef",
+            r"status\.speed\.of: nothing is called 'chef'.* Did you mean 'chief'\?",
+        ),
+        (
+            "reward.failure.values",
+            {"crsh": -1},
+            r"nothing is called 'crsh'.* Did you mean 'crash'\?",
+        ),
+        (
+            "reward.velocity_constraint.bound",
+            None,
+            r"nothing is called 'velocity'; choose from success, crash",
+        ),
+        (
+            "reward.success.outcome",
+            "sucess",
+            r"nothing is called 'sucess'.* Did you mean 'success'\?",
+        ),
         ("reward.delta_v.name", "success", r"reward: the name 'success' stands twice"),
-        ("observation", ["position", "velocty"], r"observation\.velocty: unknown name.* Did you mean 'velocity'\?"),
+        (
+            "observation",
+            ["position", "velocty"],
+            r"observation\.velocty: unknown name.* Did you mean 'velocity'\?",
+        ),
         ("observation", ["position", "position"], r"observation: the name 'position' stands twice"),
-        ("observation", ["position", 3], r"observation\.\[0\]: expected a mapping of fields, found 'position'"),
-        ("status", ["speed"], r"velocity_limit: nothing is called 'velocity_limit'; choose from speed"),
-        ("deputy.start", ["positon"], r"deputy\.start\.positon: unknown name.* Did you mean 'position'\?"),
-        ("deputy.controller", {"type": "uncontrolled"}, r"agent: 'deputy' cannot be the agent: its controller takes no"),
+        (
+            "observation",
+            ["position", 3],
+            r"observation\.\[0\]: expected a mapping of fields, found 'position'",
+        ),
+        (
+            "status",
+            ["speed"],
+            r"velocity_limit: nothing is called 'velocity_limit'; choose from speed",
+        ),
+        (
+            "deputy.start",
+            ["positon"],
+            r"deputy\.start\.positon: unknown name.* Did you mean 'position'\?",
+        ),
+        (
+            "deputy.controller",
+            {"type": "uncontrolled"},
+            r"agent: 'deputy' cannot be the agent: its controller takes no",
+        ),
         ("agent", "chief", r"agent: 'chief' cannot be the agent: its controller takes no actions"),
     ],
 )
@@ -283,17 +396,37 @@ def test_a_bad_override_is_refused(env: Environment, path: str, value: Any, mess
 @pytest.mark.parametrize(
     ("path", "make_value", "message"),
     [
-        ("deputy.mass", lambda w: jnp.stack([w, w]), r"deputy\.mass: expected a number .*an array of shape \(2,\)"),
-        ("deputy.start.position.distance", lambda w: w, r"expected a list \[low, high\].*an array of shape \(\)"),
-        ("deputy.controller.actuators.thrust_x.points", lambda w: w, r"points: expected a whole number"),
-        ("status.delta_v.norm", lambda w: w, r"norm: found an array of shape \(\); choose from l1, l2"),
+        (
+            "deputy.mass",
+            lambda w: jnp.stack([w, w]),
+            r"deputy\.mass: expected a number .*an array of shape \(2,\)",
+        ),
+        (
+            "deputy.start.position.distance",
+            lambda w: w,
+            r"expected a list \[low, high\].*an array of shape \(\)",
+        ),
+        (
+            "deputy.controller.actuators.thrust_x.points",
+            lambda w: w,
+            r"points: expected a whole number",
+        ),
+        (
+            "status.delta_v.norm",
+            lambda w: w,
+            r"norm: found an array of shape \(\); choose from l1, l2",
+        ),
         ("agent", lambda w: w, r"agent: expected a name"),
         ("deputy.mas", lambda w: w, r"unknown field 'mas'"),
     ],
 )
-def test_a_misplaced_traced_value_is_refused(env: Environment, path: str, make_value: Any, message: str) -> None:
+def test_a_misplaced_traced_value_is_refused(
+    env: Environment, path: str, make_value: Any, message: str
+) -> None:
     def act() -> Any:
-        return jax.eval_shape(lambda w: jaxsafe.override(env, {path: make_value(w)}), jnp.float32(1.0))
+        return jax.eval_shape(
+            lambda w: jaxsafe.override(env, {path: make_value(w)}), jnp.float32(1.0)
+        )
 
     assert re.search(message, fault(act))
 
@@ -303,8 +436,13 @@ def test_overrides_take_traced_values(env: Environment) -> None:
     batch = jax.vmap(lambda mass: jaxsafe.override(env, {"deputy.mass": mass}))(masses)
     assert batch.agent_platform.mass.tolist() == masses.tolist()
     low = {"deputy.controller.actuators.thrust_x.low": jnp.float32(-2.0)}
-    assert jax.jit(lambda: jaxsafe.override(env, low))().agent_platform.controller.actuators[0].low == -2.0
-    slope = jax.grad(lambda mass: 3.0 * jaxsafe.override(env, {"deputy.mass": mass}).agent_platform.mass)(12.0)
+    assert (
+        jax.jit(lambda: jaxsafe.override(env, low))().agent_platform.controller.actuators[0].low
+        == -2.0
+    )
+    slope = jax.grad(
+        lambda mass: 3.0 * jaxsafe.override(env, {"deputy.mass": mass}).agent_platform.mass
+    )(12.0)
     assert slope == 3.0
 
 
@@ -314,26 +452,68 @@ def test_overrides_take_traced_values(env: Environment) -> None:
 @pytest.mark.parametrize(
     ("act", "message"),
     [
-        (lambda: jaxsafe.make("docking2"), r"env: unknown task 'docking2'.* Did you mean 'docking2d'\?"),
-        (lambda: jaxsafe.make(""), r"env: unknown task ''.*; choose from rejoin2d, rejoin3d, docking2d"),
-        (lambda: jaxsafe.make("docking2d", actions="discret"), r"actions: unknown kind.* Did you mean 'discrete'\?"),
-        (lambda: jaxsafe.make("no_such_file.yaml"), r"no_such_file\.yaml: cannot be read: No such file"),
-        (lambda: jaxsafe.make("docking2d", {"deputy.mas": 1}), r"deputy\.mas: .* Did you mean 'mass'\?"),
+        (
+            lambda: jaxsafe.make("docking2"),
+            r"env: unknown task 'docking2'.* Did you mean 'docking2d'\?",
+        ),
+        (
+            lambda: jaxsafe.make(""),
+            r"env: unknown task ''.*; choose from rejoin2d, rejoin3d, docking2d",
+        ),
+        (
+            lambda: jaxsafe.make("docking2d", actions="discret"),
+            r"actions: unknown kind.* Did you mean 'discrete'\?",
+        ),
+        (
+            lambda: jaxsafe.make("no_such_file.yaml"),
+            r"no_such_file\.yaml: cannot be read: No such file",
+        ),
+        (
+            lambda: jaxsafe.make("docking2d", {"deputy.mas": 1}),
+            r"deputy\.mas: .* Did you mean 'mass'\?",
+        ),
         (lambda: jaxsafe.make(3), r"env: expected the name of a task or a \.yaml file, found 3"),  # type: ignore[arg-type]
         (lambda: jaxsafe.make("docking2d", ["deputy.mass=1"]), r"override"),  # type: ignore[arg-type]
-        (lambda: jaxsafe.make("docking2d", variant="releasd"), r"variant: unknown variant.* Did you mean 'released'\?"),
-        (lambda: jaxsafe.make("docking2d", randomize={"deputy.mas": [1, 2]}), r"randomize: deputy\.mas: .* 'mass'\?"),
-        (lambda: jaxsafe.make("docking2d", randomize={"deputi.mass": [1, 2]}), r"randomize: deputi: .* 'deputy'\?"),
-        (lambda: jaxsafe.make("docking2d", randomize={"deputy.mass": [2, 1]}), r"deputy\.mass: expected low ≤ high"),
-        (lambda: jaxsafe.make("docking2d", randomize={"deputy.mass": [-1, 1]}), r"randomize: deputy\.mass: .* > 0, found"),
-        (lambda: jaxsafe.make("docking2d", randomize={"deputy.mass": 3}), r"deputy\.mass: expected a list \[low, high\]"),
+        (
+            lambda: jaxsafe.make("docking2d", variant="releasd"),
+            r"variant: unknown variant.* Did you mean 'released'\?",
+        ),
+        (
+            lambda: jaxsafe.make("docking2d", randomize={"deputy.mas": [1, 2]}),
+            r"randomize: deputy\.mas: .* 'mass'\?",
+        ),
+        (
+            lambda: jaxsafe.make("docking2d", randomize={"deputi.mass": [1, 2]}),
+            r"randomize: deputi: .* 'deputy'\?",
+        ),
+        (
+            lambda: jaxsafe.make("docking2d", randomize={"deputy.mass": [2, 1]}),
+            r"deputy\.mass: expected low ≤ high",
+        ),
+        (
+            lambda: jaxsafe.make("docking2d", randomize={"deputy.mass": [-1, 1]}),
+            r"randomize: deputy\.mass: .* > 0, found",
+        ),
+        (
+            lambda: jaxsafe.make("docking2d", randomize={"deputy.mass": 3}),
+            r"deputy\.mass: expected a list \[low, high\]",
+        ),
         (
             lambda: jaxsafe.make("docking2d", randomize={"deputy.name": [1, 2]}),
             r"randomize: deputy\.name: expected the path",
         ),
-        (lambda: jaxsafe.make("docking2d", randomize={"randomize.dt": [1, 2]}), r"randomize\.randomize\.dt: expected the"),
-        (lambda: jaxsafe.make("docking2d", randomize={"deputy.start.position.distance": [1, 2]}), r"list \[low, high\]"),
-        (lambda: jaxsafe.make("docking2d", randomize=3), r"randomize: expected paths with values, found 3"),
+        (
+            lambda: jaxsafe.make("docking2d", randomize={"randomize.dt": [1, 2]}),
+            r"randomize\.randomize\.dt: expected the",
+        ),
+        (
+            lambda: jaxsafe.make("docking2d", randomize={"deputy.start.position.distance": [1, 2]}),
+            r"list \[low, high\]",
+        ),
+        (
+            lambda: jaxsafe.make("docking2d", randomize=3),
+            r"randomize: expected paths with values, found 3",
+        ),
     ],
 )
 def test_make_refuses_what_it_does_not_know(act: Callable[[], Any], message: str) -> None:
@@ -345,7 +525,9 @@ def test_a_variant_is_for_a_task_by_name(env: Environment, tmp_path: Path) -> No
     path.write_text(dump(env))
     for variant in ("paper", "released"):
         message = fault(lambda variant=variant: jaxsafe.make(path, variant=variant))
-        assert message.startswith(f"variant: {path} says itself what it is; a variant is for rejoin2d")
+        assert message.startswith(
+            f"variant: {path} says itself what it is; a variant is for rejoin2d"
+        )
     assert "Did you mean 'released'?" in fault(lambda: jaxsafe.make(path, variant="releasd"))  # type: ignore[arg-type]
 
 
@@ -360,7 +542,9 @@ def test_every_misspelt_field_is_refused_with_the_right_one(task: str) -> None:
     for mapping, key in places:
         before = dict(mapping)
         mapping.clear()
-        mapping.update({f"{name}x" if name == key else name: value for name, value in before.items()})
+        mapping.update(
+            {f"{name}x" if name == key else name: value for name, value in before.items()}
+        )
         message = fault(lambda: compose(tree))
         mapping.clear()
         mapping.update(before)
@@ -374,7 +558,12 @@ def test_every_misspelt_field_is_refused_with_the_right_one(task: str) -> None:
 @pytest.mark.parametrize("task", TASKS)
 def test_every_misspelt_type_choice_or_reference_is_refused(task: str) -> None:
     tree = parse(dump(jaxsafe.make(task)), task)
-    words = [(mapping, key) for mapping in mappings(tree) for key, value in mapping.items() if isinstance(value, str)]
+    words = [
+        (mapping, key)
+        for mapping in mappings(tree)
+        for key, value in mapping.items()
+        if isinstance(value, str)
+    ]
     words = [(mapping, key) for mapping, key in words if key != "name"]
     assert len(words) > 50
     for mapping, key in words:
@@ -382,7 +571,9 @@ def test_every_misspelt_type_choice_or_reference_is_refused(task: str) -> None:
         mapping[key] = f"{right}x"
         message = fault(lambda: compose(tree))
         mapping[key] = right
-        if key == "outcome" and mapping.get("below"):  # a bound brings its outcome; what refers to it is then wrong
+        if key == "outcome" and mapping.get(
+            "below"
+        ):  # a bound brings its outcome; what refers to it is then wrong
             assert "nothing is called 'velocity'" in message
         else:
             assert f"'{right}x'" in message
@@ -391,9 +582,23 @@ def test_every_misspelt_type_choice_or_reference_is_refused(task: str) -> None:
 
 def test_every_missing_field_without_a_default_is_named(tree: dict[str, Any]) -> None:
     places = [(mapping, key) for mapping in mappings(tree) for key in mapping]
-    required = {(mapping.get("type"), key) for mapping, key in places if refusal_without(tree, mapping, key)}
+    required = {
+        (mapping.get("type"), key) for mapping, key in places if refusal_without(tree, mapping, key)
+    }
     assert required >= {
-        *((None, key) for key in ("agent", "platforms", "terminal", "reward", "observation", "low", "high", "below")),
+        *(
+            (None, key)
+            for key in (
+                "agent",
+                "platforms",
+                "terminal",
+                "reward",
+                "observation",
+                "low",
+                "high",
+                "below",
+            )
+        ),
         *(("spacecraft", key) for key in ("type", "name", "dimension", "controller")),
         *(("at_distance", key) for key in ("type", "name", "about", "distance")),
         *(("circle", key) for key in ("type", "name", "on", "radius")),
@@ -401,7 +606,18 @@ def test_every_missing_field_without_a_default_is_named(tree: dict[str, Any]) ->
         *(("distance_change", key) for key in ("type", "name", "distance", "half_distance")),
         *(("observe", key) for key in ("type", "name", "of", "what")),
     }
-    optional = {"dt", "ends", "points", "scale", "clip", "share", "offset", "mass", "mean_motion", "azimuth"}
+    optional = {
+        "dt",
+        "ends",
+        "points",
+        "scale",
+        "clip",
+        "share",
+        "offset",
+        "mass",
+        "mean_motion",
+        "azimuth",
+    }
     assert optional.isdisjoint(key for _, key in required)
 
 
@@ -422,21 +638,38 @@ def refusal_without(tree: dict[str, Any], mapping: dict[str, Any], key: str) -> 
 def test_a_missing_field_is_named_with_what_it_takes(tree: dict[str, Any]) -> None:
     del tree["status"][3]["floor"]
     message = fault_in(tree)
-    assert message == "status.velocity_limit (velocity_limit): field 'floor' is missing; it takes a number in m/s ≥ 0"
+    assert (
+        message
+        == "status.velocity_limit (velocity_limit): field 'floor' is missing; it takes a number in m/s ≥ 0"
+    )
 
 
-def test_every_number_replaced_by_a_word_a_truth_value_or_nan_is_refused(tree: dict[str, Any]) -> None:
+def test_every_number_replaced_by_a_word_a_truth_value_or_nan_is_refused(
+    tree: dict[str, Any],
+) -> None:
     def is_number(value: Any) -> bool:
         return isinstance(value, (int, float)) and not isinstance(value, bool)
 
     def may_be_a_list(mapping: dict[str, Any], key: str) -> bool:
         return key == "scale" and mapping["type"].startswith("observe")
 
-    numbers = [(mapping, key) for mapping in mappings(tree) for key, value in mapping.items() if is_number(value)]
+    numbers = [
+        (mapping, key)
+        for mapping in mappings(tree)
+        for key, value in mapping.items()
+        if is_number(value)
+    ]
     assert len(numbers) > 30
     for mapping, key in numbers:
         right = mapping[key]
-        for wrong in ("wrong", True, float("nan"), None, [None] if may_be_a_list(mapping, key) else [1.0], {"a": 1.0}):
+        for wrong in (
+            "wrong",
+            True,
+            float("nan"),
+            None,
+            [None] if may_be_a_list(mapping, key) else [1.0],
+            {"a": 1.0},
+        ):
             mapping[key] = wrong
             assert re.search(rf"{key}: expected .*, found ", fault(lambda: compose(tree)))
         mapping[key] = right
@@ -508,7 +741,9 @@ def test_every_number_replaced_by_a_word_a_truth_value_or_nan_is_refused(tree: d
         ("agent", "deputi", r"agent: nothing is called 'deputi'.* Did you mean 'deputy'\?"),
     ],
 )  # fmt: skip
-def test_a_broken_environment_is_refused(tree: dict[str, Any], path: str, value: Any, message: str) -> None:
+def test_a_broken_environment_is_refused(
+    tree: dict[str, Any], path: str, value: Any, message: str
+) -> None:
     assert re.search(message, fault_in(put(tree, path, value)))
 
 
@@ -517,11 +752,16 @@ def test_a_status_may_refer_only_to_earlier_ones(tree: dict[str, Any]) -> None:
     assert "nothing listed before it is called 'docking_distance'" in fault_in(tree)
     tree["status"].reverse()
     tree["platforms"].reverse()
-    assert "platforms.deputy.start.position.about: nothing listed before it is called 'chief'" in fault_in(tree)
+    assert (
+        "platforms.deputy.start.position.about: nothing listed before it is called 'chief'"
+        in fault_in(tree)
+    )
 
 
 def test_the_direction_of_a_spatial_start_needs_a_polar_range() -> None:
-    message = fault(lambda: jaxsafe.make("docking3d", {"deputy.start.velocity.direction.polar": None}))
+    message = fault(
+        lambda: jaxsafe.make("docking3d", {"deputy.start.velocity.direction.polar": None})
+    )
     assert "start.velocity.direction: draws 2 numbers, the platform has 3 dimensions" in message
 
 
@@ -551,10 +791,15 @@ class ChangesShape(Status, type="changes_shape_of_test"):
             r"^memory\.status\.odd: is float32\[2\] after reset and float32\[3\] after a step$",
         ),
         ("dtype", r"status\.odd: is float32\[2\] after reset and int32\[2\] after a step"),
-        ("structure", r"^status\.odd: its memory has another structure after a step than after reset$"),
+        (
+            "structure",
+            r"^status\.odd: its memory has another structure after a step than after reset$",
+        ),
     ],
 )
-def test_a_memory_that_changes_its_form_is_told_with_its_part(tree: dict[str, Any], how: str, message: str) -> None:
+def test_a_memory_that_changes_its_form_is_told_with_its_part(
+    tree: dict[str, Any], how: str, message: str
+) -> None:
     tree["status"].append({"type": "changes_shape_of_test", "name": "odd", "how": how})
     assert re.search(message, fault(lambda: compose(tree)))
 
@@ -581,21 +826,33 @@ CYLINDER = {"type": "cylinder", "name": "docking_region", "on": "chief", "radius
         ("rejoin3d", {"wingman.start.heading.low": [1], "wingman.start.heading.high": [2]}, "platforms.wingman"),
     ],
 )  # fmt: skip
-def test_parts_that_cannot_be_computed_are_told_with_their_place(task: str, changes: dict[str, Any], place: str) -> None:
+def test_parts_that_cannot_be_computed_are_told_with_their_place(
+    task: str, changes: dict[str, Any], place: str
+) -> None:
     assert fault(lambda: jaxsafe.make(task, changes)).startswith(place)
 
 
 def test_a_number_has_no_components_in_a_frame() -> None:
     changes = {"observation.attitude_rate.frame": "deputy"}
-    assert fault(lambda: jaxsafe.make("docking2d_oriented", changes)).startswith("observation.attitude_rate")
+    assert fault(lambda: jaxsafe.make("docking2d_oriented", changes)).startswith(
+        "observation.attitude_rate"
+    )
 
 
 @pytest.mark.parametrize("task", ["rejoin2d"])
 def test_only_the_agent_may_take_actions(task: str) -> None:
     actuators = [{"name": "heading_rate", "low": -0.1, "high": 0.1}]
-    message = fault(lambda: jaxsafe.make(task, {"lead.controller": {"type": "discrete", "actuators": actuators}}))
-    assert message.startswith("platforms.lead.controller (discrete): only the agent takes actions; choose from scripted")
-    assert "cannot be the agent" in fault(lambda: jaxsafe.make(task, {"wingman.controller": {"type": "scripted"}}))
+    message = fault(
+        lambda: jaxsafe.make(
+            task, {"lead.controller": {"type": "discrete", "actuators": actuators}}
+        )
+    )
+    assert message.startswith(
+        "platforms.lead.controller (discrete): only the agent takes actions; choose from scripted"
+    )
+    assert "cannot be the agent" in fault(
+        lambda: jaxsafe.make(task, {"wingman.controller": {"type": "scripted"}})
+    )
     assert "cannot be the agent" in fault(lambda: jaxsafe.make(task, {"agent": "lead"}))
 
 
@@ -646,14 +903,22 @@ def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_components_of_a_user_s_module_are_usable_from_yaml_at_once(tree: dict[str, Any], directory: Path) -> None:
+def test_components_of_a_user_s_module_are_usable_from_yaml_at_once(
+    tree: dict[str, Any], directory: Path
+) -> None:
     (directory / "parts_of_test.py").write_text(MODULE)
     tree["imports"] = ["parts_of_test"]
     tree["status"].append({"type": "half_of_test", "name": "half", "status": "speed"})
     tree["reward"].append({"type": "bonus_of_test", "name": "bonus"})
     tree["observation"].append({"type": "clock_of_test", "name": "clock", "scale": 2.0})
-    tree["terminal"].append({"type": "slow_of_test", "name": "slow", "status": "half", "below": 1e-3})
-    tree["platforms"][1]["start"][0] = {"type": "aside_of_test", "name": "position", "distance": 70.0}
+    tree["terminal"].append(
+        {"type": "slow_of_test", "name": "slow", "status": "half", "below": 1e-3}
+    )
+    tree["platforms"][1]["start"][0] = {
+        "type": "aside_of_test",
+        "name": "position",
+        "distance": 70.0,
+    }
     path = directory / "mine.yaml"
     path.write_text(write(tree))
     env = load(path)
@@ -673,7 +938,9 @@ def test_components_of_a_user_s_module_are_usable_from_yaml_at_once(tree: dict[s
     assert dump(load(text)) == text
     path.write_text(text)
     code = "from jaxsafe.config import dump, load; print(dump(load('mine.yaml')), end='')"
-    fresh = subprocess.run([sys.executable, "-c", code], cwd=directory, check=True, capture_output=True, text=True)
+    fresh = subprocess.run(
+        [sys.executable, "-c", code], cwd=directory, check=True, capture_output=True, text=True
+    )
     assert fresh.stdout == text
 
 
@@ -716,12 +983,17 @@ def test_imports_can_be_refused(tree: dict[str, Any], directory: Path) -> None:
     (directory / "evil_of_test.py").write_text("open('ran', 'w')")
     with imports_allowed(False):
         found = fault_in(tree | {"imports": ["evil_of_test"]})
-        assert re.search(r"imports: names \['evil_of_test'\], whose code would run; imports=false refuses that$", found)
+        assert re.search(
+            r"imports: names \['evil_of_test'\], whose code would run; imports=false refuses that$",
+            found,
+        )
         load(write(tree | {"imports": []}))
     assert not (directory / "ran").exists()
 
 
-def test_an_error_in_the_code_of_a_user_names_its_line(tree: dict[str, Any], directory: Path) -> None:
+def test_an_error_in_the_code_of_a_user_names_its_line(
+    tree: dict[str, Any], directory: Path
+) -> None:
     (directory / "helper_of_test.py").write_text("def divide(x):\n    return x / 'two'\n")
     (directory / "fails_of_test.py").write_text(
         "from helper_of_test import divide\n"
@@ -733,15 +1005,23 @@ def test_an_error_in_the_code_of_a_user_names_its_line(tree: dict[str, Any], dir
         "        return divide(sim.time)\n"
     )
     for name, message in (
-        ("late", r"^status\.late: cannot be computed: TypeError: .* \(helper_of_test\.py, line 2\)$"),
-        ("early", r"^status\.early: cannot be checked: TypeError: .* \(fails_of_test\.py, line 7\)$"),
+        (
+            "late",
+            r"^status\.late: cannot be computed: TypeError: .* \(helper_of_test\.py, line 2\)$",
+        ),
+        (
+            "early",
+            r"^status\.early: cannot be checked: TypeError: .* \(fails_of_test\.py, line 7\)$",
+        ),
     ):
         data = copy.deepcopy(tree) | {"imports": ["fails_of_test"]}
         data["status"].append({"type": "fails_of_test", "name": name})
         assert re.search(message, fault_in(data))
 
 
-def test_a_misspelt_type_of_a_user_s_module_is_refused(tree: dict[str, Any], directory: Path) -> None:
+def test_a_misspelt_type_of_a_user_s_module_is_refused(
+    tree: dict[str, Any], directory: Path
+) -> None:
     text = "from jaxsafe.processors.status import Status\nclass Odd(Status, type='odd_one_of_test'):\n    pass\n"
     (directory / "odd_of_test.py").write_text(text)
     tree["status"].append({"type": "odd_on_of_test", "name": "odd"})
@@ -793,13 +1073,19 @@ def test_scalars_are_read_as_users_expect(text: str, value: Any) -> None:
     assert type(read) is type(value)
 
 
-@pytest.mark.parametrize("value", ["on", "no", "true", "1e6", "010", "", "null", 1e6, 3e-4, 10, True, None, [1, "1"]])
+@pytest.mark.parametrize(
+    "value", ["on", "no", "true", "1e6", "010", "", "null", 1e6, 3e-4, 10, True, None, [1, "1"]]
+)
 def test_plain_data_written_reads_back(value: Any) -> None:
     assert parse(write({"key": value}), "file") == {"key": value}
 
 
 def test_numbers_without_a_point_reach_the_environment(env: Environment) -> None:
-    text = dump(env).replace("mass: 12.0", "mass: 1e6").replace("mean_motion: 0.001027", "mean_motion: 3e-4")
+    text = (
+        dump(env)
+        .replace("mass: 12.0", "mass: 1e6")
+        .replace("mean_motion: 0.001027", "mean_motion: 3e-4")
+    )
     deputy = load(text.replace("points: 11", "points: 010")).agent_platform
     assert (deputy.mass, deputy.mean_motion) == (1e6, np.float32(3e-4))
     assert deputy.controller.actuators[0].points == 10
@@ -808,7 +1094,10 @@ def test_numbers_without_a_point_reach_the_environment(env: Environment) -> None
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("agent: a\nagent: b\n", r"^environment, line \d: not valid YAML: key 'agent' stands twice$"),
+        (
+            "agent: a\nagent: b\n",
+            r"^environment, line \d: not valid YAML: key 'agent' stands twice$",
+        ),
         ("x:\n  - {a: 1, a: 2}\n", r"^environment, line 2: not valid YAML: key 'a' stands twice$"),
         ("agent: [1, 2\n", r"^environment, line \d: not valid YAML: expected"),
         ("agent: 'x\n", r"^environment, line \d: not valid YAML: "),
@@ -842,11 +1131,15 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     assert fault(lambda: load(broken)).startswith(f"{broken}, line 2: not valid YAML: ")
 
 
-@pytest.mark.parametrize("kind", ["apply:os.system", "object/apply:os.system", "object/new:os.system"])
+@pytest.mark.parametrize(
+    "kind", ["apply:os.system", "object/apply:os.system", "object/new:os.system"]
+)
 def test_tags_of_python_are_refused_and_nothing_runs(kind: str, tmp_path: Path) -> None:
     sign = tmp_path / "sign"
     for text in (f'!!python/{kind} ["touch {sign}"]\n', f'dt: !!python/{kind} ["touch {sign}"]\n'):
-        assert "not valid YAML: could not determine a constructor for the tag" in fault(lambda text=text: load(text))
+        assert "not valid YAML: could not determine a constructor for the tag" in fault(
+            lambda text=text: load(text)
+        )
     assert not sign.exists()
 
 
@@ -862,13 +1155,17 @@ def test_tags_of_python_are_refused_and_nothing_runs(kind: str, tmp_path: Path) 
         ("docking2d", "observation.speed.status", "in_docking", None),
     ],
 )
-def test_a_status_of_the_wrong_kind_is_refused(task: str, path: str, status: str, wanted: str | None) -> None:
+def test_a_status_of_the_wrong_kind_is_refused(
+    task: str, path: str, status: str, wanted: str | None
+) -> None:
     env = jaxsafe.make(task)
     if wanted is None:
         jaxsafe.override(env, {path: status})
     else:
         message = fault(lambda: jaxsafe.override(env, {path: status}))
-        assert message == f"{path}: expected a status that is {wanted}, found {status!r}, which is not"
+        assert (
+            message == f"{path}: expected a status that is {wanted}, found {status!r}, which is not"
+        )
 
 
 LAUGHS = "\n".join([f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 13)])
@@ -906,7 +1203,9 @@ def test_yaml_that_is_hard_to_read_is_refused(text: str, message: str) -> None:
 
 
 def test_tags_of_the_core_schema_and_aliases_are_read() -> None:
-    text = "[!!str 12, !!int '12', !!float 12, !!bool 'true', !!null '', !!map {a: !!seq [1]}, ! 12]"
+    text = (
+        "[!!str 12, !!int '12', !!float 12, !!bool 'true', !!null '', !!map {a: !!seq [1]}, ! 12]"
+    )
     assert parse(text, "key") == ["12", 12, 12.0, True, None, {"a": [1]}, 12]
     assert parse("[&a [1, 2], *a, {<<: *a}]", "key") == [[1, 2], [1, 2], {"<<": [1, 2]}]
 
@@ -931,16 +1230,41 @@ def test_a_value_is_shown_by_its_first_letters_however_large_it_is() -> None:
     cyclic.append(cyclic)
     assert show(cyclic) == "[" * 57 + "..."
     assert show(10**5000) == "a number of thousands of digits"
-    for value in ([], (), {}, (1,), (1, [2.5, "x"]), {"a": {"b": None}}, "it's", 10**50, -1.5, True, {1}, "x" * 55):
+    for value in (
+        [],
+        (),
+        {},
+        (1,),
+        (1, [2.5, "x"]),
+        {"a": {"b": None}},
+        "it's",
+        10**50,
+        -1.5,
+        True,
+        {1},
+        "x" * 55,
+    ):
         assert show(value) == repr(value)
 
 
 @pytest.mark.parametrize(
     ("task", "region", "fitting"),
     [
-        ("docking3d", {"type": "circle", "radius": 1}, "3 dimensions; choose from cylinder, sphere$"),
-        ("rejoin3d", {"type": "circle", "radius": 1}, "3 dimensions; choose from cylinder, sphere$"),
-        ("docking2d", {"type": "cylinder", "radius": 1, "height": 1}, "2 dimensions; choose from circle, sphere$"),
+        (
+            "docking3d",
+            {"type": "circle", "radius": 1},
+            "3 dimensions; choose from cylinder, sphere$",
+        ),
+        (
+            "rejoin3d",
+            {"type": "circle", "radius": 1},
+            "3 dimensions; choose from cylinder, sphere$",
+        ),
+        (
+            "docking2d",
+            {"type": "cylinder", "radius": 1, "height": 1},
+            "2 dimensions; choose from circle, sphere$",
+        ),
         ("docking2d", {"type": "sphere", "radius": 1}, None),
         ("docking3d", {"type": "cylinder", "radius": 1, "height": 1}, None),
     ],
@@ -955,7 +1279,8 @@ def test_a_region_is_refused_in_a_space_where_its_name_says_something_else(
     else:
         message = fault(lambda: jaxsafe.override(env, {"regions": regions}))
         assert re.search(
-            rf"^regions\.{env.regions[0].name}: a {region['type']} is no part of a space of {fitting}", message
+            rf"^regions\.{env.regions[0].name}: a {region['type']} is no part of a space of {fitting}",
+            message,
         )
 
 
@@ -985,7 +1310,9 @@ def test_a_region_is_refused_in_a_space_where_its_name_says_something_else(
         ("docking2d_oriented", "deputy.attitude_rate_limits", [1e38, 1e38], "of a magnitude up to 1e[+]06"),
     ],
 )  # fmt: skip
-def test_a_number_from_which_no_finite_state_follows_is_refused(task: str, path: str, value: Any, message: str) -> None:
+def test_a_number_from_which_no_finite_state_follows_is_refused(
+    task: str, path: str, value: Any, message: str
+) -> None:
     found = fault(lambda: jaxsafe.make(task, {path: value}))
     assert path in found
     assert re.search(message, found)
@@ -993,19 +1320,27 @@ def test_a_number_from_which_no_finite_state_follows_is_refused(task: str, path:
 
 def test_a_speed_limit_of_nothing_is_refused() -> None:
     changes = {"status.velocity_limit.floor": 0, "status.velocity_limit.slope": 0}
-    assert fault(lambda: jaxsafe.make("docking2d", changes)).startswith("status.velocity_limit: expected a limit above 0")
+    assert fault(lambda: jaxsafe.make("docking2d", changes)).startswith(
+        "status.velocity_limit: expected a limit above 0"
+    )
     jaxsafe.make("docking2d", {"status.velocity_limit.floor": 0})
 
 
 def test_limits_may_be_infinite_and_read_back(env: Environment) -> None:
-    changes = {"terminal.distance.limit": float("inf"), "observation.position.clip": [-float("inf"), 1.0]}
+    changes = {
+        "terminal.distance.limit": float("inf"),
+        "observation.position.clip": [-float("inf"), 1.0],
+    }
     changed = jaxsafe.override(env, changes)
     assert load(dump(changed)) == changed
 
 
 def test_the_horizon_of_a_filter_has_an_end() -> None:
     message = fault(lambda: jaxsafe.make("docking2d", {"rta.horizon": 1e30}, rta="implicit_asif"))
-    assert message == "rta.horizon: expected a whole number ≥ 0 of a magnitude up to 10,000, found 1e+30"
+    assert (
+        message
+        == "rta.horizon: expected a whole number ≥ 0 of a magnitude up to 10,000, found 1e+30"
+    )
 
 
 # Numbers that belong together
@@ -1044,12 +1379,18 @@ def test_a_number_that_is_changed_without_those_that_follow_from_it_is_told(
         {"terminal.timeout.limit": 6000, "reward.success.time_scale": 6000},
         {"terminal.timeout.limit": 6000, "reward.success.time_scale": 7000},
         {"terminal.timeout.limit": 2000},
-        {"deputy.mean_motion": 0.1, "status.velocity_limit.slope": 0.2, "deputy.start.velocity.slope": 0.2},
+        {
+            "deputy.mean_motion": 0.1,
+            "status.velocity_limit.slope": 0.2,
+            "deputy.start.velocity.slope": 0.2,
+        },
         {"deputy.mass": 10, "randomize": {"deputy.mass": [10, 14]}},
         {"reward": ["velocity_constraint", "failure"]},
     ],
 )
-def test_numbers_that_are_changed_together_or_belong_to_no_other_are_not_told(changes: dict[str, Any]) -> None:
+def test_numbers_that_are_changed_together_or_belong_to_no_other_are_not_told(
+    changes: dict[str, Any],
+) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         jaxsafe.make("docking2d", changes)
@@ -1079,13 +1420,15 @@ def test_a_variant_puts_in_all_in_which_variants_differ(task: str) -> None:
 def test_a_filter_comes_from_a_file(tmp_path: Path) -> None:
     default = jaxsafe.make("docking2d", rta="default")
     (tmp_path / "filter.yaml").write_text(write(to_data(default.rta)))
-    (tmp_path / "env.yaml").write_text(dump(jaxsafe.make("docking3d", {"deputy.mass": 20.0}, rta="default")))
+    (tmp_path / "env.yaml").write_text(
+        dump(jaxsafe.make("docking3d", {"deputy.mass": 20.0}, rta="default"))
+    )
     for name in ("filter", "env"):
         found = jaxsafe.make("docking2d", rta=str(tmp_path / f"{name}.yaml"))
         assert dump(found) == dump(default)
-    assert dump(jaxsafe.make("docking2d", {"rta.margin": 0.01}, rta=str(tmp_path / "filter.yaml"))) == dump(
-        jaxsafe.make("docking2d", {"rta.margin": 0.01}, rta="default")
-    )
+    assert dump(
+        jaxsafe.make("docking2d", {"rta.margin": 0.01}, rta=str(tmp_path / "filter.yaml"))
+    ) == dump(jaxsafe.make("docking2d", {"rta.margin": 0.01}, rta="default"))
 
 
 @pytest.mark.parametrize(
@@ -1097,10 +1440,16 @@ def test_a_filter_comes_from_a_file(tmp_path: Path) -> None:
         ("margin: 0.1", r"rta\.yaml: rta: field 'type' is missing; choose from "),
         ("type: simplx", r"rta\.yaml: rta: unknown type 'simplx'.*Did you mean 'simplex'"),
         ("imports: 3\ntype: simplex", r"rta\.yaml: rta.imports: expected a list of modules"),
-        ("imports: [no_such_module]\ntype: simplex", r"rta\.yaml: rta.imports: cannot import 'no_such_module'"),
+        (
+            "imports: [no_such_module]\ntype: simplex",
+            r"rta\.yaml: rta.imports: cannot import 'no_such_module'",
+        ),
         ("ENV", r"rta: .*rta\.yaml is an environment without a filter"),
         ("platforms: 3", r"rta\.yaml: environment"),
-        ("{type: simplex, constraints: [collision], backups: [{type: brake, name: b}]}", "collision"),
+        (
+            "{type: simplex, constraints: [collision], backups: [{type: brake, name: b}]}",
+            "collision",
+        ),
     ],
 )
 def test_a_file_without_a_filter_is_told(text: str | None, message: str, tmp_path: Path) -> None:
@@ -1113,6 +1462,8 @@ def test_a_file_without_a_filter_is_told(text: str | None, message: str, tmp_pat
 
 
 def test_a_section_of_thousands_of_parts_is_refused_at_once(tree: dict[str, Any]) -> None:
-    tree["status"] += [{"type": "speed", "name": f"speed_{index}", "of": "deputy"} for index in range(1001)]
+    tree["status"] += [
+        {"type": "speed", "name": f"speed_{index}", "of": "deputy"} for index in range(1001)
+    ]
     message = fault(lambda: compose(tree))
     assert message == "status: expected at most 1,000 parts, found 1,007"

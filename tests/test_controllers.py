@@ -20,34 +20,48 @@ def actuator(low: float = -1.0, high: float = 2.0, **options: object) -> Actuato
 
 
 @pytest.mark.parametrize(
-    ("action", "control"), [(-1.0, -1.0), (-0.5, -0.25), (0.0, 0.5), (0.5, 1.25), (1.0, 2.0), (1.5, 2.0), (-7.0, -1.0)]
+    ("action", "control"),
+    [(-1.0, -1.0), (-0.5, -0.25), (0.0, 0.5), (0.5, 1.25), (1.0, 2.0), (1.5, 2.0), (-7.0, -1.0)],
 )
-def test_an_action_is_clipped_and_mapped_affinely_to_the_limits(action: float, control: float) -> None:
+def test_an_action_is_clipped_and_mapped_affinely_to_the_limits(
+    action: float, control: float
+) -> None:
     assert actuator().from_continuous(jnp.float32(action)) == control
 
 
 @pytest.mark.parametrize(
-    ("action", "control"), [(-1.0, -1.0), (-0.5, -0.5), (0.0, 0.0), (0.25, 0.5), (1.0, 2.0), (3.0, 2.0), (-3.0, -1.0)]
+    ("action", "control"),
+    [(-1.0, -1.0), (-0.5, -0.5), (0.0, 0.0), (0.25, 0.5), (1.0, 2.0), (3.0, 2.0), (-3.0, -1.0)],
 )
 def test_a_zero_centred_actuator_leaves_zero_at_zero(action: float, control: float) -> None:
     assert actuator(zero_centred=True).from_continuous(jnp.float32(action)) == control
 
 
-@pytest.mark.parametrize(("action", "control"), [(-3.0, -1.0), (-0.5, -0.5), (0.0, 0.0), (1.5, 1.5), (2.5, 2.0)])
-def test_without_rescaling_an_action_is_physical_and_only_clipped(action: float, control: float) -> None:
+@pytest.mark.parametrize(
+    ("action", "control"), [(-3.0, -1.0), (-0.5, -0.5), (0.0, 0.0), (1.5, 1.5), (2.5, 2.0)]
+)
+def test_without_rescaling_an_action_is_physical_and_only_clipped(
+    action: float, control: float
+) -> None:
     assert actuator(rescale=False).from_continuous(jnp.float32(action)) == control
 
 
 @settings(deadline=None, max_examples=50)
 @given(action=st.floats(-1e6, 1e6), zero_centred=st.booleans(), rescale=st.booleans())
-def test_a_control_never_exceeds_its_limits(action: float, zero_centred: bool, rescale: bool) -> None:
-    control = actuator(-0.17, 96.5, zero_centred=zero_centred, rescale=rescale).from_continuous(jnp.float32(action))
+def test_a_control_never_exceeds_its_limits(
+    action: float, zero_centred: bool, rescale: bool
+) -> None:
+    control = actuator(-0.17, 96.5, zero_centred=zero_centred, rescale=rescale).from_continuous(
+        jnp.float32(action)
+    )
     assert np.float32(-0.17) <= control <= np.float32(96.5)
 
 
 @settings(deadline=None, max_examples=50)
 @given(share=st.floats(0.0, 1.0, width=32), zero_centred=st.booleans(), rescale=st.booleans())
-def test_a_control_leads_back_to_the_action_that_gives_it(share: float, zero_centred: bool, rescale: bool) -> None:
+def test_a_control_leads_back_to_the_action_that_gives_it(
+    share: float, zero_centred: bool, rescale: bool
+) -> None:
     one = actuator(-1.0, 2.0, zero_centred=zero_centred, rescale=rescale)
     control = jnp.float32(-1.0 + 3.0 * share)
     np.testing.assert_allclose(one.from_continuous(one.to_continuous(control)), control, atol=5e-7)
@@ -90,8 +104,14 @@ def test_indices_beyond_the_points_are_clipped() -> None:
 
 
 def test_actions_are_positional_and_controls_are_named() -> None:
-    actuators = (Actuator(name="b", low=0.0, high=1.0, points=3), Actuator(name="a", low=-10.0, high=10.0, points=5))
-    continuous, discrete = normalise(Continuous(actuators=actuators)), normalise(Discrete(actuators=actuators))
+    actuators = (
+        Actuator(name="b", low=0.0, high=1.0, points=3),
+        Actuator(name="a", low=-10.0, high=10.0, points=5),
+    )
+    continuous, discrete = (
+        normalise(Continuous(actuators=actuators)),
+        normalise(Discrete(actuators=actuators)),
+    )
     assert continuous.names == discrete.names == ("b", "a")
     assert continuous.control(jnp.asarray([1.0, 0.5]), SIM) == {"b": 1.0, "a": 5.0}
     assert discrete.control(jnp.asarray([1, 4]), SIM) == {"b": 0.5, "a": 10.0}
@@ -129,23 +149,32 @@ LIMITS = {
 
 
 @pytest.mark.parametrize("task", LIMITS)
-def test_each_task_has_its_actuators_in_order_and_their_points_reach_from_end_to_end(task: str) -> None:
+def test_each_task_has_its_actuators_in_order_and_their_points_reach_from_end_to_end(
+    task: str,
+) -> None:
     continuous, discrete = (jaxsafe.make(task, actions=kind) for kind in ("continuous", "discrete"))
     size = len(LIMITS[task])
     num_points = 5 if task.startswith("rejoin") else 11
     assert continuous.action_names == discrete.action_names == tuple(LIMITS[task])
     assert discrete.num_action_points == (num_points,) * size
     assert continuous.num_action_points == ()
-    ends = {continuous: (-jnp.ones(size), jnp.ones(size)), discrete: (jnp.zeros(size, int), jnp.full(size, num_points - 1))}
+    ends = {
+        continuous: (-jnp.ones(size), jnp.ones(size)),
+        discrete: (jnp.zeros(size, int), jnp.full(size, num_points - 1)),
+    }
     for env, actions in ends.items():
         for index, action in enumerate(actions):
             found = env.agent_platform.controller.control(action, SIM)
             expected = {name: limits[index] for name, limits in LIMITS[task].items()}
-            assert {name: float(value) for name, value in found.items()} == pytest.approx(expected, rel=1e-6)
+            assert {name: float(value) for name, value in found.items()} == pytest.approx(
+                expected, rel=1e-6
+            )
 
 
 @pytest.mark.parametrize("task", LIMITS)
-def test_no_action_in_the_middle_is_no_control_and_the_oriented_thrust_is_zero_centred(task: str) -> None:
+def test_no_action_in_the_middle_is_no_control_and_the_oriented_thrust_is_zero_centred(
+    task: str,
+) -> None:
     env = jaxsafe.make(task)
     found = env.agent_platform.controller.control(jnp.zeros(env.action_size), SIM)
     assert list(found) == list(LIMITS[task])

@@ -50,7 +50,9 @@ def exact_flow(r: np.ndarray, v: np.ndarray, a: np.ndarray, n: float, t: float) 
     return (expm(system(n) * t) @ np.concatenate([r, v, a]))[:6].reshape(2, 3)
 
 
-def exact_flow_by_mean_motion(r: np.ndarray, v: np.ndarray, a: np.ndarray, n: float, t: float) -> np.ndarray:
+def exact_flow_by_mean_motion(
+    r: np.ndarray, v: np.ndarray, a: np.ndarray, n: float, t: float
+) -> np.ndarray:
     """The derivative of `exact_flow` by n: the Fréchet derivative of the exponential along dM/dn."""
     along = system(n + 0.5) - system(n - 0.5)  # M is quadratic in n, so this is dM/dn exactly
     derivative = expm_frechet(system(n) * t, along * t, compute_expm=False)
@@ -77,7 +79,9 @@ def test_the_closed_form_is_the_matrix_exponential(n: float, t: float) -> None:
 def test_the_closed_form_is_smooth_where_the_series_ends(tau: float) -> None:
     r, v, a = random_vectors(seed=2)
     t = tau / MEAN_MOTION
-    for found, expected in zip(flow(r, v, a, MEAN_MOTION, t), exact_flow(r, v, a, MEAN_MOTION, t), strict=True):
+    for found, expected in zip(
+        flow(r, v, a, MEAN_MOTION, t), exact_flow(r, v, a, MEAN_MOTION, t), strict=True
+    ):
         assert_close(found, expected, 1e-11)
 
 
@@ -85,7 +89,9 @@ def test_the_closed_form_is_smooth_where_the_series_ends(tau: float) -> None:
 def test_in_float32_the_error_is_at_most_five_parts_in_ten_million(t: float) -> None:
     for seed in range(20):
         r, v, a = random_vectors(seed)
-        for found, expected in zip(flow(r, v, a, MEAN_MOTION, t), exact_flow(r, v, a, MEAN_MOTION, t), strict=True):
+        for found, expected in zip(
+            flow(r, v, a, MEAN_MOTION, t), exact_flow(r, v, a, MEAN_MOTION, t), strict=True
+        ):
             assert found.dtype == jnp.float32
             assert_close(found, expected, 5e-7)
 
@@ -133,7 +139,10 @@ def test_planar_motion_is_spatial_motion_with_z_zero(t: float) -> None:
     for two, three in zip(planar, spatial, strict=True):
         np.testing.assert_allclose(two, three[:2], rtol=1e-14)
         assert three[2] == 0.0
-    plane, space = acceleration(*(vector[:2] for vector in vectors), MEAN_MOTION), acceleration(*vectors, MEAN_MOTION)
+    plane, space = (
+        acceleration(*(vector[:2] for vector in vectors), MEAN_MOTION),
+        acceleration(*vectors, MEAN_MOTION),
+    )
     np.testing.assert_allclose(plane, space[:2], rtol=1e-14)
     assert space[2] == 0.0
 
@@ -155,7 +164,11 @@ def test_two_flows_in_a_row_are_one(seed: int, first: float, second: float, n: f
 
 
 @settings(deadline=None, max_examples=25)
-@given(seed=st.integers(0, 10_000), t=st.floats(0.0, 2000.0), n=st.sampled_from([0.0, MEAN_MOTION, 0.01]))
+@given(
+    seed=st.integers(0, 10_000),
+    t=st.floats(0.0, 2000.0),
+    n=st.sampled_from([0.0, MEAN_MOTION, 0.01]),
+)
 def test_the_rate_of_the_flow_is_velocity_and_acceleration(seed: int, t: float, n: float) -> None:
     with jax.enable_x64(True):
         r, v, a = random_vectors(seed)
@@ -168,7 +181,9 @@ def test_the_rate_of_the_flow_is_velocity_and_acceleration(seed: int, t: float, 
 def test_the_flow_is_linear_in_state_and_thrust() -> None:
     one, other = random_vectors(seed=6), random_vectors(seed=7)
     both = [2.0 * x - 3.0 * y for x, y in zip(one, other, strict=True)]
-    expected = 2.0 * np.stack(flow(*one, MEAN_MOTION, 50.0)) - 3.0 * np.stack(flow(*other, MEAN_MOTION, 50.0))
+    expected = 2.0 * np.stack(flow(*one, MEAN_MOTION, 50.0)) - 3.0 * np.stack(
+        flow(*other, MEAN_MOTION, 50.0)
+    )
     np.testing.assert_allclose(np.stack(flow(*both, MEAN_MOTION, 50.0)), expected, atol=1e-11)
 
 
@@ -180,9 +195,13 @@ def test_all_derivatives_are_finite(n: float, size: float) -> None:
         assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(jacobians(r, v, a, n, t)))
 
 
-@pytest.mark.parametrize(("n", "t"), [(0.0, 1.0), (1e-6, 1.0), (MEAN_MOTION, 1.0), (MEAN_MOTION, 1000.0), (0.1, 30.0)])
+@pytest.mark.parametrize(
+    ("n", "t"), [(0.0, 1.0), (1e-6, 1.0), (MEAN_MOTION, 1.0), (MEAN_MOTION, 1000.0), (0.1, 30.0)]
+)
 @pytest.mark.usefixtures("x64")
-def test_the_derivative_by_mean_motion_is_that_of_the_matrix_exponential(n: float, t: float) -> None:
+def test_the_derivative_by_mean_motion_is_that_of_the_matrix_exponential(
+    n: float, t: float
+) -> None:
     vectors = random_vectors(seed=9)
     found = np.stack([jacobian[3] for jacobian in jacobians(*vectors, n, t)])
     assert_close(found, exact_flow_by_mean_motion(*vectors, n, t), 1e-9)
@@ -198,10 +217,20 @@ def test_in_float32_the_derivative_by_mean_motion_has_six_digits(t: float) -> No
 def test_a_spacecraft_feels_thrust_over_mass_and_remembers_its_delta_v() -> None:
     actuators = tuple(Actuator(name=f"thrust_{axis}", low=-1.0, high=1.0) for axis in "xyz")
     craft = normalise(
-        Spacecraft(name="deputy", dimension=3, controller=Continuous(actuators=actuators), mass=2.0, mean_motion=0.0)
+        Spacecraft(
+            name="deputy",
+            dimension=3,
+            controller=Continuous(actuators=actuators),
+            mass=2.0,
+            mean_motion=0.0,
+        )
     )
     assert craft.inputs == ("thrust_x", "thrust_y", "thrust_z")
-    controls = {"thrust_z": jnp.float32(6.0), "thrust_x": jnp.float32(2.0), "thrust_y": jnp.float32(4.0)}
+    controls = {
+        "thrust_z": jnp.float32(6.0),
+        "thrust_x": jnp.float32(2.0),
+        "thrust_y": jnp.float32(4.0),
+    }
     state = craft.step(craft.rest(), controls, 0.5)
     np.testing.assert_allclose(state.velocity, [0.5, 1.0, 1.5])
     np.testing.assert_allclose(state.position, [0.125, 0.25, 0.375])

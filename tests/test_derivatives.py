@@ -36,14 +36,19 @@ def starts(task: str, env: jaxsafe.Environment) -> dict[str, dict[str, Any]]:
         drawn = [initializer.name for initializer in env.platform(platform).start]
 
         def vector(value: Any, like: jax.Array) -> jax.Array:
-            return jnp.asarray(value)[: like.size] if np.ndim(value) else jnp.full(like.shape, value)
+            return (
+                jnp.asarray(value)[: like.size] if np.ndim(value) else jnp.full(like.shape, value)
+            )
 
         return {name: vector(given.get(name, 0.0), rest[name]) for name in drawn}
 
     if task.startswith("docking"):
         return {name: {"deputy": full("deputy", **given)} for name, given in DOCKING.items()}
     lead = full("lead", speed=250.0)
-    return {name: {"lead": lead, "wingman": full("wingman", **{"speed": 250.0, **given})} for name, given in REJOIN.items()}
+    return {
+        name: {"lead": lead, "wingman": full("wingman", **{"speed": 250.0, **given})}
+        for name, given in REJOIN.items()
+    }
 
 
 def assert_finite(tree: Any, what: str) -> None:
@@ -60,7 +65,14 @@ def test_an_episode_has_derivatives_wherever_it_may_be(task: str) -> None:
         state, before = jaxsafe.reset_to(env, start)
         _, timestep = jaxsafe.step(env, state, act(jax.random.key(0), before.observation))
         info = timestep.info
-        seen = (before.observation, timestep.observation, timestep.reward, info.margins, info.severity, info.status)
+        seen = (
+            before.observation,
+            timestep.observation,
+            timestep.reward,
+            info.margins,
+            info.severity,
+            info.status,
+        )
         return [leaf.astype(float) for leaf in jax.tree.leaves(seen)]
 
     def total(start: Any) -> jax.Array:
@@ -74,7 +86,12 @@ def test_an_episode_has_derivatives_wherever_it_may_be(task: str) -> None:
 @pytest.mark.parametrize("task", TASKS)
 def test_a_policy_has_a_value_and_a_jacobian_for_every_observation(task: str) -> None:
     policy, size = jaxsafe.load_policy(task), read_policy(find_policy(task)).env.observation_size
-    function = jax.jit(lambda o: (policy(jax.random.key(0), o), jax.jacrev(lambda o: policy(jax.random.key(0), o))(o)))
+    function = jax.jit(
+        lambda o: (
+            policy(jax.random.key(0), o),
+            jax.jacrev(lambda o: policy(jax.random.key(0), o))(o),
+        )
+    )
     for observation in (jnp.zeros(size), jnp.ones(size), *jnp.eye(size)):
         assert_finite(function(observation), task)
 
@@ -125,7 +142,9 @@ def test_a_bad_action_that_became_far_likelier_is_still_made_less_likely(old: fl
     assert float(value) > 1e8
     towards = jax.grad(log_prob)(params)["actor"]
     product = jax.tree.map(lambda a, b: jnp.sum(a * b), gradient["actor"], towards)
-    assert float(jax.tree.reduce(jnp.add, product)) > 0.0  # down the gradient is down in probability
+    assert (
+        float(jax.tree.reduce(jnp.add, product)) > 0.0
+    )  # down the gradient is down in probability
 
 
 @pytest.mark.parametrize("old", [-10.0, -1.0, 0.3])
@@ -135,7 +154,14 @@ def test_ordinary_ratios_are_what_they_were(old: float) -> None:
     params = agent.init(jax.random.key(0), env)
     key = jax.random.key(1)
     action = jax.random.normal(key, (50, 2))
-    batch = Batch(jnp.ones((50, 6)), {}, action, jnp.full(50, old), jax.random.normal(key, (50,)), jnp.zeros(50))
+    batch = Batch(
+        jnp.ones((50, 6)),
+        {},
+        action,
+        jnp.full(50, old),
+        jax.random.normal(key, (50,)),
+        jnp.zeros(50),
+    )
 
     def plain(params: Any) -> jax.Array:
         policy = agent.distribution(env, params, batch.inputs)
@@ -143,7 +169,11 @@ def test_ordinary_ratios_are_what_they_were(old: float) -> None:
         clipped = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
         surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
         value_error = 0.5 * (agent.value(params, batch.inputs) - batch.value_target) ** 2
-        return jnp.mean(-surrogate + ppo.value_coefficient * value_error - ppo.entropy_coefficient * policy.entropy())
+        return jnp.mean(
+            -surrogate
+            + ppo.value_coefficient * value_error
+            - ppo.entropy_coefficient * policy.entropy()
+        )
 
     found = jax.value_and_grad(loss)(params, env, agent, ppo, batch)
     jax.tree.map(np.testing.assert_array_equal, found, jax.value_and_grad(plain)(params))

@@ -33,7 +33,11 @@ AT = 384
 
 def rows(run: Path, name: str, seed: int) -> list[dict[str, Any]]:
     found = [json.loads(line) for line in (run / name).read_text().splitlines()]
-    return [{key: value for key, value in row.items() if key != "wall_s"} for row in found if row["seed"] == seed]
+    return [
+        {key: value for key, value in row.items() if key != "wall_s"}
+        for row in found
+        if row["seed"] == seed
+    ]
 
 
 def train(run: Path, monkeypatch: pytest.MonkeyPatch, spoilt: list[int]) -> None:
@@ -43,8 +47,14 @@ def train(run: Path, monkeypatch: pytest.MonkeyPatch, spoilt: list[int]) -> None
     def spoil_in_time(self: Training, *args: Any) -> None:
         original(self, *args)
         if self.step == AT:
-            spoil = lambda params: {**params, "log_std": params["log_std"].at[jnp.array(spoilt)].set(jnp.nan)}  # noqa: E731
-            self.state = self.state.replace(params=spoil(self.state.params), average=spoil(self.state.average))
+
+            def spoil(params: dict) -> dict:
+                log_std = params["log_std"].at[jnp.array(spoilt)].set(jnp.nan)
+                return {**params, "log_std": log_std}
+
+            self.state = self.state.replace(
+                params=spoil(self.state.params), average=spoil(self.state.average)
+            )
 
     with monkeypatch.context() as patch:
         patch.setattr(Training, "_write_progress", spoil_in_time)
@@ -71,16 +81,22 @@ def test_the_seed_stops_and_the_log_says_so(run: Path, whole: Path) -> None:
     found, before = rows(run, "progress.jsonl", 1), rows(whole, "progress.jsonl", 1)
     going = AT // 64
     assert found[:going] == before[:going]
-    assert [row["step"] for row in found] == [row["step"] for row in before]  # a row for every update all the same
+    assert [row["step"] for row in found] == [
+        row["step"] for row in before
+    ]  # a row for every update all the same
     for row in found[going:]:
         assert row["diverged"] is True
         assert row["episodes"] == found[going - 1]["episodes"]
-        assert {row[name] for name in ("success_rate", "return", "violating_share", "episode_cost")} == {None}
+        assert {
+            row[name] for name in ("success_rate", "return", "violating_share", "episode_cost")
+        } == {None}
     assert not any(row["diverged"] for row in before)
     assert {row["step"] for row in rows(run, "eval.jsonl", 1)} == {320}
 
 
-def test_no_figure_has_it_and_that_is_said(run: Path, whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_figure_has_it_and_that_is_said(
+    run: Path, whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     found, before = (json.loads((path / "results.json").read_text()) for path in (run, whole))
     assert found["diverged"] == [{"seed": 1, "step": AT + 64}]
     assert "diverged" not in before
@@ -88,12 +104,16 @@ def test_no_figure_has_it_and_that_is_said(run: Path, whole: Path, capsys: pytes
         for name, metric in found["evaluation"][kind].items():
             values = before["evaluation"][kind][name]["per_seed"]
             assert metric["per_seed"] == [values[0], None, values[2]]
-            assert metric["mean"] == (None if values[0] is None else pytest.approx((values[0] + values[2]) / 2))
+            assert metric["mean"] == (
+                None if values[0] is None else pytest.approx((values[0] + values[2]) / 2)
+            )
     assert found["training_cost"]["per_seed"][1] is None
     assert {path.name for path in (run / "policy").iterdir()} == {"seed_0.npz", "seed_2.npz"}
     assert command.main([f"resume={run}"]) == cli.DIVERGED
     capsys.readouterr()
-    assert f"DIVERGED, and left out of the averages: seed 1 by step {AT + 64}" in summary({"run": run})
+    assert f"DIVERGED, and left out of the averages: seed 1 by step {AT + 64}" in summary(
+        {"run": run}
+    )
 
 
 def test_its_best_checkpoint_is_one_from_before(run: Path) -> None:
@@ -103,13 +123,18 @@ def test_its_best_checkpoint_is_one_from_before(run: Path) -> None:
     assert not np.isfinite(content["state"].params["log_std"][1]).any()
 
 
-def test_an_evaluation_says_the_same(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_evaluation_says_the_same(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert evaluate.main([f"run={run}", "episodes=4", f"out={tmp_path / 'last'}"]) == cli.DIVERGED
     assert "DIVERGED, and left out of the averages: seed 1" in capsys.readouterr().out
     found = json.loads((tmp_path / "last" / "results.json").read_text())
     assert found["evaluation"]["stochastic"]["safety_violation_rate"]["per_seed"][1] is None
     assert rows(tmp_path / "last", "eval.jsonl", 1) == []
-    assert evaluate.main([f"run={run}", "episodes=4", "checkpoint=best", f"out={tmp_path / 'best'}"]) == 0
+    assert (
+        evaluate.main([f"run={run}", "episodes=4", "checkpoint=best", f"out={tmp_path / 'best'}"])
+        == 0
+    )
 
 
 def test_a_run_of_which_every_seed_diverged_has_no_result(
@@ -118,7 +143,10 @@ def test_a_run_of_which_every_seed_diverged_has_no_result(
     train(tmp_path / "run", monkeypatch, [0, 1, 2])
     told = capsys.readouterr().out
     assert f"seed 2 has diverged by step {AT + 64}" in told
-    assert f"DIVERGED, and left out of the averages: seeds 0 by step {AT + 64}, 1 by step {AT + 64}, 2 by" in told
+    assert (
+        f"DIVERGED, and left out of the averages: seeds 0 by step {AT + 64}, 1 by step {AT + 64}, 2 by"
+        in told
+    )
     assert "violating steps" not in told
     assert not (tmp_path / "run" / "policy").exists()
     assert "DIVERGED" in summary({"run": tmp_path / "run"})
@@ -134,10 +162,17 @@ def test_infinite_returns_count_too() -> None:
         assert diverged(state.replace(window=state.window.replace(episodes=episodes)))
 
 
-def test_a_sweep_ranks_it_last_and_marks_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_sweep_ranks_it_last_and_marks_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "sweep"
     rates = "[1e30,3e-3]"
-    words = [f"sweep.ppo.learning_rate={rates}", "ppo.final_learning_rate=3e-3", "rank=success", f"out={path}"]
+    words = [
+        f"sweep.ppo.learning_rate={rates}",
+        "ppo.final_learning_rate=3e-3",
+        "rank=success",
+        f"out={path}",
+    ]
     assert tune.main([*TINY, *words]) == 0
     told = capsys.readouterr().out
     first, last = json.loads((path / "results.json").read_text())["settings"]
@@ -146,7 +181,10 @@ def test_a_sweep_ranks_it_last_and_marks_it(tmp_path: Path, capsys: pytest.Captu
     assert [one["seed"] for one in last["diverged"]] == [0, 1, 2]
     assert set(last["evaluation"]["deterministic"]["safety_violation_rate"]) == {None}
     assert last["training_success"] == [0.0, 0.0, 0.0]
-    assert "setting 0: DIVERGED, and left out of the averages: seeds 0 by step 64, 1 by step 64, 2 by step 64" in told
+    assert (
+        "setting 0: DIVERGED, and left out of the averages: seeds 0 by step 64, 1 by step 64, 2 by step 64"
+        in told
+    )
     assert (path / "results.csv").read_text().splitlines()[-1].endswith(",3")
 
 
@@ -156,7 +194,9 @@ def test_curves_leave_out_the_seeds_that_diverged_and_say_so(run: Path, whole: P
     assert "without seed 1, which diverged" in figure.get_suptitle()
     mean = {line.get_label(): line for line in figure.axes[1].lines}["mean"]
     alone = [row for row in sound if row["seed"] != 1]
-    expected = {line.get_label(): line for line in training_curves(alone, "steps", "title").axes[1].lines}["mean"]
+    expected = {
+        line.get_label(): line for line in training_curves(alone, "steps", "title").axes[1].lines
+    }["mean"]
     np.testing.assert_array_equal(mean.get_ydata(), expected.get_ydata())
     compared = compare_curves({"broken": broken, "sound": sound}, "title")
     names = [text.get_text() for text in compared.legends[0].get_texts()]

@@ -29,14 +29,18 @@ def test_the_page_of_a_task_is_current(task: str, monkeypatch: pytest.MonkeyPatc
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
     from make_tasks import page  # pyright: ignore[reportMissingImports]
 
-    assert (ROOT / "docs" / "tasks" / f"{task}.md").read_text(encoding="utf-8") == page(task), "run docs/make_tasks.py"
+    assert (ROOT / "docs" / "tasks" / f"{task}.md").read_text(encoding="utf-8") == page(task), (
+        "run docs/make_tasks.py"
+    )
     assert (ROOT / "docs" / "tasks" / f"{task}.png").is_file()
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_file_of_a_task_is_current_and_is_the_task(task: str) -> None:
     file = ROOT / "configs" / "envs" / f"{task}.yaml"
-    assert file.read_text(encoding="utf-8") == dump(jaxsafe.make(task)), f"python -m jaxsafe.config {task} > {file}"
+    assert file.read_text(encoding="utf-8") == dump(jaxsafe.make(task)), (
+        f"python -m jaxsafe.config {task} > {file}"
+    )
     assert load(file) == jaxsafe.make(task)
 
 
@@ -52,22 +56,38 @@ def test_links_lead_to_files(page: Path) -> None:
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
-def test_the_site_builds_without_a_warning_twice_and_with_its_own_extra_alone(tmp_path: Path) -> None:
+def test_the_site_builds_without_a_warning_twice_and_with_its_own_extra_alone(
+    tmp_path: Path,
+) -> None:
     copy = tmp_path / "clone"
-    shutil.copytree(ROOT / "docs", copy / "docs", ignore=shutil.ignore_patterns("_site", "jupyter_execute"))
+    shutil.copytree(
+        ROOT / "docs", copy / "docs", ignore=shutil.ignore_patterns("_site", "jupyter_execute")
+    )
     shutil.copy(ROOT / "README.md", copy)
-    for beside in ("CITATION.cff", "LICENSE", "examples", "benchmarks", "configs", "tests", "jaxsafe"):
+    for beside in (
+        "CITATION.cff",
+        "LICENSE",
+        "examples",
+        "benchmarks",
+        "configs",
+        "tests",
+        "jaxsafe",
+    ):
         (copy / beside).symlink_to(ROOT / beside)
     for other in ("onnx", "onnxruntime", "tensorboardX", "brax", "gymnax", "stable_baselines3"):
         (tmp_path / f"{other}.py").write_text(f"raise ImportError(name={other!r})")
     environment = {**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"}
     for _ in range(2):
         build = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "docs", "docs/_site"]
-        ran = subprocess.run(build, cwd=copy, env=environment, capture_output=True, text=True, check=False)
+        ran = subprocess.run(
+            build, cwd=copy, env=environment, capture_output=True, text=True, check=False
+        )
         assert (ran.returncode, ran.stderr) == (0, "")
     first = (copy / "docs" / "_site" / "index.html").read_text(encoding="utf-8")
     assert 'href="tasks/docking3d.html"' in first  # what the README calls docs/tasks/docking3d.md
-    assert "jaxsafe.environment.reset_to" in (copy / "docs" / "_site" / "api.html").read_text(encoding="utf-8")
+    assert "jaxsafe.environment.reset_to" in (copy / "docs" / "_site" / "api.html").read_text(
+        encoding="utf-8"
+    )
 
 
 def test_the_composed_environment_survives_a_round_trip() -> None:
@@ -77,7 +97,9 @@ def test_the_composed_environment_survives_a_round_trip() -> None:
 
 def test_the_composed_environment_can_be_solved_under_jit_and_vmap() -> None:
     env = jaxsafe.make(CUSTOM)
-    outcomes, cost, margin = jax.jit(jax.vmap(fly_around, in_axes=(None, 0)))(env, jax.random.split(jax.random.key(0), 5))
+    outcomes, cost, margin = jax.jit(jax.vmap(fly_around, in_axes=(None, 0)))(
+        env, jax.random.split(jax.random.key(0), 5)
+    )
     assert [env.outcomes[outcome] for outcome in np.asarray(outcomes)] == ["success"] * 5
     assert float(cost.sum()) == 0.0
     assert float(margin.min()) > 0.0
@@ -86,7 +108,9 @@ def test_the_composed_environment_can_be_solved_under_jit_and_vmap() -> None:
 def test_flying_straight_through_the_zone_fails() -> None:
     env = jaxsafe.make(CUSTOM)
     state, _ = jaxsafe.reset_to(
-        env, {"deputy": {"position": [0.0, 71.0], "velocity": [0.0, -2.0]}}, dict.fromkeys(env.randomize, 12.0)
+        env,
+        {"deputy": {"position": [0.0, 71.0], "velocity": [0.0, -2.0]}},
+        dict.fromkeys(env.randomize, 12.0),
     )
     _, timestep = jax.jit(jaxsafe.step)(env, state, jnp.zeros(2))
     assert env.outcomes[int(timestep.info.outcome)] == "keep_out"
@@ -154,7 +178,11 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_pa
 
 
 def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:
-    blocks = [text for kind, text in BLOCK.findall((ROOT / "README.md").read_text(encoding="utf-8")) if kind == "python"]
+    blocks = [
+        text
+        for kind, text in BLOCK.findall((ROOT / "README.md").read_text(encoding="utf-8"))
+        if kind == "python"
+    ]
     shown = "assert safe.info.intervening.mean() > 0.9 and safe.cost.sum() == 0"  # what the filter is there for
     (tmp_path / "program.py").write_text("\n".join([*blocks, shown]), encoding="utf-8")
     process = run(["program.py"], tmp_path)
@@ -165,7 +193,11 @@ def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_commands_are_those_of_any_shell(page: Path) -> None:
     """In zsh a word with brackets must be quoted, and a comment behind a command is part of it."""
-    commands = [line for line in page.read_text(encoding="utf-8").splitlines() if "python -m jaxsafe" in line]
+    commands = [
+        line
+        for line in page.read_text(encoding="utf-8").splitlines()
+        if "python -m jaxsafe" in line
+    ]
     words = [word for line in commands for word in line.split()]
     assert [word for word in words if re.match(r"[\w.]+=.*[\[*?]", word)] == []
     assert [line for line in commands if line.startswith("python") and " # " in line] == []
@@ -174,7 +206,9 @@ def test_commands_are_those_of_any_shell(page: Path) -> None:
 @pytest.mark.slow
 def test_terminal_sets_hold_where_the_page_says_so(tmp_path: Path) -> None:
     page = (ROOT / "docs" / "rta.md").read_text(encoding="utf-8")
-    script = next(text for _, text in BLOCK.findall(page) if text.startswith("# terminal_sets.py\n"))
+    script = next(
+        text for _, text in BLOCK.findall(page) if text.startswith("# terminal_sets.py\n")
+    )
     (tmp_path / "terminal_sets.py").write_text(script, encoding="utf-8")
     process = run(["terminal_sets.py"], tmp_path)
     assert process.returncode == 0, process.stderr
@@ -189,4 +223,6 @@ def run(arguments: list[str], directory: Path) -> subprocess.CompletedProcess[st
     cache["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"  # many small programs
     environment = {**os.environ, **cache, "PYTHONUTF8": "1", "XLA_FLAGS": ""}
     command = [sys.executable, *arguments]
-    return subprocess.run(command, cwd=directory, env=environment, capture_output=True, encoding="utf-8", check=False)
+    return subprocess.run(
+        command, cwd=directory, env=environment, capture_output=True, encoding="utf-8", check=False
+    )

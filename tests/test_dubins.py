@@ -37,7 +37,12 @@ def step3d(x: Any, controls: Any, dt: Any = 1.0) -> jax.Array:
     state = Dubins3DState(x[:3], x[3], x[4], x[5], x[6])
     names = ("roll_rate", "flight_path_angle_rate", "acceleration")
     after = aircraft.step(state, dict(zip(names, controls, strict=True)), dt)
-    return jnp.concatenate([after.position, jnp.stack([after.heading, after.speed, after.flight_path_angle, after.roll])])
+    return jnp.concatenate(
+        [
+            after.position,
+            jnp.stack([after.heading, after.speed, after.flight_path_angle, after.roll]),
+        ]
+    )
 
 
 steps2d = jax.jit(jax.vmap(step2d, in_axes=(0, 0, None)))
@@ -64,12 +69,18 @@ def exact(x: np.ndarray, rates: np.ndarray, dt: float) -> np.ndarray:
         moving = rates[k] != 0.0
         to_go = np.where(rates[k] > 0.0, high, low) - x[4 + k]
         stops[k][moving] = np.clip(to_go[moving] / rates[k][moving], 0.0, dt)
-    bounds = np.concatenate([np.zeros((1, x.shape[1])), np.sort(stops, axis=0), np.full((1, x.shape[1]), dt)])
+    bounds = np.concatenate(
+        [np.zeros((1, x.shape[1])), np.sort(stops, axis=0), np.full((1, x.shape[1]), dt)]
+    )
     for begin, end in pairwise(bounds):
         length = end - begin
-        active = np.concatenate([stops > (begin + end) / 2.0, np.ones((1, x.shape[1]), bool)]) * rates
+        active = (
+            np.concatenate([stops > (begin + end) / 2.0, np.ones((1, x.shape[1]), bool)]) * rates
+        )
 
-        def unit(_: float, y: np.ndarray, active: np.ndarray = active, length: np.ndarray = length) -> np.ndarray:
+        def unit(
+            _: float, y: np.ndarray, active: np.ndarray = active, length: np.ndarray = length
+        ) -> np.ndarray:
             return (length * rate_of_change(y.reshape(7, -1), active)).ravel()
 
         solved = solve_ivp(unit, (0.0, 1.0), x.ravel(), method="DOP853", rtol=1e-13, atol=1e-12)
@@ -103,7 +114,9 @@ def flat(x: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def crossings(x: np.ndarray, rates: np.ndarray, dt: float) -> np.ndarray:
     """How many limits each sample reaches inside the step."""
     ends = zip(x[4:7], rates[:3], (SPEEDS, GAMMAS, ROLLS), strict=True)
-    return sum((value + dt * rate < low) | (value + dt * rate > high) for value, rate, (low, high) in ends)
+    return sum(
+        (value + dt * rate < low) | (value + dt * rate > high) for value, rate, (low, high) in ends
+    )
 
 
 # One step against the exact flow
@@ -121,10 +134,16 @@ def test_a_planar_step_of_any_length_is_within_a_millionth_of_a_foot(dt: float) 
 
 
 @pytest.mark.usefixtures("x64")
-def test_a_spatial_step_is_within_a_thousandth_of_a_foot_and_mostly_within_a_hundred_thousandth() -> None:
+def test_a_spatial_step_is_within_a_thousandth_of_a_foot_and_mostly_within_a_hundred_thousandth() -> (
+    None
+):
     x, rates = random_aircraft(seed=2)
     rates[3] = 0.0
-    assert [np.sum(crossings(x, rates, 1.0) == count) > 10 for count in range(3)] == [True, True, True]
+    assert [np.sum(crossings(x, rates, 1.0) == count) > 10 for count in range(3)] == [
+        True,
+        True,
+        True,
+    ]
     expected = exact(x, rates, 1.0)
     found = np.asarray(steps3d(x.T, rates[[2, 1, 0]].T, 1.0)).T
     np.testing.assert_allclose(found[:3], expected[:3], rtol=0.0, atol=1e-3)
@@ -137,8 +156,18 @@ def test_a_spatial_step_is_within_a_thousandth_of_a_foot_and_mostly_within_a_hun
 def test_a_spatial_step_that_reaches_all_three_limits_is_as_close() -> None:
     rng = np.random.default_rng(3)
     ends = np.stack([rng.choice(limits, NUM) for limits in (SPEEDS, GAMMAS, ROLLS)])
-    rates = rng.uniform(0.2, 1.0, (3, NUM)) * [[96.5], [0.17], [0.17]] * np.sign(ends - [[300.0], [0.0], [0.0]])
-    x = np.concatenate([np.zeros((3, NUM)), rng.uniform(-3, 3, (1, NUM)), ends - rng.uniform(0, 1, (3, NUM)) * rates])
+    rates = (
+        rng.uniform(0.2, 1.0, (3, NUM))
+        * [[96.5], [0.17], [0.17]]
+        * np.sign(ends - [[300.0], [0.0], [0.0]])
+    )
+    x = np.concatenate(
+        [
+            np.zeros((3, NUM)),
+            rng.uniform(-3, 3, (1, NUM)),
+            ends - rng.uniform(0, 1, (3, NUM)) * rates,
+        ]
+    )
     rates = np.append(rates, np.zeros((1, NUM)), axis=0)
     assert np.mean(crossings(x, rates, 1.0) == 3) > 0.99
     found = np.asarray(steps3d(x.T, rates[[2, 1, 0]].T, 1.0)).T
@@ -164,7 +193,9 @@ def test_the_spatial_integrator_has_order_six() -> None:
 
 
 @pytest.mark.parametrize("model", [2, 3])
-def test_in_float32_a_step_far_out_errs_by_less_than_the_spacing_of_its_position(model: int) -> None:
+def test_in_float32_a_step_far_out_errs_by_less_than_the_spacing_of_its_position(
+    model: int,
+) -> None:
     """At 3e5 ft neighbouring floats are 1/32 ft apart: half of that is lost in storing the result."""
     x, rates = random_aircraft(seed=4)
     x[:3] += 3e5
@@ -198,7 +229,9 @@ def test_in_float32_the_way_flown_has_six_digits(model: int) -> None:
 # Laws
 
 
-def fly(aircraft: Any, state: Any, controls: dict[str, float], num_steps: int, dt: float = 1.0) -> list[Any]:
+def fly(
+    aircraft: Any, state: Any, controls: dict[str, float], num_steps: int, dt: float = 1.0
+) -> list[Any]:
     """The states of a flight with constant controls, the start first."""
     step = jax.jit(lambda state: aircraft.step(state, controls, dt))
     states = [state]
@@ -207,12 +240,18 @@ def fly(aircraft: Any, state: Any, controls: dict[str, float], num_steps: int, d
     return states
 
 
-def planar(speed: float = 300.0, heading: float = 0.4, position: Sequence[float] = (10.0, -20.0)) -> Dubins2DState:
+def planar(
+    speed: float = 300.0, heading: float = 0.4, position: Sequence[float] = (10.0, -20.0)
+) -> Dubins2DState:
     return Dubins2DState(jnp.asarray(position), jnp.asarray(heading), jnp.asarray(speed))
 
 
-def spatial(speed: float = 300.0, heading: float = 0.4, gamma: float = 0.0, roll: float = 0.0) -> Dubins3DState:
-    return Dubins3DState(jnp.asarray([10.0, -20.0, 5.0]), *map(jnp.asarray, (heading, speed, gamma, roll)))
+def spatial(
+    speed: float = 300.0, heading: float = 0.4, gamma: float = 0.0, roll: float = 0.0
+) -> Dubins3DState:
+    return Dubins3DState(
+        jnp.asarray([10.0, -20.0, 5.0]), *map(jnp.asarray, (heading, speed, gamma, roll))
+    )
 
 
 @pytest.mark.parametrize("rate", [0.17, -0.05])
@@ -222,30 +261,47 @@ def test_a_steady_turn_is_a_circle_of_radius_speed_over_turn_rate(rate: float) -
     centre = np.array([10.0, -20.0]) + 300.0 / rate * np.array([-math.sin(0.4), math.cos(0.4)])
     radii = [np.linalg.norm(state.position - centre) for state in states]
     np.testing.assert_allclose(radii, 300.0 / abs(rate), rtol=1e-12)
-    np.testing.assert_allclose([state.heading for state in states], 0.4 + rate * np.arange(41), atol=1e-12)
+    np.testing.assert_allclose(
+        [state.heading for state in states], 0.4 + rate * np.arange(41), atol=1e-12
+    )
 
 
 @pytest.mark.usefixtures("x64")
 def test_the_heading_is_not_wrapped() -> None:
-    assert float(fly(normalise(Dubins2D(name="a")), planar(), {"heading_rate": 0.17}, 60)[-1].heading) > 10.0
+    assert (
+        float(fly(normalise(Dubins2D(name="a")), planar(), {"heading_rate": 0.17}, 60)[-1].heading)
+        > 10.0
+    )
 
 
 @pytest.mark.usefixtures("x64")
 def test_without_controls_flight_is_straight() -> None:
     two = fly(normalise(Dubins2D(name="a")), planar(), {}, 1, dt=7.0)[-1]
-    np.testing.assert_allclose(two.position, [10 + 2100 * math.cos(0.4), -20 + 2100 * math.sin(0.4)], rtol=1e-13)
+    np.testing.assert_allclose(
+        two.position, [10 + 2100 * math.cos(0.4), -20 + 2100 * math.sin(0.4)], rtol=1e-13
+    )
     three = fly(normalise(Dubins3D(name="a")), spatial(gamma=0.2), {}, 1, dt=7.0)[-1]
     forward = [math.cos(0.4) * math.cos(0.2), math.sin(0.4) * math.cos(0.2), -math.sin(0.2)]
-    np.testing.assert_allclose(three.position, np.array([10, -20, 5]) + 2100 * np.array(forward), rtol=1e-13)
-    assert (float(three.heading), float(three.speed), float(three.flight_path_angle)) == (0.4, 300.0, 0.2)
+    np.testing.assert_allclose(
+        three.position, np.array([10, -20, 5]) + 2100 * np.array(forward), rtol=1e-13
+    )
+    assert (float(three.heading), float(three.speed), float(three.flight_path_angle)) == (
+        0.4,
+        300.0,
+        0.2,
+    )
 
 
 @pytest.mark.parametrize("aircraft", [Dubins2D(name="a"), Dubins3D(name="a")])
 @pytest.mark.parametrize(("acceleration", "rest"), [(96.5, 400.0), (-96.5, 200.0)])
-def test_speed_rests_at_its_limit_and_the_way_follows(aircraft: Any, acceleration: float, rest: float) -> None:
+def test_speed_rests_at_its_limit_and_the_way_follows(
+    aircraft: Any, acceleration: float, rest: float
+) -> None:
     aircraft, start = normalise(aircraft), planar() if isinstance(aircraft, Dubins2D) else spatial()
     states = fly(aircraft, start, {"acceleration": acceleration}, 4)
-    np.testing.assert_allclose([state.speed for state in states], [300, 300 + acceleration, rest, rest, rest])
+    np.testing.assert_allclose(
+        [state.speed for state in states], [300, 300 + acceleration, rest, rest, rest]
+    )
     ways = [np.linalg.norm(after.position - before.position) for before, after in pairwise(states)]
     stop = (rest - 300.0 - acceleration) / acceleration
     second = (300.0 + acceleration + rest) / 2.0 * stop + rest * (1.0 - stop)
@@ -254,15 +310,23 @@ def test_speed_rests_at_its_limit_and_the_way_follows(aircraft: Any, acceleratio
 
 def test_a_speed_beyond_its_limits_counts_as_on_the_limit() -> None:
     for speed, rest in ((500.0, 400.0), (100.0, 200.0)):
-        for aircraft, start in ((Dubins2D(name="a"), planar(speed)), (Dubins3D(name="a"), spatial(speed))):
+        for aircraft, start in (
+            (Dubins2D(name="a"), planar(speed)),
+            (Dubins3D(name="a"), spatial(speed)),
+        ):
             after = fly(normalise(aircraft), start, {}, 1)[-1]
             assert float(after.speed) == rest
-            assert float(jnp.linalg.norm(after.position - start.position)) == pytest.approx(rest, rel=1e-6)
+            assert float(jnp.linalg.norm(after.position - start.position)) == pytest.approx(
+                rest, rel=1e-6
+            )
 
 
 @pytest.mark.parametrize("aircraft", [Dubins2D(name="a"), Dubins3D(name="a")])
 def test_a_control_left_out_is_one_of_zero(aircraft: Any) -> None:
-    aircraft, start = normalise(aircraft), planar() if isinstance(aircraft, Dubins2D) else spatial(gamma=0.2, roll=0.5)
+    aircraft, start = (
+        normalise(aircraft),
+        planar() if isinstance(aircraft, Dubins2D) else spatial(gamma=0.2, roll=0.5),
+    )
     rolling = [{"roll_rate": 0.6}] if isinstance(aircraft, Dubins3D) else []
     for controls in ({}, {"heading_rate": 0.1}, {"acceleration": 96.5}, *rolling):
         zeros = dict.fromkeys(("acceleration", "flight_path_angle_rate", "roll_rate"), 0.0)
@@ -273,25 +337,43 @@ def test_a_control_left_out_is_one_of_zero(aircraft: Any) -> None:
 def test_angles_rest_at_their_limits() -> None:
     climbing = {"flight_path_angle_rate": -0.3, "roll_rate": 0.6}
     states = fly(normalise(Dubins3D(name="a")), spatial(), climbing, 4)
-    np.testing.assert_allclose([state.roll for state in states], [0.0, 0.6, *3 * [math.pi / 3]], rtol=1e-6)
+    np.testing.assert_allclose(
+        [state.roll for state in states], [0.0, 0.6, *3 * [math.pi / 3]], rtol=1e-6
+    )
     gammas = [0.0, -0.3, *3 * [-math.pi / 9]]
     np.testing.assert_allclose([state.flight_path_angle for state in states], gammas, rtol=1e-6)
 
 
 @pytest.mark.parametrize("aircraft", [Dubins2D(name="a"), Dubins3D(name="a")])
 @pytest.mark.usefixtures("x64")
-def test_a_step_that_reaches_no_limit_before_its_end_may_be_taken_in_one_piece(aircraft: Any) -> None:
-    limits = {name: value for name, value in vars(normalise(aircraft)).items() if name.endswith("_limits")}
-    rates = {"roll": "roll_rate", "flight_path_angle": "flight_path_angle_rate", "speed": "acceleration"}
+def test_a_step_that_reaches_no_limit_before_its_end_may_be_taken_in_one_piece(
+    aircraft: Any,
+) -> None:
+    limits = {
+        name: value for name, value in vars(normalise(aircraft)).items() if name.endswith("_limits")
+    }
+    rates = {
+        "roll": "roll_rate",
+        "flight_path_angle": "flight_path_angle_rate",
+        "speed": "acceleration",
+    }
     rng = np.random.default_rng(0)
     for share in (0.0, 0.5, 1.0):  # of the way to a limit; 1 ends the step on it
         state, controls = aircraft.rest(), {}
-        for name, (low, high) in ((name.removesuffix("_limits"), value) for name, value in limits.items()):
+        for name, (low, high) in (
+            (name.removesuffix("_limits"), value) for name, value in limits.items()
+        ):
             x, goal = rng.uniform(low, high), rng.choice([low, high])
-            state, controls = state.replace(**{name: jnp.asarray(x)}), controls | {rates[name]: share * (goal - x)}
+            state, controls = (
+                state.replace(**{name: jnp.asarray(x)}),
+                controls | {rates[name]: share * (goal - x)},
+            )
         if isinstance(aircraft, Dubins2D):
             controls["heading_rate"] = 0.17
-        both = aircraft.step(state, controls, 1.0), aircraft.step_within_limits(state, controls, jnp.ones(()))
+        both = (
+            aircraft.step(state, controls, 1.0),
+            aircraft.step_within_limits(state, controls, jnp.ones(())),
+        )
         chex.assert_trees_all_close(*both, rtol=1e-10, atol=1e-6)
 
 
@@ -335,7 +417,9 @@ def test_a_heading_rate_in_space_is_held_as_a_coordinated_turn(rate: float) -> N
 def test_a_heading_rate_beyond_the_roll_limit_gives_the_tightest_turn() -> None:
     states = fly(normalise(Dubins3D(name="a")), spatial(), {"heading_rate": 1.0}, 3)
     assert float(states[-1].roll) == pytest.approx(math.pi / 3)
-    assert float(states[-1].heading - states[-2].heading) == pytest.approx(GRAVITY * math.tan(math.pi / 3) / 300.0)
+    assert float(states[-1].heading - states[-2].heading) == pytest.approx(
+        GRAVITY * math.tan(math.pi / 3) / 300.0
+    )
 
 
 @pytest.mark.usefixtures("x64")
@@ -352,7 +436,10 @@ def test_two_steps_with_held_controls_are_one_in_the_plane() -> None:
     x, rates = flat(*random_aircraft(seed=7))
     state, controls = x[[0, 1, 3, 4]].T, rates[[3, 0]].T
     np.testing.assert_allclose(
-        steps2d(steps2d(state, controls, 0.7), controls, 1.6), steps2d(state, controls, 2.3), rtol=0.0, atol=1e-9
+        steps2d(steps2d(state, controls, 0.7), controls, 1.6),
+        steps2d(state, controls, 2.3),
+        rtol=0.0,
+        atol=1e-9,
     )
 
 
@@ -363,16 +450,23 @@ def test_motion_does_not_depend_on_where_it_is_and_which_way_it_points() -> None
     turned = x.copy()
     turned[:3] += np.array([[300.0], [-20.0], [7.0]])
     turned[3] += 1.1
-    here, there = (np.asarray(steps3d(one.T, rates[[2, 1, 0]].T, 1.0)).T - one for one in (x, turned))
+    here, there = (
+        np.asarray(steps3d(one.T, rates[[2, 1, 0]].T, 1.0)).T - one for one in (x, turned)
+    )
     rotation = np.array([[math.cos(1.1), -math.sin(1.1)], [math.sin(1.1), math.cos(1.1)]])
     np.testing.assert_allclose(there[:2], rotation @ here[:2], rtol=0.0, atol=1e-9)
     np.testing.assert_allclose(there[2:], here[2:], rtol=0.0, atol=1e-9)
 
 
 def test_the_state_s_velocity_and_orientation_point_along_its_path() -> None:
-    for aircraft, state in ((Dubins2D(name="a"), planar()), (Dubins3D(name="a"), spatial(gamma=0.3, roll=-0.4))):
+    for aircraft, state in (
+        (Dubins2D(name="a"), planar()),
+        (Dubins3D(name="a"), spatial(gamma=0.3, roll=-0.4)),
+    ):
         moved = fly(normalise(aircraft), state, {}, 1, dt=1e-2)[-1]
-        np.testing.assert_allclose((moved.position - state.position) / 1e-2, state.velocity, atol=0.1)
+        np.testing.assert_allclose(
+            (moved.position - state.position) / 1e-2, state.velocity, atol=0.1
+        )
         np.testing.assert_allclose(state.orientation[:, 0] * state.speed, state.velocity, rtol=1e-6)
         np.testing.assert_allclose(jnp.linalg.norm(state.velocity), state.speed, rtol=1e-6)
 
@@ -388,7 +482,10 @@ def differences(step: Any, x: np.ndarray, controls: np.ndarray) -> tuple[np.ndar
     for k in range(both.shape[1]):
         for side, columns in ((-size, left), (size, right)):
             moved = both + side * (np.arange(both.shape[1]) == k)
-            columns.append((np.asarray(step(moved[:, : x.shape[1]], moved[:, x.shape[1] :], 1.0)) - middle) / side)
+            columns.append(
+                (np.asarray(step(moved[:, : x.shape[1]], moved[:, x.shape[1] :], 1.0)) - middle)
+                / side
+            )
     return np.stack(left, axis=-1), np.stack(right, axis=-1)
 
 
@@ -426,6 +523,8 @@ def test_in_float32_derivatives_are_finite_on_limits_and_at_zero_rates() -> None
             for acceleration in (-1e-38, 0.0, 1e-38, 1e-6, 96.5):
                 angles = () if step is step2d else (GAMMAS[1], ROLLS[0])
                 x = jnp.asarray([*start, speed, *angles])
-                controls = jnp.asarray([0.0, acceleration] if step is step2d else [0.0, 0.0, acceleration])
+                controls = jnp.asarray(
+                    [0.0, acceleration] if step is step2d else [0.0, 0.0, acceleration]
+                )
                 jacobian = jacobian2d if step is step2d else jacobian3d
                 assert all(np.isfinite(part).all() for part in jacobian(x[None], controls[None]))

@@ -30,11 +30,16 @@ def env() -> Environment:
 
 
 def shapes(tree: Any) -> Any:
-    return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)), tree)
+    return jax.tree.map(
+        lambda leaf: (leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)), tree
+    )
 
 
 def test_reset_to_agrees_with_reset(env: Environment) -> None:
-    drawn, given = jax.eval_shape(jaxsafe.reset, env, jax.random.key(0)), jaxsafe.reset_to(env, START)
+    drawn, given = (
+        jax.eval_shape(jaxsafe.reset, env, jax.random.key(0)),
+        jaxsafe.reset_to(env, START),
+    )
     assert shapes(drawn) == shapes(jax.eval_shape(lambda: given))
 
 
@@ -91,14 +96,38 @@ def test_reset_to_may_move_the_chief(env: Environment) -> None:
     [
         ({}, r"^reset_to: deputy\.position is missing: it is random at reset, so give it$"),
         ({"deputy": {"position": [1, 2]}}, r"^reset_to: deputy\.velocity is missing"),
-        ({"deputi": {}}, r"^reset_to: unknown platform 'deputi'; choose from chief, deputy\. Did you mean 'deputy'\?$"),
-        ({"deputy": {"positon": [1, 2]}}, r"^reset_to: deputy has no field 'positon'; .* Did you mean 'position'\?$"),
-        ({"deputy": {"position": [1, 2, 3], "velocity": [0, 0]}}, r"position: expected shape \(2,\), found \(3,\)"),
-        ({"deputy": {"position": 1.0, "velocity": [0, 0]}}, r"position: expected shape \(2,\), found \(\)"),
-        ({"deputy": {"position": ["a", "b"], "velocity": [0, 0]}}, r"position: expected numbers, found \['a', 'b'\]"),
-        ({"deputy": {"position": None, "velocity": [0, 0]}}, r"deputy\.position: expected numbers, found None"),
-        ({"deputy": {"position": [float("nan"), 0], "velocity": [0, 0]}}, r"position: expected finite numbers"),
-        ({"deputy": {"position": [0, 0], "velocity": [0, float("inf")]}}, r"velocity: expected finite numbers"),
+        (
+            {"deputi": {}},
+            r"^reset_to: unknown platform 'deputi'; choose from chief, deputy\. Did you mean 'deputy'\?$",
+        ),
+        (
+            {"deputy": {"positon": [1, 2]}},
+            r"^reset_to: deputy has no field 'positon'; .* Did you mean 'position'\?$",
+        ),
+        (
+            {"deputy": {"position": [1, 2, 3], "velocity": [0, 0]}},
+            r"position: expected shape \(2,\), found \(3,\)",
+        ),
+        (
+            {"deputy": {"position": 1.0, "velocity": [0, 0]}},
+            r"position: expected shape \(2,\), found \(\)",
+        ),
+        (
+            {"deputy": {"position": ["a", "b"], "velocity": [0, 0]}},
+            r"position: expected numbers, found \['a', 'b'\]",
+        ),
+        (
+            {"deputy": {"position": None, "velocity": [0, 0]}},
+            r"deputy\.position: expected numbers, found None",
+        ),
+        (
+            {"deputy": {"position": [float("nan"), 0], "velocity": [0, 0]}},
+            r"position: expected finite numbers",
+        ),
+        (
+            {"deputy": {"position": [0, 0], "velocity": [0, float("inf")]}},
+            r"velocity: expected finite numbers",
+        ),
     ],
 )
 def test_a_bad_start_is_refused(env: Environment, start: dict[str, Any], message: str) -> None:
@@ -109,7 +138,9 @@ def test_a_bad_start_is_refused(env: Environment, start: dict[str, Any], message
 
 
 def test_a_start_at_the_chief_has_an_outcome_but_is_not_done(env: Environment) -> None:
-    state, timestep = jaxsafe.reset_to(env, {"deputy": {"position": [0.0, 0.3], "velocity": [0.0, 0.0]}})
+    state, timestep = jaxsafe.reset_to(
+        env, {"deputy": {"position": [0.0, 0.3], "velocity": [0.0, 0.0]}}
+    )
     assert env.outcomes[int(timestep.info.outcome)] == "success"
     assert not timestep.done
     assert timestep.reward == 0.0
@@ -133,22 +164,32 @@ def test_a_step_does_not_depend_on_the_flags_of_the_state(env: Environment) -> N
     state, _ = reset(env, jax.random.key(2))
     ended = {name: ~flag for name, flag in state.sim.ended.items()}
     forgetful = state.replace(sim=state.sim.replace(ended=ended, status={}, regions={}))
-    chex.assert_trees_all_equal(jaxsafe.step(env, state, jnp.ones(2)), jaxsafe.step(env, forgetful, jnp.ones(2)))
+    chex.assert_trees_all_equal(
+        jaxsafe.step(env, state, jnp.ones(2)), jaxsafe.step(env, forgetful, jnp.ones(2))
+    )
 
 
-def test_rewards_of_the_steps_add_up_to_the_totals_and_terms_to_the_reward(env: Environment) -> None:
+def test_rewards_of_the_steps_add_up_to_the_totals_and_terms_to_the_reward(
+    env: Environment,
+) -> None:
     state, _ = jaxsafe.reset_to(env, {"deputy": {"position": [100.0, 0.0], "velocity": [0.0, 0.6]}})
     sums = dict.fromkeys((term.name for term in env.reward), 0.0)
     for action in jax.random.uniform(jax.random.key(0), (30, 2), minval=-1.0):
         state, timestep = step(env, state, action)
-        assert float(timestep.reward) == pytest.approx(float(sum(timestep.info.reward_terms.values())), abs=1e-7)
-        sums = {name: total + float(timestep.info.reward_terms[name]) for name, total in sums.items()}
+        assert float(timestep.reward) == pytest.approx(
+            float(sum(timestep.info.reward_terms.values())), abs=1e-7
+        )
+        sums = {
+            name: total + float(timestep.info.reward_terms[name]) for name, total in sums.items()
+        }
         totals = {name: float(total) for name, total in timestep.info.reward_totals.items()}
         assert totals == pytest.approx(sums, abs=1e-5)
     assert sums["velocity_constraint"] < 0.0
 
 
-def test_control_is_reported_in_physical_units_and_no_assurance_intervenes(env: Environment) -> None:
+def test_control_is_reported_in_physical_units_and_no_assurance_intervenes(
+    env: Environment,
+) -> None:
     state, _ = reset(env, jax.random.key(0))
     _, timestep = step(env, state, jnp.asarray([0.25, -7.0]))
     np.testing.assert_array_equal(timestep.info.control_desired, [0.25, -1.0])
@@ -185,30 +226,76 @@ def test_an_environment_names_its_parts(task: str, axes: str) -> None:
     ("task", "variant", "actions", "size", "outcomes"),
     [
         ("rejoin2d", "paper", "heading_rate acceleration", 12, "success crash distance timeout"),
-        ("rejoin3d", "paper", "roll_rate flight_path_angle_rate acceleration", 18, "success crash distance timeout"),
-        ("docking2d_oriented", "paper", "thrust attitude_acceleration", 9, "success crash distance timeout velocity"),
+        (
+            "rejoin3d",
+            "paper",
+            "roll_rate flight_path_angle_rate acceleration",
+            18,
+            "success crash distance timeout",
+        ),
+        (
+            "docking2d_oriented",
+            "paper",
+            "thrust attitude_acceleration",
+            9,
+            "success crash distance timeout velocity",
+        ),
         ("rejoin2d", "released", "heading_rate acceleration", 12, "success crash timeout distance"),
-        ("rejoin3d", "released", "flight_path_angle_rate roll_rate acceleration", 18, "success crash timeout distance"),
-        ("docking2d", "released", "thrust_x thrust_y", 6, "success timeout distance crash velocity"),
-        ("docking3d", "released", "thrust_x thrust_y thrust_z", 8, "success timeout distance crash velocity"),
-        ("docking2d_oriented", "released", "thrust attitude_acceleration", 9, "success timeout distance crash velocity"),
+        (
+            "rejoin3d",
+            "released",
+            "flight_path_angle_rate roll_rate acceleration",
+            18,
+            "success crash timeout distance",
+        ),
+        (
+            "docking2d",
+            "released",
+            "thrust_x thrust_y",
+            6,
+            "success timeout distance crash velocity",
+        ),
+        (
+            "docking3d",
+            "released",
+            "thrust_x thrust_y thrust_z",
+            8,
+            "success timeout distance crash velocity",
+        ),
+        (
+            "docking2d_oriented",
+            "released",
+            "thrust attitude_acceleration",
+            9,
+            "success timeout distance crash velocity",
+        ),
     ],
 )
-def test_a_variant_orders_its_actions_and_outcomes(task: str, variant: Any, actions: str, size: int, outcomes: str) -> None:
+def test_a_variant_orders_its_actions_and_outcomes(
+    task: str, variant: Any, actions: str, size: int, outcomes: str
+) -> None:
     env = jaxsafe.make(task, variant=variant)
     assert env.action_names == tuple(actions.split())
     assert env.observation_size == size
     assert env.outcomes == ("running", *outcomes.split(), "diverged")
     points = 11 if "docking" in task else 5
-    assert jaxsafe.make(task, variant=variant, actions="discrete").num_action_points == (points,) * env.action_size
+    assert (
+        jaxsafe.make(task, variant=variant, actions="discrete").num_action_points
+        == (points,) * env.action_size
+    )
 
 
 def test_discrete_actions_change_the_controller_and_nothing_else() -> None:
     continuous, discrete = jaxsafe.make("docking3d"), jaxsafe.make("docking3d", actions="discrete")
     assert discrete.num_action_points == (11, 11, 11)
     assert discrete.action_names == continuous.action_names
-    state, _ = jaxsafe.reset_to(continuous, {"deputy": {"position": [100.0, 50.0, 0.0], "velocity": [0.1, 0.0, 0.0]}})
-    pushed, chosen = step(continuous, state, jnp.asarray([-1.0, 0, 1])), step(discrete, state, jnp.asarray([0, 5, 10]))
+    state, _ = jaxsafe.reset_to(
+        continuous, {"deputy": {"position": [100.0, 50.0, 0.0], "velocity": [0.1, 0.0, 0.0]}}
+    )
+    pushed, chosen = (
+        step(continuous, state, jnp.asarray([-1.0, 0, 1])),
+        step(discrete, state, jnp.asarray([0, 5, 10])),
+    )
     chex.assert_trees_all_close(pushed, chosen, atol=1e-7)
     assert jaxsafe.make("docking3d", actions="continuous") == continuous
     assert discrete != continuous
@@ -217,11 +304,17 @@ def test_discrete_actions_change_the_controller_and_nothing_else() -> None:
 # Ends
 
 
-def ends(env: Environment, position: Any, velocity: Any = (0.0, 0.0)) -> tuple[list[str], str, TimeStep]:
+def ends(
+    env: Environment, position: Any, velocity: Any = (0.0, 0.0)
+) -> tuple[list[str], str, TimeStep]:
     """What ended on the first step from a start, and the outcome."""
     state, _ = jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})
     state, timestep = step(env, state, jnp.zeros(2))
-    return [name for name, ended in state.sim.ended.items() if ended], env.outcomes[int(timestep.info.outcome)], timestep
+    return (
+        [name for name, ended in state.sim.ended.items() if ended],
+        env.outcomes[int(timestep.info.outcome)],
+        timestep,
+    )
 
 
 def test_the_first_condition_that_holds_hides_those_after_it() -> None:
@@ -241,15 +334,23 @@ def test_a_condition_that_stands_apart_neither_hides_nor_is_hidden() -> None:
         (["success", "distance", "timeout", "crash"], "success"),
         (["distance", "success", "timeout", "crash"], "distance"),
     ):
-        env = jaxsafe.make("docking2d", numbers | {"terminal": names, "terminal.success.apart": True})
+        env = jaxsafe.make(
+            "docking2d", numbers | {"terminal": names, "terminal.success.apart": True}
+        )
         found, first, timestep = ends(env, [0.3, 0.0])
         assert (set(found), first) == ({"success", "distance"}, outcome)
         assert timestep.terminated
         assert float(timestep.info.reward_terms["success"]) == pytest.approx(2.0 - 1.0 / 2000.0)
         assert float(timestep.info.reward_terms["failure"]) == -1.0
-    assert ends(jaxsafe.make("docking2d", {"terminal.success.apart": True}), [0.3, 0.0])[0] == ["success"]
+    assert ends(jaxsafe.make("docking2d", {"terminal.success.apart": True}), [0.3, 0.0])[0] == [
+        "success"
+    ]
     every = {f"terminal.{name}.apart": True for name in ("success", "distance", "timeout")}
-    assert set(ends(jaxsafe.make("docking2d", numbers | every), [0.3, 0.0])[0]) == {"success", "distance", "timeout"}
+    assert set(ends(jaxsafe.make("docking2d", numbers | every), [0.3, 0.0])[0]) == {
+        "success",
+        "distance",
+        "timeout",
+    }
 
 
 def test_a_bound_is_hidden_by_ends_but_not_by_those_that_stand_apart() -> None:
@@ -263,7 +364,9 @@ def test_a_bound_is_hidden_by_ends_but_not_by_those_that_stand_apart() -> None:
 def test_a_released_docking_that_crashes_too_late_is_a_timeout() -> None:
     numbers, found = {"terminal.timeout.limit": 0.5}, {}
     for variant in ("paper", "released"):
-        found[variant] = ends(jaxsafe.make("docking2d", numbers, variant=variant), [0.3, -1.0], [0.0, 1.0])[1]
+        found[variant] = ends(
+            jaxsafe.make("docking2d", numbers, variant=variant), [0.3, -1.0], [0.0, 1.0]
+        )[1]
     assert found == {"paper": "crash", "released": "timeout"}
 
 
@@ -295,7 +398,11 @@ def test_a_state_holds_the_numbers_drawn_for_its_episode(env: Environment) -> No
 def test_reset_to_takes_arrays_inside_a_compiled_function() -> None:
     env = jaxsafe.make("docking2d")
     position, velocity = jnp.array([100.0, 0.0]), jnp.array([0.0, 0.1])
-    state = jax.jit(lambda env: jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})[0])(env)
+    state = jax.jit(
+        lambda env: jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})[
+            0
+        ]
+    )(env)
     assert (state.sim.platforms["deputy"].position == position).all()
 
 
@@ -313,7 +420,10 @@ def test_a_status_that_is_not_a_number_ends_the_episode() -> None:
     status = (*plain.status, Broken(name="broken", distance="docking_distance"))
     terminal = (*plain.terminal, TooFar(name="broken", distance="broken", limit=1e6))
     env = jaxsafe.override(plain, {"status": status, "terminal": terminal})
-    for distance, expected in ((100.0, ([], "running", 0.0)), (10.0, (["diverged"], "diverged", 1.0))):
+    for distance, expected in (
+        (100.0, ([], "running", 0.0)),
+        (10.0, (["diverged"], "diverged", 1.0)),
+    ):
         ended, outcome, timestep = ends(env, [distance, 0.0])
         assert (ended, outcome, float(timestep.cost)) == expected
 
@@ -324,7 +434,10 @@ def test_success_is_an_outcome_that_training_and_evaluation_ask_for() -> None:
     goal = plain.terminal[0].replace(name="docked")
     terms = tuple(term for term in plain.reward if term.name != "success")
     env = jaxsafe.override(plain, {"terminal": (goal, *plain.terminal[1:]), "reward": terms})
-    with pytest.raises(ConfigError, match=r"no outcome is called 'success'.*docked, crash, distance, timeout, velocity"):
+    with pytest.raises(
+        ConfigError,
+        match=r"no outcome is called 'success'.*docked, crash, distance, timeout, velocity",
+    ):
         require_success(env)
 
 
@@ -336,7 +449,11 @@ def test_success_is_an_outcome_that_training_and_evaluation_ask_for() -> None:
         ("deputy", None, "expected platforms by name, found 'deputy'"),
         ({"deputy": None}, None, "deputy: expected fields by name, found None"),
         (START, [1], r"expected parameters by name, found \[1\]"),
-        ({"deputy": {**START["deputy"], "velocity": [0.0, 1e39]}}, None, r"velocity: expected finite numbers, found \[0"),
+        (
+            {"deputy": {**START["deputy"], "velocity": [0.0, 1e39]}},
+            None,
+            r"velocity: expected finite numbers, found \[0",
+        ),
     ],
 )
 def test_reset_to_refuses_what_is_no_mapping_of_numbers(

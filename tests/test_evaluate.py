@@ -25,14 +25,18 @@ def zero(key: jax.Array, observation: jax.Array) -> jax.Array:
     return jax.numpy.zeros((*observation.shape[:-1], 2))
 
 
-def test_the_runs_own_results_come_out_again(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_runs_own_results_come_out_again(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([f"run={whole}", "episodes=6", f"out={tmp_path / 'again'}"]) == 0
     again = json.loads((tmp_path / "again" / "results.json").read_text())
     own = json.loads((whole / "results.json").read_text())
     for kind in ("stochastic", "deterministic"):
         assert again["evaluation"][kind] == own["evaluation"][kind]
     assert "success rate" in capsys.readouterr().out
-    rows = [json.loads(line) for line in (tmp_path / "again" / "eval.jsonl").read_text().splitlines()]
+    rows = [
+        json.loads(line) for line in (tmp_path / "again" / "eval.jsonl").read_text().splitlines()
+    ]
     assert len(rows) == 2 * 3 * 6
 
 
@@ -54,7 +58,9 @@ def test_a_policy_file_gives_the_results_of_its_seed_and_a_film(
         assert metric["per_seed"] == [own[name]["per_seed"][2]]
     with Image.open(place / "episode_deterministic.gif") as image:
         assert image.n_frames > 10  # type: ignore[attr-defined]
-    with pytest.raises(ConfigError, match=r"checkpoint: .* is a single policy; leave checkpoint=best out"):
+    with pytest.raises(
+        ConfigError, match=r"checkpoint: .* is a single policy; leave checkpoint=best out"
+    ):
         main([f"run={file}", "checkpoint=best"])
 
 
@@ -77,9 +83,14 @@ def test_evaluations_get_directories_of_their_own(whole: Path, tmp_path: Path) -
 
 
 def test_a_checkpoint_that_is_not_there_is_told_with_those_that_are(whole: Path) -> None:
-    with pytest.raises(ConfigError, match=r"checkpoint: no step 641 in .*; choose from 320, 640, 960, 1280"):
+    with pytest.raises(
+        ConfigError, match=r"checkpoint: no step 641 in .*; choose from 320, 640, 960, 1280"
+    ):
         main([f"run={whole}", "checkpoint=641"])
-    with pytest.raises(ConfigError, match=r"checkpoint: found 'lst'; choose from last, best, 320.*Did you mean 'last'\?"):
+    with pytest.raises(
+        ConfigError,
+        match=r"checkpoint: found 'lst'; choose from last, best, 320.*Did you mean 'last'\?",
+    ):
         main([f"run={whole}", "checkpoint=lst"])
 
 
@@ -91,7 +102,9 @@ def test_a_corrupt_checkpoint_is_told_in_one_line(whole: Path, tmp_path: Path, d
         if path.is_file() and damage == "gone":
             path.unlink()
         elif path.is_file():
-            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2] if damage == "cut" else b"garbage")
+            path.write_bytes(
+                path.read_bytes()[: path.stat().st_size // 2] if damage == "cut" else b"garbage"
+            )
     with pytest.raises(ConfigError, match=r"1280: checkpoint cannot be read: ") as error:
         main([f"run={run}"])
     assert "\n" not in str(error.value)
@@ -110,15 +123,22 @@ def test_recorded_episodes_are_those_that_were_evaluated(
     timeout: float, piece: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(seeds_module, "RECORDED_STEPS_PER_CALL", piece)
-    ends = {"terminal.timeout.limit": timeout, "terminal.distance.limit": 150.2 if timeout > 30.0 else 40e3}
+    ends = {
+        "terminal.timeout.limit": timeout,
+        "terminal.distance.limit": 150.2 if timeout > 30.0 else 40e3,
+    }
     env = jaxsafe.make("docking2d", {**ends, "deputy.start.position.distance": [150.0, 150.0]})
     monkeypatch.setattr(episodes_module, "MAX_STEPS", 40)
     episodes = run_episodes(env, zero, next(batch_keys(3, 1)), 10)
-    for i, (states, timesteps) in enumerate(Evaluator(SeedMapper(1), env, Idle()).episodes({}, 3, 3)):
+    for i, (states, timesteps) in enumerate(
+        Evaluator(SeedMapper(1), env, Idle()).episodes({}, 3, 3)
+    ):
         last = len(timesteps.reward) - 1
         assert last == int(episodes.length[i])
         assert int(timesteps.info.outcome[last]) == int(episodes.outcome[i])
-        assert float(timesteps.reward[1:].sum()) == pytest.approx(float(episodes.episode_return[i]), rel=1e-5)
+        assert float(timesteps.reward[1:].sum()) == pytest.approx(
+            float(episodes.episode_return[i]), rel=1e-5
+        )
         np.testing.assert_allclose(states.sim.time, np.arange(last + 1))
 
 
@@ -137,19 +157,29 @@ def test_an_episode_that_does_not_end_is_given_up_and_that_is_told(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(episodes_module, "MAX_STEPS", 45)
-    words = [f"run={whole / 'policy' / 'seed_0.npz'}", "episodes=2", "env.terminal.timeout.limit=1e10"]
+    words = [
+        f"run={whole / 'policy' / 'seed_0.npz'}",
+        "episodes=2",
+        "env.terminal.timeout.limit=1e10",
+    ]
     assert main([*words, f"out={tmp_path / 'x'}"]) == 0
     told = "episodes still running after 45 steps, given up and counted as failures: 2 stochastic, 2 deterministic"
     assert told in capsys.readouterr().out
     results = json.loads((tmp_path / "x" / "results.json").read_text())
     assert results["given_up"] == {"after_steps": 45, "stochastic": 2, "deterministic": 2}
-    assert json.loads((tmp_path / "x" / "eval.jsonl").read_text().splitlines()[0])["outcome"] == "running"
+    assert (
+        json.loads((tmp_path / "x" / "eval.jsonl").read_text().splitlines()[0])["outcome"]
+        == "running"
+    )
 
 
 @pytest.mark.parametrize(
     ("overrides", "steps"),
     [
-        ({"dt": 0.3, "terminal.timeout.limit": 9.0}, 31),  # 9 / 0.3 is less than 30 in single precision
+        (
+            {"dt": 0.3, "terminal.timeout.limit": 9.0},
+            31,
+        ),  # 9 / 0.3 is less than 30 in single precision
         ({"terminal.timeout.limit": 9.0, "randomize": {"dt": [0.5, 1.5]}}, 19),
         ({"terminal.timeout.limit": 9.0, "randomize": {"terminal.timeout.limit": [5.0, 20.0]}}, 21),
     ],
@@ -173,7 +203,9 @@ def chosen(*words: str) -> EnvironmentChoice:
 def test_a_policy_acts_in_another_environment_that_fits_it(tmp_path: Path) -> None:
     own, name = jaxsafe.make("docking2d", {"deputy.mass": 14.0}), "docking2d"
     file = tmp_path / "mine.yaml"
-    file.write_text(dump(jaxsafe.make("docking2d", {"deputy.mass": 24.0, "terminal.timeout.limit": 100.0})))
+    file.write_text(
+        dump(jaxsafe.make("docking2d", {"deputy.mass": 24.0, "terminal.timeout.limit": 100.0}))
+    )
     other = chosen(f"env={file}", "env.deputy.mass=30").change(own, name, "x")
     assert float(other.platform("deputy").mass) == 30.0  # type: ignore[attr-defined]
     assert float(other.terminal[-1].limit) == 100.0  # type: ignore[attr-defined]
@@ -187,19 +219,51 @@ def test_a_policy_acts_in_another_environment_that_fits_it(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("actions", "words", "message"),
     [
-        ("continuous", ["env=docking3d"], r"env: docking3d has observation_names .*, the policies of x have "),
+        (
+            "continuous",
+            ["env=docking3d"],
+            r"env: docking3d has observation_names .*, the policies of x have ",
+        ),
         ("continuous", ["env=rejoin2d"], r"env: rejoin2d has observation_names"),
-        ("continuous", ["env=docking2d_oriented"], r"env: docking2d_oriented has observation_names"),
-        ("continuous", ["env.observation=[velocity,position,speed,velocity_limit]"], "the change gives observation_names"),
+        (
+            "continuous",
+            ["env=docking2d_oriented"],
+            r"env: docking2d_oriented has observation_names",
+        ),
+        (
+            "continuous",
+            ["env.observation=[velocity,position,speed,velocity_limit]"],
+            "the change gives observation_names",
+        ),
         ("continuous", ["env=FILE"], r"env: .*mine\.yaml has observation_names"),
-        ("continuous", ["actions=discrete"], r"the change gives num_action_points \(11, 11\).*; give actions=continuous$"),
-        ("discrete", ["env=docking2d"], r"has num_action_points \(\), .* \(11, 11\); give actions=discrete$"),
-        ("discrete", ["env.deputy.controller.actuators.thrust_x.points=5"], r"num_action_points \(5, 11\), .*11\)$"),
-        ("discrete", ["actions=discret"], "actions: unknown kind 'discret'.*Did you mean 'discrete'"),
+        (
+            "continuous",
+            ["actions=discrete"],
+            r"the change gives num_action_points \(11, 11\).*; give actions=continuous$",
+        ),
+        (
+            "discrete",
+            ["env=docking2d"],
+            r"has num_action_points \(\), .* \(11, 11\); give actions=discrete$",
+        ),
+        (
+            "discrete",
+            ["env.deputy.controller.actuators.thrust_x.points=5"],
+            r"num_action_points \(5, 11\), .*11\)$",
+        ),
+        (
+            "discrete",
+            ["actions=discret"],
+            "actions: unknown kind 'discret'.*Did you mean 'discrete'",
+        ),
         ("continuous", ["env=docking4d"], "env: unknown task 'docking4d'"),
         ("continuous", ["env=none.yaml"], r"none\.yaml"),
         ("continuous", ["variant=code"], "variant: unknown variant 'code'"),
-        ("continuous", ["rta=safe"], r"rta: docking2d has no preset 'safe'; choose from none, .*, FILE\.yaml"),
+        (
+            "continuous",
+            ["rta=safe"],
+            r"rta: docking2d has no preset 'safe'; choose from none, .*, FILE\.yaml",
+        ),
         ("continuous", ["rta=none.yaml"], r"none\.yaml"),
     ],
 )
@@ -217,14 +281,19 @@ def test_an_environment_that_does_not_fit_is_refused(
 
 def test_a_discrete_policy_is_evaluated_where_actions_are_discrete() -> None:
     own = jaxsafe.make("docking2d", actions="discrete")
-    env = chosen("env=docking2d", "actions=discrete", "rta=explicit_simplex").change(own, "docking2d", "x")
+    env = chosen("env=docking2d", "actions=discrete", "rta=explicit_simplex").change(
+        own, "docking2d", "x"
+    )
     assert env.num_action_points == (11, 11)
     assert env.rta is not None
 
 
 def test_what_is_defined_otherwise_than_in_training_is_told() -> None:
     own = jaxsafe.make("docking2d")
-    assert differences(own, chosen("env.deputy.mass=24", "rta=default").change(own, "docking2d", "x")) == ""
+    assert (
+        differences(own, chosen("env.deputy.mass=24", "rta=default").change(own, "docking2d", "x"))
+        == ""
+    )
     words = ["env.observation.position.scale=10", "env.deputy.controller.actuators.thrust_y.high=2"]
     told = differences(own, chosen(*words).change(own, "docking2d", "x"))
     assert told == "defined otherwise than in training: observation position, actuator thrust_y"
@@ -234,10 +303,17 @@ def test_another_environment_is_the_change_that_makes_it(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "mine.yaml"
-    file.write_text(dump(jaxsafe.make("docking2d", {"terminal.timeout.limit": 30.0, "deputy.mass": 24.0})))
+    file.write_text(
+        dump(jaxsafe.make("docking2d", {"terminal.timeout.limit": 30.0, "deputy.mass": 24.0}))
+    )
     words = [f"run={whole / 'policy' / 'seed_1.npz'}", "episodes=3", "deterministic=true"]
     assert main([*words, f"env={file}", f"out={tmp_path / 'a'}"]) == 0
-    assert main([*words, "env.deputy.mass=24", "env.terminal.timeout.limit=30", f"out={tmp_path / 'b'}"]) == 0
+    assert (
+        main(
+            [*words, "env.deputy.mass=24", "env.terminal.timeout.limit=30", f"out={tmp_path / 'b'}"]
+        )
+        == 0
+    )
     a, b = (json.loads((tmp_path / name / "results.json").read_text()) for name in "ab")
     assert a["evaluation"] == b["evaluation"]
     assert a["changes"] == {"env": str(file)}
@@ -245,7 +321,9 @@ def test_another_environment_is_the_change_that_makes_it(
 
 def test_every_episode_is_counted_once_however_short() -> None:
     # A biased evaluation would run the same number of steps in each lane and so see more of the short episodes.
-    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 200.0, "terminal.distance.limit": 130.0})
+    env = jaxsafe.make(
+        "docking2d", {"terminal.timeout.limit": 200.0, "terminal.distance.limit": 130.0}
+    )
     episodes = run_episodes(env, zero, jax.random.key(0), 500)
     outcomes = np.asarray(episodes.outcome)
     start = jax.vmap(lambda key: env.reset(key)[0].sim.status["docking_distance"])(

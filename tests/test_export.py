@@ -30,10 +30,14 @@ def saved(task: str) -> SavedPolicy:
 def run(model: Any, inputs: np.ndarray) -> np.ndarray:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
-    return onnxruntime.InferenceSession(model.SerializeToString(), options).run(None, {"input": inputs})[0]
+    return onnxruntime.InferenceSession(model.SerializeToString(), options).run(
+        None, {"input": inputs}
+    )[0]
 
 
-@pytest.mark.parametrize("task", ["docking2d", "docking3d", "docking2d_oriented", "rejoin2d", "rejoin3d"])
+@pytest.mark.parametrize(
+    "task", ["docking2d", "docking3d", "docking2d_oriented", "rejoin2d", "rejoin3d"]
+)
 def test_another_runtime_acts_alike(task: str) -> None:
     policy = saved(task)
     _, starts = jax.jit(reset_batch, static_argnums=2)(policy.env, jax.random.key(0), 10_000)
@@ -48,17 +52,29 @@ def test_another_runtime_acts_alike(task: str) -> None:
     features = np.asarray(policy.agent.inputs(policy.env, jnp.asarray(observations)))
     model = to_onnx(network.function, features.shape)
     np.testing.assert_allclose(run(model, features), expected, atol=1e-5)
-    assert {node.op_type for node in model.graph.node} <= {"MatMul", "Add", "Tanh", "Reshape", "Expand", "Identity"}
+    assert {node.op_type for node in model.graph.node} <= {
+        "MatMul",
+        "Add",
+        "Tanh",
+        "Reshape",
+        "Expand",
+        "Identity",
+    }
 
 
 def test_discrete_policies_choose_alike() -> None:
     policy = saved("docking2d")
     env = jaxsafe.make("docking2d", actions="discrete")
     params = policy.agent.init(jax.random.key(0), env)
-    params = {"actor": jax.tree.map(lambda x: 30.0 * x, params["actor"]), "log_std": jnp.array([-1.5, -2.0])}
+    params = {
+        "actor": jax.tree.map(lambda x: 30.0 * x, params["actor"]),
+        "log_std": jnp.array([-1.5, -2.0]),
+    }
     policy = policy._replace(env=env, params=params)
     observations = np.random.default_rng(0).uniform(-1, 1, (500, 6)).astype(np.float32)
-    expected = policy.agent.act(env, policy.params, jax.random.key(0), jnp.asarray(observations), True)
+    expected = policy.agent.act(
+        env, policy.params, jax.random.key(0), jnp.asarray(observations), True
+    )
     found = run(to_onnx(functions.action(policy).function, observations.shape), observations)
     assert np.mean(found == expected) > 0.999
     assert len(np.unique(found)) >= 3
@@ -71,11 +87,20 @@ def test_discrete_policies_choose_alike() -> None:
 def test_the_state_goes_in_and_the_control_comes_out() -> None:
     policy = saved("docking2d")
     exported = functions.control(policy)
-    assert exported.inputs == ("deputy.position.x", "deputy.position.y", "deputy.velocity.x", "deputy.velocity.y")
+    assert exported.inputs == (
+        "deputy.position.x",
+        "deputy.position.y",
+        "deputy.velocity.x",
+        "deputy.velocity.y",
+    )
     start = np.array([[80.0, -60.0, 0.1, -0.05]], np.float32)
     env = policy.env
-    state, timestep = jaxsafe.reset_to(env, {"deputy": {"position": start[0, :2], "velocity": start[0, 2:]}})
-    _, timestep = env.step(state, jaxsafe.load_policy("docking2d")(jax.random.key(0), timestep.observation))
+    state, timestep = jaxsafe.reset_to(
+        env, {"deputy": {"position": start[0, :2], "velocity": start[0, 2:]}}
+    )
+    _, timestep = env.step(
+        state, jaxsafe.load_policy("docking2d")(jax.random.key(0), timestep.observation)
+    )
     found = run(to_onnx(exported.function, start.shape), start)
     np.testing.assert_allclose(found[0], timestep.info.control_actual, atol=1e-5)
 
@@ -85,7 +110,9 @@ def test_the_closed_loop_is_the_environments_own() -> None:
     start = np.array([[80.0, -60.0, 0.1, -0.05], [70.0, 106.0, -0.28, 0.28]], np.float32)
     looped = functions.closed_loop(policy, 3)
     expected = jax.jit(looped.function)(start)
-    found = run(to_onnx(functions.closed_loop(policy, 3, unrolled=True).function, start.shape), start)
+    found = run(
+        to_onnx(functions.closed_loop(policy, 3, unrolled=True).function, start.shape), start
+    )
     np.testing.assert_allclose(found, expected, atol=1e-5)
     assert looped.outputs == tuple(f"velocity_limit_{t}" for t in range(4))
     speed = np.linalg.norm(start[:, 2:], axis=1)
@@ -96,7 +123,9 @@ def test_the_closed_loop_is_the_environments_own() -> None:
 @pytest.mark.parametrize("name", ACTIVATIONS)
 def test_every_activation_of_a_policy_from_elsewhere_can_be_exported(name: str) -> None:
     values = np.linspace(-4.0, 4.0, 60, dtype=np.float32).reshape(6, 10)
-    np.testing.assert_allclose(run(to_onnx(ACTIVATIONS[name], (6, 10)), values), ACTIVATIONS[name](values), atol=1e-6)
+    np.testing.assert_allclose(
+        run(to_onnx(ACTIVATIONS[name], (6, 10)), values), ACTIVATIONS[name](values), atol=1e-6
+    )
 
 
 def test_a_property_names_its_box_and_what_must_not_happen(tmp_path: Path) -> None:
@@ -111,7 +140,12 @@ def test_a_property_names_its_box_and_what_must_not_happen(tmp_path: Path) -> No
 
 def test_a_search_finds_the_least_margin() -> None:
     bowl = lambda x: jnp.sum((x - jnp.array([0.31, -0.7])) ** 2, axis=-1, keepdims=True) - 0.01  # noqa: E731
-    worst = search(functions.Exported(bowl, ("a", "b"), ("h",)), [(-1, 1), (-1, 1)], jax.random.key(0), starts=50)
+    worst = search(
+        functions.Exported(bowl, ("a", "b"), ("h",)),
+        [(-1, 1), (-1, 1)],
+        jax.random.key(0),
+        starts=50,
+    )
     assert worst.margin == pytest.approx(-0.01, abs=1e-4)
     np.testing.assert_allclose(worst.start, [0.31, -0.7], atol=0.02)
 
@@ -125,7 +159,12 @@ def test_the_modes_of_jax_change_nothing(mode: str, tmp_path: Path) -> None:
     bowl = lambda x: jnp.sum((x - jnp.array([[0.31, -0.7]])) ** 2, axis=-1, keepdims=True) - 0.01  # noqa: E731
     with (CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING)[mode]():
         assert main([*words, f"out={found}"]) == 0
-        assert main(["run=pretrained/docking2d", "format=stablehlo", f"out={tmp_path / 'x.stablehlo'}"]) == 0
+        assert (
+            main(
+                ["run=pretrained/docking2d", "format=stablehlo", f"out={tmp_path / 'x.stablehlo'}"]
+            )
+            == 0
+        )
         exported = functions.Exported(bowl, ("a", "b"), ("h",))
         worst = search(exported, [(-1, 1), (-1, 1)], jax.random.key(0), starts=50)
     start = np.array([[80.0, -60.0, 0.1, -0.05]], np.float32)
@@ -139,56 +178,101 @@ def test_the_modes_of_jax_change_nothing(mode: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("mode", ["rank_promotion", "dtype_promotion"])
 def test_a_property_is_searched_where_types_and_ranks_are_strict(mode: str, tmp_path: Path) -> None:
     with CHECKED_WHILE_TRACING[mode]():
-        assert main(["run=pretrained/docking2d", "format=vnnlib", "steps=2", f"out={tmp_path / 'x.vnnlib'}"]) == 0
+        assert (
+            main(
+                [
+                    "run=pretrained/docking2d",
+                    "format=vnnlib",
+                    "steps=2",
+                    f"out={tmp_path / 'x.vnnlib'}",
+                ]
+            )
+            == 0
+        )
 
 
 @pytest.mark.parametrize("where", ["everywhere", "in a corner", "inside"])
 def test_a_margin_that_is_not_a_number_is_a_counterexample(where: str) -> None:
     def margins(x: jax.Array) -> jax.Array:
-        wrong = {"everywhere": x[:, 0] > -9.0, "in a corner": x[:, 0] + x[:, 1] > 1.99, "inside": jnp.abs(x[:, 0]) < 0.1}
+        wrong = {
+            "everywhere": x[:, 0] > -9.0,
+            "in a corner": x[:, 0] + x[:, 1] > 1.99,
+            "inside": jnp.abs(x[:, 0]) < 0.1,
+        }
         return jnp.stack([jnp.where(wrong[where], jnp.nan, 1.0), jnp.ones(len(x))], axis=-1)
 
-    worst = search(functions.Exported(margins, ("a", "b"), ("h_0", "h_1")), [(-1, 1), (-1, 1)], jax.random.key(0))
+    worst = search(
+        functions.Exported(margins, ("a", "b"), ("h_0", "h_1")),
+        [(-1, 1), (-1, 1)],
+        jax.random.key(0),
+    )
     assert worst.margin == -np.inf
     assert np.isnan(margins(jnp.asarray(worst.start)[None])).any()
 
 
 def test_a_slope_that_is_not_a_number_is_no_counterexample() -> None:
     cone = lambda x: 0.5 + jnp.linalg.norm(jnp.maximum(x, 0.0), axis=-1, keepdims=True)  # noqa: E731
-    worst = search(functions.Exported(cone, ("a", "b"), ("h",)), [(-1, 1), (-1, 1)], jax.random.key(0), starts=50)
+    worst = search(
+        functions.Exported(cone, ("a", "b"), ("h",)),
+        [(-1, 1), (-1, 1)],
+        jax.random.key(0),
+        starts=50,
+    )
     assert worst.margin == 0.5
     assert np.isfinite(worst.start).all()
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_policy_that_diverged_is_not_exported(value: float, tmp_path: Path, monkeypatch: Any) -> None:
+def test_a_policy_that_diverged_is_not_exported(
+    value: float, tmp_path: Path, monkeypatch: Any
+) -> None:
     monkeypatch.chdir(tmp_path)
     policy = saved("docking2d")
     layers = [jax.tree.map(np.array, layer) for layer in policy.params["actor"]]
     layers[0]["kernel"][0, 0] = value
     save_policy(Path("own.npz"), policy.env, policy.agent, {**policy.params, "actor": layers}, {})
     for words in (["format=onnx"], ["format=stablehlo"], ["format=vnnlib"]):
-        with pytest.raises(ConfigError, match=r"^own\.npz: actor/0/kernel: not all parameters are finite numbers"):
+        with pytest.raises(
+            ConfigError, match=r"^own\.npz: actor/0/kernel: not all parameters are finite numbers"
+        ):
             main(["run=own.npz", *words])
     np.savez("theirs.npz", kernel_0=np.full((6, 2), np.nan), bias_0=np.zeros(2))
-    with pytest.raises(ConfigError, match=r"^theirs\.npz: kernel_0: not all parameters are finite numbers"):
+    with pytest.raises(
+        ConfigError, match=r"^theirs\.npz: kernel_0: not all parameters are finite numbers"
+    ):
         main(["run=theirs.npz", "env=docking2d", "format=vnnlib"])
     assert not [path for path in tmp_path.iterdir() if path.suffix != ".npz"]
 
 
-def test_a_loop_that_ends_in_no_number_is_violated(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_loop_that_ends_in_no_number_is_violated(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     layers = {"kernel_0": np.full((6, 2), 3e38), "kernel_1": np.array([[1.0, 1.0], [-1.0, -1.0]])}
-    np.savez(tmp_path / "x.npz", **layers, bias_0=np.zeros(2), bias_1=np.zeros(2))  # infinity less infinity
-    words = [f"run={tmp_path / 'x.npz'}", "env=docking2d", "format=vnnlib", "steps=1", f"out={tmp_path / 'x.vnnlib'}"]
+    np.savez(
+        tmp_path / "x.npz", **layers, bias_0=np.zeros(2), bias_1=np.zeros(2)
+    )  # infinity less infinity
+    words = [
+        f"run={tmp_path / 'x.npz'}",
+        "env=docking2d",
+        "format=vnnlib",
+        "steps=1",
+        f"out={tmp_path / 'x.vnnlib'}",
+    ]
     assert main([*words, "activation=relu"]) == 0
-    assert re.search("least margin not a number from .*: violated$", capsys.readouterr().out.strip())
+    assert re.search(
+        "least margin not a number from .*: violated$", capsys.readouterr().out.strip()
+    )
 
 
-def test_the_page_tells_what_the_search_finds(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_the_page_tells_what_the_search_finds(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
     page = (Path(__file__).parent.parent / "docs" / "export.md").read_text(encoding="utf-8")
     assert main(["run=pretrained/docking2d", "format=vnnlib", f"out={tmp_path / 'x.vnnlib'}"]) == 0
     told = re.compile(r"least margin (\S+) from .*(: no counterexample among .*)")
-    (said, rest), (found, end) = (told.search(text).groups() for text in (page, capsys.readouterr().out))  # type: ignore[union-attr]
+    (said, rest), (found, end) = (
+        told.search(text).groups() for text in (page, capsys.readouterr().out)
+    )  # type: ignore[union-attr]
     assert float(found) == pytest.approx(float(said), abs=2e-4)  # on another processor
     assert end == rest
 
@@ -197,13 +281,22 @@ def test_a_run_without_such_a_policy_says_so(whole: Path, tmp_path: Path) -> Non
     with pytest.raises(ConfigError, match="seed: found 7; choose from 0, 1, 2"):
         main([f"run={whole}", "seed=7"])
     shutil.copy(whole / "config.yaml", tmp_path)
-    with pytest.raises(ConfigError, match=f"^run: {tmp_path} has no policies yet; finish it with: .* resume={tmp_path}$"):
+    with pytest.raises(
+        ConfigError,
+        match=f"^run: {tmp_path} has no policies yet; finish it with: .* resume={tmp_path}$",
+    ):
         main([f"run={tmp_path}"])
 
 
-def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: Any) -> None:
+def test_the_command_writes_each_format(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: Any
+) -> None:
     monkeypatch.chdir(tmp_path)
-    for words in (["inputs=network", "batch=3"], ["format=stablehlo"], ["format=vnnlib", "steps=2"]):
+    for words in (
+        ["inputs=network", "batch=3"],
+        ["format=stablehlo"],
+        ["format=vnnlib", "steps=2"],
+    ):
         assert main(["run=pretrained/docking2d", *words]) == 0
     assert "docking2d.onnx: feature_0" in capsys.readouterr().out
     assert {path.name for path in tmp_path.iterdir()} == {
@@ -215,7 +308,9 @@ def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFi
     expected = jaxsafe.load_policy("docking2d")(jax.random.key(0), observations)
     np.testing.assert_allclose(loaded.call(observations), expected, atol=1e-6)
     monkeypatch.setitem(sys.modules, "flatbuffers", None)
-    with pytest.raises(ConfigError, match=r"^flatbuffers is not installed; .* pip install '.\[export\]'$"):
+    with pytest.raises(
+        ConfigError, match=r"^flatbuffers is not installed; .* pip install '.\[export\]'$"
+    ):
         main(["run=pretrained/docking2d", "format=stablehlo", "out=other"])
 
 
@@ -223,21 +318,48 @@ def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFi
     ("words", "message"),
     [
         (["run=pretrained/doking"], "Did you mean 'docking2d'|choose from"),
-        (["run=pretrained/docking2d", "format=torch"], "format: found 'torch'; choose from onnx, stablehlo, vnnlib"),
+        (
+            ["run=pretrained/docking2d", "format=torch"],
+            "format: found 'torch'; choose from onnx, stablehlo, vnnlib",
+        ),
         (["run=pretrained/docking2d", "inputs=image"], "inputs: found 'image'"),
-        (["run=pretrained/docking2d", "format=vnnlib", "box.speed=[0,1]"], "box.speed: the state has no such field"),
-        (["run=pretrained/docking2d", "format=vnnlib", "box.position=3"], r"box.position: expected \[low, high\]"),
-        (["run=pretrained/rejoin2d", "format=vnnlib"], r"box.heading: expected \[low, high\] for lead.heading"),
+        (
+            ["run=pretrained/docking2d", "format=vnnlib", "box.speed=[0,1]"],
+            "box.speed: the state has no such field",
+        ),
+        (
+            ["run=pretrained/docking2d", "format=vnnlib", "box.position=3"],
+            r"box.position: expected \[low, high\]",
+        ),
+        (
+            ["run=pretrained/rejoin2d", "format=vnnlib"],
+            r"box.heading: expected \[low, high\] for lead.heading",
+        ),
         (["format=onnx"], "run: missing"),
         (
             ["run=pretrained/docking2d", "seed=1"],
             "seed: means nothing beside pretrained/docking2d, which is a single policy",
         ),
-        (["run=pretrained/docking2d", "format=vnnlib", "batch=2"], "batch: means nothing with format=vnnlib"),
-        (["run=pretrained/docking2d", "format=stablehlo", "batch=2"], "batch: means nothing with format=stablehlo"),
-        (["run=pretrained/docking2d", "format=vnnlib", "out=loop.onnx"], "out: expected NAME.vnnlib"),
-        (["run=pretrained/docking2d", "format=vnnlib", "box.position=[a,b]"], r"box.position: expected \[low, high\]"),
-        (["run=pretrained/docking2d", "format=vnnlib", "box.position=[1,.inf]"], r"box.position: expected \[low, high\]"),
+        (
+            ["run=pretrained/docking2d", "format=vnnlib", "batch=2"],
+            "batch: means nothing with format=vnnlib",
+        ),
+        (
+            ["run=pretrained/docking2d", "format=stablehlo", "batch=2"],
+            "batch: means nothing with format=stablehlo",
+        ),
+        (
+            ["run=pretrained/docking2d", "format=vnnlib", "out=loop.onnx"],
+            "out: expected NAME.vnnlib",
+        ),
+        (
+            ["run=pretrained/docking2d", "format=vnnlib", "box.position=[a,b]"],
+            r"box.position: expected \[low, high\]",
+        ),
+        (
+            ["run=pretrained/docking2d", "format=vnnlib", "box.position=[1,.inf]"],
+            r"box.position: expected \[low, high\]",
+        ),
         (
             ["run=pretrained/docking2d", "format=vnnlib", "box.position=[0,1e30]"],
             r"each within ±1e\+18, found",
@@ -256,7 +378,10 @@ def test_the_command_writes_each_format(tmp_path: Path, capsys: pytest.CaptureFi
             ["run=pretrained/docking2d", "format=vnnlib", "steps=1e6"],
             "steps: expected a whole number from 1 to 2,000",
         ),
-        (["run=pretrained/docking2d", "box.position=[1,2]"], "box.position: means nothing without format=vnnlib"),
+        (
+            ["run=pretrained/docking2d", "box.position=[1,2]"],
+            "box.position: means nothing without format=vnnlib",
+        ),
     ],
 )
 def test_mistakes_are_named(words: list[str], message: str) -> None:
@@ -272,7 +397,10 @@ def test_finite_numbers_are_told_apart() -> None:
 
 def test_a_large_batch_takes_no_memory() -> None:
     model = to_onnx(functions.action(saved("docking2d")).function, (10**9, 6))
-    assert [axis.dim_value for axis in model.graph.output[0].type.tensor_type.shape.dim] == [10**9, 2]
+    assert [axis.dim_value for axis in model.graph.output[0].type.tensor_type.shape.dim] == [
+        10**9,
+        2,
+    ]
 
 
 def test_what_has_no_counterpart_is_named() -> None:

@@ -18,49 +18,92 @@ from jaxsafe.processors.terminal import Timeout, time_limit
 
 
 def test_the_numbers_name_the_command_and_the_versions_that_made_them(tmp_path: Path) -> None:
-    argv = ["env=docking2d", "steps=40", "lanes=4", "policies=[uniform]", f"out={tmp_path / 'found.json'}"]
+    argv = [
+        "env=docking2d",
+        "steps=40",
+        "lanes=4",
+        "policies=[uniform]",
+        f"out={tmp_path / 'found.json'}",
+    ]
     assert main(argv) == 0
     found = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
     assert found["command"] == f"python -m jaxsafe.rta.falsify {shlex.join(argv)}"
     assert {"jaxsafe", "jax", "device", "processor"} <= set(found["versions"])
-    assert [(row["policy"], row["steps"], row["violating_steps"]) for row in found["policies"]] == [("uniform", 40, 0)]
+    assert [(row["policy"], row["steps"], row["violating_steps"]) for row in found["policies"]] == [
+        ("uniform", 40, 0)
+    ]
 
 
 def test_a_violation_is_the_exit_code_and_bounds_nothing(tmp_path: Path) -> None:
     out = tmp_path / "found.json"
-    assert main(["env=docking2d", "rta=none", "steps=2000", "lanes=10", "policies=[inward]", f"out={out}"]) == 1
+    assert (
+        main(
+            [
+                "env=docking2d",
+                "rta=none",
+                "steps=2000",
+                "lanes=10",
+                "policies=[inward]",
+                f"out={out}",
+            ]
+        )
+        == 1
+    )
     [row] = json.loads(out.read_text(encoding="utf-8"))["policies"]
     assert row["violating_steps"] > 0
     assert row["violation_bound"] is None
     assert "without a violation" not in report([row])
-    assert "without a violation" not in report([{**row, "violating_steps": 0}])  # inside steps they count as well
+    assert "without a violation" not in report(
+        [{**row, "violating_steps": 0}]
+    )  # inside steps they count as well
 
 
-def test_episodes_are_what_is_counted_and_whole_ones_unless_told_otherwise(capsys: pytest.CaptureFixture[str]) -> None:
+def test_episodes_are_what_is_counted_and_whole_ones_unless_told_otherwise(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """Steps of an episode depend on each other, so a million of them bound nothing a step."""
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 30.0}, rta="default")
     assert longest_episode(env) == 32
     whole = attack(env, "uniform", longest_episode(env), 5, jax.random.key(0))
     cut = attack(env, "uniform", 20, 5, jax.random.key(0))
-    assert (whole["whole_episodes"], whole["episodes"], whole["violation_bound"]) == (True, 5, 3.0 / 5)
+    assert (whole["whole_episodes"], whole["episodes"], whole["violation_bound"]) == (
+        True,
+        5,
+        3.0 / 5,
+    )
     assert (cut["whole_episodes"], cut["episodes"], cut["violation_bound"]) == (False, 5, 3.0 / 5)
-    assert main(["env=docking2d", "lanes=5", "policies=[uniform]", "env.terminal.timeout.limit=30"]) == 0
+    assert (
+        main(["env=docking2d", "lanes=5", "policies=[uniform]", "env.terminal.timeout.limit=30"])
+        == 0
+    )
     printed = capsys.readouterr().out
     assert " 160 " in printed
     assert "less than a share of 0.6 of the episodes has one" in printed
 
 
 def test_a_random_time_limit_is_read_as_each_episode_has_it() -> None:
-    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 10.0}, randomize={"terminal.timeout.limit": [5.0, 30.0]})
+    env = jaxsafe.make(
+        "docking2d",
+        {"terminal.timeout.limit": 10.0},
+        randomize={"terminal.timeout.limit": [5.0, 30.0]},
+    )
     assert longest_episode(env) == 32
     whole = attack(env, "there_and_back", longest_episode(env), 5, jax.random.key(0))
     assert whole["whole_episodes"]
     assert time_limit(env) == 10.0
-    assert time_limit(env.replace(terminal=(*env.terminal, Timeout(name="sooner", limit=jnp.float32(4.0))))) == 4.0
+    assert (
+        time_limit(
+            env.replace(terminal=(*env.terminal, Timeout(name="sooner", limit=jnp.float32(4.0))))
+        )
+        == 4.0
+    )
     assert time_limit(env.replace(terminal=env.terminal[:1])) is None
     sim = jaxsafe.reset(env, jax.random.key(0))[0].sim
     key, away = jax.random.key(1), ADVERSARIES["outward"](env, sim, jax.random.key(1))
-    for limit, turned in ((5.0, True), (30.0, False)):  # at 4 s, as an episode with this limit has it
+    for limit, turned in (
+        (5.0, True),
+        (30.0, False),
+    ):  # at 4 s, as an episode with this limit has it
         now = drawn(env, {"terminal.timeout.limit": jnp.float32(limit)})
         control = ADVERSARIES["there_and_back"](now, sim.replace(time=jnp.float32(4.0)), key)
         assert bool((control == away).all()) is not turned
@@ -79,15 +122,25 @@ def test_what_is_not_a_number_is_a_violation(monkeypatch: pytest.MonkeyPatch) ->
     assert json.loads(json.dumps(row, allow_nan=False)) == row
 
 
-@pytest.mark.parametrize("policy", ["there_and_back", pytest.param("drain", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "policy", ["there_and_back", pytest.param("drain", marks=pytest.mark.slow)]
+)
 def test_adversaries_that_turn_back_and_that_take_the_least_certificate(policy: str) -> None:
-    bare = jaxsafe.make("docking2d", {"terminal.timeout.limit": 200.0, "deputy.start.velocity.share": [0.0, 0.1]})
+    bare = jaxsafe.make(
+        "docking2d", {"terminal.timeout.limit": 200.0, "deputy.start.velocity.share": [0.0, 0.1]}
+    )
     row = attack(bare, policy, 202, 8, jax.random.key(0))
     assert row["violating_steps"] > 0
     kept = attack(
-        jaxsafe.override(bare, {"rta": jaxsafe.make("docking2d", rta="default").rta}), policy, 202, 8, jax.random.key(0)
+        jaxsafe.override(bare, {"rta": jaxsafe.make("docking2d", rta="default").rta}),
+        policy,
+        202,
+        8,
+        jax.random.key(0),
     )
-    assert kept["violating_steps"] == kept["violating_steps_inside"] == kept["uncertified_steps"] == 0
+    assert (
+        kept["violating_steps"] == kept["violating_steps_inside"] == kept["uncertified_steps"] == 0
+    )
     assert kept["worst_margin"] < (0.001 if policy == "drain" else 0.1)
 
 

@@ -25,7 +25,9 @@ def observed(task: str, ahead: np.ndarray) -> tuple[jaxsafe.Environment, jax.Arr
 def test_docking_features_are_direction_and_log_distance() -> None:
     env = jaxsafe.make("docking3d")
     agent = Agent(features="docking")
-    _, timestep = jaxsafe.reset_to(env, {"deputy": {"position": [30.0, 0.0, 40.0], "velocity": [0.0, 0.0, 0.0]}})
+    _, timestep = jaxsafe.reset_to(
+        env, {"deputy": {"position": [30.0, 0.0, 40.0], "velocity": [0.0, 0.0, 0.0]}}
+    )
     inputs = agent.inputs(env, timestep.observation)
     np.testing.assert_array_equal(inputs[:8], timestep.observation)
     np.testing.assert_allclose(inputs[8:], [0.3 / 0.51, 0.0, 0.4 / 0.51, np.log(0.505)], rtol=1e-6)
@@ -37,23 +39,33 @@ def test_approach_features_measure_the_velocity_by_its_limit(task: str) -> None:
     env = jaxsafe.make(task)
     rest = [0.0] * env.observation_names.count("position.z")
     deputy = {"position": [60.0, 0.0, *rest], "velocity": [-0.1, 0.2, *rest]}
-    _, timestep = jaxsafe.reset_to(env, {"deputy": deputy | ({"attitude": 0.0} if task == "docking2d_oriented" else {})})
+    _, timestep = jaxsafe.reset_to(
+        env, {"deputy": deputy | ({"attitude": 0.0} if task == "docking2d_oriented" else {})}
+    )
     inputs = np.asarray(Agent(features="approach").inputs(env, timestep.observation))
-    sign = -1.0 if task == "docking2d_oriented" else 1.0  # whose observation is of the chief, seen from the deputy
+    sign = (
+        -1.0 if task == "docking2d_oriented" else 1.0
+    )  # whose observation is of the chief, seen from the deputy
     velocity = np.array([-0.1, 0.2, *rest]) / (0.2 + 0.002054 * 60.0)
     d, size = velocity.size, env.observation_size
     found, along, across, speed = np.split(inputs[size + d + 1 :], np.cumsum([d, 1, d]))
     np.testing.assert_allclose(found, velocity, rtol=1e-5)
-    np.testing.assert_allclose(along, sign * velocity[0], rtol=3e-3)  # the direction has length ‖p‖/(‖p‖ + 0.001)
+    np.testing.assert_allclose(
+        along, sign * velocity[0], rtol=3e-3
+    )  # the direction has length ‖p‖/(‖p‖ + 0.001)
     np.testing.assert_allclose(across, [0.0, *velocity[1:]], atol=2e-3)
     np.testing.assert_allclose(speed, np.linalg.norm(velocity), rtol=1e-5)
-    np.testing.assert_array_equal(inputs[: size + d + 1], Agent(features="docking").inputs(env, timestep.observation))
+    np.testing.assert_array_equal(
+        inputs[: size + d + 1], Agent(features="docking").inputs(env, timestep.observation)
+    )
 
 
 def test_plain_agents_see_the_observation_and_nothing_else() -> None:
     env = jaxsafe.make("docking2d")
     _, timestep = env.reset(KEY)
-    np.testing.assert_array_equal(Agent(features="none").inputs(env, timestep.observation), timestep.observation)
+    np.testing.assert_array_equal(
+        Agent(features="none").inputs(env, timestep.observation), timestep.observation
+    )
 
 
 @pytest.mark.parametrize("task", ["rejoin2d", "rejoin3d"])
@@ -71,7 +83,9 @@ def test_rejoin_features_tell_a_collision_course(task: str) -> None:
     np.testing.assert_allclose(relative[:2], COURSE / 400.0, atol=1e-6)
     np.testing.assert_allclose(400.0 * change, 400.0 * relative + 1000.0 * way / 10.0, rtol=1e-5)
     np.testing.assert_allclose(urgent, np.clip(5.0 * change, -1.0, 1.0), rtol=1e-6)
-    np.testing.assert_allclose(closing, -1.0, atol=0.02)  # the direction of w has length ‖w‖/(‖w‖ + 0.01)
+    np.testing.assert_allclose(
+        closing, -1.0, atol=0.02
+    )  # the direction of w has length ‖w‖/(‖w‖ + 0.01)
     np.testing.assert_allclose([*across, *miss], 0.0, atol=0.1)
     np.testing.assert_allclose(danger, 1.0, atol=0.05)
 
@@ -81,14 +95,28 @@ def test_rejoin_features_are_level_however_the_wingman_rolls() -> None:
     inputs = []
     for roll, climb in ((0.0, 0.0), (0.7, 0.2), (-0.9, -0.3)):
         lead = {"position": [600.0, -300.0, 100.0], "heading": 0.4, "speed": 250.0}
-        wingman = {"position": [0.0, 0.0, 0.0], "heading": 0.2, "speed": 300.0, "roll": roll, "flight_path_angle": climb}
+        wingman = {
+            "position": [0.0, 0.0, 0.0],
+            "heading": 0.2,
+            "speed": 300.0,
+            "roll": roll,
+            "flight_path_angle": climb,
+        }
         _, timestep = jaxsafe.reset_to(env, {"lead": lead, "wingman": wingman})
-        inputs.append(np.asarray(Agent(features="rejoin").inputs(env, timestep.observation))[env.observation_size :])
-    turn = np.array([[np.cos(0.2), np.sin(0.2), 0.0], [-np.sin(0.2), np.cos(0.2), 0.0], [0.0, 0.0, 1.0]])
+        inputs.append(
+            np.asarray(Agent(features="rejoin").inputs(env, timestep.observation))[
+                env.observation_size :
+            ]
+        )
+    turn = np.array(
+        [[np.cos(0.2), np.sin(0.2), 0.0], [-np.sin(0.2), np.cos(0.2), 0.0], [0.0, 0.0, 1.0]]
+    )
     ahead = turn @ [600.0, -300.0, 100.0]
     np.testing.assert_allclose(inputs[0][:3], ahead / np.linalg.norm(ahead), atol=1e-6)
     for other in inputs[1:]:
-        np.testing.assert_allclose(other[:9], inputs[0][:9], atol=1e-5)  # the lead, and the way to the rejoin point
+        np.testing.assert_allclose(
+            other[:9], inputs[0][:9], atol=1e-5
+        )  # the lead, and the way to the rejoin point
 
 
 @pytest.mark.parametrize("task", ["rejoin2d", "rejoin3d"])
@@ -121,5 +149,7 @@ def test_the_names_of_an_observation_are_worked_out_once(monkeypatch: pytest.Mon
 )
 def test_features_of_another_task_are_refused(features: str, task: str, missing: str) -> None:
     env = jaxsafe.make(task)
-    with pytest.raises(ConfigError, match=f"agent.features: '{features}' needs an observation called '{missing}'"):
+    with pytest.raises(
+        ConfigError, match=f"agent.features: '{features}' needs an observation called '{missing}'"
+    ):
         Agent(features=features).inputs(env, jnp.zeros(env.observation_size))  # type: ignore[arg-type]

@@ -46,11 +46,19 @@ def test_a_line_that_is_no_row_of_the_log_is_an_error_that_names_it(tmp_path: Pa
         ({"step": 2**64}, "step: expected a whole number ≥ 0, found 1844674"),
         ({"step": 1, "at": [{"x": "0"}]}, r"at\.\[0\]\.x: expected a number or null, found '0'"),
         ({"step": 1, "at": {}}, r"at: expected a list, found {}"),
-        ({"step": 1, "at": [], "more": []}, r"more: expected a list of length 2, each a number or null, found \[\]"),
-        ({"step": 1, "at": []}, "more: expected a list of length 2, each a number or null, found nothing"),
+        (
+            {"step": 1, "at": [], "more": []},
+            r"more: expected a list of length 2, each a number or null, found \[\]",
+        ),
+        (
+            {"step": 1, "at": []},
+            "more: expected a list of length 2, each a number or null, found nothing",
+        ),
     ],
 )
-def test_a_row_of_another_form_is_told_with_its_line_and_place(tmp_path: Path, row: dict, found: str) -> None:
+def test_a_row_of_another_form_is_told_with_its_line_and_place(
+    tmp_path: Path, row: dict, found: str
+) -> None:
     log = tmp_path / "log.jsonl"
     log.write_text('{"step": 0, "at": [], "more": [1, null]}\n' + json.dumps(row) + "\n")
     with pytest.raises(ConfigError, match=rf"log\.jsonl, line 2: not a row of this log: {found}"):
@@ -58,7 +66,8 @@ def test_a_row_of_another_form_is_told_with_its_line_and_place(tmp_path: Path, r
 
 
 @pytest.mark.parametrize(
-    "text", ["[" * 40 + "]" * 40, "[" * 10**6, '{"a":' * 40 + "0" + "}" * 40, "NaN", "[Infinity]", "{"]
+    "text",
+    ["[" * 40 + "]" * 40, "[" * 10**6, '{"a":' * 40 + "0" + "}" * 40, "NaN", "[Infinity]", "{"],
 )
 def test_what_is_nested_deeply_or_no_json_is_not_read(tmp_path: Path, text: str) -> None:
     for name, read, wrong in (
@@ -73,7 +82,9 @@ def test_what_is_nested_deeply_or_no_json_is_not_read(tmp_path: Path, text: str)
 def test_logs_are_cut_back_to_the_rows_to_keep(tmp_path: Path) -> None:
     log = tmp_path / "log.jsonl"
     append_rows(log, ({"step": step} for step in range(5)))
-    assert keep_rows(log, lambda row: row["step"] < 2) == read_rows(log) == [{"step": 0}, {"step": 1}]
+    assert (
+        keep_rows(log, lambda row: row["step"] < 2) == read_rows(log) == [{"step": 0}, {"step": 1}]
+    )
     assert keep_rows(tmp_path / "none.jsonl", lambda row: True) == []
 
 

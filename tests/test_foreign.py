@@ -27,14 +27,19 @@ from jaxsafe.storage.files import read_json
 
 def exported(task: str, path: Path) -> Path:
     saved = read_policy(find_policy(task))
-    return write_onnx(path / f"{task}.onnx", functions.action(saved).function, (1, saved.env.observation_size), {})
+    return write_onnx(
+        path / f"{task}.onnx", functions.action(saved).function, (1, saved.env.observation_size), {}
+    )
 
 
 def as_torch_writes_it(path: Path, layers: list[tuple[np.ndarray, np.ndarray]]) -> Path:
     """Gemm with transposed weights, and ReLU."""
     nodes, constants, name = [], [], "obs"
     for i, (kernel, bias) in enumerate(layers):
-        constants += [numpy_helper.from_array(kernel.T.copy(), f"w{i}"), numpy_helper.from_array(bias, f"b{i}")]
+        constants += [
+            numpy_helper.from_array(kernel.T.copy(), f"w{i}"),
+            numpy_helper.from_array(bias, f"b{i}"),
+        ]
         nodes.append(helper.make_node("Gemm", [name, f"w{i}", f"b{i}"], [f"z{i}"], transB=1))
         name = f"z{i}"
         if i < len(layers) - 1:
@@ -42,9 +47,12 @@ def as_torch_writes_it(path: Path, layers: list[tuple[np.ndarray, np.ndarray]]) 
             name = f"a{i}"
     sizes = layers[0][0].shape[0], layers[-1][0].shape[1]
     values = [
-        helper.make_tensor_value_info(n, TensorProto.FLOAT, ["batch", k]) for n, k in zip(("obs", name), sizes, strict=True)
+        helper.make_tensor_value_info(n, TensorProto.FLOAT, ["batch", k])
+        for n, k in zip(("obs", name), sizes, strict=True)
     ]
-    onnx.save(helper.make_model(helper.make_graph(nodes, "net", values[:1], values[1:], constants)), path)
+    onnx.save(
+        helper.make_model(helper.make_graph(nodes, "net", values[:1], values[1:], constants)), path
+    )
     return path
 
 
@@ -58,9 +66,13 @@ def random_layers(*sizes: int) -> list[tuple[np.ndarray, np.ndarray]]:
 def test_what_was_exported_comes_back(task: str, tmp_path: Path) -> None:
     env = jaxsafe.make(task)
     _, agent, weights = read_foreign(exported(task, tmp_path), env)
-    observations = np.random.default_rng(0).uniform(-1, 1, (200, env.observation_size)).astype(np.float32)
+    observations = (
+        np.random.default_rng(0).uniform(-1, 1, (200, env.observation_size)).astype(np.float32)
+    )
     found = jax.jit(agent.policy(env, weights, True))(jax.random.key(0), observations)
-    np.testing.assert_allclose(found, jaxsafe.load_policy(task)(jax.random.key(0), observations), atol=2e-5)
+    np.testing.assert_allclose(
+        found, jaxsafe.load_policy(task)(jax.random.key(0), observations), atol=2e-5
+    )
 
 
 def test_networks_of_other_libraries_are_understood(tmp_path: Path) -> None:
@@ -81,49 +93,71 @@ def test_networks_of_other_libraries_are_understood(tmp_path: Path) -> None:
 
 def test_discrete_networks_give_logits(tmp_path: Path) -> None:
     env = jaxsafe.make("docking2d", actions="discrete")
-    _, agent, weights = read_foreign(as_torch_writes_it(tmp_path / "net.onnx", random_layers(6, 8, 22)), env)
+    _, agent, weights = read_foreign(
+        as_torch_writes_it(tmp_path / "net.onnx", random_layers(6, 8, 22)), env
+    )
     found = agent.policy(env, weights, True)(jax.random.key(0), jnp.ones((3, 6)))
     assert found.shape == (3, 2)
     assert found.dtype == jnp.int32
 
 
-def test_an_evaluation_of_it_is_that_of_the_original(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_evaluation_of_it_is_that_of_the_original(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     exported("docking2d", tmp_path)
     words = ["episodes=20", "deterministic=true", "env.terminal.timeout.limit=60"]
     assert main(["run=docking2d.onnx", "env=docking2d", "out=theirs", *words]) == 0
     assert main(["run=pretrained/docking2d", "out=ours", *words]) == 0
     theirs, ours = (
-        read_json(tmp_path / name / "results.json")["evaluation"]["deterministic"] for name in ("theirs", "ours")
+        read_json(tmp_path / name / "results.json")["evaluation"]["deterministic"]
+        for name in ("theirs", "ours")
     )
     for metric in ("average_return", "episode_length", "control_usage"):
         assert theirs[metric]["mean"] == pytest.approx(ours[metric]["mean"], rel=1e-3)
 
 
-def test_a_discrete_network_is_evaluated_once_by_its_modes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_discrete_network_is_evaluated_once_by_its_modes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     as_torch_writes_it(tmp_path / "net.onnx", random_layers(6, 8, 22))
-    words = ["run=net.onnx", "env=docking2d", "actions=discrete", "episodes=2", "env.terminal.timeout.limit=10", "out=x"]
+    words = [
+        "run=net.onnx",
+        "env=docking2d",
+        "actions=discrete",
+        "episodes=2",
+        "env.terminal.timeout.limit=10",
+        "out=x",
+    ]
     assert main(words) == 0
     assert list(read_json(tmp_path / "x" / "results.json")["evaluation"]) == ["deterministic"]
 
 
-def test_its_closed_loop_goes_to_a_verifier(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_its_closed_loop_goes_to_a_verifier(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     as_torch_writes_it(tmp_path / "net.onnx", random_layers(6, 8, 2))
     assert export(["run=net.onnx", "env=docking2d", "format=vnnlib", "steps=2"]) == 0
     graph = onnxruntime.InferenceSession("net_docking2d_closed_loop.onnx")
     start = np.array([[80.0, -60.0, 0.1, -0.05]], np.float32)
     state, timestep = jaxsafe.reset_to(
-        env := jaxsafe.make("docking2d"), {"deputy": {"position": start[0, :2], "velocity": start[0, 2:]}}
+        env := jaxsafe.make("docking2d"),
+        {"deputy": {"position": start[0, :2], "velocity": start[0, 2:]}},
     )
-    margins, (_, agent, weights) = [timestep.info.margins["velocity_limit"]], read_foreign(tmp_path / "net.onnx", env)
+    margins, (_, agent, weights) = (
+        [timestep.info.margins["velocity_limit"]],
+        read_foreign(tmp_path / "net.onnx", env),
+    )
     for _ in range(2):
         action = agent.policy(env, weights, True)(jax.random.key(0), timestep.observation[None])[0]
         state, timestep = jaxsafe.step(env, state, action)
         margins.append(timestep.info.margins["velocity_limit"])
     np.testing.assert_allclose(graph.run(None, {"input": start})[0], [margins], atol=1e-5)
-    with pytest.raises(ConfigError, match="inputs: found 'network'; choose from observation, state"):
+    with pytest.raises(
+        ConfigError, match="inputs: found 'network'; choose from observation, state"
+    ):
         export(["run=net.onnx", "env=docking2d", "inputs=network"])
 
 
@@ -141,19 +175,34 @@ def test_changes_of_the_environment_come_before_what_a_network_must_fit(
     assert changes["observation"] == ["position", "velocity"]
     assert export([*words, "out=four.onnx"]) == 0
     graph = onnxruntime.InferenceSession("four.onnx")
-    np.testing.assert_allclose(graph.run(None, {"input": np.ones((1, 4), np.float32)})[0], [[0.4, 0.4]], rtol=1e-6)
+    np.testing.assert_allclose(
+        graph.run(None, {"input": np.ones((1, 4), np.float32)})[0], [[0.4, 0.4]], rtol=1e-6
+    )
     with pytest.raises(ConfigError, match=r"four\.npz: does not take an observation of 6 numbers"):
         main(["run=four.npz", "env=docking2d"])
     with pytest.raises(ConfigError, match=r"variant: unknown variant 'relesed'; choose from"):
         main([*words, "variant=relesed"])
 
 
-def graph_of(path: Path, *nodes: onnx.NodeProto, kind: int = TensorProto.FLOAT, opset: int = 17, **weights: Any) -> Path:
+def graph_of(
+    path: Path,
+    *nodes: onnx.NodeProto,
+    kind: int = TensorProto.FLOAT,
+    opset: int = 17,
+    **weights: Any,
+) -> Path:
     """Write a graph from `obs`, six numbers, to `out`."""
-    values = [helper.make_tensor_value_info("obs", kind, [1, 6]), helper.make_tensor_value_info("out", kind, ["n", "m"])]
-    constants = [numpy_helper.from_array(np.asarray(value), name) for name, value in weights.items()]
+    values = [
+        helper.make_tensor_value_info("obs", kind, [1, 6]),
+        helper.make_tensor_value_info("out", kind, ["n", "m"]),
+    ]
+    constants = [
+        numpy_helper.from_array(np.asarray(value), name) for name, value in weights.items()
+    ]
     graph = helper.make_graph(nodes, "net", values[:1], values[1:], constants)
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8), path)
+    onnx.save(
+        helper.make_model(graph, opset_imports=[helper.make_opsetid("", opset)], ir_version=8), path
+    )
     return path
 
 
@@ -191,7 +240,9 @@ def test_operators_mean_what_the_runtime_means(nodes: list[onnx.NodeProto], tmp_
         **BOUNDS,
     }
     path = graph_of(tmp_path / "net.onnx", *nodes, LAST, **extra)
-    observations = np.array([[-1.0, -7.9, 2.5, -0.4, 4.0, 5.0], [7.1, 0.7, -2.5, 1.0, -4.0, 9.0]], np.float32)
+    observations = np.array(
+        [[-1.0, -7.9, 2.5, -0.4, 4.0, 5.0], [7.1, 0.7, -2.5, 1.0, -4.0, 9.0]], np.float32
+    )
     session = onnxruntime.InferenceSession(path)
     expected = [np.asarray(session.run(None, {"obs": one[None]})[0])[0] for one in observations]
     _, agent, weights = read_foreign(path, jaxsafe.make("docking2d"))
@@ -203,16 +254,48 @@ def test_operators_mean_what_the_runtime_means(nodes: list[onnx.NodeProto], tmp_
     ("nodes", "options", "message"),
     [
         ([node("Mod", "obs w", "y")], {}, "Mod of floats needs the attribute fmod=1"),
-        ([node("Split", "obs sizes", "y z", axis=1)], {"sizes": [2, 9]}, r"Split has sizes \[2, 9\] for 2 outputs"),
-        ([node("Split", "obs sizes", "y z", axis=1)], {"sizes": [9, -3]}, r"Split has sizes \[9, -3\]"),
-        ([node("Split", "obs sizes", "y", axis=1)], {"sizes": [2, 4]}, r"Split has sizes \[2, 4\] for 1 outputs"),
-        ([node("Identity", "obs", "y")], {"kind": TensorProto.INT64}, "obs: expected an input of FLOAT, found INT64"),
+        (
+            [node("Split", "obs sizes", "y z", axis=1)],
+            {"sizes": [2, 9]},
+            r"Split has sizes \[2, 9\] for 2 outputs",
+        ),
+        (
+            [node("Split", "obs sizes", "y z", axis=1)],
+            {"sizes": [9, -3]},
+            r"Split has sizes \[9, -3\]",
+        ),
+        (
+            [node("Split", "obs sizes", "y", axis=1)],
+            {"sizes": [2, 4]},
+            r"Split has sizes \[2, 4\] for 1 outputs",
+        ),
+        (
+            [node("Identity", "obs", "y")],
+            {"kind": TensorProto.INT64},
+            "obs: expected an input of FLOAT, found INT64",
+        ),
         ([node("Identity", "obs")], {"opset": 1}, "net.onnx: opset: expected 7 to"),
-        ([node("Add", "obs w", "y")], {"w": np.array([1j], np.complex64)}, "w: expected real numbers, found complex64"),
+        (
+            [node("Add", "obs w", "y")],
+            {"w": np.array([1j], np.complex64)},
+            "w: expected real numbers, found complex64",
+        ),
         ([node("Constant", "", "c"), node("Add", "obs c", "y")], {}, "net.onnx: "),
-        ([node("ReduceSum", "obs", "y", noop_with_empty_axes=1)], {}, "the attribute noop_with_empty_axes=1 is not known"),
-        ([node("Expand", "obs shape", "y")], {"shape": [10**6, 10**6, 6]}, "Expand makes an array of more than"),
-        ([node("Identity", "obs", "y", domain="else")], {}, "net.onnx: cannot be read: No opset import for domain 'else'"),
+        (
+            [node("ReduceSum", "obs", "y", noop_with_empty_axes=1)],
+            {},
+            "the attribute noop_with_empty_axes=1 is not known",
+        ),
+        (
+            [node("Expand", "obs shape", "y")],
+            {"shape": [10**6, 10**6, 6]},
+            "Expand makes an array of more than",
+        ),
+        (
+            [node("Identity", "obs", "y", domain="else")],
+            {},
+            "net.onnx: cannot be read: No opset import for domain 'else'",
+        ),
         ([node("Shape", "obs", "y")], {}, "the operator Shape is not known here"),
     ],
 )
@@ -220,7 +303,9 @@ def test_graphs_that_are_not_what_they_seem_are_refused(
     nodes: list[onnx.NodeProto], options: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     options = {"w": np.array([0.3], np.float32), **BOUNDS, **options}
-    graph = graph_of(tmp_path / "net.onnx", *nodes, *([] if "opset" in options else [LAST]), **options)
+    graph = graph_of(
+        tmp_path / "net.onnx", *nodes, *([] if "opset" in options else [LAST]), **options
+    )
     with pytest.raises(ConfigError, match=message) as caught:
         read_foreign(graph, jaxsafe.make("docking2d"))
     assert "\n" not in str(caught.value)
@@ -237,13 +322,18 @@ def test_a_damaged_graph_is_told(tmp_path: Path) -> None:
     model = onnx.load_from_string(good)
     model.graph.input[0].type.tensor_type.shape.dim[1].dim_value = 5
     (tmp_path / "x.onnx").write_bytes(model.SerializeToString())
-    with pytest.raises(ConfigError, match=r"does not take an observation of 6 numbers: its input is declared as \[0, 5\]"):
+    with pytest.raises(
+        ConfigError,
+        match=r"does not take an observation of 6 numbers: its input is declared as \[0, 5\]",
+    ):
         read_foreign(tmp_path / "x.onnx", env)
     draw = random.Random(0)
     for _ in range(40):
         damaged = bytearray(good)
         damaged[draw.randrange(len(good))] ^= 1 << draw.randrange(8)
-        (tmp_path / "x.onnx").write_bytes(damaged[: draw.choice([len(good), draw.randrange(len(good))])])
+        (tmp_path / "x.onnx").write_bytes(
+            damaged[: draw.choice([len(good), draw.randrange(len(good))])]
+        )
         with contextlib.suppress(ConfigError):  # any other error is a fault
             read_foreign(tmp_path / "x.onnx", env)
 
@@ -255,16 +345,27 @@ def test_constants_casts_and_extremes_are_understood(tmp_path: Path) -> None:
     ends = helper.make_node("Constant", [], ["ends"], value_ints=[2])
     begins = helper.make_node("Constant", [], ["begins"], value_ints=[0])
     axes = helper.make_node("Constant", [], ["axes"], value_ints=[1])
-    clipped = [helper.make_node("Max", ["obs", "low", "low"], ["y"]), helper.make_node("Min", ["y", "high"], ["z"])]
+    clipped = [
+        helper.make_node("Max", ["obs", "low", "low"], ["y"]),
+        helper.make_node("Min", ["y", "high"], ["z"]),
+    ]
     cut = helper.make_node("Slice", ["z", "begins", "ends", "axes"], ["out"])
     env = jaxsafe.make("docking2d")
     _, agent, weights = read_foreign(graph(low, high, begins, ends, axes, *clipped, cut), env)
-    found = agent.policy(env, weights, True)(jax.random.key(0), jnp.array([[0.1, 0.4, 0.9, 0.0, 0.0, 0.0], [0.9] * 6]))
+    found = agent.policy(env, weights, True)(
+        jax.random.key(0), jnp.array([[0.1, 0.4, 0.9, 0.0, 0.0, 0.0], [0.9] * 6])
+    )
     np.testing.assert_allclose(found, [[0.25, 0.4], [0.5, 0.5]])
-    words = [helper.make_node("Constant", [], ["a"], value_string="x"), helper.make_node("Identity", ["obs"], ["out"])]
+    words = [
+        helper.make_node("Constant", [], ["a"], value_string="x"),
+        helper.make_node("Identity", ["obs"], ["out"]),
+    ]
     with pytest.raises(ConfigError, match="a constant of kind value_string is not known here"):
         read_foreign(graph(*words), env)
-    casts = [helper.make_node("Cast", ["obs"], ["z"], to=10), helper.make_node("Cast", ["z"], ["out"], to=1)]
+    casts = [
+        helper.make_node("Cast", ["obs"], ["z"], to=10),
+        helper.make_node("Cast", ["z"], ["out"], to=1),
+    ]
     with pytest.raises(ConfigError, match="Cast to type 10 is not known here"):
         read_foreign(graph(*casts), env)
 
@@ -293,15 +394,26 @@ def claim(path: Path, name: str, header: str, content: bytes = b"") -> None:
     """Put a member with a header of one's own into an archive."""
     text = header.encode().ljust(118) + b"\n"
     with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as file:
-        file.writestr(f"{name}.npy", b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + content)
+        file.writestr(
+            f"{name}.npy", b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + content
+        )
 
 
 @pytest.mark.parametrize(
     ("header", "message"),
     [
-        ("{'descr': '<f4', 'fortran_order': False, 'shape': (10000000000000, 2)}", "does not take an observation of 6"),
-        ("{'descr': '<f4', 'fortran_order': False, 'shape': (6, 4000000000)}", "x.npz: expected 2 outputs"),
-        ("{'descr': '<f4', 'fortran_order': False, 'shape': (6, 2)}", "cannot be read: not an .npz of numbers"),
+        (
+            "{'descr': '<f4', 'fortran_order': False, 'shape': (10000000000000, 2)}",
+            "does not take an observation of 6",
+        ),
+        (
+            "{'descr': '<f4', 'fortran_order': False, 'shape': (6, 4000000000)}",
+            "x.npz: expected 2 outputs",
+        ),
+        (
+            "{'descr': '<f4', 'fortran_order': False, 'shape': (6, 2)}",
+            "cannot be read: not an .npz of numbers",
+        ),
         (
             "{'descr': '<c8', 'fortran_order': False, 'shape': (6, 2)}",
             "kernel_0: expected a matrix of numbers, found c",
@@ -310,13 +422,23 @@ def claim(path: Path, name: str, header: str, content: bytes = b"") -> None:
             "{'descr': '<f4', 'fortran_order': False, 'shape': (12,)}",
             r"expected a matrix of numbers, found float32 of",
         ),
-        ("{'descr': '|O', 'fortran_order': False, 'shape': (6, 2)}", "expected a matrix of numbers, found object"),
+        (
+            "{'descr': '|O', 'fortran_order': False, 'shape': (6, 2)}",
+            "expected a matrix of numbers, found object",
+        ),
         ("{'descr': " + "[" * 60 + "}", "not an .npz of numbers"),
     ],
 )
-def test_arrays_that_claim_what_does_not_fit_are_not_read(header: str, message: str, tmp_path: Path) -> None:
+def test_arrays_that_claim_what_does_not_fit_are_not_read(
+    header: str, message: str, tmp_path: Path
+) -> None:
     claim(tmp_path / "x.npz", "kernel_0", header)
-    claim(tmp_path / "x.npz", "bias_0", "{'descr': '<f4', 'fortran_order': False, 'shape': (1,)}", b"\0\0\0\0")
+    claim(
+        tmp_path / "x.npz",
+        "bias_0",
+        "{'descr': '<f4', 'fortran_order': False, 'shape': (1,)}",
+        b"\0\0\0\0",
+    )
     with pytest.raises(ConfigError, match=message):
         read_foreign(tmp_path / "x.npz", jaxsafe.make("docking2d"))
 
@@ -333,15 +455,25 @@ def test_more_mistakes_are_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="deterministic: expected true or nothing, found False"):
         main(["run=x.onnx", "env=docking2d", "deterministic=false"])
     np.savez(tmp_path / "layers.npz", kernel_0=np.ones((6, 2)), bias_0=np.ones(2))
-    with pytest.raises(ConfigError, match=r"env: missing; the task in which .*layers\.npz shall act"):
+    with pytest.raises(
+        ConfigError, match=r"env: missing; the task in which .*layers\.npz shall act"
+    ):
         main([f"run={tmp_path / 'layers.npz'}"])
     with pytest.raises(ConfigError, match="checkpoint: means nothing for a policy from elsewhere"):
         main(["run=x.npz", "env=docking2d", "checkpoint=best"])
     for words in (["run=x.onnx", "env=docking2d"], ["run=pretrained/docking2d"]):
-        with pytest.raises(ConfigError, match=r"activation: means nothing but for the layers in an \.npz with env=TASK"):
+        with pytest.raises(
+            ConfigError,
+            match=r"activation: means nothing but for the layers in an \.npz with env=TASK",
+        ):
             main([*words, "activation=relu"])
     node = helper.make_node("Erf", ["obs"], ["out"])
-    values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 6]) for name in ("obs", "out")]
-    onnx.save(helper.make_model(helper.make_graph([node], "net", values[:1], values[1:])), tmp_path / "erf.onnx")
+    values = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 6]) for name in ("obs", "out")
+    ]
+    onnx.save(
+        helper.make_model(helper.make_graph([node], "net", values[:1], values[1:])),
+        tmp_path / "erf.onnx",
+    )
     with pytest.raises(ConfigError, match="the operator Erf is not known here"):
         read_foreign(tmp_path / "erf.onnx", env)

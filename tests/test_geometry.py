@@ -58,7 +58,9 @@ def test_the_gradient_of_the_safe_norm_is_the_direction_and_zero_at_zero() -> No
 @given(azimuth=ANGLES, polar=ANGLES)
 def test_directions_are_unit_vectors(azimuth: float, polar: float) -> None:
     assert float(safe_norm(direction(jnp.asarray(azimuth)))) == pytest.approx(1.0, abs=1e-6)
-    assert float(safe_norm(direction(jnp.asarray(azimuth), jnp.asarray(polar)))) == pytest.approx(1.0, abs=1e-6)
+    assert float(safe_norm(direction(jnp.asarray(azimuth), jnp.asarray(polar)))) == pytest.approx(
+        1.0, abs=1e-6
+    )
 
 
 def test_azimuth_is_measured_from_x_and_polar_angle_from_z() -> None:
@@ -66,9 +68,15 @@ def test_azimuth_is_measured_from_x_and_polar_angle_from_z() -> None:
     np.testing.assert_allclose(direction(jnp.asarray(0.0)), [1, 0], atol=1e-6)
     np.testing.assert_allclose(direction(jnp.asarray(quarter)), [0, 1], atol=1e-6)
     np.testing.assert_allclose(direction(jnp.asarray(0.3), jnp.asarray(0.0)), [0, 0, 1], atol=1e-6)
-    np.testing.assert_allclose(direction(jnp.asarray(0.3), jnp.asarray(jnp.pi)), [0, 0, -1], atol=1e-6)
-    np.testing.assert_allclose(direction(jnp.asarray(0.0), jnp.asarray(quarter)), [1, 0, 0], atol=1e-6)
-    np.testing.assert_allclose(direction(jnp.asarray(quarter), jnp.asarray(quarter)), [0, 1, 0], atol=1e-6)
+    np.testing.assert_allclose(
+        direction(jnp.asarray(0.3), jnp.asarray(jnp.pi)), [0, 0, -1], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        direction(jnp.asarray(0.0), jnp.asarray(quarter)), [1, 0, 0], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        direction(jnp.asarray(quarter), jnp.asarray(quarter)), [0, 1, 0], atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("kind", [Circle, Sphere])
@@ -91,7 +99,10 @@ def test_a_region_moves_with_its_platform_and_lists_the_others() -> None:
     region = normalise(Circle(name="region", on="chief", radius=1.0))
     placed = region.place({"chief": at(10.0, 5.0), "deputy": at(10.5, 5.5), "third": at(0.0, 0.0)})
     np.testing.assert_array_equal(placed.position, [10.0, 5.0])
-    assert {name: bool(inside) for name, inside in placed.inside.items()} == {"deputy": True, "third": False}
+    assert {name: bool(inside) for name, inside in placed.inside.items()} == {
+        "deputy": True,
+        "third": False,
+    }
 
 
 # Magnitude and direction
@@ -99,12 +110,16 @@ def test_a_region_moves_with_its_platform_and_lists_the_others() -> None:
 
 @settings(deadline=None, max_examples=30)
 @given(st.lists(st.floats(-1e6, 1e6, width=32), min_size=2, max_size=3))
-def test_mag_norm_is_the_magnitude_and_a_unit_vector_that_give_the_vector_back(vector: list[float]) -> None:
+def test_mag_norm_is_the_magnitude_and_a_unit_vector_that_give_the_vector_back(
+    vector: list[float],
+) -> None:
     found = mag_norm(jnp.asarray(vector))
     assert found.shape == (len(vector) + 1,)
     assert float(found[0]) == pytest.approx(np.linalg.norm(vector), rel=1e-6, abs=1e-18)
     np.testing.assert_allclose(found[0] * found[1:], vector, rtol=1e-5, atol=1e-18)
-    assert float(safe_norm(found[1:])) == pytest.approx(1.0 if float(found[0]) > 0.0 else 0.0, abs=1e-6)
+    assert float(safe_norm(found[1:])) == pytest.approx(
+        1.0 if float(found[0]) > 0.0 else 0.0, abs=1e-6
+    )
 
 
 def test_mag_norm_is_all_zeros_at_zero_with_finite_derivatives() -> None:
@@ -121,7 +136,9 @@ def test_the_derivative_of_mag_norm_is_the_projection_across_the_vector() -> Non
     along = vector / 13.0
     jacobian = jax.jacrev(mag_norm)(jnp.asarray(vector))
     np.testing.assert_allclose(jacobian[0], along, rtol=1e-14)
-    np.testing.assert_allclose(jacobian[1:], (np.eye(3) - np.outer(along, along)) / 13.0, atol=1e-15)
+    np.testing.assert_allclose(
+        jacobian[1:], (np.eye(3) - np.outer(along, along)) / 13.0, atol=1e-15
+    )
 
 
 # Rotations
@@ -129,7 +146,9 @@ def test_the_derivative_of_mag_norm_is_the_projection_across_the_vector() -> Non
 
 @settings(deadline=None, max_examples=30)
 @given(yaw=ANGLES, pitch=ANGLES, roll=ANGLES)
-def test_rotations_are_orthogonal_and_keep_handedness(yaw: float, pitch: float, roll: float) -> None:
+def test_rotations_are_orthogonal_and_keep_handedness(
+    yaw: float, pitch: float, roll: float
+) -> None:
     for matrix in (rotation(jnp.float32(yaw)), rotation(*map(jnp.float32, (yaw, pitch, roll)))):
         np.testing.assert_allclose(matrix @ matrix.T, np.eye(len(matrix)), atol=2e-6)
         assert float(jnp.linalg.det(matrix)) == pytest.approx(1.0, abs=2e-6)
@@ -137,7 +156,9 @@ def test_rotations_are_orthogonal_and_keep_handedness(yaw: float, pitch: float, 
 
 @settings(deadline=None, max_examples=30)
 @given(yaw=ANGLES, pitch=ANGLES, roll=ANGLES)
-def test_a_spatial_rotation_is_yaw_times_pitch_times_roll(yaw: float, pitch: float, roll: float) -> None:
+def test_a_spatial_rotation_is_yaw_times_pitch_times_roll(
+    yaw: float, pitch: float, roll: float
+) -> None:
     def turn(angle: float, first: int, second: int) -> np.ndarray:
         matrix = np.eye(3)
         matrix[[first, second], [first, second]] = np.cos(angle)
@@ -152,13 +173,17 @@ def test_a_spatial_rotation_is_yaw_times_pitch_times_roll(yaw: float, pitch: flo
 
 def test_a_planar_rotation_turns_x_into_the_heading_and_is_the_spatial_one_from_above() -> None:
     matrix = rotation(jnp.float32(0.3))
-    np.testing.assert_allclose(matrix @ jnp.asarray([1.0, 0.0]), direction(jnp.float32(0.3)), atol=1e-7)
+    np.testing.assert_allclose(
+        matrix @ jnp.asarray([1.0, 0.0]), direction(jnp.float32(0.3)), atol=1e-7
+    )
     np.testing.assert_allclose(rotation(jnp.float32(0.3), 0.0, 0.0)[:2, :2], matrix, atol=1e-7)
 
 
 @settings(deadline=None, max_examples=30)
 @given(yaw=ANGLES, pitch=ANGLES, roll=ANGLES)
-def test_what_is_seen_from_a_body_turned_back_is_the_vector(yaw: float, pitch: float, roll: float) -> None:
+def test_what_is_seen_from_a_body_turned_back_is_the_vector(
+    yaw: float, pitch: float, roll: float
+) -> None:
     matrix, vector = rotation(*map(jnp.float32, (yaw, pitch, roll))), jnp.asarray([3.0, -4.0, 12.0])
     seen = to_body(matrix, vector)
     np.testing.assert_allclose(seen, matrix.T @ vector, atol=1e-4)
@@ -179,7 +204,9 @@ def flying(x: float, y: float, heading: float) -> Dubins2DState:
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.7, -3.0, 50.0])
-def test_the_rejoin_point_is_behind_the_lead_at_its_aspect_angle_and_turns_with_it(heading: float) -> None:
+def test_the_rejoin_point_is_behind_the_lead_at_its_aspect_angle_and_turns_with_it(
+    heading: float,
+) -> None:
     offset = normalise(Aspect(distance=500.0, angle=jnp.pi / 3)).vector(flying(1.0, 2.0, heading))
     bearing = heading + np.pi + np.pi / 3
     np.testing.assert_allclose(offset, [500 * np.cos(bearing), 500 * np.sin(bearing)], atol=0.01)
@@ -210,15 +237,30 @@ def test_a_spacecraft_is_its_own_hill_frame_for_offsets() -> None:
 
 @pytest.mark.parametrize(
     ("offset", "centre"),
-    [(None, [10.0, 20.0]), (Displacement(by=(3.0, -4.0)), [13.0, 16.0]), (Aspect(distance=5.0, angle=0.0), [10.0, 15.0])],
+    [
+        (None, [10.0, 20.0]),
+        (Displacement(by=(3.0, -4.0)), [13.0, 16.0]),
+        (Aspect(distance=5.0, angle=0.0), [10.0, 15.0]),
+    ],
 )
-def test_a_region_is_placed_at_its_offset_from_its_platform(offset: Any, centre: list[float]) -> None:
+def test_a_region_is_placed_at_its_offset_from_its_platform(
+    offset: Any, centre: list[float]
+) -> None:
     region = normalise(Circle(name="region", on="lead", offset=offset, radius=1.0))
-    platforms = {"lead": flying(10.0, 20.0, np.pi / 2), "there": flying(*centre, 0.0), "off": flying(*centre, 0.0)}
-    platforms["off"] = platforms["off"].replace(position=platforms["off"].position + jnp.asarray([0.0, 1.01]))
+    platforms = {
+        "lead": flying(10.0, 20.0, np.pi / 2),
+        "there": flying(*centre, 0.0),
+        "off": flying(*centre, 0.0),
+    }
+    platforms["off"] = platforms["off"].replace(
+        position=platforms["off"].position + jnp.asarray([0.0, 1.01])
+    )
     placed = region.place(platforms)
     np.testing.assert_allclose(placed.position, centre, atol=1e-5)
-    assert {name: bool(inside) for name, inside in placed.inside.items()} == {"there": True, "off": False}
+    assert {name: bool(inside) for name, inside in placed.inside.items()} == {
+        "there": True,
+        "off": False,
+    }
 
 
 @pytest.mark.parametrize(
@@ -235,6 +277,8 @@ def test_a_region_is_placed_at_its_offset_from_its_platform(offset: Any, centre:
         ((80.0, 80.0, 0.0), False),
     ],
 )
-def test_a_cylinder_contains_its_boundary_and_half_its_height_to_each_side(offset: tuple, inside: bool) -> None:
+def test_a_cylinder_contains_its_boundary_and_half_its_height_to_each_side(
+    offset: tuple, inside: bool
+) -> None:
     cylinder = normalise(Cylinder(name="region", on="lead", radius=100.0, height=300.0))
     assert bool(cylinder.contains(jnp.asarray(offset))) == inside

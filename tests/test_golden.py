@@ -38,10 +38,21 @@ SCATTERED = [f"{task}_transitions" for task in TASKS]
 
 COLUMNS: dict[str, dict[str, Any]] = {
     "rejoin2d": {"position": slice(0, 2), "heading": 2, "speed": 3},
-    "rejoin3d": {"position": slice(0, 3), "heading": 3, "flight_path_angle": 4, "roll": 5, "speed": 6},
+    "rejoin3d": {
+        "position": slice(0, 3),
+        "heading": 3,
+        "flight_path_angle": 4,
+        "roll": 5,
+        "speed": 6,
+    },
     "docking2d": {"position": slice(0, 2), "velocity": slice(2, 4)},
     "docking3d": {"position": slice(0, 3), "velocity": slice(3, 6)},
-    "docking2d_oriented": {"position": slice(0, 2), "attitude": 2, "velocity": slice(3, 5), "attitude_rate": 5},
+    "docking2d_oriented": {
+        "position": slice(0, 2),
+        "attitude": 2,
+        "velocity": slice(3, 5),
+        "attitude_rate": 5,
+    },
 }
 PLATFORMS = {"rejoin": ("lead", "wingman"), "docking": ("deputy",)}  # the chief rests at the origin
 REWARDS = {
@@ -63,10 +74,21 @@ STATUSES = {
 }
 MOTION = {  # within which one step agrees, by state field; positions in m or ft
     "rejoin2d": {"position": 1e-6, "heading": 1e-12, "speed": 1e-12},
-    "rejoin3d": {"position": 1e-3, "heading": 1e-6, "flight_path_angle": 1e-12, "roll": 1e-12, "speed": 1e-12},
+    "rejoin3d": {
+        "position": 1e-3,
+        "heading": 1e-6,
+        "flight_path_angle": 1e-12,
+        "roll": 1e-12,
+        "speed": 1e-12,
+    },
     "docking2d": {"position": 1e-10, "velocity": 1e-10},
     "docking3d": {"position": 1e-10, "velocity": 1e-10},
-    "docking2d_oriented": {"position": 1e-8, "velocity": 1e-8, "attitude": 1e-9, "attitude_rate": 1e-12},
+    "docking2d_oriented": {
+        "position": 1e-8,
+        "velocity": 1e-8,
+        "attitude": 1e-9,
+        "attitude_rate": 1e-12,
+    },
 }
 pytestmark = pytest.mark.usefixtures("x64")
 
@@ -88,7 +110,9 @@ class Replayed(Platform, type="replayed_of_test"):
 
 
 def task_of(recording: str) -> str:
-    return "_".join(part for part in recording.split("_") if part not in ("discrete", "rta", "transitions"))
+    return "_".join(
+        part for part in recording.split("_") if part not in ("discrete", "rta", "transitions")
+    )
 
 
 def kind_of(recording: str) -> str:
@@ -169,11 +193,17 @@ def replay(env: Environment, fields: Fields, actions: jax.Array) -> tuple[TimeSt
     def episode(fields: Fields, actions: jax.Array) -> tuple[TimeStep, Any]:
         first = jaxsafe.reset_to(env, jax.tree.map(lambda leaf: leaf[0], fields))[0]
 
-        def advance(state: State, inputs: tuple[Fields, jax.Array]) -> tuple[State, tuple[TimeStep, Any]]:
+        def advance(
+            state: State, inputs: tuple[Fields, jax.Array]
+        ) -> tuple[State, tuple[TimeStep, Any]]:
             after, action = inputs
             platforms = [
                 Replayed(
-                    name=one.name, dimension=one.dimension, controller=one.controller, inner=one, recorded=after[one.name]
+                    name=one.name,
+                    dimension=one.dimension,
+                    controller=one.controller,
+                    inner=one,
+                    recorded=after[one.name],
                 )
                 if one.name in after
                 else one
@@ -182,7 +212,9 @@ def replay(env: Environment, fields: Fields, actions: jax.Array) -> tuple[TimeSt
             state, timestep = jaxsafe.step(env.replace(platforms=tuple(platforms)), state, action)
             return state, (timestep, state.sim.replace(platforms={}))
 
-        return jax.lax.scan(advance, first, (jax.tree.map(lambda leaf: leaf[1:], fields), actions))[1]
+        return jax.lax.scan(advance, first, (jax.tree.map(lambda leaf: leaf[1:], fields), actions))[
+            1
+        ]
 
     return jax.vmap(episode)(fields, actions)
 
@@ -192,7 +224,12 @@ def assert_same(found: Any, expected: Any, message: str, tolerance: float = 1e-9
 
 
 def assert_as_recorded(
-    recording: str, data: Mapping[str, Any], timestep: TimeStep, sim: Any, rows: np.ndarray, suffix: str
+    recording: str,
+    data: Mapping[str, Any],
+    timestep: TimeStep,
+    sim: Any,
+    rows: np.ndarray,
+    suffix: str,
 ) -> None:
     """Statuses, observation, every reward term, ends and outcome on the chosen rows."""
     kind, info = kind_of(recording), timestep.info
@@ -208,7 +245,8 @@ def assert_as_recorded(
         np.testing.assert_array_equal(sim.ended[name][rows], failure == code, err_msg=name)
     np.testing.assert_array_equal(timestep.terminated[rows], data["done"][rows])
     outcomes = [
-        "success" if won else FAILURES[kind][code] for won, code in zip(success.tolist(), failure.tolist(), strict=True)
+        "success" if won else FAILURES[kind][code]
+        for won, code in zip(success.tolist(), failure.tolist(), strict=True)
     ]
     env = released(recording)
     assert [env.outcomes[index] for index in np.asarray(info.outcome)[rows]] == outcomes
@@ -219,11 +257,17 @@ def assert_as_recorded(
     else:
         safe = data[f"status_max_vel_constraint{suffix}"][rows]
         np.testing.assert_array_equal(info.margins["velocity_limit"][rows] >= 0.0, safe)
-        assert_same(-info.margins["velocity_limit"][rows], data[f"status_max_vel_violation{suffix}"][rows], "violation")
+        assert_same(
+            -info.margins["velocity_limit"][rows],
+            data[f"status_max_vel_violation{suffix}"][rows],
+            "violation",
+        )
 
 
 def test_the_recordings_are_complete() -> None:
-    count = {recording: len(transitions(recording)["action"]) for recording in (*RECORDINGS, *SCATTERED)}
+    count = {
+        recording: len(transitions(recording)["action"]) for recording in (*RECORDINGS, *SCATTERED)
+    }
     assert {name: count[name] for name in TASKS} == {
         "rejoin2d": 2839,
         "rejoin3d": 4806,
@@ -239,7 +283,10 @@ def test_whole_episodes_are_judged_as_recorded(recording: str) -> None:
     data = episodes(recording)
     timestep, sim = replay(released(recording), state_fields(recording, data), data["action"])
     rows = data["taken"]
-    after = {name: array[:, 1:] if array.shape[1:2] > rows.shape[1:2] else array for name, array in data.items()}
+    after = {
+        name: array[:, 1:] if array.shape[1:2] > rows.shape[1:2] else array
+        for name, array in data.items()
+    }
     assert_as_recorded(recording, after, timestep, sim, rows, "")
     if kind_of(recording) == "docking":
         total = np.cumsum(timestep.info.status["delta_v"], axis=1)
@@ -249,7 +296,9 @@ def test_whole_episodes_are_judged_as_recorded(recording: str) -> None:
 def test_the_released_filter_decides_as_recorded() -> None:
     """At every step of every episode, with its hysteresis: whether it intervenes, and the control that acts."""
     data = episodes("rejoin2d_rta")
-    timestep, _ = replay(released("rejoin2d_rta"), state_fields("rejoin2d_rta", data), data["action"])
+    timestep, _ = replay(
+        released("rejoin2d_rta"), state_fields("rejoin2d_rta", data), data["action"]
+    )
     rows, info = data["taken"], timestep.info
     np.testing.assert_array_equal(info.intervening[rows], data["rta_intervening"][rows])
     assert_same(info.control_desired[rows], data["rta_control_desired"][rows], "desired", 1e-15)
@@ -262,7 +311,9 @@ def test_the_released_filter_decides_as_recorded() -> None:
 def test_one_step_from_every_recorded_state_is_the_recorded_step(recording: str) -> None:
     data = transitions(recording)
     env, actions = released(recording), data["action"]
-    if recording.endswith("_rta"):  # the filter remembers what single steps do not know: take the control that acted
+    if recording.endswith(
+        "_rta"
+    ):  # the filter remembers what single steps do not know: take the control that acted
         env, actions = jaxsafe.override(env, {"rta": None}), data["control"] / bounds(env)[1]
     platforms, timestep = single_steps(env, state_fields(recording, data, "_t0"), actions)
     assert_same(timestep.info.control_desired, data["control"], "control", 1e-14)
@@ -296,7 +347,12 @@ def test_every_discrete_index_means_what_it_meant(recording: str) -> None:
     controller: Any = env.agent_platform.controller
     assert env.num_action_points == tuple(map(len, table))
     for actuator, expected in zip(controller.actuators, table, strict=True):
-        assert_same(jax.vmap(actuator.from_discrete)(jnp.arange(len(expected))), expected, actuator.name, 1e-15)
+        assert_same(
+            jax.vmap(actuator.from_discrete)(jnp.arange(len(expected))),
+            expected,
+            actuator.name,
+            1e-15,
+        )
 
 
 def test_every_state_on_a_boundary_is_judged_as_recorded() -> None:
@@ -308,12 +364,18 @@ def test_every_state_on_a_boundary_is_judged_as_recorded() -> None:
         state, timestep = jaxsafe.reset_to(released(task), state_fields(task, data))
         ended = {name: bool(flag) for name, flag in state.sim.ended.items()}
         failure = status["failure"] or None
-        assert ended == {name: name == failure or (name == "success" and status["success"]) for name in ended}, edge["note"]
+        assert ended == {
+            name: name == failure or (name == "success" and status["success"]) for name in ended
+        }, edge["note"]
         for theirs, ours in STATUSES[kind_of(task)].items():
-            assert_same(timestep.info.status[ours], status[theirs], f"{edge['note']}: {ours}", 1e-12)
+            assert_same(
+                timestep.info.status[ours], status[theirs], f"{edge['note']}: {ours}", 1e-12
+            )
         if None not in edge["obs"]:
             assert_same(timestep.observation, edge["obs"], edge["note"], 1e-12)
-        judged.append((task, failure, status["success"], status.get("in_rejoin", status.get("in_docking"))))
+        judged.append(
+            (task, failure, status["success"], status.get("in_rejoin", status.get("in_docking")))
+        )
     assert len(judged) == 49
     assert len(set(judged)) > 15
 
@@ -333,7 +395,11 @@ def measures(recording: str, data: Mapping[str, np.ndarray]) -> dict[str, np.nda
     if "deputy" in fields:
         velocity, distance = fields["deputy"]["velocity"], np.linalg.norm(apart, axis=1)
         share = np.linalg.norm(velocity, axis=1) / (0.2 + 2 * 0.001027 * distance)
-        found |= {"range": distance, "share": share, "course": np.arctan2(velocity[:, 1], velocity[:, 0])}
+        found |= {
+            "range": distance,
+            "share": share,
+            "course": np.arctan2(velocity[:, 1], velocity[:, 0]),
+        }
     return found
 
 
@@ -342,11 +408,15 @@ def test_starts_are_drawn_from_the_recorded_distribution(task: str) -> None:
     """Kolmogorov-Smirnov on every number of 1 000 recorded and 20 000 of our starts, at a level of 1e-4 a task."""
     data = np.load(GOLDEN / f"{task}_init.npz")
     env = released(task)
-    states, _ = jax.jit(jax.vmap(jaxsafe.reset, in_axes=(None, 0)))(env, jax.random.split(jax.random.key(3), 20_000))
+    states, _ = jax.jit(jax.vmap(jaxsafe.reset, in_axes=(None, 0)))(
+        env, jax.random.split(jax.random.key(3), 20_000)
+    )
     ours = {}
     for name in PLATFORMS[kind_of(task)]:
         record, columns = states.sim.platforms[name], COLUMNS[task]
-        width = 1 + max(where.stop - 1 if isinstance(where, slice) else where for where in columns.values())
+        width = 1 + max(
+            where.stop - 1 if isinstance(where, slice) else where for where in columns.values()
+        )
         ours[f"{name}_state"] = np.zeros((20_000, width))
         for field, where in columns.items():
             ours[f"{name}_state"][:, where] = np.asarray(getattr(record, field))
@@ -391,7 +461,13 @@ def free_run(env: Environment, fields: Fields, actions: jax.Array) -> tuple[Any,
 
 @pytest.mark.parametrize(
     ("task", "tolerance"),
-    [("rejoin2d", 0.4), ("rejoin3d", 0.4), ("docking2d", 5e-3), ("docking3d", 5e-3), ("docking2d_oriented", 3e-2)],
+    [
+        ("rejoin2d", 0.4),
+        ("rejoin3d", 0.4),
+        ("docking2d", 5e-3),
+        ("docking3d", 5e-3),
+        ("docking2d_oriented", 3e-2),
+    ],
 )
 def test_float32_stays_close_over_whole_episodes(task: str, tolerance: float) -> None:
     """Positions relative to the lead or chief [ft, m], up to 2001 or 3001 steps, 5e5 ft or 4e4 m from the origin."""
@@ -403,7 +479,10 @@ def test_float32_stays_close_over_whole_episodes(task: str, tolerance: float) ->
         platforms, timestep = free_run(released(task), *single)
     assert timestep.reward.dtype == jnp.float32
     other, agent = PLATFORMS["rejoin"] if "rejoin" in task else ("chief", "deputy")
-    apart = [np.asarray(each[agent].position, float) - each[other].position for each in (platforms, precise)]
+    apart = [
+        np.asarray(each[agent].position, float) - each[other].position
+        for each in (platforms, precise)
+    ]
     assert np.abs(apart[0] - apart[1])[rows].max() < tolerance
     np.testing.assert_array_equal(timestep.info.outcome[rows], expected.info.outcome[rows])
     np.testing.assert_allclose(timestep.reward[rows], expected.reward[rows], rtol=0, atol=2e-4)

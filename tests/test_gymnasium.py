@@ -50,7 +50,13 @@ def same(ours: Any, theirs: Any, where: np.ndarray, name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
-        pytest.param(name, kind, marks=[pytest.mark.slow] if kind == "discrete" and name != "jaxsafe/Docking2D-v0" else [])
+        pytest.param(
+            name,
+            kind,
+            marks=[pytest.mark.slow]
+            if kind == "discrete" and name != "jaxsafe/Docking2D-v0"
+            else [],
+        )
         for name in (task.gymnasium_id for task in TASKS.values())
         for kind in ("continuous", "discrete")
     ],
@@ -58,7 +64,9 @@ def same(ours: Any, theirs: Any, where: np.ndarray, name: str) -> None:
 def test_gymnasiums_own_checks_find_nothing(name: str, kind: str) -> None:
     env = gym.make(name, actions=kind, render_mode="rgb_array")
     check_env(env.unwrapped)
-    assert isinstance(env.action_space, gym.spaces.MultiDiscrete if kind == "discrete" else gym.spaces.Box)
+    assert isinstance(
+        env.action_space, gym.spaces.MultiDiscrete if kind == "discrete" else gym.spaces.Box
+    )
 
 
 def step_by_step(ours: GymVectorEnv, theirs: SyncVectorEnv, steps: int) -> int:
@@ -67,7 +75,9 @@ def step_by_step(ours: GymVectorEnv, theirs: SyncVectorEnv, steps: int) -> int:
     assert ours.single_observation_space == theirs.single_observation_space
     assert (ours.action_space, mode) == (theirs.action_space, theirs.metadata["autoreset_mode"])
     everywhere, ends = np.ones(ours.num_envs, bool), 0
-    for (observation, infos), (expected, their_infos) in [(ours.reset(seed=5), theirs.reset(seed=5))]:
+    for (observation, infos), (expected, their_infos) in [
+        (ours.reset(seed=5), theirs.reset(seed=5))
+    ]:
         np.testing.assert_allclose(observation, expected, rtol=1e-6)
         same(infos, their_infos, everywhere, "reset")
     for action in actions(theirs, steps):
@@ -82,7 +92,9 @@ def step_by_step(ours: GymVectorEnv, theirs: SyncVectorEnv, steps: int) -> int:
             with pytest.raises(ResetNeeded, match="episodes of lanes"):
                 ours.step(action)
             mask = {"reset_mask": done}
-            (observation, infos), (expected, their_infos) = (e.reset(options=dict(mask)) for e in (ours, theirs))
+            (observation, infos), (expected, their_infos) = (
+                e.reset(options=dict(mask)) for e in (ours, theirs)
+            )
             np.testing.assert_allclose(observation, expected, rtol=1e-5, atol=1e-6)
             same(infos, their_infos, everywhere, "reset")
     return ends
@@ -101,7 +113,9 @@ def test_a_batch_is_what_single_environments_are_step_by_step(mode: AutoresetMod
 def test_a_batch_of_any_task_and_of_discrete_actions_is_too(task: str) -> None:
     options: dict[str, Any] = {"actions": "discrete", "max_episode_steps": 5}
     ours = GymVectorEnv(task, 3, autoreset_mode=AutoresetMode.SAME_STEP, **options)
-    theirs = SyncVectorEnv([lambda: GymEnv(task, **options)] * 3, autoreset_mode=AutoresetMode.SAME_STEP)
+    theirs = SyncVectorEnv(
+        [lambda: GymEnv(task, **options)] * 3, autoreset_mode=AutoresetMode.SAME_STEP
+    )
     assert step_by_step(ours, theirs, 12) >= 6
 
 
@@ -113,11 +127,15 @@ def test_the_example_docks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_final_observations_may_be_written_to_and_wrappers_count_episodes() -> None:
-    env = RecordEpisodeStatistics(GymVectorEnv("docking2d", 4, autoreset_mode="SameStep", max_episode_steps=3))
+    env = RecordEpisodeStatistics(
+        GymVectorEnv("docking2d", 4, autoreset_mode="SameStep", max_episode_steps=3)
+    )
     env.reset(seed=0)
     zero = np.zeros((4, 2), np.float32)
     *_, infos = [env.step(zero) for _ in range(3)][-1]
-    assert infos["final_info"]["outcome"].tolist() == ["running"] * 4  # cut short by the limit alone
+    assert (
+        infos["final_info"]["outcome"].tolist() == ["running"] * 4
+    )  # cut short by the limit alone
     infos["final_obs"][:] = 0.0
     assert infos["episode"]["l"].tolist() == [3] * 4
 
@@ -130,7 +148,9 @@ def test_seeds_are_chains_of_keys() -> None:
     assert np.array_equal(env.reset(seed=7)[0], first)
     assert np.array_equal(env.reset()[0], second)
     _, now = jax.random.split(jax.random.key(7))
-    np.testing.assert_allclose(jaxsafe.make("docking2d").reset(now)[1].observation, first, rtol=1e-6)
+    np.testing.assert_allclose(
+        jaxsafe.make("docking2d").reset(now)[1].observation, first, rtol=1e-6
+    )
     other = gym.make("jaxsafe/Docking2D-v0")
     assert not np.array_equal(other.reset()[0], gym.make("jaxsafe/Docking2D-v0").reset()[0])
 
@@ -142,21 +162,30 @@ def test_every_seed_has_a_start_of_its_own_however_big_it_is() -> None:
     env = GymEnv("docking2d")
     starts = [env.reset(seed=seed)[0] for seed in BIG]
     assert len({start.tobytes() for start in starts}) == len(BIG)
-    np.testing.assert_allclose(GymVectorEnv("docking2d", len(BIG)).reset(seed=BIG)[0], starts, rtol=1e-6)
-    np.testing.assert_allclose(GymVectorEnv("docking2d", 3).reset(seed=2**32 - 1)[0], starts[2:5], rtol=1e-6)
+    np.testing.assert_allclose(
+        GymVectorEnv("docking2d", len(BIG)).reset(seed=BIG)[0], starts, rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        GymVectorEnv("docking2d", 3).reset(seed=2**32 - 1)[0], starts[2:5], rtol=1e-6
+    )
     drawn = GymEnv("docking2d")
     first, _ = drawn.reset()
     assert np.array_equal(env.reset(seed=drawn.np_random_seed)[0], first)
 
 
-@pytest.mark.parametrize("build", [lambda: gym.make("jaxsafe/Docking2D-v0"), lambda: GymVectorEnv("docking2d", 2)])
+@pytest.mark.parametrize(
+    "build", [lambda: gym.make("jaxsafe/Docking2D-v0"), lambda: GymVectorEnv("docking2d", 2)]
+)
 def test_a_generator_of_ones_own_decides_the_starts(build: Any) -> None:
     env, starts = build(), []
     for seed in (3, 4, 3):  # at first, and in the middle of a chain
         env.np_random = np.random.default_rng(seed)
         starts.append(np.stack([env.reset()[0] for _ in range(2)]))
     assert np.array_equal(starts[0], starts[2])
-    assert len(np.unique(np.concatenate(starts[:2]).reshape(-1, 6), axis=0)) == np.concatenate(starts[:2]).size // 6
+    assert (
+        len(np.unique(np.concatenate(starts[:2]).reshape(-1, 6), axis=0))
+        == np.concatenate(starts[:2]).size // 6
+    )
     with pytest.raises(ConfigError, match=r"np_random: expected a numpy.random.Generator, found 3"):
         env.np_random = 3
 
@@ -207,11 +236,15 @@ def test_lanes_are_seeded_one_by_one() -> None:
 def test_a_copy_goes_on_alike_and_compiles_nothing(build: Any, copied: Any) -> None:
     def fly(env: Any) -> np.ndarray:
         observations = [env.reset(seed=seed)[0] for seed in (0, 1)]
-        observations += [env.step(np.zeros(env.action_space.shape, np.float32))[0] for _ in range(3)]
+        observations += [
+            env.step(np.zeros(env.action_space.shape, np.float32))[0] for _ in range(3)
+        ]
         return np.stack([*observations, env.reset()[0], env.reset()[0]])
 
     def programs() -> list[int]:
-        return [program._cache_size() for program in (lanes.advance, lanes.restart, lanes._raw_keys)]
+        return [
+            program._cache_size() for program in (lanes.advance, lanes.restart, lanes._raw_keys)
+        ]
 
     env = build()
     expected, before = fly(env), programs()
@@ -231,7 +264,9 @@ MODES = {
 }
 
 
-@pytest.mark.parametrize("mode", [pytest.param(mode, marks=[pytest.mark.slow] * (mode == "no_jit")) for mode in MODES])
+@pytest.mark.parametrize(
+    "mode", [pytest.param(mode, marks=[pytest.mark.slow] * (mode == "no_jit")) for mode in MODES]
+)
 def test_the_modes_of_jax_change_nothing(mode: str) -> None:
     def fly() -> list[np.ndarray]:
         options: dict[str, Any] = {"autoreset_mode": "SameStep", "max_episode_steps": 2}
@@ -248,7 +283,9 @@ def test_the_modes_of_jax_change_nothing(mode: str) -> None:
     expected = fly()
     with MODES[mode]():
         found = fly()
-    for one, other in list(zip(found, expected, strict=True))[: 4 if mode == "double_precision" else None]:  # other starts
+    for one, other in list(zip(found, expected, strict=True))[
+        : 4 if mode == "double_precision" else None
+    ]:  # other starts
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
         assert one.dtype == (np.float64 if mode == "double_precision" else np.float32)
 
@@ -286,7 +323,11 @@ def test_an_action_that_is_no_number_ends_the_episode_as_a_failure_that_costs(ta
     observation, _, terminated, truncated, infos = batch.step(np.stack([zero[0], action, zero[0]]))
     assert (terminated.tolist(), truncated.any()) == ([False, True, False], False)
     final = infos["final_info"]
-    assert (final["cost"][1], final["outcome"][1], final["is_success"][1]) == (1.0, "diverged", False)
+    assert (final["cost"][1], final["outcome"][1], final["is_success"][1]) == (
+        1.0,
+        "diverged",
+        False,
+    )
     assert np.array_equal(observation[[0, 2]], calm.step(zero)[0][[0, 2]])
     assert np.isfinite(observation).all()
     assert np.isfinite(batch.step(zero)[0]).all()
@@ -299,7 +340,9 @@ def test_every_option_of_make_is_understood() -> None:
     }  # fmt: skip
     env = gym.make("jaxsafe/Docking2D-v0", **options)
     expected = jaxsafe.make("docking2d", **options)
-    assert jax.tree.all(jax.tree.map(lambda a, b: bool((a == b).all()), env.unwrapped.env, expected))
+    assert jax.tree.all(
+        jax.tree.map(lambda a, b: bool((a == b).all()), env.unwrapped.env, expected)
+    )
     same_env = GymEnv(expected)
     env.reset(seed=1), same_env.reset(seed=1)
     for _ in range(3):
@@ -311,7 +354,11 @@ def test_the_whole_action_space_and_no_more_reaches_the_actuators() -> None:
                 {"rescale": False, "low": -3.0, "high": 0.5}.items()}  # fmt: skip
     env, batch = GymEnv("docking2d", physical), GymVectorEnv("docking2d", 2, physical)
     assert np.array_equal(batch.action_space.low, [[-3.0, -1.0]] * 2)
-    assert batch.single_action_space == env.action_space == SafetyEnv("docking2d", overrides=physical).action_space
+    assert (
+        batch.single_action_space
+        == env.action_space
+        == SafetyEnv("docking2d", overrides=physical).action_space
+    )
     env.reset(seed=0)
     for bound in (env.action_space.low, env.action_space.high):
         assert np.array_equal(env.step(bound)[-1]["control_actual"], bound)
@@ -330,13 +377,17 @@ def test_an_episode_can_be_watched() -> None:
     assert (first != second).any()
     env.reset()
     assert len(env.unwrapped._frames._past) == 1
-    batch = gym.make_vec("jaxsafe/Rejoin2D-v0", num_envs=2, render_mode="rgb_array", max_episode_steps=2)
+    batch = gym.make_vec(
+        "jaxsafe/Rejoin2D-v0", num_envs=2, render_mode="rgb_array", max_episode_steps=2
+    )
     batch.reset(seed=0)
     for _ in range(3):
         batch.step(np.zeros((2, 2), np.float32))
     assert np.array_equal(batch.render()[0].shape, first.shape)
     assert len(batch.unwrapped._frames[0]._past) == 1
-    batch = GymVectorEnv("docking2d", 1, autoreset_mode="SameStep", render_mode="rgb_array", max_episode_steps=3)
+    batch = GymVectorEnv(
+        "docking2d", 1, autoreset_mode="SameStep", render_mode="rgb_array", max_episode_steps=3
+    )
     batch.reset(seed=0)
     for _ in range(4):  # the third ends the episode and shows the start of the next
         batch.step(np.zeros((1, 2), np.float32))
@@ -347,7 +398,11 @@ START = {**FAST, "parameters": {"deputy.mass": 13.0}}
 
 
 def test_a_batch_starts_where_single_environments_do() -> None:
-    options: dict[str, Any] = {"overrides": SOON, "randomize": {"deputy.mass": [10, 14]}, "max_episode_steps": 3}
+    options: dict[str, Any] = {
+        "overrides": SOON,
+        "randomize": {"deputy.mass": [10, 14]},
+        "max_episode_steps": 3,
+    }
     ours = GymVectorEnv("docking2d", 3, autoreset_mode="SameStep", **options)
     theirs = SyncVectorEnv([lambda: GymEnv("docking2d", **options)] * 3, autoreset_mode="SameStep")
     for seed in (5, None):
@@ -355,7 +410,9 @@ def test_a_batch_starts_where_single_environments_do() -> None:
         np.testing.assert_allclose(found[0], expected[0], rtol=1e-6)
         same(found[1], expected[1], np.ones(3, bool), "reset")
         for action in actions(theirs, 5):  # an episode that follows starts at random
-            np.testing.assert_allclose(ours.step(action)[0], theirs.step(action)[0], rtol=1e-5, atol=1e-6)
+            np.testing.assert_allclose(
+                ours.step(action)[0], theirs.step(action)[0], rtol=1e-5, atol=1e-6
+            )
     before = ours.reset(seed=0)[0]
     after, infos = ours.reset(options={**START, "reset_mask": np.array([False, True, False])})
     assert np.array_equal(after[[0, 2]], before[[0, 2]])
@@ -368,8 +425,12 @@ def test_a_batch_starts_where_single_environments_do() -> None:
 
 
 def test_workers_that_are_forked_are_refused_where_they_would_wait_for_ever() -> None:
-    with pytest.raises(ConfigError, match=r"^AsyncVectorEnv: forked processes .* 'spawn'.* for the compiled batch$"):
-        gym.make_vec("jaxsafe/Docking2D-v0", 2, vectorization_mode="async", vector_kwargs={"context": "fork"})
+    with pytest.raises(
+        ConfigError, match=r"^AsyncVectorEnv: forked processes .* 'spawn'.* for the compiled batch$"
+    ):
+        gym.make_vec(
+            "jaxsafe/Docking2D-v0", 2, vectorization_mode="async", vector_kwargs={"context": "fork"}
+        )
     with pytest.raises(ConfigError, match="AsyncVectorEnv"):
         gym.vector.AsyncVectorEnv([lambda: GymEnv("docking2d")], context="fork")
 
@@ -378,8 +439,15 @@ def test_workers_that_are_forked_are_refused_where_they_would_wait_for_ever() ->
 def test_a_forked_process_is_told_what_works() -> None:
     env = GymEnv("docking2d")
     env.reset(seed=0)
-    uses = [lambda: env.step([0.0, 0.0]), env.reset, lambda: env.reset(options=START), lambda: GymEnv("docking2d")]
-    with multiprocessing.get_context("fork").Pool(1, initializer=_forked.extend, initargs=(uses,)) as pool:
+    uses = [
+        lambda: env.step([0.0, 0.0]),
+        env.reset,
+        lambda: env.reset(options=START),
+        lambda: GymEnv("docking2d"),
+    ]
+    with multiprocessing.get_context("fork").Pool(
+        1, initializer=_forked.extend, initargs=(uses,)
+    ) as pool:
         for index in range(len(uses)):
             with pytest.raises(ConfigError, match=r"process \d+: forked processes would wait"):
                 pool.apply_async(_use, (index,)).get(timeout=60)
@@ -394,7 +462,9 @@ def _use(index: int) -> None:
 
 @pytest.mark.slow
 def test_workers_that_are_spawned_work() -> None:
-    env = gym.make_vec("jaxsafe/Docking2D-v0", 2, vectorization_mode="async", vector_kwargs={"context": "spawn"})
+    env = gym.make_vec(
+        "jaxsafe/Docking2D-v0", 2, vectorization_mode="async", vector_kwargs={"context": "spawn"}
+    )
     expected = GymVectorEnv("docking2d", 2).reset(seed=0)[0]
     np.testing.assert_allclose(env.reset(seed=0)[0], expected, rtol=1e-6)
     env.step(env.action_space.sample())
@@ -405,20 +475,59 @@ def test_workers_that_are_spawned_work() -> None:
     ("build", "message"),
     [
         (lambda: GymEnv("doking3d"), "Did you mean 'docking3d'"),
-        (lambda: GymEnv("docking2d", action="discrete"), "action: unknown option; choose from .*'actions'"),
-        (lambda: GymEnv("docking2d", render_mode="human"), "render_mode: found 'human'; choose from rgb_array"),
-        (lambda: GymEnv("docking2d", max_episode_steps=0), "max_episode_steps: expected a whole number ≥ 1, found 0"),
-        (lambda: GymEnv(jaxsafe.make("docking2d"), rta="default"), "rta: the environment is made already"),
-        (lambda: GymEnv("docking2d", max_episode_steps=10**400), "max_episode_steps: expected a whole number from 1 to 2"),
+        (
+            lambda: GymEnv("docking2d", action="discrete"),
+            "action: unknown option; choose from .*'actions'",
+        ),
+        (
+            lambda: GymEnv("docking2d", render_mode="human"),
+            "render_mode: found 'human'; choose from rgb_array",
+        ),
+        (
+            lambda: GymEnv("docking2d", max_episode_steps=0),
+            "max_episode_steps: expected a whole number ≥ 1, found 0",
+        ),
+        (
+            lambda: GymEnv(jaxsafe.make("docking2d"), rta="default"),
+            "rta: the environment is made already",
+        ),
+        (
+            lambda: GymEnv("docking2d", max_episode_steps=10**400),
+            "max_episode_steps: expected a whole number from 1 to 2",
+        ),
         (lambda: GymVectorEnv("docking2d", 0), "num_envs: expected a whole number ≥ 1, found 0"),
-        (lambda: GymVectorEnv("docking2d", 2, autoreset_mode="Same"), "autoreset_mode: unknown mode 'Same'"),
-        (lambda: GymEnv("docking2d").reset(options={"from": 3}), "reset: options: unknown 'from'; choose from start"),
-        (lambda: GymVectorEnv("docking2d", 2).reset(seed=[1, 2, 3]), "seed: expected 2 seeds, found 3"),
-        (lambda: GymVectorEnv("docking2d", 2).reset(seed=[1, -1]), "seed: expected a whole number ≥ 0, found -1"),
-        (lambda: GymVectorEnv("docking2d", 2).reset(seed=1.5), "seed: expected a whole number ≥ 0, or one for each lane"),
-        (lambda: GymEnv("docking2d").reset(seed=True), "seed: expected a whole number ≥ 0, found True"),
-        (lambda: GymEnv("docking2d").reset(seed=10**5000), "seed: expected at most 128 bits, found 16610"),
-        (lambda: GymVectorEnv("docking2d", 2).reset(options={"reset_mask": [True, False]}), "reset_mask: expected a bool"),
+        (
+            lambda: GymVectorEnv("docking2d", 2, autoreset_mode="Same"),
+            "autoreset_mode: unknown mode 'Same'",
+        ),
+        (
+            lambda: GymEnv("docking2d").reset(options={"from": 3}),
+            "reset: options: unknown 'from'; choose from start",
+        ),
+        (
+            lambda: GymVectorEnv("docking2d", 2).reset(seed=[1, 2, 3]),
+            "seed: expected 2 seeds, found 3",
+        ),
+        (
+            lambda: GymVectorEnv("docking2d", 2).reset(seed=[1, -1]),
+            "seed: expected a whole number ≥ 0, found -1",
+        ),
+        (
+            lambda: GymVectorEnv("docking2d", 2).reset(seed=1.5),
+            "seed: expected a whole number ≥ 0, or one for each lane",
+        ),
+        (
+            lambda: GymEnv("docking2d").reset(seed=True),
+            "seed: expected a whole number ≥ 0, found True",
+        ),
+        (
+            lambda: GymEnv("docking2d").reset(seed=10**5000),
+            "seed: expected at most 128 bits, found 16610",
+        ),
+        (
+            lambda: GymVectorEnv("docking2d", 2).reset(options={"reset_mask": [True, False]}),
+            "reset_mask: expected a bool",
+        ),
     ],
 )
 def test_mistakes_are_named(build: Any, message: str) -> None:
@@ -442,4 +551,7 @@ def test_wrong_actions_and_wrong_order_are_named() -> None:
 
 def test_importing_jaxsafe_is_enough() -> None:
     code = "import jaxsafe, gymnasium; print(gymnasium.spec('jaxsafe/Docking2DOriented-v0').kwargs['task'])"
-    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "docking2d_oriented"
+    assert (
+        subprocess.check_output([sys.executable, "-c", code], text=True).strip()
+        == "docking2d_oriented"
+    )

@@ -31,7 +31,9 @@ def test_a_step_is_ours_and_resets_by_itself(make: Any) -> None:
     action = jnp.array([0.5, -0.5])
     for index in range(4):
         key = jax.random.key(index)
-        observation, state, reward, terminated, truncated, info = env.step(key, state, action, params)
+        observation, state, reward, terminated, truncated, info = env.step(
+            key, state, action, params
+        )
         expected, timestep = core.step(expected, action)
         np.testing.assert_allclose(reward, timestep.reward, rtol=1e-5)
         np.testing.assert_allclose(info["final_observation"], timestep.observation, rtol=1e-5)
@@ -43,8 +45,15 @@ def test_a_step_is_ours_and_resets_by_itself(make: Any) -> None:
 def test_an_action_that_is_no_number_is_a_failure_that_costs(make: Any) -> None:
     env = make("docking2d")
     _, state = env.reset(jax.random.key(0))
-    observation, _, _, terminated, truncated, info = env.step(jax.random.key(1), state, jnp.array([jnp.nan, 0.0]))
-    assert (bool(terminated), bool(truncated), float(info["cost"]), bool(info["is_success"])) == (True, False, 1.0, False)
+    observation, _, _, terminated, truncated, info = env.step(
+        jax.random.key(1), state, jnp.array([jnp.nan, 0.0])
+    )
+    assert (bool(terminated), bool(truncated), float(info["cost"]), bool(info["is_success"])) == (
+        True,
+        False,
+        1.0,
+        False,
+    )
     assert np.isfinite(observation).all()
 
 
@@ -72,9 +81,15 @@ def test_older_libraries_get_five_values(make: Any) -> None:
 def test_parameters_are_a_pytree_to_map_over(make: Any) -> None:
     env = make("docking2d")
     masses = jnp.array([10.0, 14.0])
-    params = jax.vmap(lambda mass: env.default_params.replace(env=jaxsafe.override(env.env, {"deputy.mass": mass})))(masses)
+    params = jax.vmap(
+        lambda mass: env.default_params.replace(
+            env=jaxsafe.override(env.env, {"deputy.mass": mass})
+        )
+    )(masses)
     _, state = env.reset(jax.random.key(0))
-    observation, *_ = jax.vmap(env.step, in_axes=(None, None, None, 0))(jax.random.key(1), state, jnp.ones(2), params)
+    observation, *_ = jax.vmap(env.step, in_axes=(None, None, None, 0))(
+        jax.random.key(1), state, jnp.ones(2), params
+    )
     assert observation[0, 2] > observation[1, 2]  # the lighter one is faster
 
 
@@ -89,10 +104,13 @@ def test_a_limit_of_its_own_truncates(make: Any) -> None:
 def test_a_limit_that_no_program_can_count_to_is_refused(make: Any) -> None:
     env = make("docking2d")
     with pytest.raises(
-        ConfigError, match="max_steps_in_episode: expected a whole number from 1 to 2,147,483,647, found 1000"
+        ConfigError,
+        match="max_steps_in_episode: expected a whole number from 1 to 2,147,483,647, found 1000",
     ):
         env.default_params.replace(max_steps_in_episode=10**10)
-    assert jax.tree.map(lambda _: 0, env.default_params).max_steps_in_episode == 0  # axes to map over
+    assert (
+        jax.tree.map(lambda _: 0, env.default_params).max_steps_in_episode == 0
+    )  # axes to map over
 
 
 def test_discrete_actions_are_one_choice(make: Any) -> None:
@@ -101,7 +119,9 @@ def test_discrete_actions_are_one_choice(make: Any) -> None:
     _, state = env.reset(jax.random.key(0))
     expected, _ = core.reset(jax.random.key(0))
     found = env.step(jax.random.key(1), state, jnp.int32(3 * 11 + 7))
-    np.testing.assert_allclose(found[2], core.step(expected, jnp.array([3, 7]))[1].reward, rtol=1e-5)
+    np.testing.assert_allclose(
+        found[2], core.step(expected, jnp.array([3, 7]))[1].reward, rtol=1e-5
+    )
 
 
 def test_spaces_are_those_of_gymnax(make: Any) -> None:
@@ -113,7 +133,9 @@ def test_spaces_are_those_of_gymnax(make: Any) -> None:
 
 def test_the_action_space_is_the_actuators(make: Any) -> None:
     thrust = "deputy.controller.actuators.thrust_x"
-    env = make("docking2d", {f"{thrust}.rescale": False, f"{thrust}.low": -3.0, f"{thrust}.high": 0.5})
+    env = make(
+        "docking2d", {f"{thrust}.rescale": False, f"{thrust}.low": -3.0, f"{thrust}.high": 0.5}
+    )
     space = env.action_space(env.default_params)
     assert (space.low.tolist(), space.high.tolist()) == ([-3.0, -1.0], [0.5, 1.0])
     wide = env.default_params.replace(env=jaxsafe.override(env.env, {f"{thrust}.high": 2.0}))
@@ -132,7 +154,9 @@ def test_it_works_in_every_mode_of_jax(make: Any, mode: str) -> None:
         starts, steps = jax.random.split(starts, 4), jax.random.split(steps, 5)
         _, state = jax.vmap(env.reset, (0, None))(starts, params)
         zero = np.zeros((4, 2), np.float32)
-        observation, *_, truncated, _ = jax.vmap(env.step, (0, 0, 0, None))(steps[:4], state, zero, params)
+        observation, *_, truncated, _ = jax.vmap(env.step, (0, 0, 0, None))(
+            steps[:4], state, zero, params
+        )
         assert np.isfinite(observation).all()
         assert truncated.all()
         _, state = chosen.reset(first)

@@ -23,7 +23,13 @@ def start(place: Path, *words: str, devices: tuple[int, ...] = (1, 1)) -> list[s
     job = str(random.SystemRandom().randrange(1, 4000))  # decides the port
     processes = []
     for rank, count in enumerate(devices):
-        slurm = {"JOB_ID": job, "STEP_NODELIST": "localhost", "NTASKS": len(devices), "PROCID": rank, "LOCALID": rank}
+        slurm = {
+            "JOB_ID": job,
+            "STEP_NODELIST": "localhost",
+            "NTASKS": len(devices),
+            "PROCID": rank,
+            "LOCALID": rank,
+        }
         env = {**os.environ, **{f"SLURM_{name}": str(value) for name, value in slurm.items()}}
         env["XLA_FLAGS"] = env["XLA_FLAGS"].replace("device_count=2", f"device_count={count}")
         command = [sys.executable, "-m", "jaxsafe.train", "distributed=true", *words]
@@ -42,19 +48,33 @@ def test_two_processes_train_what_one_trains(whole: Path, tmp_path: Path) -> Non
     again = start(tmp_path, *TINY, f"out={run}")
     assert [process.wait(300) for process in again] == [2, 2]
     for rank in range(2):
-        assert "already holds something and is never overwritten" in (tmp_path / f"log{rank}").read_text()
+        assert (
+            "already holds something and is never overwritten"
+            in (tmp_path / f"log{rank}").read_text()
+        )
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seeds", "devices"), [(1, (1, 1)), (2, (2, 2))])  # between processes; in each, which is faster
-def test_two_processes_whose_devices_share_seeds(seeds: int, devices: tuple[int, ...], tmp_path: Path) -> None:
-    shared = [f"seeds={seeds}", "steps=320", "ppo.num_minibatches=1", "devices_per_seed=2"]  # five updates
+@pytest.mark.parametrize(
+    ("seeds", "devices"), [(1, (1, 1)), (2, (2, 2))]
+)  # between processes; in each, which is faster
+def test_two_processes_whose_devices_share_seeds(
+    seeds: int, devices: tuple[int, ...], tmp_path: Path
+) -> None:
+    shared = [
+        f"seeds={seeds}",
+        "steps=320",
+        "ppo.num_minibatches=1",
+        "devices_per_seed=2",
+    ]  # five updates
     words = [word for word in TINY if not word.startswith(("seeds=", "steps="))] + shared
     processes = start(tmp_path, *words, f"out={tmp_path / 'two'}", devices=devices)
     assert [process.wait(300) for process in processes] == [0, 0], (tmp_path / "log0").read_text()
     assert main([*words, f"out={tmp_path / 'one'}"]) == 0
     for seed in range(seeds):
-        found, expected = (np.load(tmp_path / name / "policy" / f"seed_{seed}.npz") for name in ("two", "one"))
+        found, expected = (
+            np.load(tmp_path / name / "policy" / f"seed_{seed}.npz") for name in ("two", "one")
+        )
         assert list(found) == list(expected)
         for name in found:
             if found[name].dtype.kind == "f":
@@ -69,7 +89,9 @@ def test_a_lost_process_ends_the_run(tmp_path: Path) -> None:
 def test_another_number_goes_on_after_a_process_is_lost(tmp_path: Path) -> None:
     run = tmp_path / "run"
     lose_one(tmp_path, run)
-    alone = subprocess.Popen([sys.executable, "-m", "jaxsafe.train", f"resume={run}"], stdout=subprocess.PIPE, text=True)
+    alone = subprocess.Popen(
+        [sys.executable, "-m", "jaxsafe.train", f"resume={run}"], stdout=subprocess.PIPE, text=True
+    )
     grows(run, alone)
     alone.send_signal(signal.SIGINT)
     assert "stopped at step" in alone.communicate(timeout=60)[0]

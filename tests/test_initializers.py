@@ -64,7 +64,9 @@ def test_distances_are_uniform_between_100_and_150_metres(starts: dict[str, np.n
     assert is_uniform(starts["distance"], 100.0, 150.0)
 
 
-def test_speeds_are_uniform_up_to_the_limit_at_their_distance(starts: dict[str, np.ndarray]) -> None:
+def test_speeds_are_uniform_up_to_the_limit_at_their_distance(
+    starts: dict[str, np.ndarray],
+) -> None:
     assert starts["share"].max() <= 1.0 + 1e-6
     assert is_uniform(starts["share"], 0.0, 1.0)
 
@@ -120,7 +122,9 @@ def test_ranges_can_be_overridden_without_compiling_anew() -> None:
 
 
 @pytest.mark.parametrize(("polar", "size"), [(None, 2), ((0.0, np.pi), 3)])
-def test_a_direction_without_a_polar_range_is_planar(polar: tuple[float, float] | None, size: int) -> None:
+def test_a_direction_without_a_polar_range_is_planar(
+    polar: tuple[float, float] | None, size: int
+) -> None:
     drawn = direction(*uniform(jax.random.key(0), *normalise(Direction(polar=polar)).intervals))
     assert drawn.shape == (size,)
     assert float(jnp.linalg.norm(drawn)) == pytest.approx(1.0, abs=1e-6)
@@ -143,12 +147,16 @@ NOWHERE = Sim(jnp.zeros(()), {}, {}, {}, {}, jnp.zeros((), bool))
 def test_a_fixed_start_is_its_value_whatever_the_key(value: float | tuple[float, ...]) -> None:
     fixed = normalise(Fixed(name="heading", value=value))
     for seed in (0, 1):
-        np.testing.assert_array_equal(fixed.draw(jax.random.key(seed), {}, NOWHERE), np.asarray(value, np.float32))
+        np.testing.assert_array_equal(
+            fixed.draw(jax.random.key(seed), {}, NOWHERE), np.asarray(value, np.float32)
+        )
 
 
 def draw(initializer: Uniform | AroundAtAltitude, sim: Sim = NOWHERE, seed: int = 0) -> np.ndarray:
     keys = jax.random.split(jax.random.key(seed), NUM_STARTS)
-    return np.asarray(jax.jit(jax.vmap(lambda key: normalise(initializer).draw(key, {}, sim)))(keys), float)
+    return np.asarray(
+        jax.jit(jax.vmap(lambda key: normalise(initializer).draw(key, {}, sim)))(keys), float
+    )
 
 
 def test_a_uniform_scalar_is_uniform_between_its_bounds() -> None:
@@ -178,17 +186,29 @@ def test_a_uniform_vector_is_uniform_and_independent_in_each_component() -> None
         (0.0, (1.0, 2.0), "expected low ≤ high, found 0.0 and [1.0, 2.0]"),
     ],
 )
-def test_uniform_bounds_must_be_in_order_and_of_one_shape(low: object, high: object, problem: str | None) -> None:
+def test_uniform_bounds_must_be_in_order_and_of_one_shape(
+    low: object, high: object, problem: str | None
+) -> None:
     assert normalise(Uniform(name="position", low=low, high=high)).problem() == problem
 
 
 def test_around_at_altitude_is_uniform_in_horizontal_distance_azimuth_and_altitude() -> None:
     lead = SimpleNamespace(position=jnp.asarray([300.0, -200.0, 9_999.0]))
-    around = AroundAtAltitude(name="position", about="lead", distance=(5.0, 10.0), altitude=(-3.0, 16.0))
+    around = AroundAtAltitude(
+        name="position", about="lead", distance=(5.0, 10.0), altitude=(-3.0, 16.0)
+    )
     sample = draw(around, NOWHERE.replace(platforms={"lead": lead}))
     x, y = sample[:, 0] - 300.0, sample[:, 1] + 200.0
-    drawn = {"distance": np.hypot(x, y), "azimuth": np.arctan2(y, x) % (2 * np.pi), "altitude": sample[:, 2]}
-    for name, (low, high) in {"distance": (5, 10), "azimuth": (0, 2 * np.pi), "altitude": (-3, 16)}.items():
+    drawn = {
+        "distance": np.hypot(x, y),
+        "azimuth": np.arctan2(y, x) % (2 * np.pi),
+        "altitude": sample[:, 2],
+    }
+    for name, (low, high) in {
+        "distance": (5, 10),
+        "azimuth": (0, 2 * np.pi),
+        "altitude": (-3, 16),
+    }.items():
         assert is_uniform(drawn[name], low, high), name
     for one, other in combinations(drawn, 2):
         assert spearmanr(drawn[one], drawn[other]).pvalue > LEVEL, (one, other)
@@ -225,7 +245,9 @@ def test_a_rejoin_starts_as_in_table_3(task: str) -> None:
 
 
 def test_an_oriented_start_has_any_attitude_and_no_turn_rate() -> None:
-    state, _ = draw_starts(jaxsafe.make("docking2d_oriented"), jax.random.split(jax.random.key(8), NUM_STARTS))
+    state, _ = draw_starts(
+        jaxsafe.make("docking2d_oriented"), jax.random.split(jax.random.key(8), NUM_STARTS)
+    )
     deputy = state.sim.platforms["deputy"]
     assert is_uniform(np.asarray(deputy.attitude, float), -np.pi, np.pi)
     assert not deputy.attitude_rate.any()

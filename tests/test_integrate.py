@@ -21,7 +21,24 @@ from jaxsafe.simulation.integrate import (
 )
 
 LIMITS = np.array([200.0, 400.0])
-EDGES = [0.0, 1e-300, 1e-12, 1e-6, 1e-3, 0.1, 0.5, 1.0 - 1e-12, 1.0, 1.0 + 1e-12, 1.5, 2.0, 2.0 + 1e-12, 3.0, 10.0, 100.0]
+EDGES = [
+    0.0,
+    1e-300,
+    1e-12,
+    1e-6,
+    1e-3,
+    0.1,
+    0.5,
+    1.0 - 1e-12,
+    1.0,
+    1.0 + 1e-12,
+    1.5,
+    2.0,
+    2.0 + 1e-12,
+    3.0,
+    10.0,
+    100.0,
+]
 
 
 def series(tau: float, first: int) -> float:
@@ -49,9 +66,14 @@ def test_the_derivatives_of_the_ratios_satisfy_their_recurrence() -> None:
     """Each ratio c_k has τ c_k′ = c_(k−1) − k c_k, with c₀ = cos τ."""
     taus = jnp.asarray([*EDGES, *(-edge for edge in EDGES)])
     values = jax.vmap(sine_ratios)(taus)
-    first, second = (jax.jit(jax.vmap(rate))(taus) for rate in (jax.jacfwd(sine_ratios), jax.hessian(sine_ratios)))
+    first, second = (
+        jax.jit(jax.vmap(rate))(taus)
+        for rate in (jax.jacfwd(sine_ratios), jax.hessian(sine_ratios))
+    )
     for k, before in enumerate([jnp.cos(taus), *values[:2]]):
-        np.testing.assert_allclose(taus * first[k], before - (k + 1) * values[k], rtol=0.0, atol=1e-14)
+        np.testing.assert_allclose(
+            taus * first[k], before - (k + 1) * values[k], rtol=0.0, atol=1e-14
+        )
         assert np.isfinite(second[k]).all()
 
 
@@ -59,13 +81,19 @@ def test_in_float32_the_ratios_keep_six_digits_near_zero_and_beyond() -> None:
     for tau in (0.0, 1e-20, 1e-6, 1e-3, 0.03, 0.99, 1.01, 3.0):
         for found, first in zip(sine_ratios(jnp.float32(tau)), (1, 2, 3), strict=True):
             assert found.dtype == jnp.float32
-            np.testing.assert_allclose(found, series(float(np.float32(tau)), first), rtol=1e-6, atol=1e-7)
+            np.testing.assert_allclose(
+                found, series(float(np.float32(tau)), first), rtol=1e-6, atol=1e-7
+            )
 
 
 def test_a_ramp_moves_until_it_rests_on_a_limit() -> None:
     times = jnp.linspace(0.0, 4.0, 9)
-    np.testing.assert_allclose(ramp(300.0, 50.0, LIMITS, times), [300, 325, 350, 375, 400, 400, 400, 400, 400])
-    np.testing.assert_allclose(ramp(300.0, -50.0, LIMITS, times), [300, 275, 250, 225, 200, 200, 200, 200, 200])
+    np.testing.assert_allclose(
+        ramp(300.0, 50.0, LIMITS, times), [300, 325, 350, 375, 400, 400, 400, 400, 400]
+    )
+    np.testing.assert_allclose(
+        ramp(300.0, -50.0, LIMITS, times), [300, 275, 250, 225, 200, 200, 200, 200, 200]
+    )
     np.testing.assert_allclose(ramp(300.0, 0.0, LIMITS, times), np.full(9, 300.0))
 
 
@@ -85,7 +113,9 @@ def test_a_ramp_moves_until_it_rests_on_a_limit() -> None:
         (200.0, 0.0, 4.0),
     ],
 )
-def test_the_time_to_a_limit_is_that_of_the_state_s_rest(x: float, rate: float, time: float) -> None:
+def test_the_time_to_a_limit_is_that_of_the_state_s_rest(
+    x: float, rate: float, time: float
+) -> None:
     assert float(time_to_limit(x, rate, LIMITS, 4.0)) == time
 
 
@@ -112,7 +142,9 @@ def test_a_time_to_a_limit_has_no_derivative() -> None:
 
 
 def test_pieces_partition_the_step_in_order() -> None:
-    begin, length = pieces([jnp.float32(0.75), jnp.float32(0.25), jnp.float32(1.0)], jnp.float32(1.0))
+    begin, length = pieces(
+        [jnp.float32(0.75), jnp.float32(0.25), jnp.float32(1.0)], jnp.float32(1.0)
+    )
     np.testing.assert_array_equal(begin, [0.0, 0.25, 0.75, 1.0])
     np.testing.assert_array_equal(length, [0.25, 0.5, 0.25, 0.0])
     begin, length = pieces([jnp.float32(2.0), jnp.float32(0.0)], jnp.float32(2.0))
@@ -122,11 +154,15 @@ def test_pieces_partition_the_step_in_order() -> None:
 
 @pytest.mark.parametrize("degree", range(6))
 def test_three_nodes_integrate_polynomials_of_degree_five(degree: int) -> None:
-    assert np.dot(WEIGHTS, np.array(NODES) ** degree) == pytest.approx(1.0 / (degree + 1), abs=1e-15)
+    assert np.dot(WEIGHTS, np.array(NODES) ** degree) == pytest.approx(
+        1.0 / (degree + 1), abs=1e-15
+    )
     assert np.dot(WEIGHTS, np.array(NODES) ** 6) != pytest.approx(1.0 / 7.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("degree", range(3))
 def test_partial_weights_integrate_quadratics_up_to_each_node(degree: int) -> None:
     nodes = np.array(NODES)
-    np.testing.assert_allclose(np.array(PARTIAL_WEIGHTS) @ nodes**degree, nodes ** (degree + 1) / (degree + 1), atol=1e-15)
+    np.testing.assert_allclose(
+        np.array(PARTIAL_WEIGHTS) @ nodes**degree, nodes ** (degree + 1) / (degree + 1), atol=1e-15
+    )

@@ -35,13 +35,21 @@ def test_lanes_do_what_the_pure_functions_do(actions: str) -> None:
     lanes, seeds = Lanes(env, 3, np.inf), [4, 5, 6]
     lanes.seed(np.ones(3, bool), seeds)
     lanes.restart(np.ones(3, bool))
-    action = np.array([[0, 10], [3, 3], [7, 1]], np.int32) if actions == "discrete" else np.eye(3, 2, dtype=np.float32)
+    action = (
+        np.array([[0, 10], [3, 3], [7, 1]], np.int32)
+        if actions == "discrete"
+        else np.eye(3, 2, dtype=np.float32)
+    )
     keys = [jax.random.split(jax.random.key(seed)) for seed in seeds]
     expected = [Episodes(*env.reset(now)) for _, now in keys]
     for _ in range(3):
         lanes.step(action)
-        expected = [Episodes(*env.step(one.state, a)) for one, a in zip(expected, action, strict=True)]
+        expected = [
+            Episodes(*env.step(one.state, a)) for one, a in zip(expected, action, strict=True)
+        ]
     lanes.restart(np.array([False, True, False]))
     expected[1] = Episodes(*env.reset(jax.random.split(keys[1][0])[1]))
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *expected)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), lanes.now, stacked)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), lanes.now, stacked
+    )

@@ -32,7 +32,10 @@ SUCCESS, CRASH = 1, 2
 
 
 def time_step(
-    reward: float, delta_v: tuple[float, ...] = (0.0, 0.0), severity: tuple[float, ...] = (0.0, 0.0), outcome: int = 0
+    reward: float,
+    delta_v: tuple[float, ...] = (0.0, 0.0),
+    severity: tuple[float, ...] = (0.0, 0.0),
+    outcome: int = 0,
 ) -> TimeStep:
     """A step with two safety constraints; its totals are not used but carried along."""
     margins = {name: jnp.asarray(-share) for name, share in zip("ab", severity, strict=True)}
@@ -75,7 +78,9 @@ def episodes() -> Episode:
 
 
 def test_sums_begin_at_zero() -> None:
-    assert all(leaf == 0 for leaf in jax.tree.leaves(begin(time_step(5.0, (1.0, 1.0), (1.0, 1.0), 1))))
+    assert all(
+        leaf == 0 for leaf in jax.tree.leaves(begin(time_step(5.0, (1.0, 1.0), (1.0, 1.0), 1)))
+    )
 
 
 def test_steps_add_up(episodes: Episode) -> None:
@@ -100,11 +105,15 @@ def test_counts_are_integers_and_shapes_do_not_change_from_step_to_step() -> Non
     before = begin(time_step(1.0))
     after = accumulate(before, time_step(1.0, (0.1, 0.1), (0.5, 0.5), SUCCESS))
     chex.assert_trees_all_equal_shapes_and_dtypes(before, after)
-    assert {before.length.dtype, before.outcome.dtype, before.violating_steps.dtype} == {jnp.dtype("int32")}
+    assert {before.length.dtype, before.outcome.dtype, before.violating_steps.dtype} == {
+        jnp.dtype("int32")
+    }
 
 
 def test_sums_work_on_batches_and_without_delta_v() -> None:
-    batch = jax.tree.map(lambda leaf: jnp.stack([leaf, 2 * leaf]), time_step(1.0, (0.5, 0.5), (0.5, 0.25)))
+    batch = jax.tree.map(
+        lambda leaf: jnp.stack([leaf, 2 * leaf]), time_step(1.0, (0.5, 0.5), (0.5, 0.25))
+    )
     episode = accumulate(accumulate(begin(batch), batch), batch)
     np.testing.assert_allclose(episode.episode_return, [2.0, 4.0])
     np.testing.assert_allclose(episode.severity_max, [0.5, 1.0])
@@ -141,7 +150,9 @@ def test_without_violations_severity_is_zero() -> None:
     found = summarise(jax.tree.map(lambda leaf: leaf[None], episode), SUCCESS)
     for name in ("safety_violation_rate", "episode_safety_violation_rate"):
         assert found[name] == 0.0
-    assert found["episode_violation_severity_mean"] == found["episode_violation_severity_max"] == 0.0
+    assert (
+        found["episode_violation_severity_mean"] == found["episode_violation_severity_max"] == 0.0
+    )
     assert found["success_rate"] == 1.0
 
 
@@ -156,7 +167,10 @@ def test_what_an_environment_does_not_measure_is_none(episodes: Episode) -> None
     found = summarise(episodes, -1, has_delta_v=True, has_delta_v_l1=False, has_constraints=False)
     known = {"average_return", "episode_length", "control_usage", "mean_reward"}
     assert {name for name, value in found.items() if value is not None} == known
-    assert summarise(episodes, SUCCESS, has_delta_v=False, has_delta_v_l1=True)["control_usage_l1"] is not None
+    assert (
+        summarise(episodes, SUCCESS, has_delta_v=False, has_delta_v_l1=True)["control_usage_l1"]
+        is not None
+    )
 
 
 def test_an_environment_says_what_it_measures() -> None:
@@ -180,7 +194,9 @@ def test_a_figure_that_is_not_finite_is_none(episodes: Episode) -> None:
 def test_the_metrics_of_a_real_episode_agree_with_its_steps() -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 19})
     actions = jax.random.uniform(jax.random.key(1), (20, 2), minval=-1.0)
-    state, timestep = jaxsafe.reset_to(env, {"deputy": {"position": [120.0, 0.0], "velocity": [0.0, 0.4]}})
+    state, timestep = jaxsafe.reset_to(
+        env, {"deputy": {"position": [120.0, 0.0], "velocity": [0.0, 0.4]}}
+    )
     episode, taken, step = begin(timestep), [], jax.jit(jaxsafe.step)
     for action in actions:
         state, timestep = step(env, state, action)
@@ -189,13 +205,21 @@ def test_the_metrics_of_a_real_episode_agree_with_its_steps() -> None:
     limits = np.asarray([timestep.info.status["velocity_limit"] for timestep in taken], float)
     over = np.maximum([timestep.info.status["speed"] for timestep in taken] - limits, 0.0) / limits
     assert 0 < (over > 0).sum() < 20
-    assert found["control_usage"] == pytest.approx(np.linalg.norm(actions, axis=1).sum() / 12, rel=1e-5)
+    assert found["control_usage"] == pytest.approx(
+        np.linalg.norm(actions, axis=1).sum() / 12, rel=1e-5
+    )
     assert found["control_usage_l1"] == pytest.approx(np.abs(actions).sum() / 12, rel=1e-5)
     assert found["episode_safety_violation_rate"] == pytest.approx((over > 0).mean())
-    assert found["episode_violation_severity_mean"] == pytest.approx(over[over > 0].mean(), rel=1e-3)
+    assert found["episode_violation_severity_mean"] == pytest.approx(
+        over[over > 0].mean(), rel=1e-3
+    )
     assert found["episode_violation_severity_max"] == pytest.approx(over.max(), rel=1e-3)
-    assert found["mean_reward"] == pytest.approx(np.mean([float(timestep.reward) for timestep in taken]), rel=1e-4)
-    assert found["average_return"] == pytest.approx(sum(map(float, state.reward_totals.values())), rel=1e-4)
+    assert found["mean_reward"] == pytest.approx(
+        np.mean([float(timestep.reward) for timestep in taken]), rel=1e-4
+    )
+    assert found["average_return"] == pytest.approx(
+        sum(map(float, state.reward_totals.values())), rel=1e-4
+    )
     assert found["episode_length"] == 20.0
 
 
@@ -204,10 +228,14 @@ def test_the_metrics_of_a_real_episode_agree_with_its_steps() -> None:
 
 def efficiency(success: Any, episodes: Any, **options: Any) -> dict[str, Any]:
     steps = 100 * (1 + np.arange(len(success)))
-    return interaction_efficiency(steps, np.asarray(success, float), np.asarray(episodes), **options)
+    return interaction_efficiency(
+        steps, np.asarray(success, float), np.asarray(episodes), **options
+    )
 
 
-def test_interaction_efficiency_is_the_first_step_at_which_the_average_over_seeds_reaches_four_fifths() -> None:
+def test_interaction_efficiency_is_the_first_step_at_which_the_average_over_seeds_reaches_four_fifths() -> (
+    None
+):
     success = [[0.9, 0.0], [0.7, 0.7], [1.0, 0.6], [0.5, 0.8], [1.0, 1.0]]
     assert efficiency(success, np.full((5, 2), 50)) == {"timesteps": 300, "per_seed": [100, 400]}
 
@@ -217,7 +245,9 @@ def test_a_rate_of_exactly_four_fifths_counts() -> None:
     rates = [0.97, 0.61, 0.74, 0.85, 0.64, 0.8, 0.85, 0.9, 0.97, 0.67]
     assert np.mean([rates], axis=1)[0] < 0.8  # as floats
     assert efficiency([rates], [[100] * 10])["timesteps"] == 100
-    single = np.full((1, 1), 80 * np.float32(0.01) - np.float32(6e-8), np.float32)  # as a sum of hundredths may end
+    single = np.full(
+        (1, 1), 80 * np.float32(0.01) - np.float32(6e-8), np.float32
+    )  # as a sum of hundredths may end
     assert efficiency(single, [[100]]) == {"timesteps": 100, "per_seed": [100]}
     assert efficiency([[0.79999]], [[100]])["timesteps"] is None
 
@@ -231,17 +261,29 @@ def test_a_rate_counts_only_from_twenty_finished_episodes_on() -> None:
 def test_the_average_waits_for_every_seed_to_have_finished_enough() -> None:
     success = [[1.0, 1.0, 1.0, 1.0, 1.0]] * 2
     episodes = [[50, 50, 50, 50, 19], [60, 60, 60, 60, 20]]
-    assert efficiency(success, episodes) == {"timesteps": 200, "per_seed": [100, 100, 100, 100, 200]}
+    assert efficiency(success, episodes) == {
+        "timesteps": 200,
+        "per_seed": [100, 100, 100, 100, 200],
+    }
 
 
 def test_interaction_efficiency_is_none_if_never_reached() -> None:
-    assert efficiency([[0.7, 1.0]] * 3, np.full((3, 2), 99)) == {"timesteps": 100, "per_seed": [None, 100]}
-    assert efficiency([[0.5, 1.0]] * 3, np.full((3, 2), 99)) == {"timesteps": None, "per_seed": [None, 100]}
+    assert efficiency([[0.7, 1.0]] * 3, np.full((3, 2), 99)) == {
+        "timesteps": 100,
+        "per_seed": [None, 100],
+    }
+    assert efficiency([[0.5, 1.0]] * 3, np.full((3, 2), 99)) == {
+        "timesteps": None,
+        "per_seed": [None, 100],
+    }
     assert efficiency([[1.0]], [[19]]) == {"timesteps": None, "per_seed": [None]}
 
 
 def test_a_seed_without_a_rate_yet_does_not_count_as_a_success() -> None:
-    assert efficiency([[np.nan, 1.0], [0.9, 1.0]], [[0, 50], [20, 60]]) == {"timesteps": 200, "per_seed": [200, 100]}
+    assert efficiency([[np.nan, 1.0], [0.9, 1.0]], [[0, 50], [20, 60]]) == {
+        "timesteps": 200,
+        "per_seed": [200, 100],
+    }
 
 
 # Over seeds
@@ -250,7 +292,9 @@ def test_a_seed_without_a_rate_yet_does_not_count_as_a_success() -> None:
 def test_the_mean_of_ten_seeds_has_the_interval_of_scipys_percentile_bootstrap() -> None:
     values = np.random.default_rng(3).normal(5.0, 2.0, 10)
     found = over_seeds([float(value) for value in values])
-    expected = bootstrap((values,), np.mean, method="percentile", n_resamples=20_000, rng=np.random.default_rng(1))
+    expected = bootstrap(
+        (values,), np.mean, method="percentile", n_resamples=20_000, rng=np.random.default_rng(1)
+    )
     assert found["mean"] == pytest.approx(values.mean())
     assert found["iqm"] == pytest.approx(trim_mean(values, 0.25))
     assert found["per_seed"] == pytest.approx(list(values))
@@ -286,7 +330,12 @@ def test_one_seed_or_two_have_no_interval() -> None:
 
 
 def test_a_metric_without_a_meaning_stays_none() -> None:
-    assert over_seeds([None, None]) == {"mean": None, "ci95": None, "iqm": None, "per_seed": [None, None]}
+    assert over_seeds([None, None]) == {
+        "mean": None,
+        "ci95": None,
+        "iqm": None,
+        "per_seed": [None, None],
+    }
 
 
 def test_the_interquartile_mean_drops_the_outer_quarters_over_all_tasks() -> None:
@@ -297,4 +346,7 @@ def test_the_interquartile_mean_drops_the_outer_quarters_over_all_tasks() -> Non
 
 
 def test_the_stratified_bootstrap_resamples_within_tasks() -> None:
-    assert stratified_iqm([[0.0] * 5, [1.0] * 5])["ci95"] == [0.5, 0.5]  # every resample has five of each
+    assert stratified_iqm([[0.0] * 5, [1.0] * 5])["ci95"] == [
+        0.5,
+        0.5,
+    ]  # every resample has five of each

@@ -45,7 +45,9 @@ def core(env: jaxsafe.Environment, key: jax.Array, num_envs: int) -> Any:
     """A start, a step, and a rollout long enough for a second start."""
     key_reset, key_rollout = jax.random.split(key)
     state, timestep = jaxsafe.reset(env, key_reset)
-    action = jnp.zeros(env.action_size, int if env.num_action_points else timestep.observation.dtype)
+    action = jnp.zeros(
+        env.action_size, int if env.num_action_points else timestep.observation.dtype
+    )
     state, timestep = jaxsafe.step(env, state, action)
 
     def policy(key: jax.Array, observation: jax.Array) -> jax.Array:
@@ -86,7 +88,9 @@ def test_training_and_evaluation_can_be_traced(mode: str, training: str) -> None
 
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", CHECKED_WHILE_TRACING)
-@pytest.mark.parametrize(("task", "rta"), [(task, rta) for task in TASKS for rta in TASKS[task].filters])
+@pytest.mark.parametrize(
+    ("task", "rta"), [(task, rta) for task in TASKS for rta in TASKS[task].filters]
+)
 def test_every_filter_can_be_traced(mode: str, task: str, rta: str) -> None:
     with CHECKED_WHILE_TRACING[mode]():
         env = jaxsafe.make(task, rta=rta)
@@ -102,7 +106,9 @@ def test_everything_runs(mode: str) -> None:
         for env, key_core in zip((plain, filtered), keys, strict=True):
             _, timestep, _ = jax.jit(lambda env, key: core(env, key, 2))(env, key_core)
             assert bool(jnp.isfinite(timestep.observation).all())
-        state, _ = learn(TRAININGS["ppo"], key, lambda function, *given: jax.jit(function)(*given))[:2]
+        state, _ = learn(TRAININGS["ppo"], key, lambda function, *given: jax.jit(function)(*given))[
+            :2
+        ]
         assert int(state.num_updates) == 2
         assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(state.params))
 
@@ -122,7 +128,9 @@ def test_steps_and_filters_run_without_compilation(rta: str | None) -> None:
 @pytest.mark.slow
 def test_training_runs_without_compilation() -> None:
     with jax.disable_jit():
-        state = learn(TRAININGS["ppo"], jax.random.key(0), lambda function, *given: function(*given))[0]
+        state = learn(
+            TRAININGS["ppo"], jax.random.key(0), lambda function, *given: function(*given)
+        )[0]
     assert int(state.num_updates) == 2
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(state.params))
 

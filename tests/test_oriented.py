@@ -24,7 +24,9 @@ def step(x: Any, controls: Any, dt: Any = 1.0) -> jax.Array:
     craft = normalise(OrientedSpacecraft(name="craft"))
     state = OrientedState(x[:2], x[2:4], jnp.zeros(1), x[4], x[5])
     after = craft.step(state, {"thrust": controls[0], "attitude_acceleration": controls[1]}, dt)
-    return jnp.concatenate([after.position, after.velocity, jnp.stack([after.attitude, after.attitude_rate])])
+    return jnp.concatenate(
+        [after.position, after.velocity, jnp.stack([after.attitude, after.attitude_rate])]
+    )
 
 
 steps = jax.jit(jax.vmap(step, in_axes=(0, 0, None)))
@@ -39,20 +41,29 @@ def exact(x: np.ndarray, controls: np.ndarray, dt: float) -> np.ndarray:
     n = MEAN_MOTION
     for length, acceleration in ((stop, turn), (dt - stop, 0.0 * turn)):
 
-        def unit(_: float, y: np.ndarray, length: np.ndarray = length, turn: np.ndarray = acceleration) -> np.ndarray:
+        def unit(
+            _: float, y: np.ndarray, length: np.ndarray = length, turn: np.ndarray = acceleration
+        ) -> np.ndarray:
             px, _, vx, vy, angle, rate = y.reshape(6, -1)
             ax = 2 * n * vy + 3 * n**2 * px + thrust / MASS * np.cos(angle)
             ay = -2 * n * vx + thrust / MASS * np.sin(angle)
             return (length * np.stack([vx, vy, ax, ay, rate, turn])).ravel()
 
-        x = solve_ivp(unit, (0.0, 1.0), x.ravel(), method="DOP853", rtol=1e-13, atol=1e-14).y[:, -1].reshape(6, -1)
+        x = (
+            solve_ivp(unit, (0.0, 1.0), x.ravel(), method="DOP853", rtol=1e-13, atol=1e-14)
+            .y[:, -1]
+            .reshape(6, -1)
+        )
     return x
 
 
 def random_craft(seed: int, num: int = NUM) -> tuple[np.ndarray, np.ndarray]:
     """States [6, num] and controls [2, num]; a fifth of each on the rate's limit, just off it, with a zero control."""
     rng = np.random.default_rng(seed)
-    rate, end = rng.uniform(-RATE_LIMIT, RATE_LIMIT, num), rng.choice([-RATE_LIMIT, RATE_LIMIT], num)
+    rate, end = (
+        rng.uniform(-RATE_LIMIT, RATE_LIMIT, num),
+        rng.choice([-RATE_LIMIT, RATE_LIMIT], num),
+    )
     kind = rng.integers(5, size=num)
     rate[kind == 0], rate[kind == 1] = end[kind == 0], 0.9999 * end[kind == 1]
     planar = np.concatenate([rng.uniform(-150, 150, (2, num)), rng.uniform(-0.5, 0.5, (2, num))])
@@ -87,7 +98,10 @@ def test_a_step_of_ten_seconds_reaches_the_limit_from_anywhere_and_is_still_clos
 
 @pytest.mark.usefixtures("x64")
 def test_the_error_falls_with_the_sixth_power_of_the_step() -> None:
-    start, controls = np.array([[90.0, -40.0, 0.2, 0.1, 0.3, -RATE_LIMIT]]), np.array([[2.0, RATE_LIMIT / 100.0]])
+    start, controls = (
+        np.array([[90.0, -40.0, 0.2, 0.1, 0.3, -RATE_LIMIT]]),
+        np.array([[2.0, RATE_LIMIT / 100.0]]),
+    )
     expected, errors = exact(start.T, controls.T, 160.0), []
     for num_steps in (4, 8, 16):
         x = start
@@ -101,7 +115,10 @@ def test_the_error_falls_with_the_sixth_power_of_the_step() -> None:
 
 def test_in_float32_a_step_has_six_digits() -> None:
     x, controls = (array.astype(np.float32) for array in random_craft(seed=3))
-    found, expected = np.asarray(steps(x.T, controls.T, 1.0)).T, exact(x.astype(float), controls.astype(float), 1.0)
+    found, expected = (
+        np.asarray(steps(x.T, controls.T, 1.0)).T,
+        exact(x.astype(float), controls.astype(float), 1.0),
+    )
     assert found.dtype == np.float32
     np.testing.assert_allclose(found[:2], expected[:2], rtol=0.0, atol=150 * 4e-7)
     np.testing.assert_allclose(found[2:4], expected[2:4], rtol=0.0, atol=4e-7)
@@ -119,7 +136,9 @@ def test_without_a_turn_it_is_a_spacecraft_with_the_thrust_rotated() -> None:
         return jnp.concatenate([after.position, after.velocity])
 
     found = steps(x.T, controls.T, 1.0)
-    np.testing.assert_allclose(found[:, :4], jax.vmap(plain)(x.T, controls[0]), rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(
+        found[:, :4], jax.vmap(plain)(x.T, controls[0]), rtol=0.0, atol=1e-12
+    )
     np.testing.assert_allclose(found[:, 4], x[4], rtol=0.0, atol=1e-14)
 
 
@@ -129,11 +148,15 @@ def test_without_thrust_the_attitude_does_not_move_the_craft() -> None:
     controls[0] = 0.0
     still = x.copy()
     still[4:] = 0.0
-    np.testing.assert_array_equal(steps(x.T, controls.T, 1.0)[:, :4], steps(still.T, controls.T, 1.0)[:, :4])
+    np.testing.assert_array_equal(
+        steps(x.T, controls.T, 1.0)[:, :4], steps(still.T, controls.T, 1.0)[:, :4]
+    )
 
 
 def at(attitude: float, rate: float) -> OrientedState:
-    return OrientedState(jnp.zeros(2), jnp.zeros(2), jnp.zeros(1), jnp.asarray(attitude), jnp.asarray(rate))
+    return OrientedState(
+        jnp.zeros(2), jnp.zeros(2), jnp.zeros(1), jnp.asarray(attitude), jnp.asarray(rate)
+    )
 
 
 def test_the_turn_rate_rests_at_its_limit() -> None:
@@ -144,8 +167,12 @@ def test_the_turn_rate_rests_at_its_limit() -> None:
         rates.append(float(state.attitude_rate))
         attitudes.append(float(state.attitude))
     np.testing.assert_allclose(np.array(rates) / RATE_LIMIT, [0.75, 1, 1, 1, 1], rtol=1e-6)
-    second = 0.75 / 3 + 0.75 / 3 / 6 + 2 / 3  # a third of a second until the limit, at it afterwards
-    np.testing.assert_allclose(np.array(attitudes) / RATE_LIMIT, np.cumsum([0.375, second, 1, 1, 1]), rtol=1e-5)
+    second = (
+        0.75 / 3 + 0.75 / 3 / 6 + 2 / 3
+    )  # a third of a second until the limit, at it afterwards
+    np.testing.assert_allclose(
+        np.array(attitudes) / RATE_LIMIT, np.cumsum([0.375, second, 1, 1, 1]), rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize("x64", [False, True])
@@ -155,12 +182,21 @@ def test_the_attitude_is_wrapped_to_the_half_open_interval(x64: bool) -> None:
         turn = jax.jit(lambda attitude, rate: craft.step(at(attitude, rate), {}, 1.0).attitude)
         pi = np.asarray(np.pi, jnp.result_type(float))[()]
         ulp = np.spacing(pi)
-        starts = [pi, -pi, *(sign * (pi + k * ulp) for sign in (1, -1) for k in (-2, -1, 1, 2, 5)), 7.0, -40.0, 0.0]
+        starts = [
+            pi,
+            -pi,
+            *(sign * (pi + k * ulp) for sign in (1, -1) for k in (-2, -1, 1, 2, 5)),
+            7.0,
+            -40.0,
+            0.0,
+        ]
         for attitude in starts:
             for rate in (0.0, 1e-9, -1e-9, ulp, -ulp, RATE_LIMIT, -RATE_LIMIT):
                 after = turn(attitude, rate)
                 assert -pi <= after < pi, (attitude, rate)
-                assert unwrapped(float(after) - float(attitude) - rate) == pytest.approx(0.0, abs=1e-5)
+                assert unwrapped(float(after) - float(attitude) - rate) == pytest.approx(
+                    0.0, abs=1e-5
+                )
 
 
 @settings(deadline=None, max_examples=50)
@@ -169,7 +205,11 @@ def test_attitude_and_turn_rate_stay_in_their_ranges(seed: int) -> None:
     rng = np.random.default_rng(seed)
     x = np.float32([[0.0, 0.0, 0.0, 0.0, rng.uniform(-math.pi, math.pi), 0.0]])
     for _ in range(20):
-        x = np.asarray(steps(x, np.float32(rng.uniform(-1, 1, (1, 2)) * [2.0, 3 * RATE_LIMIT]), np.float32(1.0)))
+        x = np.asarray(
+            steps(
+                x, np.float32(rng.uniform(-1, 1, (1, 2)) * [2.0, 3 * RATE_LIMIT]), np.float32(1.0)
+            )
+        )
         assert -np.float32(np.pi) <= x[0, 4] < np.float32(np.pi)
         assert abs(x[0, 5]) <= np.float32(RATE_LIMIT)
 
@@ -185,7 +225,9 @@ def test_a_quarter_turn_of_the_attitude_points_the_body_along_y() -> None:
     state = at(math.pi / 2, 0.0)
     np.testing.assert_allclose(state.orientation[:, 0], [0.0, 1.0], atol=1e-6)
     assert float(state.heading) == pytest.approx(math.pi / 2)
-    pushed = normalise(OrientedSpacecraft(name="craft", mean_motion=0.0)).step(state, {"thrust": 2.0}, 1.0)
+    pushed = normalise(OrientedSpacecraft(name="craft", mean_motion=0.0)).step(
+        state, {"thrust": 2.0}, 1.0
+    )
     np.testing.assert_allclose(pushed.velocity, [0.0, 2.0 / 12.0], atol=1e-7)
     np.testing.assert_allclose(pushed.position, [0.0, 1.0 / 12.0], atol=1e-7)
 
@@ -211,5 +253,7 @@ def test_derivatives_are_finite_differences() -> None:
 def test_in_float32_derivatives_are_finite_on_the_limit_and_at_zero_controls() -> None:
     for rate in (-RATE_LIMIT, 0.0, RATE_LIMIT):
         for turn in (-1e-38, 0.0, 1e-38, TURN):
-            parts = jacobian(jnp.asarray([[100.0, 0.0, 0.0, 0.0, 0.0, rate]]), jnp.asarray([[0.0, turn]]))
+            parts = jacobian(
+                jnp.asarray([[100.0, 0.0, 0.0, 0.0, 0.0, rate]]), jnp.asarray([[0.0, turn]])
+            )
             assert all(np.isfinite(part).all() for part in parts)

@@ -13,7 +13,16 @@ def test_a_commit_is_that_of_the_code_and_says_when_the_code_is_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def git(*words: str) -> str:
-        command = ["git", "-C", str(tmp_path), "-c", "user.name=test", "-c", "user.email=test@example.org", *words]
+        command = [
+            "git",
+            "-C",
+            str(tmp_path),
+            "-c",
+            "user.name=test",
+            "-c",
+            "user.email=test@example.org",
+            *words,
+        ]
         return subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
 
     package = tmp_path / "package"
@@ -33,7 +42,11 @@ def test_a_commit_is_that_of_the_code_and_says_when_the_code_is_another(
     git("commit", "-qm", "all of it")
     head = git("rev-parse", "HEAD")[:12]
     assert provenance.commit() == head
-    for result in (tmp_path / "page.md", package / "policies" / "one.npz", package / "policies" / "another.npz"):
+    for result in (
+        tmp_path / "page.md",
+        package / "policies" / "one.npz",
+        package / "policies" / "another.npz",
+    ):
         result.write_text("another")
     assert provenance.commit() == head
     for code in (package / "code.py", tmp_path / "configs" / "task.yaml", package / "new.py"):
@@ -43,7 +56,9 @@ def test_a_commit_is_that_of_the_code_and_says_when_the_code_is_another(
         assert provenance.commit() == head
 
 
-def test_a_package_inside_another_repository_has_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_package_inside_another_repository_has_no_commit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     package = tmp_path / ".venv" / "package"
     package.mkdir(parents=True)
     (package / "types.py").write_text("installed")

@@ -117,14 +117,30 @@ def test_picked_parts_pass_no_conversion_and_other_values_do(car: Car) -> None:
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        ("lenth", 1, r"^lenth: unknown field 'lenth'; choose from name, .*, left, right\. Did you mean 'length'\?$"),
+        (
+            "lenth",
+            1,
+            r"^lenth: unknown field 'lenth'; choose from name, .*, left, right\. Did you mean 'length'\?$",
+        ),
         ("rigt.radius", 1, r"^rigt: unknown field 'rigt'; .* Did you mean 'right'\?$"),
-        ("wheels.rigt.radius", 1, r"^wheels\.rigt: unknown name 'rigt'; choose from left, right\. Did you mean 'right'\?$"),
-        ("right.radus", 1, r"^right\.radus: unknown field 'radus'; choose from name, radius\. Did you mean 'radius'\?$"),
+        (
+            "wheels.rigt.radius",
+            1,
+            r"^wheels\.rigt: unknown name 'rigt'; choose from left, right\. Did you mean 'right'\?$",
+        ),
+        (
+            "right.radus",
+            1,
+            r"^right\.radus: unknown field 'radus'; choose from name, radius\. Did you mean 'radius'\?$",
+        ),
         ("engine.wheels.left.radus", 1, r"^engine\.wheels\.left\.radus: unknown field 'radus'"),
         ("wheels.left", 1, r"^wheels\.left: name one of its fields: name, radius$"),
         ("left", 1, r"^left: name one of its fields: name, radius$"),
-        ("wheels", ["left", "rigt"], r"^wheels\.rigt: unknown name 'rigt'; .* Did you mean 'right'\?$"),
+        (
+            "wheels",
+            ["left", "rigt"],
+            r"^wheels\.rigt: unknown name 'rigt'; .* Did you mean 'right'\?$",
+        ),
         ("engine.wheels", ["x"], r"^engine\.wheels\.x: unknown name 'x'; choose from left, right$"),
         ("table.z", 1, r"^table: unknown name 'z'; choose from x, y$"),
         ("table.x.y", 1, r"^table\.x: table has no fields$"),
@@ -135,7 +151,9 @@ def test_picked_parts_pass_no_conversion_and_other_values_do(car: Car) -> None:
         ("wheels.", 1, r"^wheels: unknown name ''"),
     ],
 )
-def test_a_path_that_leads_nowhere_is_told_in_one_line(car: Car, path: str, value: Any, message: str) -> None:
+def test_a_path_that_leads_nowhere_is_told_in_one_line(
+    car: Car, path: str, value: Any, message: str
+) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
         set_path(car, path, value)
     assert "\n" not in str(caught.value)

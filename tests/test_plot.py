@@ -45,7 +45,9 @@ def test_curves_show_each_seed_their_mean_and_its_interval() -> None:
     assert panel.get_xlabel() == "environment steps per seed"
     assert panel.get_ylabel() == "success rate [%]"
     mean = next(line for line in panel.lines if line.get_label() == "mean")
-    values = np.array([row["success_rate"] or np.nan for row in rows()]).reshape(50, 4)[3:]  # nothing finished before
+    values = np.array([row["success_rate"] or np.nan for row in rows()]).reshape(50, 4)[
+        3:
+    ]  # nothing finished before
     np.testing.assert_allclose(mean.get_ydata(), 100 * values.mean(axis=1))
     np.testing.assert_allclose(mean.get_xdata(), 100 * np.arange(4, 51))
     shaded = panel.collections[0].get_paths()[0].vertices
@@ -74,20 +76,33 @@ def episode(step: int, dimension: int) -> tuple[int, list[dict]]:
         }
         for p in path
     ]
-    platforms = [{"chief": {"position": [0.0] * dimension}, "deputy": {"position": list(p)}} for p in path]
+    platforms = [
+        {"chief": {"position": [0.0] * dimension}, "deputy": {"position": list(p)}} for p in path
+    ]
     return step, [{"status": s, "platforms": p} for s, p in zip(status, platforms, strict=True)]
 
 
 @pytest.mark.parametrize(("dimension", "planes"), [(2, 1), (3, 2)])
-def test_trajectories_show_one_start_during_training_and_all_after_it_in_each_plane(dimension: int, planes: int) -> None:
+def test_trajectories_show_one_start_during_training_and_all_after_it_in_each_plane(
+    dimension: int, planes: int
+) -> None:
     other = episode(200, dimension)
     for row in other[1]:
         row["platforms"]["deputy"]["position"][0] *= -1.0
-    figure = trajectories([episode(0, dimension), episode(100, dimension), episode(200, dimension), other], "title", "m")
+    figure = trajectories(
+        [episode(0, dimension), episode(100, dimension), episode(200, dimension), other],
+        "title",
+        "m",
+    )
     axes = [panel for panel in figure.axes if panel.get_xlabel() == "x [m]"]
-    assert [panel.get_title() for panel in axes[:2]] == ["one start, during training", "after training"]
+    assert [panel.get_title() for panel in axes[:2]] == [
+        "one start, during training",
+        "after training",
+    ]
     assert len(axes) == 2 * planes
-    during, after = ([line for line in panel.lines if len(line.get_xdata()) > 1] for panel in axes[:2])
+    during, after = (
+        [line for line in panel.lines if len(line.get_xdata()) > 1] for panel in axes[:2]
+    )
     assert (len(during), len(after)) == (3, 2)
     np.testing.assert_allclose(during[0].get_xdata(), np.linspace(80.0, 0.0, 20))
     np.testing.assert_allclose(after[1].get_xdata(), np.linspace(-80.0, 0.0, 20))
@@ -111,7 +126,9 @@ def test_the_ends_of_the_paths_have_a_panel_where_a_region_is_small_beside_them(
 
 
 def test_a_platform_alone_is_drawn_where_it_is_and_a_training_that_diverged_leaves_gaps() -> None:
-    alone = [{"platforms": {"deputy": {"position": [3.0 - k, 4.0]}}, "status": {}} for k in range(4)]
+    alone = [
+        {"platforms": {"deputy": {"position": [3.0 - k, 4.0]}}, "status": {}} for k in range(4)
+    ]
     figure = trajectories([(0, alone)], "title", "m")
     path = next(line for line in figure.axes[0].lines if len(line.get_xdata()) > 1)
     np.testing.assert_allclose(path.get_xydata()[0], [3.0, 4.0])
@@ -140,9 +157,14 @@ def test_early_policies_that_go_far_away_do_not_set_the_scale() -> None:
 
 def test_paths_are_seen_from_the_lead_along_its_heading_with_the_region_that_it_carries() -> None:
     env = jaxsafe.make("rejoin2d")
-    heading = np.linspace(0.0, 2.0, 30)  # the lead flies a turn, the wingman keeps 300 ft behind and 100 ft aside of it
+    heading = np.linspace(
+        0.0, 2.0, 30
+    )  # the lead flies a turn, the wingman keeps 300 ft behind and 100 ft aside of it
     lead = 1e4 * np.stack([np.sin(heading), 1.0 - np.cos(heading)], axis=1)
-    ahead, aside = np.stack([np.cos(heading), np.sin(heading)], 1), np.stack([-np.sin(heading), np.cos(heading)], 1)
+    ahead, aside = (
+        np.stack([np.cos(heading), np.sin(heading)], 1),
+        np.stack([-np.sin(heading), np.cos(heading)], 1),
+    )
     rows = [
         {
             "platforms": {
@@ -183,14 +205,21 @@ def test_figures_come_from_the_log_files_alone(whole: Path, tmp_path: Path) -> N
     assert image[..., :3].std() > 0.05  # not blank
 
 
-def test_the_agent_is_drawn_whatever_it_and_the_others_are_called(whole: Path, tmp_path: Path) -> None:
+def test_the_agent_is_drawn_whatever_it_and_the_others_are_called(
+    whole: Path, tmp_path: Path
+) -> None:
     """Logs have the platforms in the order of the alphabet."""
     for name in ("config.yaml", "progress.jsonl", "episodes.jsonl"):
         text = (whole / name).read_text()
-        (tmp_path / name).write_text(re.sub(r"\bchief\b", "target", re.sub(r"\bdeputy\b", "chaser", text)))
+        (tmp_path / name).write_text(
+            re.sub(r"\bchief\b", "target", re.sub(r"\bdeputy\b", "chaser", text))
+        )
     rows = [json.loads(line) for line in (tmp_path / "episodes.jsonl").read_text().splitlines()]
     assert [*rows[0]["platforms"]] == ["target", "chaser"]  # chief, deputy
-    swapped = [{**row, "platforms": {name: row["platforms"][name] for name in ("chaser", "target")}} for row in rows]
+    swapped = [
+        {**row, "platforms": {name: row["platforms"][name] for name in ("chaser", "target")}}
+        for row in rows
+    ]
     (tmp_path / "episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in swapped))
     episodes = _episodes(tmp_path / "episodes.jsonl", ["target", "chaser"])
     figure = trajectories(episodes, "title", "m")
@@ -213,21 +242,32 @@ def test_names_are_drawn_letter_by_letter(name: str) -> None:
     drawn = figure.axes[0].text(0.0, 0.0, shown[0])
     assert drawn._preprocess_math(shown[0])[1] is False  # pyright: ignore[reportAttributeAccessIssue]
     seen = drawn._preprocess_math(shown[0])[0]  # pyright: ignore[reportAttributeAccessIssue]
-    assert seen.removeprefix("\u200b") == name.replace("\x1b", r"\x1b").replace("\x07", r"\x07").replace("\udcff", "?")
+    assert seen.removeprefix("\u200b") == name.replace("\x1b", r"\x1b").replace(
+        "\x07", r"\x07"
+    ).replace("\udcff", "?")
 
 
 def test_an_interval_is_drawn_and_named_only_where_there_are_seeds_enough() -> None:
     for count, interval in ((2, False), (3, True)):
         panel = training_curves(rows(num_seeds=count), "steps", "title").axes[0]
-        assert ("95 % interval" in panel.get_legend_handles_labels()[1]) == bool(panel.collections) == interval
+        assert (
+            ("95 % interval" in panel.get_legend_handles_labels()[1])
+            == bool(panel.collections)
+            == interval
+        )
         figure = compare_curves({"one": rows(num_seeds=count)}, "docking2d")
         title = figure.get_suptitle()
-        assert title == f"docking2d: the last 100 training episodes, mean{' and 95 % interval' * interval} over seeds"
+        assert (
+            title
+            == f"docking2d: the last 100 training episodes, mean{' and 95 % interval' * interval} over seeds"
+        )
         assert bool(figure.axes[0].collections) == interval
 
 
 def test_what_to_stay_out_of_is_not_drawn_like_the_goal() -> None:
-    assert kept_out(jaxsafe.make(Path(__file__).parent.parent / "configs" / "custom_env.yaml")) == {"keep_out"}
+    assert kept_out(jaxsafe.make(Path(__file__).parent.parent / "configs" / "custom_env.yaml")) == {
+        "keep_out"
+    }
     for task in TASKS:
         assert kept_out(jaxsafe.make(task)) == set()
     step, rows = episode(100, 2)
@@ -241,7 +281,11 @@ def test_what_to_stay_out_of_is_not_drawn_like_the_goal() -> None:
 
 @pytest.mark.parametrize("nasty", [FORMULA, "_$x"])
 def test_a_run_whose_every_name_is_a_formula_is_drawn(
-    whole: Path, tmp_path: Path, nasty: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    whole: Path,
+    tmp_path: Path,
+    nasty: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """Names of the environment, of its platforms and regions, and of the run."""
 
@@ -250,16 +294,24 @@ def test_a_run_whose_every_name_is_a_formula_is_drawn(
             return {renamed(key): renamed(one) for key, one in value.items()}
         if isinstance(value, list):
             return [renamed(one) for one in value]
-        return f"{value}{nasty}" if value in ("docking2d", "chief", "deputy", "docking_region") else value
+        return (
+            f"{value}{nasty}"
+            if value in ("docking2d", "chief", "deputy", "docking_region")
+            else value
+        )
 
     monkeypatch.chdir(tmp_path)
     run = tmp_path / nasty
     shutil.copytree(whole, run, ignore=shutil.ignore_patterns("figures"))
-    content = yaml12.parse((whole / "config.yaml").read_text().replace("features: docking2d", "features: x"), "x")
+    content = yaml12.parse(
+        (whole / "config.yaml").read_text().replace("features: docking2d", "features: x"), "x"
+    )
     (run / "config.yaml").write_text(yaml12.write(renamed(content)))
     for log in ("episodes.jsonl", "progress.jsonl"):
         lines = (whole / log).read_text().splitlines()
-        (run / log).write_text("".join(json.dumps(renamed(json.loads(line))) + "\n" for line in lines))
+        (run / log).write_text(
+            "".join(json.dumps(renamed(json.loads(line))) + "\n" for line in lines)
+        )
     shutil.copytree(run, tmp_path / "other")
     assert main([f"run={nasty}"]) == 0
     assert "trajectories.png" in capsys.readouterr().out
@@ -269,7 +321,9 @@ def test_a_run_whose_every_name_is_a_formula_is_drawn(
 @pytest.mark.parametrize("kind", ["png", "pdf", "svg"])
 def test_a_figure_is_of_the_kind_that_its_name_says(kind: str, tmp_path: Path) -> None:
     path = save(training_curves(rows(2), "steps", "title"), tmp_path / f"x.{kind}")
-    assert path.read_bytes()[:5] in {"png": [b"\x89PNG\r"], "pdf": [b"%PDF-"], "svg": [b"<?xml"]}[kind]
+    assert (
+        path.read_bytes()[:5] in {"png": [b"\x89PNG\r"], "pdf": [b"%PDF-"], "svg": [b"<?xml"]}[kind]
+    )
     with pytest.raises(ConfigError, match=r"out: cannot draw x\.docx; choose from "):
         save(training_curves(rows(2), "steps", "title"), tmp_path / "x.docx")
 
@@ -278,7 +332,9 @@ def test_a_run_without_rows_is_told_in_one_line(whole: Path, tmp_path: Path) -> 
     shutil.copy(whole / "config.yaml", tmp_path / "config.yaml")
     with pytest.raises(ConfigError, match=r"has no rows in progress\.jsonl yet"):
         draw_all(tmp_path)
-    (tmp_path / "progress.jsonl").write_text(json.dumps(rows(1)[0] | {"episodes": 0, "cost": 0}) + "\nbroken\n{}\n")
+    (tmp_path / "progress.jsonl").write_text(
+        json.dumps(rows(1)[0] | {"episodes": 0, "cost": 0}) + "\nbroken\n{}\n"
+    )
     with pytest.raises(ConfigError, match=r"progress\.jsonl, line 2"):
         draw_all(tmp_path)
 
@@ -286,13 +342,43 @@ def test_a_run_without_rows_is_told_in_one_line(whole: Path, tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("name", "old", "new", "message"),
     [
-        ("episodes.jsonl", '"position": [', '"position": ["x", ', "row 1: platforms.chief.position: expected a list"),
-        ("episodes.jsonl", '"final": false', '"final": null', "row 1: final: expected true or false, found None"),
-        ("episodes.jsonl", '"speed"', '"sped"', "row 1: status.speed: expected a number or null, found nothing"),
-        ("progress.jsonl", '"return": null', '"return": "x"', "line 1: not a row of this log: return: expected"),
+        (
+            "episodes.jsonl",
+            '"position": [',
+            '"position": ["x", ',
+            "row 1: platforms.chief.position: expected a list",
+        ),
+        (
+            "episodes.jsonl",
+            '"final": false',
+            '"final": null',
+            "row 1: final: expected true or false, found None",
+        ),
+        (
+            "episodes.jsonl",
+            '"speed"',
+            '"sped"',
+            "row 1: status.speed: expected a number or null, found nothing",
+        ),
+        (
+            "progress.jsonl",
+            '"return": null',
+            '"return": "x"',
+            "line 1: not a row of this log: return: expected",
+        ),
         ("progress.jsonl", '"step": 64', '"step": 65', "progress.jsonl, row "),
-        ("results.json", '"mean": 0.0', '"mean": -1', "expected a number from 0 to 1 or null, found -1"),
-        ("results.json", '"wall_s"', '"wall"', "results.json: wall_s: expected a number ≥ 0, found nothing"),
+        (
+            "results.json",
+            '"mean": 0.0',
+            '"mean": -1',
+            "expected a number from 0 to 1 or null, found -1",
+        ),
+        (
+            "results.json",
+            '"wall_s"',
+            '"wall"',
+            "results.json: wall_s: expected a number ≥ 0, found nothing",
+        ),
     ],
 )
 def test_what_is_drawn_or_told_is_checked_first(
@@ -306,7 +392,11 @@ def test_what_is_drawn_or_told_is_checked_first(
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    runs = f"[{tmp_path / 'one'},{tmp_path / 'other'}]" if name == "results.json" else str(tmp_path / "one")
+    runs = (
+        f"[{tmp_path / 'one'},{tmp_path / 'other'}]"
+        if name == "results.json"
+        else str(tmp_path / "one")
+    )
     with pytest.raises(ConfigError) as caught:
         main([f"run={runs}"])
     assert message in str(caught.value)
@@ -343,9 +433,16 @@ def test_several_runs_in_one_figure_with_a_table(
 def test_comparison_is_logarithmic_only_where_runs_differ_much_in_length():
     def rows(steps):
         quantities = dict.fromkeys(("success_rate", "return", "length"), 0.5)
-        return [{"step": step, "wall_s": step / 1e4, "seed": 0, "episodes": 9, **quantities} for step in (1000, steps)]
+        return [
+            {"step": step, "wall_s": step / 1e4, "seed": 0, "episodes": 9, **quantities}
+            for step in (1000, steps)
+        ]
 
-    for steps, mark, scale in ((5_000, None, "linear"), (50_000, None, "log"), (5_000, ("far", 50_000.0), "log")):
+    for steps, mark, scale in (
+        (5_000, None, "linear"),
+        (50_000, None, "log"),
+        (5_000, ("far", 50_000.0), "log"),
+    ):
         figure = compare_curves({"one": rows(2_000), "other": rows(steps)}, "docking2d", mark=mark)
         assert {panel.get_xscale() for panel in figure.axes} == {scale}
 
@@ -356,18 +453,30 @@ def test_curves_of_a_comparison_begin_when_every_seed_has_finished_enough_episod
     curve = next(line for line in panel.lines if line.get_label() == "one")
     assert curve.get_xdata()[0] == 300
     few = [{**row, "episodes": row["episodes"] // 50} for row in known]
-    curve = next(line for line in compare_curves({"one": few}, "docking2d").axes[0].lines if line.get_label() == "one")
+    curve = next(
+        line
+        for line in compare_curves({"one": few}, "docking2d").axes[0].lines
+        if line.get_label() == "one"
+    )
     assert 0 < len(curve.get_xdata()) < 10  # those with all 9 episodes that the run finished
     (mark,) = [line for line in panel.lines if line.get_label() == "the paper's 80 %"]
     assert mark.get_xydata().tolist() == [[3000.0, 80.0]]
 
 
 def test_every_seed_has_its_line_and_those_that_failed_are_named() -> None:
-    failing = [{**row, "success_rate": 0.3} if row["seed"] == 8 else {**row, "success_rate": 0.9} for row in rows(500)]
-    figure = seed_curves({"one": failing, "other": rows(500)}, "docking2d", {"one": [8], "other": []})
+    failing = [
+        {**row, "success_rate": 0.3} if row["seed"] == 8 else {**row, "success_rate": 0.9}
+        for row in rows(500)
+    ]
+    figure = seed_curves(
+        {"one": failing, "other": rows(500)}, "docking2d", {"one": [8], "other": []}
+    )
     seeds = {row["seed"] for row in failing}
     assert [len(panel.lines) for panel in figure.axes] == [len(seeds) + 1] * 2  # and the 80 % line
-    assert [panel.get_title() for panel in figure.axes] == ["one: seed 8 failed", "other: no seed failed"]
+    assert [panel.get_title() for panel in figure.axes] == [
+        "one: seed 8 failed",
+        "other: no seed failed",
+    ]
     dashed = [line for line in figure.axes[0].lines if line.get_linestyle() == "--"]
     assert len(dashed) == 1
     np.testing.assert_allclose(dashed[0].get_ydata(), 30.0)

@@ -31,7 +31,9 @@ def episode(env: jaxsafe.Environment, altered: tuple[int, ...]) -> list[dict]:
             {
                 "t": float(k),
                 "control_desired": asked,
-                "control_actual": {name: value / (2.0 if k in altered else 1.0) for name, value in asked.items()},
+                "control_actual": {
+                    name: value / (2.0 if k in altered else 1.0) for name, value in asked.items()
+                },
                 "margins": {one.name: 1.0 - 0.1 * k for one in env.constraints},
                 "rta": {"intervening": k in altered, "predicted_margin": 0.9 - 0.1 * k},
                 "outcome": "success" if k == 8 else "running",
@@ -48,11 +50,16 @@ def labels(figure: object) -> list[str]:
     ("task", "expected"),
     [
         ("docking2d", ["thrust x [N]", "thrust y [N]", "h of velocity limit [m/s]"]),
-        ("docking2d_oriented", ["thrust [N]", "attitude acceleration [rad/s²]", "h of velocity limit [m/s]"]),
+        (
+            "docking2d_oriented",
+            ["thrust [N]", "attitude acceleration [rad/s²]", "h of velocity limit [m/s]"],
+        ),
         ("rejoin2d", ["heading rate [rad/s]", "acceleration [ft/s²]", "h of collision [ft]"]),
     ],
 )
-def test_interventions_have_a_panel_for_each_control_and_constraint(task: str, expected: list[str]) -> None:
+def test_interventions_have_a_panel_for_each_control_and_constraint(
+    task: str, expected: list[str]
+) -> None:
     env = jaxsafe.make(task, rta="default")
     figure = interventions(episode(env, (3, 4, 7)), env, "title")
     assert labels(figure) == expected
@@ -65,7 +72,9 @@ def test_interventions_show_what_was_asked_for_and_what_acted() -> None:
     figure = interventions(episode(env, (3, 4, 7)), env, "title")
     panel = figure.axes[0]
     steps = {patch.get_label(): patch.get_data() for patch in panel.patches}  # type: ignore[attr-defined]
-    np.testing.assert_allclose(steps["desired"].values, 0.02 * np.arange(1, 9))  # of the start there is no control
+    np.testing.assert_allclose(
+        steps["desired"].values, 0.02 * np.arange(1, 9)
+    )  # of the start there is no control
     np.testing.assert_allclose(steps["actual"].values[[1, 2, 3, 4]], [0.04, 0.03, 0.04, 0.10])
     np.testing.assert_allclose(steps["actual"].edges, np.arange(9))
     spans = [path.get_extents().intervalx for path in panel.collections[0].get_paths()]
@@ -119,7 +128,9 @@ def test_only_a_run_with_a_filter_draws_interventions(whole: Path, tmp_path: Pat
         "platforms": {"chief": {"position": [0.0, 0.0]}, "deputy": {"position": [9.0, 0.0]}},
         "status": {"docking_distance": 9.0, "speed": 0.1, "velocity_limit": 0.2},
     }  # fmt: skip
-    (run / "episodes.jsonl").write_text("".join(json.dumps(common | row) + "\n" for row in episode(env, (3,))))
+    (run / "episodes.jsonl").write_text(
+        "".join(json.dumps(common | row) + "\n" for row in episode(env, (3,)))
+    )
     draw_all(run)
     names = {"training_steps.png", "trajectories.png", "speed_distance.png"}
     assert {path.name for path in (run / "figures").iterdir()} == {*names, "interventions.png"}
@@ -127,7 +138,8 @@ def test_only_a_run_with_a_filter_draws_interventions(whole: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize(
-    ("task", "rta"), [("docking2d", "default"), ("docking3d", "implicit_simplex"), ("rejoin2d", "default")]
+    ("task", "rta"),
+    [("docking2d", "default"), ("docking3d", "implicit_simplex"), ("rejoin2d", "default")],
 )
 def test_what_is_drawn_as_certified_is_what_the_filter_certifies(task: str, rta: str) -> None:
     env = jaxsafe.make(task, rta=rta)
@@ -143,7 +155,9 @@ def test_what_is_drawn_as_certified_is_what_the_filter_certifies(task: str, rta:
         for i, j in [(0, 0), (3, 8), (4, 2), (5, 3), (6, 8)]:
             info = starts(env, at(env, start, x[j], y[i]))
             assert bool(info.rta.certified) == certified[i, j]
-            np.testing.assert_allclose(h[i, j], min(float(one) for one in info.margins.values()), rtol=1e-5, atol=1e-5)
+            np.testing.assert_allclose(
+                h[i, j], min(float(one) for one in info.margins.values()), rtol=1e-5, atol=1e-5
+            )
 
 
 def at(env: jaxsafe.Environment, start: safe_set.Start, x: float, y: float) -> dict:
@@ -175,7 +189,9 @@ def test_head_on_the_filter_keeps_farther_away_than_the_constraint() -> None:
 def test_the_safe_set_has_a_panel_for_each_plane(task: str) -> None:
     env = jaxsafe.make(task, {"rta.margin": 0.0} if task == "docking2d" else None, rta="default")
     required = float(env.rta.required_margin(env))
-    assert (required > float(env.rta.margin)) == (task == "docking2d")  # a speed limit needs more, for between the samples
+    assert (required > float(env.rta.margin)) == (
+        task == "docking2d"
+    )  # a speed limit needs more, for between the samples
     plane = safe_set.planes(env)
     figure = safe_set.draw(env, task, y=None if task == "docking2d" else (-300.0, 300.0), points=13)
     panels = [panel for panel in figure.axes if panel.get_title()]
@@ -192,7 +208,14 @@ def test_the_command_writes_a_figure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setattr(command, "enable_compilation_cache", lambda: None)
-    words = ["env=docking2d", "x=[0,50]", "y=[0,0.4]", "points=5", "env.rta.margin=0.05", f"out={tmp_path / 'here.png'}"]
+    words = [
+        "env=docking2d",
+        "x=[0,50]",
+        "y=[0,0.4]",
+        "points=5",
+        "env.rta.margin=0.05",
+        f"out={tmp_path / 'here.png'}",
+    ]
     assert command.main(words) == 0
     assert capsys.readouterr().out.strip() == str(tmp_path / "here.png")
     assert imread(tmp_path / "here.png").shape[0] > 300
@@ -202,15 +225,26 @@ def test_the_command_writes_a_figure(
     ("words", "message"),
     [
         (["rta=default"], "env: missing"),
-        (["env=docking2d", "rta=none"], "rta: expected a filter that certifies states, for instance default, found none"),
-        (["env=rejoin2d", "rta=released"], "rta: expected a filter that certifies .* found collision_simplex"),
-        (["env=docking2d", "x=[5,1]"], r"x: expected the ends of the axis, for instance \[0,150\], found \[5, 1\]"),
+        (
+            ["env=docking2d", "rta=none"],
+            "rta: expected a filter that certifies states, for instance default, found none",
+        ),
+        (
+            ["env=rejoin2d", "rta=released"],
+            "rta: expected a filter that certifies .* found collision_simplex",
+        ),
+        (
+            ["env=docking2d", "x=[5,1]"],
+            r"x: expected the ends of the axis, for instance \[0,150\], found \[5, 1\]",
+        ),
         (["env=docking2d", "y=3"], "y: expected the ends of the axis"),
         (["env=docking2d", "points=1"], "points: expected a whole number ≥ 2, found 1"),
         (["env=docking2d", "pionts=9"], "pionts: unknown option; .* Did you mean 'points'"),
     ],
 )
-def test_bad_options_are_told_in_one_line(words: list[str], message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_bad_options_are_told_in_one_line(
+    words: list[str], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(command, "enable_compilation_cache", lambda: None)
     with pytest.raises(ConfigError, match=message):
         command.main(words)
@@ -219,5 +253,7 @@ def test_bad_options_are_told_in_one_line(words: list[str], message: str, monkey
 def test_a_cascade_has_no_certificate_of_its_own() -> None:
     inner = jaxsafe.make("docking2d", rta="default").rta
     env = jaxsafe.make("docking2d", rta=Cascade(stages=(Stage(name="only", rta=inner),)))
-    with pytest.raises(ConfigError, match=r"rta: expected a filter that certifies states, .* found cascade"):
+    with pytest.raises(
+        ConfigError, match=r"rta: expected a filter that certifies states, .* found cascade"
+    ):
         safe_set.draw(env, "title")

@@ -23,13 +23,25 @@ from jaxsafe.types import Sim
 
 AGENT = normalise(Agent(hidden=(16,)))
 SMALL = normalise(
-    PPO(num_envs=8, num_steps=16, num_epochs=8, num_minibatches=2, gamma=0.9, gae_lambda=0.95, final_learning_rate=3e-3)
+    PPO(
+        num_envs=8,
+        num_steps=16,
+        num_epochs=8,
+        num_minibatches=2,
+        gamma=0.9,
+        gae_lambda=0.95,
+        final_learning_rate=3e-3,
+    )
 )
 
 
-def train(env: Environment, updates: int = 40, ppo: PPO = SMALL, agent: Agent = AGENT) -> TrainState:
+def train(
+    env: Environment, updates: int = 40, ppo: PPO = SMALL, agent: Agent = AGENT
+) -> TrainState:
     def run(key: jax.Array) -> TrainState:
-        return jax.lax.fori_loop(0, updates, lambda _, s: update(env, agent, ppo, updates, s), init(env, agent, ppo, key))
+        return jax.lax.fori_loop(
+            0, updates, lambda _, s: update(env, agent, ppo, updates, s), init(env, agent, ppo, key)
+        )
 
     return jax.jit(run)(jax.random.key(0))
 
@@ -63,7 +75,9 @@ def test_gae_equals_a_loop_over_random_episodes() -> None:
         following = delta + 0.97 * 0.8 * ~done[t] * following
         expected[t] = following
     arrays = (jnp.asarray(x, jnp.float32) for x in (reward, values, next_values))
-    found = gae(*arrays, jnp.asarray(terminated), jnp.asarray(done), jnp.array(0.97), jnp.array(0.8))
+    found = gae(
+        *arrays, jnp.asarray(terminated), jnp.asarray(done), jnp.array(0.97), jnp.array(0.8)
+    )
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
@@ -85,8 +99,12 @@ def test_what_is_learnt_does_not_depend_on_how_many_samples_go_through_the_netwo
     whole = train(env, updates=3, agent=agent)
     monkeypatch.setattr(ppo_module, "CHUNK", 16)  # a minibatch has 64 samples, a batch 128
     parts = train(env, updates=3, agent=agent)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), whole.params, parts.params)
-    assert not np.array_equal(whole.params["actor"][0]["kernel"], parts.params["actor"][0]["kernel"])  # in another order
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), whole.params, parts.params
+    )
+    assert not np.array_equal(
+        whole.params["actor"][0]["kernel"], parts.params["actor"][0]["kernel"]
+    )  # in another order
 
 
 def test_a_terminated_episode_counts_nothing_beyond_its_end() -> None:
@@ -111,9 +129,13 @@ def test_a_truncated_episode_counts_what_would_follow() -> None:
 def test_an_episode_of_training_is_truncated_after_its_limit() -> None:
     limited = SMALL.replace(max_episode_steps=jnp.array(3.0))
     state = init(probe(Constant(name="reward"), steps=1000), AGENT, limited, jax.random.key(0))
-    _, transitions = collect(probe(Constant(name="reward"), steps=1000), AGENT, limited, state, jax.random.key(1))
+    _, transitions = collect(
+        probe(Constant(name="reward"), steps=1000), AGENT, limited, state, jax.random.key(1)
+    )
     done = jnp.arange(1, SMALL.num_steps + 1) % 3 == 0
-    np.testing.assert_array_equal(transitions.done, jnp.broadcast_to(done[:, None], transitions.done.shape))
+    np.testing.assert_array_equal(
+        transitions.done, jnp.broadcast_to(done[:, None], transitions.done.shape)
+    )
     assert not transitions.terminated.any()
     assert not transitions.episode.outcome.any()
 
@@ -125,7 +147,9 @@ def test_the_policy_learns_the_action_that_the_observation_calls_for(discrete: b
     for observation in (-1.0, 1.0):
         mode = AGENT.distribution(env, state.params, jnp.array([observation])).mode()
         if discrete:
-            assert int(mode[0]) == (3 if observation > 0 else 1)  # the points are −1, −0.5, 0, 0.5, 1
+            assert int(mode[0]) == (
+                3 if observation > 0 else 1
+            )  # the points are −1, −0.5, 0, 0.5, 1
         else:
             assert float(mode[0]) == pytest.approx(0.5 * observation, abs=0.1)
 
@@ -143,7 +167,9 @@ def test_the_learning_rate_falls_linearly_to_its_end() -> None:
 
 def test_the_learning_rate_falls_as_it_is_told() -> None:
     for decay, middle in (("linear", 5.05e-3), ("exponential", 1e-3)):
-        ppo = normalise(PPO(learning_rate=1e-2, final_learning_rate=1e-4, learning_rate_decay=decay))
+        ppo = normalise(
+            PPO(learning_rate=1e-2, final_learning_rate=1e-4, learning_rate_decay=decay)
+        )
         rates = [float(learning_rate(ppo, progress)) for progress in (0.0, 0.5, 1.0)]
         np.testing.assert_allclose(rates, [1e-2, middle, 1e-4], rtol=1e-5)
 
@@ -153,7 +179,9 @@ def test_the_noise_falls_besides_what_is_learnt(discrete: bool) -> None:
     env = probe(Constant(name="reward"), discrete=discrete)
     state = init(env, AGENT, SMALL, jax.random.key(0))
     kept = update(env, AGENT, SMALL, 10, state).params["log_std"]
-    less = update(env, AGENT, SMALL.replace(noise_decay=jnp.array(2.0)), 10, state).params["log_std"]
+    less = update(env, AGENT, SMALL.replace(noise_decay=jnp.array(2.0)), 10, state).params[
+        "log_std"
+    ]
     np.testing.assert_allclose(kept - less, 0.2, rtol=1e-5)
 
 
@@ -169,8 +197,14 @@ def test_the_discount_of_an_update_is_that_of_its_progress() -> None:
     growing = SMALL.replace(gamma=jnp.array(0.5), horizon_growth=jnp.array(10.0))
     state = init(env, AGENT, growing, jax.random.key(0)).replace(num_updates=jnp.array(10))
     found, *others = (
-        jnp.concatenate([leaf.ravel() for leaf in jax.tree.leaves(update(env, AGENT, ppo, 10, state).params)])
-        for ppo in (growing, SMALL.replace(gamma=jnp.array(0.95)), SMALL.replace(gamma=jnp.array(0.5)))
+        jnp.concatenate(
+            [leaf.ravel() for leaf in jax.tree.leaves(update(env, AGENT, ppo, 10, state).params)]
+        )
+        for ppo in (
+            growing,
+            SMALL.replace(gamma=jnp.array(0.95)),
+            SMALL.replace(gamma=jnp.array(0.5)),
+        )
     )
     at_the_end, at_the_start = (float(jnp.abs(found - other).max()) for other in others)
     assert at_the_end < 1e-5
@@ -181,9 +215,13 @@ def test_hyperparameters_are_leaves_that_vmap() -> None:
     env = probe(Constant(name="reward"))
     rates = jnp.array([1e-3, 3e-3])
     state = init(env, AGENT, SMALL, jax.random.key(0))
-    one = lambda rate: update(env, AGENT, SMALL.replace(learning_rate=rate), 10, state).params["critic"][0]["bias"]  # noqa: E731
-    together = jax.vmap(one)(rates)
-    np.testing.assert_allclose(together, jnp.stack([one(rate) for rate in rates]), atol=1e-6)
+
+    def bias(rate: jax.Array) -> jax.Array:
+        ppo = SMALL.replace(learning_rate=rate)
+        return update(env, AGENT, ppo, 10, state).params["critic"][0]["bias"]
+
+    together = jax.vmap(bias)(rates)
+    np.testing.assert_allclose(together, jnp.stack([bias(rate) for rate in rates]), atol=1e-6)
 
 
 def test_no_gradient_is_larger_than_allowed() -> None:
@@ -202,9 +240,13 @@ class Push(Match):
         return sim.platforms["point"].push
 
 
-@pytest.mark.parametrize(("limit", "low", "high"), [(0.5, 0.0, 0.5), (0.1, 0.0, 0.1), (5.0, 0.95, 1.0)])
+@pytest.mark.parametrize(
+    ("limit", "low", "high"), [(0.5, 0.0, 0.5), (0.1, 0.0, 0.1), (5.0, 0.95, 1.0)]
+)
 def test_costs_are_kept_within_their_limit(limit: float, low: float, high: float) -> None:
-    env = probe(Push(name="reward"), most=0.2)  # pays to break the rule; an episode of one step costs 0 or 1
+    env = probe(
+        Push(name="reward"), most=0.2
+    )  # pays to break the rule; an episode of one step costs 0 or 1
     agent, ppo = AGENT.replace(cost_critic=True), SMALL.replace(cost_limit=limit, multiplier=2.0)
     state = train(env, 200, ppo, agent)
     assert low <= float(jnp.mean(state.window.episodes.violating_steps)) <= high
@@ -215,34 +257,57 @@ def test_the_critic_of_costs_expects_what_a_step_costs() -> None:
     env = probe(Constant(name="reward"), steps=3, most=-1.0)  # every push is too hard
     agent = AGENT.replace(cost_critic=True)
     state = train(env, 60, agent=agent)
-    assert float(agent.cost_rate(state.params, jnp.ones(1))) == pytest.approx(0.1 * (2.71 + 1.9 + 1.0) / 3, abs=0.05)
+    assert float(agent.cost_rate(state.params, jnp.ones(1))) == pytest.approx(
+        0.1 * (2.71 + 1.9 + 1.0) / 3, abs=0.05
+    )
 
 
 def test_the_multiplier_follows_the_excess() -> None:
     env = probe(Constant(name="reward"), most=-1.0)
     state = init(env, AGENT.replace(cost_critic=True), SMALL, jax.random.key(0))
     costs = state.window.episodes.replace(violating_steps=jnp.full(100, 3))
-    window, some, none = state.window.replace(episodes=costs, count=jnp.array(100)), jnp.array([True]), jnp.array([False])
+    window, some, none = (
+        state.window.replace(episodes=costs, count=jnp.array(100)),
+        jnp.array([True]),
+        jnp.array([False]),
+    )
     rate = float(SMALL.multiplier_rate)
     for limit, change in ((3.0, 0.0), (6.0, -0.5 * rate), (2.0, 0.5 * rate), (0.1, rate)):
-        found = dual_ascent(SMALL.replace(cost_limit=jnp.array(limit)), jnp.array(2.0), window, some)
+        found = dual_ascent(
+            SMALL.replace(cost_limit=jnp.array(limit)), jnp.array(2.0), window, some
+        )
         assert float(found) == pytest.approx(2.0 * np.exp(change), rel=1e-5)
-        assert float(dual_ascent(SMALL, jnp.array(2.0), window, none)) == 2.0  # nothing new is known
+        assert (
+            float(dual_ascent(SMALL, jnp.array(2.0), window, none)) == 2.0
+        )  # nothing new is known
 
 
 def test_the_kept_networks_are_those_of_training_or_their_average() -> None:
     env = probe(Match(name="reward"))
     plain, averaged = train(env), train(env, ppo=SMALL.replace(averaging=0.5))
-    assert jax.tree.all(jax.tree.map(lambda a, b: bool((a == b).all()), plain.average, plain.params))
-    assert jax.tree.all(jax.tree.map(lambda a, b: bool((a == b).all()), averaged.params, plain.params))
-    few = {n: train(env, n, SMALL.replace(averaging=1.0, final_learning_rate=SMALL.learning_rate)) for n in (1, 2)}
+    assert jax.tree.all(
+        jax.tree.map(lambda a, b: bool((a == b).all()), plain.average, plain.params)
+    )
+    assert jax.tree.all(
+        jax.tree.map(lambda a, b: bool((a == b).all()), averaged.params, plain.params)
+    )
+    few = {
+        n: train(env, n, SMALL.replace(averaging=1.0, final_learning_rate=SMALL.learning_rate))
+        for n in (1, 2)
+    }
     start = init(env, AGENT, SMALL, jax.random.key(0)).params
-    expected = jax.tree.map(lambda a, b, c: 0.25 * a + 0.25 * b + 0.5 * c, start, few[1].params, few[2].params)
-    for found, wanted in zip(jax.tree.leaves(few[2].average), jax.tree.leaves(expected), strict=True):
+    expected = jax.tree.map(
+        lambda a, b, c: 0.25 * a + 0.25 * b + 0.5 * c, start, few[1].params, few[2].params
+    )
+    for found, wanted in zip(
+        jax.tree.leaves(few[2].average), jax.tree.leaves(expected), strict=True
+    ):
         np.testing.assert_allclose(found, wanted, atol=1e-5)
 
 
-def test_the_numbers_of_devices_that_may_share_a_seed_are_the_common_divisors_and_found_quickly() -> None:
+def test_the_numbers_of_devices_that_may_share_a_seed_are_the_common_divisors_and_found_quickly() -> (
+    None
+):
     assert PPO(num_envs=24, num_steps=64, num_minibatches=2).shares == [1, 2, 3, 4, 6, 8, 12, 24]
     assert PPO(num_envs=9, num_steps=1, num_minibatches=1).shares == [1, 3, 9]
     assert PPO(num_envs=2**30 - 1, num_steps=1, num_minibatches=1).shares[:4] == [1, 3, 7, 9]

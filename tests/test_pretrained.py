@@ -29,7 +29,9 @@ def test_every_task_has_a_policy_trained_in_it(task: str) -> None:
 def flown(task: str, episodes: int) -> float:
     """The share of successes."""
     env, policy = jaxsafe.make(task), jaxsafe.load_policy(task)
-    found = jax.jit(lambda env, key: run_episodes(env, policy, key, episodes))(env, jax.random.key(7))
+    found = jax.jit(lambda env, key: run_episodes(env, policy, key, episodes))(
+        env, jax.random.key(7)
+    )
     return float(np.mean(np.asarray(found.outcome) == env.success))
 
 
@@ -43,12 +45,17 @@ def test_every_policy_does_its_task(task: str) -> None:
     assert flown(task, 500) >= 0.98
 
 
-def test_pretrained_policies_are_evaluated_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pretrained_policies_are_evaluated_by_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["run=pretrained/docking2d", "episodes=20", "deterministic=true"]) == 0
     assert (tmp_path / "evaluations" / "docking2d" / "last-20-seed0" / "results.json").is_file()
 
 
 def test_an_unknown_name_is_told_with_those_that_are_known() -> None:
-    with pytest.raises(ConfigError, match=r"policy: 'docking' is no .npz file and not pretrained; choose from docking2d, "):
+    with pytest.raises(
+        ConfigError,
+        match=r"policy: 'docking' is no .npz file and not pretrained; choose from docking2d, ",
+    ):
         jaxsafe.load_policy("docking")

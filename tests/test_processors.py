@@ -61,7 +61,9 @@ def env() -> Environment:
 
 def world(*, time: float = 0.0, ended: str | None = None, **status: Any) -> Sim:
     """A world with chosen statuses; the deputy at (3, 4) m with (0.6, −0.8) m/s after a Δv of (0.03, −0.04) m/s."""
-    deputy = SpacecraftState(jnp.asarray([3.0, 4.0]), jnp.asarray([0.6, -0.8]), jnp.asarray([0.03, -0.04]))
+    deputy = SpacecraftState(
+        jnp.asarray([3.0, 4.0]), jnp.asarray([0.6, -0.8]), jnp.asarray([0.03, -0.04])
+    )
     platforms = {"chief": SpacecraftState(REST, REST, REST), "deputy": deputy}
     region = normalise(Circle(name="region", on="chief", radius=5.0))
     return Sim(
@@ -78,7 +80,9 @@ def start(env: Environment, position: tuple[float, ...], velocity: tuple[float, 
     return jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})[0]
 
 
-def run(env: Environment, state: State, action: tuple[float, ...], num_steps: int) -> list[TimeStep]:
+def run(
+    env: Environment, state: State, action: tuple[float, ...], num_steps: int
+) -> list[TimeStep]:
     timesteps = []
     for _ in range(num_steps):
         state, timestep = step(env, state, jnp.asarray(action))
@@ -104,9 +108,13 @@ def test_speed_is_the_norm_of_the_velocity() -> None:
 
 def test_in_region_reads_the_region_and_the_boundary_is_inside() -> None:
     assert InRegion(name="i", of="deputy", region="region").process((), world())
-    outside = world().replace(platforms={**world().platforms, "deputy": SpacecraftState(jnp.full(2, 4.0), REST, REST)})
+    outside = world().replace(
+        platforms={**world().platforms, "deputy": SpacecraftState(jnp.full(2, 4.0), REST, REST)}
+    )
     region = normalise(Circle(name="region", on="chief", radius=5.0)).place(outside.platforms)
-    assert not InRegion(name="i", of="deputy", region="region").process((), outside.replace(regions={"region": region}))
+    assert not InRegion(name="i", of="deputy", region="region").process(
+        (), outside.replace(regions={"region": region})
+    )
 
 
 def test_the_speed_limit_grows_by_twice_the_mean_motion_per_metre() -> None:
@@ -118,7 +126,9 @@ def test_the_speed_limit_grows_by_twice_the_mean_motion_per_metre() -> None:
 
 def test_delta_v_is_the_norm_of_the_velocity_change_bought_with_thrust() -> None:
     assert float(DeltaV(name="d", of="deputy").process((), world())) == pytest.approx(0.05)
-    assert float(DeltaV(name="d", of="deputy", norm="l1").process((), world())) == pytest.approx(0.07)
+    assert float(DeltaV(name="d", of="deputy", norm="l1").process((), world())) == pytest.approx(
+        0.07
+    )
 
 
 def test_the_speed_limit_may_begin_to_grow_at_a_distance() -> None:
@@ -158,7 +168,9 @@ def held_for(inside: str, dt: float = 1.0, **options: bool) -> list[float]:
         ("1000", True, [0, 0, 0, 0]),
     ],
 )
-def test_time_held_counts_from_the_sample_on_which_it_became_true(inside: str, first_sample: bool, times: list) -> None:
+def test_time_held_counts_from_the_sample_on_which_it_became_true(
+    inside: str, first_sample: bool, times: list
+) -> None:
     assert held_for(inside, first_sample=first_sample) == times
 
 
@@ -179,7 +191,11 @@ def test_the_margin_is_the_limit_minus_the_speed(speed: float, margin: float) ->
 
 def test_separation_is_the_distance_beyond_its_minimum() -> None:
     constraint = normalise(Separation(name="c", distance="d", minimum=100.0))
-    assert [float(constraint.margin(world(d=distance))) for distance in (150.0, 100.0, 40.0)] == [50.0, 0.0, -60.0]
+    assert [float(constraint.margin(world(d=distance))) for distance in (150.0, 100.0, 40.0)] == [
+        50.0,
+        0.0,
+        -60.0,
+    ]
     assert constraint.limit(world(d=40.0)) == 100.0
 
 
@@ -222,9 +238,15 @@ def test_too_far_is_strictly_above_the_limit() -> None:
         (Held(name="x", time="d", duration=100.0, inclusive=False), False, False, True),
     ],
 )
-def test_a_limit_itself_counts_where_it_is_inclusive(end: Any, below: bool, at: bool, above: bool) -> None:
+def test_a_limit_itself_counts_where_it_is_inclusive(
+    end: Any, below: bool, at: bool, above: bool
+) -> None:
     built = normalise(end)
-    assert [bool(built.reached(world(d=distance))) for distance in (99.9, 100.0, 100.1)] == [below, at, above]
+    assert [bool(built.reached(world(d=distance))) for distance in (99.9, 100.0, 100.1)] == [
+        below,
+        at,
+        above,
+    ]
 
 
 def test_a_boolean_status_may_end_an_episode() -> None:
@@ -265,10 +287,14 @@ def test_the_distance_reward_telescopes(distances: list[float]) -> None:
     assert total == pytest.approx(ends, abs=1e-5)
 
 
-@pytest.mark.parametrize(("speed", "value"), [(0.2, 0.0), (0.25, 0.0), (0.75, -0.015), (10.25, -0.11)])
+@pytest.mark.parametrize(
+    ("speed", "value"), [(0.2, 0.0), (0.25, 0.0), (0.75, -0.015), (10.25, -0.11)]
+)
 def test_the_velocity_reward_is_paid_only_above_the_limit(speed: float, value: float) -> None:
     reward = normalise(VelocityConstraint(name="x", offset=-0.01, scale=-0.01, **SPEEDS))
-    assert float(reward.process((), world(speed=speed, velocity_limit=0.25))) == pytest.approx(value, rel=1e-6)
+    assert float(reward.process((), world(speed=speed, velocity_limit=0.25))) == pytest.approx(
+        value, rel=1e-6
+    )
 
 
 def test_the_delta_v_reward_is_a_hundredth_of_delta_v() -> None:
@@ -285,7 +311,8 @@ def test_success_pays_more_the_sooner_and_only_for_its_outcome() -> None:
 
 
 @pytest.mark.parametrize(
-    ("ended", "value"), [("crash", -1.0), ("timeout", -3.0), ("velocity", 0.0), ("success", 0.0), (None, 0.0)]
+    ("ended", "value"),
+    [("crash", -1.0), ("timeout", -3.0), ("velocity", 0.0), ("success", 0.0), (None, 0.0)],
 )
 def test_failure_pays_by_outcome(ended: str | None, value: float) -> None:
     reward = normalise(Failure(name="x", values={"crash": -1.0, "timeout": -3.0, "velocity": 0.0}))
@@ -320,12 +347,16 @@ def paid(reward: Any, inside: str) -> list[float]:
 def test_while_in_pays_each_step_inside_and_leaving_refunds_exactly(
     inside: str, both_samples: bool, values: list[float]
 ) -> None:
-    assert paid(WhileIn(name="x", status="s", value=2.0, both_samples=both_samples), inside) == values
+    assert (
+        paid(WhileIn(name="x", status="s", value=2.0, both_samples=both_samples), inside) == values
+    )
 
 
 @settings(deadline=None, max_examples=30)
 @given(inside=st.text("01", min_size=1, max_size=15), both_samples=st.booleans())
-def test_the_sum_of_while_in_is_never_negative_and_zero_whenever_outside(inside: str, both_samples: bool) -> None:
+def test_the_sum_of_while_in_is_never_negative_and_zero_whenever_outside(
+    inside: str, both_samples: bool
+) -> None:
     values = paid(WhileIn(name="x", status="s", value=0.5, both_samples=both_samples), inside)
     for total, flag in zip(np.cumsum(values), inside, strict=True):
         assert total >= 0.0
@@ -344,8 +375,12 @@ def test_the_sum_of_while_in_is_never_negative_and_zero_whenever_outside(inside:
         ("0000", True, [0, 0, 0, 0]),
     ],
 )
-def test_first_time_pays_once_an_episode(inside: str, count_start: bool, values: list[float]) -> None:
-    assert paid(FirstTime(name="x", status="s", value=3.0, count_start=count_start), inside) == values
+def test_first_time_pays_once_an_episode(
+    inside: str, count_start: bool, values: list[float]
+) -> None:
+    assert (
+        paid(FirstTime(name="x", status="s", value=3.0, count_start=count_start), inside) == values
+    )
 
 
 # Observations
@@ -354,7 +389,9 @@ def test_first_time_pays_once_an_episode(inside: str, count_start: bool, values:
 def test_an_observation_is_divided_by_its_scale_and_then_clipped() -> None:
     plain = normalise(Observe(name="x", of="deputy", what="position", scale=2.0))
     np.testing.assert_allclose(plain.process((), world()), [1.5, 2.0])
-    clipped = normalise(Observe(name="x", of="deputy", what="velocity", scale=0.5, clip=(-1.0, 1.0)))
+    clipped = normalise(
+        Observe(name="x", of="deputy", what="velocity", scale=0.5, clip=(-1.0, 1.0))
+    )
     np.testing.assert_allclose(clipped.process((), world()), [1.0, -1.0])
     scaled = normalise(Observe(name="x", of="deputy", what="velocity", scale=-2.0))
     np.testing.assert_allclose(scaled.process((), world()), [-0.3, 0.4])
@@ -373,7 +410,12 @@ def test_every_element_of_an_observation_has_a_name() -> None:
     assert Observe(name="h", of="deputy", what="heading").labels(world()) == ("h",)
     assert ObserveAngle(name="a", of="deputy", what="heading").labels(world()) == ("a.cos", "a.sin")
     assert ObserveStatus(name="s", status="s").labels(world(s=1.0)) == ("s",)
-    assert ObserveStatus(name="s", status="s").labels(world(s=[1.0, 2.0, 3.0, 4.0])) == ("s.0", "s.1", "s.2", "s.3")
+    assert ObserveStatus(name="s", status="s").labels(world(s=[1.0, 2.0, 3.0, 4.0])) == (
+        "s.0",
+        "s.1",
+        "s.2",
+        "s.3",
+    )
 
 
 def pair() -> Sim:
@@ -381,7 +423,9 @@ def pair() -> Sim:
     wingman = Dubins2DState(jnp.asarray([1.0, 2.0]), jnp.asarray(jnp.pi / 2), jnp.asarray(4.0))
     lead = Dubins2DState(jnp.asarray([1.0, 7.0]), jnp.asarray(-jnp.pi), jnp.asarray(2.0))
     platforms = {"lead": lead, "wingman": wingman}
-    region = normalise(Circle(name="region", on="lead", offset=Displacement(by=(0.0, 3.0)), radius=1.0))
+    region = normalise(
+        Circle(name="region", on="lead", offset=Displacement(by=(0.0, 3.0)), radius=1.0)
+    )
     return world().replace(platforms=platforms, regions={"region": region.place(platforms)})
 
 
@@ -397,19 +441,28 @@ def measured(observation: Observation, sim: Sim) -> np.ndarray:
         ({"relative_to": "wingman", "frame": "wingman"}, [5.0, 0.0]),
         ({"relative_to": "wingman", "frame": "lead"}, [0.0, -5.0]),
         ({"relative_to": "wingman", "frame": "wingman", "form": "magnorm"}, [5.0, 1.0, 0.0]),
-        ({"relative_to": "wingman", "form": "magnorm", "scale": (10.0, 1.0, 4.0)}, [0.5, 0.0, 0.25]),
+        (
+            {"relative_to": "wingman", "form": "magnorm", "scale": (10.0, 1.0, 4.0)},
+            [0.5, 0.0, 0.25],
+        ),
         ({"relative_to": "lead", "form": "magnorm"}, [0.0, 0.0, 0.0]),
         ({"relative_to": "wingman", "scale": (1.0, -2.0)}, [0.0, -2.5]),
         ({"relative_to": "wingman", "scale": (1.0, -2.0), "clip": (-1.0, 1.0)}, [0.0, -1.0]),
     ],
 )
-def test_a_position_is_observed_in_any_frame_and_form(options: dict[str, Any], expected: list[float]) -> None:
+def test_a_position_is_observed_in_any_frame_and_form(
+    options: dict[str, Any], expected: list[float]
+) -> None:
     found = measured(Observe(name="x", of="lead", what="position", **options), pair())
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_a_velocity_is_observed_in_any_frame() -> None:
-    for options, expected in (({}, [-2.0, 0.0]), ({"frame": "lead"}, [2.0, 0.0]), ({"frame": "wingman"}, [0.0, 2.0])):
+    for options, expected in (
+        ({}, [-2.0, 0.0]),
+        ({"frame": "lead"}, [2.0, 0.0]),
+        ({"frame": "wingman"}, [0.0, 2.0]),
+    ):
         found = measured(Observe(name="x", of="lead", what="velocity", **options), pair())
         np.testing.assert_allclose(found, expected, atol=1e-6)
     found = measured(Observe(name="x", of="lead", what="velocity", relative_to="wingman"), pair())
@@ -422,7 +475,10 @@ def test_a_velocity_is_observed_in_any_frame() -> None:
         ({}, [1.0, 10.0]),
         ({"relative_to": "wingman"}, [0.0, 8.0]),
         ({"relative_to": "wingman", "frame": "wingman"}, [8.0, 0.0]),
-        ({"relative_to": "wingman", "frame": "wingman", "form": "magnorm", "scale": 2.0}, [4.0, 0.5, 0.0]),
+        (
+            {"relative_to": "wingman", "frame": "wingman", "form": "magnorm", "scale": 2.0},
+            [4.0, 0.5, 0.0],
+        ),
     ],
 )
 def test_a_region_is_observed_by_its_centre(options: dict[str, Any], expected: list[float]) -> None:
@@ -444,8 +500,12 @@ def test_a_body_frame_in_space_takes_heading_flight_path_and_roll_into_account()
     sim = world().replace(platforms={"craft": craft, "below": below})
     ahead = measured(Observe(name="x", of="craft", what="velocity", frame="craft"), sim)
     np.testing.assert_allclose(ahead, [300.0, 0.0, 0.0], atol=1e-3)
-    seen = measured(Observe(name="x", of="below", what="position", relative_to="craft", frame="craft"), sim)
-    down = -10.0 * np.array([-math.sin(0.2), math.cos(0.2) * math.sin(-0.5), math.cos(0.2) * math.cos(-0.5)])
+    seen = measured(
+        Observe(name="x", of="below", what="position", relative_to="craft", frame="craft"), sim
+    )
+    down = -10.0 * np.array(
+        [-math.sin(0.2), math.cos(0.2) * math.sin(-0.5), math.cos(0.2) * math.cos(-0.5)]
+    )
     np.testing.assert_allclose(seen, down, atol=1e-5)
     roll = Observe(name="x", of="craft", what="roll", scale=0.25, clip=(-1.0, 1.0))
     assert measured(roll, sim).tolist() == [-1.0]
@@ -460,8 +520,12 @@ def test_a_body_frame_in_space_takes_heading_flight_path_and_roll_into_account()
         ("docking2d_oriented", "attitude", [1.0, 1.0, 1.0]),
     ],
 )
-def test_a_scale_of_the_wrong_length_is_told_with_its_observation(task: str, name: str, scale: list[float]) -> None:
-    with pytest.raises(jaxsafe.ConfigError, match=rf"^observation\.{name}: cannot be computed: ") as caught:
+def test_a_scale_of_the_wrong_length_is_told_with_its_observation(
+    task: str, name: str, scale: list[float]
+) -> None:
+    with pytest.raises(
+        jaxsafe.ConfigError, match=rf"^observation\.{name}: cannot be computed: "
+    ) as caught:
         jaxsafe.make(task, {f"observation.{name}.scale": scale})
     assert "\n" not in str(caught.value)
 
@@ -487,7 +551,9 @@ def test_a_scale_of_the_wrong_length_is_told_with_its_observation(task: str, nam
         ),
     ],
 )  # fmt: skip
-def test_the_elements_of_each_task_s_observation_have_these_names(task: str, names: list[str]) -> None:
+def test_the_elements_of_each_task_s_observation_have_these_names(
+    task: str, names: list[str]
+) -> None:
     assert jaxsafe.make(task).observation_names == tuple(names)
 
 
@@ -509,7 +575,9 @@ def test_a_docking_step_pays_what_table_8_says(env: Environment) -> None:
         "success": 0.0,
         "failure": 0.0,
     }
-    assert {name: float(term) for name, term in info.reward_terms.items()} == pytest.approx(expected, abs=2e-7)
+    assert {name: float(term) for name, term in info.reward_terms.items()} == pytest.approx(
+        expected, abs=2e-7
+    )
     assert float(timestep.reward) == pytest.approx(sum(expected.values()), abs=2e-7)
     assert timestep.cost == 0.0
 
@@ -517,17 +585,25 @@ def test_a_docking_step_pays_what_table_8_says(env: Environment) -> None:
 def test_the_delta_v_reward_is_of_the_thrust_that_acted(env: Environment) -> None:
     (timestep,) = run(env, start(env, (200.0, 0.0), (0.0, 0.0)), (-30.0, 40.0), 1)
     np.testing.assert_array_equal(timestep.info.control_actual, [-1.0, 1.0])
-    assert float(timestep.info.reward_terms["delta_v"]) == pytest.approx(-0.01 * math.sqrt(2.0) / 12.0, rel=1e-6)
+    assert float(timestep.info.reward_terms["delta_v"]) == pytest.approx(
+        -0.01 * math.sqrt(2.0) / 12.0, rel=1e-6
+    )
 
 
-def test_a_step_above_the_limit_costs_and_its_severity_is_a_share_of_the_limit(env: Environment) -> None:
+def test_a_step_above_the_limit_costs_and_its_severity_is_a_share_of_the_limit(
+    env: Environment,
+) -> None:
     (timestep,) = run(env, start(env, (100.0, 0.0), (0.0, 2.0)), (0.0, 0.0), 1)
     info = timestep.info
     limit, speed = float(info.status["velocity_limit"]), float(info.status["speed"])
     assert timestep.cost == 1.0
     assert float(info.margins["velocity_limit"]) == pytest.approx(limit - speed, rel=1e-6)
-    assert float(info.severity["velocity_limit"]) == pytest.approx((speed - limit) / limit, rel=1e-6)
-    assert float(info.reward_terms["velocity_constraint"]) == pytest.approx(-0.01 - 0.01 * (speed - limit), rel=1e-6)
+    assert float(info.severity["velocity_limit"]) == pytest.approx(
+        (speed - limit) / limit, rel=1e-6
+    )
+    assert float(info.reward_terms["velocity_constraint"]) == pytest.approx(
+        -0.01 - 0.01 * (speed - limit), rel=1e-6
+    )
     assert outcome(env, timestep) == "running"
 
 
@@ -546,13 +622,17 @@ def test_docking_slowly_succeeds_and_docking_fast_crashes(env: Environment) -> N
 
 def test_the_surface_of_the_docking_region_is_inside(env: Environment) -> None:
     for position, inside in (((0.5, 0.0), True), ((0.0, -0.5), True), ((0.50001, 0.0), False)):
-        _, timestep = jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": (0.0, 0.0)}})
+        _, timestep = jaxsafe.reset_to(
+            env, {"deputy": {"position": position, "velocity": (0.0, 0.0)}}
+        )
         assert bool(timestep.info.status["in_docking"]) == inside
         assert outcome(env, timestep) == ("success" if inside else "running")
 
 
 def test_flying_beyond_forty_kilometres_ends_with_distance(env: Environment) -> None:
-    near, far = (run(env, start(env, (0.0, y), (0.0, 0.0)), (0.0, 0.0), 1)[0] for y in (39_999.0, 40_001.0))
+    near, far = (
+        run(env, start(env, (0.0, y), (0.0, 0.0)), (0.0, 0.0), 1)[0] for y in (39_999.0, 40_001.0)
+    )
     assert (outcome(env, near), outcome(env, far)) == ("running", "distance")
     assert far.info.reward_terms["failure"] == -1.0
 
@@ -562,11 +642,15 @@ def test_a_timeout_ends_the_episode_on_the_step_after_the_limit(env: Environment
     timesteps = run(short, start(short, (100.0, 0.0), (0.0, 0.0)), (0.0, 0.0), 4)
     assert [outcome(short, timestep) for timestep in timesteps] == ["running"] * 3 + ["timeout"]
     assert [bool(timestep.terminated) for timestep in timesteps] == [False] * 3 + [True]
-    assert [float(timestep.info.reward_terms["failure"]) for timestep in timesteps] == [0.0] * 3 + [-1.0]
+    assert [float(timestep.info.reward_terms["failure"]) for timestep in timesteps] == [0.0] * 3 + [
+        -1.0
+    ]
 
 
 def test_a_timeout_may_be_declared_a_truncation() -> None:
-    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 1, "terminal.timeout.ends": "truncated"})
+    env = jaxsafe.make(
+        "docking2d", {"terminal.timeout.limit": 1, "terminal.timeout.ends": "truncated"}
+    )
     timesteps = run(env, start(env, (100.0, 0.0), (0.0, 0.0)), (0.0, 0.0), 2)
     assert [bool(timestep.truncated) for timestep in timesteps] == [False, True]
     assert not any(timestep.terminated for timestep in timesteps)
@@ -604,12 +688,18 @@ def test_the_velocity_bound_ends_the_episode_once_the_sum_is_below_minus_five() 
 
 def test_a_sum_of_exactly_minus_five_ends_nothing() -> None:
     env = bounded(-2.5)
-    assert [outcome(env, timestep) for timestep in too_fast(env, 3)] == ["running", "running", "velocity"]
+    assert [outcome(env, timestep) for timestep in too_fast(env, 3)] == [
+        "running",
+        "running",
+        "velocity",
+    ]
 
 
 def test_the_unchanged_task_reaches_the_bound_when_the_sum_does(env: Environment) -> None:
     timesteps = run(env, start(env, (100.0, 0.0), (0.0, 20.0)), (0.0, 0.0), 30)
-    totals = np.cumsum([float(timestep.info.reward_terms["velocity_constraint"]) for timestep in timesteps])
+    totals = np.cumsum(
+        [float(timestep.info.reward_terms["velocity_constraint"]) for timestep in timesteps]
+    )
     ended = [outcome(env, timestep) == "velocity" for timestep in timesteps]
     assert ended == [total < -5.0 for total in totals]
     assert 20 < ended.index(True) < 28
@@ -620,7 +710,9 @@ def test_a_reward_after_the_bound_sees_the_end() -> None:
     (timestep,) = too_fast(env, 1)
     assert outcome(env, timestep) == "velocity"
     assert timestep.info.reward_terms["failure"] == -3.0
-    assert float(timestep.reward - timestep.info.reward_terms["distance_change"]) == pytest.approx(-9.0, rel=1e-6)
+    assert float(timestep.reward - timestep.info.reward_terms["distance_change"]) == pytest.approx(
+        -9.0, rel=1e-6
+    )
 
 
 def test_a_bound_may_be_a_truncation() -> None:
@@ -647,7 +739,10 @@ def test_the_first_end_in_the_list_is_the_outcome() -> None:
         (timestep,) = run(env, start(env, (x, 0.0), (-speed, 0.0)), (0.0, 0.0), 1)
         assert outcome(env, timestep) == expected
     patient = jaxsafe.override(env, {"terminal.distance.limit": 40_000.0})
-    assert outcome(patient, run(patient, start(patient, (9.0, 0.0), (0.0, 0.0)), (0.0, 0.0), 1)[0]) == "timeout"
+    assert (
+        outcome(patient, run(patient, start(patient, (9.0, 0.0), (0.0, 0.0)), (0.0, 0.0), 1)[0])
+        == "timeout"
+    )
 
 
 def test_success_with_a_timeout_pays_success_only() -> None:

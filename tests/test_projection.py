@@ -21,11 +21,19 @@ def boxes(m: int, dtype: Any) -> tuple[np.ndarray, ...]:
     """Points inside boxes about 0."""
     rng = np.random.default_rng(m)
     low, high = -rng.uniform(0.5, 1.0, (NUM, m)), rng.uniform(0.5, 2.0, (NUM, m))
-    return tuple(each.astype(dtype) for each in (np.clip(rng.uniform(-1.5, 1.5, (NUM, m)), low, high), low, high))
+    return tuple(
+        each.astype(dtype)
+        for each in (np.clip(rng.uniform(-1.5, 1.5, (NUM, m)), low, high), low, high)
+    )
 
 
 def oracle(
-    u: np.ndarray, low: np.ndarray, high: np.ndarray, rows: np.ndarray, offsets: np.ndarray, solver: str = "quadprog"
+    u: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    rows: np.ndarray,
+    offsets: np.ndarray,
+    solver: str = "quadprog",
 ) -> np.ndarray | None:
     u, low, high, rows, offsets = (each.astype(float) for each in (u, low, high, rows, offsets))
     return solve_qp(np.eye(len(u)), -u, G=-rows, h=-offsets, lb=low, ub=high, solver=solver)
@@ -34,7 +42,9 @@ def oracle(
 @pytest.mark.parametrize("m", [1, 2, 3])
 @pytest.mark.parametrize(("dtype", "tolerance"), TOLERANCES)
 @pytest.mark.usefixtures("x64")
-def test_box_and_half_space_are_projected_on_as_by_quadprog(m: int, dtype: Any, tolerance: float) -> None:
+def test_box_and_half_space_are_projected_on_as_by_quadprog(
+    m: int, dtype: Any, tolerance: float
+) -> None:
     rng = np.random.default_rng(10 + m)
     u, low, high = boxes(m, dtype)
     a, b = rng.normal(size=(NUM, m)).astype(dtype), rng.normal(size=NUM).astype(dtype)
@@ -47,7 +57,9 @@ def test_box_and_half_space_are_projected_on_as_by_quadprog(m: int, dtype: Any, 
             continue  # neither clearly feasible nor clearly not
         assert bool(feasible[i]) == (expected is not None)
         if expected is None:
-            expected = np.where(a[i] > 0, high[i], np.where(a[i] < 0, low[i], u[i]))  # closest to the half-space
+            expected = np.where(
+                a[i] > 0, high[i], np.where(a[i] < 0, low[i], u[i])
+            )  # closest to the half-space
         np.testing.assert_allclose(found[i], expected, rtol=0, atol=tolerance)
     assert 0.5 < np.mean(feasible) < 1.0
 
@@ -55,13 +67,18 @@ def test_box_and_half_space_are_projected_on_as_by_quadprog(m: int, dtype: Any, 
 @pytest.mark.parametrize("m", [1, 2, 3])
 @pytest.mark.parametrize(("dtype", "tolerance"), [(np.float64, 1e-12), (np.float32, 2e-6)])
 @pytest.mark.usefixtures("x64")
-def test_box_and_ball_are_projected_on_at_least_as_well_as_by_slsqp(m: int, dtype: Any, tolerance: float) -> None:
+def test_box_and_ball_are_projected_on_at_least_as_well_as_by_slsqp(
+    m: int, dtype: Any, tolerance: float
+) -> None:
     rng = np.random.default_rng(20 + m)
     u, low, high = boxes(m, dtype)
     beta, p, k = (
-        each.astype(dtype) for each in (rng.uniform(0.5, 2.0, NUM), rng.normal(size=(NUM, m)), rng.uniform(-1, 1, NUM))
+        each.astype(dtype)
+        for each in (rng.uniform(0.5, 2.0, NUM), rng.normal(size=(NUM, m)), rng.uniform(-1, 1, NUM))
     )
-    found, feasible = (np.asarray(each) for each in jax.jit(jax.vmap(project_box_ball))(u, low, high, beta, p, k))
+    found, feasible = (
+        np.asarray(each) for each in jax.jit(jax.vmap(project_box_ball))(u, low, high, beta, p, k)
+    )
     for i in range(150):
         centre = np.clip(-p[i] / beta[i], low[i], high[i]).astype(float)
 
@@ -102,12 +119,16 @@ def rows_for(m: int, count: int = 2) -> tuple[np.ndarray, np.ndarray]:
 def test_the_nearest_control_is_that_of_other_solvers(m: int, solver: str) -> None:
     u, low, high = boxes(m, np.float64)
     rows, offsets = rows_for(m)
-    found, feasible = (np.asarray(each) for each in jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets))
+    found, feasible = (
+        np.asarray(each) for each in jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets)
+    )
     for i in range(NUM):
         expected = oracle(u[i], low[i], high[i], rows[i], offsets[i], solver)
         assert bool(feasible[i]) == (expected is not None)
         if expected is not None:
-            np.testing.assert_allclose(found[i], expected, rtol=0, atol=1e-9 if solver == "quadprog" else 1e-5)
+            np.testing.assert_allclose(
+                found[i], expected, rtol=0, atol=1e-9 if solver == "quadprog" else 1e-5
+            )
     assert 0.4 < feasible.mean() < 1.0
     assert (found[~feasible] == u[~feasible]).all()
 
@@ -133,10 +154,15 @@ def test_float32_finds_the_same_nearest_control(m: int) -> None:
 def test_the_nearest_control_meets_the_conditions_of_karush_kuhn_and_tucker() -> None:
     u, low, high = boxes(3, np.float64)
     rows, offsets = rows_for(3)
-    found, feasible = (np.asarray(each) for each in jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets))
+    found, feasible = (
+        np.asarray(each) for each in jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets)
+    )
     identity = np.eye(3)
     for i in np.flatnonzero(feasible):
-        sides, ends = np.concatenate([rows[i], identity, -identity]), np.concatenate([offsets[i], low[i], -high[i]])
+        sides, ends = (
+            np.concatenate([rows[i], identity, -identity]),
+            np.concatenate([offsets[i], low[i], -high[i]]),
+        )
         slack = sides @ found[i] - ends
         assert slack.min() > -1e-9
         active = slack < 1e-8
@@ -153,7 +179,11 @@ def test_slack_costs_what_it_should(m: int, count: int) -> None:
     """Against quadprog with the slack as variables of its own."""
     u, low, high = boxes(m, np.float64)
     rng = np.random.default_rng(70 + m)
-    rows, offsets, cost = rng.normal(size=(NUM, count, m)), rng.normal(size=(NUM, count)), rng.uniform(0.1, 100.0, NUM)
+    rows, offsets, cost = (
+        rng.normal(size=(NUM, count, m)),
+        rng.normal(size=(NUM, count)),
+        rng.uniform(0.1, 100.0, NUM),
+    )
     rows[:50, -1] = 0.0
     found, _ = jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets, cost)
     for i in range(300):
@@ -196,11 +226,15 @@ def test_derivatives_are_finite_differences_where_something_is_active() -> None:
         good = 0
         for j, leaf in enumerate(problem):
             nudge = 1e-6 * rng.normal(size=leaf.shape)
-            ahead, behind = ([*problem[:j], leaf + sign * nudge, *problem[j + 1 :]] for sign in (1, -1))
+            ahead, behind = (
+                [*problem[:j], leaf + sign * nudge, *problem[j + 1 :]] for sign in (1, -1)
+            )
             expected = (jax.vmap(value)(*ahead) - jax.vmap(value)(*behind)) / 2.0
             found = np.sum(np.reshape(slopes[j] * nudge, (NUM, -1)), axis=1)
             close = np.abs(found - np.asarray(expected)) < 1e-5 * 1e-6 + 1e-4 * np.abs(expected)
-            assert close[np.asarray(feasible)].mean() > 0.99  # the rest changes its active set within the nudge
+            assert (
+                close[np.asarray(feasible)].mean() > 0.99
+            )  # the rest changes its active set within the nudge
             good += int(np.sum(np.abs(found) > 1e-9))
         assert good > NUM
 
@@ -229,7 +263,9 @@ def test_degenerate_problems_give_numbers() -> None:
     for project, problem, expected in problems:
         found, feasible = project(*problem)
         assert bool(feasible) == expected
-        slopes = jax.jacrev(lambda u, project=project, rest=problem[1:]: project(u, *rest)[0])(problem[0])
+        slopes = jax.jacrev(lambda u, project=project, rest=problem[1:]: project(u, *rest)[0])(
+            problem[0]
+        )
         assert np.isfinite(found).all()
         assert np.isfinite(slopes).all()
 
@@ -239,7 +275,11 @@ def test_a_row_of_zeros_has_derivatives(slack: float | None) -> None:
     low, high = -jnp.ones(2), jnp.ones(2)
 
     def value(rows: jax.Array) -> jax.Array:
-        return jnp.sum(nearest_control(jnp.array([0.9, 0.9]), low, high, rows, jnp.array([-1.0, -0.5]), slack)[0])
+        return jnp.sum(
+            nearest_control(jnp.array([0.9, 0.9]), low, high, rows, jnp.array([-1.0, -0.5]), slack)[
+                0
+            ]
+        )
 
     slopes = jax.grad(value)(jnp.array([[0.0, 0.0], [-1.0, 0.0]]))
     assert np.isfinite(slopes).all()
@@ -254,7 +294,9 @@ def test_a_control_on_its_bound_keeps_its_derivative() -> None:
         (nearest_control, (jnp.eye(2), jnp.array([-5.0, -5.0]))),
     ]
     for project, rest in problems:
-        slope = jax.jacfwd(lambda u, project=project, rest=rest: project(u, low, high, *rest)[0])(corner)
+        slope = jax.jacfwd(lambda u, project=project, rest=rest: project(u, low, high, *rest)[0])(
+            corner
+        )
         np.testing.assert_array_equal(slope, np.eye(2))
 
 
@@ -265,7 +307,12 @@ def test_a_step_that_nothing_was_altered_in_has_a_derivative(rta: str) -> None:
 
     def outcome(action: Any) -> Any:
         timestep = jaxsafe.step(env, state, action)[1]
-        return timestep.observation, timestep.reward, timestep.info.rta.correction, timestep.info.rta.predicted_margin
+        return (
+            timestep.observation,
+            timestep.reward,
+            timestep.info.rta.correction,
+            timestep.info.rta.predicted_margin,
+        )
 
     for action in (jnp.zeros(2), jnp.array([0.1, 0.2]), jnp.array([1.0, -1.0])):
         assert outcome(action)[2] == 0.0

@@ -37,7 +37,9 @@ step_many = jax.jit(jax.vmap(jaxsafe.step, in_axes=(None, 0, 0)))
 
 @pytest.fixture(scope="module")
 def env() -> Environment:
-    return jaxsafe.make("docking2d", randomize={"deputy.mass": [10, 14], "reward.delta_v.scale": [-0.5, -0.1]})
+    return jaxsafe.make(
+        "docking2d", randomize={"deputy.mass": [10, 14], "reward.delta_v.scale": [-0.5, -0.1]}
+    )
 
 
 def keys(num: int = 64) -> jax.Array:
@@ -51,7 +53,9 @@ def test_numbers_lie_in_their_intervals_and_fill_them(env: Environment) -> None:
         share = (np.asarray(drawn[path]) - low) / (high - low)
         assert share.min() >= -1e-6
         assert share.max() <= 1.0 + 1e-6
-        np.testing.assert_allclose(np.sort(share), np.linspace(0, 1, 256), atol=0.12)  # Kolmogorov and Smirnov's distance
+        np.testing.assert_allclose(
+            np.sort(share), np.linspace(0, 1, 256), atol=0.12
+        )  # Kolmogorov and Smirnov's distance
 
 
 def test_numbers_differ_by_lane_by_reset_and_by_path(env: Environment) -> None:
@@ -85,11 +89,16 @@ def test_a_step_uses_the_drawn_number_and_the_state_keeps_it(env: Environment) -
 
 def test_a_start_uses_the_drawn_number() -> None:
     env = jaxsafe.make(
-        "docking2d", randomize={"status.velocity_limit.floor": [0.3, 0.9], "regions.docking_region.radius": [1, 5]}
+        "docking2d",
+        randomize={
+            "status.velocity_limit.floor": [0.3, 0.9],
+            "regions.docking_region.radius": [1, 5],
+        },
     )
     state, timestep = reset_many(env, keys())
     limit = (
-        np.asarray(state.parameters["status.velocity_limit.floor"]) + 0.002054 * timestep.info.status["docking_distance"]
+        np.asarray(state.parameters["status.velocity_limit.floor"])
+        + 0.002054 * timestep.info.status["docking_distance"]
     )
     np.testing.assert_allclose(timestep.info.status["velocity_limit"], limit, rtol=1e-5)
     np.testing.assert_allclose(timestep.observation[:, -1], limit, rtol=1e-5)
@@ -108,9 +117,14 @@ def test_a_randomized_episode_is_the_episode_with_the_numbers_written_in(env: En
         chex.assert_trees_all_close(timestep, expected, rtol=1e-6, atol=1e-6)
 
 
-@pytest.mark.parametrize("task", ["docking2d", "docking3d", "docking2d_oriented", "rejoin2d", "rejoin3d"])
+@pytest.mark.parametrize(
+    "task", ["docking2d", "docking3d", "docking2d_oriented", "rejoin2d", "rejoin3d"]
+)
 def test_starts_are_bitwise_those_without_random_numbers(task: str) -> None:
-    plain, random = jaxsafe.make(task), jaxsafe.make(task, randomize={"dt": [0.5, 2.0], "terminal.timeout.limit": [9, 99]})
+    plain, random = (
+        jaxsafe.make(task),
+        jaxsafe.make(task, randomize={"dt": [0.5, 2.0], "terminal.timeout.limit": [9, 99]}),
+    )
     (before, first), (after, second) = (reset_many(env, keys(8)) for env in (plain, random))
     chex.assert_trees_all_equal(before.sim.platforms, after.sim.platforms)
     chex.assert_trees_all_equal(first.observation, second.observation)
@@ -120,10 +134,14 @@ def test_other_intervals_do_not_compile_again(env: Environment) -> None:
     step(env, reset(env, keys()[0])[0], jnp.zeros(2))
     num_traces = len(TRACED)
     for mass in ([1, 2], [3.5, 3.5], jnp.asarray([7.0, 8.0]), np.asarray([7, 9])):
-        changed = jaxsafe.make("docking2d", randomize={"deputy.mass": mass, "reward.delta_v.scale": [0, 1]})
+        changed = jaxsafe.make(
+            "docking2d", randomize={"deputy.mass": mass, "reward.delta_v.scale": [0, 1]}
+        )
         state, _ = step(changed, reset(changed, keys()[1])[0], jnp.zeros(2))
         assert float(mass[0]) <= float(state.parameters["deputy.mass"]) <= float(mass[1])
-    state, _ = jaxsafe.reset_to(env, START, {"deputy.mass": 9, "reward.delta_v.scale": np.float64(1.0)})
+    state, _ = jaxsafe.reset_to(
+        env, START, {"deputy.mass": 9, "reward.delta_v.scale": np.float64(1.0)}
+    )
     step(env, state, jnp.zeros(2))
     assert len(TRACED) == num_traces > 0
 
@@ -144,13 +162,24 @@ def test_reset_to_takes_the_numbers_that_are_random(env: Environment) -> None:
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        (None, r"^reset_to: parameter 'deputy\.mass' is missing: it is random at reset, so give it$"),
+        (
+            None,
+            r"^reset_to: parameter 'deputy\.mass' is missing: it is random at reset, so give it$",
+        ),
         ({"deputy.mass": 3}, r"^reset_to: parameter 'reward\.delta_v\.scale' is missing"),
-        ({"deputy.mas": 3}, r"^reset_to: parameter 'deputy\.mas' is not random; .* Did you mean 'deputy\.mass'\?$"),
-        ({"dt": 1.0}, r"^reset_to: parameter 'dt' is not random; choose from deputy\.mass, reward\.delta_v\.scale"),
+        (
+            {"deputy.mas": 3},
+            r"^reset_to: parameter 'deputy\.mas' is not random; .* Did you mean 'deputy\.mass'\?$",
+        ),
+        (
+            {"dt": 1.0},
+            r"^reset_to: parameter 'dt' is not random; choose from deputy\.mass, reward\.delta_v\.scale",
+        ),
     ],
 )
-def test_reset_to_refuses_unknown_and_missing_numbers(env: Environment, parameters: Any, message: str) -> None:
+def test_reset_to_refuses_unknown_and_missing_numbers(
+    env: Environment, parameters: Any, message: str
+) -> None:
     with pytest.raises(ConfigError) as caught:
         jaxsafe.reset_to(env, START, parameters)
     assert re.search(message, str(caught.value))
@@ -158,7 +187,9 @@ def test_reset_to_refuses_unknown_and_missing_numbers(env: Environment, paramete
 
 
 def test_reset_to_refuses_numbers_where_nothing_is_random() -> None:
-    with pytest.raises(ConfigError, match=r"^reset_to: parameter 'deputy\.mass' is not random; choose from none$"):
+    with pytest.raises(
+        ConfigError, match=r"^reset_to: parameter 'deputy\.mass' is not random; choose from none$"
+    ):
         jaxsafe.reset_to(jaxsafe.make("docking2d"), START, {"deputy.mass": 3.0})
 
 
@@ -212,7 +243,10 @@ def test_a_path_that_leads_to_no_number_in_range_is_refused(randomize: Any, mess
     ("path", "named"),
     [
         ("lead.start.position.low", r"lead\.start\.position"),
-        ("lead.controller.commands.heading_rate.values", r"lead\.controller\.commands\.heading_rate\.values"),
+        (
+            "lead.controller.commands.heading_rate.values",
+            r"lead\.controller\.commands\.heading_rate\.values",
+        ),
         ("observation.lead_position.scale", r"observation\.lead_position\.scale"),
         ("observation.lead_position.clip", r"observation\.lead_position\.clip"),
     ],
@@ -226,7 +260,9 @@ def test_a_path_of_a_vector_is_refused(path: str, named: str) -> None:
 
 @pytest.mark.parametrize("num_envs", [None, 3])
 def test_a_rollout_draws_anew_at_every_automatic_reset(num_envs: int | None) -> None:
-    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 2.0}, randomize={"deputy.mass": [5, 50]})
+    env = jaxsafe.make(
+        "docking2d", {"terminal.timeout.limit": 2.0}, randomize={"deputy.mass": [5, 50]}
+    )
 
     def policy(key: jax.Array, observation: jax.Array) -> jax.Array:
         return jnp.ones((*observation.shape[:-1], 2))
@@ -236,27 +272,39 @@ def test_a_rollout_draws_anew_at_every_automatic_reset(num_envs: int | None) -> 
     mass = np.sqrt(2.0) / np.asarray(timesteps.info.status["delta_v"]).reshape(12, -1)
     assert np.asarray(timesteps.done).reshape(12, -1)[2::3].all()
     episodes = mass.reshape(4, 3, -1)
-    np.testing.assert_allclose(episodes, np.broadcast_to(episodes[:, :1], episodes.shape), rtol=1e-5)
+    np.testing.assert_allclose(
+        episodes, np.broadcast_to(episodes[:, :1], episodes.shape), rtol=1e-5
+    )
     assert len(np.unique(episodes[:, 0].round(3))) == 4 * (num_envs or 1)
 
 
 def test_only_the_lanes_that_end_draw_anew() -> None:
-    env = jaxsafe.make("docking2d", {"terminal.distance.limit": 125.0}, randomize={"deputy.mass": [5, 50]})
+    env = jaxsafe.make(
+        "docking2d", {"terminal.distance.limit": 125.0}, randomize={"deputy.mass": [5, 50]}
+    )
     state, _ = reset_many(env, keys(16))
     (after, _), timestep = step_or_reset_batch(env, state, jnp.zeros((16, 2)), jax.random.key(1))
     changed = after.parameters["deputy.mass"] != state.parameters["deputy.mass"]
     assert 0 < timestep.done.sum() < 16
     np.testing.assert_array_equal(changed, timestep.done)
-    (alone, _), _ = step_or_reset(env, jax.tree.map(lambda leaf: leaf[0], state), jnp.zeros(2), jax.random.key(2))
-    assert bool(alone.parameters["deputy.mass"] != state.parameters["deputy.mass"][0]) == bool(timestep.done[0])
+    (alone, _), _ = step_or_reset(
+        env, jax.tree.map(lambda leaf: leaf[0], state), jnp.zeros(2), jax.random.key(2)
+    )
+    assert bool(alone.parameters["deputy.mass"] != state.parameters["deputy.mass"][0]) == bool(
+        timestep.done[0]
+    )
 
 
 def test_yaml_reads_and_writes_random_numbers() -> None:
     env = jaxsafe.make("docking2d", randomize={"deputy.mass": [10, 14]})
     text = dump(env)
-    assert "randomize: {deputy.mass: [10.0, 14.0]}" in text.replace("\n  deputy", " {deputy").replace("]\n", "]}\n")
+    assert "randomize: {deputy.mass: [10.0, 14.0]}" in text.replace(
+        "\n  deputy", " {deputy"
+    ).replace("]\n", "]}\n")
     assert load(text) == env
-    written = dump(jaxsafe.make("docking2d")).replace("randomize: {}", "randomize: {deputy.mass: [10, 14]}")
+    written = dump(jaxsafe.make("docking2d")).replace(
+        "randomize: {}", "randomize: {deputy.mass: [10, 14]}"
+    )
     assert load(written) == env != jaxsafe.make("docking2d")
     with pytest.raises(ConfigError, match=r"^randomize: deputy\.mas: unknown field 'mas'[^\n]*$"):
         load(written.replace("deputy.mass: [", "deputy.mas: ["))
@@ -291,7 +339,9 @@ def test_equal_environments_start_alike_whatever_order_their_numbers_were_writte
     first, second = (jaxsafe.make("docking2d", randomize=one) for one in (intervals, backwards))
     assert first == second
     assert dump(first) == dump(second)
-    bare = first.replace(randomize=dict(reversed(first.randomize.items())))  # as no check has seen it
+    bare = first.replace(
+        randomize=dict(reversed(first.randomize.items()))
+    )  # as no check has seen it
     expected = reset(first, keys()[0])[0].parameters
     for env in (first, second, bare):
         chex.assert_trees_all_equal(jaxsafe.reset(env, keys()[0])[0].parameters, expected)
@@ -299,16 +349,25 @@ def test_equal_environments_start_alike_whatever_order_their_numbers_were_writte
 
 
 def test_a_number_of_the_filter_may_be_random() -> None:
-    env = jaxsafe.make("docking2d", rta="default", randomize={"rta.margin": [2e-4, 1e-3], "deputy.mass": [10, 14]})
+    env = jaxsafe.make(
+        "docking2d", rta="default", randomize={"rta.margin": [2e-4, 1e-3], "deputy.mass": [10, 14]}
+    )
     margins = np.asarray(reset_many(env, keys())[0].parameters["rta.margin"])
     assert len(np.unique(margins)) == 64
     assert margins.min() >= 2e-4
     assert margins.max() <= 1e-3
     assert load(dump(env)) == env
-    with pytest.raises(ConfigError, match=r"^randomize: rta\.margin: rta has no fields because it is not set$"):
+    with pytest.raises(
+        ConfigError, match=r"^randomize: rta\.margin: rta has no fields because it is not set$"
+    ):
         jaxsafe.make("docking2d", randomize={"rta.margin": [2e-4, 1e-3]})
 
 
 def test_two_paths_of_one_number_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"^randomize: platforms\.deputy\.mass and deputy\.mass are the same number"):
-        jaxsafe.make("docking2d", randomize={"deputy.mass": [1, 2], "platforms.deputy.mass": [3, 4]})
+    with pytest.raises(
+        ConfigError,
+        match=r"^randomize: platforms\.deputy\.mass and deputy\.mass are the same number",
+    ):
+        jaxsafe.make(
+            "docking2d", randomize={"deputy.mass": [1, 2], "platforms.deputy.mass": [3, 4]}
+        )

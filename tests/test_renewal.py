@@ -33,7 +33,8 @@ def test_lanes_are_renewed_alike_however_many_they_are(size: int, axis: Literal[
         where = np.isin(lanes, chosen)
         found = program(jnp.asarray(where), draw, jnp.ones(()), old, axis)
         np.testing.assert_array_equal(
-            jnp.moveaxis(found["a"], axis, 0), np.where(where, 1.0 + lanes, 0.0)[:, None] * np.ones(3)
+            jnp.moveaxis(found["a"], axis, 0),
+            np.where(where, 1.0 + lanes, 0.0)[:, None] * np.ones(3),
         )
         np.testing.assert_array_equal(found["b"], np.where(where, -lanes, lanes))
 
@@ -45,12 +46,18 @@ def test_gradients_reach_the_starts_of_batches_of_any_size(num_envs: int) -> Non
     state = state.replace(num_steps=jnp.arange(num_envs) % 2)
 
     def total(least: jax.Array) -> tuple[jax.Array, jax.Array]:
-        wide = jaxsafe.override(env, {"deputy.start.position.distance": jnp.stack([least, jnp.float32(150.0)])})
-        (after, _), timestep = step_or_reset_batch(wide, state, jnp.zeros((num_envs, 2)), jax.random.key(1))
+        wide = jaxsafe.override(
+            env, {"deputy.start.position.distance": jnp.stack([least, jnp.float32(150.0)])}
+        )
+        (after, _), timestep = step_or_reset_batch(
+            wide, state, jnp.zeros((num_envs, 2)), jax.random.key(1)
+        )
         fresh = jnp.linalg.norm(after.sim.platforms["deputy"].position, axis=-1)[timestep.done]
         return jnp.sum(fresh), fresh
 
     for derivative in (jax.grad, jax.jacfwd):
         slope, distances = derivative(total, has_aux=True)(jnp.float32(100.0))
         assert len(distances) == num_envs // 2
-        np.testing.assert_allclose(slope, np.sum((150.0 - distances) / 50.0), rtol=1e-4)  # d = low + (high − low) u
+        np.testing.assert_allclose(
+            slope, np.sum((150.0 - distances) / 50.0), rtol=1e-4
+        )  # d = low + (high − low) u

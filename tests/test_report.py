@@ -46,7 +46,9 @@ def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[list[str]]:
 
     monkeypatch.setattr(running, "_call", call)
     few = {"heavy": ["env.deputy.mass=24"], SHIPPED: ["seed=1"]}
-    monkeypatch.setattr(Item, "evaluations", property(lambda item: few if item.kind == "features" else {}))
+    monkeypatch.setattr(
+        Item, "evaluations", property(lambda item: few if item.kind == "features" else {})
+    )
     monkeypatch.chdir(tmp_path)
     return made
 
@@ -70,12 +72,18 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
     assert f"| docking2d | features | deterministic | {100 * rate:.2f} [" in page
     best = best_seed(results)
     run = Path("runs/report/docking2d-features")
-    assert Path("best/docking2d.npz").read_bytes() == (run / "policy" / f"seed_{best}.npz").read_bytes()
+    assert (
+        Path("best/docking2d.npz").read_bytes()
+        == (run / "policy" / f"seed_{best}.npz").read_bytes()
+    )
     shipped = json.loads((run / "evaluations" / SHIPPED / "results.json").read_text())["evaluation"]
     rate = shipped["stochastic"]["success_rate"]
     assert f"| docking2d | {best} | {100 * rate['mean']:.2f} % |" in page
     assert len(rate["per_seed"]) == 1
-    assert f"python -m jaxsafe.evaluate run=runs/docking2d-features/policy/seed_{best}.npz episodes=6 seed=1\n" in page
+    assert (
+        f"python -m jaxsafe.evaluate run=runs/docking2d-features/policy/seed_{best}.npz episodes=6 seed=1\n"
+        in page
+    )
     for file in (
         "docking2d_training.png",
         "docking2d_seeds.png",
@@ -96,14 +104,18 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
     assert len(calls) == 4
 
 
-def test_a_report_in_parts_makes_the_page_of_one(calls: list[list[str]], capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_report_in_parts_makes_the_page_of_one(
+    calls: list[list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ["tasks=docking2d", "film=false", *REST]
     assert command.main([*words, "kinds=[features,plain]"]) == 0
     whole = Path("report/baselines.md").read_text()
     for kind in ("plain", "features"):
         assert command.main([*words, f"kinds={kind}", "out=parts"]) == 0
     parts = Path("parts/baselines.md").read_text()
-    assert [line for line in whole.splitlines() if "|" in line] == [line for line in parts.splitlines() if "|" in line]
+    assert [line for line in whole.splitlines() if "|" in line] == [
+        line for line in parts.splitlines() if "|" in line
+    ]
     assert parts.count("- `python benchmarks/baselines") == 2
     assert sum(module == "jaxsafe.train" for module, *_ in calls) == 2
 
@@ -113,7 +125,10 @@ def test_a_report_in_parts_makes_the_page_of_one(calls: list[list[str]], capsys:
     record.write_text(json.dumps(found))
     capsys.readouterr()
     assert command.main([*words, "kinds=plain", "out=parts"]) == 0
-    assert f"{record}: was made with other options and is left out; report it again" in capsys.readouterr().out
+    assert (
+        f"{record}: was made with other options and is left out; report it again"
+        in capsys.readouterr().out
+    )
     assert "features |" not in Path("parts/baselines.md").read_text()
 
 
@@ -124,7 +139,9 @@ def test_an_evaluation_with_other_options_than_today_s_is_left_out_and_made_anew
     assert command.main(words) == 0
     assert "| docking2d | heavy |" in Path("report/baselines.md").read_text()
     heavier = {"heavy": ["env.deputy.mass=30"], SHIPPED: ["seed=1"]}
-    monkeypatch.setattr(Item, "evaluations", property(lambda item: heavier if item.kind == "features" else {}))
+    monkeypatch.setattr(
+        Item, "evaluations", property(lambda item: heavier if item.kind == "features" else {})
+    )
     records, old = kept(plan(["docking2d"], ["features"], REST), Path("report/baselines"))
     assert list(records[0].evaluations) == [SHIPPED]
     assert old == [
@@ -138,19 +155,24 @@ def test_an_evaluation_with_other_options_than_today_s_is_left_out_and_made_anew
     assert "| docking2d | heavy |" in Path("report/baselines.md").read_text()
 
 
-def test_a_record_is_of_the_commit_that_trained_it(calls: list[list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_record_is_of_the_commit_that_trained_it(
+    calls: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
     words = ["tasks=docking2d", "kinds=plain", *REST]
     for now, trained in (("first", "first"), ("second", "first")):
         monkeypatch.setattr(run_directory, "commit", lambda now=now: now)
         assert command.main(words) == 0
-        assert f"`python benchmarks/baselines {shlex.join(words)}` on commit {trained}: docking2d-plain" in (
-            Path("report/baselines.md").read_text()
+        assert (
+            f"`python benchmarks/baselines {shlex.join(words)}` on commit {trained}: docking2d-plain"
+            in (Path("report/baselines.md").read_text())
         )
     assert len(calls) == 1
 
 
 def test_the_page_of_the_project_is_that_of_its_records_and_of_todays_recipes() -> None:
-    records, old = kept(plan([*TASKS], [*KINDS], [f"seeds={command.SEEDS}"]), PAGE.parent / DIRECTORY)
+    records, old = kept(
+        plan([*TASKS], [*KINDS], [f"seeds={command.SEEDS}"]), PAGE.parent / DIRECTORY
+    )
     assert len(records) == len(TASKS) * len(KINDS), old
     assert Report(records).text(PAGE.parent / DIRECTORY) == PAGE.read_text(encoding="utf-8")
 
@@ -167,7 +189,10 @@ def test_an_interrupted_report_goes_on(calls: list[list[str]], whole: Path) -> N
 
 
 def test_a_report_killed_while_its_figures_were_drawn_draws_them(calls: list[list[str]]) -> None:
-    run, words = Path("runs/report/docking2d-features"), ["tasks=docking2d", "kinds=features", "film=false", *REST]
+    run, words = (
+        Path("runs/report/docking2d-features"),
+        ["tasks=docking2d", "kinds=features", "film=false", *REST],
+    )
     assert train.main([*TINY, f"out={run}"]) == 0
     pictures = {file.name: file.read_bytes() for file in (run / "figures").iterdir()}
     (run / "figures").rename(run / "figures.part")
@@ -186,7 +211,12 @@ def test_a_report_killed_while_its_figures_were_drawn_draws_them(calls: list[lis
         (".json", r"(?s)^.*$", "{}", "options: expected a mapping, found nothing"),
         (".json", r"(?s)^.*$", "null", "expected a mapping, found None"),
         (".json", r'"command": ".*"', '"command": 1', "command: expected text, found 1"),
-        (".json", r'"timesteps": null', '"timesteps": "x"', "interaction_efficiency.timesteps: expected a whole number"),
+        (
+            ".json",
+            r'"timesteps": null',
+            '"timesteps": "x"',
+            "interaction_efficiency.timesteps: expected a whole number",
+        ),
         (
             ".json",
             r'"seeds": 3,\n    "seed": 0,',
@@ -220,21 +250,33 @@ def test_a_broken_record_is_left_out_with_a_line_that_says_so(
 def test_a_run_whose_configuration_is_broken_is_told(calls: list[list[str]]) -> None:
     run = Path("runs/report/docking2d-plain")
     run.mkdir(parents=True)
-    for text in ("{}", "null", "env: x\ntraining: 1\nenvironment: {}", "env: x\ntraining: {}\nenvironment: []"):
+    for text in (
+        "{}",
+        "null",
+        "env: x\ntraining: 1\nenvironment: {}",
+        "env: x\ntraining: {}\nenvironment: []",
+    ):
         (run / "config.yaml").write_text(text)
         with pytest.raises(ConfigError, match=r"docking2d-plain/config\.yaml: "):
             command.main(["tasks=docking2d", "kinds=plain", *REST])
 
 
-def test_what_is_not_known_is_a_dash_on_the_page_and_a_seed_without_success_failed(whole: Path) -> None:
+def test_what_is_not_known_is_a_dash_on_the_page_and_a_seed_without_success_failed(
+    whole: Path,
+) -> None:
     unknown = {"mean": None, "ci95": None, "iqm": None, "per_seed": [None, 1.0, 1.0]}
     assert (_percent(unknown), _number(unknown), _rate(unknown, 100, 3)) == ("–", "–", "–")
-    results = {"seed": 4, "evaluation": {way: {"success_rate": unknown} for way in ("stochastic", "deterministic")}}
+    results = {
+        "seed": 4,
+        "evaluation": {way: {"success_rate": unknown} for way in ("stochastic", "deterministic")},
+    }
     assert failed_seeds(results) == [4]
 
 
 def test_ctrl_c_gives_the_training_time_to_save(tmp_path: Path) -> None:
-    saving = f"import time, pathlib; time.sleep(1.0); pathlib.Path({str(tmp_path / 'saved')!r}).touch()"
+    saving = (
+        f"import time, pathlib; time.sleep(1.0); pathlib.Path({str(tmp_path / 'saved')!r}).touch()"
+    )
     process = subprocess.Popen([sys.executable, "-c", saving])
     threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
@@ -297,7 +339,13 @@ def test_every_command_of_the_plan_is_valid() -> None:
 def test_the_wall_time_to_a_level_waits_for_twenty_episodes_of_every_seed() -> None:
     rates = [(None, 1.0, 9), (1.0, 1.0, 19), (0.9, 0.9, 20), (0.92, 0.98, 30), (1.0, 1.0, 40)]
     curves = [
-        {"seed": seed, "step": 10 * index, "success_rate": row[seed], "episodes": row[2], "wall_s": index + seed / 10}
+        {
+            "seed": seed,
+            "step": 10 * index,
+            "success_rate": row[seed],
+            "episodes": row[2],
+            "wall_s": index + seed / 10,
+        }
         for seed in (0, 1)
         for index, row in enumerate(rates)
     ]
@@ -311,15 +359,23 @@ def test_the_wall_time_to_a_level_waits_for_twenty_episodes_of_every_seed() -> N
 
 
 def test_samples_a_second_are_those_of_all_seeds_after_the_first_update():
-    curves = [{"seed": seed, "step": 100 * i, "wall_s": 20.0 + 2 * i} for seed in (3, 4) for i in (1, 2, 3)]
+    curves = [
+        {"seed": seed, "step": 100 * i, "wall_s": 20.0 + 2 * i}
+        for seed in (3, 4)
+        for i in (1, 2, 3)
+    ]
     assert samples_per_second(curves) == 2 * 200 / 4
     assert samples_per_second(curves[:1]) is None
 
 
 def test_the_best_policy_succeeds_most_then_violates_least_then_has_the_highest_return() -> None:
-    def results(success: list[float], violating: list[float | None], value: list[float | None]) -> dict:
+    def results(
+        success: list[float], violating: list[float | None], value: list[float | None]
+    ) -> dict:
         names = ("success_rate", "episode_safety_violation_rate", "average_return")
-        columns = dict(zip(names, ({"per_seed": one} for one in (success, violating, value)), strict=True))
+        columns = dict(
+            zip(names, ({"per_seed": one} for one in (success, violating, value)), strict=True)
+        )
         return {"seed": 5, "evaluation": {"deterministic": columns}}
 
     assert best_seed(results([0.9, 1.0, 0.8], [0.0, 0.1, 0.0], [9.0, 1.0, 9.0])) == 6
@@ -341,8 +397,15 @@ def test_trainings_with_a_filter_start_where_it_promises_safety() -> None:
 
 def test_a_seed_failed_if_it_did_either_way_and_finished_episodes_are_those_by_the_step() -> None:
     rates = {"stochastic": [0.95, 0.949, 1.0], "deterministic": [1.0, 1.0, 0.3]}
-    results = {"seed": 7, "evaluation": {way: {"success_rate": {"per_seed": rate}} for way, rate in rates.items()}}
+    results = {
+        "seed": 7,
+        "evaluation": {way: {"success_rate": {"per_seed": rate}} for way, rate in rates.items()},
+    }
     assert failed_seeds(results) == [8, 9]
-    curves = [{"seed": seed, "step": 100 * i, "episodes": 10 * i + seed} for seed in (3, 4) for i in (1, 2, 3)]
+    curves = [
+        {"seed": seed, "step": 100 * i, "episodes": 10 * i + seed}
+        for seed in (3, 4)
+        for i in (1, 2, 3)
+    ]
     assert finished(curves, 200) == 23.5
     assert finished(curves, 250) == 23.5

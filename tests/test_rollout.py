@@ -51,7 +51,10 @@ def state_at(env: Environment, observation: jax.Array) -> State:
 
 def is_start(observation: jax.Array) -> bool:
     """Whether this may be the observation of a start: 100-150 m away within the speed limit."""
-    return 99.99 <= 100 * np.hypot(*observation[:2]) <= 150.01 and observation[4] <= observation[5] + 1e-6
+    return (
+        99.99 <= 100 * np.hypot(*observation[:2]) <= 150.01
+        and observation[4] <= observation[5] + 1e-6
+    )
 
 
 def before(env: Environment, observation: jax.Array, action: jax.Array) -> np.ndarray:
@@ -72,12 +75,16 @@ def assert_is_a_run(env: Environment, timesteps: TimeStep) -> None:
         if timesteps.terminated[t - 1]:
             start = before(env, following, timesteps.info.control_actual[t])
             assert is_start(start)
-            np.testing.assert_allclose(policy(None, jnp.float32(start)), timesteps.info.control_actual[t], atol=1e-4)
+            np.testing.assert_allclose(
+                policy(None, jnp.float32(start)), timesteps.info.control_actual[t], atol=1e-4
+            )
             starts.append(start)
         else:
             action = policy(None, last)
             np.testing.assert_allclose(timesteps.info.control_actual[t], action, atol=1e-6)
-            np.testing.assert_allclose(following, step(env, state_at(env, last), action)[1].observation, atol=1e-5)
+            np.testing.assert_allclose(
+                following, step(env, state_at(env, last), action)[1].observation, atol=1e-5
+            )
     assert len(starts) == NUM_STEPS // LENGTH
     assert len(np.unique(np.round(np.asarray(starts)[:, 0], 4))) == len(starts)
 
@@ -88,17 +95,23 @@ def test_a_rollout_stacks_time_steps(single: TimeStep, env: Environment) -> None
     assert single.reward.shape == (NUM_STEPS,)
 
 
-def test_episodes_follow_each_other_from_fresh_random_starts(env: Environment, single: TimeStep) -> None:
+def test_episodes_follow_each_other_from_fresh_random_starts(
+    env: Environment, single: TimeStep
+) -> None:
     assert_is_a_run(env, single)
 
 
 def test_the_step_that_ends_an_episode_keeps_its_facts(single: TimeStep, env: Environment) -> None:
     ends = np.arange(NUM_STEPS) % LENGTH == LENGTH - 1
     np.testing.assert_array_equal(single.terminated, ends)
-    np.testing.assert_array_equal(single.info.outcome, np.where(ends, env.outcomes.index("timeout"), 0))
+    np.testing.assert_array_equal(
+        single.info.outcome, np.where(ends, env.outcomes.index("timeout"), 0)
+    )
     np.testing.assert_array_equal(single.info.reward_terms["failure"], np.where(ends, -1.0, 0.0))
     for t in np.flatnonzero(ends):
-        last = step(env, state_at(env, single.observation[t - 1]), policy(None, single.observation[t - 1]))[1]
+        last = step(
+            env, state_at(env, single.observation[t - 1]), policy(None, single.observation[t - 1])
+        )[1]
         np.testing.assert_allclose(single.observation[t], last.observation, atol=1e-5)
 
 
@@ -123,7 +136,9 @@ def test_in_a_batch_only_the_finished_environments_start_anew(env: Environment) 
     state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(1), 4)
     state = state.replace(num_steps=jnp.asarray([0, LENGTH - 1, 1, LENGTH - 1]))
     action = jax.random.uniform(jax.random.key(3), (4, 2), minval=-1.0)
-    (after, observation), timestep = jax.jit(step_or_reset_batch)(env, state, action, jax.random.key(2))
+    (after, observation), timestep = jax.jit(step_or_reset_batch)(
+        env, state, action, jax.random.key(2)
+    )
     assert timestep.done.tolist() == [False, True, False, True]
     assert after.num_steps.tolist() == [1, 0, 2, 0]
     for i in range(4):
@@ -137,7 +152,9 @@ def test_in_a_batch_only_the_finished_environments_start_anew(env: Environment) 
 
 @pytest.mark.parametrize("ends", ["terminated", "truncated"])
 def test_every_kind_of_end_is_followed_by_a_start(ends: str) -> None:
-    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": LENGTH - 1, "terminal.timeout.ends": ends})
+    env = jaxsafe.make(
+        "docking2d", {"terminal.timeout.limit": LENGTH - 1, "terminal.timeout.ends": ends}
+    )
     state, _ = jaxsafe.reset(env, jax.random.key(0))
     for num_steps, expected in ((LENGTH - 2, LENGTH - 1), (LENGTH - 1, 0)):
         before = state.replace(num_steps=jnp.asarray(num_steps))
@@ -155,9 +172,14 @@ def test_environments_may_be_the_last_axis(env: Environment) -> None:
     for axis in (0, -1):
         state, _ = begin(env, jax.random.key(1), num_envs=300, axis=axis)
         state = state.replace(num_steps=jnp.arange(300) % LENGTH)
-        found.append(advance(env, state, action if axis == 0 else action.T, jax.random.key(2), axis=axis))
+        found.append(
+            advance(env, state, action if axis == 0 else action.T, jax.random.key(2), axis=axis)
+        )
     assert 0 < found[0][1].done.sum() < 300
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, jnp.moveaxis(b, -1, 0), rtol=1e-5, atol=1e-5), *found)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, jnp.moveaxis(b, -1, 0), rtol=1e-5, atol=1e-5),
+        *found,
+    )
 
 
 def test_the_starts_of_a_large_batch_are_those_of_its_lanes() -> None:
@@ -169,24 +191,39 @@ def test_the_starts_of_a_large_batch_are_those_of_its_lanes() -> None:
     assert np.flatnonzero(timestep.done).tolist() == [3, 200]
     fresh, _ = jax.jit(reset_batch, static_argnums=2)(env, key, 256)
     for lane in (3, 200):
-        jax.tree.map(lambda a, b, i=lane: np.testing.assert_allclose(a[i], b[i], rtol=1e-6), after, fresh)
+        jax.tree.map(
+            lambda a, b, i=lane: np.testing.assert_allclose(a[i], b[i], rtol=1e-6), after, fresh
+        )
 
 
 def test_a_limit_truncates_what_still_runs(env: Environment) -> None:
     state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(1), 4)
-    state = state.replace(num_steps=jnp.asarray([0, 1, 2, LENGTH - 1]))  # the last one's own time is over
-    (after, _), timestep = jax.jit(step_or_reset_batch)(env, state, jnp.zeros((4, 2)), jax.random.key(2), 2)
+    state = state.replace(
+        num_steps=jnp.asarray([0, 1, 2, LENGTH - 1])
+    )  # the last one's own time is over
+    (after, _), timestep = jax.jit(step_or_reset_batch)(
+        env, state, jnp.zeros((4, 2)), jax.random.key(2), 2
+    )
     assert timestep.truncated.tolist() == [False, True, True, False]
     assert timestep.terminated.tolist() == [False, False, False, True]
-    assert [env.outcomes[i] for i in timestep.info.outcome] == ["running", "running", "running", "timeout"]
+    assert [env.outcomes[i] for i in timestep.info.outcome] == [
+        "running",
+        "running",
+        "running",
+        "timeout",
+    ]
     assert after.num_steps.tolist() == [1, 0, 0, 0]
 
 
-def test_a_rollout_under_jit_is_the_same_and_compiles_once(env: Environment, single: TimeStep) -> None:
+def test_a_rollout_under_jit_is_the_same_and_compiles_once(
+    env: Environment, single: TimeStep
+) -> None:
     plain = jaxsafe.rollout(env, policy, jax.random.key(0), NUM_STEPS)
     chex.assert_trees_all_close(single, plain, atol=1e-5)
     num_traces = len(TRACED)
-    other = rollout(jaxsafe.override(env, {"deputy.mass": 20}), policy, jax.random.key(0), NUM_STEPS)
+    other = rollout(
+        jaxsafe.override(env, {"deputy.mass": 20}), policy, jax.random.key(0), NUM_STEPS
+    )
     assert len(TRACED) == num_traces > 0
     assert not np.allclose(other.observation, plain.observation)
 
@@ -221,6 +258,13 @@ def test_discrete_actions_roll_out_with_a_new_key_at_every_step() -> None:
         ({"num_steps": 3, "num_envs": 0}, "num_envs: expected a whole number ≥ 1, found 0"),
     ],
 )
-def test_a_rollout_of_no_number_of_steps_or_environments_is_refused(counts: Any, message: str) -> None:
+def test_a_rollout_of_no_number_of_steps_or_environments_is_refused(
+    counts: Any, message: str
+) -> None:
     with pytest.raises(ConfigError, match=f"^rollout: {message}$"):
-        jaxsafe.rollout(jaxsafe.make("docking2d"), lambda key, observation: jnp.zeros(2), jax.random.key(0), **counts)
+        jaxsafe.rollout(
+            jaxsafe.make("docking2d"),
+            lambda key, observation: jnp.zeros(2),
+            jax.random.key(0),
+            **counts,
+        )

@@ -38,7 +38,12 @@ SHORT = [
     slow("implicit_simplex", "rejoin2d", ("search",)),
 ]
 COMPARED = ("explicit_asif", "released")  # of the literature; they guarantee nothing
-LONG = [(preset, task) for task in TASKS for preset in TASKS[task].filters if preset not in (*COMPARED, "default")]
+LONG = [
+    (preset, task)
+    for task in TASKS
+    for preset in TASKS[task].filters
+    if preset not in (*COMPARED, "default")
+]
 
 BRAKE = {"type": "brake", "name": "brake"}
 SLOW = {"type": "slow", "speed": 0.1}
@@ -57,7 +62,11 @@ def test_no_adversary_breaks_the_filter(preset: str, task: str, policies: tuple[
 def test_an_oriented_spacecraft_across_its_velocity_turns_rather_than_pushes_it_away() -> None:
     """A start with less than the margin, met in training: thrust that no longer holds the limit kept it above for 109 s."""
     env = jaxsafe.make("docking2d_oriented", rta="default")
-    start = {"position": [7.8028517, -148.32379], "velocity": [-0.408887, 0.29509956], "attitude": 0.931799}
+    start = {
+        "position": [7.8028517, -148.32379],
+        "velocity": [-0.408887, 0.29509956],
+        "attitude": 0.931799,
+    }
     state, timestep = jaxsafe.reset_to(env, {"deputy": start | {"attitude_rate": 0.0}})
     assert not timestep.info.rta.certified
     margins = []
@@ -73,8 +82,14 @@ def test_far_from_the_chief_an_oriented_spacecraft_is_not_certified() -> None:
     env = jaxsafe.make("docking2d_oriented", rta="default")
     distance, where = 15_000.0, 1.356068
     course, speed = where + np.pi + 0.408682, 0.2 + 0.002054 * distance - 0.806556
-    start = {"position": [distance * np.cos(where), distance * np.sin(where)], "attitude": course + np.radians(86.421369)}
-    start |= {"velocity": [speed * np.cos(course), speed * np.sin(course)], "attitude_rate": np.radians(-1.224431)}
+    start = {
+        "position": [distance * np.cos(where), distance * np.sin(where)],
+        "attitude": course + np.radians(86.421369),
+    }
+    start |= {
+        "velocity": [speed * np.cos(course), speed * np.sin(course)],
+        "attitude_rate": np.radians(-1.224431),
+    }
     state, timestep = jaxsafe.reset_to(env, {"deputy": start})
     assert not timestep.info.rta.certified
     margins = []
@@ -93,16 +108,28 @@ def test_in_its_terminal_set_an_oriented_spacecraft_holds_the_limit_for_long() -
         far, where, course, tilt, rate, share = jax.random.uniform(key, (6,))
         distance = 2200.0 * jnp.sqrt(far)
         speed = (0.2 + 0.002054 * distance) * jnp.minimum(1.3 * share, 1.0) - 2.6e-4
-        ways = [jnp.stack([jnp.cos(angle), jnp.sin(angle)]) for angle in (2.0 * jnp.pi * where, 2.0 * jnp.pi * course)]
+        ways = [
+            jnp.stack([jnp.cos(angle), jnp.sin(angle)])
+            for angle in (2.0 * jnp.pi * where, 2.0 * jnp.pi * course)
+        ]
         tilt = jnp.radians(75.0) * (2.0 * tilt - 1.0)
         start = {"position": distance * ways[0], "velocity": jnp.maximum(speed, 0.0) * ways[1]}
-        start |= {"attitude": 2.0 * jnp.pi * course - tilt, "attitude_rate": jnp.pi / 90.0 * (2.0 * rate - 1.0)}
-        sim = jaxsafe.reset_to(env.replace(rta=None), {"deputy": start})[0].sim.replace(regions={}, status={})
-        faults = env.rta.terminal.faults(env, sim, env.rta) | env.rta.backups[0].faults(env, sim, env.rta)
+        start |= {
+            "attitude": 2.0 * jnp.pi * course - tilt,
+            "attitude_rate": jnp.pi / 90.0 * (2.0 * rate - 1.0),
+        }
+        sim = jaxsafe.reset_to(env.replace(rta=None), {"deputy": start})[0].sim.replace(
+            regions={}, status={}
+        )
+        faults = env.rta.terminal.faults(env, sim, env.rta) | env.rta.backups[0].faults(
+            env, sim, env.rta
+        )
         inside = env.rta.terminal.contains(env, sim) & ~jnp.any(jnp.stack(list(faults.values())))
 
         def follow(sim: Sim, _: None) -> tuple[Sim, jax.Array]:
-            after = advance(env, sim, jnp.clip(env.rta.backups[0].control(env, sim, {}), *bounds(env)))
+            after = advance(
+                env, sim, jnp.clip(env.rta.backups[0].control(env, sim, {}), *bounds(env))
+            )
             return after, env.rta.lowest(env, sim, after)
 
         return inside, distance, jax.lax.scan(follow, sim, length=150)[1].min()
@@ -124,17 +151,27 @@ REFUSED = [
     ("docking2d_oriented", {"dt": 2}, "steps of 1 s alone"),
     ("docking2d_oriented", {"rta.horizon": 5}, "5 steps of the horizon are too short"),
     ("rejoin2d", {"dt": 0.2}, "40 steps of the horizon are too short for backup controller 'left'"),
-    ("rejoin2d", {"lead.controller.commands.heading_rate.at": 0.18}, "'lead' may turn or accelerate faster"),
+    (
+        "rejoin2d",
+        {"lead.controller.commands.heading_rate.at": 0.18},
+        "'lead' may turn or accelerate faster",
+    ),
     ("rejoin2d", {"constraints.collision.minimum": 200}, "clearance of velocity_matched is below"),
     ("rejoin3d", {"dt": 2}, "steps of at most 1 s"),
-    ("rejoin3d", {"lead.controller.commands.heading_rate.at": 0.35}, "turns faster than the agent can copy"),
+    (
+        "rejoin3d",
+        {"lead.controller.commands.heading_rate.at": 0.35},
+        "turns faster than the agent can copy",
+    ),
     ("rejoin3d", {"lead.controller.commands": [TURNS_LATER]}, "may change its turn"),
     ("rejoin3d", {"lead.controller.commands": [WEAVES]}, "may change its turn"),
 ]
 
 
 @pytest.mark.parametrize(("task", "changes", "message"), REFUSED)
-def test_a_filter_that_could_certify_nothing_is_refused(task: str, changes: dict[str, Any], message: str) -> None:
+def test_a_filter_that_could_certify_nothing_is_refused(
+    task: str, changes: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
         jaxsafe.make(task, changes, rta="default")
     assert str(caught.value).startswith("rta")
@@ -146,7 +183,9 @@ def test_a_filter_that_could_certify_nothing_is_refused(task: str, changes: dict
 
 def test_a_change_of_traced_numbers_is_not_refused() -> None:
     env = jaxsafe.make("rejoin2d", rta="default")
-    jax.eval_shape(lambda minimum: jaxsafe.override(env, {"constraints.collision.minimum": minimum}), 200.0)
+    jax.eval_shape(
+        lambda minimum: jaxsafe.override(env, {"constraints.collision.minimum": minimum}), 200.0
+    )
 
     def fixed(x: jax.Array) -> jax.Array:
         return x + jaxsafe.override(env, {"reward.success.value": 2.0}).dt
@@ -157,11 +196,31 @@ def test_a_change_of_traced_numbers_is_not_refused() -> None:
 UNCERTIFIED = [
     ("docking2d", {}, {"position": [0.0, 25_000.0], "velocity": [0.0, -51.0]}),
     ("docking2d", {"deputy.mass": 2400}, {"position": [0.0, 150.0], "velocity": [0.0, -0.5]}),
-    ("docking3d", {"deputy.mass": 2400}, {"position": [0.0, 150.0, 0.0], "velocity": [0.0, -0.5, 0.0]}),
-    ("docking2d", {"deputy.controller.actuators.thrust_y.high": 0}, {"position": [0.0, 150.0], "velocity": [0.0, -0.5]}),
-    ("docking2d", {"deputy.mean_motion": 0.05}, {"position": [0.0, 150.0], "velocity": [0.0, -0.5]}),
-    ("docking2d", {"status.velocity_limit.slope": 0.1}, {"position": [0.0, 150.0], "velocity": [0.0, -14.0]}),
-    ("docking2d", {"status.velocity_limit.floor": 1e-4}, {"position": [0.0, 150.0], "velocity": [0.0, -0.1]}),
+    (
+        "docking3d",
+        {"deputy.mass": 2400},
+        {"position": [0.0, 150.0, 0.0], "velocity": [0.0, -0.5, 0.0]},
+    ),
+    (
+        "docking2d",
+        {"deputy.controller.actuators.thrust_y.high": 0},
+        {"position": [0.0, 150.0], "velocity": [0.0, -0.5]},
+    ),
+    (
+        "docking2d",
+        {"deputy.mean_motion": 0.05},
+        {"position": [0.0, 150.0], "velocity": [0.0, -0.5]},
+    ),
+    (
+        "docking2d",
+        {"status.velocity_limit.slope": 0.1},
+        {"position": [0.0, 150.0], "velocity": [0.0, -14.0]},
+    ),
+    (
+        "docking2d",
+        {"status.velocity_limit.floor": 1e-4},
+        {"position": [0.0, 150.0], "velocity": [0.0, -0.1]},
+    ),
 ]
 
 
@@ -178,8 +237,14 @@ def test_a_certificate_checks_the_numbers_that_its_proof_assumes(
 
 
 def test_a_lead_that_cannot_be_copied_is_not_certified_whatever_an_episode_draws() -> None:
-    env = jaxsafe.make("rejoin2d", randomize={"lead.controller.commands.heading_rate.at": [0.0, 0.35]}, rta="default")
-    state, first = jax.jit(jax.vmap(jaxsafe.reset, in_axes=(None, 0)))(env, jax.random.split(jax.random.key(0), 64))
+    env = jaxsafe.make(
+        "rejoin2d",
+        randomize={"lead.controller.commands.heading_rate.at": [0.0, 0.35]},
+        rta="default",
+    )
+    state, first = jax.jit(jax.vmap(jaxsafe.reset, in_axes=(None, 0)))(
+        env, jax.random.split(jax.random.key(0), 64)
+    )
     turn = state.parameters["lead.controller.commands.heading_rate.at"]
     assert first.info.rta.certified[turn < 0.16].all()
     assert not first.info.rta.certified[turn > 0.166].any()
@@ -193,9 +258,13 @@ def test_the_margin_of_a_speed_limit_follows_the_step(dt: float) -> None:
     assert float(env.rta.required_margin(env)) == pytest.approx(max(2.5e-4, 2.07e-4 * dt), rel=0.15)
 
 
-def test_a_start_that_is_not_certified_becomes_so_under_an_agent_that_asks_for_nothing_sensible() -> None:
+def test_a_start_that_is_not_certified_becomes_so_under_an_agent_that_asks_for_nothing_sensible() -> (
+    None
+):
     env = jaxsafe.make("docking2d", rta="implicit_simplex")
-    state, first = jaxsafe.reset_to(env, {"deputy": {"position": [1000.0, 0.0], "velocity": [0.0, 2.0]}})
+    state, first = jaxsafe.reset_to(
+        env, {"deputy": {"position": [1000.0, 0.0], "velocity": [0.0, 2.0]}}
+    )
     assert not first.info.rta.certified
     certified = []
     for _ in range(12):
@@ -212,7 +281,9 @@ def test_a_certificate_that_is_not_renewed_ends_before_anything_is_violated() ->
     """A lead that turns faster than it was certified for, from the step on at which the environment is another."""
     env = jaxsafe.make("rejoin2d", rta="default")
     lead = {"position": [0.0, 0.0], "heading": 0.0, "speed": 275.0}
-    state, first = jaxsafe.reset_to(env, {"lead": lead, "wingman": lead | {"position": [-400.0, 0.0], "speed": 400.0}})
+    state, first = jaxsafe.reset_to(
+        env, {"lead": lead, "wingman": lead | {"position": [-400.0, 0.0], "speed": 400.0}}
+    )
     assert first.info.rta.certified
     turning = jaxsafe.override(env, {"lead.controller.commands.heading_rate.at": 0.3})
     for _ in range(5):
@@ -226,9 +297,14 @@ def test_a_state_that_is_not_a_number_is_not_certified(task: str) -> None:
     state, _ = reset(env, jax.random.key(0))
     own = state.sim.platforms[env.agent]
     for name, value in vars(own).items():
-        broken = {**state.sim.platforms, env.agent: own.replace(**{name: jnp.full_like(value, jnp.nan)})}
+        broken = {
+            **state.sim.platforms,
+            env.agent: own.replace(**{name: jnp.full_like(value, jnp.nan)}),
+        }
         if name != "delta_v":
-            _, timestep = step(env, state.replace(sim=state.sim.replace(platforms=broken)), jnp.zeros(2))
+            _, timestep = step(
+                env, state.replace(sim=state.sim.replace(platforms=broken)), jnp.zeros(2)
+            )
             assert not timestep.info.rta.certified
 
 
@@ -241,15 +317,22 @@ def test_no_adversary_breaks_any_filter(preset: str, task: str) -> None:
 
 
 def assert_unbroken(env: Environment, row: dict[str, Any]) -> None:
-    assert row["violating_steps"] == row["violating_steps_inside"] == row["uncertified_steps"] == 0, row
+    assert (
+        row["violating_steps"] == row["violating_steps_inside"] == row["uncertified_steps"] == 0
+    ), row
     assert row["unsafe_starts"] == 0.0
     assert env.rta is not None
     assert row["worst_margin"] >= float(env.rta.margin) - 1e-4
     if env.constraints[0].between:
-        assert row["worst_margin_inside"] >= float(env.rta.margin) - 0.5  # ft; the bound is looser on shorter steps
+        assert (
+            row["worst_margin_inside"] >= float(env.rta.margin) - 0.5
+        )  # ft; the bound is looser on shorter steps
 
 
-@pytest.mark.parametrize(("task", "policy"), [("docking2d", "greedy"), ("rejoin2d", "intercept"), ("docking2d", "search")])
+@pytest.mark.parametrize(
+    ("task", "policy"),
+    [("docking2d", "greedy"), ("rejoin2d", "intercept"), ("docking2d", "search")],
+)
 def test_the_same_adversaries_break_the_bare_task(task: str, policy: str) -> None:
     row = attack(jaxsafe.make(task), policy, 150, 32, jax.random.key(1))
     assert row["violating_steps_inside"] > 0
@@ -264,7 +347,9 @@ def test_an_environment_with_a_filter_is_written_and_read(task: str) -> None:
         env = jaxsafe.make(task, rta=preset)
         assert load(dump(env)) == env
         assert jaxsafe.override(env, {"rta": None}) == bare
-    with pytest.raises(ConfigError, match=rf"^rta: {task} has no preset 'defualt'; choose from none, .*default"):
+    with pytest.raises(
+        ConfigError, match=rf"^rta: {task} has no preset 'defualt'; choose from none, .*default"
+    ):
         jaxsafe.make(task, rta="defualt")
 
 
@@ -279,13 +364,20 @@ def test_a_control_that_is_certified_passes_unaltered(task: str) -> None:
     assert not info.intervening
     assert info.rta.correction == 0.0
     assert info.rta.certified
-    np.testing.assert_allclose(info.rta.predicted_margin, min(info.margins.values()), rtol=1e-4)  # a bound in between
+    np.testing.assert_allclose(
+        info.rta.predicted_margin, min(info.margins.values()), rtol=1e-4
+    )  # a bound in between
 
 
 def fast(env: Environment) -> Any:
     """A start at the speed limit, moving across."""
-    position, velocity = 100.0 * np.eye(env.action_size)[0], (0.2 + 2 * 0.001027 * 100.0) * np.eye(env.action_size)[1]
-    return jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": 0.999 * velocity}})[0]
+    position, velocity = (
+        100.0 * np.eye(env.action_size)[0],
+        (0.2 + 2 * 0.001027 * 100.0) * np.eye(env.action_size)[1],
+    )
+    return jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": 0.999 * velocity}})[
+        0
+    ]
 
 
 @pytest.mark.parametrize("task", DOCKING)
@@ -296,7 +388,9 @@ def test_an_intervention_is_reported_in_full(task: str) -> None:
     assert info.intervening
     assert info.margins["velocity_limit"] >= 0.0
     np.testing.assert_allclose(info.control_desired, jnp.eye(env.action_size)[1])
-    np.testing.assert_allclose(info.rta.correction, np.linalg.norm(info.control_actual - info.control_desired), rtol=1e-6)
+    np.testing.assert_allclose(
+        info.rta.correction, np.linalg.norm(info.control_actual - info.control_desired), rtol=1e-6
+    )
     delta_v = np.linalg.norm(info.control_actual) / 12.0  # the reward is for the thrust that acted
     np.testing.assert_allclose(info.status["delta_v"], delta_v, rtol=1e-5)
     _, bare = step(jaxsafe.make(task), fast(env), jnp.eye(env.action_size)[1])
@@ -323,7 +417,9 @@ def test_a_state_that_is_not_a_number_still_gives_a_control(preset: str) -> None
     env = jaxsafe.make("rejoin2d", rta=preset)
     state, _ = reset(env, jax.random.key(0))
     wingman = state.sim.platforms["wingman"].replace(heading=jnp.float32(jnp.nan))
-    broken = state.replace(sim=state.sim.replace(platforms={**state.sim.platforms, "wingman": wingman}))
+    broken = state.replace(
+        sim=state.sim.replace(platforms={**state.sim.platforms, "wingman": wingman})
+    )
     _, timestep = step(env, broken, jnp.array([0.5, -0.5]))
     assert np.isfinite(timestep.info.control_actual).all()
     assert not timestep.info.rta.certified
@@ -339,7 +435,9 @@ def test_reset_and_step_agree_in_structure(task: str) -> None:
 
     start, after = jax.eval_shape(both, env)
     assert jax.tree.structure(start) == jax.tree.structure(after)
-    assert [(a.shape, a.dtype) for a in jax.tree.leaves(start)] == [(a.shape, a.dtype) for a in jax.tree.leaves(after)]
+    assert [(a.shape, a.dtype) for a in jax.tree.leaves(start)] == [
+        (a.shape, a.dtype) for a in jax.tree.leaves(after)
+    ]
 
 
 @pytest.mark.parametrize("task", DOCKING)
@@ -377,24 +475,34 @@ def test_the_sampled_data_filter_changes_no_more_than_it_must(task: str) -> None
     assert 5 < altered < 25
 
 
-@pytest.mark.parametrize("task", [*DOCKING, "rejoin2d", slow("docking2d_oriented"), slow("rejoin3d")])
+@pytest.mark.parametrize(
+    "task", [*DOCKING, "rejoin2d", slow("docking2d_oriented"), slow("rejoin3d")]
+)
 def test_a_batch_of_any_size_is_filtered_alike(task: str) -> None:
     """jaxlib 0.10.2 went wrong beyond 32 768 numbers, silently."""
     env, num = jaxsafe.make(task, rta="default"), 20_480
     low, high = bounds(env)
-    states, _ = jax.jit(jax.vmap(reset, in_axes=(None, 0)))(env, jax.random.split(jax.random.key(0), num))
+    states, _ = jax.jit(jax.vmap(reset, in_axes=(None, 0)))(
+        env, jax.random.split(jax.random.key(0), num)
+    )
     desired = low + (high - low) * jax.random.uniform(jax.random.key(1), (num, env.action_size))
 
     @jax.jit
     def both(env: Any, state: Any, desired: jax.Array) -> Any:
-        backups = [one.control(env, state.sim, others_later(env, state.sim)) for one in env.rta.backups]
+        backups = [
+            one.control(env, state.sim, others_later(env, state.sim)) for one in env.rta.backups
+        ]
         return backups, env.rta.propose(env, state.sim, desired, desired)[0]
 
     batched = jax.vmap(both, in_axes=(None, 0, 0))
     apart = jax.tree.map(lambda x: x.reshape(20, -1, *x.shape[1:]), (states, desired))
     small = jax.jit(lambda lanes: jax.lax.map(lambda part: batched(env, *part), lanes))(apart)
     small = jax.tree.map(lambda x: x.reshape(num, *x.shape[2:]), small)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4), batched(env, states, desired), small)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4),
+        batched(env, states, desired),
+        small,
+    )
 
 
 @pytest.mark.parametrize("task", DOCKING)
@@ -407,12 +515,19 @@ def test_in_float32_every_projection_is_certified(task: str) -> None:
         way, course = jax.random.normal(keys[0], (2, size))
         distance = 2000.0 * jax.random.uniform(keys[1]) ** 2
         speed = (0.2 + 2 * 0.001027 * distance) * jax.random.uniform(keys[2], minval=0.99)
-        start = {"position": distance * way / jnp.linalg.norm(way), "velocity": speed * course / jnp.linalg.norm(course)}
+        start = {
+            "position": distance * way / jnp.linalg.norm(way),
+            "velocity": speed * course / jnp.linalg.norm(course),
+        }
         state, first = jaxsafe.reset_to(env, {"deputy": start})
         desired = jax.random.uniform(keys[3], (size,), minval=-1.0)
         projected, feasible = env.rta.propose(env, state.sim, desired, jnp.zeros(size))
         actual, _, _ = env.rta.filter(env, state.sim, state.memory.rta, desired)
-        return first.info.rta.certified & feasible, jnp.any(actual != projected), jnp.any(projected != desired)
+        return (
+            first.info.rta.certified & feasible,
+            jnp.any(actual != projected),
+            jnp.any(projected != desired),
+        )
 
     known, backed_up, altered = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(0), 20_000))
     assert (known & altered).sum() > 5000
@@ -434,7 +549,9 @@ def test_the_derivative_of_every_plant_is_that_of_its_step(task: str) -> None:
     for name, slope in vars(rate).items():
         if name != "delta_v":
             change = (getattr(after, name) - getattr(before, name)) / 1e-6
-            np.testing.assert_allclose(slope, change, rtol=2e-3, atol=2e-4 * float(np.abs(change).max() + 1e-3))
+            np.testing.assert_allclose(
+                slope, change, rtol=2e-3, atol=2e-4 * float(np.abs(change).max() + 1e-3)
+            )
 
 
 @pytest.mark.parametrize(("task", "degree"), [("docking2d", 1), ("docking3d", 1), ("rejoin2d", 2)])
@@ -442,7 +559,12 @@ def test_the_derivative_of_every_plant_is_that_of_its_step(task: str) -> None:
 def test_barrier_rows_are_the_change_of_h_along_the_plant(task: str, degree: int) -> None:
     env = jaxsafe.make(task)
     name = env.constraints[0].name
-    rta = ExplicitASIF(constraints=(name,), backups=(), strengthening=Polynomial(linear=jnp.asarray(0.3)), degree=degree)
+    rta = ExplicitASIF(
+        constraints=(name,),
+        backups=(),
+        strengthening=Polynomial(linear=jnp.asarray(0.3)),
+        degree=degree,
+    )
     sim = jaxsafe.reset(env, jax.random.key(1))[0].sim
     rows, offsets = rta.rows(env, sim, env.action_size)
     low, high = bounds(env)
@@ -466,11 +588,19 @@ def test_derivatives_through_the_filter_are_numbers_at_every_kink(task: str) -> 
     env = jaxsafe.make(task, rta="default")
     size = env.action_size
     zero, unit = np.zeros(size), np.eye(size)[0]
-    starts = [(zero, zero), (zero, 0.2 * unit), (100 * unit, zero), (100 * unit, 0.405 * unit), (100 * unit, 5.0 * unit)]
+    starts = [
+        (zero, zero),
+        (zero, 0.2 * unit),
+        (100 * unit, zero),
+        (100 * unit, 0.405 * unit),
+        (100 * unit, 5.0 * unit),
+    ]
 
     def outputs(action: jax.Array, sim: Any, state: Any) -> jax.Array:
         _, timestep = jaxsafe.step(env, state.replace(sim=sim), action)
-        return jnp.sum(timestep.observation) + jnp.sum(timestep.info.control_actual) + timestep.reward
+        return (
+            jnp.sum(timestep.observation) + jnp.sum(timestep.info.control_actual) + timestep.reward
+        )
 
     slopes = jax.jit(jax.grad(outputs, argnums=(0, 1), allow_int=True))
     for position, velocity in starts:
@@ -480,15 +610,21 @@ def test_derivatives_through_the_filter_are_numbers_at_every_kink(task: str) -> 
                 assert leaf.dtype == jax.dtypes.float0 or np.isfinite(leaf).all()
 
 
-@pytest.mark.parametrize(("task", "dt"), [("rejoin2d", 1.0), ("rejoin2d", 5.0), ("rejoin3d", 1.0), ("rejoin3d", 2.0)])
+@pytest.mark.parametrize(
+    ("task", "dt"), [("rejoin2d", 1.0), ("rejoin2d", 5.0), ("rejoin3d", 1.0), ("rejoin3d", 2.0)]
+)
 @pytest.mark.usefixtures("x64")
 def test_no_distance_within_a_step_is_below_its_bound(task: str, dt: float) -> None:
     """Extreme controls near a lead that reverses its turn, also such that reach a limit within the step."""
     turn = {"type": "constant", "name": "heading_rate", "at": -0.17}
-    env = jaxsafe.make(task, {"dt": dt, "lead.controller": {"type": "scripted", "commands": [turn]}})
+    env = jaxsafe.make(
+        task, {"dt": dt, "lead.controller": {"type": "scripted", "commands": [turn]}}
+    )
     low, high = bounds(env)
     rng = np.random.default_rng(0)
-    sims = jax.vmap(jaxsafe.reset, in_axes=(None, 0))(env, jax.random.split(jax.random.key(0), 500))[0].sim
+    sims = jax.vmap(jaxsafe.reset, in_axes=(None, 0))(
+        env, jax.random.split(jax.random.key(0), 500)
+    )[0].sim
     lead, wingman = (sims.platforms[name] for name in ("lead", "wingman"))
     near = lead.position + rng.normal(size=lead.position.shape) * 150.0
     wingman = wingman.replace(position=near, speed=jnp.asarray(rng.uniform(200.0, 400.0, 500)))
@@ -502,7 +638,9 @@ def test_no_distance_within_a_step_is_below_its_bound(task: str, dt: float) -> N
         after = advance(env, sim, control)
         shares = jnp.linspace(0.0, 1.0, 101)[1:]
         way = jax.vmap(lambda share: within_step(env, sim, control, share))(shares)
-        true = jnp.min(jax.vmap(lambda one: constraint(env, "collision").margin(judge(env, one)))(way))
+        true = jnp.min(
+            jax.vmap(lambda one: constraint(env, "collision").margin(judge(env, one)))(way)
+        )
         return true, constraint(env, "collision").margin(judge(env, after, sim))
 
     true, bound = jax.jit(jax.vmap(both))(sims, controls)
@@ -524,10 +662,20 @@ def test_backing_up_for_long_far_from_the_origin_does_not_drift_into_the_lead(ta
         origin = jax.random.uniform(keys[1], lead.position.shape, minval=-5e5, maxval=5e5)
         side = jax.random.normal(keys[2], lead.position.shape)
         away = (env.rta.terminal.clearance + 0.9) * side / jnp.linalg.norm(side)
-        course = {name: getattr(lead, name) for name in ("heading", "speed", "flight_path_angle") if hasattr(lead, name)}
+        course = {
+            name: getattr(lead, name)
+            for name in ("heading", "speed", "flight_path_angle")
+            if hasattr(lead, name)
+        }
         nearly = 1.0 + 1e-6 * jax.random.normal(keys[3])
-        wingman = wingman.replace(position=origin + away, **{name: value * nearly for name, value in course.items()})
-        platforms = {**state.sim.platforms, "lead": lead.replace(position=origin), "wingman": wingman}
+        wingman = wingman.replace(
+            position=origin + away, **{name: value * nearly for name, value in course.items()}
+        )
+        platforms = {
+            **state.sim.platforms,
+            "lead": lead.replace(position=origin),
+            "wingman": wingman,
+        }
 
         def attacked(state: Any, _: None) -> tuple[Any, tuple[jax.Array, jax.Array]]:
             control = intercept(env, state.sim, keys[4])
@@ -566,17 +714,28 @@ def test_a_start_outside_the_safe_set_is_flagged_and_braked() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rta.constraints": ["velocity_limi"]}, r"rta\.constraints: nothing is called 'velocity_limi'.*Did you mean"),
+        (
+            {"rta.constraints": ["velocity_limi"]},
+            r"rta\.constraints: nothing is called 'velocity_limi'.*Did you mean",
+        ),
         ({"rta.margin": -1}, r"rta\.margin: expected a number .*≥ 0, found -1"),
         ({"rta.backups": [BRAKE, BRAKE]}, r"rta: without a horizon there is one backup controller"),
-        ({"rta.horizon": 5, "rta.terminal": SLOW, "rta.backups": [BRAKE, BRAKE]}, r"rta: the name 'brake' is there twice"),
+        (
+            {"rta.horizon": 5, "rta.terminal": SLOW, "rta.backups": [BRAKE, BRAKE]},
+            r"rta: the name 'brake' is there twice",
+        ),
         ({"rta.backups": []}, r"rta: expected at least one constraint and one backup controller"),
         ({"rta.horizon": 5}, r"rta: a horizon needs a terminal set"),
         ({"rta.gamma": 0}, r"rta\.gamma: expected a number in \(0, 1\], found 0"),
-        ({"rta": {"type": "simplx"}}, r"rta: unknown type 'simplx'; choose from .*Did you mean 'simplex'\?"),
+        (
+            {"rta": {"type": "simplx"}},
+            r"rta: unknown type 'simplx'; choose from .*Did you mean 'simplex'\?",
+        ),
     ],
 )
-def test_a_filter_that_does_not_fit_is_told_in_one_line(changes: dict[str, Any], message: str) -> None:
+def test_a_filter_that_does_not_fit_is_told_in_one_line(
+    changes: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
         jaxsafe.make("docking2d", changes, rta="default")
     assert "\n" not in str(caught.value)
@@ -584,8 +743,12 @@ def test_a_filter_that_does_not_fit_is_told_in_one_line(changes: dict[str, Any],
 
 def test_the_filters_of_the_literature_are_there_to_be_broken() -> None:
     """The continuous-time barrier against a control that is held, and a monitor that never looks at the desired control."""
-    row = attack(jaxsafe.make("docking2d", rta="explicit_asif"), "intercept", 150, 32, jax.random.key(1))
-    assert row["uncertified_steps"] >= row["violating_steps_inside"] >= row["violating_steps"] > 0  # and the filter knows
+    row = attack(
+        jaxsafe.make("docking2d", rta="explicit_asif"), "intercept", 150, 32, jax.random.key(1)
+    )
+    assert (
+        row["uncertified_steps"] >= row["violating_steps_inside"] >= row["violating_steps"] > 0
+    )  # and the filter knows
     env = jaxsafe.make("docking2d", {"rta.enforce": True}, rta="explicit_asif")
     assert attack(env, "intercept", 150, 32, jax.random.key(1))["violating_steps"] == 0
     row = attack(jaxsafe.make("rejoin2d", rta="released"), "head_on", 150, 32, jax.random.key(1))
@@ -629,7 +792,10 @@ def test_stages_follow_each_other() -> None:
     assert load(dump(env)) == env
     assert jaxsafe.override(env, {"rta.stages.tight.rta.margin": 0.1}) != env
     start = {"deputy": {"position": [100.0, 0.0], "velocity": [0.0, 0.3]}}
-    alone = {name: jaxsafe.make("docking2d", rta=stage.rta) for name, stage in (("loose", loose), ("tight", tight))}
+    alone = {
+        name: jaxsafe.make("docking2d", rta=stage.rta)
+        for name, stage in (("loose", loose), ("tight", tight))
+    }
     seen = set()
     for push in (-0.5, 0.0, 0.8, 1.0):
         desired = jnp.array([0.0, push])
@@ -646,7 +812,9 @@ def test_stages_follow_each_other() -> None:
 
 def test_rejoin_needs_barriers_of_a_higher_degree() -> None:
     """A turn moves the distance only after two derivatives: of degree 1 the row is empty, which is told at once."""
-    with pytest.raises(ConfigError, match=r"^rta: of degree 1 the control has no influence on 'collision'"):
+    with pytest.raises(
+        ConfigError, match=r"^rta: of degree 1 the control has no influence on 'collision'"
+    ):
         jaxsafe.make("rejoin2d", {"rta.degree": 1}, rta="explicit_asif")
 
 
@@ -664,12 +832,19 @@ def test_slack_lets_a_barrier_be_missed_at_a_price() -> None:
 def test_the_released_filter_only_fits_where_it_can_turn() -> None:
     with pytest.raises(ConfigError, match=r"^rta: cannot be computed"):
         jaxsafe.make("docking2d", rta=CollisionSimplex(other="chief"))
-    with pytest.raises(ConfigError, match=r"^rta\.other: nothing is called 'leed'.*Did you mean 'lead'"):
+    with pytest.raises(
+        ConfigError, match=r"^rta\.other: nothing is called 'leed'.*Did you mean 'lead'"
+    ):
         jaxsafe.make("rejoin2d", {"rta.other": "leed"}, rta="released")
 
 
 def test_a_filter_and_the_constraint_that_it_needs_come_together() -> None:
-    renamed = {"type": "speed_limit", "name": "slow", "speed": "speed", "velocity_limit": "velocity_limit"}
+    renamed = {
+        "type": "speed_limit",
+        "name": "slow",
+        "speed": "speed",
+        "velocity_limit": "velocity_limit",
+    }
     rta = Simplex(**{**DOCKING_FILTER, "constraints": ("slow",)})
     env = jaxsafe.make("docking2d", {"constraints": [renamed], "rta.margin": 0.01}, rta=rta)
     assert [one.name for one in env.constraints] == ["slow"]
@@ -703,13 +878,21 @@ SHY = {"type": "of_tests_shy", "name": "heading_rate", "other": "wingman"}
         slow("rejoin3d", {}, False),
     ],
 )
-def test_a_certificate_is_the_least_h_on_the_way_of_each_backup(task: str, changes: dict[str, Any], reacts: bool) -> None:
+def test_a_certificate_is_the_least_h_on_the_way_of_each_backup(
+    task: str, changes: dict[str, Any], reacts: bool
+) -> None:
     env = jaxsafe.make(task, changes, rta="default")
     rta, away = env.rta, jnp.zeros(2 if task == "rejoin2d" else 3)
     assert isinstance(rta, Simplex)
     lead = {"position": away, "heading": 0.0, "speed": 250.0}
-    wingman = {"position": away.at[:2].set(jnp.array([-300.0, 250.0])), "heading": 0.1, "speed": 300.0}
-    sim = jaxsafe.reset_to(env, {"lead": lead, "wingman": wingman})[0].sim.replace(regions={}, status={})
+    wingman = {
+        "position": away.at[:2].set(jnp.array([-300.0, 250.0])),
+        "heading": 0.1,
+        "speed": 300.0,
+    }
+    sim = jaxsafe.reset_to(env, {"lead": lead, "wingman": wingman})[0].sim.replace(
+        regions={}, status={}
+    )
     assert others_react(env, sim) == reacts
 
     @jax.jit
@@ -720,10 +903,14 @@ def test_a_certificate_is_the_least_h_on_the_way_of_each_backup(task: str, chang
             def one(carry: Any, _: None, backup: Any = backup) -> Any:
                 at, least = carry
                 later = others_later(env, at)
-                after = advance(env, at, jnp.clip(backup.control(env, at, later), *bounds(env)), later)
+                after = advance(
+                    env, at, jnp.clip(backup.control(env, at, later), *bounds(env)), later
+                )
                 return (after, jnp.minimum(least, env.rta.lowest(env, at, after))), None
 
-            (last, least), _ = jax.lax.scan(one, (sim, env.rta.lowest(env, sim, sim)), length=rta.horizon)
+            (last, least), _ = jax.lax.scan(
+                one, (sim, env.rta.lowest(env, sim, sim)), length=rta.horizon
+            )
             values.append(jnp.where(env.rta.terminal.contains(env, last), least, -jnp.inf))
         return values
 

@@ -30,13 +30,21 @@ def resolved(*words: str) -> tuple[TrainConfig, jaxsafe.Environment]:
 
 def collected(learns_from: str) -> Transition:
     env = jaxsafe.make("docking2d", rta="default")
-    agent, ppo = normalise(Agent(hidden=(8,))), normalise(PPO(num_envs=16, num_steps=32, learns_from=learns_from))
+    agent, ppo = (
+        normalise(Agent(hidden=(8,))),
+        normalise(PPO(num_envs=16, num_steps=32, learns_from=learns_from)),
+    )
     state = init(env, agent, ppo, jax.random.key(0))
-    return jax.jit(lambda state, key: collect(env, agent, ppo, state, key)[1])(state, jax.random.key(1))
+    return jax.jit(lambda state, key: collect(env, agent, ppo, state, key)[1])(
+        state, jax.random.key(1)
+    )
 
 
 def test_ppo_learns_from_the_desired_or_the_actual_control() -> None:
-    desired, actual = np.asarray(collected("desired").action), np.asarray(collected("actual").action)
+    desired, actual = (
+        np.asarray(collected("desired").action),
+        np.asarray(collected("actual").action),
+    )
     altered = (desired != actual).any(axis=-1)
     assert 0.01 < altered.mean() < 0.9
     assert (np.abs(actual[altered]) <= 1.0).all()  # what acted was within its bounds
@@ -45,7 +53,10 @@ def test_ppo_learns_from_the_desired_or_the_actual_control() -> None:
 
 def test_the_log_probability_is_that_of_the_stored_action() -> None:
     env = jaxsafe.make("docking2d", rta="default")
-    agent, ppo = normalise(Agent(hidden=(8,))), normalise(PPO(num_envs=16, num_steps=32, learns_from="actual"))
+    agent, ppo = (
+        normalise(Agent(hidden=(8,))),
+        normalise(PPO(num_envs=16, num_steps=32, learns_from="actual")),
+    )
     params = init(env, agent, ppo, jax.random.key(0)).params
     found = collected("actual")
     expected = agent.distribution(env, params, found.inputs).log_prob(found.action)
@@ -78,10 +89,19 @@ def test_interventions_are_punished_where_there_is_a_filter_and_nothing_else_is_
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["rta_training=unpunished"], r"^rta_training: 'unpunished' needs run time assurance, for instance rta=default"),
-        (["rta_training=punished"], r"^rta_training: 'punished' needs run time assurance, for instance rta=default"),
+        (
+            ["rta_training=unpunished"],
+            r"^rta_training: 'unpunished' needs run time assurance, for instance rta=default",
+        ),
+        (
+            ["rta_training=punished"],
+            r"^rta_training: 'punished' needs run time assurance, for instance rta=default",
+        ),
         (["rta=default", "rta_training=punishd"], r"^rta_training: .*Did you mean 'punished'"),
-        (["rta=default", "rta_training=corrected", "actions=discrete"], r"^ppo\.learns_from: .*use actions=continuous"),
+        (
+            ["rta=default", "rta_training=corrected", "actions=discrete"],
+            r"^ppo\.learns_from: .*use actions=continuous",
+        ),
         (["rta=released"], r"^rta: docking2d has no preset 'released'"),
     ],
 )
@@ -108,19 +128,25 @@ def results(path: Path) -> Any:
     return json.loads((path / "results.json").read_text())["evaluation"]["stochastic"]
 
 
-def test_a_run_reports_how_often_it_was_corrected(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_reports_how_often_it_was_corrected(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert results(run)["intervention_rate"]["mean"] > 0.0
     assert results(run)["episode_safety_violation_rate"]["mean"] == 0.0
     rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
     assert any(row["intervention_share"] for row in rows)
     assert any(row["reward/intervention"] for row in rows)
-    logged = [json.loads(line) for file in run.rglob("*.jsonl") for line in file.read_text().splitlines()]
+    logged = [
+        json.loads(line) for file in run.rglob("*.jsonl") for line in file.read_text().splitlines()
+    ]
     steps = [row["rta"] for row in logged if "rta" in row]
     assert any(row["intervening"] for row in steps)
     assert all(row["certified"] for row in steps)
 
 
-def test_an_evaluation_switches_the_filter(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_evaluation_switches_the_filter(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert evaluate([f"run={run}", "episodes=6", f"out={tmp_path / 'own'}"]) == 0
     assert results(tmp_path / "own") == results(run)
     assert "steps with an intervention" in capsys.readouterr().out
@@ -128,8 +154,13 @@ def test_an_evaluation_switches_the_filter(run: Path, tmp_path: Path, capsys: py
     assert "intervention" not in capsys.readouterr().out
     assert results(tmp_path / "none")["intervention_rate"]["mean"] is None
     assert results(tmp_path / "none")["episode_safety_violation_rate"]["mean"] > 0.0
-    assert json.loads((tmp_path / "none" / "results.json").read_text())["changes"] == {"rta": "none"}
-    assert evaluate([f"run={run}", "episodes=6", "rta=discrete_asif", f"out={tmp_path / 'other'}"]) == 0
+    assert json.loads((tmp_path / "none" / "results.json").read_text())["changes"] == {
+        "rta": "none"
+    }
+    assert (
+        evaluate([f"run={run}", "episodes=6", "rta=discrete_asif", f"out={tmp_path / 'other'}"])
+        == 0
+    )
     assert results(tmp_path / "other") != results(run)
     with pytest.raises(ConfigError, match=r"^rta: docking2d has no preset 'of'"):
         evaluate([f"run={run}", "rta=of"])

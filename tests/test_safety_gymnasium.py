@@ -21,7 +21,9 @@ def test_the_cost_stands_between_reward_and_end() -> None:
 
 def test_the_cost_of_a_lane_is_that_of_the_step_even_where_it_starts_anew() -> None:
     ends = {"terminal.timeout.limit": 1.0, "reward.velocity_constraint.scale": -0.01}
-    env = SafetyEnv("docking2d", 8, {**ends, "deputy.start.velocity.share": [1.5, 1.6]})  # every start is too fast
+    env = SafetyEnv(
+        "docking2d", 8, {**ends, "deputy.start.velocity.share": [1.5, 1.6]}
+    )  # every start is too fast
     assert env.single_action_space.shape == (2,)
     assert env.single_observation_space.shape == (6,)
     env.reset(seed=0)
@@ -43,7 +45,9 @@ def test_the_cost_of_a_lane_is_that_of_the_step_even_where_it_starts_anew() -> N
 def test_an_action_that_is_no_number_costs_and_ends_the_episode(num_envs: int | None) -> None:
     env = SafetyEnv("docking2d", num_envs)
     env.reset(seed=0)
-    _, _, cost, terminated, truncated, _ = env.step(np.full(env.action_space.shape, np.nan, np.float32))
+    _, _, cost, terminated, truncated, _ = env.step(
+        np.full(env.action_space.shape, np.nan, np.float32)
+    )
     assert np.all(cost == 1.0)
     assert np.all(terminated)
     assert not np.any(truncated)
@@ -52,8 +56,12 @@ def test_an_action_that_is_no_number_costs_and_ends_the_episode(num_envs: int | 
 @pytest.mark.peer
 @pytest.mark.slow
 @pytest.mark.filterwarnings("default")
-def test_omnisafe_learns_to_dock_within_the_budget(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    if importlib.util.find_spec("omnisafe") is None:  # importing it needs what the example puts in place first
+def test_omnisafe_learns_to_dock_within_the_budget(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    if (
+        importlib.util.find_spec("omnisafe") is None
+    ):  # importing it needs what the example puts in place first
         pytest.skip("needs omnisafe")
     monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "examples"))
     monkeypatch.chdir(tmp_path)

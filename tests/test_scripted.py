@@ -31,13 +31,24 @@ def test_a_constant_is_the_same_at_all_times() -> None:
 
 def test_a_schedule_is_zero_before_its_first_time_and_keeps_its_last_value() -> None:
     schedule = Schedule(name="heading_rate", times=(2.0, 5.0, 6.0), values=(0.5, -0.25, 0.0))
-    assert values(schedule, [0.0, 1.9, 2.0, 4.9, 5.0, 5.9, 6.0, 1e6]) == [0.0, 0.0, 0.5, 0.5, -0.25, -0.25, 0.0, 0.0]
+    assert values(schedule, [0.0, 1.9, 2.0, 4.9, 5.0, 5.9, 6.0, 1e6]) == [
+        0.0,
+        0.0,
+        0.5,
+        0.5,
+        -0.25,
+        -0.25,
+        0.0,
+        0.0,
+    ]
     assert values(Schedule(name="x", times=(0.0,), values=(3.0,)), [0.0, 9.0]) == [3.0, 3.0]
 
 
 def test_a_sinusoid_has_amplitude_period_and_phase() -> None:
     weave = Sinusoid(name="heading_rate", amplitude=0.1, period=40.0)
-    np.testing.assert_allclose(values(weave, [0.0, 10.0, 20.0, 30.0, 45.0]), [0.0, 0.1, 0.0, -0.1, 0.1 / 2**0.5], atol=1e-7)
+    np.testing.assert_allclose(
+        values(weave, [0.0, 10.0, 20.0, 30.0, 45.0]), [0.0, 0.1, 0.0, -0.1, 0.1 / 2**0.5], atol=1e-7
+    )
     ahead = Sinusoid(name="heading_rate", amplitude=0.1, period=40.0, phase=math.pi / 2)
     np.testing.assert_allclose(values(ahead, [0.0, 10.0, 20.0]), [0.1, 0.0, -0.1], atol=1e-7)
 
@@ -49,7 +60,9 @@ def test_a_script_names_its_commands_and_takes_no_actions() -> None:
     assert script.points == ()
     assert not script.takes_actions
     found = script.control(jnp.zeros(0), at(1.0))
-    assert {name: float(value) for name, value in found.items()} == pytest.approx({"b": 1.0, "a": 2.0})
+    assert {name: float(value) for name, value in found.items()} == pytest.approx(
+        {"b": 1.0, "a": 2.0}
+    )
     assert Scripted().control(jnp.zeros(0), at(0.0)) == {}
 
 
@@ -64,7 +77,9 @@ def test_a_script_names_its_commands_and_takes_no_actions() -> None:
 )
 def test_a_schedule_with_a_problem_is_refused(times: Any, values: Any, problem: str) -> None:
     schedule = Schedule(name="heading_rate", times=times, values=values)
-    with pytest.raises(ConfigError, match=rf"^platforms\.lead\.controller\.commands\.heading_rate: {problem}$"):
+    with pytest.raises(
+        ConfigError, match=rf"^platforms\.lead\.controller\.commands\.heading_rate: {problem}$"
+    ):
         jaxsafe.make("rejoin2d", {"lead.controller": normalise(Scripted(commands=(schedule,)))})
 
 
@@ -76,7 +91,9 @@ def follow(controller: Any, num_steps: int) -> list[Any]:
     """The lead's states along an episode of rejoin2d, the start first."""
     env = jaxsafe.make("rejoin2d", {"lead.controller": normalise(controller)})
     start = {"position": [0.0, 0.0], "heading": 0.0, "speed": 300.0}
-    state, _ = jaxsafe.reset_to(env, {"lead": start, "wingman": start | {"position": [5000.0, 0.0]}})
+    state, _ = jaxsafe.reset_to(
+        env, {"lead": start, "wingman": start | {"position": [5000.0, 0.0]}}
+    )
     step, states = jax.jit(jaxsafe.step), [state.sim.platforms["lead"]]
     for _ in range(num_steps):
         state, _ = step(env, state, jnp.zeros(2))
@@ -87,8 +104,12 @@ def follow(controller: Any, num_steps: int) -> list[Any]:
 def test_a_command_holds_over_the_step_that_begins_at_its_time() -> None:
     schedule = Schedule(name="heading_rate", times=(1.0, 3.0), values=(0.1, -0.05))
     states = follow(Scripted(commands=(schedule, Constant(name="acceleration", at=2.0))), 5)
-    np.testing.assert_allclose([state.heading for state in states], [0.0, 0.0, 0.1, 0.2, 0.15, 0.1], atol=1e-6)
-    np.testing.assert_allclose([state.speed for state in states], 300.0 + 2.0 * np.arange(6), rtol=1e-6)
+    np.testing.assert_allclose(
+        [state.heading for state in states], [0.0, 0.0, 0.1, 0.2, 0.15, 0.1], atol=1e-6
+    )
+    np.testing.assert_allclose(
+        [state.speed for state in states], 300.0 + 2.0 * np.arange(6), rtol=1e-6
+    )
 
 
 def test_a_weaving_lead_comes_back_to_its_heading_after_a_period() -> None:

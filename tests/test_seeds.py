@@ -21,10 +21,14 @@ HYPER = normalise(PPO(num_envs=4, num_steps=32, num_epochs=2))
 UPDATES = 5
 
 
-def train(shared: tuple, key: jax.Array, updates: int = UPDATES, shard: Shard = WHOLE) -> TrainState:
+def train(
+    shared: tuple, key: jax.Array, updates: int = UPDATES, shard: Shard = WHOLE
+) -> TrainState:
     env, agent, ppo = shared
     begin = init(env, agent, ppo, key, shard)
-    return jax.lax.fori_loop(0, updates, lambda _, state: update(env, agent, ppo, UPDATES, state, shard), begin)
+    return jax.lax.fori_loop(
+        0, updates, lambda _, state: update(env, agent, ppo, UPDATES, state, shard), begin
+    )
 
 
 def seeds(first: int, count: int, share: int = 1, updates: int = UPDATES) -> TrainState:
@@ -33,7 +37,9 @@ def seeds(first: int, count: int, share: int = 1, updates: int = UPDATES) -> Tra
     def train_shared(shared: tuple, key: jax.Array) -> TrainState:
         return train(shared, key, updates, mapper.shard)
 
-    state = mapper.map(train_shared, out_specs=STATE)(mapper.replicate((ENV, AGENT, HYPER)), mapper.keys(first))
+    state = mapper.map(train_shared, out_specs=STATE)(
+        mapper.replicate((ENV, AGENT, HYPER)), mapper.keys(first)
+    )
     return mapper.gather(state)
 
 
@@ -70,7 +76,9 @@ def test_oriented_docking_starts_bit_for_bit_where_the_seed_alone_starts() -> No
 
 
 @pytest.mark.parametrize(("updates", "share"), [(0, 2), (UPDATES, 2)])
-def test_devices_that_share_a_seed_train_what_one_trains_to_rounding(updates: int, share: int) -> None:
+def test_devices_that_share_a_seed_train_what_one_trains_to_rounding(
+    updates: int, share: int
+) -> None:
     alone, shared = seeds(0, 1, 1, updates), seeds(0, 1, share, updates)
     if not updates:
         jax.tree.map(np.testing.assert_array_equal, alone, shared)
@@ -81,7 +89,9 @@ def test_devices_that_share_a_seed_train_what_one_trains_to_rounding(updates: in
 def test_a_seed_is_to_rounding_the_same_run_under_vmap(three: TrainState) -> None:
     keys = jax.vmap(jax.random.key)(np.arange(3))
     together = jax.jit(jax.vmap(train, in_axes=(None, 0)))((ENV, AGENT, HYPER), keys)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), three.params, together.params)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), three.params, together.params
+    )
 
 
 def test_seeds_differ(three: TrainState) -> None:

@@ -33,15 +33,21 @@ def test_every_number_is_equally_likely_in_every_place() -> None:
 def test_neighbours_are_independent_in_a_batch_of_the_usual_size() -> None:
     found = orders(2048, 50).astype(float)
     centred = (found - 1023.5) / 591.2
-    correlation = (centred[:, 1:] * centred[:, :-1]).mean(axis=1)  # −1/2047 expected, 1/√2048 each, 50 of them
+    correlation = (centred[:, 1:] * centred[:, :-1]).mean(
+        axis=1
+    )  # −1/2047 expected, 1/√2048 each, 50 of them
     assert abs(correlation.mean()) < 4 / np.sqrt(2048 * 50)
-    minibatch = centred[:, :1024].mean(axis=1) * np.sqrt(1024) * np.sqrt(2)  # half of all, without replacement
+    minibatch = (
+        centred[:, :1024].mean(axis=1) * np.sqrt(1024) * np.sqrt(2)
+    )  # half of all, without replacement
     assert scipy.stats.kstest(minibatch, "norm").pvalue > 0.001
 
 
 def test_minibatches_split_close_pairs_as_often_as_chance_does() -> None:
     found = orders(2048, 200)
     place = np.argsort(found, axis=1)
-    together = ((place[:, 0::2] < 1024) == (place[:, 1::2] < 1024)).sum(axis=1)  # 2k and 2k + 1 in the same half
+    together = ((place[:, 0::2] < 1024) == (place[:, 1::2] < 1024)).sum(
+        axis=1
+    )  # 2k and 2k + 1 in the same half
     assert together.mean() == pytest.approx(1024 * 1023 / 2047, abs=4 * 16 / np.sqrt(200))
     assert together.std() == pytest.approx(16, rel=0.25)

@@ -28,7 +28,11 @@ def test_the_end_of_an_episode_is_told_as_the_library_wants_it(make: Any) -> Non
     assert reward.dtype == np.float32
     assert (observation != first).any()
     for lane, info in enumerate(infos):
-        assert (info["outcome"], info["is_success"], info["TimeLimit.truncated"]) == ("timeout", False, False)
+        assert (info["outcome"], info["is_success"], info["TimeLimit.truncated"]) == (
+            "timeout",
+            False,
+            False,
+        )
         assert (info["terminal_observation"] != observation[lane]).any()
     env.seed(5)
     assert np.array_equal(env.reset(), first)
@@ -45,7 +49,11 @@ def test_an_action_that_is_no_number_is_a_failure_that_costs(make: Any) -> None:
     env.reset()
     observation, _, done, infos = env.step(np.array([[0.0, 0.0], [np.nan, 0.0]]))
     assert done.tolist() == [False, True]
-    assert (infos[1]["cost"], infos[1]["outcome"], infos[1]["is_success"]) == (1.0, "diverged", False)
+    assert (infos[1]["cost"], infos[1]["outcome"], infos[1]["is_success"]) == (
+        1.0,
+        "diverged",
+        False,
+    )
     assert np.isfinite(observation).all()
 
 
@@ -66,16 +74,23 @@ def test_options_place_lanes_and_the_infos_of_starts_are_kept(make: Any) -> None
             one.set_options(options)
         np.testing.assert_allclose(env.reset(), expected.reset(), rtol=1e-6)
         for _ in range(5):  # options are for one reset
-            np.testing.assert_allclose(env.step(np.ones((3, 2)))[0], expected.step(np.ones((3, 2)))[0], rtol=1e-5)
+            np.testing.assert_allclose(
+                env.step(np.ones((3, 2)))[0], expected.step(np.ones((3, 2)))[0], rtol=1e-5
+            )
             for ours, theirs in zip(env.reset_infos, expected.reset_infos, strict=True):
                 assert ours.keys() == theirs.keys()
                 assert ours["margins"] == pytest.approx(theirs["margins"])
                 assert ours["status"] == pytest.approx(theirs["status"])
-                assert (ours["outcome"], type(ours["cost"])) == (theirs["outcome"], type(theirs["cost"]))
+                assert (ours["outcome"], type(ours["cost"])) == (
+                    theirs["outcome"],
+                    type(theirs["cost"]),
+                )
     with pytest.raises(ConfigError, match="set_options: expected options for 3 lanes, found 1"):
         env.set_options([placed(20.0)])
     env.set_options({"stat": {}})
-    with pytest.raises(ConfigError, match="reset: options: unknown 'stat'; choose from start, parameters"):
+    with pytest.raises(
+        ConfigError, match="reset: options: unknown 'stat'; choose from start, parameters"
+    ):
         env.reset()
 
 

@@ -25,20 +25,36 @@ def shell(command: str, place: Path) -> subprocess.CompletedProcess[str]:
     command = f"jaxsafe() {{ module=$1; shift; '{sys.executable}' -m jaxsafe.$module \"$@\"; }}; {command}"
     found = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUTF8": "0"}
     return subprocess.run(
-        ["bash", "-c", command], cwd=place, env=found, capture_output=True, check=False, encoding="utf-8", errors="replace"
+        ["bash", "-c", command],
+        cwd=place,
+        env=found,
+        capture_output=True,
+        check=False,
+        encoding="utf-8",
+        errors="replace",
     )
 
 
-@pytest.mark.parametrize("environment", ["PYTHONIOENCODING=cp1252", "PYTHONIOENCODING=ascii", "LC_ALL=POSIX"])
+@pytest.mark.parametrize(
+    "environment", ["PYTHONIOENCODING=cp1252", "PYTHONIOENCODING=ascii", "LC_ALL=POSIX"]
+)
 def test_what_an_encoding_lacks_is_replaced(environment: str, tmp_path: Path) -> None:
-    told = shell(f"export {environment}; jaxsafe plot.safe_set points=1 2>&1; jaxsafe train --help", tmp_path)
+    told = shell(
+        f"export {environment}; jaxsafe plot.safe_set points=1 2>&1; jaxsafe train --help", tmp_path
+    )
     assert told.stdout.startswith("error: points: expected a whole number ")
     assert "usage: python -m jaxsafe.train" in told.stdout
     assert told.stderr == ""
 
 
-def test_an_environment_that_is_printed_can_be_read_again_whatever_the_encoding(tmp_path: Path) -> None:
-    text = (ROOT / "configs" / "custom_env.yaml").read_text(encoding="utf-8").replace("docking_region", "Ringfläche_日本")
+def test_an_environment_that_is_printed_can_be_read_again_whatever_the_encoding(
+    tmp_path: Path,
+) -> None:
+    text = (
+        (ROOT / "configs" / "custom_env.yaml")
+        .read_text(encoding="utf-8")
+        .replace("docking_region", "Ringfläche_日本")
+    )
     (tmp_path / "mine.yaml").write_text(text, encoding="utf-8")
     ran = shell("export PYTHONIOENCODING=cp1252; jaxsafe config mine.yaml > copy.yaml", tmp_path)
     assert (ran.returncode, ran.stderr) == (0, "")
@@ -49,7 +65,11 @@ def test_an_environment_that_is_printed_can_be_read_again_whatever_the_encoding(
     ("command", "code", "told"),
     [
         ("jaxsafe config docking2d | head -1; exit ${PIPESTATUS[0]}", 0, ""),
-        ("jaxsafe config docking2d > /dev/full", 2, "error: standard output: No space left on device\n"),
+        (
+            "jaxsafe config docking2d > /dev/full",
+            2,
+            "error: standard output: No space left on device\n",
+        ),
         ("jaxsafe config docking2d >&-", 0, ""),
         ("jaxsafe config docking2d 2>&- > file", 0, ""),
         ("jaxsafe config nowhere 2>&-", 2, ""),
@@ -61,7 +81,11 @@ def test_a_reader_that_goes_away_and_a_full_disk_end_no_command_in_a_traceback(
     command: str, code: int, told: str, tmp_path: Path
 ) -> None:
     ran = shell(command, tmp_path)
-    assert (ran.returncode, ran.stderr[: len(told)], ran.stderr.count("\n")) == (code, told, int(bool(told)))
+    assert (ran.returncode, ran.stderr[: len(told)], ran.stderr.count("\n")) == (
+        code,
+        told,
+        int(bool(told)),
+    )
 
 
 def test_control_characters_of_a_stranger_do_not_reach_the_terminal() -> None:

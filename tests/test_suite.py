@@ -19,7 +19,9 @@ from jaxsafe.schema.component import Component, fields
 from jaxsafe.types import State, TimeStep
 
 CUSTOM = "custom_env"
-VARIANTS = [(task, actions) for task in (*TASKS, CUSTOM) for actions in ("continuous", "discrete")][:-1]
+VARIANTS = [(task, actions) for task in (*TASKS, CUSTOM) for actions in ("continuous", "discrete")][
+    :-1
+]
 REJOIN = [task for task in TASKS if task.startswith("rejoin")]
 NUM_STEPS, NUM_ENVS = 40, 5
 
@@ -40,7 +42,11 @@ OWN_DIRECTION = {"wingman_velocity.x", "wingman_velocity.y", "wingman_velocity.z
 """An aircraft flies forwards: in its own frame the direction of its velocity is x."""
 
 ALIKE_AT_START = {
-    "rejoin2d": {"lead_position.magnitude", "rejoin_position.magnitude", *sorted(OWN_DIRECTION)[:2]},
+    "rejoin2d": {
+        "lead_position.magnitude",
+        "rejoin_position.magnitude",
+        *sorted(OWN_DIRECTION)[:2],
+    },
     "rejoin3d": {"lead_position.magnitude", "rejoin_position.magnitude", *OWN_DIRECTION}
     | {"lead_velocity.z", "roll", "flight_path_angle"},
     "docking2d_oriented": {"attitude_rate"},
@@ -110,7 +116,10 @@ def first(env: Environment, task: str, started: tuple[State, TimeStep]) -> tuple
     if task not in REJOIN:
         return started
     offsets = ([-20.0, 5.0], [-300.0, 40.0], REJOIN_POINT, [-200.0, 300.0], [-800.0, -300.0])
-    starts = [rejoin_start(env, *each) for each in zip(offsets, np.linspace(0.0, 0.4, NUM_ENVS), strict=True)]
+    starts = [
+        rejoin_start(env, *each)
+        for each in zip(offsets, np.linspace(0.0, 0.4, NUM_ENVS), strict=True)
+    ]
     for start, speed in zip(starts, np.linspace(250.0, 300.0, NUM_ENVS), strict=True):
         start["lead"]["speed"] = speed
     return place(env, starts)
@@ -159,16 +168,31 @@ def place(env: Environment, starts: list[dict[str, Any]]) -> tuple[State, TimeSt
     return place_many(env, stacked, dict.fromkeys(env.randomize, 12.0))
 
 
-def docking_start(env: Environment, position: Any, velocity: Any = (0.0, 0.0), **fields: float) -> dict[str, Any]:
-    fields = {"attitude": 0.3, "attitude_rate": 0.0} | fields if "attitude" in env.agent_platform.random_fields else {}
+def docking_start(
+    env: Environment, position: Any, velocity: Any = (0.0, 0.0), **fields: float
+) -> dict[str, Any]:
+    fields = (
+        {"attitude": 0.3, "attitude_rate": 0.0} | fields
+        if "attitude" in env.agent_platform.random_fields
+        else {}
+    )
     return {"deputy": {"position": pad(env, position), "velocity": pad(env, velocity), **fields}}
 
 
-def rejoin_start(env: Environment, offset: Any, heading: float = 0.0, speed: float = 300.0, **angles: float) -> Any:
+def rejoin_start(
+    env: Environment, offset: Any, heading: float = 0.0, speed: float = 300.0, **angles: float
+) -> Any:
     """The lead at the origin, flying along x at 300 ft/s; the wingman at an offset from it."""
-    angles = {"roll": 0.0, "flight_path_angle": 0.0} | angles if env.agent_platform.dimension == 3 else {}
+    angles = (
+        {"roll": 0.0, "flight_path_angle": 0.0} | angles
+        if env.agent_platform.dimension == 3
+        else {}
+    )
     lead = {"position": pad(env, (0.0, 0.0)), "heading": 0.0, "speed": 300.0}
-    return {"lead": lead, "wingman": {"position": pad(env, offset), "heading": heading, "speed": speed, **angles}}
+    return {
+        "lead": lead,
+        "wingman": {"position": pad(env, offset), "heading": heading, "speed": speed, **angles},
+    }
 
 
 def inside(env: Environment, task: str) -> dict[str, Any]:
@@ -197,12 +221,18 @@ def edges(env: Environment, task: str) -> list[dict[str, Any]]:
 
 
 def test_with_and_without_jit_are_the_same(env: Environment) -> None:
-    chex.assert_trees_all_close(jaxsafe.reset(env, keys()[0]), reset(env, keys()[0]), rtol=1e-5, atol=1e-5)
+    chex.assert_trees_all_close(
+        jaxsafe.reset(env, keys()[0]), reset(env, keys()[0]), rtol=1e-5, atol=1e-5
+    )
     state, taken = reset(env, keys()[0])[0], random_actions(env)
-    chex.assert_trees_all_close(jaxsafe.step(env, state, taken), step(env, state, taken), rtol=1e-5, atol=1e-5)
+    chex.assert_trees_all_close(
+        jaxsafe.step(env, state, taken), step(env, state, taken), rtol=1e-5, atol=1e-5
+    )
 
 
-def test_a_batch_of_states_is_a_loop_over_states(env: Environment, started: tuple[State, TimeStep]) -> None:
+def test_a_batch_of_states_is_a_loop_over_states(
+    env: Environment, started: tuple[State, TimeStep]
+) -> None:
     actions = random_actions(env, NUM_ENVS)
     stepped = step_many(env, started[0], actions)
     for i in range(NUM_ENVS):
@@ -211,24 +241,37 @@ def test_a_batch_of_states_is_a_loop_over_states(env: Environment, started: tupl
         chex.assert_trees_all_close(item(stepped, i), alone, rtol=1e-5, atol=1e-5)
 
 
-def test_a_batch_of_parameters_is_a_loop_over_overrides(env: Environment, started: tuple[State, TimeStep]) -> None:
+def test_a_batch_of_parameters_is_a_loop_over_overrides(
+    env: Environment, started: tuple[State, TimeStep]
+) -> None:
     state, taken = item(started[0], 0), action(env, 1.0)
     actuator = f"{env.agent}.controller.actuators.{env.action_names[0]}.high"
 
     def changed(high: Any, dt: Any, farthest: Any) -> Environment:
-        return jaxsafe.override(env, {actuator: high, "dt": dt, "terminal.distance.limit": farthest})
+        return jaxsafe.override(
+            env, {actuator: high, "dt": dt, "terminal.distance.limit": farthest}
+        )
 
     numbers = [0.1, 0.2, 0.3], [0.5, 1.0, 2.0], [1.0, 1e6, 10.0]
-    batch = jax.jit(jax.vmap(lambda *each: jaxsafe.step(changed(*each), state, taken)))(*map(jnp.asarray, numbers))
+    batch = jax.jit(jax.vmap(lambda *each: jaxsafe.step(changed(*each), state, taken)))(
+        *map(jnp.asarray, numbers)
+    )
     for i, each in enumerate(zip(*numbers, strict=True)):
-        chex.assert_trees_all_close(item(batch, i), step(changed(*each), state, taken), rtol=1e-5, atol=1e-5)
+        chex.assert_trees_all_close(
+            item(batch, i), step(changed(*each), state, taken), rtol=1e-5, atol=1e-5
+        )
     np.testing.assert_allclose(batch[1].info.control_desired[:, 0], numbers[0], rtol=1e-6)
     np.testing.assert_array_equal(batch[0].sim.time, numbers[1])
     assert batch[1].terminated.tolist() == [True, False, True]
 
 
-def test_a_batch_of_environments_steps_as_each_of_them(env: Environment, started: tuple[State, TimeStep]) -> None:
-    changes = [{"reward.distance_change.scale": scale, "dt": dt} for scale, dt in ((6, 1), (12, 2), (24, 0.5))]
+def test_a_batch_of_environments_steps_as_each_of_them(
+    env: Environment, started: tuple[State, TimeStep]
+) -> None:
+    changes = [
+        {"reward.distance_change.scale": scale, "dt": dt}
+        for scale, dt in ((6, 1), (12, 2), (24, 0.5))
+    ]
     each = [jaxsafe.override(env, change) for change in changes]
     batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
     states, actions = jax.tree.map(lambda leaf: leaf[:3], started[0]), random_actions(env, 3)
@@ -238,20 +281,31 @@ def test_a_batch_of_environments_steps_as_each_of_them(env: Environment, started
         chex.assert_trees_all_close(item(stepped, i), alone, rtol=1e-5, atol=1e-5)
 
 
-def test_the_same_key_and_actions_give_the_same_bits(env: Environment, started: tuple[State, TimeStep]) -> None:
+def test_the_same_key_and_actions_give_the_same_bits(
+    env: Environment, started: tuple[State, TimeStep]
+) -> None:
     chex.assert_trees_all_equal(reset_many(env, keys()), started)
     state, taken = item(started[0], 0), random_actions(env)
     chex.assert_trees_all_equal(step(env, state, taken), step(env, state, taken))
 
 
 @pytest.mark.parametrize("x64", [False, True])
-def test_reset_and_step_agree_in_structure_shape_and_dtype(variant: tuple[str, str], x64: bool) -> None:
+def test_reset_and_step_agree_in_structure_shape_and_dtype(
+    variant: tuple[str, str], x64: bool
+) -> None:
     def shapes(tree: Any) -> Any:
-        return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)), tree)
+        return jax.tree.map(
+            lambda leaf: (leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)), tree
+        )
 
     with jax.enable_x64(x64):
         agent = build(*variant).agent
-        env = build(*variant, randomize={f"{agent}.controller.actuators.{build(*variant).action_names[0]}.high": [1, 2]})
+        env = build(
+            *variant,
+            randomize={
+                f"{agent}.controller.actuators.{build(*variant).action_names[0]}.high": [1, 2]
+            },
+        )
         started = jax.eval_shape(jaxsafe.reset, env, jax.random.key(0))
         stepped = jax.eval_shape(jaxsafe.step, env, started[0], action(env, 0.0))
         chex.assert_trees_all_equal_structs(started, stepped)
@@ -263,7 +317,9 @@ def test_reset_and_step_agree_in_structure_shape_and_dtype(variant: tuple[str, s
 
 def test_any_numbers_compile_once(env: Environment, task: str) -> None:
     numbers = (10, 11.0, np.float32(12.0), np.float64(13.0), jnp.asarray(14.0), jnp.asarray(15))
-    changed = [jaxsafe.override(env, {"dt": dt, "reward.failure.values.distance": -dt}) for dt in numbers]
+    changed = [
+        jaxsafe.override(env, {"dt": dt, "reward.failure.values.distance": -dt}) for dt in numbers
+    ]
     step(env, reset(env, keys()[0])[0], random_actions(env))
     num_traces = len(TRACED)
     for one in (env, *changed, jax.tree.map(lambda leaf: leaf * 1.5, env)):
@@ -275,7 +331,9 @@ def test_any_numbers_compile_once(env: Environment, task: str) -> None:
     assert len(TRACED) == num_traces > 0
 
 
-def test_what_is_dumped_loads_as_the_same_environment(env: Environment, variant: tuple[str, str]) -> None:
+def test_what_is_dumped_loads_as_the_same_environment(
+    env: Environment, variant: tuple[str, str]
+) -> None:
     assert load(dump(env)) == env
     if variant[0] != CUSTOM:
         released = build(*variant, variant="released")
@@ -285,29 +343,43 @@ def test_what_is_dumped_loads_as_the_same_environment(env: Environment, variant:
 # Observations
 
 
-def test_starts_vary_in_every_element(started: tuple[State, TimeStep], env: Environment, task: str) -> None:
+def test_starts_vary_in_every_element(
+    started: tuple[State, TimeStep], env: Environment, task: str
+) -> None:
     spread = np.asarray(started[1].observation).std(axis=0)
-    alike = {name for name, deviation in zip(env.observation_names, spread, strict=True) if deviation < 1e-5}
+    alike = {
+        name
+        for name, deviation in zip(env.observation_names, spread, strict=True)
+        if deviation < 1e-5
+    }
     assert alike == ALIKE_AT_START.get(task, set())
 
 
 def test_no_element_of_the_observation_is_constant(timesteps: TimeStep, env: Environment) -> None:
-    for name, column in zip(env.observation_names, np.moveaxis(np.asarray(timesteps.observation), -1, 0), strict=True):
+    for name, column in zip(
+        env.observation_names, np.moveaxis(np.asarray(timesteps.observation), -1, 0), strict=True
+    ):
         if name in OWN_DIRECTION:
             np.testing.assert_allclose(column, float(name.endswith("x")), atol=1e-5)
         else:
-            assert (column.std(axis=1) > 1e-4).all() or name == "lead_velocity.magnitude", name  # the lead keeps its speed
+            assert (column.std(axis=1) > 1e-4).all() or name == "lead_velocity.magnitude", (
+                name
+            )  # the lead keeps its speed
             assert column.std(axis=0).max() > 1e-3, name
 
 
-def test_normalisation_undone_returns_the_raw_vector(rollouts: tuple[State, TimeStep], task: str) -> None:
+def test_normalisation_undone_returns_the_raw_vector(
+    rollouts: tuple[State, TimeStep], task: str
+) -> None:
     states, timesteps = jax.tree.map(np.asarray, rollouts)
     divisors = np.asarray(DIVISORS[task])
     for lane in range(NUM_ENVS):
         for t in range(0, NUM_STEPS, 7):
             raw = raw_observation(task, item(item(states, lane), t))
             seen = np.clip(raw, -np.abs(divisors), np.abs(divisors)) if task in REJOIN else raw
-            np.testing.assert_allclose(timesteps.observation[lane, t] * divisors, seen, rtol=1e-5, atol=1e-5)
+            np.testing.assert_allclose(
+                timesteps.observation[lane, t] * divisors, seen, rtol=1e-5, atol=1e-5
+            )
 
 
 def raw_observation(task: str, state: State) -> np.ndarray:
@@ -315,7 +387,9 @@ def raw_observation(task: str, state: State) -> np.ndarray:
     if task in REJOIN:
         lead, wingman = state.sim.platforms["lead"], state.sim.platforms["wingman"]
         behind = lead.heading + 4 * np.pi / 3
-        offset = np.append(500 * np.asarray([np.cos(behind), np.sin(behind)]), np.zeros(lead.position.size - 2))
+        offset = np.append(
+            500 * np.asarray([np.cos(behind), np.sin(behind)]), np.zeros(lead.position.size - 2)
+        )
         away = lead.position.astype(float) - wingman.position
         seen = [away, away + offset, flight(wingman), flight(lead)]
         angles = [wingman.roll, wingman.flight_path_angle] if task == "rejoin3d" else []
@@ -326,7 +400,9 @@ def raw_observation(task: str, state: State) -> np.ndarray:
     if task == "docking2d_oriented":
         c, s = np.cos(deputy.attitude), np.sin(deputy.attitude)
         turn = np.asarray([[c, s], [-s, c]])
-        return np.concatenate([-turn @ deputy.position, turn @ deputy.velocity, [c, s, deputy.attitude_rate], limits])
+        return np.concatenate(
+            [-turn @ deputy.position, turn @ deputy.velocity, [c, s, deputy.attitude_rate], limits]
+        )
     zone = [] if task != CUSTOM else mag_norm(np.asarray([0.0, 50.0]) - deputy.position)
     slow = [] if task != CUSTOM else [0.1 + 0.01 * max(zone[0] - 20.0, 0.0)]
     return np.concatenate([deputy.position, deputy.velocity, limits, zone, slow])
@@ -368,12 +444,19 @@ def test_everything_stays_finite_at_the_edges_of_space(env: Environment, task: s
 @pytest.mark.parametrize("task", [*REJOIN, "docking2d_oriented"])
 def test_limits_are_reached_and_never_exceeded(task: str, actions: str) -> None:
     env = build(task, actions)
-    lanes = [random_actions(env, 200), *(jnp.broadcast_to(action(env, share), (200, env.action_size)) for share in (1, -1))]
+    lanes = [
+        random_actions(env, 200),
+        *(jnp.broadcast_to(action(env, share), (200, env.action_size)) for share in (1, -1)),
+    ]
     blocks = jnp.stack([action(env, np.sign(np.sin(t / 7.0))) for t in range(1, 201)])
     lanes += [blocks, 3 * lanes[1] - lanes[2]]
     states, _ = run(env, reset_many(env, keys())[0], jnp.stack(lanes))
     agent = jax.tree.map(np.asarray, states.sim.platforms[env.agent])
-    limits = {"speed": (200.0, 400.0)} if task in REJOIN else {"attitude_rate": (-np.pi / 90, np.pi / 90)}
+    limits = (
+        {"speed": (200.0, 400.0)}
+        if task in REJOIN
+        else {"attitude_rate": (-np.pi / 90, np.pi / 90)}
+    )
     if task == "rejoin3d":
         limits |= {"flight_path_angle": (-np.pi / 9, np.pi / 9), "roll": (-np.pi / 3, np.pi / 3)}
     for name, (low, high) in limits.items():
@@ -395,29 +478,45 @@ def test_the_terms_sum_to_the_reward_and_to_the_totals(timesteps: TimeStep) -> N
         np.testing.assert_allclose(total, terms[name].cumsum(axis=1), atol=1e-4)
 
 
-def test_the_distance_reward_telescopes(timesteps: TimeStep, first: tuple[State, TimeStep], task: str) -> None:
+def test_the_distance_reward_telescopes(
+    timesteps: TimeStep, first: tuple[State, TimeStep], task: str
+) -> None:
     name, half = ("lead_distance", 5000.0) if task in REJOIN else ("docking_distance", 100.0)
-    before, after = (np.asarray(info.status[name], float) for info in (first[1].info, timesteps.info))
+    before, after = (
+        np.asarray(info.status[name], float) for info in (first[1].info, timesteps.info)
+    )
     total = np.asarray(timesteps.info.reward_terms["distance_change"], float).cumsum(axis=1)
-    np.testing.assert_allclose(total, 2.0 * 0.5 ** (after / half) - 2.0 * 0.5 ** (before / half)[:, None], atol=1e-5)
+    np.testing.assert_allclose(
+        total, 2.0 * 0.5 ** (after / half) - 2.0 * 0.5 ** (before / half)[:, None], atol=1e-5
+    )
     assert np.abs(total).max() > 1e-3
 
 
-def test_cost_is_one_exactly_where_a_margin_is_negative(timesteps: TimeStep, env: Environment) -> None:
+def test_cost_is_one_exactly_where_a_margin_is_negative(
+    timesteps: TimeStep, env: Environment
+) -> None:
     info = jax.tree.map(np.asarray, timesteps.info)
     violated = np.any([margin < 0.0 for margin in info.margins.values()], axis=0)
     np.testing.assert_array_equal(timesteps.cost, np.where(violated, 1.0, 0.0))
     assert 0.0 < timesteps.cost.mean() < 1.0
     for constraint in env.constraints:
         name = constraint.name
-        limit = info.status[constraint.velocity_limit] if hasattr(constraint, "speed") else float(constraint.minimum)
-        np.testing.assert_allclose(info.severity[name], np.maximum(-info.margins[name], 0.0) / limit, rtol=1e-5)
+        limit = (
+            info.status[constraint.velocity_limit]
+            if hasattr(constraint, "speed")
+            else float(constraint.minimum)
+        )
+        np.testing.assert_allclose(
+            info.severity[name], np.maximum(-info.margins[name], 0.0) / limit, rtol=1e-5
+        )
 
 
 def coinciding(env: Environment, task: str) -> Environment:
     """Success, distance and timeout, and near the lead the crash too, hold on the first step from `inside`."""
     changes = {"terminal.timeout.limit": 0.5, "terminal.distance.limit": 0.1}
-    return jaxsafe.override(env, changes | ({"terminal.success.duration": 0.5} if task in REJOIN else {}))
+    return jaxsafe.override(
+        env, changes | ({"terminal.success.duration": 0.5} if task in REJOIN else {})
+    )
 
 
 def test_at_most_one_outcome_ends_an_episode(env: Environment, task: str) -> None:
@@ -438,7 +537,11 @@ def without(env: Environment, outcome: str, task: str) -> Environment:
     """The same environment in which this outcome does not hold any more."""
     docked = {"regions.docking_region.radius": 0.0}
     success = {"terminal.success.duration": 100.0} if task in REJOIN else docked
-    never = {"success": success, "crash": {"terminal.crash.limit": 0.0}, "distance": {"terminal.distance.limit": 1e6}}
+    never = {
+        "success": success,
+        "crash": {"terminal.crash.limit": 0.0},
+        "distance": {"terminal.distance.limit": 1e6},
+    }
     return jaxsafe.override(env, never.get(outcome, {}))
 
 
@@ -458,15 +561,22 @@ def test_success_and_timeout_are_both_paid_in_the_released_variant(task: str) ->
     assert found == [-1.0, 0.0]
 
 
-def visits(task: str, variant: str, offset: Any, accelerations: list[float]) -> dict[str, np.ndarray]:
+def visits(
+    task: str, variant: str, offset: Any, accelerations: list[float]
+) -> dict[str, np.ndarray]:
     """Facts of a wingman that flies along x beside the lead: inside or not, and its rewards by step."""
     env = build(task, variant=variant)
     state, timestep = place(env, [rejoin_start(env, np.add(REJOIN_POINT, offset))])
-    actions = jnp.stack([action(env, [*(env.action_size - 1) * [0.0], share]) for share in accelerations])
+    actions = jnp.stack(
+        [action(env, [*(env.action_size - 1) * [0.0], share]) for share in accelerations]
+    )
     info = jax.tree.map(np.asarray, run(env, state, actions[None])[1].info)
     facts = {"inside": info.status["in_rejoin"], "stay": info.reward_totals["in_rejoin"]}
     facts |= {"arrival": info.reward_terms["in_rejoin_first_time"]}
-    return {"before": np.asarray(timestep.info.status["in_rejoin"]), **{name: fact[0] for name, fact in facts.items()}}
+    return {
+        "before": np.asarray(timestep.info.status["in_rejoin"]),
+        **{name: fact[0] for name, fact in facts.items()},
+    }
 
 
 @pytest.mark.parametrize("variant", ["paper", "released"])
@@ -481,7 +591,11 @@ def test_leaving_the_region_refunds_exactly(task: str, variant: str) -> None:
     paid = np.float32([sum([np.float32(0.1)] * n, np.float32(0.0)) for n in range(1, 30)])
     for begin in (0, 1 + int(np.flatnonzero(np.diff(inside.astype(int)) == 1)[0])):
         length = int(np.argmin(inside[begin:]))
-        expected = np.append(np.float32(0.0), paid)[:length] if variant == "released" and begin else paid[:length]
+        expected = (
+            np.append(np.float32(0.0), paid)[:length]
+            if variant == "released" and begin
+            else paid[:length]
+        )
         np.testing.assert_array_equal(facts["stay"][begin : begin + length], expected)
     assert facts["stay"].max() > 0.6
 
@@ -510,7 +624,11 @@ def test_planar_docking_is_spatial_docking_with_z_zero() -> None:
     envs = [build(f"docking{dimension}d") for dimension in (2, 3)]
     actions = random_actions(envs[0], 1, 30)
     planar, spatial = (
-        run(env, place(env, [docking_start(env, [100.0, -20.0], [0.1, 0.3])])[0], pad_actions(env, actions, 0))
+        run(
+            env,
+            place(env, [docking_start(env, [100.0, -20.0], [0.1, 0.3])])[0],
+            pad_actions(env, actions, 0),
+        )
         for env in envs
     )
     _agree(planar, spatial, "deputy", ["delta_v", "velocity"])
@@ -523,11 +641,16 @@ def test_planar_rejoin_is_spatial_rejoin_in_straight_level_flight() -> None:
     envs = [build("rejoin2d", overrides={"regions.rejoin_region.radius": 100.0}), build("rejoin3d")]
     actions = random_actions(envs[0], 1, 30).at[..., 0].set(0.0)
     starts = [rejoin_start(env, REJOIN_POINT - 100.0, heading=0.2) for env in envs]
-    runs = [run(env, place(env, [one])[0], pad_actions(env, actions, 1)) for env, one in zip(envs, starts, strict=True)]
+    runs = [
+        run(env, place(env, [one])[0], pad_actions(env, actions, 1))
+        for env, one in zip(envs, starts, strict=True)
+    ]
     planar, spatial = runs
     _agree(planar, spatial, "wingman", ["heading", "speed"])
     keep = np.setdiff1d(np.arange(16), [3, 7, 11, 15])
-    np.testing.assert_allclose(planar[1].observation, spatial[1].observation[..., keep], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        planar[1].observation, spatial[1].observation[..., keep], rtol=1e-4, atol=1e-5
+    )
     np.testing.assert_allclose(spatial[1].observation[..., [3, 7, 11, 15, 16, 17]], 0.0, atol=1e-6)
 
 
@@ -538,12 +661,16 @@ def pad_actions(env: Environment, actions: jax.Array, at: int) -> jax.Array:
     return jnp.insert(actions, 2 if at == 0 else 1, 0.0, axis=-1)
 
 
-def _agree(planar: tuple[State, TimeStep], spatial: tuple[State, TimeStep], agent: str, names: list[str]) -> None:
+def _agree(
+    planar: tuple[State, TimeStep], spatial: tuple[State, TimeStep], agent: str, names: list[str]
+) -> None:
     flat, deep = (states.sim.platforms[agent] for states in (planar[0], spatial[0]))
     np.testing.assert_allclose(flat.position, deep.position[..., :2], rtol=1e-5, atol=1e-3)
     for name in names:
         here, there = getattr(flat, name), getattr(deep, name)
-        np.testing.assert_allclose(here, there[..., :2] if there.ndim == 3 else there, rtol=1e-5, atol=1e-5)
+        np.testing.assert_allclose(
+            here, there[..., :2] if there.ndim == 3 else there, rtol=1e-5, atol=1e-5
+        )
     assert not deep.position[..., 2].any()
     chex.assert_trees_all_close(planar[1].reward, spatial[1].reward, atol=1e-5)
     chex.assert_trees_all_close(planar[1].info.status, spatial[1].info.status, rtol=1e-4, atol=1e-3)
@@ -552,12 +679,17 @@ def _agree(planar: tuple[State, TimeStep], spatial: tuple[State, TimeStep], agen
 
 @pytest.mark.parametrize(("x64", "tolerance"), [(True, 1e-9), (False, 2e-3)])
 @pytest.mark.parametrize("task", REJOIN)
-def test_rejoin_does_not_change_when_the_whole_world_is_moved_and_turned(task: str, x64: bool, tolerance: float) -> None:
+def test_rejoin_does_not_change_when_the_whole_world_is_moved_and_turned(
+    task: str, x64: bool, tolerance: float
+) -> None:
     with jax.enable_x64(x64):
         env, draw = build(task), np.random.default_rng(3)
         start = rejoin_start(env, [-600.0, -300.0], heading=0.3, roll=0.2, flight_path_angle=-0.1)
         motions = [(0.0, pad(env, [0.0, 0.0]))]
-        motions += [(draw.uniform(-7, 7), draw.uniform(-1e4, 1e4, env.agent_platform.dimension)) for _ in range(4)]
+        motions += [
+            (draw.uniform(-7, 7), draw.uniform(-1e4, 1e4, env.agent_platform.dimension))
+            for _ in range(4)
+        ]
         state, begun = place(env, [moved(start, *motion) for motion in motions])
         actions = jnp.broadcast_to(random_actions(env, 20), (len(motions), 20, env.action_size))
         timesteps = run(env, state, actions)[1]
@@ -567,7 +699,9 @@ def test_rejoin_does_not_change_when_the_whole_world_is_moved_and_turned(task: s
             timesteps.reward,
             timesteps.info.margins["collision"] / 100,
         ):
-            np.testing.assert_allclose(found, np.broadcast_to(found[:1], found.shape), rtol=tolerance, atol=tolerance)
+            np.testing.assert_allclose(
+                found, np.broadcast_to(found[:1], found.shape), rtol=tolerance, atol=tolerance
+            )
 
 
 def moved(start: dict[str, Any], turn: float, shift: np.ndarray) -> dict[str, Any]:
@@ -575,7 +709,8 @@ def moved(start: dict[str, Any], turn: float, shift: np.ndarray) -> dict[str, An
     matrix = np.eye(shift.size)
     matrix[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     return {
-        name: fields | {"position": matrix @ fields["position"] + shift, "heading": fields["heading"] + turn}
+        name: fields
+        | {"position": matrix @ fields["position"] + shift, "heading": fields["heading"] + turn}
         for name, fields in start.items()
     }
 
@@ -589,7 +724,10 @@ def slopes_at(env: Environment, task: str) -> tuple[dict[str, Any], dict[str, fl
     if task in REJOIN:
         angles = {"roll": 0.2, "flight_path_angle": 0.1}
         start = rejoin_start(env, [-300.0, 400.0], heading=0.3, **angles)
-        parameters = {"wingman.controller.actuators.acceleration.high": 90.0, "reward.distance_change.half_distance": 900.0}
+        parameters = {
+            "wingman.controller.actuators.acceleration.high": 90.0,
+            "reward.distance_change.half_distance": 900.0,
+        }
         parameters |= {"wingman.gravity": 30.0} if task == "rejoin3d" else {}
         return start, shared | parameters | {"lead.controller.commands.heading_rate.at": 0.01}
     parameters = {"deputy.mass": 3.0, "deputy.mean_motion": 0.01, "reward.delta_v.scale": -0.5}
@@ -600,7 +738,8 @@ def slopes_at(env: Environment, task: str) -> tuple[dict[str, Any], dict[str, fl
 
 
 @pytest.mark.parametrize(
-    ("task", "actions"), [(task, "continuous") for task in (*TASKS, CUSTOM)] + [("docking2d", "discrete")]
+    ("task", "actions"),
+    [(task, "continuous") for task in (*TASKS, CUSTOM)] + [("docking2d", "discrete")],
 )
 @pytest.mark.usefixtures("x64")
 def test_derivatives_of_a_return_are_those_of_finite_differences(task: str, actions: str) -> None:
@@ -611,8 +750,12 @@ def test_derivatives_of_a_return_are_those_of_finite_differences(task: str, acti
 
     def episode_return(inputs: tuple[dict[str, jax.Array], jax.Array]) -> jax.Array:
         changed = jaxsafe.override(env, inputs[0])
-        _, timesteps = jax.lax.scan(lambda state, action: jaxsafe.step(changed, state, action), state, inputs[1])
-        return jnp.sum(timesteps.reward) + jnp.sum(timesteps.observation**2 * jnp.arange(1, env.observation_size + 1))
+        _, timesteps = jax.lax.scan(
+            lambda state, action: jaxsafe.step(changed, state, action), state, inputs[1]
+        )
+        return jnp.sum(timesteps.reward) + jnp.sum(
+            timesteps.observation**2 * jnp.arange(1, env.observation_size + 1)
+        )
 
     if actions == "continuous":
         point, unravel = ravel_pytree((parameters, taken))
@@ -624,7 +767,9 @@ def test_derivatives_of_a_return_are_those_of_finite_differences(task: str, acti
     expected = (value(point + nudges) - value(point - nudges)) / 2e-6
     found = jax.jit(jax.grad(lambda point: episode_return(unravel(point))))(point)
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-    assert (np.abs(found) > 1e-6).sum() >= found.size - env.action_size  # the last turns have yet to tell
+    assert (
+        np.abs(found) > 1e-6
+    ).sum() >= found.size - env.action_size  # the last turns have yet to tell
 
 
 @pytest.mark.parametrize("task", [*TASKS, CUSTOM])
@@ -637,14 +782,24 @@ def test_derivatives_are_finite_at_the_edges(task: str) -> None:
             after, timestep = jaxsafe.step(env, state.replace(sim=sim), action)
             info = timestep.info
             return jax.tree.leaves(
-                (timestep.reward, timestep.observation, info.margins, info.severity, after.sim.platforms)
+                (
+                    timestep.reward,
+                    timestep.observation,
+                    info.margins,
+                    info.severity,
+                    after.sim.platforms,
+                )
             )
 
-        values, pull_back = jax.vjp(outputs, env, state.sim, jnp.broadcast_to(share, env.action_size))
+        values, pull_back = jax.vjp(
+            outputs, env, state.sim, jnp.broadcast_to(share, env.action_size)
+        )
         found = jax.tree.leaves(pull_back([jnp.ones_like(value) for value in values]))
         return [leaf for leaf in found if jnp.issubdtype(leaf.dtype, jnp.floating)]
 
-    found = jax.jit(jax.vmap(jax.vmap(slopes, (None, 0)), (0, None)))(states, jnp.asarray([0.0, 1.0, -1.0, 0.5]))
+    found = jax.jit(jax.vmap(jax.vmap(slopes, (None, 0)), (0, None)))(
+        states, jnp.asarray([0.0, 1.0, -1.0, 0.5])
+    )
     assert len(found) > 30
     assert any(leaf.any() for leaf in found)
     chex.assert_tree_all_finite(found)
@@ -665,7 +820,9 @@ def test_an_episode_whose_state_is_not_finite_ends_as_a_violation_and_a_failure(
         platforms = {**state.sim.platforms, env.agent: own}
         begun = state.replace(sim=state.sim.replace(platforms=platforms))
         after, timestep = step(env, begun, action(env, 0.0))
-        numbers = [leaf for leaf in jax.tree.leaves(after.sim.platforms) if leaf.dtype == jnp.float32]
+        numbers = [
+            leaf for leaf in jax.tree.leaves(after.sim.platforms) if leaf.dtype == jnp.float32
+        ]
         if all(np.isfinite(leaf).all() for leaf in numbers):
             continue  # a field that the step computes anew
         assert env.outcomes[int(timestep.info.outcome)] == "diverged"
@@ -700,7 +857,9 @@ def test_a_number_at_either_end_of_what_is_allowed_gives_finite_states(task: str
             action = jnp.full((len(keys), env.action_size), (-1.0) ** index)
             state, timestep = jax.vmap(jaxsafe.step, in_axes=(None, 0, 0))(env, state, action)
             seen += [state, timestep]
-        floats = [leaf for leaf in jax.tree.leaves(seen) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+        floats = [
+            leaf for leaf in jax.tree.leaves(seen) if jnp.issubdtype(leaf.dtype, jnp.floating)
+        ]
         return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in floats]))
 
     env, keys = jaxsafe.make(task), jax.random.split(jax.random.key(0), 4)
@@ -717,7 +876,9 @@ def test_a_number_at_either_end_of_what_is_allowed_gives_finite_states(task: str
     assert accepted > 200
 
 
-def paths_of_numbers(component: Component, place: str = "") -> Iterator[tuple[str, tuple[int, ...]]]:
+def paths_of_numbers(
+    component: Component, place: str = ""
+) -> Iterator[tuple[str, tuple[int, ...]]]:
     """The dotted path and the shape of every number of an environment."""
     for name, field in fields(type(component)).items():
         value, here = getattr(component, name), f"{place}{name}"
@@ -727,6 +888,10 @@ def paths_of_numbers(component: Component, place: str = "") -> Iterator[tuple[st
             yield from paths_of_numbers(value, f"{here}.")
         elif isinstance(value, tuple):
             for part in value:
-                yield from paths_of_numbers(part, f"{here}.{part.name}.") if isinstance(part, Component) else ()
+                yield from (
+                    paths_of_numbers(part, f"{here}.{part.name}.")
+                    if isinstance(part, Component)
+                    else ()
+                )
         elif isinstance(value, Mapping):
             yield from ((f"{here}.{key}", ()) for key in value)

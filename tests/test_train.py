@@ -53,7 +53,9 @@ def assert_same_end(run: Path, whole: Path) -> None:
     jax.tree.map(np.testing.assert_array_equal, final_state(run), final_state(whole))
     for policy in sorted((whole / "policy").iterdir()):
         one, other = np.load(policy), np.load(run / "policy" / policy.name)
-        assert {name: one[name].tobytes() for name in one.files} == {name: other[name].tobytes() for name in other.files}
+        assert {name: one[name].tobytes() for name in one.files} == {
+            name: other[name].tobytes() for name in other.files
+        }
 
 
 def test_a_run_directory_holds_everything(whole: Path) -> None:
@@ -62,7 +64,11 @@ def test_a_run_directory_holds_everything(whole: Path) -> None:
         "config.yaml", "progress.jsonl", "progress.csv", "eval.jsonl", "episodes.jsonl", "checkpoints", "policy", "figures",
         "results.json",
     }  # fmt: skip
-    assert {path.name for path in (whole / "policy").iterdir()} == {"seed_0.npz", "seed_1.npz", "seed_2.npz"}
+    assert {path.name for path in (whole / "policy").iterdir()} == {
+        "seed_0.npz",
+        "seed_1.npz",
+        "seed_2.npz",
+    }
     assert {path.name for path in (whole / "figures").iterdir()} == {
         "training_steps.png", "trajectories.png", "speed_distance.png",
     }  # fmt: skip
@@ -70,7 +76,9 @@ def test_a_run_directory_holds_everything(whole: Path) -> None:
 
 def test_progress_has_a_row_for_every_update_of_every_seed(whole: Path) -> None:
     rows = logs(whole)["progress.jsonl"]
-    assert [(row["step"], row["seed"]) for row in rows] == [(64 * (u + 1), seed) for u in range(20) for seed in range(3)]
+    assert [(row["step"], row["seed"]) for row in rows] == [
+        (64 * (u + 1), seed) for u in range(20) for seed in range(3)
+    ]
     last = rows[-1]
     outcomes = ("success", "crash", "distance", "timeout", "velocity")
     assert sum(last[f"outcome/{name}"] for name in outcomes) == pytest.approx(1.0, abs=1e-5)
@@ -84,14 +92,25 @@ def test_progress_has_a_row_for_every_update_of_every_seed(whole: Path) -> None:
 def test_results_follow_the_schema(whole: Path) -> None:
     results = json.loads((whole / "results.json").read_text())
     assert (results["algorithm"], results["rta"]) == ("ppo", "none")
-    assert {"env", "preset", "seeds", "steps", "wall_s", "compile_s", "versions", "interaction_efficiency"} < set(results)
+    assert {
+        "env",
+        "preset",
+        "seeds",
+        "steps",
+        "wall_s",
+        "compile_s",
+        "versions",
+        "interaction_efficiency",
+    } < set(results)
     assert results["compile_s"] < results["training_computation_time"] < results["wall_s"]
     assert set(results["interaction_efficiency"]) == {"timesteps", "per_seed"}
     for kind in ("stochastic", "deterministic"):
         for metric in results["evaluation"][kind].values():
             assert set(metric) == {"mean", "ci95", "iqm", "per_seed"}
             assert len(metric["per_seed"]) == 3
-    rows = [row for row in logs(whole)["eval.jsonl"] if row["final"] and row["kind"] == "stochastic"]
+    rows = [
+        row for row in logs(whole)["eval.jsonl"] if row["final"] and row["kind"] == "stochastic"
+    ]
     assert len(rows) == 3 * 6
     mean = results["evaluation"]["stochastic"]["average_return"]["mean"]
     assert mean == pytest.approx(np.mean([row["return"] for row in rows]), rel=1e-4)
@@ -99,7 +118,16 @@ def test_results_follow_the_schema(whole: Path) -> None:
 
 def test_logged_episodes_hold_states_controls_statuses_and_rewards(whole: Path) -> None:
     rows = logs(whole)["episodes.jsonl"]
-    assert {row["step"] for row in rows} == {0, 64, 128, 256, 320, 640, 960, 1280}  # early learning, then each evaluation
+    assert {row["step"] for row in rows} == {
+        0,
+        64,
+        128,
+        256,
+        320,
+        640,
+        960,
+        1280,
+    }  # early learning, then each evaluation
     episode = [row for row in rows if row["step"] == 640]
     assert [row["t"] for row in episode] == list(range(len(episode)))
     assert [row["outcome"] for row in episode[:-1]] == ["running"] * (len(episode) - 1)
@@ -112,7 +140,9 @@ class _CrashError(Exception):
     pass
 
 
-def _crash_at(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, call: int, after: bool) -> None:
+def _crash_at(
+    monkeypatch: pytest.MonkeyPatch, owner: type, name: str, call: int, after: bool
+) -> None:
     original: Callable[..., Any] = getattr(owner, name)
     calls = iter(range(1, 1000))
 
@@ -165,9 +195,18 @@ def test_a_kill_while_the_last_checkpoint_is_written_anew_loses_nothing(
     assert (run / "checkpoints" / "1280.before").exists()
     assert (run / "checkpoints" / "1280").exists() == (when == "after")
     with monkeypatch.context() as patch:
-        patch.setattr(Training, "train", lambda self: self.step == 1280 or pytest.fail(f"went back to {self.step}"))
+        patch.setattr(
+            Training,
+            "train",
+            lambda self: self.step == 1280 or pytest.fail(f"went back to {self.step}"),
+        )
         assert command.main([f"resume={run}"]) == 0
-    assert sorted(path.name for path in (run / "checkpoints").iterdir()) == ["1280", "320", "640", "960"]
+    assert sorted(path.name for path in (run / "checkpoints").iterdir()) == [
+        "1280",
+        "320",
+        "640",
+        "960",
+    ]
     assert_same_end(run, whole)
 
 
@@ -177,13 +216,18 @@ def test_a_run_has_one_command_at_work_on_it(tmp_path: Path, whole: Path) -> Non
     (run / "results.json").unlink()
     with (
         processes.own_files(run),
-        pytest.raises(ConfigError, match=f"^{run}: another command is at work on this run; wait for its end, or stop it$"),
+        pytest.raises(
+            ConfigError,
+            match=f"^{run}: another command is at work on this run; wait for its end, or stop it$",
+        ),
     ):
         command.main([f"resume={run}"])
     assert command.main([f"resume={run}"]) == 0
 
 
-def test_a_refused_training_leaves_its_directory_free(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_refused_training_leaves_its_directory_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def refused(*_: object) -> None:
         raise ConfigError("ppo.num_envs: this training needs 9 GiB")
 
@@ -197,7 +241,11 @@ def test_a_refused_training_leaves_its_directory_free(tmp_path: Path, monkeypatc
 
 @pytest.mark.parametrize("step", [448, 1280])  # the second with nothing left to train
 def test_ctrl_c_stops_after_a_chunk_with_a_checkpoint_and_resumes(
-    tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], step: int
+    tmp_path: Path,
+    whole: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    step: int,
 ) -> None:
     run = tmp_path / "run"
     original = Training._write_progress
@@ -210,7 +258,10 @@ def test_ctrl_c_stops_after_a_chunk_with_a_checkpoint_and_resumes(
     with monkeypatch.context() as patch:
         patch.setattr(Training, "_write_progress", interrupt)
         assert command.main([*TINY, f"out={run}"]) == cli.INTERRUPTED
-    assert f"stopped at step {step:,}; go on with: python -m jaxsafe.train resume={run}" in capsys.readouterr().out
+    assert (
+        f"stopped at step {step:,}; go on with: python -m jaxsafe.train resume={run}"
+        in capsys.readouterr().out
+    )
     assert command.main([f"resume={run}"]) == 0
     assert_same_end(run, whole)
 
@@ -218,7 +269,11 @@ def test_ctrl_c_stops_after_a_chunk_with_a_checkpoint_and_resumes(
 def _two_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let docking2d and a twin of it be all tasks, so that both run the program of `whole`."""
     two = {"docking2d": TASKS["docking2d"], "twin": TASKS["docking2d"]}
-    for module in ("jaxsafe.envs", "jaxsafe.train.host.options", "jaxsafe.train.host.run_directory"):
+    for module in (
+        "jaxsafe.envs",
+        "jaxsafe.train.host.options",
+        "jaxsafe.train.host.run_directory",
+    ):
         monkeypatch.setattr(f"{module}.TASKS", two)
 
 
@@ -229,7 +284,9 @@ def test_all_tasks_run_one_after_another_and_resume(
     path = tmp_path / "all"
     words = [word for word in TINY if not word.startswith("env=")]
     given = {word.partition("=")[0] for word in words} | {"preset"}
-    same = [f"{key}={value}" for key, value in recipe("docking2d", None).items() if key not in given]
+    same = [
+        f"{key}={value}" for key, value in recipe("docking2d", None).items() if key not in given
+    ]
     original = Training._write_progress
 
     def interrupt(self: Training, *args: Any) -> None:
@@ -270,30 +327,47 @@ def test_the_clocks_of_runs_that_take_turns_add_up(monkeypatch: pytest.MonkeyPat
     assert (one.seconds, other.seconds) == (23.0, 20.0)
 
 
-def test_options_that_do_not_fit_all_tasks_are_told_with_the_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_that_do_not_fit_all_tasks_are_told_with_the_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=r"^env=all: rejoin2d: deputy: unknown field 'deputy'"):
         command.main(["env=all", "env.deputy.mass=14"])
     assert not list(tmp_path.iterdir())
 
 
-def test_resuming_a_complete_run_changes_nothing(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_resuming_a_complete_run_changes_nothing(
+    whole: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = {path: path.stat().st_mtime_ns for path in whole.rglob("*")}
     assert command.main([f"resume={whole}"]) == 0
     assert "is complete" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in whole.rglob("*")} == before
 
 
-def test_runs_without_a_name_take_the_next_free_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_without_a_name_take_the_next_free_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "runs" / "docking2d").mkdir(parents=True)
     assert command.main(TINY) == 0
     assert (tmp_path / "runs" / "docking2d-2" / "results.json").exists()
 
 
-def test_evaluation_only_at_the_end_finds_what_evaluation_on_the_way_does(tmp_path: Path, whole: Path) -> None:
+def test_evaluation_only_at_the_end_finds_what_evaluation_on_the_way_does(
+    tmp_path: Path, whole: Path
+) -> None:
     run = tmp_path / "run"
-    assert command.main([*(word for word in TINY if "eval_every" not in word), "eval_every=1000000", f"out={run}"]) == 0
+    assert (
+        command.main(
+            [
+                *(word for word in TINY if "eval_every" not in word),
+                "eval_every=1000000",
+                f"out={run}",
+            ]
+        )
+        == 0
+    )
     for name in ("eval.jsonl", "episodes.jsonl"):
         assert logs(run)[name] == [row for row in logs(whole)[name] if row["step"] == 1280]
 
@@ -312,9 +386,15 @@ def test_a_policy_file_acts_like_the_trained_network(whole: Path) -> None:
 @pytest.mark.slow
 def test_twenty_kills_at_random_moments_change_nothing(tmp_path: Path) -> None:
     """Kill runs twenty times at random moments, resume each until it ends, and compare with a run left alone."""
-    longer = [*(word.replace("=320", "=4000") for word in TINY if not word.startswith("steps")), "steps=40000"]
+    longer = [
+        *(word.replace("=320", "=4000") for word in TINY if not word.startswith("steps")),
+        "steps=40000",
+    ]
     call, whole, rng = [sys.executable, "-m", "jaxsafe.train"], tmp_path / "whole", random.Random(0)
-    for out in (tmp_path / "first", whole):  # the second finds its programs compiled, as the runs to be killed will
+    for out in (
+        tmp_path / "first",
+        whole,
+    ):  # the second finds its programs compiled, as the runs to be killed will
         begin = time.monotonic()
         subprocess.run([*call, *longer, f"out={out}"], check=True, capture_output=True)
         usual = time.monotonic() - begin
@@ -323,7 +403,9 @@ def test_twenty_kills_at_random_moments_change_nothing(tmp_path: Path) -> None:
     while kills < 20 or not ended:
         run = tmp_path / f"run-{ended}"
         arguments = [f"resume={run}"] if (run / "config.yaml").exists() else [*longer, f"out={run}"]
-        process = subprocess.Popen([*call, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            [*call, *arguments], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
         try:
             process.wait(timeout=rng.uniform(0.1, 0.9) * usual if kills < 20 else None)
         except subprocess.TimeoutExpired:
@@ -338,22 +420,36 @@ def test_twenty_kills_at_random_moments_change_nothing(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["docking2d", "docking3d"])
 def test_the_default_recipe_learns_to_dock(tmp_path: Path, task: str) -> None:
-    assert command.main([f"env={task}", "seeds=2", "seed=2000", "episodes=200", f"out={tmp_path / 'run'}"]) == 0
+    assert (
+        command.main(
+            [f"env={task}", "seeds=2", "seed=2000", "episodes=200", f"out={tmp_path / 'run'}"]
+        )
+        == 0
+    )
     results = json.loads((tmp_path / "run" / "results.json").read_text())
     for kind in ("stochastic", "deterministic"):
         assert min(results["evaluation"][kind]["success_rate"]["per_seed"]) > 0.9
 
 
-def test_tensorboard_gets_the_progress_of_every_seed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tensorboard_gets_the_progress_of_every_seed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run = tmp_path / "run"
     assert command.main([*TINY, "tensorboard=true", f"out={run}"]) == 0
     (events,) = (run / "tensorboard").iterdir()
     content = events.read_bytes()
     for seed in range(3):
-        known = [row for row in logs(run)["progress.jsonl"] if row["seed"] == seed and row["return"] is not None]
+        known = [
+            row
+            for row in logs(run)["progress.jsonl"]
+            if row["seed"] == seed and row["return"] is not None
+        ]
         assert content.count(f"return/seed_{seed}".encode()) == len(known) > 10
     monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    with pytest.raises(ConfigError, match=r"tensorboard: tensorboardX is not installed; in a clone .*'\.\[tensorboard\]'"):
+    with pytest.raises(
+        ConfigError,
+        match=r"tensorboard: tensorboardX is not installed; in a clone .*'\.\[tensorboard\]'",
+    ):
         command.main([*TINY, "tensorboard=true", f"out={tmp_path / 'other'}"])
     assert not (tmp_path / "other").exists()
 
@@ -369,16 +465,22 @@ def test_nothing_is_lost_when_checkpoints_are_missing(
     assert command.main([f"resume={run}"]) == 0
     assert "checkpoints after step 0 are missing" in capsys.readouterr().out
     assert (run / "progress.jsonl.bak").read_bytes() == (whole / "progress.jsonl").read_bytes()
-    assert len((run / "progress.csv").read_text().splitlines()) == len((whole / "progress.csv").read_text().splitlines())
+    assert len((run / "progress.csv").read_text().splitlines()) == len(
+        (whole / "progress.csv").read_text().splitlines()
+    )
     assert_same_end(run, whole)
 
 
-def test_a_damaged_progress_log_is_told_before_anything_is_done(tmp_path: Path, whole: Path) -> None:
+def test_a_damaged_progress_log_is_told_before_anything_is_done(
+    tmp_path: Path, whole: Path
+) -> None:
     run = tmp_path / "run"
     shutil.copytree(whole, run)
     (run / "results.json").unlink()
     (run / "progress.jsonl").unlink()
-    with pytest.raises(ConfigError, match=r"progress\.jsonl: expected 60 rows up to step 1280, found 0"):
+    with pytest.raises(
+        ConfigError, match=r"progress\.jsonl: expected 60 rows up to step 1280, found 0"
+    ):
         command.main([f"resume={run}"])
 
 
@@ -393,7 +495,10 @@ def test_a_log_that_lost_its_end_is_gone_back_to_the_checkpoint_that_it_covers(
         "".join(lines[:47]) + lines[47][:9]
     )  # up to step 960 with 15 whole updates of 3 seeds
     assert command.main([f"resume={run}"]) == 0
-    assert "progress.jsonl ends before the checkpoint of step 1,280: going on from 960" in capsys.readouterr().out
+    assert (
+        "progress.jsonl ends before the checkpoint of step 1,280: going on from 960"
+        in capsys.readouterr().out
+    )
     assert_same_end(run, whole)
 
 
@@ -404,14 +509,20 @@ def flip(file: Path, place: float, bit: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_flipped_bit_in_a_checkpoint_is_told_or_changes_nothing(tmp_path: Path, whole: Path, seed: int) -> None:
+def test_a_flipped_bit_in_a_checkpoint_is_told_or_changes_nothing(
+    tmp_path: Path, whole: Path, seed: int
+) -> None:
     draw, expected, refused = random.Random(seed), final_state(whole), 0
     for number in range(4):
         run = tmp_path / str(number)
         shutil.copytree(whole / "checkpoints" / "1280", run / "checkpoints" / "1280")
         shutil.copy(whole / "config.yaml", run)
         data = sorted((run / "checkpoints").rglob("d/*"), key=lambda file: -file.stat().st_size)[:2]
-        flip([*data, run / "checkpoints" / "1280" / "facts" / "metadata"][number % 3], draw.random(), draw.randrange(8))
+        flip(
+            [*data, run / "checkpoints" / "1280" / "facts" / "metadata"][number % 3],
+            draw.random(),
+            draw.randrange(8),
+        )
         try:
             found = final_state(run)
         except ConfigError:
@@ -424,7 +535,11 @@ def test_a_flipped_bit_in_a_checkpoint_is_told_or_changes_nothing(tmp_path: Path
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("seeds: 3", "seeds: 5", r"config\.yaml: training\.seeds: found 5, but the checkpoints were made with 3; put"),
+        (
+            "seeds: 3",
+            "seeds: 5",
+            r"config\.yaml: training\.seeds: found 5, but the checkpoints were made with 3; put",
+        ),
         ("seed: 0", "seed: 1", r"config\.yaml: training\.seed: found 1, but .* made with 0"),
         ("gamma: 0.", "gamma: 0.1", r"config\.yaml: training\.ppo\.gamma: found 0\.1"),
         ("dt: 1.0", "dt: 2.0", r"config\.yaml: environment\.dt: found 2\.0, but .* made with 1\.0"),
@@ -445,7 +560,9 @@ def test_a_checkpoint_is_tied_to_the_configuration_that_made_it(
             main([f"{option}={run}"])
 
 
-def test_a_run_may_go_on_for_longer_and_look_at_itself_more_often(tmp_path: Path, whole: Path) -> None:
+def test_a_run_may_go_on_for_longer_and_look_at_itself_more_often(
+    tmp_path: Path, whole: Path
+) -> None:
     run = tmp_path / "run"
     shutil.copytree(whole, run)
     text = (run / "config.yaml").read_text()
@@ -476,7 +593,9 @@ def test_facts_of_a_checkpoint_are_checked_and_those_of_before_are_known(
         final_state(run)
 
 
-def test_a_corrupt_checkpoint_leaves_one_line_on_standard_error(tmp_path: Path, whole: Path) -> None:
+def test_a_corrupt_checkpoint_leaves_one_line_on_standard_error(
+    tmp_path: Path, whole: Path
+) -> None:
     run = tmp_path / "run"
     shutil.copytree(whole, run)
     (run / "results.json").unlink()
@@ -507,12 +626,16 @@ cli.run(main, str, cli.at_once)
 
 
 @pytest.mark.parametrize("step", [1, 2])
-def test_a_checkpoint_without_room_is_one_line_and_leaves_the_one_before(tmp_path: Path, step: int) -> None:
+def test_a_checkpoint_without_room_is_one_line_and_leaves_the_one_before(
+    tmp_path: Path, step: int
+) -> None:
     call = [sys.executable, "-c", FULL, str(tmp_path), str(step)]
     found = subprocess.run(call, capture_output=True, text=True, check=False)
     assert found.returncode == 2
     [line] = found.stderr.splitlines()
-    assert line.startswith(f"error: {tmp_path}/checkpoints/{step}: checkpoint cannot be written: File too large")
+    assert line.startswith(
+        f"error: {tmp_path}/checkpoints/{step}: checkpoint cannot be written: File too large"
+    )
     assert Checkpoints(tmp_path).steps == [1]
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["1"]
 
@@ -527,11 +650,15 @@ def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(tmp_path: Path) -> 
     policy = load_policy(straight / "policy" / "seed_0.npz")
     assert policy(jax.random.key(0), np.zeros(6, np.float32)).shape == (2,)
     shutil.copytree(straight, stopped)
-    last = max(int(path.name) for path in (stopped / "checkpoints").iterdir() if path.name.isdecimal())
+    last = max(
+        int(path.name) for path in (stopped / "checkpoints").iterdir() if path.name.isdecimal()
+    )
     shutil.rmtree(stopped / "checkpoints" / str(last))
     (stopped / "results.json").unlink()
     assert command.main([f"resume={stopped}"]) == 0
-    assert [row["multiplier"] for row in logs(stopped)["progress.jsonl"]] == [row["multiplier"] for row in rows]
+    assert [row["multiplier"] for row in logs(stopped)["progress.jsonl"]] == [
+        row["multiplier"] for row in rows
+    ]
 
 
 @pytest.mark.parametrize(
@@ -541,10 +668,22 @@ def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(tmp_path: Path) -> 
         (["cost_limit=5"], "cost_limit: plain PPO has none; add algorithm=ppo_lagrangian"),
         (["algorithm=ppo_lagrangian", "cost_limit=0"], "cost_limit: expected a number > 0"),
         (["algorithm=trpo"], "algorithm: found .trpo.; choose from ppo, ppo_lagrangian"),
-        (["agent.cost_critic=true"], "agent.cost_critic: follows from the algorithm; give algorithm=ppo_lagrangian"),
-        (["algorithm=ppo_lagrangian", "cost_limit=1", "ppo.cost_limit=2"], "ppo.cost_limit: follows from the algorithm"),
-        (["ppo.multiplier_rate=0.1"], "ppo.multiplier_rate: plain PPO has none; add algorithm=ppo_lagrangian"),
-        (["algorithm=ppo_lagrangian", "cost_limit=1", "ppo.gamma=1"], "ppo.gamma: expected less than 1 with algorithm=ppo"),
+        (
+            ["agent.cost_critic=true"],
+            "agent.cost_critic: follows from the algorithm; give algorithm=ppo_lagrangian",
+        ),
+        (
+            ["algorithm=ppo_lagrangian", "cost_limit=1", "ppo.cost_limit=2"],
+            "ppo.cost_limit: follows from the algorithm",
+        ),
+        (
+            ["ppo.multiplier_rate=0.1"],
+            "ppo.multiplier_rate: plain PPO has none; add algorithm=ppo_lagrangian",
+        ),
+        (
+            ["algorithm=ppo_lagrangian", "cost_limit=1", "ppo.gamma=1"],
+            "ppo.gamma: expected less than 1 with algorithm=ppo",
+        ),
     ],
 )
 def test_a_cost_limit_needs_the_algorithm_for_it(words: list[str], message: str) -> None:

@@ -42,7 +42,9 @@ def test_double_precision_is_jax_s_own() -> None:
 def test_derivatives_are_cosine_and_minus_sine() -> None:
     x = jnp.linspace(-9.0, 9.0, 401)
     np.testing.assert_allclose(jax.vmap(jax.grad(lambda t: sin_cos(t)[0]))(x), np.cos(x), atol=2e-7)
-    np.testing.assert_allclose(jax.vmap(jax.grad(lambda t: sin_cos(t)[1]))(x), -np.sin(x), atol=2e-7)
+    np.testing.assert_allclose(
+        jax.vmap(jax.grad(lambda t: sin_cos(t)[1]))(x), -np.sin(x), atol=2e-7
+    )
     second = jax.vmap(jax.grad(jax.grad(lambda t: sin_cos(t)[0])))(x)
     np.testing.assert_allclose(second, -np.sin(x), atol=2e-7)
 
@@ -57,10 +59,14 @@ def test_acute_angles_need_no_reduction() -> None:
     assert (float(zero[0]), float(zero[1])) == (0.0, 1.0)
     for derivative in (jax.grad, jax.jacfwd):
         np.testing.assert_allclose(
-            jax.vmap(derivative(lambda t: sin_cos_acute(t)[0]))(x[::500]), np.cos(x[::500]), atol=2e-7
+            jax.vmap(derivative(lambda t: sin_cos_acute(t)[0]))(x[::500]),
+            np.cos(x[::500]),
+            atol=2e-7,
         )
         np.testing.assert_allclose(
-            jax.vmap(derivative(lambda t: sin_cos_acute(t)[1]))(x[::500]), -np.sin(x[::500]), atol=2e-7
+            jax.vmap(derivative(lambda t: sin_cos_acute(t)[1]))(x[::500]),
+            -np.sin(x[::500]),
+            atol=2e-7,
         )
 
 
@@ -78,7 +84,11 @@ def test_the_tangent_is_sine_over_cosine() -> None:
 
 
 def test_the_arctangent_is_within_two_bits_everywhere() -> None:
-    spread = [np.linspace(-3.0, 3.0, 100_001), np.geomspace(1e-8, 1e8, 10_001), [0.0, np.inf, -np.inf]]
+    spread = [
+        np.linspace(-3.0, 3.0, 100_001),
+        np.geomspace(1e-8, 1e8, 10_001),
+        [0.0, np.inf, -np.inf],
+    ]
     x = np.concatenate(spread).astype(np.float32)
     np.testing.assert_allclose(jax.jit(arctan)(x), np.arctan(x.astype(float)), atol=2e-7, rtol=3e-7)
     assert np.isnan(arctan(jnp.float32(np.nan)))
@@ -86,8 +96,12 @@ def test_the_arctangent_is_within_two_bits_everywhere() -> None:
     np.testing.assert_allclose(slopes, 1.0 / (1.0 + x.astype(float) ** 2), atol=2e-7)
 
 
-@pytest.mark.parametrize(("low", "period"), [(-np.pi, 2 * np.pi), (-np.pi / 2, np.pi), (-0.2, 2 * np.pi)])
-def test_a_wrapped_angle_is_in_its_range_and_differs_by_whole_periods(low: float, period: float) -> None:
+@pytest.mark.parametrize(
+    ("low", "period"), [(-np.pi, 2 * np.pi), (-np.pi / 2, np.pi), (-0.2, 2 * np.pi)]
+)
+def test_a_wrapped_angle_is_in_its_range_and_differs_by_whole_periods(
+    low: float, period: float
+) -> None:
     x = np.random.default_rng(0).uniform(-50.0, 50.0, 10_000).astype(np.float32)
     found = np.asarray(wrap(x, low, period), float)
     assert (found >= low - 1e-5).all()

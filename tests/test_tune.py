@@ -25,7 +25,9 @@ SWEEP = [*BASE, f"sweep.ppo.gamma=[{GAMMA},0.99]", "sweep.ppo.num_steps=[16,32]"
 
 def options(*words: str) -> Arguments:
     swept = {word.partition("=")[0] for word in words}
-    return Arguments.parse([*(word for word in TINY if f"sweep.{word.partition('=')[0]}" not in swept), *words])
+    return Arguments.parse(
+        [*(word for word in TINY if f"sweep.{word.partition('=')[0]}" not in swept), *words]
+    )
 
 
 def results(path: Path) -> dict[int, dict[str, Any]]:
@@ -41,7 +43,9 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_grid_has_every_combination() -> None:
-    arguments = options("sweep.ppo.gamma=[0.9,0.95,1]", "sweep.env.reward.delta_v.scale=[-0.01,-0.02]")
+    arguments = options(
+        "sweep.ppo.gamma=[0.9,0.95,1]", "sweep.env.reward.delta_v.scale=[-0.01,-0.02]"
+    )
     found = settings(arguments, pop_sweep(arguments), None, 0)
     assert len({tuple(each.changes.values()) for each in found}) == 6
     for each in found:
@@ -80,16 +84,31 @@ def test_settings_that_differ_in_sizes_are_compiled_apart() -> None:
             "sweep.ppo.gamma: expected a list [a,b,…], uniform(low,high) or log(low,high), found 0.9",
         ),
         (["sweep.ppo.gamma=[]"], "sweep.ppo.gamma: expected a list"),
-        (["sweep.ppo.gamma=log(0,1)"], "sweep.ppo.gamma: expected low < high, for log above 0, found 'log(0,1)'"),
+        (
+            ["sweep.ppo.gamma=log(0,1)"],
+            "sweep.ppo.gamma: expected low < high, for log above 0, found 'log(0,1)'",
+        ),
         (["sweep.ppo.gamma=uniform(a,b)"], "sweep.ppo.gamma: expected two numbers in the brackets"),
         (["sweep.ppo.gamma=uniform(0.9,1)"], "sweep.ppo.gamma: a range needs samples=N"),
         (["sweep.ppo.gamma=[0.9,1.5]"], "ppo.gamma: expected a number in [0, 1], found 1.5"),
         (["sweep.ppo.gama=[0.9]"], "ppo.gama: unknown field 'gama'"),
-        (["sweep.seeds=[1,2]"], "sweep.seeds: must be the same in all settings; give seeds=… instead"),
-        (["sweep.agent.hidden=[[8]]"], "sweep.agent.hidden: agent.hidden is given as well; leave one out"),
-        (["sweep.ppo.clip=[0.1]", "rank=speed"], "rank: unknown order 'speed'; choose from steps, success, deterministic"),
+        (
+            ["sweep.seeds=[1,2]"],
+            "sweep.seeds: must be the same in all settings; give seeds=… instead",
+        ),
+        (
+            ["sweep.agent.hidden=[[8]]"],
+            "sweep.agent.hidden: agent.hidden is given as well; leave one out",
+        ),
+        (
+            ["sweep.ppo.clip=[0.1]", "rank=speed"],
+            "rank: unknown order 'speed'; choose from steps, success, deterministic",
+        ),
         (["sweep.ppo.clip=[0.1]", "samples=0"], "samples: expected a whole number ≥ 1, found 0"),
-        (["sweep.env=[docking2d,docking3d]"], "sweep.env: must be the same in all settings; give env=… instead"),
+        (
+            ["sweep.env=[docking2d,docking3d]"],
+            "sweep.env: must be the same in all settings; give env=… instead",
+        ),
         (["resume=nowhere"], "resume: no sweep in 'nowhere'"),
     ],
 )
@@ -102,22 +121,38 @@ def test_what_cannot_be_swept_is_said_in_one_line(words: list[str], message: str
 
 def test_a_setting_learns_what_the_same_training_learns(swept: Path, whole: Path) -> None:
     """Of the fixture `whole`: the same options, γ and batches of 16 steps as in the recipe and in `TINY`."""
-    row = next(row for row in results(swept).values() if (row["ppo.gamma"], row["ppo.num_steps"]) == (GAMMA, 16))
+    row = next(
+        row
+        for row in results(swept).values()
+        if (row["ppo.gamma"], row["ppo.num_steps"]) == (GAMMA, 16)
+    )
     progress = [json.loads(line) for line in (whole / "progress.jsonl").read_text().splitlines()]
     for seed in range(3):
         own = [each for each in progress if each["seed"] == seed]
         assert row["curve"]["steps"] == [each["step"] for each in own]
         np.testing.assert_allclose(
-            row["curve"]["success_rate"][seed], [each["success_rate"] or 0.0 for each in own], atol=1e-4
+            row["curve"]["success_rate"][seed],
+            [each["success_rate"] or 0.0 for each in own],
+            atol=1e-4,
         )
         assert row["training_return"][seed] == pytest.approx(own[-1]["return"], rel=1e-4)
-    assert row["interaction_efficiency"] == json.loads((whole / "results.json").read_text())["interaction_efficiency"]
+    assert (
+        row["interaction_efficiency"]
+        == json.loads((whole / "results.json").read_text())["interaction_efficiency"]
+    )
     evaluation = json.loads((whole / "results.json").read_text())["evaluation"]
     for kind, metrics in evaluation.items():
         for name, metric in metrics.items():
-            found, expected = (np.array(values, float) for values in (row["evaluation"][kind][name], metric["per_seed"]))
+            found, expected = (
+                np.array(values, float)
+                for values in (row["evaluation"][kind][name], metric["per_seed"])
+            )
             np.testing.assert_allclose(found, expected, rtol=1e-4, err_msg=name)
-    other = next(row for row in results(swept).values() if (row["ppo.gamma"], row["ppo.num_steps"]) == (0.99, 16))
+    other = next(
+        row
+        for row in results(swept).values()
+        if (row["ppo.gamma"], row["ppo.num_steps"]) == (0.99, 16)
+    )
     assert other["training_return"] != row["training_return"]
 
 
@@ -132,10 +167,15 @@ def test_the_table_ranks_every_setting(swept: Path) -> None:
     assert [str(row["setting"]) for row in ranked] == [row["setting"] for row in rows]
 
 
-@pytest.mark.parametrize(("rank", "order"), [("steps", [2, 0, 1]), ("success", [1, 0, 2]), ("deterministic", [0, 2, 1])])
+@pytest.mark.parametrize(
+    ("rank", "order"), [("steps", [2, 0, 1]), ("success", [1, 0, 2]), ("deterministic", [0, 2, 1])]
+)
 def test_each_rank_has_its_best_first(rank: str, order: list[int]) -> None:
     def row(steps: int | None, success: float, deterministic: float) -> dict[str, Any]:
-        found = {"stochastic": {"success_rate": [success]}, "deterministic": {"success_rate": [deterministic]}}
+        found = {
+            "stochastic": {"success_rate": [success]},
+            "deterministic": {"success_rate": [deterministic]},
+        }
         curve = {"success_rate": [[0.5]]}
         return {"interaction_efficiency": {"timesteps": steps}, "evaluation": found, "curve": curve}
 
@@ -163,7 +203,9 @@ def test_a_sweep_does_not_go_on_by_another_recipe(swept: Path, tmp_path: Path) -
     content = yaml12.read(path / "sweep.yaml")
     content["first"]["training"]["ppo"]["clip"] = 0.37
     (path / "sweep.yaml").write_text(yaml12.write(content))
-    with pytest.raises(ConfigError, match=f"resume: the recipe or the environment of {path} has changed"):
+    with pytest.raises(
+        ConfigError, match=f"resume: the recipe or the environment of {path} has changed"
+    ):
         command.main([f"resume={path}"])
 
 
@@ -184,16 +226,46 @@ def test_a_killed_sweep_goes_on_and_ends_the_same(swept: Path, tmp_path: Path) -
         ("sweep.yaml", "{}", "sweep.yaml: request: expected a mapping, found nothing"),
         ("sweep.yaml", "null", "sweep.yaml: expected a mapping, found None"),
         ("sweep.yaml", "[]", r"sweep.yaml: expected a mapping, found \[\]"),
-        ("sweep.yaml", "{request: {1: 2}, first: {}}", "sweep.yaml: request: expected text, found 1"),
-        ("settings.jsonl", '{"setting": 0}', "row 1: interaction_efficiency: expected a mapping, found nothing"),
-        ("settings.jsonl", '{"setting": "0"}', "line 1: not a row of this log: setting: expected a whole number"),
-        ("settings.jsonl", '{"setting": 4}', "row 1: setting: expected one of the 4 settings, each once, found 4"),
-        ("settings.jsonl", ("ppo.gamma", 0.5), r"row 1: ppo\.gamma: expected 0\..* in setting 0, found 0\.5"),
-        ("settings.jsonl", ("training_success", [1, 2, 3]), "training_success: expected a list of length 3, each a number"),
-        ("settings.jsonl", ("curve", {"steps": []}), "curve.steps: expected a list of length 20, each a whole number"),
+        (
+            "sweep.yaml",
+            "{request: {1: 2}, first: {}}",
+            "sweep.yaml: request: expected text, found 1",
+        ),
+        (
+            "settings.jsonl",
+            '{"setting": 0}',
+            "row 1: interaction_efficiency: expected a mapping, found nothing",
+        ),
+        (
+            "settings.jsonl",
+            '{"setting": "0"}',
+            "line 1: not a row of this log: setting: expected a whole number",
+        ),
+        (
+            "settings.jsonl",
+            '{"setting": 4}',
+            "row 1: setting: expected one of the 4 settings, each once, found 4",
+        ),
+        (
+            "settings.jsonl",
+            ("ppo.gamma", 0.5),
+            r"row 1: ppo\.gamma: expected 0\..* in setting 0, found 0\.5",
+        ),
+        (
+            "settings.jsonl",
+            ("training_success", [1, 2, 3]),
+            "training_success: expected a list of length 3, each a number",
+        ),
+        (
+            "settings.jsonl",
+            ("curve", {"steps": []}),
+            "curve.steps: expected a list of length 20, each a whole number",
+        ),
     ],
 )
-def test_broken_files_of_a_sweep_are_told(swept: Path, tmp_path: Path, name: str, text: Any, message: str) -> None:
+def test_broken_files_of_a_sweep_are_told(
+    swept: Path, tmp_path: Path, name: str, text: Any, message: str
+) -> None:
     path = tmp_path / "sweep"
     path.mkdir()
     for file in ("sweep.yaml", "settings.jsonl"):
@@ -214,4 +286,7 @@ def test_an_interrupted_sweep_says_how_to_go_on(
     monkeypatch.setattr("jaxsafe.tune.lanes.train_all", interrupted)
     assert command.main([*SWEEP, f"out={tmp_path / 'sweep'}"]) == cli.INTERRUPTED
     said = capsys.readouterr().out.splitlines()[-1]
-    assert said == f"stopped with 0 of 4 settings; go on with: python -m jaxsafe.tune resume={tmp_path / 'sweep'}"
+    assert (
+        said
+        == f"stopped with 0 of 4 settings; go on with: python -m jaxsafe.tune resume={tmp_path / 'sweep'}"
+    )

@@ -15,7 +15,9 @@ def episodes_like(values: np.ndarray) -> Episode:
     zero = begin(reset_batch(ENV, jax.random.key(0), 1)[1])
     shaped = jax.tree.map(lambda x: jnp.zeros(values.shape, x.dtype), zero)
     return shaped.replace(
-        episode_return=jnp.asarray(values), length=jnp.full(values.shape, 7), outcome=jnp.ones(values.shape, int)
+        episode_return=jnp.asarray(values),
+        length=jnp.full(values.shape, 7),
+        outcome=jnp.ones(values.shape, int),
     )
 
 
@@ -42,14 +44,20 @@ def test_the_cost_counts_the_violating_steps_of_all_finished_episodes() -> None:
 
 def test_the_cost_of_the_training_counts_every_violating_step_once() -> None:
     rng = np.random.default_rng(2)
-    window, counted, before = empty_window(episodes_like(np.zeros(1, np.float32))), 0, np.zeros(3, int)
+    window, counted, before = (
+        empty_window(episodes_like(np.zeros(1, np.float32))),
+        0,
+        np.zeros(3, int),
+    )
     for _ in range(20):
         violated, done = rng.random((5, 3)) < 0.5, rng.random((5, 3)) < 0.2
         rows = []
         for step in range(5):
             rows.append(before + violated[step])
             before = np.where(done[step], 0, rows[-1])
-        episodes = episodes_like(np.zeros((5, 3), np.float32)).replace(violating_steps=jnp.asarray(np.stack(rows)))
+        episodes = episodes_like(np.zeros((5, 3), np.float32)).replace(
+            violating_steps=jnp.asarray(np.stack(rows))
+        )
         window = jax.jit(push)(window, episodes, jnp.asarray(done))
         counted += violated.sum()
         assert int(total_cost(window)) == counted
@@ -57,13 +65,17 @@ def test_the_cost_of_the_training_counts_every_violating_step_once() -> None:
 
 def test_a_batch_with_more_episodes_than_the_window_leaves_its_last_ones() -> None:
     values = np.arange(300, dtype=np.float32).reshape(100, 3)
-    window = push(empty_window(episodes_like(values)), episodes_like(values), jnp.ones((100, 3), bool))
+    window = push(
+        empty_window(episodes_like(values)), episodes_like(values), jnp.ones((100, 3), bool)
+    )
     np.testing.assert_array_equal(np.sort(window.episodes.episode_return), np.arange(200, 300))
 
 
 def test_averages_are_over_the_filled_part_only() -> None:
     values = np.array([[1.0, 3.0, 9.0]], np.float32)
-    window = push(empty_window(episodes_like(values)), episodes_like(values), jnp.array([[True, True, False]]))
+    window = push(
+        empty_window(episodes_like(values)), episodes_like(values), jnp.array([[True, True, False]])
+    )
     row = means(window, ENV.outcomes)
     assert float(row["return"]) == 2.0
     assert float(row["length"]) == 7.0
@@ -78,7 +90,9 @@ def test_the_latest_cost_is_that_of_the_last_episodes() -> None:
     finished: list[int] = []
     for _ in range(60):
         costs, done = rng.integers(0, 50, (4, 2)), rng.random((4, 2)) < 0.5
-        episodes = episodes_like(np.zeros((4, 2), np.float32)).replace(violating_steps=jnp.asarray(costs, jnp.int32))
+        episodes = episodes_like(np.zeros((4, 2), np.float32)).replace(
+            violating_steps=jnp.asarray(costs, jnp.int32)
+        )
         window = jax.jit(push)(window, episodes, jnp.asarray(done))
         finished += costs[done].tolist()
         assert float(latest_cost(window, 25)) == pytest.approx(np.mean(finished[-25:]))

@@ -39,11 +39,26 @@ def test_every_command_works_in_double_precision(tmp_path: Path) -> None:
 
     command("evaluate", f"run={run}", "episodes=4", "seed=1", f"out={tmp_path / 'evaluation'}")
     command("plot", f"run={run}", "x=wall")
-    command("tune", "env=docking2d", "seeds=2", *RUNS, "sweep.ppo.gamma=[0.9,0.99]", f"out={tmp_path / 'sweep'}")
+    command(
+        "tune",
+        "env=docking2d",
+        "seeds=2",
+        *RUNS,
+        "sweep.ppo.gamma=[0.9,0.99]",
+        f"out={tmp_path / 'sweep'}",
+    )
     assert len((tmp_path / "sweep" / "settings.jsonl").read_text().splitlines()) == 2
-    command("rta.falsify", "env=docking2d", "rta=default", "policies=uniform", "steps=32", "lanes=8")
+    command(
+        "rta.falsify", "env=docking2d", "rta=default", "policies=uniform", "steps=32", "lanes=8"
+    )
 
-    for words in (["out=a.onnx"], ["format=stablehlo", "out=b.stablehlo"], ["format=vnnlib", "steps=2", "out=c.vnnlib"]):
-        command("export", f"run={run}", *words[:-1], f"out={tmp_path / words[-1].removeprefix('out=')}")
+    for words in (
+        ["out=a.onnx"],
+        ["format=stablehlo", "out=b.stablehlo"],
+        ["format=vnnlib", "steps=2", "out=c.vnnlib"],
+    ):
+        command(
+            "export", f"run={run}", *words[:-1], f"out={tmp_path / words[-1].removeprefix('out=')}"
+        )
     session = onnxruntime.InferenceSession(str(tmp_path / "a.onnx"))
     assert session.run(None, {"input": np.zeros((1, 6), np.float32)})[0].dtype == np.float32

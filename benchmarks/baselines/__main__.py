@@ -12,7 +12,9 @@ from jaxsafe.commands import cli
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema.errors import ConfigError
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the package of this file is imported by its name
+sys.path.insert(
+    0, str(Path(__file__).resolve().parent.parent)
+)  # the package of this file is imported by its name
 
 SEEDS = 10
 """Of every training, unless the user says otherwise."""
@@ -29,8 +31,14 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.train.host.options import resolve
 
     arguments = Arguments.parse(argv)
-    out, runs = Path(arguments.pop_text("out") or "report"), Path(arguments.pop_text("runs") or "runs/report")
-    tasks, kinds = (_names(name, arguments.pop(name), [*known]) for name, known in (("tasks", TASKS), ("kinds", KINDS)))
+    out, runs = (
+        Path(arguments.pop_text("out") or "report"),
+        Path(arguments.pop_text("runs") or "runs/report"),
+    )
+    tasks, kinds = (
+        _names(name, arguments.pop(name), [*known])
+        for name, known in (("tasks", TASKS), ("kinds", KINDS))
+    )
     policies = arguments.pop_text("policies")
     film = arguments.pop_flag("film") is not False
     rest = [word for word in argv if word.partition("=")[0] in arguments.options]

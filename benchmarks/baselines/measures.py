@@ -14,7 +14,10 @@ def failed_seeds(results: Mapping[str, Any]) -> list[int]:
 
     A seed whose success is not known failed.
     """
-    each = [results["evaluation"][way]["success_rate"]["per_seed"] for way in ("stochastic", "deterministic")]
+    each = [
+        results["evaluation"][way]["success_rate"]["per_seed"]
+        for way in ("stochastic", "deterministic")
+    ]
     pairs = enumerate(zip(*each, strict=True), start=results["seed"])
     return [seed for seed, pair in pairs if any(rate is None or rate < 0.95 for rate in pair)]
 
@@ -26,7 +29,9 @@ def finished(curves: Sequence[Mapping[str, Any]], step: int) -> float:
     return sum(counts) / len(counts)
 
 
-def steps_to(level: float, curves: Sequence[Mapping[str, Any]], at_least: int = ENOUGH_EPISODES) -> int | None:
+def steps_to(
+    level: float, curves: Sequence[Mapping[str, Any]], at_least: int = ENOUGH_EPISODES
+) -> int | None:
     """Environment steps per seed until the success rate in training reaches a level, by the definition of Table 2.
 
     Args:
@@ -42,7 +47,9 @@ def steps_to(level: float, curves: Sequence[Mapping[str, Any]], at_least: int = 
 def wall_to(level: float, curves: Sequence[Mapping[str, Any]]) -> float | None:
     """Seconds until the success rate in training reaches a level, by the definition of Table 2."""
     reached = steps_to(level, curves)
-    return None if reached is None else max(row["wall_s"] for row in curves if row["step"] == reached)
+    return (
+        None if reached is None else max(row["wall_s"] for row in curves if row["step"] == reached)
+    )
 
 
 def samples_per_second(curves: Sequence[Mapping[str, Any]]) -> float | None:

@@ -29,8 +29,14 @@ class Report:
         """Of at least one record."""
         self.records = sorted(records, key=lambda record: [*TASKS].index(record.item.task))
         self.own = [(record.item, record.results) for record in self.records]
-        self.further = [(record, name, found) for record in self.records for name, found in record.evaluations.items()]
-        self.episodes = {record.item.name: record.options["training"]["episodes"] for record in records}
+        self.further = [
+            (record, name, found)
+            for record in self.records
+            for name, found in record.evaluations.items()
+        ]
+        self.episodes = {
+            record.item.name: record.options["training"]["episodes"] for record in records
+        }
         self.kinds = [kind for kind in KINDS if any(record.item.kind == kind for record in records)]
         self.tasks = [task for task in TASKS if any(record.item.task == task for record in records)]
 
@@ -38,8 +44,14 @@ class Report:
         """Write `baselines.md`, and the figures of training into the directory beside it where the records are."""
         files = out / DIRECTORY
         for task in self.tasks:
-            curves = {record.item.kind: record.curves for record in self.records if record.item.task == task}
-            failed = {item.kind: failed_seeds(found) for item, found in self.own if item.task == task}
+            curves = {
+                record.item.kind: record.curves
+                for record in self.records
+                if record.item.task == task
+            }
+            failed = {
+                item.kind: failed_seeds(found) for item, found in self.own if item.task == task
+            }
             steps = TASKS[task].paper_steps
             mark = None if steps is None else ("the paper's 80 %", steps)
             save(compare_curves(curves, task, mark=mark), files / f"{task}_training.png")
@@ -97,13 +109,18 @@ class Report:
             made_by = ", ".join(f"{name} {version}" for name, version in versions.items())
             made_by += f"; {device}{f' ({processor})' if processor else ''}, float32"
             found.setdefault((f"`{record.command}`{where}", made_by), []).append(record.item.name)
-        return [f"- {origin}: {', '.join(names)} ({versions})" for (origin, versions), names in found.items()]
+        return [
+            f"- {origin}: {', '.join(names)} ({versions})"
+            for (origin, versions), names in found.items()
+        ]
 
     def _efficiency(self) -> str:
         rows = []
         for record in self.records:
             item, found = record.item, record.results
-            steps, per_seed = (found["interaction_efficiency"][name] for name in ("timesteps", "per_seed"))
+            steps, per_seed = (
+                found["interaction_efficiency"][name] for name in ("timesteps", "per_seed")
+            )
             paper, strict = TASKS[item.task].paper_steps, steps_to(0.8, record.curves, WINDOW)
             rows.append([
                 item.task, item.kind, f"{paper:,}", f"{steps:,}" if steps else "never",
@@ -131,7 +148,11 @@ class Report:
         rows = []
         for record in self.records:
             if record.item.kind in ("quick", "lanes"):
-                reached, pace, found = wall_to(0.95, record.curves), samples_per_second(record.curves), record.results
+                reached, pace, found = (
+                    wall_to(0.95, record.curves),
+                    samples_per_second(record.curves),
+                    record.results,
+                )
                 rows.append([
                     record.item.task, record.item.kind, f"{found['steps']:,}",
                     f"{reached:.1f}" if reached is not None else "never", f"{found['wall_s']:.1f}",
@@ -305,7 +326,9 @@ class Report:
         for kind in self.kinds:
             for way in ("stochastic", "deterministic"):
                 scores = [
-                    found["evaluation"][way]["success_rate"]["per_seed"] for item, found in self.own if item.kind == kind
+                    found["evaluation"][way]["success_rate"]["per_seed"]
+                    for item, found in self.own
+                    if item.kind == kind
                 ]
                 both = stratified_iqm(scores)
                 rows.append([kind, way, _percent({"mean": both["iqm"], "ci95": both["ci95"]})])
@@ -326,17 +349,28 @@ class Report:
                     f"Training in each way, once every seed has finished {ENOUGH_EPISODES} episodes (where those are long,"
                     " much is learnt before that): mean and 95 % interval over seeds",
                 ),
-                (f"{task}_seeds.png", "Success in training of every seed; dashed those that failed after it"),
+                (
+                    f"{task}_seeds.png",
+                    "Success in training of every seed; dashed those that failed after it",
+                ),
                 (
                     f"{task}_trajectories.png",
                     "Paths of deterministic episodes of the first seed (`features`): from one start while it was trained,"
                     " then from several, and their ends",
                 ),
-                (f"{task}_speed_distance.png", "Speed against distance in the same episodes, and the limit"),
+                (
+                    f"{task}_speed_distance.png",
+                    "Speed against distance in the same episodes, and the limit",
+                ),
                 (f"{task}.gif", "A deterministic episode of the best policy"),
             ):
                 if (files / file).exists():
-                    lines += [f"![{task}: {caption.replace('`', '')}]({files.name}/{file})", "", f"*{caption}.*", ""]
+                    lines += [
+                        f"![{task}: {caption.replace('`', '')}]({files.name}/{file})",
+                        "",
+                        f"*{caption}.*",
+                        "",
+                    ]
         return "\n".join(lines).rstrip()
 
     def _settings(self) -> str:
@@ -355,8 +389,12 @@ class Report:
             lines.append(f"python -m jaxsafe.train {shlex.join(item.words)} out={run}")
             count = self.episodes[item.name]
             for name, options in item.evaluations.items():
-                subject = run / "policy" / f"seed_{best_seed(found)}.npz" if name == SHIPPED else run
-                lines.append(f"python -m jaxsafe.evaluate run={subject} episodes={count} {shlex.join(options)}")
+                subject = (
+                    run / "policy" / f"seed_{best_seed(found)}.npz" if name == SHIPPED else run
+                )
+                lines.append(
+                    f"python -m jaxsafe.evaluate run={subject} episodes={count} {shlex.join(options)}"
+                )
                 if name == SHIPPED:
                     lines.append(f"python -m jaxsafe.evaluate run={subject} {shlex.join(FILM)}")
         return "\n".join([*lines, "```"])
@@ -386,4 +424,8 @@ def _number(metric: Mapping[str, Any], digits: int = 2) -> str:
 
 def _rate(metric: Mapping[str, Any], starts: int, seeds: int) -> str:
     """A share of episodes; a zero with the bound that it proves, of starts: all seeds have the same."""
-    return _percent(metric) if metric["mean"] != 0 else f"0 of {starts * seeds:,} (< {300 / starts:.2g} %)"
+    return (
+        _percent(metric)
+        if metric["mean"] != 0
+        else f"0 of {starts * seeds:,} (< {300 / starts:.2g} %)"
+    )

@@ -33,8 +33,13 @@ KINDS: Mapping[str, Kind] = {
         "4,096 environments side by side, for accelerators; all begin together, so in oriented docking those that have not"
         " docked all time out at 12.3 million steps, a dip in the curves of every seed",
     ),
-    "quick": Kind(("preset=quick",), "fewer epochs and steps, for a result soon; evaluated in 100 episodes a seed"),
-    "discrete": Kind(("actions=discrete",), "the recipe of `features` with the paper's discrete actions"),
+    "quick": Kind(
+        ("preset=quick",),
+        "fewer epochs and steps, for a result soon; evaluated in 100 episodes a seed",
+    ),
+    "discrete": Kind(
+        ("actions=discrete",), "the recipe of `features` with the paper's discrete actions"
+    ),
     "plain_discrete": Kind(("preset=plain", "actions=discrete"), "the recipe of `plain` with them"),
     "rta": Kind(
         ("rta=default",),
@@ -42,7 +47,8 @@ KINDS: Mapping[str, Kind] = {
         " starts at up to 99 % of the speed limit, since some faster starts nothing can keep safe",
     ),
     "unpunished": Kind(
-        ("rta=default", "rta_training=unpunished"), "the same, and interventions cost nothing (`rta_training=unpunished`)"
+        ("rta=default", "rta_training=unpunished"),
+        "the same, and interventions cost nothing (`rta_training=unpunished`)",
     ),
 }
 """By the name that the page uses."""
@@ -113,9 +119,16 @@ def best_seed(results: Mapping[str, Any]) -> int:
         results: of a run, with its own evaluation after training.
     """
     found = results["evaluation"]["deterministic"]
-    columns = [found[name]["per_seed"] for name in ("success_rate", "episode_safety_violation_rate", "average_return")]
+    columns = [
+        found[name]["per_seed"]
+        for name in ("success_rate", "episode_safety_violation_rate", "average_return")
+    ]
     rank = [  # what is not known is null
-        (-1.0 if success is None else success, -(violating or 0.0), -math.inf if value is None else value)
+        (
+            -1.0 if success is None else success,
+            -(violating or 0.0),
+            -math.inf if value is None else value,
+        )
         for success, violating, value in zip(*columns, strict=True)
     ]
     return results["seed"] + rank.index(max(rank))
@@ -137,4 +150,8 @@ def plan(tasks: Sequence[str], kinds: Sequence[str], words: Sequence[str]) -> li
         for one in chosen:
             if one not in known:
                 raise ConfigError(f"{name}: found {one!r}; choose from {nearest(str(one), known)}")
-    return [Item(task, kind, (f"env={task}", *_options(task, kind), *words)) for kind in kinds for task in tasks]
+    return [
+        Item(task, kind, (f"env={task}", *_options(task, kind), *words))
+        for kind in kinds
+        for task in tasks
+    ]

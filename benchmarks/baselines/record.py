@@ -16,7 +16,16 @@ from jaxsafe.train.host.log import NEEDS, check_order, read_progress
 from jaxsafe.train.host.results import check_results, read_results
 from jaxsafe.train.host.run_directory import read_content
 
-CURVES = ("wall_s", "success_rate", "return", "length", "delta_v", "violating_share", "cost", "episodes")
+CURVES = (
+    "wall_s",
+    "success_rate",
+    "return",
+    "length",
+    "delta_v",
+    "violating_share",
+    "cost",
+    "episodes",
+)
 
 Results = dict[str, Any]
 
@@ -41,8 +50,13 @@ def keep(item: Item, run: Path, files: Path, command: str) -> None:
     if (run / "film" / FILM_FILE).exists():
         _copy(run / "film" / FILM_FILE, files / f"{item.task}.gif")
     rows = read_progress(run)
-    write_csv(files / f"{item.name}.csv", [{name: row.get(name) for name in ("seed", "step", *CURVES)} for row in rows])
-    evaluations = {name: item.evaluation_directory(run, name) / "results.json" for name in item.evaluations}
+    write_csv(
+        files / f"{item.name}.csv",
+        [{name: row.get(name) for name in ("seed", "step", *CURVES)} for row in rows],
+    )
+    evaluations = {
+        name: item.evaluation_directory(run, name) / "results.json" for name in item.evaluations
+    }
     record = {
         "command": command,
         "commit": read_content(run).get("commit"),
@@ -64,7 +78,9 @@ def kept(items: Iterable[Item], files: Path) -> tuple[list[Record], list[str]]:
         try:
             found = read_json(path, {"options": {}})
             if found["options"] != json.loads(json.dumps(finite(options_of(item)))):
-                left_out.append(f"{path}: was made with other options and is left out; report it again")
+                left_out.append(
+                    f"{path}: was made with other options and is left out; report it again"
+                )
                 continue
             record = _record(item, found, path)
         except ConfigError as error:

@@ -34,7 +34,9 @@ def train(item: Item, runs: Path) -> Path:
     run = runs / item.name
     if (run / "config.yaml").exists():
         _refuse_other(item, run)
-        if not (run / "results.json").exists() or not (run / "figures").exists():  # figures come last
+        if (
+            not (run / "results.json").exists() or not (run / "figures").exists()
+        ):  # figures come last
             _call("jaxsafe.train", [f"resume={run}"])
     else:
         _call("jaxsafe.train", [*item.words, f"out={run}"])
@@ -53,9 +55,16 @@ def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
         write_bytes(run / BEST, (run / "policy" / f"seed_{best}.npz").read_bytes())
     for name, options in item.evaluations.items():
         out = item.evaluation_directory(run, name)
-        if not (out / "results.json").exists() or not answers(options, read_json(out / "results.json", {})):
-            shutil.rmtree(out, ignore_errors=True)  # of an evaluation that was interrupted, or of other options
-            _call("jaxsafe.evaluate", [f"run={item.subject(run, name)}", f"episodes={episodes}", *options, f"out={out}"])
+        if not (out / "results.json").exists() or not answers(
+            options, read_json(out / "results.json", {})
+        ):
+            shutil.rmtree(
+                out, ignore_errors=True
+            )  # of an evaluation that was interrupted, or of other options
+            _call(
+                "jaxsafe.evaluate",
+                [f"run={item.subject(run, name)}", f"episodes={episodes}", *options, f"out={out}"],
+            )
     film = run / "film"
     if render and not (film / FILM_FILE).exists():
         shutil.rmtree(film, ignore_errors=True)
@@ -84,7 +93,9 @@ def _refuse_other(item: Item, run: Path) -> None:
     content = read_content(run)
     content["training"].pop("out", None)
     if any(content[part] != value for part, value in options_of(item).items()):
-        raise ConfigError(f"runs: {run} was trained with other options; remove it, or give another directory")
+        raise ConfigError(
+            f"runs: {run} was trained with other options; remove it, or give another directory"
+        )
 
 
 def _call(module: str, words: Sequence[str]) -> None:
