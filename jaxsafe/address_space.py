@@ -6,6 +6,7 @@ caught. A program that imports jaxsafe is left alone: it may need less than a co
 
 from __future__ import annotations
 
+import os
 import sys
 
 try:
@@ -42,6 +43,11 @@ def is_shortage(error: BaseException) -> bool:
     return isinstance(error, MemoryError) or any(sign in str(error) for sign in signs)
 
 
-if sys.argv[:1] == ["-m"] and (fault := shortage()):  # as long as Python looks for the command
+_command = sys.argv[:1] == ["-m"]  # as long as Python looks for the module
+_command |= os.path.basename("".join(sys.argv[:1])) in (
+    "jaxsafe",
+    "jaxsafe.exe",
+)  # the console script
+if _command and (fault := shortage()):
     print(f"error: {fault}", file=sys.stderr)
     raise SystemExit(2)

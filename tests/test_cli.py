@@ -1,3 +1,4 @@
+import importlib
 import io
 import json
 import os
@@ -14,6 +15,7 @@ import jax
 import numpy as np
 import pytest
 
+from jaxsafe import commands
 from jaxsafe.agents import policy_file as policy_module
 from jaxsafe.agents.policy_file import read_policy
 from jaxsafe.commands import cli, falsify
@@ -534,3 +536,32 @@ def test_a_warning_is_one_line_and_the_command_goes_on(
     )
     assert captured.err.count("\n") == 1
     assert "limit: 50.0" in captured.out
+
+
+@pytest.mark.parametrize("words", [["jaxsafe"], ["jaxsafe", "help"], ["jaxsafe", "--help"]])
+def test_alone_the_program_lists_its_commands(
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", words)
+    commands.main()
+    told = capsys.readouterr().out
+    assert [name for name in commands.COMMANDS if f"  {name} " not in told] == []
+
+
+def test_a_command_is_called_by_its_name(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["jaxsafe", "plot", "rnu=x"])
+    with pytest.raises(SystemExit) as left:
+        commands.main()
+    assert left.value.code == 2
+    assert "Did you mean 'run'?" in capsys.readouterr().err
+    monkeypatch.setattr(sys, "argv", ["jaxsafe", "trian"])
+    with pytest.raises(SystemExit) as left:
+        commands.main()
+    assert left.value.code == 2
+    told = capsys.readouterr().err
+    assert told.startswith("error: unknown command 'trian'; choose from train, evaluate")
+    assert told.endswith("Did you mean 'train'?\n")
+    for name in commands.COMMANDS:
+        assert callable(importlib.import_module(f"jaxsafe.commands.{name}").command)

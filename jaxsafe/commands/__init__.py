@@ -1,1 +1,37 @@
 """The commands, one file each. Nothing else imports them."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+COMMANDS = {
+    "train": "train all seeds of a task, evaluate them, draw figures",
+    "evaluate": "evaluate trained policies, in their own environment or another",
+    "plot": "draw a run from its log files, or several runs in one figure",
+    "tune": "train many settings as one program and rank them",
+    "export": "write a policy as ONNX, StableHLO or VNN-LIB",
+    "config": "print an environment as YAML",
+    "falsify": "let adversaries try to break a filter",
+    "safe_set": "draw where a filter certifies",
+}
+"""What each command does, in the order of the list that `jaxsafe` prints."""
+
+
+def main() -> None:
+    """Run `jaxsafe COMMAND [key=value …]`, which is `python -m jaxsafe.COMMAND` in fewer letters."""
+    name, *words = sys.argv[1:] or ["help"]
+    if name in ("help", "-h", "--help"):
+        width = max(map(len, COMMANDS))
+        print("usage: jaxsafe COMMAND [key=value …]\n")
+        print("\n".join(f"  {command:{width}}  {about}" for command, about in COMMANDS.items()))
+        print("\njaxsafe COMMAND help lists the options of a command")
+        return
+    if name not in COMMANDS:
+        from jaxsafe.schema.errors import nearest, show
+
+        choice = nearest(name, COMMANDS)
+        print(f"error: unknown command {show(name)}; choose from {choice}", file=sys.stderr)
+        sys.exit(2)
+    sys.argv = [f"jaxsafe {name}", *words]
+    importlib.import_module(f"jaxsafe.commands.{name}").command()
