@@ -82,22 +82,22 @@ GRACE = 5.0
 """Seconds beyond its time after which a part is ended."""
 
 TESTS = (
-    "tests/test_golden.py",
-    "tests/test_train.py::test_a_crashed_run_resumes_to_the_same_end",
-    "tests/test_seeds.py::test_a_seed_is_to_rounding_the_same_run_under_vmap",
-    "tests/test_rta.py::test_no_adversary_breaks_the_filter",
-    "tests/test_rta.py::test_a_control_that_is_certified_passes_unaltered",
-    "tests/test_rta.py::test_what_is_not_a_number_never_reaches_the_plant",
-    "tests/test_rta.py::test_in_float32_every_projection_is_certified",
-    "tests/test_suite.py::test_everything_stays_finite",
-    "tests/test_suite.py::test_everything_stays_finite_at_the_edges_of_space",
-    "tests/test_suite.py::test_limits_are_reached_and_never_exceeded",
-    "tests/test_suite.py::test_cost_is_one_exactly_where_a_margin_is_negative",
-    "tests/test_suite.py::test_planar_docking_is_spatial_docking_with_z_zero",
-    "tests/test_suite.py::test_planar_rejoin_is_spatial_rejoin_in_straight_level_flight",
-    "tests/test_cwh.py::test_in_float32_the_error_is_at_most_five_parts_in_ten_million",
-    "tests/test_dubins.py::test_in_float32_the_way_flown_has_six_digits",
-    "tests/test_trig.py",
+    "tests/envs/test_golden.py",
+    "tests/train/test_train.py::test_a_crashed_run_resumes_to_the_same_end",
+    "tests/devices/test_seed_mapper.py::test_a_seed_is_to_rounding_the_same_run_under_vmap",
+    "tests/rta/test_rta.py::test_no_adversary_breaks_the_filter",
+    "tests/rta/test_rta.py::test_a_control_that_is_certified_passes_unaltered",
+    "tests/rta/test_rta.py::test_what_is_not_a_number_never_reaches_the_plant",
+    "tests/rta/test_rta.py::test_in_float32_every_projection_is_certified",
+    "tests/envs/test_task_laws.py::test_everything_stays_finite",
+    "tests/envs/test_task_laws.py::test_everything_stays_finite_at_the_edges_of_space",
+    "tests/envs/test_task_laws.py::test_limits_are_reached_and_never_exceeded",
+    "tests/envs/test_task_laws.py::test_cost_is_one_exactly_where_a_margin_is_negative",
+    "tests/envs/test_task_laws.py::test_planar_docking_is_spatial_docking_with_z_zero",
+    "tests/envs/test_task_laws.py::test_planar_rejoin_is_spatial_rejoin_in_straight_level_flight",
+    "tests/simulation/test_cwh.py::test_in_float32_the_error_is_at_most_five_parts_in_ten_million",
+    "tests/simulation/test_dubins.py::test_in_float32_the_way_flown_has_six_digits",
+    "tests/simulation/test_trig.py",
 )
 """Those of `numbers`, the most telling first."""
 

@@ -1,7 +1,7 @@
 """The tables of the pages, from the results of the benchmarks and of the report, so that they cannot drift.
 
 Run `python benchmarks/tables.py` after a benchmark or a report: each table replaces the one in its page that has the same
-first row. `tests/test_benchmarks.py` compares the committed pages with it.
+first row. `tests/benchmarks/test_benchmarks.py` compares the committed pages with it.
 """
 
 from __future__ import annotations

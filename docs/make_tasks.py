@@ -1,7 +1,7 @@
 """The pages `docs/tasks/<task>.md` and their figures, from the environments themselves, so that they cannot drift.
 
-Run `python docs/make_tasks.py` after a change to a task; `tests/test_docs.py` compares the committed pages with it. The
-paragraphs above and below the figure are written by hand; every table comes from the components of `jaxsafe.make`.
+Run `python docs/make_tasks.py` after a change to a task; `tests/docs/test_docs.py` compares the committed pages with it.
+The paragraphs above and below the figure are written by hand; every table comes from the components of `jaxsafe.make`.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished training run that nobody interrupted."""
-    from tiny import TINY
+    from tiny_run import TINY
 
     from jaxsafe.commands.train import main
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 import pytest
-from tiny import TINY
+from tiny_run import TINY
 
 RUNS = [word for word in TINY if not word.startswith(("seeds", "env="))]
 

@@ -85,7 +85,7 @@ place_many = jax.jit(jax.vmap(jaxsafe.reset_to, in_axes=(None, 0, None)))
 
 
 def build(task: str, actions: str = "continuous", **options: Any) -> Environment:
-    path = Path(__file__).parent.parent / "configs" / f"{task}.yaml"
+    path = Path(__file__).parents[2] / "configs" / f"{task}.yaml"
     return jaxsafe.make(str(path) if task == CUSTOM else task, actions=actions, **options)
 
 

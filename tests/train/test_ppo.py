@@ -2,7 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Constant, Match, Position, probe
+from probe_environments import Constant, Match, Position, probe
 
 from jaxsafe.agents.agent import Agent
 from jaxsafe.environment import Environment

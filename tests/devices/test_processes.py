@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_train import assert_same_end
-from tiny import TINY
+from tiny_run import TINY, assert_same_end
 
 from jaxsafe.commands.train import main
 

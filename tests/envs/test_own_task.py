@@ -9,13 +9,13 @@ from pathlib import Path
 
 import jax
 import pytest
-from tiny import TINY
+from tiny_run import TINY
 
 import jaxsafe
 from jaxsafe.envs import TASKS, Task, make, register
 from jaxsafe.schema.errors import ConfigError
 
-PAGE = Path(__file__).parent.parent / "docs" / "extend.md"
+PAGE = Path(__file__).parents[2] / "docs" / "extend.md"
 OPTIONS = [word for word in TINY if not word.startswith("env=")]
 
 

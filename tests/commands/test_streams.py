@@ -8,7 +8,7 @@ from pathlib import Path
 
 import jax
 import pytest
-from tiny import TINY
+from tiny_run import TINY
 
 from jaxsafe import make
 from jaxsafe.commands import cli
@@ -17,7 +17,7 @@ from jaxsafe.commands.streams import LastingStream
 from jaxsafe.config import load
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 def shell(command: str, place: Path) -> subprocess.CompletedProcess[str]:

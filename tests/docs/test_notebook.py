@@ -5,7 +5,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-NOTEBOOK = Path(__file__).parent.parent / "docs" / "episodes.ipynb"
+NOTEBOOK = Path(__file__).parents[2] / "docs" / "episodes.ipynb"
 
 
 def execute(folder: Path) -> Any:

@@ -25,7 +25,7 @@ from jaxsafe.simulation.platform import Platform
 from jaxsafe.transition import bounds
 from jaxsafe.types import State, TimeStep
 
-GOLDEN = Path(__file__).parent / "golden"
+GOLDEN = Path(__file__).parents[1] / "golden"
 RECORDINGS = [
     *TASKS,
     "rejoin2d_rta",

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import TINY
+from tiny_run import TINY
 
 import jaxsafe
 from jaxsafe.agents.policy_file import read_policy

@@ -63,7 +63,7 @@ def test_omnisafe_learns_to_dock_within_the_budget(
         importlib.util.find_spec("omnisafe") is None
     ):  # importing it needs what the example puts in place first
         pytest.skip("needs omnisafe")
-    monkeypatch.syspath_prepend(str(Path(__file__).parent.parent / "examples"))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
     monkeypatch.chdir(tmp_path)
     from omnisafe_docking2d import train  # pyright: ignore[reportMissingImports]
 

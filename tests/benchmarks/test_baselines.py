@@ -19,7 +19,7 @@ from baselines.measures import failed_seeds, finished, samples_per_second, steps
 from baselines.page import DIRECTORY, Report, _number, _percent, _rate
 from baselines.plan import KINDS, SHIPPED, Item, best_seed, plan
 from baselines.record import keep, kept
-from tiny import TINY
+from tiny_run import TINY
 
 from jaxsafe.commands import evaluate as evaluate
 from jaxsafe.commands import train as train
@@ -31,7 +31,7 @@ from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.options import resolve_all
 
-PAGE = Path(__file__).parent.parent / "docs" / "baselines.md"
+PAGE = Path(__file__).parents[2] / "docs" / "baselines.md"
 REST = [word for word in TINY if not word.startswith("env=")]
 
 

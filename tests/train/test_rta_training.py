@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tiny import TINY
+from tiny_run import TINY
 
 import jaxsafe
 from jaxsafe.agents.agent import Agent

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 import pytest
 from orbax.checkpoint import CheckpointManager
-from tiny import TINY
+from tiny_run import TINY, assert_same_end, final_state, logs
 
 from jaxsafe.agents.policy_file import load_policy, read_policy
 from jaxsafe.commands import cli
@@ -23,39 +23,9 @@ from jaxsafe.commands import train as command
 from jaxsafe.devices import processes
 from jaxsafe.envs import TASKS
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.checkpoint import Checkpoints
 from jaxsafe.train.host.options import recipe
-from jaxsafe.train.host.restore import restore
 from jaxsafe.train.host.session import Clock, Training
-
-
-def logs(run: Path) -> dict[str, list[dict[str, Any]]]:
-    """All rows of the logs but for the clock."""
-    found = {}
-    for name in ("progress.jsonl", "eval.jsonl", "episodes.jsonl"):
-        found[name] = [json.loads(line) for line in (run / name).read_text().splitlines()]
-        for row in found[name]:
-            row.pop("wall_s", None)
-    return found
-
-
-def final_state(run: Path) -> Any:
-    config, env, _ = run_directory.read(run, "run")
-    checkpoints = Checkpoints(run)
-    content, facts = restore(checkpoints, checkpoints.steps[-1], env, config)
-    state = content["state"].replace(key=jax.random.key_data(content["state"].key))
-    return {"state": state, "best": content["best"], "updates": facts["updates"]}
-
-
-def assert_same_end(run: Path, whole: Path) -> None:
-    assert logs(run) == logs(whole)
-    jax.tree.map(np.testing.assert_array_equal, final_state(run), final_state(whole))
-    for policy in sorted((whole / "policy").iterdir()):
-        one, other = np.load(policy), np.load(run / "policy" / policy.name)
-        assert {name: one[name].tobytes() for name in one.files} == {
-            name: other[name].tobytes() for name in other.files
-        }
 
 
 def test_a_run_directory_holds_everything(whole: Path) -> None:

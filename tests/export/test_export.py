@@ -267,7 +267,7 @@ def test_a_loop_that_ends_in_no_number_is_violated(
 def test_the_page_tells_what_the_search_finds(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    page = (Path(__file__).parent.parent / "docs" / "export.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[2] / "docs" / "export.md").read_text(encoding="utf-8")
     assert main(["run=pretrained/docking2d", "format=vnnlib", f"out={tmp_path / 'x.vnnlib'}"]) == 0
     told = re.compile(r"least margin (\S+) from .*(: no counterexample among .*)")
     (said, rest), (found, end) = (

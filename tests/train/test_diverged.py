@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from probes import Position, probe
-from tiny import TINY
+from probe_environments import Position, probe
+from tiny_run import TINY
 
 from jaxsafe.agents.agent import Agent
 from jaxsafe.commands import cli

@@ -265,7 +265,7 @@ def test_an_interval_is_drawn_and_named_only_where_there_are_seeds_enough() -> N
 
 
 def test_what_to_stay_out_of_is_not_drawn_like_the_goal() -> None:
-    assert kept_out(jaxsafe.make(Path(__file__).parent.parent / "configs" / "custom_env.yaml")) == {
+    assert kept_out(jaxsafe.make(Path(__file__).parents[2] / "configs" / "custom_env.yaml")) == {
         "keep_out"
     }
     for task in TASKS:

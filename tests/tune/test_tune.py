@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny import TINY
+from tiny_run import TINY
 
 from jaxsafe.commands import cli
 from jaxsafe.commands import tune as command

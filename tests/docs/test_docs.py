@@ -17,7 +17,7 @@ import jaxsafe
 from jaxsafe.config import dump, load
 from jaxsafe.envs import TASKS
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 CUSTOM = ROOT / "configs" / "custom_env.yaml"
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 MARK = "--- end of block ---"
