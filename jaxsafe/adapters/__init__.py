@@ -1,4 +1,7 @@
-"""The tasks in other libraries: each adapter is one file over `reset` and `step`, and nothing in the core knows of it."""
+"""Adapters that offer the tasks to other libraries.
+
+Each adapter is one file over `reset` and `step`. Nothing in the core knows of it.
+"""
 
 from __future__ import annotations
 
@@ -21,17 +24,20 @@ FORKED = (
     "forked processes would wait for ever for JAX's threads; start workers with context='spawn'"
     " (make_vec: vector_kwargs={'context': 'spawn'})"
 )
-"""What is wrong with workers that are forked, and what works."""
+"""What is wrong with forked workers, and what works instead."""
 
 _process: int | None = None
-"""The process that has made or stepped environments; its threads of JAX are not in what it forks."""
+"""Id of the process that has made or stepped environments.
+
+A process that is forked from it does not have its threads of JAX.
+"""
 
 
 def refuse_fork() -> None:
     """Raise in a process that was forked from one that has used JAX here.
 
     Raises:
-        ConfigError: always there, since any computation would wait for ever.
+        ConfigError: this is such a process. Any computation would wait for ever in it.
     """
     global _process
     if _process not in (None, os.getpid()):
@@ -44,10 +50,18 @@ def environment(
     overrides: Mapping[str, Any] | None,
     options: Mapping[str, Any],
 ) -> Environment:
-    """What `jaxsafe.make` makes of the arguments of an adapter, or the environment that it was given.
+    """Return the environment that the arguments of an adapter describe.
+
+    Args:
+        task: the name of a task, a YAML file, or an environment that is made already.
+        overrides: as `jaxsafe.make` takes them.
+        options: the other arguments of `jaxsafe.make`, by name. An environment that is made already
+            takes none.
 
     Raises:
-        ConfigError: as `jaxsafe.make`.
+        ConfigError: an option is unknown, or is given for an environment that is made already. Also
+            raised as by `jaxsafe.make`, and in a process that was forked from one that has used
+            JAX.
     """
     refuse_fork()
     known = list(inspect.signature(make).parameters)[1:]
@@ -58,20 +72,25 @@ def environment(
         return make(task, overrides, **options)
     if options:
         raise ConfigError(
-            f"{next(iter(options))}: the environment is made already; give it to jaxsafe.make instead"
+            f"{next(iter(options))}: the environment is made already;"
+            " give it to jaxsafe.make instead"
         )
     return override(task, overrides) if overrides else task
 
 
 MAX_COUNT = 2**31 - 1
-"""The largest number of environments or of steps: the programs count in 32 bits."""
+"""The largest number of environments or of steps. The programs count in 32 bits."""
 
 
 def checked_count(name: str, count: Any) -> int:
-    """Return a number of environments or of steps.
+    """Return a number of environments or of steps as an `int`.
+
+    Args:
+        name: the name of the argument, for the error message.
+        count: the number that was given.
 
     Raises:
-        ConfigError: it is no whole number, below 1 or above `MAX_COUNT`.
+        ConfigError: `count` is not a whole number from 1 to `MAX_COUNT`.
     """
     if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
         raise ConfigError(f"{name}: expected a whole number ≥ 1, found {show(count)}")
@@ -83,7 +102,10 @@ def checked_count(name: str, count: Any) -> int:
 
 
 def observation_bounds(env: Environment) -> tuple[list[float], list[float]]:
-    """The least and the greatest value of each element of an observation: infinite where it is not clipped."""
+    """Return the lowest and the highest value of each element of an observation.
+
+    Elements that are not clipped have infinite bounds.
+    """
     bounds = []
     for item in env.observation:
         size = sum(
@@ -98,10 +120,10 @@ def observation_bounds(env: Environment) -> tuple[list[float], list[float]]:
 
 
 def action_bounds(env: Environment) -> tuple[list[Any], list[Any]]:
-    """Return the least and the greatest value of each element of a continuous action.
+    """Return the lowest and the highest value of each element of a continuous action.
 
-    They are −1 and 1 where the actuator rescales, else the actuator's own limits. Where episodes draw a limit, it is the
-    widest that they can draw.
+    They are −1 and 1 where the actuator rescales, and else the actuator's own limits in physical
+    units. If episodes draw a limit at random, the widest that can be drawn is returned.
     """
     if not acts_in_physical_units(env):
         return [-1.0] * env.action_size, [1.0] * env.action_size
@@ -112,7 +134,7 @@ def action_bounds(env: Environment) -> tuple[list[Any], list[Any]]:
 
 
 def acts_in_physical_units(env: Environment) -> bool:
-    """Return whether some actuator takes its element of a continuous action as it is."""
+    """Return whether some actuator does not rescale its element of a continuous action."""
     return not all(actuator.rescale for actuator in _actuators(env))
 
 

@@ -1,4 +1,7 @@
-"""The tasks as Brax environments, for its PPO, SAC and APG: `ppo.train(BraxEnv("docking2d"), wrap_env_fn=wrap, …)`."""
+"""The tasks as environments of Brax, for its PPO, SAC and APG.
+
+ppo.train(BraxEnv("docking2d"), wrap_env_fn=wrap, …)
+"""
 # pyright: reportMissingImports=false
 
 from __future__ import annotations
@@ -25,12 +28,14 @@ except ImportError as error:
 
 
 class BraxEnv(Env):
-    """One task. `pipeline_state` is our state.
+    """One task as an environment of Brax.
 
-    `metrics` are `cost`, `success` and `reward_…` of each term, which Brax sums over episodes.
+    `pipeline_state` is the `State` of the environment. `metrics` are `cost`, `success`, and
+    `reward_…` for each reward term. Brax sums them over episodes.
 
-    `done` is 1 where the task ended. A task that truncates by itself (none of the five does) looks to Brax as if it had
-    terminated; the limit that Brax knows of is its own `episode_length`.
+    `done` is 1 where the task ended. If a task truncates an episode by itself, Brax sees a
+    termination. None of the five tasks does that. The limit that Brax knows of is its own
+    `episode_length`.
     """
 
     def __init__(
@@ -39,10 +44,16 @@ class BraxEnv(Env):
         overrides: Mapping[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        """Make the environment; `options` are `variant`, `randomize`, `rta` of `jaxsafe.make`.
+        """Make the environment.
+
+        Args:
+            task: the name of a task, a YAML file, or an environment that `jaxsafe.make` returned.
+            overrides: as `jaxsafe.make` takes them.
+            options: `variant`, `randomize` and `rta` of `jaxsafe.make`.
 
         Raises:
-            ConfigError: as `jaxsafe.make`; or actions are discrete, or are not in [−1, 1]: Brax's agents know no others.
+            ConfigError: actions are discrete, or are not in [−1, 1]. Brax's agents know only
+                continuous actions in that interval. Also raised as by `jaxsafe.make`.
         """
         self.env = environment(task, overrides, options)
         if self.env.num_action_points:
@@ -50,11 +61,12 @@ class BraxEnv(Env):
         for name, low, high in zip(self.env.action_names, *action_bounds(self.env), strict=True):
             if (low, high) != (-1.0, 1.0):
                 raise ConfigError(
-                    f"actuator {name}: Brax's agents act in [-1, 1], found [{low:g}, {high:g}]; leave rescale on"
+                    f"actuator {name}: Brax's agents act in [-1, 1], found [{low:g}, {high:g}];"
+                    " leave rescale on"
                 )
 
     def reset(self, rng: Key) -> State:
-        """A random start."""
+        """Return a random start."""
         state, timestep = reset(self.env, rng)
         return State(
             state,
@@ -66,7 +78,7 @@ class BraxEnv(Env):
         )
 
     def step(self, state: State, action: Array) -> State:
-        """Advance one time step of the task."""
+        """Return the state one time step of the task later."""
         following, timestep = step(self.env, state.pipeline_state, action)
         return state.replace(
             pipeline_state=following,
@@ -102,10 +114,11 @@ class BraxEnv(Env):
 
 
 class Repeat(Wrapper):
-    """Takes each action for several steps of the task, at most until the episode ends.
+    """A wrapper that takes each action for several steps, at most until the episode ends.
 
-    Rewards and metrics are summed over the steps taken. Brax's own repetition goes on after the end and adds to the
-    rewards what is paid there, and it has the metrics of the last step only.
+    Rewards and metrics are sums over the steps taken. Brax's own repetition goes on after the end
+    of an episode and adds the rewards that are paid there. Its metrics are those of the last step
+    only.
     """
 
     def __init__(self, env: Env, action_repeat: int) -> None:
@@ -125,7 +138,11 @@ class Repeat(Wrapper):
 
 
 class FreshStarts(Wrapper):
-    """Starts each episode anew. Brax's own AutoResetWrapper begins every episode of a lane where its first began."""
+    """A wrapper that draws a new start for each episode.
+
+    With Brax's own AutoResetWrapper, every episode of an environment begins where its first episode
+    began.
+    """
 
     def reset(self, rng: Key) -> State:
         state = self.env.reset(rng)
@@ -156,10 +173,18 @@ def wrap(
     action_repeat: int = 1,
     randomization_fn: Callable | None = None,
 ) -> Wrapper:
-    """What to give Brax's trainers as `wrap_env_fn`: many episodes side by side, each with a fresh start.
+    """Return a batch of environments in which each episode has a fresh start.
+
+    Give this function to Brax's trainers as `wrap_env_fn`.
+
+    Args:
+        env: the environment of one task.
+        episode_length: number of steps of the task after which an episode is truncated.
+        action_repeat: number of steps of the task for which each action is taken.
+        randomization_fn: must be None. It is for Brax's own physics.
 
     Raises:
-        ConfigError: with a `randomization_fn`, which is for Brax's own physics, or an `action_repeat` below 1.
+        ConfigError: there is a `randomization_fn`, or `action_repeat` is below 1.
     """
     if randomization_fn is not None:
         raise ConfigError("randomization_fn: give BraxEnv randomize={path: [low, high]} instead")
@@ -169,7 +194,7 @@ def wrap(
 
 
 def mend_brax() -> None:
-    """Put back `jax.device_put_replicated`, which Brax 0.14.2 calls and JAX 0.10 no longer has."""
+    """Restore `jax.device_put_replicated`. Brax 0.14.2 calls it, and JAX 0.10 no longer has it."""
     if hasattr(jax, "device_put_replicated"):
         return
 

@@ -1,4 +1,4 @@
-"""From environments and time steps to Gymnasium's spaces and infos."""
+"""Conversion of environments and time steps to Gymnasium's spaces and infos."""
 
 from __future__ import annotations
 
@@ -16,12 +16,23 @@ from jaxsafe.types import TimeStep
 Space = gym.spaces.Box | gym.spaces.MultiDiscrete
 
 _FACTS = (
-    "margins", "severity", "reward_terms", "reward_totals", "status", "control_desired", "control_actual", "intervening",
-)  # fmt: skip
+    "margins",
+    "severity",
+    "reward_terms",
+    "reward_totals",
+    "status",
+    "control_desired",
+    "control_actual",
+    "intervening",
+)
+"""Fields of `Info` that become entries of Gymnasium's `info` as they are."""
 
 
 def spaces(env: Environment) -> tuple[gym.spaces.Box, Space]:
-    """Of observations and of actions."""
+    """Return the space of observations and the space of actions.
+
+    Discrete actions have a `MultiDiscrete` space, continuous ones a `Box`.
+    """
     dtype = jnp.result_type(float)
     low, high = observation_bounds(env)
     observation = gym.spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
@@ -34,7 +45,12 @@ def spaces(env: Environment) -> tuple[gym.spaces.Box, Space]:
 
 
 def facts(env: Environment, timestep: TimeStep) -> dict[str, Any]:
-    """What `info` holds, of one step or of a batch on the host."""
+    """Return the entries of `info`.
+
+    Args:
+        env: the environment.
+        timestep: one time step or a batch of them, as NumPy arrays.
+    """
     info = timestep.info
     outcomes = np.array(env.outcomes, object)
     found = {
@@ -47,8 +63,17 @@ def facts(env: Environment, timestep: TimeStep) -> dict[str, Any]:
 
 
 def masked(found: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
-    """Gymnasium's form of a batch of infos: beside each entry, under `_` and its name, which lanes have it."""
-    mask = mask.copy()  # one for all, since it must not change
+    """Return a batch of infos in Gymnasium's form.
+
+    In that form each entry has a second one beside it, named after it with `_` in front. The second
+    one says which environments of the batch have the first.
+
+    Args:
+        found: the entries, each [num_envs, …] or a mapping of such entries.
+        mask: which environments have them, [num_envs].
+    """
+    # All entries share one copy, so nobody may write to it.
+    mask = mask.copy()
     mask.setflags(write=False)
     batch = {}
     for name, value in found.items():
@@ -58,7 +83,12 @@ def masked(found: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
 
 
 def of_lane(infos: Mapping[str, Any], lane: int) -> dict[str, Any]:
-    """Return the info of one lane, as a single environment has it, from Gymnasium's form of a batch."""
+    """Return the info of one environment of a batch, in the form that a single environment has.
+
+    Args:
+        infos: the infos of the batch, in Gymnasium's form.
+        lane: the index of the environment in the batch.
+    """
     found = {}
     for name, value in infos.items():
         if name.startswith("_") and name[1:] in infos:

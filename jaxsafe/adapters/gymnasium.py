@@ -1,4 +1,4 @@
-"""Gymnasium environments: one at a time, or a batch in one compiled step.
+"""Gymnasium environments, one at a time or as a batch in one compiled step.
 
     gymnasium.make("jaxsafe/Docking3D-v0", rta="default")
     gymnasium.make_vec("jaxsafe/Docking3D-v0", num_envs=64, autoreset_mode="SameStep")
@@ -30,16 +30,22 @@ from jaxsafe.schema.errors import ConfigError, nearest
 
 
 class _Chains:
-    """The chains of keys that episodes start from, one for each lane."""
+    """Chains of PRNG keys from which episodes start, one for each environment of the batch."""
 
     env: Environment
     _lanes: Lanes
     _unseeded: np.ndarray
-    """Where no chain has begun, or `np_random` is a new generator and the next chain begins from it; [num_envs]."""
+    """Which environments begin a chain at their next start even without a seed, [num_envs].
+
+    They are those without a chain, and all of them once `np_random` has become a new generator.
+    """
 
     @property
     def np_random(self) -> np.random.Generator:
-        """Return the generator of Gymnasium's; episodes start from it where no seed is given, if it was set."""
+        """Return Gymnasium's random number generator.
+
+        Once it has been set, chains that begin without a seed take theirs from it.
+        """
         return super().np_random  # type: ignore[misc]
 
     @np_random.setter
@@ -47,13 +53,20 @@ class _Chains:
         if not isinstance(value, np.random.Generator):
             raise ConfigError(f"np_random: expected a numpy.random.Generator, found {value!r}")
         self._np_random = value
-        self._np_random_seed = -1  # Gymnasium's sign of a generator whose seed is unknown
+        # In Gymnasium −1 stands for a generator whose seed is unknown.
+        self._np_random_seed = -1
         self._unseeded[:] = True
 
     def _start(
         self, mask: np.ndarray, seeds: Sequence[int | None], placed: Episodes | None
     ) -> None:
-        """Start an episode in each lane of the mask, at random or as it is placed."""
+        """Start an episode in each environment of the mask.
+
+        Args:
+            mask: which environments to start, [num_envs].
+            seeds: a seed for each environment of the batch, or None.
+            placed: the start of the episodes. None stands for random starts.
+        """
         self._begin_chains(mask, seeds)
         if placed is None:
             self._lanes.restart(mask)
@@ -61,7 +74,7 @@ class _Chains:
             self._lanes.place(mask, placed)
 
     def _begin_chains(self, mask: np.ndarray, seeds: Sequence[int | None]) -> None:
-        """Begin a chain in each lane of the mask that is asked to, or has none."""
+        """Begin a chain in each environment of the mask that has a seed or needs a chain."""
         begin = mask & (self._unseeded | [seed is not None for seed in seeds])
         if not begin.any():
             return
@@ -80,17 +93,25 @@ class _Chains:
 
 
 class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
-    """One environment.
+    """One environment with Gymnasium's interface.
 
-    `reset(seed=s)` starts a chain of keys from `jax.random.key(s)`, and each reset takes the next: equal seeds give equal
-    episodes, one after another. `reset(options={"start": …, "parameters": …})` starts where `jaxsafe.reset_to` would.
+    `reset(seed=s)` starts a chain of keys from `jax.random.key(s)`, and each reset takes the next
+    key. So equal seeds give equal sequences of episodes.
 
-    `info` holds `cost` (1 on a step that violates a safety constraint), `margins` (h of each constraint, safe where ≥ 0),
-    `severity`, `reward_terms` and `reward_totals`, `status`, `outcome` (a name, `running` until the end), `is_success`,
-    `control_desired` and `control_actual`, `intervening`, and with run time assurance `rta`.
+    `reset(options={"start": …, "parameters": …})` starts where `jaxsafe.reset_to` would.
+
+    `info` holds:
+
+    - `cost`: 1 on a step that violates a safety constraint,
+    - `margins`: h of each constraint, which is safe where h ≥ 0,
+    - `outcome`: the name of the outcome, `running` until the end,
+    - `is_success`, `severity`, `status`, `reward_terms` and `reward_totals`,
+    - `control_desired`, `control_actual` and `intervening`,
+    - `rta`: only with run time assurance.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 as Gymnasium declares it
+    # Gymnasium declares it so, without an annotation.
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(
         self,
@@ -107,8 +128,9 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
             task: the name of a task, a YAML file, or an environment that `jaxsafe.make` returned.
             overrides: as `jaxsafe.make` takes them.
             render_mode: `rgb_array`, or None for no pictures.
-            max_episode_steps: truncate episodes after as many steps, besides the ends of the task.
-            options: `actions`, `variant`, `randomize`, `rta` of `jaxsafe.make`.
+            max_episode_steps: number of steps after which an episode is truncated, if the task has
+                not ended it before. None stands for no such limit.
+            options: `actions`, `variant`, `randomize` and `rta` of `jaxsafe.make`.
 
         Raises:
             ConfigError: as `jaxsafe.make`.
@@ -124,7 +146,19 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict]:
-        """Start an episode: see the class."""
+        """Start an episode.
+
+        Args:
+            seed: a new chain of keys begins here. None takes the next key of the chain.
+            options: `start` and `parameters`, as `jaxsafe.reset_to` takes them. Without options the
+                start is random.
+
+        Returns:
+            The observation and `info`.
+
+        Raises:
+            ConfigError: the seed or the options are refused.
+        """
         super().reset(seed=seed)
         chosen = _checked_options(options, ("start", "parameters"))
         self._start(_ALONE, [_checked_seed(seed)], _placed(self.env, chosen))
@@ -137,8 +171,9 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
         """Advance one time step of the task.
 
         Raises:
-            ResetNeeded: before the first reset.
-            ConfigError: the action has another shape, or is not whole numbers where actions are discrete.
+            ResetNeeded: there was no reset before.
+            ConfigError: the action has another shape, or actions are discrete and it is not whole
+                numbers.
         """
         if not self._lanes.running:
             raise ResetNeeded("step: call reset first")
@@ -146,10 +181,17 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
         return self._receive(self._lanes.now)
 
     def render(self) -> Any:
-        """A picture of the episode so far, (height, width, 3), if there is a render mode."""
+        """Return a picture of the episode so far, [height, width, 3].
+
+        Without a render mode it is None, with a warning.
+
+        Raises:
+            ResetNeeded: there was no reset before.
+        """
         if self._frames is None:
             gym.logger.warn(
-                "render: no render_mode was chosen; make the environment with render_mode='rgb_array'"
+                "render: no render_mode was chosen;"
+                " make the environment with render_mode='rgb_array'"
             )
             return None
         if not self._lanes.running:
@@ -172,10 +214,15 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
 class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Many environments, stepped by one compiled program.
 
-    Each lane does what a `GymEnv` of its own would do with the same seed; `reset(seed=s)` seeds lane i with s + i. What
-    follows the end of an episode is Gymnasium's `autoreset_mode`: `NextStep`, `SameStep` (then `infos["final_obs"]`,
-    [num_envs, observation], and `infos["final_info"]` hold what the episode ended with, where `infos["_final_obs"]`) or
-    `Disabled` (then `reset(options={"reset_mask": …})` starts those lanes again).
+    Each environment does what a `GymEnv` of its own would do with the same seed. `reset(seed=s)`
+    seeds environment i with s + i. Gymnasium's `autoreset_mode` decides what follows the end of an
+    episode:
+
+    - `NextStep`: the next step starts a new episode and ignores the action.
+    - `SameStep`: the same step starts a new episode. `infos["final_obs"]`, [num_envs, observation],
+      and `infos["final_info"]` hold what the old episode ended with. They count where
+      `infos["_final_obs"]` is True.
+    - `Disabled`: `reset(options={"reset_mask": …})` starts the environments of the mask again.
     """
 
     def __init__(
@@ -189,7 +236,16 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         max_episode_steps: int | None = None,
         **options: Any,
     ) -> None:
-        """Make the environments; arguments as of `GymEnv`.
+        """Make the environments.
+
+        Args:
+            task: as `GymEnv` takes it.
+            num_envs: number of environments.
+            overrides: as `jaxsafe.make` takes them.
+            autoreset_mode: what follows the end of an episode.
+            render_mode: as `GymEnv` takes it.
+            max_episode_steps: as `GymEnv` takes it.
+            options: as `GymEnv` takes them.
 
         Raises:
             ConfigError: as `jaxsafe.make`.
@@ -210,7 +266,20 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict]:
-        """Start an episode in each lane, or where `options["reset_mask"]` says; the other options are those of `GymEnv`."""
+        """Start an episode in each environment, or in those of a mask.
+
+        Args:
+            seed: the seed of environment 0, to which the others add their index; or a list with a
+                seed, or None, for each environment. None takes the next keys of the chains.
+            options: those of `GymEnv.reset`, and `reset_mask`, a bool array [num_envs].
+
+        Returns:
+            The observations, [num_envs, observation], and the infos.
+
+        Raises:
+            ResetNeeded: the first reset has a mask that leaves out some environments.
+            ConfigError: the seeds or the options are refused.
+        """
         chosen = dict(_checked_options(options, ("start", "parameters", "reset_mask")))
         mask = _checked_mask(chosen.pop("reset_mask", None), self.num_envs)
         if not self._lanes.running and not mask.all():
@@ -222,7 +291,14 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def start_lanes(
         self, seeds: Sequence[int | None], options: Sequence[Mapping[str, Any] | None]
     ) -> tuple[np.ndarray, dict]:
-        """Start an episode in each lane, with the seed and the options of `GymEnv` that stand at its place.
+        """Start an episode in each environment, with a seed and options of its own.
+
+        Args:
+            seeds: a seed, or None, for each environment.
+            options: options of `GymEnv.reset`, or None, for each environment.
+
+        Returns:
+            The observations, [num_envs, observation], and the infos.
 
         Raises:
             ConfigError: as `GymEnv.reset`.
@@ -238,7 +314,7 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return self._begun(np.ones(self.num_envs, bool))
 
     def _begun(self, mask: np.ndarray) -> tuple[np.ndarray, dict]:
-        """Return what a reset returns, after episodes have started in the lanes of the mask."""
+        """Return observations and infos after environments of a mask have started episodes."""
         episodes = self._lanes.now
         self._over = np.where(mask, False, self._over)
         self._film(mask, episodes)
@@ -249,11 +325,20 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
-        """Advance every lane one time step of the task.
+        """Advance every environment one time step of the task.
+
+        Args:
+            actions: an action for each environment, [num_envs, action].
+
+        Returns:
+            The observations, [num_envs, observation]; rewards, `terminated` and `truncated`,
+            [num_envs] each; and the infos.
 
         Raises:
-            ResetNeeded: before the first reset, or with `Disabled` where a lane's episode is over.
-            ConfigError: the actions have another shape, or are not whole numbers where actions are discrete.
+            ResetNeeded: there was no reset before, or `autoreset_mode` is `Disabled` and an episode
+                is over.
+            ConfigError: the actions have another shape, or actions are discrete and they are not
+                whole numbers.
         """
         if not self._lanes.running:
             raise ResetNeeded("step: call reset first")
@@ -261,7 +346,8 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if self.autoreset_mode is AutoresetMode.DISABLED and over.any():
             lanes = np.flatnonzero(over).tolist()
             raise ResetNeeded(
-                f"step: the episodes of lanes {lanes} are over; reset them with options={{'reset_mask': …}}"
+                f"step: the episodes of lanes {lanes} are over;"
+                " reset them with options={'reset_mask': …}"
             )
         action = _checked_action(self.env, actions)
         if action.shape != self.action_space.shape:
@@ -271,8 +357,9 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._lanes.step(action)
         restarted, final = np.zeros_like(over), {}
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and over.any():
+            # The start replaces the step that these environments have taken above.
             restarted = over
-            self._lanes.restart(over)  # instead of the step
+            self._lanes.restart(over)
         episodes = self._lanes.now
         taken = episodes.timestep
         self._over = taken.terminated | taken.truncated
@@ -290,10 +377,17 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return np.array(episodes.timestep.observation), rewards, *flags, infos
 
     def render(self) -> Any:
-        """A picture of each lane's episode so far, if there is a render mode."""
+        """Return a picture of each environment's episode so far, [height, width, 3] each.
+
+        Without a render mode it is None, with a warning.
+
+        Raises:
+            ResetNeeded: there was no reset before.
+        """
         if not self._frames:
             gym.logger.warn(
-                "render: no render_mode was chosen; make the environments with render_mode='rgb_array'"
+                "render: no render_mode was chosen;"
+                " make the environments with render_mode='rgb_array'"
             )
             return None
         if not self._lanes.running:
@@ -301,9 +395,14 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return tuple(frames.draw() for frames in self._frames)
 
     def _seeds(self, seed: int | Iterable[int | None] | None) -> list[int | None]:
-        """Return the seed that each lane is asked for."""
+        """Return a seed, or None, for each environment.
+
+        Raises:
+            ConfigError: there are too many seeds or too few, or one is refused.
+        """
         if seed is None or isinstance(seed, int | np.integer):
-            super().reset(seed=seed)  # sets np_random
+            # Gymnasium's own reset sets `np_random`.
+            super().reset(seed=seed)
             first = _checked_seed(seed)
             return [None if first is None else first + lane for lane in range(self.num_envs)]
         if not isinstance(seed, Iterable):
@@ -316,7 +415,12 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return seeds
 
     def _film(self, restarted: np.ndarray, episodes: Episodes) -> None:
-        """Remember what pictures show."""
+        """Remember what the pictures of each environment show.
+
+        Args:
+            restarted: which environments have started a new episode, [num_envs].
+            episodes: the episodes after the step or reset.
+        """
         for lane, frames in enumerate(self._frames):
             if restarted[lane]:
                 frames.clear()
@@ -332,7 +436,6 @@ class Frames:
     """Pictures of an episode that is still going on."""
 
     def __init__(self, env: Environment) -> None:
-        """Remember nothing yet."""
         self._env, self._past = env, []
 
     def clear(self) -> None:
@@ -340,25 +443,36 @@ class Frames:
         self._past.clear()
 
     def add(self, sim: Any, margins: Mapping[str, Any]) -> None:
-        """Remember one step, on the host."""
+        """Remember one step.
+
+        Args:
+            sim: the simulation after the step, as NumPy arrays.
+            margins: h of each safety constraint.
+        """
         self._past.append((sim, margins))
 
     def draw(self) -> np.ndarray:
-        """The latest step with the path that led there, (height, width, 3)."""
-        from jaxsafe.plot.animation import Scene  # draws in matplotlib
+        """Return a picture of the latest step and the path that led there, [height, width, 3]."""
+        # Only drawing needs matplotlib.
+        from jaxsafe.plot.animation import Scene
 
         sim, margins = jax.tree.map(lambda *steps: np.stack(steps), *self._past)
         return Scene(self._env, sim, margins, self._env.agent).draw(len(self._past) - 1)
 
 
 _ALONE = np.ones(1, bool)
-"""The mask of the only lane."""
+"""The mask of a batch of one environment."""
 
 
 def _refuse_forking_workers() -> None:
-    """Raise where `AsyncVectorEnv` makes the environment whose spaces it reads before it forks its workers.
+    """Raise if `AsyncVectorEnv` is making this environment and will fork its workers.
 
-    They would wait for ever for JAX's threads. An error in a worker reaches its parent as a mere EOFError.
+    Forked workers would wait for ever for JAX's threads. Before it forks them, `AsyncVectorEnv`
+    makes an environment in the parent process to read its spaces. The error is raised there,
+    because an error in a worker reaches the parent as a mere EOFError.
+
+    Raises:
+        ConfigError: the workers will be forked.
     """
     frame = inspect.currentframe()
     while frame is not None:
@@ -366,17 +480,17 @@ def _refuse_forking_workers() -> None:
             chosen = frame.f_locals.get("context") or multiprocessing.get_start_method(
                 allow_none=True
             )
-            if (
-                chosen or multiprocessing.get_all_start_methods()[0]
-            ) == "fork":  # the first is the default
+            # The first start method of the list is the default.
+            if (chosen or multiprocessing.get_all_start_methods()[0]) == "fork":
                 raise ConfigError(
-                    f"AsyncVectorEnv: {FORKED}, or leave out vectorization_mode for the compiled batch"
+                    f"AsyncVectorEnv: {FORKED},"
+                    " or leave out vectorization_mode for the compiled batch"
                 )
         frame = frame.f_back
 
 
 MAX_SEED_BITS = 128
-"""As many as Gymnasium's own seeds have, which are drawn where none is given."""
+"""The largest number of bits of a seed. The seeds that Gymnasium draws itself have as many."""
 
 
 def _checked_seed(seed: Any) -> int | None:
@@ -391,7 +505,10 @@ def _checked_seed(seed: Any) -> int | None:
 
 
 def _checked_action(env: Environment, action: Any) -> np.ndarray:
-    """One type, or JAX would compile for each that it is given; a discrete action that is no whole number stays wrong."""
+    """Return an action as an array of one dtype, so that the step is compiled only once.
+
+    Discrete actions that are not integers are passed on as they are and fail in the step.
+    """
     array = np.asarray(action)
     whole = array.dtype.kind in "iub" and env.num_action_points
     return array.astype(np.int32 if whole else jnp.result_type(float))
@@ -400,14 +517,17 @@ def _checked_action(env: Environment, action: Any) -> np.ndarray:
 def _grouped(
     options: Sequence[Mapping[str, Any] | None],
 ) -> list[tuple[Mapping[str, Any] | None, np.ndarray]]:
-    """Return each of the options with a mask of the lanes that have it; what is empty is one group."""
+    """Return each of the options with a mask of the environments that have them, [num_envs].
+
+    All environments without options are one group.
+    """
     groups = {id(one) if one else None: one for one in options}
     own = np.array([id(one) if one else None for one in options], object)
     return [(one, own == key) for key, one in groups.items()]
 
 
 def _placed(env: Environment, chosen: Mapping[str, Any]) -> Episodes | None:
-    """Return the episode at the start that is chosen, None for one at random."""
+    """Return an episode at the start that the options choose, or None if they choose none."""
     refuse_fork()
     return (
         Episodes(*reset_to(env, chosen.get("start", {}), chosen.get("parameters")))
@@ -440,7 +560,8 @@ def _checked_mask(mask: Any, num_envs: int) -> np.ndarray:
             f"{mask.dtype} of shape {mask.shape}" if isinstance(mask, np.ndarray) else repr(mask)
         )
         raise ConfigError(
-            f"reset: reset_mask: expected a bool array of shape ({num_envs},), some of it True, found {found}"
+            f"reset: reset_mask: expected a bool array of shape ({num_envs},), some of it True,"
+            f" found {found}"
         )
     return mask
 

@@ -1,7 +1,10 @@
-"""The tasks as gymnax environments: `reset(key, params)` and `step(key, state, action, params)`, which resets by itself.
+"""The tasks as environments of gymnax.
 
-env = GymnaxEnv("docking2d")                  # gymnax ≥ 1.0: six values from a step
-env = GymnaxEnv("docking2d", legacy=True)     # gymnax 0.0.9, rejax, PureJaxRL: five, with one `done`
+They have `reset(key, params)` and `step(key, state, action, params)`. A step that ends an episode
+also starts the next one.
+
+env = GymnaxEnv("docking2d")                  # gymnax ≥ 1.0: a step returns six values
+env = GymnaxEnv("docking2d", legacy=True)     # gymnax 0.0.9, rejax, PureJaxRL: five, one `done`
 """
 # pyright: reportMissingImports=false
 
@@ -36,22 +39,32 @@ except ImportError as error:
 
 
 class GymnaxParams(Record):
-    """What gymnax calls parameters: the environment, which is a pytree of all its numbers, and a limit."""
+    """The parameters of an environment, as gymnax calls them.
+
+    They are the environment itself, a pytree of all its numbers, and a limit of steps.
+    """
 
     env: Environment
-    max_steps_in_episode: int = 10_000  # longer than any of the five tasks lasts
+    max_steps_in_episode: int = 10_000
+    """Number of steps after which an episode is truncated. None of the five tasks lasts so long."""
 
     def __post_init__(self) -> None:
-        """Refuse a limit that no program can count to. Traced limits, and trees of axes such as 0, are left alone."""
+        """Refuse a limit that no program can count to.
+
+        Limits that are traced, and the axes that stand for them in `in_axes`, are left alone.
+        """
         if isinstance(self.max_steps_in_episode, int) and self.max_steps_in_episode > MAX_COUNT:
             checked_count("max_steps_in_episode", self.max_steps_in_episode)
 
 
 class GymnaxEnv:
-    """One task; `jax.vmap` it over keys and states, and over parameters.
+    """One task as an environment of gymnax.
 
-    `info` holds `cost`, `is_success`, `terminated`, `truncated` and `final_observation`, the one that the step led to
-    before any reset. Discrete actions, one choice for each actuator, become one choice among all their combinations.
+    Its methods work under `jax.vmap` over keys and states, and over parameters.
+
+    `info` holds `cost`, `is_success`, `terminated`, `truncated` and `final_observation`. The final
+    observation is the one that the step led to, before any reset. Discrete actions are one choice
+    for each actuator. Here they become one choice among all their combinations.
     """
 
     def __init__(
@@ -62,7 +75,13 @@ class GymnaxEnv:
         legacy: bool = False,
         **options: Any,
     ) -> None:
-        """Make the environment; `options` are `actions`, `variant`, `randomize`, `rta` of `jaxsafe.make`.
+        """Make the environment.
+
+        Args:
+            task: the name of a task, a YAML file, or an environment that `jaxsafe.make` returned.
+            overrides: as `jaxsafe.make` takes them.
+            legacy: whether `step` returns one `done` in place of `terminated` and `truncated`.
+            options: `actions`, `variant`, `randomize` and `rta` of `jaxsafe.make`.
 
         Raises:
             ConfigError: as `jaxsafe.make`.
@@ -72,19 +91,21 @@ class GymnaxEnv:
 
     @property
     def default_params(self) -> GymnaxParams:
-        """The environment as it was made."""
+        """Return the environment as it was made, with the default limit of steps."""
         return GymnaxParams(self.env)
 
     def reset(self, key: Key, params: GymnaxParams | None = None) -> tuple[Array, State]:
-        """A random start: observation and state."""
+        """Return the observation and the state of a random start."""
         return _reset(key, params or self.default_params)
 
     def step(
         self, key: Key, state: State, action: Array, params: GymnaxParams | None = None
     ) -> tuple:
-        """One step, and a fresh start where it ends the episode: (observation, state, reward, terminated, truncated, info).
+        """Take one step, and draw a fresh start where it ends the episode.
 
-        With `legacy`, (observation, state, reward, done, info).
+        Returns:
+            The values (observation, state, reward, terminated, truncated, info). With `legacy` they
+            are (observation, state, reward, done, info).
         """
         *taken, info = _step(key, state, action, params or self.default_params)
         ends = (info["terminated"], info["truncated"])
@@ -92,7 +113,10 @@ class GymnaxEnv:
 
     @property
     def num_actions(self) -> int:
-        """Number of combinations of discrete actions, or of elements of a continuous one."""
+        """Return the number of combinations of discrete actions.
+
+        If actions are continuous, it is the number of elements of one.
+        """
         return (
             math.prod(self.env.num_action_points)
             if self.env.num_action_points
@@ -100,9 +124,11 @@ class GymnaxEnv:
         )
 
     def action_space(self, params: GymnaxParams | None = None) -> Any:
-        """Return `Box`, [−1, 1] or the limits of actuators that do not rescale, or `Discrete` over all combinations.
+        """Return the space of actions.
 
-        The limits are those of `params`.
+        It is `Discrete` over all combinations of discrete actions, and a `Box` of continuous ones.
+        The box is [−1, 1] for actuators that rescale. For the others it has the limits that they
+        have in `params`.
         """
         if self.env.num_action_points:
             return spaces.Discrete(self.num_actions)
@@ -116,7 +142,7 @@ class GymnaxEnv:
         return spaces.Box(*arrays, (self.env.action_size,), dtype=jnp.float32)
 
     def observation_space(self, params: GymnaxParams | None = None) -> Any:
-        """`Box` with the bounds of what is clipped."""
+        """Return a `Box`. Elements of an observation that are not clipped have no bounds."""
         low, high = observation_bounds(self.env)
         return spaces.Box(
             jnp.array(low), jnp.array(high), (len(low),), dtype=jnp.result_type(float)
@@ -125,7 +151,10 @@ class GymnaxEnv:
 
 @jax.jit
 def _reset(key: Key, params: GymnaxParams) -> tuple[Array, State]:
-    """Compiled once for all environments of one structure, as is `_step`."""
+    """Return the observation and the state of a random start.
+
+    This function and `_step` are compiled once for all environments of one structure.
+    """
     state, timestep = reset(params.env, key)
     return timestep.observation, state
 

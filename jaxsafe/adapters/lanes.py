@@ -1,7 +1,10 @@
-"""A batch of environments that is stepped from Python: one compiled call, one array of states in, one out.
+"""A batch of environments that is stepped from Python.
 
-A call costs some microseconds for each array that it hands over, and an environment, its state and a time step are a
-hundred. So each is packed into one array of words, bit by bit, and unpacked inside the compiled program.
+A step is one compiled call. It takes one array of states and returns one.
+
+A call costs some microseconds for each array that it hands over. An environment, its state and a
+time step are a hundred arrays. So the environment is packed into one array of words, bit by bit,
+and states and time steps into another. The compiled program unpacks them.
 """
 
 from __future__ import annotations
@@ -26,20 +29,29 @@ class Episodes(NamedTuple):
     """Episodes side by side, [num_envs]."""
 
     state: State
-    timestep: TimeStep  # the latest
+    timestep: TimeStep
+    """The latest time step."""
 
 
 class Packing:
-    """How the leaves of a pytree lie in one array, [words] or with lanes [words, num_envs]: type by type.
+    """The layout of the leaves of a pytree in one array of words, dtype by dtype.
 
-    Compiled programs belong to one object, so a process has only one for each structure, see `packing`. Copies and what is
-    read from a pickle are that object too.
+    The array is [words], or [words, num_envs] for a batch.
+
+    Compiled programs belong to one `Packing` object. So a process has only one of them for each
+    structure, which `packing` returns. A copy is that same object, and so is one that is read from
+    a pickle.
     """
 
     def __init__(
         self, structure: Any, shapes: tuple[tuple[tuple[int, ...], np.dtype], ...]
     ) -> None:
-        """Lay out leaves of these shapes, without the axis of lanes, and types."""
+        """Lay out the leaves.
+
+        Args:
+            structure: the structure of the pytree.
+            shapes: shape and dtype of each leaf. The shapes leave out the axis of the batch.
+        """
         self._structure, self._shapes = structure, shapes
         self._blocks: list[tuple[np.dtype, int, int, list[tuple[int, int, int]]]] = []
         end = 0
@@ -57,11 +69,15 @@ class Packing:
         return _packing, (self._structure, self._shapes)
 
     def empty(self, lanes: int) -> np.ndarray:
-        """Words of no meaning."""
+        """Return words that stand for no tree yet, [words, num_envs].
+
+        Args:
+            lanes: number of environments.
+        """
         return np.zeros((self._size, lanes), _unsigned(jnp.result_type(float)))
 
     def pack(self, tree: Any) -> Array:
-        """The words of a tree."""
+        """Return the words of a tree, [words] or [words, num_envs]."""
         leaves, word = jax.tree.leaves(tree), _unsigned(jnp.result_type(float))
 
         def words(leaf: Array, shape: tuple[int, ...], dtype: np.dtype) -> Array:
@@ -74,7 +90,7 @@ class Packing:
         return jnp.concatenate([words(leaves[i], *self._shapes[i]) for i in ordered])
 
     def unpack(self, words: Array) -> Any:
-        """The tree of some words."""
+        """Return the tree whose words these are."""
 
         def typed(block: Array, dtype: np.dtype) -> Array:
             if dtype.kind == "b":
@@ -87,7 +103,11 @@ class Packing:
         return self._tree(words, typed, leaf)
 
     def receive(self, words: Array) -> Any:
-        """The tree of some words with lanes, as NumPy arrays that must not be written to."""
+        """Return the tree of a batch as NumPy arrays. They must not be written to.
+
+        Args:
+            words: the words of the batch, [words, num_envs].
+        """
 
         def typed(block: np.ndarray, dtype: np.dtype) -> np.ndarray:
             return block.astype(_unsigned(dtype), copy=False).view(dtype)
@@ -109,9 +129,14 @@ class Packing:
 
 
 def packing(example: Any, lanes: int = 0) -> Packing:
-    """That of trees like this one of arrays or their shapes, whose first `lanes` axes are not laid out.
+    """Return the packing of trees shaped like `example`.
 
-    Like examples get the very same object, so that they share compiled programs.
+    Examples of the same structure, shapes and dtypes get the very same object, so that they share
+    compiled programs.
+
+    Args:
+        example: a tree of arrays or of their shapes.
+        lanes: number of leading axes that are batch axes. They are not part of the layout.
     """
     leaves, structure = jax.tree.flatten(example)
     return _packing(structure, tuple((leaf.shape[lanes:], np.dtype(leaf.dtype)) for leaf in leaves))
@@ -123,42 +148,56 @@ def _packing(structure: Any, shapes: tuple[tuple[tuple[int, ...], np.dtype], ...
 
 
 def _unsigned(dtype: Any) -> np.dtype:
-    """The unsigned type that is as wide."""
+    """Return the unsigned integer type of the same width."""
     return np.dtype(f"u{np.dtype(dtype).itemsize}")
 
 
 class Layout(NamedTuple):
-    """How an environment and its episodes are packed, and the kind of their keys."""
+    """The packings of an environment and its episodes, and the kind of their PRNG keys."""
 
     env: Packing
     episodes: Packing
-    key_impl: str  # as `jax.random.key(seed, impl=…)` takes it
+    key_impl: str
+    """The kind of PRNG keys, as `jax.random.key(seed, impl=…)` takes it."""
 
 
 class Lanes:
-    """`num_envs` environments."""
+    """A batch of environments, with their episodes and the chains of PRNG keys of their starts."""
 
     def __init__(self, env: Environment, num_envs: int, max_episode_steps: float) -> None:
-        """Pack the environment; no episode runs yet."""
+        """Pack the environment. No episode runs yet.
+
+        Args:
+            env: the environment.
+            num_envs: number of environments in the batch.
+            max_episode_steps: number of steps after which an episode is truncated. Infinity stands
+                for no limit.
+        """
         impl: Any = jax.config.jax_default_prng_impl  # pyright: ignore[reportAttributeAccessIssue]
         keys = np.zeros((num_envs, *_key_shape(impl)), np.uint32)
         episodes = jax.eval_shape(functools.partial(_start, impl), env, keys)[1]
         self._layout = Layout(packing(env), packing(episodes, lanes=1), impl)
         self._env = np.asarray(self._layout.env.pack(env))
         self._limit = np.float32(max_episode_steps)
-        self._keys: Any = keys  # raw, of the chains that starts come from
+        # The next key of each environment's chain as raw words, [num_envs, words of a key].
+        self._keys: Any = keys
         self._words: Any = self._layout.episodes.empty(num_envs)
         self.running = False
 
     @property
     def now(self) -> Any:
-        """The `Episodes`, of NumPy arrays that must not be written to."""
+        """Return the `Episodes` as NumPy arrays. They must not be written to."""
         return self._layout.episodes.receive(self._words)
 
     def seed(self, mask: np.ndarray, seeds: Sequence[int]) -> None:
-        """Begin new chains of keys where the mask says, [num_envs], each at `jax.random.key(seed)`.
+        """Begin new chains of keys.
 
-        A seed of more than 32 bits begins at the key of its lowest 32, folded with the others.
+        A chain begins at `jax.random.key(seed)`. If the seed has more than 32 bits, it begins at
+        the key of the lowest 32 bits, into which the other bits are folded.
+
+        Args:
+            mask: which environments begin a new chain, [num_envs].
+            seeds: a seed for each environment of the batch.
         """
         refuse_fork()
         size = max(1, *(-(-seed.bit_length() // 32) for seed in seeds))
@@ -167,27 +206,35 @@ class Lanes:
         self._keys = np.where(mask[:, None], keys, self._keys)
 
     def restart(self, mask: np.ndarray) -> None:
-        """Start an episode where the mask says, [num_envs]; the first time, everywhere."""
+        """Start an episode at random in each environment of the mask, [num_envs].
+
+        Before the first step, every environment of the batch must have been started.
+        """
         refuse_fork()
         self._keys, self._words = restart(self._layout, self._env, self._keys, self._words, mask)
         self.running = True
 
     def place(self, mask: np.ndarray, episode: Episodes) -> None:
-        """Go on from this episode, that of one lane, where the mask says; the chains of keys stay as they are."""
+        """Let the environments of the mask go on from an episode. Their chains of keys stay.
+
+        Args:
+            mask: which environments take the episode, [num_envs].
+            episode: the episode of one environment, without a batch axis.
+        """
         refuse_fork()
         words = pack(self._layout.episodes, jax.tree.map(lambda x: x[None], episode))
         self._words = np.where(mask, words, self._words)
         self.running = True
 
     def step(self, actions: np.ndarray) -> None:
-        """Advance every lane by its action, [num_envs, action]."""
+        """Advance every environment by its action, [num_envs, action]."""
         refuse_fork()
         self._words = advance(self._layout, self._env, self._words, actions, self._limit)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def pack(packing: Packing, tree: Any) -> Array:
-    """The words of a tree."""
+    """Return the words of a tree, [words] or [words, num_envs]."""
     return packing.pack(tree)
 
 
@@ -195,7 +242,15 @@ def pack(packing: Packing, tree: Any) -> Array:
 def restart(
     layout: Layout, env: Array, keys: Array, words: Array, mask: Array
 ) -> tuple[Array, Array]:
-    """The next keys and words, with a new episode where the mask says."""
+    """Return the next keys and words, with a new episode in each environment of the mask.
+
+    Args:
+        layout: the packings.
+        env: the words of the environment, [words].
+        keys: the next key of each environment's chain as raw words, [num_envs, words of a key].
+        words: the words of the episodes, [words, num_envs].
+        mask: which environments start an episode, [num_envs].
+    """
     running = (keys, layout.episodes.unpack(words))
 
     def draw(parameters: tuple[Array, Array], lanes: Array) -> tuple[Array, Episodes]:
@@ -208,7 +263,15 @@ def restart(
 
 @functools.partial(jax.jit, static_argnums=0)
 def advance(layout: Layout, env: Array, words: Array, action: Array, limit: float) -> Array:
-    """The words one step later."""
+    """Return the words of the episodes one step later, [words, num_envs].
+
+    Args:
+        layout: the packings.
+        env: the words of the environment, [words].
+        words: the words of the episodes, [words, num_envs].
+        action: an action for each environment, [num_envs, action].
+        limit: number of steps after which an episode is truncated.
+    """
     state, timestep = layout.episodes.unpack(words)
     state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(layout.env.unpack(env), state, action)
     return layout.episodes.pack(Episodes(state, cut_short(state, timestep, limit)))
@@ -216,13 +279,20 @@ def advance(layout: Layout, env: Array, words: Array, action: Array, limit: floa
 
 @functools.partial(jax.jit, static_argnums=0)
 def _raw_keys(impl: str, seeds: Array) -> Array:
-    """Return the key of each seed, given as words of 32 bits, the lowest first, [num_envs, words]."""
+    """Return the key of each seed as raw words, [num_envs, words of a key].
+
+    Args:
+        impl: the kind of keys, as `jax.random.key` takes it.
+        seeds: words of 32 bits for each seed, the lowest first, [num_envs, words].
+    """
 
     def raw_key(words: Array) -> Array:
         raw = jax.random.key_data(jax.random.key(words[0], impl=impl))
         for i in range(1, words.size):
             folded = jax.random.fold_in(jax.random.wrap_key_data(raw, impl=impl), words[i])
-            folded, _ = jax.random.split(folded)  # `unsafe_rbg` folds in any order alike
+            # The split tells apart seeds whose words are in another order. For keys of the kind
+            # `unsafe_rbg`, folding alone gives the same key in any order.
+            folded, _ = jax.random.split(folded)
             raw = jnp.where(jnp.any(words[i:] > 0), jax.random.key_data(folded), raw)
         return raw
 
@@ -234,13 +304,14 @@ def _key_shape(impl: str) -> tuple[int, ...]:
 
 
 def _start(impl: str, env: Environment, keys: Array) -> tuple[Array, Episodes]:
-    """The keys that follow, and an episode in each lane."""
+    """Return the next keys of the chains, and an episode in each environment."""
 
     def start(key: Array) -> tuple[Array, Episodes]:
         following, now = jax.random.split(jax.random.wrap_key_data(key, impl=impl))
         return jax.random.key_data(following), Episodes(*reset(env, now))
 
-    # What other kinds of keys draw under vmap depends on the first lane's key: a lane would start where it started before.
+    # Under vmap, what keys of another kind than threefry draw depends on the key of the first
+    # environment of the batch. An environment would start where it started before.
     over_lanes = (
         jax.vmap(start) if impl == "threefry2x32" else functools.partial(jax.lax.map, start)
     )

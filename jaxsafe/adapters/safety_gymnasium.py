@@ -1,4 +1,7 @@
-"""The convention of constrained RL: a step returns the cost between reward and `terminated`, six values in all."""
+"""Environments by the convention of constrained RL.
+
+A step returns six values, with the cost between reward and `terminated`.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,13 @@ from jaxsafe.environment import Environment
 
 
 class SafetyEnv:
-    """A task as Safety-Gymnasium's environments are: `observation, reward, cost, terminated, truncated, info`.
+    """A task with the interface of Safety-Gymnasium's environments.
 
-    One environment, or with `num_envs` a compiled batch in which a lane whose episode ends starts anew in the same step.
-    Then `infos["final_observation"]` holds what the ended episodes led to, where `infos["_final_observation"]`.
+    A step returns `observation, reward, cost, terminated, truncated, info`.
+
+    It is one environment, or with `num_envs` a compiled batch. An environment of the batch whose
+    episode ends starts a new one in the same step. Then `infos["final_observation"]` holds the last
+    observation of the old episode, where `infos["_final_observation"]` is True.
     """
 
     def __init__(
@@ -26,7 +32,14 @@ class SafetyEnv:
         overrides: Mapping[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        """Make the environment; `options` as of `GymEnv`.
+        """Make the environment.
+
+        Args:
+            task: the name of a task, a YAML file, or an environment that `jaxsafe.make` returned.
+            num_envs: number of environments of a batch. None stands for one environment without a
+                batch axis.
+            overrides: as `jaxsafe.make` takes them.
+            options: as `GymEnv` takes them.
 
         Raises:
             ConfigError: as `jaxsafe.make`.
@@ -49,11 +62,23 @@ class SafetyEnv:
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict]:
-        """As Gymnasium's."""
+        """Start an episode, as `GymEnv.reset` or `GymVectorEnv.reset`."""
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, Any, Any, Any, Any, dict]:
-        """Advance one time step: observation, reward, cost, terminated, truncated, info."""
+        """Advance one time step of the task.
+
+        Args:
+            action: the action, or [num_envs, action].
+
+        Returns:
+            The observation, reward, cost, `terminated`, `truncated` and `info`.
+
+        Raises:
+            ResetNeeded: there was no reset before.
+            ConfigError: the action has another shape, or actions are discrete and it is not whole
+                numbers.
+        """
         observation, reward, terminated, truncated, info = self.env.step(action)
         cost = info["cost"]
         if "final_obs" in info:
@@ -66,9 +91,8 @@ class SafetyEnv:
         return observation, reward, cost, terminated, truncated, info
 
     def render(self) -> Any:
-        """As Gymnasium's."""
+        """Return a picture, or one for each environment of the batch."""
         return self.env.render()
 
     def close(self) -> None:
-        """As Gymnasium's."""
         self.env.close()

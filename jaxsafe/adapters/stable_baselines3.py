@@ -1,4 +1,7 @@
-"""The compiled batch of environments as Stable-Baselines3 wants it: `PPO("MlpPolicy", SB3VecEnv("docking2d", 64))`."""
+"""The compiled batch of environments with the interface of Stable-Baselines3.
+
+PPO("MlpPolicy", SB3VecEnv("docking2d", 64))
+"""
 # pyright: reportMissingImports=false
 
 from __future__ import annotations
@@ -21,10 +24,13 @@ except ImportError as error:
 
 
 class SB3VecEnv(VecEnv):
-    """Many environments in one compiled step; a lane whose episode ends starts anew in the same step.
+    """Many environments in one compiled step.
 
-    `infos` holds per lane `cost` and, where an episode has ended, `terminal_observation`, `TimeLimit.truncated`,
-    `is_success` and `outcome`. `reset_infos` holds per lane all that `GymEnv.reset` tells of the latest start.
+    An environment whose episode ends starts a new one in the same step.
+
+    For each environment `infos` holds `cost`. Where an episode has ended it also holds
+    `terminal_observation`, `TimeLimit.truncated`, `is_success` and `outcome`. `reset_infos` holds,
+    for each environment, the `info` that `GymEnv.reset` would return at its latest start.
     `set_options` takes the options of `GymEnv.reset`.
     """
 
@@ -35,7 +41,13 @@ class SB3VecEnv(VecEnv):
         overrides: Mapping[str, Any] | None = None,
         **options: Any,
     ) -> None:
-        """Make the environments; arguments as of `GymVectorEnv`.
+        """Make the environments.
+
+        Args:
+            task: the name of a task, a YAML file, or an environment that `jaxsafe.make` returned.
+            num_envs: number of environments.
+            overrides: as `jaxsafe.make` takes them.
+            options: the other arguments of `GymVectorEnv`, except `autoreset_mode`.
 
         Raises:
             ConfigError: as `jaxsafe.make`.
@@ -44,7 +56,13 @@ class SB3VecEnv(VecEnv):
         super().__init__(num_envs, self.env.single_observation_space, self.env.single_action_space)
 
     def reset(self) -> np.ndarray:
-        """Start an episode in each lane, from the seeds and with the options given before, if any."""
+        """Start an episode in each environment.
+
+        Seeds and options that were given before this reset are used once.
+
+        Returns:
+            The observations, [num_envs, observation].
+        """
         observation, infos = self.env.start_lanes(self._seeds, self._options)
         self.reset_infos = [of_lane(infos, lane) for lane in range(self.num_envs)]
         self._reset_seeds()
@@ -52,7 +70,15 @@ class SB3VecEnv(VecEnv):
         return observation
 
     def set_options(self, options: list[dict] | dict | None = None) -> None:
-        """Give options of `GymEnv.reset` to the next reset, one dict for all lanes or one for each."""
+        """Set the options of the next reset.
+
+        Args:
+            options: options of `GymEnv.reset`: one dict for all environments, or a list with one
+                for each.
+
+        Raises:
+            ConfigError: the list has another length than there are environments.
+        """
         if not isinstance(options, dict | None) and len(options) != self.num_envs:
             raise ConfigError(
                 f"set_options: expected options for {self.num_envs} lanes, found {len(options)}"

@@ -1,1 +1,5 @@
-"""Agents: what they see, their networks, the distributions they draw actions from, and files of their weights."""
+"""Agents.
+
+The package has what they see, their networks, the distributions from which they draw actions, and
+the files of their weights.
+"""

@@ -1,4 +1,7 @@
-"""The distributions over actions: normal for continuous ones, one choice per actuator for discrete ones."""
+"""The distributions over actions.
+
+Continuous actions have normal distributions. Discrete actions are one choice per actuator.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,10 @@ from jaxsafe.types import Key
 
 
 class Gaussian(Component):
-    """Independent normal distributions; actions outside [−1, 1] are clipped by the actuators, not here."""
+    """Independent normal distributions, one for each actuator.
+
+    Actions outside [−1, 1] are clipped by the actuators, not here.
+    """
 
     mean: Float[Array, "*batch a"]
     log_std: Float[Array, " a"]
@@ -36,10 +42,14 @@ class Gaussian(Component):
 
 
 class Categorical(Component):
-    """One independent choice per actuator; their logits stand one after the other."""
+    """One independent choice per actuator.
+
+    The logits of an actuator's choices follow those of the actuator before it.
+    """
 
     logits: Float[Array, "*batch points"]
     points: tuple[int, ...]
+    """The number of choices of each actuator."""
 
     def mode(self) -> Array:
         return jnp.stack([jnp.argmax(block, axis=-1) for block in self._blocks()], axis=-1).astype(

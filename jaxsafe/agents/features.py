@@ -1,4 +1,7 @@
-"""What the agent computes from an observation before its networks see it; what is observed stays the paper's."""
+"""Features: what the agent computes from an observation before its networks see it.
+
+The environment's observation itself stays the paper's.
+"""
 
 from __future__ import annotations
 
@@ -14,21 +17,35 @@ from jaxsafe.simulation.geometry import rotation, safe_norm
 from jaxsafe.types import Number
 
 SMALLEST_LIMIT = 1e-6
-"""A speed limit is never smaller in the features. No environment observes less, but other code may ask a policy about an
-observation of zeros, which would be divided by zero."""
+"""The smallest speed limit that the features divide by.
+
+No environment observes a smaller one. But other code may ask a policy about an observation of
+zeros, and that would divide by zero.
+"""
 
 Features = Callable[[Environment, Float[Array, "*batch o"]], Float[Array, "*batch i"]]
+"""A function from an environment and its observations to the inputs of the networks."""
 
 
 def none(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch o"]:
-    """The observation and nothing else."""
+    """Return the observation and nothing else."""
     return observation
 
 
 def docking(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
     """Append the direction p/(‖p‖ + 0.01) and log(‖p‖ + 0.005) of the observed position p.
 
-    The target is 0.005 wide in units of p, which a plain perceptron resolves late or never.
+    The target is 0.005 wide in units of p. A plain perceptron resolves that late or never.
+
+    Args:
+        env: the environment, which must observe a position.
+        observation: observations [*batch, o].
+
+    Returns:
+        The observation and its features, [*batch, i].
+
+    Raises:
+        ConfigError: the environment does not observe a position.
     """
     position = _vector(env, observation, "position", "docking")
     distance = _norm(position)
@@ -38,10 +55,25 @@ def docking(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Ar
 
 
 def approach(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
-    """Append to `docking` the velocity as a share of the speed limit: its parts along and across the way to the chief.
+    """Append to `docking` the velocity as a share of the speed limit.
 
-    With the direction p of the chief and v/limit, both in the frame of the observation: v/limit, p·v/limit, what is left of
-    v/limit across p, and ‖v‖/limit, which is 1 at the limit.
+    With p the direction of the chief and v the velocity, both in the frame of the observation,
+    these are:
+
+    - v/limit.
+    - p·v/limit, the part of v/limit along the way to the chief.
+    - What is left of v/limit across p.
+    - ‖v‖/limit. It is 1 at the limit.
+
+    Args:
+        env: the environment, which must observe position, velocity, speed and speed limit.
+        observation: observations [*batch, o].
+
+    Returns:
+        The observation and its features, [*batch, i].
+
+    Raises:
+        ConfigError: the environment does not observe one of them.
     """
     position = _vector(env, observation, "position", "approach")
     limit = jnp.maximum(_elements(env, observation, "velocity_limit", "approach"), SMALLEST_LIMIT)
@@ -60,15 +92,37 @@ def approach(env: Environment, observation: Float[Array, "*batch o"]) -> Float[A
 
 
 def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
-    """Append the way to the rejoin point, the lead's relative velocity, and how far both will miss each other.
+    """Append the way to the rejoin point, the lead's relative velocity, and the miss distance.
 
-    All vectors are turned from the wingman's body into its level frame, in which left is left however it rolls. The way as
-    a vector, which is small near the point where its direction turns quickly; the relative velocity w; and w + way/10 s,
-    the change of velocity that would take it to the point in 10 s: a pilot who keeps that at zero arrives, and stays. The
-    way and the change once more five times as long and clipped.
-    With the direction p of the lead (in space appended as well): the cosine between p and w, the part of p across w, 0 on
-    a collision course, and that part times the observed distance: the miss distance if neither manoeuvres, unless it is
-    clipped.
+    All vectors are turned from the wingman's body frame into its level frame. There left is left
+    however the wingman rolls. With p the direction of the lead and w its velocity relative to the
+    wingman, the features are:
+
+    - p, in space only.
+    - The way to the rejoin point, as a vector. It is small near the point, where its direction
+      turns quickly.
+    - w.
+    - w + way/10 s, the change of velocity that would take the wingman to the point in 10 s. A pilot
+      who keeps it at zero arrives, and stays.
+    - The way and the change once more, five times as long and clipped to [−1, 1].
+    - The cosine between p and w.
+    - The part of p across w. It is 0 on a collision course.
+    - That part times the observed distance. This is the miss distance if neither aircraft
+      manoeuvres, unless the observed distance is clipped.
+    - Two numbers near 1 on a collision course: how directly w opposes p, times a bell curve of the
+      part of p across w or of the miss distance.
+
+    Args:
+        env: the environment, which must observe the magnitudes and directions of the positions of
+            lead and rejoin point and of both velocities, and in space also flight path angle and
+            roll.
+        observation: observations [*batch, o].
+
+    Returns:
+        The observation and its features, [*batch, i].
+
+    Raises:
+        ConfigError: the environment does not observe one of them.
     """
     distance, bearing = _magnitude_and_direction(env, observation, "lead_position")
     far, towards = _magnitude_and_direction(env, observation, "rejoin_position")
@@ -89,9 +143,8 @@ def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Arr
     per_10_s = _scale(env, "rejoin_position")[0] / (10.0 * _scale(env, "wingman_velocity")[0])
     change = relative + per_10_s * way
     near, urgent = (jnp.clip(5.0 * vector, -1.0, 1.0) for vector in (way, change))
-    level = (
-        () if "roll" not in env.observation_names else (bearing,)
-    )  # in the plane the observation has it
+    # In the plane the observation already has the direction of the lead in the level frame.
+    level = () if "roll" not in env.observation_names else (bearing,)
     aim = (*level, way, near, relative, change, urgent)
     return jnp.concatenate([observation, *aim, closing, 4.0 * across, miss, *danger], axis=-1)
 
@@ -99,10 +152,11 @@ def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Arr
 FEATURES: Mapping[str, Features] = {
     each.__name__: each for each in (none, docking, approach, rejoin)
 }
-"""By name, as in `agent.features`."""
+"""The features by name, as `agent.features` gives it."""
 
 
-@jax.jit  # one program, and so the same roundings, whether what surrounds it is compiled or not
+# One program has the same roundings whether its surroundings are compiled or not.
+@jax.jit
 def _norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch 1"]:
     return safe_norm(vector)[..., None]
 
@@ -110,7 +164,11 @@ def _norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch 1"]:
 def _magnitude_and_direction(
     env: Environment, observation: Float[Array, "*batch o"], name: str
 ) -> tuple[Float[Array, "*batch 1"], Float[Array, "*batch d"]]:
-    """An observed vector in the wingman's level frame, R_y(γ)·R_x(φ) times what it is in the body frame."""
+    """Return magnitude and direction of an observed vector in the wingman's level frame.
+
+    The direction there is R_y(γ)·R_x(φ) times the direction in the body frame, where γ is the
+    flight path angle and φ the roll.
+    """
     magnitude, direction = (
         _elements(env, observation, f"{name}.magnitude", "rejoin"),
         _vector(env, observation, name, "rejoin"),
@@ -126,7 +184,7 @@ def _magnitude_and_direction(
 
 
 def _scale(env: Environment, name: str) -> Number:
-    """What an observation was divided by."""
+    """Return the number by which the environment divided an observation."""
     return next(one.scale for one in env.observation if one.name == name)
 
 
@@ -142,7 +200,13 @@ def _vector(
 def _elements(
     env: Environment, observation: Float[Array, "*batch o"], name: str, features: str
 ) -> Float[Array, "*batch 1"]:
-    """An element of the observation.
+    """Return an element of the observation.
+
+    Args:
+        env: the environment.
+        observation: observations [*batch, o].
+        name: name of the element.
+        features: name of the features that need it, for the message.
 
     Raises:
         ConfigError: the environment does not observe it.

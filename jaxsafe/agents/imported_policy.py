@@ -1,7 +1,7 @@
-"""Policies that were trained elsewhere: an ONNX graph, or layers in an .npz, from the paper's observation to the action.
+"""Policies that were trained elsewhere: an ONNX graph, or layers in an .npz.
 
-The output of a continuous policy is the action in [−1, 1]; that of a discrete one the logits of each actuator's choices,
-one after the other.
+They take the paper's observation. A continuous policy returns the action in [−1, 1]. A discrete
+policy returns the logits of each actuator's choices, one actuator after the other.
 """
 
 from __future__ import annotations
@@ -29,44 +29,47 @@ ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {
     "relu": jax.nn.relu,
     "swish": jax.nn.swish,
 }
-"""Between the layers of an .npz."""
+"""The functions that may stand between the layers of an .npz, by name."""
 
 MAX_NAMES = 200
-"""Letters of the names in a file that a message repeats."""
+"""Most letters that a message repeats of the names in a file."""
 
 
 @jax.tree_util.register_static
 class ForeignAgent:
-    """Acts as an `Agent` where only acting is needed; sampled actions are the modes."""
+    """A stand-in for `Agent` where only acting is needed. Its sampled actions are the modes."""
 
     def __init__(self, network: Network) -> None:
-        """`network(weights, observation)` of one observation."""
+        """Wrap `network(weights, observation)`, which takes one observation."""
         self.network = network
 
     def inputs(
         self, env: Environment, observation: Float[Array, "batch o"]
     ) -> Float[Array, "batch o"]:
-        """Return what the network sees: the observation as it is."""
+        """Return the observation as it is. It is what the network sees."""
         return observation
 
     def distribution(
         self, env: Environment, params: Params, inputs: Array
     ) -> Categorical | Gaussian:
-        """Return what the network says of one observation or a batch; only its mode means something."""
+        """Return a distribution for one observation or a batch. Only its mode means something."""
         out = jnp.vectorize(lambda one: self.network(params, one), signature="(o)->(a)")(inputs)
         if env.num_action_points:
             return Categorical(logits=out, points=env.num_action_points)
         return Gaussian(mean=out, log_std=jnp.zeros(env.action_size))
 
     def policy(self, env: Environment, params: Params, deterministic: Array | bool) -> Policy:
-        """Return the action for each of a batch of observations."""
+        """Return a function of key and observations that returns an action for each observation."""
         return lambda key, observation: self.distribution(
             env, params, self.inputs(env, observation)
         ).mode()
 
 
 class ForeignPolicy(NamedTuple):
-    """What `jaxsafe.agents.policy_file.SavedPolicy` is for a policy of our own, as far as acting needs it."""
+    """A policy that was trained elsewhere, with all that acting needs.
+
+    `jaxsafe.agents.policy_file.SavedPolicy` is its counterpart for policies of our own.
+    """
 
     env: Environment
     agent: ForeignAgent
@@ -74,15 +77,16 @@ class ForeignPolicy(NamedTuple):
 
 
 def read_foreign(path: Path, env: Environment, activation: str = "tanh") -> ForeignPolicy:
-    """The policy in a file, to act in an environment.
+    """Return the policy in a file, to act in an environment.
 
     Args:
         path: `.onnx`, or `.npz` with `kernel_0` (inputs, outputs), `bias_0`, `kernel_1`, ….
         env: where it will act.
-        activation: between the layers of an .npz: `tanh`, `relu` or `swish`.
+        activation: the function between the layers of an .npz: `tanh`, `relu` or `swish`.
 
     Raises:
-        ConfigError: the file cannot be read, or its inputs and outputs are not those of the environment.
+        ConfigError: the file cannot be read, or its inputs and outputs are not those of the
+            environment.
     """
     if path.suffix == ".onnx":
         network, weights = read_graph(path)
@@ -93,12 +97,22 @@ def read_foreign(path: Path, env: Environment, activation: str = "tanh") -> Fore
 
 
 def _check(path: Path, env: Environment, network: Network, weights: Mapping[str, Any]) -> None:
-    """Raise a ConfigError unless a network, of these weights or their shapes, takes observations and gives actions."""
+    """Check that a network takes observations of an environment and returns actions.
+
+    Args:
+        path: the file, for the message.
+        env: the environment.
+        network: the network.
+        weights: its weights, or their shapes.
+
+    Raises:
+        ConfigError: it does not.
+    """
     wanted = sum(env.num_action_points) or env.action_size
     observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
     try:
         found = jax.eval_shape(network, weights, observation)
-    except Exception as error:  # JAX and the operators below refuse in many ways
+    except Exception as error:  # JAX and the operators of a graph raise many kinds of errors
         reason = str(error).partition("\n")[0]
         raise ConfigError(
             f"{path}: does not take an observation of {env.observation_size} numbers: {reason}"
@@ -114,7 +128,13 @@ def _check(path: Path, env: Environment, network: Network, weights: Mapping[str,
 def _read_layers(
     path: Path, env: Environment, activation: str
 ) -> tuple[Network, dict[str, np.ndarray]]:
-    """Read the layers in an .npz, after their names and shapes alone have shown that they fit."""
+    """Read the layers in an .npz, and return their function and their weights.
+
+    The arrays are read only after their names and shapes have shown that they fit.
+
+    Raises:
+        ConfigError: the activation is not known, or the file holds something else.
+    """
     if activation not in ACTIVATIONS:
         raise ConfigError(
             f"activation: found {activation!r}; choose from {nearest(activation, ACTIVATIONS)}"
@@ -139,7 +159,7 @@ def _read_layers(
 
 
 def _network(count: int, activation: str) -> Network:
-    """Return the function of so many layers."""
+    """Return the function of a perceptron with this number of layers."""
 
     def network(weights: Mapping[str, Array], x: Array) -> Array:
         for i in range(count):

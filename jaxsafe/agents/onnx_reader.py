@@ -1,4 +1,7 @@
-"""ONNX graphs as functions: operator by operator what networks of other libraries are made of."""
+"""ONNX graphs as functions, evaluated operator by operator.
+
+The operators are those of which networks of other libraries are made.
+"""
 # pyright: reportMissingImports=false
 
 from __future__ import annotations
@@ -16,23 +19,30 @@ from jaxtyping import Array, Float
 from jaxsafe.schema.errors import ConfigError, missing, show
 
 Network = Callable[[Mapping[str, Array], Float[Array, " o"]], Float[Array, " a"]]
-"""From weights and one observation to one output."""
+"""A function from weights and one observation to one output."""
 
 DOMAINS = ("", "ai.onnx")
-"""Those of ONNX itself: an operator of another domain may have the name of one of these and mean something else."""
+"""The domains of ONNX itself.
+
+An operator of another domain may have the name of one of ONNX's and mean something else.
+"""
 
 MIN_OPSET = 7
-"""Before it, shapes of operands were matched by an attribute."""
+"""The oldest opset that is read. Before it, an attribute matched the shapes of operands."""
 
 MAX_NODES, MAX_SIZE = 10_000, 2**26
-"""Operators of a graph, and numbers of an array that one of them makes: a small file could ask for any."""
+"""Most operators of a graph, and most numbers of an array that an operator makes.
+
+Without these bounds a small file could ask for any amount of work and memory.
+"""
 
 
 def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
-    """The function of a graph with one input and one output, and its weights.
+    """Return the function of a graph with one input and one output, and its weights.
 
     Raises:
-        ConfigError: the file cannot be read, or has more inputs, outputs, or an operator that is not known.
+        ConfigError: the file cannot be read, has several inputs or outputs, or has an operator that
+            is not known.
     """
     try:
         import onnx
@@ -51,9 +61,8 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
         }
     except ConfigError:
         raise
-    except (
-        Exception
-    ) as error:  # protobuf, the checker, numpy and the file system have errors of their own
+    # protobuf, the checker, numpy and the file system have errors of their own.
+    except Exception as error:
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise ConfigError(f"{path}: cannot be read: {reason}") from None
     graph = model.graph
@@ -74,15 +83,15 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
         known = kind in onnx.TensorProto.DataType.values()
         found = onnx.TensorProto.DataType.Name(kind) if known else kind
         raise ConfigError(f"{path}: {declared.name}: expected an input of FLOAT, found {found}")
-    sizes = [
-        axis.dim_value for axis in declared.type.tensor_type.shape.dim
-    ]  # 0 where it has a name
+    # The size of an axis is 0 where the axis has a name instead.
+    sizes = [axis.dim_value for axis in declared.type.tensor_type.shape.dim]
     if len(nodes) > MAX_NODES:
         raise ConfigError(f"{path}: expected at most {MAX_NODES:,} operators, found {len(nodes):,}")
     for name, value in {**weights, **constants}.items():
         if value.dtype.kind not in "iub" and not jnp.issubdtype(value.dtype, jnp.floating):
             raise ConfigError(f"{path}: {name}: expected real numbers, found {value.dtype}")
-    # what says shapes and axes must be known while tracing; what computes are the weights
+    # Integers give shapes and axes, so they must be known while tracing. The other arrays are the
+    # weights.
     whole = {
         name: value for name, value in {**weights, **constants}.items() if value.dtype.kind in "iu"
     }
@@ -120,7 +129,11 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
 
 
 def _node(path: Path, node: Any) -> tuple[str, list[str], list[str], dict[str, Any]]:
-    """Return kind, inputs, outputs and attributes of an operator; a ConfigError for what is not known here."""
+    """Return kind, inputs, outputs and attributes of an operator.
+
+    Raises:
+        ConfigError: the operator or one of its attributes is not known here.
+    """
     from onnx import helper
 
     kind = node.op_type
@@ -136,7 +149,11 @@ def _node(path: Path, node: Any) -> tuple[str, list[str], list[str], dict[str, A
 
 
 def _constant(path: Path, attributes: Mapping[str, Any]) -> np.ndarray:
-    """Return the value of a constant: an array, one number, or a list."""
+    """Return the value of a constant, given as an array, one number, or a list.
+
+    Raises:
+        ConfigError: the constant is of another kind.
+    """
     from onnx import numpy_helper
 
     if len(attributes) != 1:
@@ -158,10 +175,10 @@ def _constant(path: Path, attributes: Mapping[str, Any]) -> np.ndarray:
 
 
 def _split(x: list[Any], a: Mapping[str, Any], count: int) -> list[Array]:
-    """Cut an array into parts of given sizes, or into as many equal parts as there are outputs."""
+    """Cut an array into parts of given sizes, or into `count` equal parts."""
     axis, given = a.get("axis", 0), x[1] if len(x) > 1 and x[1] is not None else a.get("split")
     whole = x[0].shape[axis]
-    part = -(-whole // count)  # the last one is smaller where they cannot be equal
+    part = -(-whole // count)  # where the parts cannot be equal, the last one is smaller
     equal = [min(part, max(0, whole - i * part)) for i in range(count)]
     sizes = equal if given is None else [int(size) for size in given]
     if len(sizes) != count or min(sizes) < 0 or sum(sizes) != whole:
@@ -170,7 +187,11 @@ def _split(x: list[Any], a: Mapping[str, Any], count: int) -> list[Array]:
 
 
 def _mod(x: list[Any], a: Mapping[str, Any]) -> Array:
-    """Return a remainder: of the sign of the dividend with `fmod`, which floats need, else of the divisor."""
+    """Return a remainder.
+
+    With the attribute `fmod` it has the sign of the dividend, otherwise that of the divisor. Floats
+    need `fmod`.
+    """
     if a.get("fmod", 0):
         return jnp.fmod(*x)
     if any(jnp.issubdtype(jnp.result_type(one), jnp.floating) for one in x):
@@ -179,7 +200,7 @@ def _mod(x: list[Any], a: Mapping[str, Any]) -> Array:
 
 
 def _divide(x: list[Any], a: Mapping[str, Any]) -> Array:
-    """Return a quotient, of whole numbers the whole part."""
+    """Return a quotient. A quotient of integers is rounded towards 0."""
     if all(jnp.issubdtype(jnp.result_type(one), jnp.integer) for one in x):
         return jnp.sign(x[0]) * jnp.sign(x[1]) * (jnp.abs(x[0]) // jnp.abs(x[1]))
     return jnp.divide(*x)
@@ -214,7 +235,7 @@ def _axes(x: list[Any], a: Mapping[str, Any]) -> Any:
 
 
 def _reduced(x: list[Any], a: Mapping[str, Any]) -> Any:
-    return _axes(x, a) or None  # without axes, over all
+    return _axes(x, a) or None  # without axes the reduction is over all of them
 
 
 def _reshape(x: list[Any], a: Mapping[str, Any]) -> Array:
@@ -289,4 +310,7 @@ _ATTRIBUTES: Mapping[str, str] = {
     "ArgMax": "axis keepdims",
     "Mod": "fmod",
 }
-"""The attributes that are understood. Any other may only be 0, which is its default in each of these operators."""
+"""The attributes that are understood, by operator.
+
+Any other attribute may only be 0, its default in each of these operators.
+"""

@@ -1,6 +1,7 @@
-"""Policies as small .npz files: arrays and one JSON string, read without pickle, so a stranger's file is only data.
+"""Policies as small .npz files.
 
-Those in `jaxsafe/pretrained/` come with the package and are known by the names of their tasks.
+A file holds arrays and one JSON string. It is read without pickle, so a stranger's file is only
+data. The policies in `jaxsafe/pretrained/` come with the package and have the names of their tasks.
 """
 
 from __future__ import annotations
@@ -29,7 +30,17 @@ from jaxsafe.storage.forms import COUNT, TEXT, check
 def save_policy(
     path: Path, env: Environment, agent: Agent, params: Params, about: dict[str, Any]
 ) -> None:
-    """Write weights, the agent's structure and the complete environment they belong to."""
+    """Write a policy file.
+
+    It holds the weights, the agent's structure, and the complete environment they belong to.
+
+    Args:
+        path: the file.
+        env: the environment.
+        agent: the agent.
+        params: its parameters.
+        about: what else the header says, see `SavedPolicy.about`.
+    """
     arrays = {
         jax.tree_util.keystr(key, simple=True, separator="/"): np.asarray(leaf)
         for key, leaf in jax.tree.leaves_with_path(params)
@@ -46,13 +57,13 @@ def save_policy(
 
 
 MAX_LAYERS = 64
-"""Hidden layers that a policy file may have: each takes a while to trace."""
+"""Largest number of hidden layers in a policy file. Each layer takes a while to trace."""
 
 _ABOUT = {"env": TEXT, "preset": TEXT, "seed": COUNT, "step": COUNT}
-"""What else a header says, if it does."""
+"""The form of what else a header may say."""
 
 PRETRAINED = "pretrained/"
-"""Before a name where a run may be given as well."""
+"""Prefix of the name of a pretrained policy, where the directory of a run may be given as well."""
 
 _PRETRAINED = Path(__file__).resolve().parent.parent / "pretrained"
 
@@ -63,7 +74,8 @@ class SavedPolicy(NamedTuple):
     env: Environment
     agent: Agent
     params: Params
-    about: dict[str, Any]  # env (its name), preset, seed and step of the training that it came from
+    about: dict[str, Any]
+    """The training that the policy came from: `env` (its name), `preset`, `seed` and `step`."""
 
 
 def read_policy(path: str | os.PathLike) -> SavedPolicy:
@@ -93,7 +105,7 @@ def read_policy(path: str | os.PathLike) -> SavedPolicy:
         like = jax.eval_shape(lambda key: agent.init(key, env), jax.random.key(0))
     except ConfigError:
         raise
-    except Exception as error:  # JAX refuses in many ways
+    except Exception as error:  # JAX raises many kinds of errors
         raise ConfigError(
             f"{path}: agent: does not fit the environment: {str(error).partition(chr(10))[0]}"
         ) from None
@@ -102,31 +114,39 @@ def read_policy(path: str | os.PathLike) -> SavedPolicy:
 
 
 def load_policy(policy: str | os.PathLike, deterministic: bool = True) -> Policy:
-    """Return `policy(key, observation) -> action`; observations may have leading batch axes.
+    """Return `policy(key, observation) -> action`. Observations may have leading batch axes.
 
     Args:
-        policy: the name of a task, for the policy that comes with the package, or a policy file such as
-            `runs/docking3d/policy/seed_0.npz`.
-        deterministic: whether to act by the mode of the distribution over actions; then the key means nothing.
+        policy: the name of a task, for the policy that comes with the package, or a policy file
+            such as `runs/docking3d/policy/seed_0.npz`.
+        deterministic: whether to act by the mode of the distribution over actions. The key then
+            means nothing.
 
     Raises:
         ConfigError: there is no such policy, or the file holds something else.
     """
     saved = read_policy(find_policy(policy))
     act = saved.agent.policy(saved.env, saved.params, deterministic)
-    return jax.jit(act)  # or each call would work out the inputs anew
+    # Compiled once. Otherwise each call would work out anew what the inputs are.
+    return jax.jit(act)
 
 
 def is_single(run: str) -> bool:
-    """Whether a command's `run` is one policy, in a file or of the package, and not a directory with those of all seeds."""
+    """Return whether a command's `run` is one policy, in a file or of the package.
+
+    Otherwise it is a directory with the policies of all seeds.
+    """
     return run.endswith(".npz") or (run.startswith(PRETRAINED) and not Path(run).exists())
 
 
 def find_policy(policy: str | os.PathLike) -> Path:
-    """The file of a policy, given by a path, by the name of a task, or by `pretrained/` and that name.
+    """Return the file of a policy.
+
+    Args:
+        policy: a path, the name of a task, or `pretrained/` and the name of a task.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is no such policy.
     """
     path, known = Path(policy), {file.stem: file for file in sorted(_PRETRAINED.glob("*.npz"))}
     if path.suffix == ".npz":
@@ -144,6 +164,12 @@ def find_policy(policy: str | os.PathLike) -> Path:
 
 
 def _fill(like: Any, archive: Archive, path: str) -> Any:
+    """Return the parameters in an archive, in the structure and shapes of `like`.
+
+    Raises:
+        ConfigError: an array is missing, or is not one of numbers of the right shape.
+    """
+
     def pick(key: Any, leaf: jax.ShapeDtypeStruct) -> jax.Array:
         name = jax.tree_util.keystr(key, simple=True, separator="/")
         shape, dtype = archive.describe(name) if name in archive.names else (None, None)

@@ -1,4 +1,4 @@
-"""What the commands share: one-line errors with exit codes, and streams that last."""
+"""One-line errors, exit codes and lasting streams, which all commands share."""
 
 from __future__ import annotations
 
@@ -19,11 +19,14 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells expect."""
 
 DIVERGED = 3
-"""Exit code of a training or an evaluation in which the networks of a seed are not finite: there is no result for it."""
+"""Exit code of a training or an evaluation with a seed whose networks are not finite.
+
+There is no result for such a seed.
+"""
 
 
 IMPORTS = "  imports=false          refuse files that name modules to import: that runs the code of whoever wrote them"
-"""The help of an option that every command has."""
+"""Help text of an option that every command has."""
 
 
 def run(
@@ -31,9 +34,17 @@ def run(
     usage: Callable[[], str],
     leave: Callable[[int], NoReturn] = sys.exit,
 ) -> None:
-    """Run a command and leave with its exit code, by `leave` after an error or Ctrl-C.
+    """Run a command and leave with its exit code.
 
-    Output that nobody reads any more is no error. Output that could not be written is one, told when the work is done.
+    Output that nobody reads any more is no error. Output that could not be written is an error.
+    That error is reported when the work is done.
+
+    Args:
+        main: the command. It takes the words of the command line and returns its exit code, or None
+            instead of 0.
+        usage: a function that returns the help text.
+        leave: a function that ends the process after an error or Ctrl-C. In all other cases
+            `sys.exit` ends it.
     """
     argv = sys.argv[1:]
     with lasting_streams() as stdout:
@@ -51,7 +62,7 @@ def run(
 
 
 def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tuple[int, bool]:
-    """Return the exit code of a command, and whether it came to its end."""
+    """Return the exit code of a command and whether it came to its end."""
     try:
         flags, words = [], []
         for word in argv:
@@ -81,7 +92,7 @@ def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tu
 
 
 def _platform_fault() -> str | None:
-    """Return what is wrong with the platform that the user chose for JAX, None if nothing is."""
+    """Return what is wrong with the platform that the user chose for JAX, else None."""
     chosen = os.environ.get("JAX_PLATFORMS")
     if not chosen:
         return None
@@ -98,7 +109,10 @@ def _platform_fault() -> str | None:
 
 @contextmanager
 def _warnings_in_one_line() -> Iterator[None]:
-    """Print what this package warns of as the commands print errors; other warnings stay as they are."""
+    """Print warnings of this package in one line, as the commands print errors.
+
+    Other warnings stay as they are.
+    """
     with warnings.catch_warnings():
         show_other = warnings.showwarning
 
@@ -113,7 +127,11 @@ def _warnings_in_one_line() -> Iterator[None]:
 
 
 def at_once(code: int) -> NoReturn:
-    """Leave without Python's shutdown: it would wait for threads that compile, and orbax's print tracebacks into it."""
+    """Leave with an exit code, but without Python's shutdown.
+
+    The shutdown would wait for threads that compile, and threads of orbax would print tracebacks
+    during it.
+    """
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(code)

@@ -1,4 +1,7 @@
-"""`python -m jaxsafe.config docking3d`: the complete environment as one YAML file, on standard output."""
+"""The command `python -m jaxsafe.config docking3d` prints an environment.
+
+It prints the complete environment as one YAML file on standard output.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from jaxsafe.schema.errors import ConfigError
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+    """Run the command and return its exit code."""
     from jaxsafe.config import describe
     from jaxsafe.envs import make
     from jaxsafe.schema import yaml12
@@ -25,15 +28,14 @@ def main(argv: Sequence[str]) -> int:
     options = {name: arguments.pop_text(name) for name in ("actions", "variant", "rta")}
     arguments.refuse_rest([*options, "env.…"])
     env = make(task, changes, **options)  # type: ignore[arg-type]
-    utf8 = (
-        codecs.lookup(sys.stdout.encoding).name == "utf-8"
-    )  # as whoever reads the file takes it to be
+    # Whoever reads the file takes it to be UTF-8, so output in another encoding is only ASCII.
+    utf8 = codecs.lookup(sys.stdout.encoding).name == "utf-8"
     print(yaml12.write(describe(env), ascii_only=not utf8), end="")
     return 0
 
 
 def usage() -> str:
-    """The help text."""
+    """Return the help text."""
     options = (
         "[actions=continuous|discrete] [variant=paper|released] [rta=PRESET] [env.PATH=VALUE …]"
     )

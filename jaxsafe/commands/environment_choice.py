@@ -1,4 +1,8 @@
-"""Where a policy shall act: in the environment in which it was trained, changed by options, or in another that fits it."""
+"""Choice of the environment in which a policy acts.
+
+A policy acts in the environment in which it was trained, in that environment changed by options, or
+in another environment that fits it.
+"""
 
 from __future__ import annotations
 
@@ -11,19 +15,24 @@ from jaxsafe.schema.convert import to_data
 from jaxsafe.schema.errors import ConfigError
 
 OPTIONS = ("env", "actions", "variant", "rta", "env.…")
-"""The options of a command that say where a policy acts."""
+"""Options of a command that say in which environment a policy acts."""
 
 
 class EnvironmentChoice(NamedTuple):
-    """What a command says of the environment."""
+    """The environment that a command line asks for."""
 
-    task: str | None  # a name or a file; None is the environment in which the policy was trained
-    options: dict[str, Any]  # those given of actions, variant and rta
-    overrides: dict[str, Any]  # new values by dotted path
+    task: str | None
+    """Name or file of a task. None stands for the environment in which the policy was trained."""
+
+    options: dict[str, Any]
+    """Values of `actions`, `variant` and `rta`. An option that was not given is left out."""
+
+    overrides: dict[str, Any]
+    """New values by dotted path."""
 
     @classmethod
     def pop(cls, arguments: Arguments) -> EnvironmentChoice:
-        """Take what is said out of a command line."""
+        """Take the choice of an environment out of a command line."""
         task, overrides = arguments.pop_text("env"), arguments.pop_overrides()
         given = {name: arguments.pop_text(name) for name in ("actions", "variant", "rta")}
         return cls(
@@ -32,7 +41,7 @@ class EnvironmentChoice(NamedTuple):
 
     @property
     def changes(self) -> dict[str, Any]:
-        """All that is said, for the results."""
+        """Everything that the command line says about the environment, for the results."""
         return {
             **({} if self.task is None else {"env": self.task}),
             **self.options,
@@ -40,19 +49,24 @@ class EnvironmentChoice(NamedTuple):
         }
 
     def make(self) -> Environment:
-        """Return the environment of a task; raises as `jaxsafe.make`."""
+        """Return the environment of the task.
+
+        Raises:
+            ConfigError: `jaxsafe.make` refuses the task, an option or an override.
+        """
         return make(str(self.task), self.overrides, **self.options)
 
     def change(self, trained: Environment, name: str, run: str) -> Environment:
-        """Return the environment for the policies of a run.
+        """Return the environment in which the policies of a run act.
 
         Args:
-            trained: the environment in which they were trained.
-            name: of that environment.
-            run: where they are from.
+            trained: the environment in which the policies were trained.
+            name: the name of that environment.
+            run: the run from which the policies come, for error messages.
 
         Raises:
-            ConfigError: what is said is wrong, or the observation or the action is not theirs.
+            ConfigError: an option or an override is wrong, or the environment has another
+                observation or action than the policies.
         """
         env = (
             adapt(trained, name, self.overrides, **self.options)
@@ -76,9 +90,13 @@ class EnvironmentChoice(NamedTuple):
 
 
 def differences(trained: Environment, env: Environment) -> str:
-    """Return a line about what a policy sees or does by the same name, but defined otherwise than where it was trained.
+    """Return a line about observations and actuators that are defined otherwise than in training.
 
-    Empty if there is nothing of the kind.
+    Such a part has the same name in both environments. The line is empty if there is no such part.
+
+    Args:
+        trained: the environment in which a policy was trained.
+        env: the environment in which the policy acts.
     """
     found = []
     pairs = {

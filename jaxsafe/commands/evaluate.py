@@ -1,4 +1,7 @@
-"""`python -m jaxsafe.evaluate run=runs/x`: metrics of trained policies, in their own environment or a changed one."""
+"""The command `python -m jaxsafe.evaluate run=runs/x` measures trained policies.
+
+It computes their metrics in their own environment or in a changed one.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ OPTIONS = ("run", "activation", "episodes", "seed", "checkpoint", "deterministic
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+    """Run the command and return its exit code."""
     claim_cores()
     enable_compilation_cache()
     from jaxsafe.commands import environment_choice
@@ -72,7 +75,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def usage() -> str:
-    """The help text."""
+    """Return the help text."""
     return (
         "usage: python -m jaxsafe.evaluate run=RUN [key=value …]\n\n"
         "  run=RUN                a run directory, a policy file (.npz), or pretrained/TASK\n"

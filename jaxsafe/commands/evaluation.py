@@ -1,4 +1,4 @@
-"""Evaluating trained policies into a directory of its own."""
+"""Evaluation of trained policies, written into a directory of its own."""
 
 from __future__ import annotations
 
@@ -27,15 +27,19 @@ def evaluate(
     out: str | None,
     render: bool = False,
 ) -> tuple[Path, dict[str, Any]]:
-    """Evaluate every policy; write `results.json` and `eval.jsonl` and return the place of the first and its content.
+    """Evaluate every policy and write `results.json` and `eval.jsonl`.
 
     Args:
         subject: the policies.
-        env: the environment to evaluate in, which the policies fit.
-        kinds: of `stochastic` and `deterministic`.
-        request: `run`, `episodes`, `evaluation_seed`, `checkpoint`, `changes`: what was asked for, part of the results.
-        out: a new directory; None makes one in `subject.place`.
-        render: whether to draw the first episode of the first policy as `episode_<kind>.gif` as well.
+        env: the environment to evaluate in. The policies fit it.
+        kinds: `stochastic`, `deterministic` or both.
+        request: what was asked for: `run`, `episodes`, `evaluation_seed`, `checkpoint` and
+            `changes`. It becomes part of the results.
+        out: a new directory. None makes one in `subject.place`.
+        render: whether to draw the first episode of the first policy as `episode_<kind>.gif` too.
+
+    Returns:
+        The path of `results.json` and its content.
 
     Raises:
         ConfigError: `out` holds something, or no outcome of the environment is a success.
@@ -78,7 +82,10 @@ def evaluate(
 
 
 def _not_finite(subject: Subject) -> list[int]:
-    """Return the places of the policies with a number that is not finite, as a training that diverged leaves them."""
+    """Return the indices of the policies that have a parameter that is not finite.
+
+    A training that diverged leaves such policies.
+    """
     leaves = jax.tree.leaves(subject.mapper.gather(subject.params))
     return [
         place
@@ -96,5 +103,5 @@ def _render(subject: Subject, evaluator: Evaluator, seed: int, kind: str, path: 
 
 
 def film(path: Path, kind: str) -> Path:
-    """Return the place of the animation of an episode in the directory of an evaluation."""
+    """Return the path of an episode's animation in the directory of an evaluation."""
     return path / f"episode_{kind}.gif"

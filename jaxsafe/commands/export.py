@@ -1,4 +1,7 @@
-"""`python -m jaxsafe.export run=pretrained/docking2d format=onnx`: a policy as a file for other tools."""
+"""The command `python -m jaxsafe.export run=pretrained/docking2d format=onnx` exports a policy.
+
+It writes the policy to a file for other tools.
+"""
 
 from __future__ import annotations
 
@@ -21,17 +24,27 @@ if TYPE_CHECKING:
 FORMATS = ("onnx", "stablehlo", "vnnlib")
 OPTIONS = ("run", "seed", "activation", "format", "inputs", "batch", "steps", "box.FIELD", "out")
 BOX = {"position": (70.0, 106.0), "velocity": (-0.28, 0.28)}
-"""Starts of the closed-loop docking property of the verification community, in m and m/s, over 40 s."""
+"""Bounds of the starts by field, in m and m/s.
+
+These are the starts of the verification community's closed-loop docking property over 40 s.
+"""
 
 MAX_STEPS = 2000
-"""Of the closed loop, as many as a docking episode has: each step is some 350 operators and 3 MiB while they are made."""
+"""Largest number of steps of the closed loop.
+
+A docking episode has as many. Each step adds about 350 operators and takes 3 MiB while they are
+made.
+"""
 
 MAX_BOUND = 1e18
-"""Of a box: squares of larger numbers are infinite in single precision, and so is every margin."""
+"""Largest absolute value of a bound of a box.
+
+Squares of larger numbers are infinite in single precision, and so is every margin.
+"""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+    """Run the command and return its exit code."""
     import jax
     import jax.numpy as jnp
 
@@ -88,7 +101,8 @@ def main(argv: Sequence[str]) -> int:
     exported = kinds[inputs]()
     if form == "stablehlo":
         try:
-            import flatbuffers  # noqa: F401  jax.export needs it and does not ask for it
+            # jax.export needs flatbuffers but does not require it to be installed.
+            import flatbuffers  # noqa: F401
         except ImportError as error:
             raise missing(error, "flatbuffers", "export") from None
         target = Path(out or f"{stem}.stablehlo")
@@ -109,7 +123,15 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _policy(arguments: Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy, str]:
-    """What `run` and the options beside it mean, and the first part of the names of files."""
+    """Return the policy that the command line names, and the first part of the names of files.
+
+    Args:
+        arguments: the command line, out of which the options about the policy are taken.
+        run: a run directory, a policy file, `pretrained/TASK`, or a policy from elsewhere.
+
+    Raises:
+        ConfigError: there is no such policy, or the options do not fit it.
+    """
     from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
     from jaxsafe.commands.environment_choice import EnvironmentChoice, differences
     from jaxsafe.commands.policy_source import pop_source
@@ -125,7 +147,8 @@ def _policy(arguments: Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy
     if elsewhere:
         return elsewhere.read(), f"{Path(run).stem}_{elsewhere.task}"
     if not single:
-        run_directory.read(Path(run), "run")  # imports what a user's environment is made of
+        # Reading the run imports the modules of which a user's environment is made.
+        run_directory.read(Path(run), "run")
         stems = [
             file.stem.removeprefix("seed_") for file in (Path(run) / "policy").glob("seed_*.npz")
         ]
@@ -148,7 +171,10 @@ def _policy(arguments: Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy
 
 @contextmanager
 def _with_advice(env: Environment) -> Iterator[None]:
-    """Say of a filter, of which most have no counterpart in ONNX, how to leave it out."""
+    """Add to an error how to leave out the filter of the environment.
+
+    Most filters have no counterpart in ONNX.
+    """
     try:
         yield
     except ConfigError as error:
@@ -160,7 +186,10 @@ def _with_advice(env: Environment) -> Iterator[None]:
 
 
 def _require_finite(run: str, saved: SavedPolicy | ForeignPolicy) -> None:
-    """Refuse what a training that diverged left; in a network from elsewhere an infinite constant may be a bound."""
+    """Refuse a policy that was left by a training that diverged.
+
+    An infinite constant in a network from elsewhere may be a bound, so only NaN is refused there.
+    """
     import jax
     import numpy as np
 
@@ -188,7 +217,18 @@ def _vnnlib(
     path: Path,
     about: dict[str, str],
 ) -> int:
-    """Write graph and property, and say what a search for a counterexample finds."""
+    """Write the graph and the property, and print what a search for a counterexample finds.
+
+    Args:
+        unrolled: the closed loop without a loop in its graph, to be written.
+        looped: the same closed loop with a loop, to be searched.
+        given: intervals of starts from the command line, by name.
+        path: the path of the property. The graph gets the same name with the suffix `.onnx`.
+        about: facts about the policy, for the graph.
+
+    Returns:
+        The exit code.
+    """
     import jax
 
     from jaxsafe.export.onnx import write_onnx
@@ -214,7 +254,18 @@ def _vnnlib(
 
 
 def _box(names: Sequence[str], given: dict[str, object]) -> list[tuple[float, float]]:
-    """The interval of each element: by its own name, its field's, or the field's without the platform."""
+    """Return the interval of each element of the state at a start.
+
+    An interval is found by the name of the element, by the name of its field, or by the name of the
+    field without the platform.
+
+    Args:
+        names: the names of the elements.
+        given: intervals from the command line, by name. They replace those of `BOX`.
+
+    Raises:
+        ConfigError: an element has no proper interval, or an interval belongs to no element.
+    """
     bounds, used = {**BOX, **given}, set()
     box = []
     for name in names:
@@ -244,7 +295,7 @@ def _is_interval(value: Any) -> TypeGuard[Sequence[float]]:
 
 
 def usage() -> str:
-    """The help text."""
+    """Return the help text."""
     return (
         "usage: python -m jaxsafe.export run=RUN [key=value …]\n\n"
         "  run=RUN             a run directory, a policy file (.npz), or pretrained/TASK\n"

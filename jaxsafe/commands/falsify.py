@@ -1,7 +1,8 @@
-"""`python -m jaxsafe.rta.falsify env=docking2d rta=default`: tries to break a filter, and counts what happened.
+"""The command `python -m jaxsafe.rta.falsify env=docking2d rta=default` tries to break a filter.
 
-Every adversary acts on whole episodes from the task's own starts; the last one searches for sequences of controls that
-defeat the filter. Violations are counted at the samples and inside the steps, see `attack`.
+It counts what happened. Every adversary acts on whole episodes from the task's own starts. The last
+one searches for sequences of controls that defeat the filter. Violations are counted at the samples
+and inside the steps, see `jaxsafe.evaluate.run_adversaries.attack`.
 """
 
 from __future__ import annotations
@@ -18,13 +19,20 @@ from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.storage import provenance
 
 MOST_STEPS = 1_000_000
-"""Of each adversary, where `steps` is not given. Episodes longer than this allows are cut."""
+"""Largest number of steps of each adversary where `steps` is not given.
+
+Episodes that are longer than this allows are cut.
+"""
 
 OPTIONS = ("env", "rta", "steps", "lanes", "seed", "policies", "actions", "variant", "out")
 
 
 def report(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows as a table."""
+    """Return a table of what the adversaries achieved.
+
+    Args:
+        rows: the result of `attack` for each adversary.
+    """
     lines = [
         f"{'policy':12} {'steps':>10} {'violating':>10} {'inside':>8} {'worst h':>10} {'inside':>10}"
         f" {'altered':>8} {'‖Δu‖':>8}"
@@ -48,7 +56,7 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def violated(row: dict[str, Any]) -> bool:
-    """Whether a constraint was, at a sample or inside a step."""
+    """Return whether a constraint was violated, at a sample or inside a step."""
     return bool(row["violating_steps"] or row["violating_steps_inside"])
 
 
@@ -57,7 +65,7 @@ def _number(value: float | None) -> str:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code: 1 if there was a violation."""
+    """Run the command and return its exit code, which is 1 if there was a violation."""
     enable_compilation_cache()
     import jax
 
@@ -108,7 +116,8 @@ def main(argv: Sequence[str]) -> int:
             else "\n".join(report(rows).splitlines()[:2]),
             flush=True,
         )
-        if out:  # after each, so that nothing is lost if the run is stopped
+        # The file is written after each adversary, so that nothing is lost if the run is stopped.
+        if out:
             write_text(
                 Path(out),
                 json.dumps({**facts, "policies": rows}, indent=1, ensure_ascii=False) + "\n",
@@ -121,7 +130,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def usage() -> str:
-    """The help text."""
+    """Return the help text."""
     return (
         "usage: python -m jaxsafe.rta.falsify env=TASK [key=value …]\n\n"
         "  rta=default            the filter to attack (that of a file: its own); none attacks the bare task\n"

@@ -1,4 +1,7 @@
-"""`python -m jaxsafe.plot run=runs/x`: the paper's figures from a run's own log files; several runs in one figure."""
+"""The command `python -m jaxsafe.plot run=runs/x` draws the paper's figures.
+
+It draws them from the run's own log files. Several runs are drawn in one figure.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from jaxsafe.schema.errors import ConfigError, nearest
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+    """Run the command and return its exit code."""
     from jaxsafe.commands.run_figures import draw_all
     from jaxsafe.plot.figures import AXES
     from jaxsafe.train.host import run_directory
@@ -42,7 +45,18 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _compare(runs: Sequence[Any], x: str, out: Path) -> None:
-    """Draw the runs, each under the name of its directory, and print a table of them."""
+    """Draw several runs in one figure and print a table of their results.
+
+    Each run appears under the name of its directory.
+
+    Args:
+        runs: the run directories.
+        x: the horizontal axis, one of `jaxsafe.plot.figures.AXES`.
+        out: the path of the figure.
+
+    Raises:
+        ConfigError: the runs cannot be compared, or one of them is not finished.
+    """
     from jaxsafe.commands.run_figures import progress
     from jaxsafe.plot.compare import compare_curves
     from jaxsafe.plot.style import save
@@ -68,7 +82,7 @@ def _compare(runs: Sequence[Any], x: str, out: Path) -> None:
 
 
 def usage() -> str:
-    """The help text."""
+    """Return the help text."""
     return (
         "usage: python -m jaxsafe.plot run=RUN [x=steps|wall]\n"
         "       python -m jaxsafe.plot 'run=[RUN,RUN,…]' [x=steps|wall] [out=comparison.png]\n\n"

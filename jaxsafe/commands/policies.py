@@ -1,4 +1,4 @@
-"""What is evaluated: the policies of all seeds of a run, or the one in a policy file."""
+"""Policies to evaluate: those of all seeds of a run, or the one in a policy file."""
 
 from __future__ import annotations
 
@@ -23,17 +23,35 @@ from jaxsafe.train.host.results import facts
 class Subject(NamedTuple):
     """Policies that were trained together, and where they come from."""
 
-    name: str  # of the environment
-    env: Environment  # in which they were trained
+    name: str
+    """Name of the environment."""
+
+    env: Environment
+    """Environment in which the policies were trained."""
+
     agent: Agent | ForeignAgent
+    """Agent that acts with the parameters of a policy."""
+
     mapper: SeedMapper
-    params: Params  # [mapper.padded], placed
-    facts: dict[str, Any]  # env, preset, algorithm, seeds, seed (the first), steps: for the results
-    place: Path  # where evaluations of them are written
+    """Mapping of functions over the policies."""
+
+    params: Params
+    """Parameters [mapper.padded], placed on the devices."""
+
+    facts: dict[str, Any]
+    """Facts for the results: `env`, `preset`, `algorithm`, `seeds`, `seed` (the first), `steps`."""
+
+    place: Path
+    """Directory into which evaluations of the policies are written."""
 
 
 def load_foreign(source: Source) -> Subject:
-    """A policy that was trained elsewhere, to act in a task; see `foreign`.
+    """Return a policy that was trained elsewhere, to act in a task.
+
+    Which files can be read stands in `jaxsafe.agents.imported_policy`.
+
+    Args:
+        source: the policy, as a command names it.
 
     Raises:
         ConfigError: there is no such task, or the policy does not fit it.
@@ -60,7 +78,13 @@ def load_foreign(source: Source) -> Subject:
 
 
 def load(run: str, checkpoint: str | None) -> Subject:
-    """Read a run directory, a policy file, or a policy that comes with the package, `pretrained/<task>`.
+    """Return the policies of a run, or a single policy.
+
+    Args:
+        run: a run directory, a policy file, or `pretrained/<task>` for a policy that comes with the
+            package.
+        checkpoint: `last`, `best` or the step of a checkpoint of a run. None stands for `last`. A single
+            policy has no checkpoints, so only None is possible for it.
 
     Raises:
         ConfigError: there is no such run, policy or checkpoint.
@@ -82,9 +106,8 @@ def _of_file(path: Path) -> Subject:
     saved, mapper = read_policy(path), SeedMapper(1)
     params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], saved.params))
     about = {"env": path.stem, "preset": "unknown", "seed": 0, "step": 0} | saved.about
-    algorithm = (
-        "ppo_lagrangian" if saved.agent.cost_critic else "ppo"
-    )  # no other has a critic of the cost
+    # No algorithm but PPO-Lagrangian has a critic of the cost.
+    algorithm = "ppo_lagrangian" if saved.agent.cost_critic else "ppo"
     found = {"env": about["env"], "preset": about["preset"], "algorithm": algorithm, "seeds": 1}
     found |= {"seed": about["seed"], "steps": about["step"]}
     return Subject(

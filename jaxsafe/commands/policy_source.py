@@ -14,24 +14,41 @@ from jaxsafe.schema.errors import ConfigError
 
 
 class Source(NamedTuple):
-    """What a command says of a policy from elsewhere."""
+    """A policy that was trained elsewhere, as a command line describes it."""
 
     path: Path
+    """File of the policy."""
+
     choice: EnvironmentChoice
+    """Environment in which the policy shall act."""
+
     activation: str
+    """Name of the function between the layers in an .npz."""
 
     @property
     def task(self) -> str:
-        """The name of the environment in which it shall act."""
+        """Name of the environment in which the policy shall act."""
         return short_name(self.choice.task or "")
 
     def read(self) -> ForeignPolicy:
-        """Read it; raises a ConfigError if there is no such environment, or as `read_foreign` does."""
+        """Return the policy.
+
+        Raises:
+            ConfigError: there is no such environment, or `read_foreign` refuses the policy.
+        """
         return read_foreign(self.path, self.choice.make(), self.activation)
 
 
 def pop_source(arguments: Arguments, run: str, choice: EnvironmentChoice) -> Source | None:
-    """Take `activation` of a command; None if `run` is a policy of our own.
+    """Take the description of a policy from elsewhere out of a command line.
+
+    Args:
+        arguments: the command line, out of which `activation` is taken.
+        run: the policy file.
+        choice: the environment in which the policy shall act.
+
+    Returns:
+        The policy from elsewhere, or None if `run` is a policy of our own.
 
     Raises:
         ConfigError: the options do not fit each other.
@@ -42,9 +59,8 @@ def pop_source(arguments: Arguments, run: str, choice: EnvironmentChoice) -> Sou
         raise ConfigError(
             f"env: missing; the task in which {run} shall act, for instance env=docking2d"
         )
-    layers = (
-        choice.task is not None and run.endswith(".npz") and "header.npy" not in names
-    )  # which policies of ours have
+    # Policies of our own have a header.
+    layers = choice.task is not None and run.endswith(".npz") and "header.npy" not in names
     arguments.refuse_beside(
         [] if layers else ["activation"], "but for the layers in an .npz with env=TASK"
     )
@@ -53,9 +69,13 @@ def pop_source(arguments: Arguments, run: str, choice: EnvironmentChoice) -> Sou
 
 
 def _names(path: str) -> set[str]:
-    """Return what an archive holds, without reading any of it; nothing if there is none."""
+    """Return the names of the entries of an archive. There are none if there is no archive.
+
+    The entries are not read.
+    """
     try:
         with zipfile.ZipFile(path) as archive:
             return set(archive.namelist())
-    except Exception:  # whatever it is, reading it tells more
+    # Whatever is wrong with the file, reading it later tells more.
+    except Exception:
         return set()

@@ -1,4 +1,4 @@
-"""The figures of a run from its own log files."""
+"""Figures of a run, drawn from its own log files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,14 @@ from jaxsafe.train.host.log import filter_name, headline, read_progress
 
 
 def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
-    """Draw every figure for which the run has data, into `<run>/figures/`, and return their paths.
+    """Draw every figure for which the run has data into `<run>/figures/`.
+
+    Args:
+        run: the run directory.
+        x: the horizontal axis of training curves: steps, or wall time.
+
+    Returns:
+        The paths of the figures.
 
     Raises:
         ConfigError: the run has no progress log.
@@ -57,12 +64,10 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
         if "rta" in episodes[-1][1][0]:
             figures["interventions"] = interventions(most_altered(episodes), env, title)
     place = run / "figures"
-    new = (
-        place if place.exists() else place.with_name("figures.part")
-    )  # for the first time all or none
-    shutil.rmtree(
-        place.with_name("figures.part"), ignore_errors=True
-    )  # of a command that was killed
+    # If there are no figures yet, all of them appear at once or none does.
+    new = place if place.exists() else place.with_name("figures.part")
+    # A command that was killed may have left this directory.
+    shutil.rmtree(place.with_name("figures.part"), ignore_errors=True)
     paths = [save(figure, new / f"{name}.png") for name, figure in figures.items()]
     if new != place:
         new.rename(place)
@@ -70,10 +75,10 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
 
 
 def progress(run: Path) -> list[dict[str, Any]]:
-    """The progress log of a run.
+    """Return the rows of the progress log of a run.
 
     Raises:
-        ConfigError: it has no rows.
+        ConfigError: the log has no rows.
     """
     rows = read_progress(run)
     if not rows:
@@ -84,12 +89,15 @@ def progress(run: Path) -> list[dict[str, Any]]:
 def _episodes(
     path: Path, names: Sequence[str], form: Callable[[Rows], Any] | None = None
 ) -> Episodes:
-    """Logged episodes of these platforms, each with the training step of its policy; those of the end only once.
+    """Return the logged episodes, each with the training step of its policy.
+
+    If final episodes are logged at a step, other episodes at the same step are left out, so that
+    the end of the training appears only once.
 
     Args:
-        path: of the log.
-        names: of the platforms.
-        form: what each row must look like, from all rows.
+        path: the path of the log.
+        names: the names of the platforms to keep in the rows.
+        form: a function of all rows that returns what each row must look like.
 
     Raises:
         ConfigError: a row lacks what the figures show, or has something else there.
@@ -108,7 +116,15 @@ def _episodes(
 
 
 def _row_form(env: Environment, names: Sequence[str], rows: Rows) -> dict[str, Any]:
-    """Return the form of a row of an episode log; what older logs have not is asked of all rows if one has it."""
+    """Return what a row of an episode log must look like.
+
+    Older logs lack some fields. Such a field is required of all rows if one row has it.
+
+    Args:
+        env: the environment of the run.
+        names: the names of the platforms that are drawn. Only the first needs a heading.
+        rows: all rows of the log.
+    """
     sizes = {platform.name: platform.dimension for platform in env.platforms}
     place = {"position": numbers(max(sizes.values()))}
     headed = any(

@@ -1,4 +1,7 @@
-"""`python -m jaxsafe.plot.safe_set env=rejoin2d rta=default`: draw where a filter certifies."""
+"""The command `python -m jaxsafe.plot.safe_set env=rejoin2d rta=default` draws a safe set.
+
+The figure shows at which states a filter certifies.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ OPTIONS = ("env", "rta", "x", "y", "points", "out")
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+    """Run the command and return its exit code."""
     enable_compilation_cache()
     arguments = Arguments.parse(argv)
     task, rta, out = (arguments.pop_text(name) for name in ("env", "rta", "out"))
@@ -26,7 +29,8 @@ def main(argv: Sequence[str]) -> int:
     arguments.refuse_rest([*OPTIONS, "env.…"])
     if task is None:
         raise ConfigError("env: missing; for instance env=rejoin2d")
-    rta = rta or default_filter(task)  # a file may have its own
+    # A file may have a filter of its own, so it gets no default filter.
+    rta = rta or default_filter(task)
     env = make(task, changes, rta=rta)
     print(
         save(
@@ -48,7 +52,7 @@ def _ends(arguments: Arguments, key: str) -> Ends | None:
 
 
 def usage() -> str:
-    """The help text."""
+    """Return the help text."""
     return (
         "usage: python -m jaxsafe.plot.safe_set env=TASK [key=value …]\n\n"
         "  rta=default            the filter, one that certifies states\n"

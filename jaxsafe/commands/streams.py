@@ -1,8 +1,8 @@
 """Standard output and standard error of a command. Whatever happens to them, the work goes on.
 
-Letters that an encoding lacks are replaced, control characters, which may come with a stranger's file and would act on the
-terminal, are spelt out. A stream that is closed leads nowhere, and so does one that can take no more: the reader of a pipe
-has gone, or the disk is full.
+Letters that an encoding lacks are replaced. Control characters are spelt out, because they may come
+with a stranger's file and would act on the terminal. A stream that is closed leads nowhere. So does
+a stream that can take no more, because the reader of a pipe has gone or the disk is full.
 """
 
 from __future__ import annotations
@@ -17,10 +17,13 @@ from jaxsafe.schema.errors import CONTROL_ESCAPES, TEXT_CONTROLS
 
 
 class LastingStream:
-    """A text stream that never raises an OSError: after the first one it discards what is written, and keeps the error."""
+    """A text stream that never raises an OSError.
+
+    After the first OSError it keeps the error and discards what is written.
+    """
 
     def __init__(self, stream: Any, allowed: str = "") -> None:
-        """Wrap a stream, to which these control characters may be written too."""
+        """Wrap a stream. The control characters in `allowed` may be written to it too."""
         self._stream = stream
         self._controls = (
             CONTROL_ESCAPES | TEXT_CONTROLS | {ord(letter): letter for letter in allowed}
@@ -28,12 +31,12 @@ class LastingStream:
         self.error: OSError | None = None
 
     def write(self, text: str) -> int:
-        """Write text."""
+        """Write text and return its length."""
         self._attempt(self._stream.write, text.translate(self._controls))
         return len(text)
 
     def flush(self) -> None:
-        """Write what is buffered."""
+        """Write the text that is buffered."""
         self._attempt(self._stream.flush)
 
     def __getattr__(self, name: str) -> Any:
@@ -45,23 +48,25 @@ class LastingStream:
         except OSError as error:
             self.error = error
             nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(
-                nowhere, self._stream.fileno()
-            )  # for what is in the buffer, for libraries and for child processes
+            # The text in the buffer, libraries and child processes use the file descriptor.
+            os.dup2(nowhere, self._stream.fileno())
             os.close(nowhere)
 
 
 @contextmanager
 def lasting_streams() -> Iterator[LastingStream]:
-    """Make `sys.stdout` and `sys.stderr` last for the time of a command, and give the first of them."""
+    """Make `sys.stdout` and `sys.stderr` last for the time of a command.
+
+    Yields:
+        The lasting standard output.
+    """
     before = sys.stdout, sys.stderr
+    # A file that gets the number of a closed stream would receive what libraries print there.
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
-        pass  # a file that gets the number of a closed stream would receive what libraries print there
+        pass
     os.close(number)
-    sys.stdout, sys.stderr = (
-        _lasting(before[0]),
-        _lasting(before[1], allowed="\r"),
-    )  # with which a bar is drawn anew
+    # A progress bar is drawn anew with a carriage return.
+    sys.stdout, sys.stderr = _lasting(before[0]), _lasting(before[1], allowed="\r")
     try:
         yield sys.stdout
     finally:
@@ -71,7 +76,8 @@ def lasting_streams() -> Iterator[LastingStream]:
 
 
 def _lasting(stream: Any, allowed: str = "") -> Any:
-    if stream is None:  # it was closed when Python started
+    # A stream that was closed when Python started is None.
+    if stream is None:
         stream = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     if hasattr(stream, "reconfigure"):
         stream.reconfigure(errors="replace")

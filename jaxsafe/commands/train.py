@@ -1,4 +1,7 @@
-"""`python -m jaxsafe.train env=docking3d seeds=10`: train all seeds, evaluate, draw figures, print a table."""
+"""The command `python -m jaxsafe.train env=docking3d seeds=10` trains policies.
+
+It trains all seeds, evaluates them, draws figures and prints a table.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +21,11 @@ if TYPE_CHECKING:
     from jaxsafe.train.host.session import Training
 
 BEGAN = time.monotonic()
+"""Time [s] at which the command began. The clock of the first run starts then."""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+    """Run the command and return its exit code."""
     claim_cores()
     enable_compilation_cache()
     import jax
@@ -51,9 +55,9 @@ def main(argv: Sequence[str]) -> int:
             try:
                 finished = _train([run for run in runs if not _complete(run)], path)
             except Exception as error:
-                alone = (
-                    jax.process_count() == 1
-                )  # else it may be the loss of another process, after which the run goes on
+                # With several processes, the error may be the loss of another one. The run can go
+                # on after that.
+                alone = jax.process_count() == 1
                 if (
                     resume is None
                     and processes.leads()
@@ -76,15 +80,14 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _complete(run: Path) -> bool:
-    """Whether all is there, with figures if only they are missing."""
+    """Return whether a run is complete. If only its figures are missing, draw them."""
     from jaxsafe.devices import processes
 
     if not (run / "results.json").exists():
         return False
     print(f"{run} is complete; nothing is left to do")
-    if (
-        not (run / "figures").exists() and processes.leads()
-    ):  # killed between the results and the figures
+    # The command may have been killed between the results and the figures.
+    if not (run / "figures").exists() and processes.leads():
         from jaxsafe.commands.run_figures import draw_all
 
         draw_all(run)
@@ -92,9 +95,17 @@ def _complete(run: Path) -> bool:
 
 
 def _train(runs: Sequence[Path], path: Path) -> bool:
-    """Train runs in `path` one after another, then evaluate them; False if the user asked to stop.
+    """Train runs one after another, then evaluate all of them.
 
-    The programs of a run are compiled while the one before it trains: to compile alone leaves cores idle.
+    The programs of a run are compiled while the run before it trains, because compiling alone
+    leaves cores idle.
+
+    Args:
+        runs: the directories of the runs.
+        path: the directory from which the user can resume all of them.
+
+    Returns:
+        False if the user asked to stop, else True.
     """
     from jaxsafe.train.host.results import finish, table
 
@@ -118,7 +129,8 @@ def _train(runs: Sequence[Path], path: Path) -> bool:
             trained.append((run, training))
         for _, training in trained:
             training.prepare_evaluation()
-        from jaxsafe.commands.run_figures import draw_all  # only now: it takes a while
+        # This import takes a while, so it waits until the figures are needed.
+        from jaxsafe.commands.run_figures import draw_all
 
         for run, training in trained:
             print(table(finish(training), run / "results.json"))
@@ -127,7 +139,13 @@ def _train(runs: Sequence[Path], path: Path) -> bool:
 
 
 def _open(run: Path, files: ExitStack, began: float) -> Training:
-    """What is left of a run; its logs are closed with `files`, and its clock has run since `began`."""
+    """Return what is left of a run to train.
+
+    Args:
+        run: the run directory.
+        files: the stack that closes the logs of the run.
+        began: the time [s] of `time.monotonic` since which the clock of the run has run.
+    """
     from jaxsafe.devices import processes
     from jaxsafe.train.host import run_directory
     from jaxsafe.train.host.session import Clock, Training
@@ -138,7 +156,7 @@ def _open(run: Path, files: ExitStack, began: float) -> Training:
 
 
 def usage() -> str:
-    """The help text."""
+    """Return the help text."""
     from jaxsafe.train.host.options import usage
 
     return usage()

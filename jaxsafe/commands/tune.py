@@ -1,4 +1,7 @@
-"""`python -m jaxsafe.tune env=docking2d seeds=4 'sweep.ppo.gamma=[0.95,0.97]'`: train every setting and rank them."""
+"""The command `python -m jaxsafe.tune` trains every setting of a sweep and ranks the settings.
+
+For example: `python -m jaxsafe.tune env=docking2d seeds=4 'sweep.ppo.gamma=[0.95,0.97]'`.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +14,14 @@ from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores
 
 RANKS = ("steps", "success", "deterministic")
+"""Orders of the table of settings. The first is the default."""
+
 EPISODES = 200
-"""Of the evaluation of each seed, unless the user says otherwise."""
+"""Number of episodes in the evaluation of each seed, unless the user says otherwise."""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+    """Run the command and return its exit code."""
     claim_cores()
     enable_compilation_cache()
     from tqdm import tqdm
@@ -57,9 +62,8 @@ def main(argv: Sequence[str]) -> int:
     )
     total = sum(found[i].config.num_updates for i in left)
     try:
-        with tqdm(
-            total=total, unit=" updates", disable=None
-        ) as bar:  # none where there is no terminal
+        # `disable=None` draws no bar where there is no terminal.
+        with tqdm(total=total, unit=" updates", disable=None) as bar:
             for done in train_all(found, left, bar.update):
                 results.add(path, done)
                 rows |= done
@@ -78,7 +82,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def usage() -> str:
-    """The help text."""
+    """Return the help text."""
     return (
         "usage: python -m jaxsafe.tune env=TASK 'sweep.OPTION=[a,b,…]' [key=value …]      or      resume=DIR\n\n"
         "  sweep.OPTION=[a,b]     values of an option of jaxsafe.train, or of env.PATH; several make a grid\n"

@@ -1,4 +1,7 @@
-"""Environments as YAML: `load`, `dump`, and dotted-path overrides. The tasks themselves are Python, in `jaxsafe.envs`."""
+"""Environments as YAML, with `load` and `dump`, and overrides by dotted paths.
+
+The tasks themselves are Python and stand in `jaxsafe.envs`.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +22,24 @@ __all__ = ["build", "describe", "dump", "from_data", "load", "load_filter", "ove
 
 
 def build(env: Environment) -> Environment:
-    """Make a declared environment ready for use: numbers become arrays, and its parts are checked."""
+    """Return a declared environment ready for use.
+
+    Its numbers become arrays, and its parts are checked.
+
+    Raises:
+        ConfigError: one line that names the part that does not fit and what is allowed.
+    """
     return check(normalise(env))
 
 
 def load(source: str | os.PathLike) -> Environment:
     """Read an environment from a YAML file, or from the YAML text that `dump` returns.
 
-    Modules under `imports` are imported first, so that the components which they define can be named.
+    The modules listed under `imports` are imported first. So the file can name the components that
+    these modules define.
+
+    Args:
+        source: the path of a file, or a text of more than one line.
 
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.
@@ -41,9 +54,12 @@ def load(source: str | os.PathLike) -> Environment:
 
 
 def load_filter(path: str | os.PathLike) -> RTA:
-    """Read a run time assurance filter from a YAML file: what stands under `rta` in an environment, or an environment.
+    """Read a run time assurance filter from a YAML file.
 
-    Of an environment its filter is taken. A filter alone may begin with `imports`, as an environment may.
+    Args:
+        path: a file with an environment, whose filter is taken, or with what stands under `rta` in
+            an environment. A file with a filter alone may begin with `imports`, as one with an
+            environment may.
 
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.
@@ -63,20 +79,27 @@ def load_filter(path: str | os.PathLike) -> RTA:
 
 
 def dump(env: Environment) -> str:
-    """The complete environment as YAML text, so that `load(dump(env)) == env`."""
+    """Return the complete environment as YAML text, so that `load(dump(env)) == env`."""
     from jaxsafe.schema import yaml12
 
     return yaml12.write(describe(env))
 
 
 def describe(env: Environment) -> dict[str, Any]:
-    """The complete environment as plain data, beginning with the modules outside jaxsafe that define parts of it."""
+    """Return the complete environment as plain data.
+
+    If modules outside jaxsafe define parts of it, the data begin with the names of these modules.
+    """
     needed = modules(env)
     return ({"imports": needed} if needed else {}) | to_data(env)
 
 
 def from_data(data: Any, place: str) -> Environment:
-    """Read what `describe` returns; `place` begins the messages of errors.
+    """Read an environment from the plain data that `describe` returns.
+
+    Args:
+        data: the plain data.
+        place: the place of the data, with which messages of errors begin.
 
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.

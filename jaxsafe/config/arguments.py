@@ -1,4 +1,7 @@
-"""The `key=value` words of a command line, read as YAML scalars and checked as they are taken out."""
+"""The `key=value` words of a command line.
+
+Values are read as YAML scalars and are checked when they are taken out.
+"""
 
 from __future__ import annotations
 
@@ -11,20 +14,24 @@ from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError, nearest, show
 
 PATHS = ("env", "out", "run", "runs", "resume", "policies")
-"""Options that are paths, and taken as typed: `out=2024.10` is no number, and `out="my run #3"` has no comment."""
+"""Options that are paths.
+
+They are taken as typed, so `out=2024.10` is no number and `out="my run #3"` has no comment.
+"""
 
 MAX_COUNT = 2**31 - 1
-"""The largest whole number, unless an option says otherwise: the programs count in 32 bits."""
+"""Largest whole number, unless an option says otherwise. The programs count in 32 bits."""
 
 MAX_SEED = 2**32 - 1
-"""The largest seed: keys of random numbers are made of its lowest 32 bits."""
+"""Largest seed. Keys of random numbers are made of its lowest 32 bits."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
-    """A command line `key=value …` as typed, values read as YAML scalars but for paths."""
+    """The options of a command line `key=value …`."""
 
     options: dict[str, Any]
+    """Values by key. Paths are as typed, other values are read as YAML scalars."""
 
     @classmethod
     def parse(cls, argv: Sequence[str]) -> Arguments:
@@ -46,14 +53,16 @@ class Arguments:
         return cls(options)
 
     def pop(self, key: str, default: Any = None) -> Any:
-        """Take one option out."""
+        """Take out an option. Return its value, or `default` if it was not given."""
         return self.options.pop(key, default)
 
     def pop_text(self, key: str) -> str | None:
-        """Take out an option that is a name or a path; `runs/7` and `7` are both text.
+        """Take out an option that is a name or a path. Return None if it was not given.
+
+        Both `runs/7` and `7` are text.
 
         Raises:
-            ConfigError: it was given without a value.
+            ConfigError: the option has no value, or it is a list, a mapping or a truth value.
         """
         if key not in self.options:
             return None
@@ -65,8 +74,14 @@ class Arguments:
     def pop_count(self, key: str, default: int, least: int = 1, most: int = MAX_COUNT) -> int:
         """Take out a whole number.
 
+        Args:
+            key: the option.
+            default: the number if the option was not given.
+            least: the smallest number that is allowed.
+            most: the largest number that is allowed.
+
         Raises:
-            ConfigError: it is something else, too small or too large.
+            ConfigError: the value is no whole number, or it is too small or too large.
         """
         given = self.options.pop(key, default)
         value = int(given) if isinstance(given, float) and given.is_integer() else given
@@ -79,18 +94,19 @@ class Arguments:
         return value
 
     def pop_seed(self, key: str = "seed") -> int:
-        """Take out the seed of random numbers, 0 if it was not given.
+        """Take out the seed of random numbers. Return 0 if it was not given.
 
         Raises:
-            ConfigError: it is not one, or so large that it would give the numbers of a smaller one.
+            ConfigError: the value is no seed, or it is so large that it would give the same random
+                numbers as a smaller seed.
         """
         return self.pop_count(key, 0, least=0, most=MAX_SEED)
 
     def pop_flag(self, key: str) -> bool | None:
-        """Take out true or false; None if it was not given.
+        """Take out an option that is true or false. Return None if it was not given.
 
         Raises:
-            ConfigError: it is something else.
+            ConfigError: the value is neither true nor false.
         """
         if key not in self.options:
             return None
@@ -100,31 +116,49 @@ class Arguments:
         return value
 
     def pop_overrides(self) -> dict[str, Any]:
-        """Take out the `env.<path>=value` options, without their prefix."""
+        """Take out the `env.<path>=value` options. Return their values by path, without `env.`."""
         paths = [key for key in self.options if key.startswith("env.")]
         return {key.removeprefix("env."): self.options.pop(key) for key in paths}
 
     def refuse_beside(self, keys: Iterable[str], situation: str) -> None:
-        """Raise a ConfigError for an option that would change nothing in this situation."""
+        """Refuse options that would change nothing.
+
+        Args:
+            keys: the options.
+            situation: why they would change nothing, as the end of the message.
+
+        Raises:
+            ConfigError: one of the options was given.
+        """
         for key in keys:
             if key in self.options:
                 raise ConfigError(f"{key}: means nothing {situation}; leave it out")
 
     def refuse_rest(self, known: Sequence[str]) -> None:
-        """Raise a ConfigError for an option that nobody took."""
+        """Refuse options that have not been taken out.
+
+        Args:
+            known: the options that the command has, to suggest the nearest one.
+
+        Raises:
+            ConfigError: an option is left.
+        """
         for key in self.options:
             raise ConfigError(f"{key}: unknown option; choose from {nearest(key, known)}")
 
 
 def _path(text: str, key: str) -> Any:
-    """Return a path as typed, or a list of them in brackets; None where there is none."""
+    """Return a path as typed, or a list of paths if it is in brackets. Return None for no text."""
     return _from_home(
         yaml12.parse(text, key, as_text=True) if text.startswith("[") else text or None, key
     )
 
 
 def _from_home(path: Any, key: str) -> Any:
-    """Return a path, or each of a list, with the home directory for its `~`, which a shell leaves alone in `out=~/x`."""
+    """Return a path, or each path of a list, with the home directory in place of its `~`.
+
+    A shell leaves the `~` of `out=~/x` alone.
+    """
     if isinstance(path, list):
         return [_from_home(one, key) for one in path]
     if not isinstance(path, str) or not path.startswith("~"):

@@ -1,4 +1,8 @@
-"""Checks of a composed environment: names refer to parts that exist, earlier ones where order matters; it can be traced."""
+"""Checks that the parts of a composed environment fit together.
+
+Names must refer to parts that exist, and to earlier parts where order matters. The environment must
+also be one that can be traced.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +29,10 @@ from jaxsafe.transition import judge
 from jaxsafe.types import Sim
 
 MAX_PARTS = 1000
-"""Parts that a section may have. Each is traced by itself, which takes about ten seconds for as many."""
+"""Largest number of parts of a section.
+
+Each part is traced by itself, which takes about ten seconds for this many.
+"""
 
 _SECTIONS = ("platforms", "regions", "status", "constraints", "terminal", "reward", "observation")
 
@@ -35,11 +42,11 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
 
     Args:
         env: the environment.
-        before: one that has passed and whose numbers alone differ, if there is one. Then it is not traced again; only its
-            filter is asked anew whether it suits the numbers.
+        before: an environment that has passed, if there is one. If `env` differs from it in numbers
+            only, `env` is not traced again. Its filter is still asked whether it suits the numbers.
 
     Raises:
-        ConfigError: naming the part that does not fit and what it may refer to.
+        ConfigError: one line that names the part that does not fit and what it may refer to.
     """
     names = {section: [part.name for part in getattr(env, section)] for section in _SECTIONS}
     for section, found in names.items():
@@ -50,7 +57,7 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
     for section in _SECTIONS:
         for index, part in enumerate(getattr(env, section)):
             for place, refers, name in references(part, f"{section}.{part.name}"):
-                # Later ones are not there yet when a start is drawn, or a status evaluated.
+                # Later parts are not there yet when a start is drawn or a status is evaluated.
                 early = section == "status" or place.startswith(f"platforms.{part.name}.start")
                 ordered = refers.section == section and early
                 known = names[refers.section][: index if ordered else None]
@@ -67,7 +74,8 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
             raise ConfigError(f"{required}: an environment needs at least one")
     if before is None or _shapes(env) != _shapes(before):
         _check_computable(*_shapes(env), jnp.result_type(float))
-    _check_suited(env)  # what a filter proves depends on the numbers
+    # What a filter proves depends on the numbers, so the filter is asked in either case.
+    _check_suited(env)
     return env
 
 
@@ -81,7 +89,10 @@ def _check_problems(env: Environment) -> None:
 
 
 def _problems(component: Component, place: str) -> Iterator[tuple[str, str]]:
-    """What components say is wrong with themselves; traced numbers cannot be judged."""
+    """Yield what a component and those inside it say is wrong with themselves, each with its place.
+
+    Nothing is yielded for a component with traced numbers, because they cannot be judged.
+    """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(component)):
         return
     for name in fields(type(component)):
@@ -89,9 +100,8 @@ def _problems(component: Component, place: str) -> Iterator[tuple[str, str]]:
         for inner in value if isinstance(value, tuple) else (value,):
             if isinstance(inner, Component):
                 yield from _problems(inner, join(join(place, name), getattr(inner, "name", "")))
-    with (
-        jax.ensure_compile_time_eval()
-    ):  # inside a trace comparisons of constants would be traced too
+    # Inside a trace, comparisons of constants would be traced too.
+    with jax.ensure_compile_time_eval():
         try:
             problem = component.problem()
         except ConfigError:
@@ -191,7 +201,10 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
 
 
 def _check_randomized(env: Environment) -> None:
-    """Every path leads to one number, and every number of its interval is allowed there."""
+    """Check the numbers that are drawn at random.
+
+    Every path must lead to one number, and every number of its interval must be allowed there.
+    """
 
     def convert(value: Any, field: Any, place: str) -> Any:
         one = field.unit.length in (None, ANY) if field.unit else isinstance(value, Mapping)
@@ -209,9 +222,8 @@ def _check_randomized(env: Environment) -> None:
             )
         if isinstance(interval, Tracer):
             continue
-        low, high = np.asarray(
-            interval
-        ).tolist()  # an element of a constant array would be traced inside a trace
+        # Inside a trace, an element of a constant JAX array would be traced too.
+        low, high = np.asarray(interval).tolist()
         if not np.isfinite(low) or not np.isfinite(high):
             raise ConfigError(f"randomize.{path}: expected finite bounds, found [{low}, {high}]")
         for value in (low, high, *([0.0] if low < 0.0 < high else [])):
@@ -242,9 +254,15 @@ def _shapes(env: Environment) -> tuple[Any, tuple]:
 
 @lru_cache(maxsize=256)
 def _check_computable(structure: Any, shapes: tuple, precision: Any) -> None:
-    """All that does not depend on numbers, traced once for environments that differ in nothing else.
+    """Check everything that does not depend on numbers.
 
-    `precision` is the type of a new number, which decides what comes out: part of what is remembered by.
+    Environments that differ in numbers only are traced once, because the result is cached.
+
+    Args:
+        structure: the tree structure of the environment.
+        shapes: the shape and dtype of each leaf.
+        precision: the dtype of a new number. It decides what comes out of the trace, so it is part
+            of the cache's key.
     """
     env = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
     _check_kinds(env)
@@ -252,7 +270,7 @@ def _check_computable(structure: Any, shapes: tuple, precision: Any) -> None:
 
 
 def _check_kinds(env: Environment) -> None:
-    """Truth values where they are asked for, numbers elsewhere."""
+    """Check that a status is a truth value where one is asked for, and a number where one is."""
 
     def statuses(env: Environment) -> Mapping[str, Any]:
         platforms = {platform.name: platform.rest() for platform in env.platforms}
@@ -262,7 +280,8 @@ def _check_kinds(env: Environment) -> None:
 
     try:
         found = jax.eval_shape(statuses, env)
-    except Exception:  # reported with its place when all is traced
+    # The error is reported with its place when the whole environment is traced.
+    except Exception:
         return
     for section in _SECTIONS:
         for part in getattr(env, section):
@@ -278,7 +297,10 @@ def _check_kinds(env: Environment) -> None:
 
 
 def _check_tracing(env: Environment) -> None:
-    """Trace one reset and one step, so that what does not fit together is reported here, with its place."""
+    """Trace one reset and one step.
+
+    So what does not fit together is reported here, with its place.
+    """
 
     def episode(env: Environment) -> Any:
         start, first = reset(env, jax.random.key(0))
@@ -310,19 +332,22 @@ def _check_tracing(env: Environment) -> None:
         jax.tree_util.tree_leaves_with_path(begin), jax.tree.leaves(after), strict=True
     ):
         if (old.shape, old.dtype) != (new.shape, new.dtype):
-            place = jax.tree_util.keystr(path[1:], simple=True, separator=".").removeprefix(
-                "sim."
-            )  # [0] is which record
+            # The first entry of the path only says in which record the leaf is.
+            place = jax.tree_util.keystr(path[1:], simple=True, separator=".").removeprefix("sim.")
             raise ConfigError(
                 f"{place}: is {old.dtype}{list(old.shape)} after reset and {new.dtype}{list(new.shape)} after a step"
             )
 
 
 def _check_suited(env: Environment) -> None:
-    """Reject a filter that reports a fault at every one of eight sampled starts. Traced numbers cannot be judged."""
+    """Reject a filter that reports a fault at every one of eight sampled starts.
+
+    An environment with traced numbers passes, because they cannot be judged.
+    """
     if env.rta is None or any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(env)):
         return
-    with jax.ensure_compile_time_eval():  # inside a trace constants would be traced too
+    # Inside a trace, constants would be traced too.
+    with jax.ensure_compile_time_eval():
         if not _can_report(*_shapes(env), jnp.result_type(float)):
             return
         found = _faults_of_starts(env, jax.random.split(jax.random.key(0), 8))
@@ -333,7 +358,15 @@ def _check_suited(env: Environment) -> None:
 
 @lru_cache(maxsize=256)
 def _can_report(structure: Any, shapes: tuple, precision: Any) -> bool:
-    """Return whether a filter can report any fault. Finding out traces a start, which is done once for each structure."""
+    """Return whether a filter can report any fault.
+
+    Finding out traces a start, which is done once for each structure.
+
+    Args:
+        structure: the tree structure of the environment.
+        shapes: the shape and dtype of each leaf.
+        precision: the dtype of a new number. It is part of the cache's key.
+    """
     env = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
     return bool(jax.eval_shape(_faults, env, jax.random.key(0)))
 
@@ -345,7 +378,7 @@ def _faults(env: Environment, key: jax.Array) -> Mapping[str, jax.Array]:
 
 
 def _without_filter(paths: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what is random outside the filter."""
+    """Return the intervals of the random numbers that are not the filter's."""
     return {path: interval for path, interval in paths.items() if not path.startswith("rta.")}
 
 

@@ -1,4 +1,7 @@
-"""Changing an environment by dotted paths: `reward.delta_v.scale`, `deputy.mass`, `terminal.timeout.limit`."""
+"""Changes of an environment by dotted paths.
+
+Such paths are `reward.delta_v.scale`, `deputy.mass` and `terminal.timeout.limit`.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +19,15 @@ from jaxsafe.schema.errors import ConfigError, show
 def override(env: Environment, changes: Mapping[str, Any]) -> Environment:
     """Return the environment with the values at dotted paths replaced.
 
-    A path walks through field names, the names of the things in a list, and, at the start, platform names. A list of names
-    where a list of parts stands keeps those parts in that order: `{"observation": ["position", "velocity"]}`. Values may be
-    traced, so a sweep is `jax.vmap(lambda w: f(override(env, {"reward.delta_v.scale": w})))(weights)` and a gradient with
-    respect to a parameter is `jax.grad` of the same.
+    Values may be traced. So a sweep is
+    `jax.vmap(lambda w: f(override(env, {"reward.delta_v.scale": w})))(weights)`, and `jax.grad` of
+    the same function is a gradient with respect to a parameter.
+
+    Args:
+        env: the environment.
+        changes: new values by path. A path consists of field names and of the names of parts in a
+            list. It may begin with the name of a platform. Where a list of parts stands, a list of
+            names keeps those parts in that order: `{"observation": ["position", "velocity"]}`.
 
     Raises:
         ConfigError: a path leads nowhere, or a value has the wrong type, shape or range.

@@ -1,4 +1,7 @@
-"""Numbers that the tasks derive from one another, but that stand in an environment as two: changing one alone is told."""
+"""Warnings about a number that is changed without another one that belongs to it.
+
+The tasks derive such numbers from one another, but an environment has them as two numbers.
+"""
 
 from __future__ import annotations
 
@@ -18,33 +21,41 @@ from jaxsafe.schema.errors import ConfigWarning
 from jaxsafe.simulation.initializers import BelowSpeedLimit
 
 _OFTEN = {1.0: "equal to", 2.0: "twice"}
+"""Words for factors that are common."""
 
 
 class Tie(NamedTuple):
-    """Two numbers by their paths; the second is `factor` times the first where they belong together."""
+    """Two numbers that may belong together."""
 
     paths: tuple[str, str]
+    """Dotted paths of the two numbers."""
+
     numbers: tuple[Any, Any]
+    """The two numbers."""
+
     factor: float = 1.0
+    """Quotient of the second number and the first where they belong together."""
 
     @property
     def traced(self) -> bool:
-        """Whether nothing can be said about the numbers."""
+        """Whether a number is traced, so that nothing can be said about the two."""
         return any(isinstance(number, Tracer) for number in self.numbers)
 
     @property
     def holds(self) -> bool:
-        """Whether the numbers belong together as they are."""
+        """Whether the numbers belong together with their present values."""
         first, second = map(np.asarray, self.numbers)
         return bool(abs(self.factor * first - second) <= 1e-6 * abs(second))
 
 
 def warn_of_ties(before: Environment, after: Environment) -> None:
-    """Warn in one line for each number that was tied to others, and was changed or made random without them.
+    """Warn of each number that was tied to others and was changed or made random without them.
+
+    Each warning is one line.
 
     Args:
         before: the environment as it was.
-        after: the environment with what a user changed. Numbers that are traced are not judged.
+        after: the environment with the changes of a user. Numbers that are traced are not judged.
     """
     held = {tie.paths: tie for tie in _ties(before) if not tie.traced and tie.holds}
     newly_random = {
@@ -78,7 +89,7 @@ def warn_of_ties(before: Environment, after: Environment) -> None:
 
 
 def _ties(env: Environment) -> Iterator[Tie]:
-    """Yield the numbers of an environment that may be tied; the tasks write them so."""
+    """Yield the pairs of numbers of an environment that the tasks derive from one another."""
     limits = [one for one in env.status if isinstance(one, VelocityLimit)]
     for timeout in (one for one in env.terminal if isinstance(one, Timeout)):
         for reward in (one for one in env.reward if isinstance(one, Success)):

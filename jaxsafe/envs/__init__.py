@@ -1,7 +1,7 @@
-"""The tasks by name, and `make`.
+"""The tasks by name, and `make`, which returns the environment of a task.
 
-Each domain is a file, `rejoin` and `docking`, that ends in its tasks. `task` has the record of a task
-and the call that registers one.
+The two domains, `rejoin` and `docking`, have a file each. The tasks of a domain are at the end of
+its file. `task` has the record of a task and the call that registers one.
 """
 
 from __future__ import annotations
@@ -40,11 +40,15 @@ __all__ = [
     "user_module",
 ]
 
-for _task in (*rejoin.TASKS, *docking.TASKS):  # in the order of the paper
+# The tasks are registered in the order of the paper.
+for _task in (*rejoin.TASKS, *docking.TASKS):
     register(_task)
 
 VARIANTS = ("paper", "released")
-"""`paper` is a task as it is declared, `released` has the semantics of the published SafeRL code."""
+"""Variants of a task.
+
+`paper` is the task as it is declared. `released` has the semantics of the published SafeRL code.
+"""
 
 _ACTIONS = {"continuous": Continuous, "discrete": Discrete}
 
@@ -61,17 +65,20 @@ def make(
     """Return an environment, ready for `reset` and `step`.
 
     Args:
-        task: the name of a task, `MODULE:NAME` to import the module that registers it first, or the path of a YAML file
-            as printed by `python -m jaxsafe.config`.
+        task: the name of a task, or the path of a YAML file as printed by
+            `python -m jaxsafe.config`. `MODULE:NAME` first imports the module that registers the
+            task.
         overrides: new values by dotted path, for instance `{"reward.delta_v.scale": -0.02}`.
-        actions: `continuous`, in [−1, 1], or `discrete`, indices of points per actuator; None leaves what the task has
-            (the tasks by name are continuous).
-        variant: `paper`, or `released` for the semantics of the published SafeRL code; None is `paper`.
-        randomize: numbers drawn anew for each episode, by dotted path with their interval, for instance
-            `{"deputy.mass": [10, 14]}`.
-        rta: run time assurance: the name of a preset of the task, `default` for the recommended one, a filter, a YAML file
-            with one, as `jaxsafe.config.load_filter` reads it, or `none` to remove what a file has; None leaves the
-            environment as it is (the tasks by name have none).
+        actions: `continuous` for actions in [−1, 1], or `discrete` for indices of points, one for
+            each actuator. None leaves what the task has. The tasks by name are continuous.
+        variant: `paper`, or `released` for the semantics of the published SafeRL code. None stands
+            for `paper`.
+        randomize: intervals, by dotted path, of numbers that are drawn anew for each episode, for
+            instance `{"deputy.mass": [10, 14]}`.
+        rta: run time assurance. It is the name of a preset of the task, `default` for the
+            recommended preset, a filter, or a YAML file with a filter that
+            `jaxsafe.config.load_filter` can read. `none` removes the filter that a file has. None
+            leaves the environment as it is. The tasks by name have no filter.
 
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.
@@ -104,24 +111,40 @@ def adapt(
     randomize: Mapping[str, Sequence[float]] | None = None,
     rta: str | RTA | None = None,
 ) -> Environment:
-    """Return an environment with what the options of `make` change; `task` is its name, or its file.
+    """Return an environment changed by the options of `make`.
+
+    Args:
+        env: the environment.
+        task: the name of its task, or its file.
+        overrides: new values by dotted path.
+        actions: the kind of actions, as for `make`.
+        variant: the variant of the task, as for `make`, but None changes nothing.
+        randomize: the intervals of random numbers by dotted path.
+        rta: run time assurance, as for `make`.
 
     Raises:
-        ConfigError: as `make`.
+        ConfigError: one line that names the place, what was found and what is allowed.
     """
     if variant is not None:
         env = override(env, _variant_values(task, variant))
     if actions is not None:
         env = _with_actions(env, actions)
-    filters = (
-        {} if rta is None else {"rta": _filter(task, rta)}
-    )  # fits together with the overrides, not without
+    # A filter may fit the environment only together with the overrides, so both are set at once.
+    filters = {} if rta is None else {"rta": _filter(task, rta)}
     random = {} if randomize is None else {"randomize": randomize}
     return override(env, {**filters, **(overrides or {}), **random})
 
 
 def _variant_values(name: str, variant: str) -> dict[str, Any]:
-    """Return all in which the variants of a task differ, by dotted path, as this variant has it."""
+    """Return the values of a variant, by dotted path, in everything in which the variants differ.
+
+    Args:
+        name: the name of a task, which may begin with its module.
+        variant: one of `VARIANTS`.
+
+    Raises:
+        ConfigError: there is no such variant, or `name` is not the name of a task.
+    """
     if variant not in VARIANTS:
         raise ConfigError(
             f"variant: unknown variant {show(variant)}; choose from {nearest(variant, VARIANTS)}"

@@ -1,10 +1,12 @@
-"""Proximal policy optimisation, one seed, as a pure function from training state to training state.
+"""Proximal policy optimisation of one seed, a pure function from training state to training state.
 
-With an agent that has a critic of the cost it is PPO-Lagrangian (Ray, Achiam and Amodei 2019): rewards less a multiplier
-times costs, and the multiplier grows while the episodes cost more than `cost_limit`.
+With an agent that has a critic of the cost it is PPO-Lagrangian (Ray, Achiam and Amodei 2019). It
+maximises rewards less a multiplier times costs. The multiplier grows while the episodes cost more
+than `cost_limit`.
 
-`update` reads like the algorithm: collect a batch, estimate advantages, improve the networks over some epochs. Seeds,
-devices and files are the caller's business. Hyperparameters that are numbers are leaves; sizes are structure.
+`update` reads like the algorithm: collect a batch, estimate advantages, improve the networks over
+some epochs. Seeds, devices and files are the caller's business. Hyperparameters that are numbers
+are leaves, and sizes are structure.
 """
 
 from __future__ import annotations
@@ -32,75 +34,80 @@ from jaxsafe.train.shuffle import shuffle
 from jaxsafe.types import Dimensionless, Key, Positive, Record, State, TimeStep
 
 Share = Range(0.0, 1.0)
+"""Range of a number from 0 to 1."""
 
 MAX_COUNT = 2**31 - 1
-"""The largest number of environments, steps or minibatches: programs count in 32 bits."""
+"""The largest number of environments, steps or minibatches. Programs count in 32 bits."""
 
 CHUNK = 512
-"""Samples that a CPU takes through the networks at once: so many activations stay in a core's cache."""
+"""Number of samples that a CPU takes through the networks at once.
 
+The activations of this many samples stay in a core's cache.
+"""
 
 MAX_LOG_RATIO = 20.0
-"""The ratio of new to old probabilities is taken as at most e²⁰. Where a ratio overflows, the loss or its gradient is not a
-number. This bound also leaves room for the squares in the norm of the gradient."""
+"""Largest logarithm of the ratio of new to old probabilities. A larger ratio is taken as e²⁰.
+
+Where a ratio overflows, the loss or its gradient is not a number. This bound also leaves room for
+the squares in the norm of the gradient.
+"""
 
 
 class PPO(Component):
-    """Hyperparameters; names as in the literature."""
+    """Hyperparameters of PPO. Their names are those of the literature."""
 
-    num_envs: Annotated[int, Range(1, largest=MAX_COUNT)] = 16  # episodes run side by side
-    num_steps: Annotated[int, Range(1, largest=MAX_COUNT)] = 128  # steps of each between updates
-    max_episode_steps: Annotated[Dimensionless, Range(1.0)] = (
-        1e6  # episodes of training are truncated after as many
-    )
+    num_envs: Annotated[int, Range(1, largest=MAX_COUNT)] = 16
+    """Number of environments, whose episodes run side by side."""
+    num_steps: Annotated[int, Range(1, largest=MAX_COUNT)] = 128
+    """Number of steps of each environment between two updates."""
+    max_episode_steps: Annotated[Dimensionless, Range(1.0)] = 1e6
+    """Number of steps after which episodes of training are truncated."""
     num_epochs: Annotated[int, Range(1, largest=10_000)] = 10
     num_minibatches: Annotated[int, Range(1, largest=MAX_COUNT)] = 2
     learning_rate: Annotated[Dimensionless, Positive] = 3e-3
-    final_learning_rate: Annotated[Dimensionless, Range(0.0)] = 3e-4  # reached at the end
-    learning_rate_decay: Literal["linear", "exponential"] = "linear"  # on the way there
+    final_learning_rate: Annotated[Dimensionless, Range(0.0)] = 3e-4
+    """Learning rate at the end of the training."""
+    learning_rate_decay: Literal["linear", "exponential"] = "linear"
+    """How the learning rate changes from `learning_rate` to `final_learning_rate`."""
     gamma: Annotated[Dimensionless, Share] = 0.97
-    horizon_growth: Annotated[Dimensionless, Positive] = (
-        1.0  # factor on 1/(1 − γ), reached exponentially at the end
-    )
+    horizon_growth: Annotated[Dimensionless, Positive] = 1.0
+    """Factor by which the horizon 1/(1 − γ) has grown at the end. It grows exponentially."""
     gae_lambda: Annotated[Dimensionless, Share] = 1.0
     clip: Annotated[Dimensionless, Positive] = 0.2
-    noise_decay: Annotated[Dimensionless, Range(0.0, largest=20.0)] = (
-        0.0  # how far log_std falls by the end, besides what is learnt
-    )
+    noise_decay: Annotated[Dimensionless, Range(0.0, largest=20.0)] = 0.0
+    """How far log_std falls by the end, besides what is learnt."""
     value_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.5
     entropy_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.0
     max_grad_norm: Annotated[Dimensionless, Positive] = 0.5
-    averaging: Annotated[Dimensionless, Share] = (
-        0.0  # share of the training over which the kept networks are averaged
-    )
-    learns_from: Literal["desired", "actual"] = (
-        "desired"  # control, where run time assurance changed it
-    )
-    cost_limit: Annotated[Dimensionless, Positive] = (
-        25.0  # PPO-Lagrangian: violating steps that an episode may have
-    )
-    multiplier: Annotated[Dimensionless, Positive] = (
-        0.01  # at the start, in reward per violating step
-    )
-    multiplier_rate: Annotated[Dimensionless, Range(0.0)] = (
-        0.03  # by which its logarithm changes in an update, at most
-    )
+    averaging: Annotated[Dimensionless, Share] = 0.0
+    """Share of the training over which the networks that are kept are averaged."""
+    learns_from: Literal["desired", "actual"] = "desired"
+    """The control to learn from where run time assurance changed it: the agent's, or what acted."""
+    cost_limit: Annotated[Dimensionless, Positive] = 25.0
+    """Number of violating steps that an episode may have, with PPO-Lagrangian."""
+    multiplier: Annotated[Dimensionless, Positive] = 0.01
+    """Multiplier of the cost at the start, in reward per violating step, with PPO-Lagrangian."""
+    multiplier_rate: Annotated[Dimensionless, Range(0.0)] = 0.03
+    """Largest change of the multiplier's logarithm in an update, with PPO-Lagrangian."""
 
     @property
     def batch_size(self) -> int:
-        """Environment steps in one update."""
+        """Number of environment steps in one update."""
         return self.num_envs * self.num_steps
 
     @property
     def shares(self) -> list[int]:
-        """Numbers of devices that can share a seed: each has as many environments, and samples of a minibatch."""
+        """The numbers of devices that can share a seed.
+
+        Each device has the same number of environments and of samples of a minibatch.
+        """
         most = math.gcd(self.num_envs, self.batch_size // self.num_minibatches)
         small = [count for count in range(1, math.isqrt(most) + 1) if most % count == 0]
         return sorted({*small, *(most // count for count in small)})
 
 
 class TrainState(Record):
-    """Everything that training needs to go on: what a checkpoint holds."""
+    """Everything that training needs to go on. A checkpoint holds it."""
 
     params: Params
     optimizer: optax.OptState
@@ -108,31 +115,35 @@ class TrainState(Record):
     observation: Float[Array, "num_envs o"]
     episode: Episode  # sums of the running episodes, [num_envs]
     window: Window  # the latest finished episodes
-    key: Key  # of the whole run; update i uses fold_in(key, i)
+    key: Key
+    """Key of the whole run. Update i uses fold_in(key, i)."""
     num_updates: Int[Array, ""]
-    average: Params  # of the networks over the latest updates: what is evaluated and kept
-    multiplier: Any = ()  # of the cost, with PPO-Lagrangian
+    average: Params
+    """Average of the networks over the latest updates. It is evaluated and kept."""
+    multiplier: Any = ()
+    """Multiplier of the cost, with PPO-Lagrangian."""
 
 
 class Transition(NamedTuple):
     """One step of every environment, stacked [num_steps, num_envs]."""
 
     inputs: Float[Array, "t n i"]  # what the actor saw
-    totals: Mapping[
-        str, Float[Array, "t n"]
-    ]  # of each reward term before the step, if the critic sees them
+    totals: Mapping[str, Float[Array, "t n"]]
+    """What each reward term had summed to before the step, if the critic sees it."""
     action: Array
     log_prob: Float[Array, "t n"]
     reward: Float[Array, "t n"]
     terminated: Bool[Array, "t n"]
     done: Bool[Array, "t n"]
-    next_inputs: Float[Array, "t n i"]  # of the true next observation, before any reset
+    next_inputs: Float[Array, "t n i"]
+    """Inputs of the true next observation, before any reset."""
     episode: Episode  # sums including this step
-    cost: Any = ()  # if there is a critic of it
+    cost: Any = ()
+    """The cost of the step, if there is a critic of it."""
 
 
 class Batch(NamedTuple):
-    """What the loss needs of each sample."""
+    """What the loss needs of each sample. All fields are [samples, …]."""
 
     inputs: Array
     totals: Mapping[str, Array]
@@ -140,18 +151,33 @@ class Batch(NamedTuple):
     log_prob: Array
     advantage: Array
     value_target: Array
-    cost_target: Any = ()  # (1 − γ) times the discounted cost to come, if there is a critic of it
+    cost_target: Any = ()
+    """(1 − γ) times the discounted cost to come, if there is a critic of it."""
 
 
 def over_devices(whole: Any, split: Any) -> TrainState:
-    """Which fields of a state devices that share the environments of a seed have whole, and which by their environments."""
+    """Return a `TrainState` that has one of two values in each field, such as shardings.
+
+    Args:
+        whole: the value of fields that all devices of a seed have whole.
+        split: the value of fields with an axis of environments. Devices that share the environments
+            of a seed have the entries of their own ones.
+    """
     names = {field.name for field in dataclasses.fields(TrainState)}
     by_environment = {"env_state", "observation", "episode"}
     return TrainState(**{name: split if name in by_environment else whole for name in names})
 
 
 def init(env: Environment, agent: Agent, ppo: PPO, key: Key, shard: Shard = WHOLE) -> TrainState:
-    """Fresh networks and episodes for one seed; of a shard, its environments."""
+    """Return the state of one seed with fresh networks and episodes.
+
+    Args:
+        env: the environment.
+        agent: the agent.
+        ppo: the hyperparameters.
+        key: the key of the seed.
+        shard: the part of the environments that this device has.
+    """
     key_params, key_reset, key_run = jax.random.split(key, 3)
     params = agent.init(key_params, env)
     env_state, timestep = reset_batch(env, key_reset, ppo.num_envs, shard)
@@ -171,9 +197,18 @@ def update(
     state: TrainState,
     shard: Shard = WHOLE,
 ) -> TrainState:
-    """Collect one batch with the current policy and improve policy and value on it.
+    """Collect one batch with the current policy, and improve policy and value on it.
 
-    Devices that share the environments share the work: each runs its own and takes its part of every minibatch.
+    Devices that share the environments share the work. Each runs its own environments and takes its
+    part of every minibatch.
+
+    Args:
+        env: the environment.
+        agent: the agent.
+        ppo: the hyperparameters.
+        total_updates: number of updates of the whole training. Schedules run over it.
+        state: the state before the update.
+        shard: the part of the environments that this device has.
     """
     key_collect, key_learn = jax.random.split(jax.random.fold_in(state.key, state.num_updates))
     state, transitions = collect(env, agent, ppo, state, key_collect, shard)
@@ -198,16 +233,26 @@ def update(
 
 
 def diverged(state: TrainState) -> Bool[Array, ""]:
-    """Return whether the networks, or the returns of the latest episodes, are no longer finite: nothing more is learnt."""
+    """Return whether the networks, or the returns of the latest episodes, are no longer finite.
+
+    From then on nothing more is learnt.
+    """
     watched = (state.params, state.window.episodes.episode_return)
     return ~jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(watched)]))
 
 
 def dual_ascent(ppo: PPO, multiplier: Array, window: Window, done: Array) -> Array:
-    """The multiplier after an update in which episodes ended: log λ rises by rate·clip(J_C/limit − 1, −1, 1).
+    """Return the multiplier λ after an update. It changes only if episodes ended.
 
-    J_C is the mean cost of the latest finished episodes. On the logarithm, because what a violating step is worth in
+    Its logarithm rises by rate·clip(J_C/limit − 1, −1, 1), where J_C is the mean cost of the latest
+    finished episodes. The rule acts on the logarithm, because what a violating step is worth in
     reward differs by orders of magnitude between tasks.
+
+    Args:
+        ppo: the hyperparameters.
+        multiplier: the multiplier before the update.
+        window: the latest finished episodes, including those of this update.
+        done: whether episodes ended, by step and environment.
     """
     excess = jnp.clip(latest_cost(window) / ppo.cost_limit - 1.0, -1.0, 1.0)
     following = jnp.clip(multiplier * jnp.exp(ppo.multiplier_rate * excess), 1e-4, 1e2)
@@ -215,7 +260,7 @@ def dual_ascent(ppo: PPO, multiplier: Array, window: Window, done: Array) -> Arr
 
 
 def learning_rate(ppo: PPO, progress: Array | float) -> Array:
-    """The step size after a share of the training."""
+    """Return the step size after a share of the training, `progress`."""
     first, last = jnp.asarray(ppo.learning_rate), jnp.asarray(ppo.final_learning_rate)
     if ppo.learning_rate_decay == "exponential":
         return first * (last / first) ** progress
@@ -223,9 +268,10 @@ def learning_rate(ppo: PPO, progress: Array | float) -> Array:
 
 
 def discount(ppo: PPO, progress: Array | float) -> Array:
-    """The discount factor after a share of the training: its horizon 1/(1 − γ) grows exponentially by `horizon_growth`.
+    """Return the discount factor γ after a share of the training, `progress`.
 
-    A short horizon finds the way early; a long one then finds the quick way.
+    Its horizon 1/(1 − γ) grows exponentially by `horizon_growth`. A short horizon finds the way
+    early. A long one then finds the quick way.
     """
     return 1.0 - (1.0 - jnp.asarray(ppo.gamma)) / jnp.asarray(ppo.horizon_growth) ** progress
 
@@ -233,7 +279,19 @@ def discount(ppo: PPO, progress: Array | float) -> Array:
 def collect(
     env: Environment, agent: Agent, ppo: PPO, state: TrainState, key: Key, shard: Shard = WHOLE
 ) -> tuple[TrainState, Transition]:
-    """Run every environment for `num_steps`; episodes go on from one update to the next."""
+    """Run every environment for `num_steps`. Episodes go on from one update to the next.
+
+    Args:
+        env: the environment.
+        agent: the agent.
+        ppo: the hyperparameters.
+        state: the state.
+        key: a PRNG key.
+        shard: the part of the environments that this device has.
+
+    Returns:
+        The state with the environments after these steps, and the transitions.
+    """
 
     def one_step(
         carry: tuple[State, Array, Episode], key: Key
@@ -267,7 +325,10 @@ def collect(
 
 
 def _acted(env: Environment, action: Array, timestep: TimeStep) -> Array:
-    """The actions, where run time assurance intervened those that give the control that acted."""
+    """Return the actions to learn from.
+
+    Where run time assurance intervened, they are those that give the control that acted.
+    """
     controller: Any = env.agent_platform.controller
     acted = jax.vmap(controller.action)(timestep.info.control_actual)
     return jnp.where(timestep.info.intervening[:, None], acted, action)
@@ -282,12 +343,22 @@ def gae(
     gamma: Array,
     lam: Array,
 ) -> Array:
-    """Generalised advantage estimates along the leading axis.
+    """Return generalised advantage estimates along the leading axis.
 
     δ_t = r_t + γ V(s_{t+1})(1 − terminated_t) − V(s_t),  A_t = δ_t + γλ(1 − done_t) A_{t+1}
 
-    V(s_{t+1}) is the value of the state that the step led to, before any reset, so an episode that is truncated, or still
-    running at the end of the batch, counts what would follow, and one that terminated does not.
+    V(s_{t+1}) is the value of the state that the step led to, before any reset. So an episode that
+    is truncated, or still running at the end of the batch, counts what would follow. An episode
+    that terminated does not.
+
+    Args:
+        reward: rewards r [t, n].
+        value: values V(s_t) [t, n].
+        next_value: values V(s_{t+1}) [t, n].
+        terminated: whether the task ended with the step, [t, n].
+        done: whether the episode ended with the step, terminated or truncated, [t, n].
+        gamma: the discount factor γ.
+        lam: λ of the estimates.
     """
     terminated, done = terminated.astype(reward.dtype), done.astype(reward.dtype)
     delta = reward + gamma * next_value * (1.0 - terminated) - value
@@ -310,7 +381,21 @@ def learn(
     key: Key,
     shard: Shard = WHOLE,
 ) -> tuple[Params, optax.OptState]:
-    """Some epochs of minibatch steps, each epoch over a new shuffle of the batch."""
+    """Take some epochs of minibatch steps. Each epoch has a new shuffle of the batch.
+
+    Args:
+        env: the environment.
+        agent: the agent.
+        ppo: the hyperparameters.
+        step_size: the learning rate.
+        state: the state. It holds the parameters and the optimizer's state before.
+        batch: the samples of all devices of the seed.
+        key: a PRNG key.
+        shard: the part of every minibatch that this device takes.
+
+    Returns:
+        The parameters and the optimizer's state after the last step.
+    """
     pack, unpack = packing(state.params)
 
     def gradient(params: Params, rows: Array) -> Params:
@@ -329,9 +414,8 @@ def learn(
     ) -> tuple[tuple[Params, optax.OptState], None]:
         params, optimizer = carry
         gradient = shard.mean(mean_gradient(unpack(params), shard.own(rows)))
-        with jax.numpy_dtype_promotion(
-            "standard"
-        ):  # Adam of optax raises a float to a whole number
+        # Adam of optax raises a float to an integer power.
+        with jax.numpy_dtype_promotion("standard"):
             step, optimizer = _optimizer(ppo).update(gradient, optimizer)
         return (jax.tree.map(lambda p, s: p - step_size * s, params, pack(step)), optimizer), None
 
@@ -347,13 +431,12 @@ def learn(
 
 
 def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch) -> Array:
-    """Clipped surrogate + value error − entropy bonus, averaged over the batch."""
+    """Return the clipped surrogate loss + value error − entropy bonus, averaged over the batch."""
     policy = agent.distribution(env, params, batch.inputs)
     log_ratio = policy.log_prob(batch.action) - batch.log_prob
     bounded = jax.lax.stop_gradient(jnp.minimum(log_ratio, MAX_LOG_RATIO))
-    ratio = jnp.exp(
-        bounded + (log_ratio - jax.lax.stop_gradient(log_ratio))
-    )  # the second term, 0, has the derivative
+    # The second term is 0 and has the derivative.
+    ratio = jnp.exp(bounded + (log_ratio - jax.lax.stop_gradient(log_ratio)))
     clipped = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
     seen = agent.critic_inputs(batch.inputs, batch.totals)
@@ -375,7 +458,10 @@ def _to_batch(
     transitions: Transition,
     shard: Shard = WHOLE,
 ) -> Batch:
-    """Advantages, normalised over the whole batch, and targets of the critics; all samples in one row."""
+    """Return advantages and targets of the critics, with all samples along one axis.
+
+    Advantages are normalised over the whole batch.
+    """
     t, params = transitions, state.params
     seen = [
         agent.critic_inputs(*one)
@@ -402,7 +488,7 @@ def _to_batch(
 def _in_chunks(
     critic: Callable[[Array], Array], seen: Float[Array, "t n c"]
 ) -> Float[Array, "t n"]:
-    """What a critic says of each sample."""
+    """Return what a critic says of each sample. On a CPU it sees `CHUNK` samples at a time."""
     t, n, size = seen.shape
     parts = _num_chunks(t * n)
     return (
@@ -413,12 +499,12 @@ def _in_chunks(
 
 
 def _num_chunks(samples: int) -> int:
-    """In how many parts samples go through the networks."""
+    """Return in how many parts this number of samples goes through the networks."""
     return 1 if accelerated() or samples % CHUNK else max(1, samples // CHUNK)
 
 
 def _optimizer(ppo: PPO) -> optax.GradientTransformation:
-    """Gradient clipping and Adam's direction; the step size is the schedule's."""
+    """Return gradient clipping, then Adam's direction. The step size comes from the schedule."""
     return optax.flatten(
         optax.chain(optax.clip_by_global_norm(ppo.max_grad_norm), optax.scale_by_adam(eps=1e-5))
     )

@@ -1,4 +1,7 @@
-"""The finished episodes of a seed, kept inside the compiled training step: the training curve of Table 2, and its cost."""
+"""The latest finished episodes of a seed, kept inside the compiled training step.
+
+The training curve of Table 2 and the cost of the training come from them.
+"""
 
 from __future__ import annotations
 
@@ -10,34 +13,48 @@ from jaxsafe.metrics import Episode
 from jaxsafe.types import Record
 
 SIZE = 100
-"""Episodes in the window, as in the paper's training curves."""
+"""Number of episodes in the window, as in the paper's training curves."""
 
 
 class Window(Record):
-    """A ring of the last `SIZE` finished episodes, and counts over all."""
+    """A ring of the last `SIZE` finished episodes, and counts over all episodes."""
 
-    episodes: Episode  # each field [SIZE]; slots never filled are zero
-    count: Int[Array, ""]  # episodes
-    cost: Int[Array, ""]  # steps with a violation
-    running_cost: Int[Array, ""]  # those of the episodes that still run
+    episodes: Episode
+    """The finished episodes, each field [SIZE]. Slots that were never filled are zero."""
+    count: Int[Array, ""]
+    """Number of finished episodes since the start of the training."""
+    cost: Int[Array, ""]
+    """Number of steps with a violation in all finished episodes."""
+    running_cost: Int[Array, ""]
+    """Number of steps with a violation in the episodes that still run."""
 
 
 def empty_window(like: Episode) -> Window:
-    """A window in which no episode has finished yet; `like` gives dtypes."""
+    """Return a window in which no episode has finished yet.
+
+    Args:
+        like: episodes whose fields have the dtypes of the window.
+    """
     episodes = jax.tree.map(lambda x: jnp.zeros(SIZE, x.dtype), like)
     none = jnp.zeros((), jnp.int32)
     return Window(episodes, none, none, none)
 
 
 def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
-    """Add those of [num_steps, num_envs] episodes that are done, in order of time; those of the last step run on."""
+    """Add the episodes that ended to the window, in order of time.
+
+    Args:
+        window: the window.
+        episodes: sums of the episodes after each step, each field [num_steps, num_envs].
+        done: whether the episode ended with the step. Episodes that have not ended by the last step
+            still run.
+    """
     finished = done.ravel()
     order = jnp.cumsum(finished, dtype=jnp.int32) - 1
     latest = finished & (order >= order[-1] + 1 - SIZE)
-    slot = jnp.where(latest, (window.count + order) % SIZE, SIZE)  # out of range: dropped
-    row = (
-        jnp.full(SIZE, -1).at[slot].set(jnp.arange(slot.size), mode="drop")
-    )  # one scatter, which is dear to compile
+    slot = jnp.where(latest, (window.count + order) % SIZE, SIZE)  # SIZE is out of range: dropped
+    # One scatter serves all fields, because a scatter takes long to compile.
+    row = jnp.full(SIZE, -1).at[slot].set(jnp.arange(slot.size), mode="drop")
     ring = jax.tree.map(
         lambda old, new: jnp.where(row < 0, old, new.ravel()[row]), window.episodes, episodes
     )
@@ -47,12 +64,22 @@ def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
 
 
 def total_cost(window: Window) -> Array:
-    """Violating steps since the start of the training: those of finished episodes and of the episodes that still run."""
+    """Return the number of violating steps since the start of the training.
+
+    Finished episodes and episodes that still run count.
+    """
     return window.cost + window.running_cost
 
 
 def latest_cost(window: Window, number: int = 25) -> Array:
-    """The mean cost, in violating steps, of the latest finished episodes; 0 while there are none."""
+    """Return the mean cost of the latest finished episodes, in violating steps per episode.
+
+    It is 0 while there are none.
+
+    Args:
+        window: the window.
+        number: how many episodes to average, at most `SIZE`.
+    """
     known = jnp.minimum(window.count, number)
     age = (window.count - 1 - jnp.arange(SIZE)) % SIZE
     return jnp.sum(jnp.where(age < known, window.episodes.violating_steps, 0)) / jnp.maximum(
@@ -61,10 +88,16 @@ def latest_cost(window: Window, number: int = 25) -> Array:
 
 
 def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:
-    """Averages over the episodes in the window, by column name of the progress log; 0 while it is empty.
+    """Return averages over the episodes in the window, by column of the progress log.
 
-    A share is an average of shares: every episode counts alike, however long it is. The rates of `metrics.summarise` are
-    other numbers under other names: there every step counts alike.
+    They are 0 while the window is empty. A share is an average of shares: every episode counts
+    alike, however long it is. The rates of `metrics.summarise` are other numbers under other names.
+    In them every step counts alike.
+
+    Args:
+        window: the window.
+        outcomes: names of the outcomes, as `env.outcomes`. The first one means that the episode
+            still runs.
     """
     filled = (jnp.arange(SIZE, dtype=window.count.dtype) < window.count).astype(
         jnp.result_type(float)

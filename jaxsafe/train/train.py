@@ -1,4 +1,7 @@
-"""Training as pure functions: of one seed, and the programs that train all seeds on their devices."""
+"""Training as pure functions.
+
+`train` trains one seed. `programs` returns what trains all seeds on their devices.
+"""
 
 from __future__ import annotations
 
@@ -19,17 +22,20 @@ from jaxsafe.train.ppo import PPO, TrainState
 from jaxsafe.types import Key
 
 STATE = ppo.over_devices(SPLIT_BY_SEED, SPLIT_BY_ENV)
-"""How the training states of all seeds lie on the devices."""
+"""Sharding of the training states of all seeds."""
 
 
 Curves = dict[str, jax.Array]
-"""By column of the progress log, [updates]: means over the last 100 episodes, and counts."""
+"""Means over the last 100 episodes, and counts, [updates] each, by column of the progress log."""
 
 Callback = Callable[[TrainState, Curves], bool | None]
-"""Called on the host with the state and the curves of the updates since the last call. True stops."""
+"""A function on the host. Its arguments are the state and the curves since the last call.
+
+If it returns True the training stops.
+"""
 
 CALLS = 50
-"""How often a callback is called in a training, if nothing else is said."""
+"""How often a callback is called in a training, unless `every` says otherwise."""
 
 
 def train(
@@ -43,23 +49,24 @@ def train(
 ) -> tuple[TrainState, Curves]:
     """Train one seed.
 
-    Without a callback this is a pure function of its arguments: `jax.jit` compiles it, `jax.vmap`
-    trains over keys, numbers of the environment and hyperparameters. It does what
-    `python -m jaxsafe.train` does with the same options and the key `jax.random.key(seed)`.
+    Without a callback this is a pure function of its arguments. `jax.jit` compiles it, and
+    `jax.vmap` trains over keys, numbers of the environment, or hyperparameters. With the key
+    `jax.random.key(seed)` it does what `python -m jaxsafe.train` does with the same options.
 
     Args:
         env: the environment.
         agent: what the networks see and how large they are.
-        hyperparameters: those of PPO. `resolve({"env": "docking3d"})` returns a task's recipe:
-            `config.agent` and `config.ppo`.
+        hyperparameters: hyperparameters of PPO. `resolve({"env": "docking3d"})` returns a task's
+            recipe, with `config.agent` and `config.ppo`.
         key: a typed PRNG key.
         num_updates: how many batches of `hyperparameters.batch_size` steps are collected and learnt
-            from. A static number. Schedules run over that many.
-        callback: called on the host after every `every` updates, for logs or a stop of one's own.
-        every: updates between two calls; a fiftieth of the training, if it is None.
+            from. It is a static number. Schedules run over that many updates.
+        callback: a function that is called on the host after every `every` updates, for logs or a
+            stop of one's own.
+        every: number of updates between two calls. None stands for a fiftieth of the training.
 
     Returns:
-        The state, of which `average` holds the parameters for `agent.policy`, and the curves.
+        The state and the curves. `state.average` holds the parameters for `agent.policy`.
     """
     shared = (env, normalise(agent), normalise(hyperparameters))
     start = jax.jit(isolated(begin))
@@ -78,15 +85,16 @@ def train(
 
 
 def programs(mapper: SeedMapper, length: int, limit: int) -> tuple[Any, Any]:
-    """What a training of all seeds runs on its devices, to be called or lowered; `shared` is `(env, agent, hyper)`.
+    """Return the programs of a training of all seeds, to be called or lowered.
 
     Args:
-        mapper: of the seeds.
-        length: updates at a time.
-        limit: updates of the whole run.
+        mapper: the mapper of the seeds.
+        length: number of updates at a time.
+        limit: number of updates of the whole run.
 
     Returns:
         `(shared, keys) -> state` for `begin`, and `(shared, state) -> (state, curves)` for `chunk`.
+        There `shared` is `(env, agent, hyper)`, and the other arrays have a leading axis of seeds.
     """
 
     def advance(shared: tuple, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
@@ -97,7 +105,13 @@ def programs(mapper: SeedMapper, length: int, limit: int) -> tuple[Any, Any]:
 
 
 def begin(shared: tuple, key: jax.Array, shard: Shard = WHOLE) -> TrainState:
-    """Fresh networks and episodes of one seed."""
+    """Return the state of one seed with fresh networks and episodes.
+
+    Args:
+        shared: `(env, agent, hyper)`.
+        key: the key of the seed.
+        shard: the part of the environments that this device has.
+    """
     env, agent, hyper = shared
     return ppo.init(env, agent, hyper, key, shard)
 
@@ -105,9 +119,19 @@ def begin(shared: tuple, key: jax.Array, shard: Shard = WHOLE) -> TrainState:
 def chunk(
     shared: tuple, state: TrainState, length: int, limit: int, shard: Shard = WHOLE
 ) -> tuple[TrainState, dict[str, jax.Array]]:
-    """`length` updates of one seed, fewer at the end of the run, with the averages of the window after each.
+    """Train one seed for `length` updates, or for fewer at the end of the run.
 
-    A seed that has diverged is counted on and otherwise left as it is.
+    The updates of a seed that has diverged are counted. Otherwise it is left as it is.
+
+    Args:
+        shared: `(env, agent, hyper)`.
+        state: the state of the seed.
+        length: number of updates.
+        limit: number of updates of the whole run.
+        shard: the part of the environments that this device has.
+
+    Returns:
+        The state, and the curves: counts and averages over the window after each update.
     """
     env, agent, hyper = shared
 
