@@ -422,7 +422,7 @@ def test_too_little_address_space_is_told_in_one_line(
     command: str, kilobytes: int, tmp_path: Path
 ) -> None:
     script = f"ulimit -v {kilobytes}; exec {sys.executable} -m jaxsafe.{command}"
-    environment = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parent.parent)}
+    environment = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[2])}
     found = subprocess.run(
         ["bash", "-c", script], env=environment, cwd=tmp_path, capture_output=True, text=True
     )

@@ -241,6 +241,7 @@ def _two_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     two = {"docking2d": TASKS["docking2d"], "twin": TASKS["docking2d"]}
     for module in (
         "jaxsafe.envs",
+        "jaxsafe.envs.task",
         "jaxsafe.train.host.options",
         "jaxsafe.train.host.run_directory",
     ):
