@@ -1,9 +1,10 @@
-"""Imported before jaxlib is: silences a false alarm of two of its versions."""
+"""Silence a false alarm of two versions of jaxlib. It is imported before jaxlib is."""
 
 import os
 from importlib.metadata import version
 
 if version("jaxlib") in ("0.10.0", "0.10.1"):
-    # For every program from the compilation cache they log an error about the machine's features +prefer-no-gather and
-    # +prefer-no-scatter, which are no features of machines but their own choices. What fails still raises.
+    # For every program from the compilation cache these versions log an error. It is about the
+    # features +prefer-no-gather and +prefer-no-scatter of the machine. They are not features of a
+    # machine but choices of jaxlib itself. What fails still raises.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

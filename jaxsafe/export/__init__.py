@@ -1,1 +1,4 @@
-"""Policies for other tools: ONNX, StableHLO, and the closed loop with its safety property for verifiers."""
+"""Export of policies to other tools.
+
+A policy becomes ONNX or StableHLO. For verifiers there is the closed loop with its safety property.
+"""

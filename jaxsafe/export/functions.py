@@ -1,4 +1,7 @@
-"""What is exported of a policy: its network, its action on an observation, its control of a state, or the closed loop."""
+"""Functions of a policy that can be exported.
+
+They are its network, its action on an observation, its control of a state, and the closed loop.
+"""
 
 from __future__ import annotations
 
@@ -18,15 +21,19 @@ Function = Callable[[Float[Array, "batch i"]], Float[Array, "batch o"]]
 
 
 class Exported(NamedTuple):
-    """A function of one batch of vectors, and what their elements mean."""
+    """A function of a batch of vectors, with a name for each element of its input and output."""
 
     function: Function
-    inputs: tuple[str, ...]  # a name for each element
+    inputs: tuple[str, ...]
     outputs: tuple[str, ...]
 
 
 def network(saved: SavedPolicy) -> Exported:
-    """The actor alone: from what it sees (features) to means, or logits of discrete actions."""
+    """Return the actor alone.
+
+    It is a function from the features that the actor sees to the means of its actions. If actions
+    are discrete, it returns their logits.
+    """
     size = saved.params["actor"][0]["kernel"].shape[0]
     count = saved.params["actor"][-1]["bias"].size
     names = (
@@ -43,7 +50,11 @@ def network(saved: SavedPolicy) -> Exported:
 
 
 def action(saved: SavedPolicy | ForeignPolicy) -> Exported:
-    """From the observation to the action that the environment takes: the mode, features included."""
+    """Return the function from an observation to the action that the environment takes.
+
+    The action is the mode of the policy's distribution. Computing the features is part of the
+    function.
+    """
 
     def function(observation: Array) -> Array:
         inputs = saved.agent.inputs(saved.env, observation)
@@ -53,7 +64,10 @@ def action(saved: SavedPolicy | ForeignPolicy) -> Exported:
 
 
 def control(saved: SavedPolicy | ForeignPolicy) -> Exported:
-    """From the state at which an episode may start to the control that acts first, in physical units."""
+    """Return the function from a start to the control that acts first, in physical units.
+
+    The start is the state in which an episode begins, with the elements of `state_names`.
+    """
     act = action(saved).function
 
     def one(start: Array) -> Array:
@@ -66,9 +80,15 @@ def control(saved: SavedPolicy | ForeignPolicy) -> Exported:
 
 
 def closed_loop(saved: SavedPolicy | ForeignPolicy, steps: int, unrolled: bool = False) -> Exported:
-    """From the state at a start to every safety margin h at the start and after each of some steps: safe where all ≥ 0.
+    """Return the function from a start to every safety margin h on the way.
 
-    `unrolled` without a loop, as an ONNX graph needs it; compiled by XLA that would take minutes.
+    The margins are those at the start and after each step. The way is safe if all are ≥ 0.
+
+    Args:
+        saved: the policy.
+        steps: number of steps.
+        unrolled: whether the function has no loop. An ONNX graph needs it so. XLA would take
+            minutes to compile it.
     """
     act, env = action(saved).function, saved.env
 
@@ -96,7 +116,10 @@ def closed_loop(saved: SavedPolicy | ForeignPolicy, steps: int, unrolled: bool =
 
 
 def state_names(env: Environment) -> tuple[str, ...]:
-    """Every number that a start draws, `platform.field` or `platform.field.axis`, in the order of the exported state."""
+    """Return the names of the numbers that a start draws, in the order of the exported state.
+
+    A name is `platform.field`, or `platform.field.axis` for an element of a vector.
+    """
     names = []
     for path, size in _fields(env):
         names += [path] if size == 0 else [f"{path}.{'xyz'[axis]}" for axis in range(size)]
@@ -104,7 +127,10 @@ def state_names(env: Environment) -> tuple[str, ...]:
 
 
 def _fields(env: Environment) -> list[tuple[str, int]]:
-    """Field by field its path and number of elements, 0 for a scalar."""
+    """Return the path and the number of elements of each field that a start draws.
+
+    The number is 0 for a scalar.
+    """
     found = []
     for platform in env.platforms:
         rest = platform.rest()
@@ -115,6 +141,7 @@ def _fields(env: Environment) -> list[tuple[str, int]]:
 
 
 def _placed(env: Environment, start: Array) -> dict[str, dict[str, Array]]:
+    """Return a start as `reset_to` takes it, from the vector of its numbers."""
     placed: dict[str, dict[str, Array]] = {}
     at = 0
     for path, size in _fields(env):

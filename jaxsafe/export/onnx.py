@@ -1,7 +1,9 @@
-"""JAX functions as ONNX graphs: each primitive becomes the ONNX operators that say the same.
+"""Conversion of JAX functions to ONNX graphs.
 
-Only primitives that policies, features and dynamics of the tasks are made of; anything else is refused by name. Shapes are
-fixed, opset 17, float32: what verifiers and small runtimes understand.
+Each primitive becomes the ONNX operators that compute the same. Only the primitives of which
+policies, features and dynamics of the tasks consist are known. Any other primitive is refused by
+name. A graph has fixed shapes, opset 17 and float32, because verifiers and small runtimes
+understand these.
 """
 # pyright: reportMissingImports=false
 
@@ -26,37 +28,82 @@ except ImportError as error:
     raise missing(error, "onnx", "export") from None
 
 OPSET = 17
+"""Version of the ONNX operators. Verifiers and small runtimes understand it."""
 
 _SAME = {
-    "add": "Add", "add_any": "Add", "sub": "Sub", "mul": "Mul", "div": "Div", "max": "Max", "min": "Min", "neg": "Neg",
-    "exp": "Exp", "log": "Log", "sqrt": "Sqrt", "tanh": "Tanh", "abs": "Abs", "sin": "Sin", "cos": "Cos", "atan": "Atan",
-    "sign": "Sign", "floor": "Floor", "round": "Round", "lt": "Less", "gt": "Greater", "le": "LessOrEqual",
-    "ge": "GreaterOrEqual", "eq": "Equal", "and": "And", "or": "Or", "not": "Not", "copy": "Identity",
-    "stop_gradient": "Identity", "logistic": "Sigmoid", "pow": "Pow",
-}  # fmt: skip
+    "add": "Add",
+    "add_any": "Add",
+    "sub": "Sub",
+    "mul": "Mul",
+    "div": "Div",
+    "max": "Max",
+    "min": "Min",
+    "neg": "Neg",
+    "exp": "Exp",
+    "log": "Log",
+    "sqrt": "Sqrt",
+    "tanh": "Tanh",
+    "abs": "Abs",
+    "sin": "Sin",
+    "cos": "Cos",
+    "atan": "Atan",
+    "sign": "Sign",
+    "floor": "Floor",
+    "round": "Round",
+    "lt": "Less",
+    "gt": "Greater",
+    "le": "LessOrEqual",
+    "ge": "GreaterOrEqual",
+    "eq": "Equal",
+    "and": "And",
+    "or": "Or",
+    "not": "Not",
+    "copy": "Identity",
+    "stop_gradient": "Identity",
+    "logistic": "Sigmoid",
+    "pow": "Pow",
+}
+"""ONNX operators of primitives that have the same arguments, by name of the primitive."""
+
 _INSIDE = {
     "jit": "jaxpr",
     "pjit": "jaxpr",
     "custom_jvp_call": "call_jaxpr",
     "custom_vjp_call": "call_jaxpr",
 }
+"""Parameters that hold the inner jaxpr of primitives that call one, by name of the primitive."""
+
 _TYPES = {
-    "float32": TensorProto.FLOAT, "float64": TensorProto.FLOAT, "int32": TensorProto.INT32, "int64": TensorProto.INT32,
+    "float32": TensorProto.FLOAT,
+    "float64": TensorProto.FLOAT,
+    "int32": TensorProto.INT32,
+    "int64": TensorProto.INT32,
     "bool": TensorProto.BOOL,
-}  # fmt: skip
-"""The graph is of single precision, also where JAX computes in double precision."""
+}
+"""ONNX types by JAX's dtype. The graph has single precision even if JAX computes in double."""
+
 _NARROW = {"float64": np.float32, "int64": np.int32}
+"""Dtypes that constants get in the graph, by the wider ones that they have in JAX."""
 
 
 def write_onnx(
     path: Path, function: Callable[[Any], Any], shape: Sequence[int], about: dict[str, str]
 ) -> Path:
-    """Write `function`, of one float array of that shape, as a checked ONNX file.
+    """Write a function as an ONNX file, and check it.
 
-    The graph has one input, `input`, and one output, `output`; `about` becomes its metadata.
+    The graph has one input, `input`, and one output, `output`.
+
+    Args:
+        path: the file.
+        function: a function of one float array.
+        shape: the shape of that array.
+        about: metadata of the file.
+
+    Returns:
+        The path of the file.
 
     Raises:
-        ConfigError: the function is made of something that has no counterpart here.
+        ConfigError: the function contains a primitive that has no counterpart here.
     """
     model = to_onnx(function, shape)
     helper.set_model_props(model, about)
@@ -65,11 +112,18 @@ def write_onnx(
 
 
 def to_onnx(function: Callable[[Any], Any], shape: Sequence[int]) -> Any:
-    """The model of `write_onnx`."""
+    """Return the checked ONNX model of a function.
+
+    Args:
+        function: a function of one float array.
+        shape: the shape of that array.
+
+    Raises:
+        ConfigError: the function contains a primitive that has no counterpart here.
+    """
     closed = jax.make_jaxpr(function)(jax.ShapeDtypeStruct(shape, jnp.float32))
-    jaxpr, _ = partial_eval.dce_jaxpr(
-        closed.jaxpr, [True], instantiate=True
-    )  # what nothing needs may be anything
+    # Primitives whose results nothing needs are left out, because they need no counterpart.
+    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True], instantiate=True)
     graph = _Graph()
     [output] = graph.inline(jaxpr, closed.consts, ["input"])
     graph.node("Identity", [output], "output")
@@ -90,6 +144,8 @@ def to_onnx(function: Callable[[Any], Any], shape: Sequence[int]) -> Any:
 
 
 class _Graph:
+    """An ONNX graph that is being built. Constants and results of nodes are known by name."""
+
     def __init__(self) -> None:
         self.nodes: list[Any] = []
         self.constants: list[Any] = []
@@ -107,7 +163,7 @@ class _Graph:
         return self._initializer(array.astype(_NARROW.get(array.dtype.name, array.dtype)))
 
     def integers(self, *values: int) -> str:
-        """Add whole numbers that are not data: shapes, axes and bounds."""
+        """Add integers that are not data: shapes, axes and bounds. They stay 64 bits wide."""
         return self._initializer(np.array(values, np.int64))
 
     def _initializer(self, array: np.ndarray) -> str:
@@ -116,7 +172,13 @@ class _Graph:
         return name
 
     def inline(self, jaxpr: Any, consts: Sequence[Any], inputs: Sequence[str]) -> list[str]:
-        """Add the equations of a jaxpr; the names of its results."""
+        """Add the equations of a jaxpr, and return the names of its results.
+
+        Args:
+            jaxpr: the jaxpr.
+            consts: the values of its constants.
+            inputs: the names of its inputs in the graph.
+        """
         names: dict[Any, str] = dict(zip(jaxpr.invars, inputs, strict=True))
         names |= {
             var: self.constant(value) for var, value in zip(jaxpr.constvars, consts, strict=True)
@@ -131,7 +193,7 @@ class _Graph:
         return [read(atom) for atom in jaxpr.outvars]
 
     def prune(self, *outputs: str) -> None:
-        """Leave out what nothing needs."""
+        """Remove nodes and constants that the outputs do not need."""
         needed, kept = set(outputs), []
         for node in reversed(self.nodes):
             if needed & set(node.output):
@@ -166,6 +228,7 @@ class _Graph:
         return [translate(inputs, shapes, equation.outvars[0].aval, params)]
 
     def _pieces(self, whole: str, sizes: Sequence[int], axis: int) -> list[str]:
+        """Split an array along an axis into pieces of these sizes."""
         results = [self._name() for _ in sizes]
         self.nodes.append(
             helper.make_node("Split", [whole, self.integers(*sizes)], results, axis=axis)
@@ -173,7 +236,13 @@ class _Graph:
         return results
 
     def _masked(self, whole: str, mask: Any) -> str:
-        """One bit m of a whole number: (x mod 2m) − (x mod m). ONNX has bitwise operators from opset 18 on only."""
+        """Return one bit m of integers x as (x mod 2m) − (x mod m).
+
+        ONNX has bitwise operators only from opset 18 on.
+
+        Raises:
+            ConfigError: the mask is not a constant with one bit.
+        """
         bit = int(mask.val) if isinstance(mask, core.Literal) else 0
         if bit <= 0 or bit & (bit - 1):
             raise ConfigError("onnx: 'and' of whole numbers has a counterpart for one bit only")
@@ -267,6 +336,7 @@ class _Graph:
             or len(shapes[1]) > 2
         ):
             raise ConfigError(
-                f"onnx: a product of shapes {shapes} over axes {left} and {right} has no counterpart here"
+                f"onnx: a product of shapes {shapes} over axes {left} and {right}"
+                " has no counterpart here"
             )
         return self.node("MatMul", inputs)

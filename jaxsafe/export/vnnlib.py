@@ -1,7 +1,8 @@
-"""The safety of a controller as a question for neural-network verifiers, and a search for a counterexample.
+"""The safety of a controller as a question for verifiers, and a search for a counterexample.
 
-A verifier gets the closed loop as one ONNX graph, from a start to every margin h on the way, and a VNN-LIB file that
-describes what must not happen: a start in the box from which some margin is negative.
+Verifiers of neural networks get two files. An ONNX graph holds the closed loop, from a start to
+every margin h on the way. A VNN-LIB file describes what must not happen: a start in a box from
+which some margin is negative. The search looks for such a start.
 """
 
 from __future__ import annotations
@@ -19,23 +20,37 @@ from jaxsafe.storage.files import write_bytes
 from jaxsafe.types import Key
 
 Box = Sequence[tuple[float, float]]
+"""The lowest and the highest value of each element of a start."""
 
 
 class Worst(NamedTuple):
-    """The start with the least margin that a search found."""
+    """The start with the smallest margin that a search found."""
 
-    margin: float  # −∞ if some margin on the way is not a number, which is not safe either
+    margin: float
+    """The smallest margin on the way, or −∞ if some margin is NaN. That is not safe either."""
+
     start: np.ndarray
     tried: int
+    """Number of starts that the search tried."""
 
 
 def write_vnnlib(path: Path, exported: Exported, box: Box) -> Path:
-    """Write the property that some output is ≤ 0 for some input in the box: `unsat` means safe.
+    """Write the property that some output is ≤ 0 for some input in the box.
 
-    VNN-LIB knows no strict inequality, so a margin of 0, which is safe, counts as unsafe.
+    If a verifier answers `unsat`, every start in the box is safe. VNN-LIB has no strict inequality.
+    So a margin of 0 counts as unsafe, although it is safe.
+
+    Args:
+        path: the file.
+        exported: the closed loop.
+        box: bounds of each input.
+
+    Returns:
+        The path of the file.
     """
     lines = [
-        f"; unsafe if any of {len(exported.outputs)} margins is <= 0; unsat: every start in the box is safe"
+        f"; unsafe if any of {len(exported.outputs)} margins is <= 0;"
+        " unsat: every start in the box is safe"
     ]
     lines += [f"; X_{i} is {name}" for i, name in enumerate(exported.inputs)]
     lines += [f"(declare-const X_{i} Real)" for i in range(len(exported.inputs))]
@@ -54,9 +69,18 @@ def write_vnnlib(path: Path, exported: Exported, box: Box) -> Path:
 def search(
     exported: Exported, box: Box, key: Key, starts: int = 10_000, best: int = 64, rounds: int = 100
 ) -> Worst:
-    """Look for a start in the box with a negative margin: corners, random starts, then descent from the worst of them.
+    """Look for a start in the box from which some margin is negative.
 
-    It may miss one: a search that finds nothing is no proof. A margin that is not a number is no safe one.
+    The search tries corners and random starts, and then descends from the worst of them. It may
+    miss a start, so a search that finds nothing is no proof. A margin that is NaN counts as unsafe.
+
+    Args:
+        exported: the closed loop.
+        box: bounds of each element of a start.
+        key: a PRNG key for the random starts.
+        starts: number of random starts.
+        best: number of starts from which the search descends, those with the smallest margins.
+        rounds: number of steps of each descent.
     """
     low, high = (jnp.array([[bounds[i] for bounds in box]], jnp.result_type(float)) for i in (0, 1))
     corners = np.stack(np.meshgrid(*([0.0, 1.0] for _ in box), indexing="ij"), axis=-1).reshape(
@@ -77,9 +101,8 @@ def search(
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             share, worst, at = carry
             gradient = jax.grad(lambda s: jnp.sum(least(s)))(share)
-            gradient = jnp.where(
-                jnp.isfinite(gradient), gradient, 0.0
-            )  # from where there is no slope, stay
+            # Where there is no finite slope, the start stays.
+            gradient = jnp.where(jnp.isfinite(gradient), gradient, 0.0)
             length = jnp.linalg.norm(gradient, axis=-1, keepdims=True)
             moved = jnp.clip(
                 share - 0.1 * 0.95**i * gradient / jnp.maximum(length, 1e-12), 0.0, 1.0

@@ -1,1 +1,4 @@
-"""Sweeps: many settings of one training, compiled once wherever they differ in numbers only."""
+"""Sweeps over many settings of one training.
+
+Settings that differ in numbers only are compiled once.
+"""

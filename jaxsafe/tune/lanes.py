@@ -1,4 +1,8 @@
-"""Training many settings at once: a lane is one seed of one setting, and all lanes run the same compiled program."""
+"""Training of many settings at once.
+
+In this module a lane is the training of one seed with one setting. All lanes run the same compiled
+program.
+"""
 
 from __future__ import annotations
 
@@ -28,21 +32,27 @@ from jaxsafe.tune.settings import Setting, alike, lane
 from jaxsafe.types import Key
 
 CURVES = ("success_rate", "count", "return", "diverged")
-"""What is kept of the training curves."""
+"""Quantities of the training curves that are kept."""
 
 CHUNKS = 20
-"""Pieces that a training is cut into, so that Ctrl-C and the bar do not wait for its end."""
+"""Number of pieces into which a training is cut.
+
+Between two pieces Ctrl-C takes effect and the progress bar moves. Neither waits for the end.
+"""
 
 
 def train_all(
     found: Sequence[Setting], chosen: Sequence[int], tick: Callable[[int], object]
 ) -> Iterator[dict[int, dict[str, Any]]]:
-    """Train and evaluate the chosen settings, some at a time: their results by index.
+    """Train and evaluate the chosen settings, some at a time.
 
     Args:
         found: all settings of a sweep.
-        chosen: indices of those to train.
-        tick: called with numbers of finished updates, one for each setting.
+        chosen: indices of the settings to train.
+        tick: called with the number of updates finished since the last call, summed over settings.
+
+    Yields:
+        The results of the settings that were trained together, by index.
     """
     for group in alike(found, chosen):
         lanes = Lanes(found[group[0]], len(group))
@@ -52,10 +62,18 @@ def train_all(
 
 
 class Lanes:
-    """Compiled once for settings that differ in numbers only."""
+    """A training that is compiled once for settings that differ in numbers only."""
 
     def __init__(self, like: Setting, count: int) -> None:
-        """Prepare for `count` settings such as `like`: on a CPU a few at a time that keep all cores busy, else all."""
+        """Prepare for settings such as `like`.
+
+        On a CPU a few settings at a time are trained together, as many as keep all cores busy.
+        Elsewhere all are trained together.
+
+        Args:
+            like: one of the settings. The others differ from it in numbers only.
+            count: number of settings.
+        """
         self.like, self.seeds, devices = like, like.config.seeds, jax.devices()
         on_cpu = devices[0].platform == "cpu"
         self.at_once = (
@@ -64,11 +82,18 @@ class Lanes:
         self.mapper = SeedMapper(self.at_once * self.seeds)
         self.length = -(-like.config.num_updates // CHUNKS)
         self._init = self.mapper.map(lambda _, one: begin(*one))
-        self._advance: Any = None  # compiled with the first lanes
+        # Compiled when the first lanes are known.
+        self._advance: Any = None
         self._evaluate = self.mapper.map(_one_evaluation)
 
     def run(self, some: Sequence[Setting], tick: Callable[[int], object]) -> list[dict[str, Any]]:
-        """Train and evaluate at most `at_once` settings; a result for each."""
+        """Train and evaluate at most `at_once` settings, and return a result for each.
+
+        Args:
+            some: the settings.
+            tick: called with the number of updates finished since the last call, summed over
+                settings.
+        """
         places = self.mapper.pad(np.arange(self.at_once * self.seeds))
         trees = [lane(some[min(place // self.seeds, len(some) - 1)]) for place in places]
         lanes = self.mapper.place(jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees))
@@ -95,7 +120,16 @@ class Lanes:
         ]
 
     def _fitting(self, lanes: Any, keys: jax.Array) -> jax.stages.Compiled:
-        """The program of some updates, refused before there is a state if either needs more memory than there is."""
+        """Compile the program of one piece of the training.
+
+        Args:
+            lanes: environment, agent and hyperparameters of each lane.
+            keys: a PRNG key for each lane.
+
+        Raises:
+            ConfigError: the state or the program needs more memory than there is. This is found
+                out before the state is allocated.
+        """
         like = self.mapper.like(jax.eval_shape(self._init, (), (lanes, keys)))
         state = memory.size(like) // self.mapper.mesh.size
         memory.require(
@@ -114,7 +148,13 @@ class Lanes:
         return chunk(*one, self.length, self.like.config.num_updates)
 
     def _episodes(self, lanes: Any, params: Any, deterministic: bool) -> Episode:
-        """The evaluation episodes of every lane: each field [lanes, episodes]."""
+        """Return the evaluation episodes of every lane. Each field is [lanes, episodes].
+
+        Args:
+            lanes: environment, agent and hyperparameters of each lane.
+            params: the weights of each lane's networks.
+            deterministic: whether actions are the mode of the policy's distribution.
+        """
 
         def batch(key: Key) -> Episode:
             shared = self.mapper.replicate((key, np.asarray(deterministic)))
@@ -125,9 +165,17 @@ class Lanes:
     def _result(
         self, setting: Setting, curve: dict[str, np.ndarray], sums: dict[str, Episode]
     ) -> dict[str, Any]:
+        """Return the results of one setting.
+
+        Args:
+            setting: the setting.
+            curve: the training curves, each [seeds, updates].
+            sums: the evaluation episodes by kind of evaluation. Each field is [seeds, episodes].
+        """
         steps = (1 + np.arange(setting.config.num_updates)) * setting.config.ppo.batch_size
         diverged = curve["diverged"]
-        success = np.where(diverged, 0.0, curve["success_rate"]).T  # what diverged succeeds no more
+        # A seed that has diverged succeeds no more.
+        success = np.where(diverged, 0.0, curve["success_rate"]).T
         episodes = curve["count"].T
         last = np.where(diverged, np.nan, curve["return"])[:, -1]
         left_out = np.flatnonzero(diverged[:, -1]).tolist()

@@ -1,4 +1,4 @@
-"""The files of a sweep, and its table."""
+"""The files and the table of a sweep."""
 
 from __future__ import annotations
 
@@ -21,20 +21,34 @@ from jaxsafe.train.host.results import percent, told_diverged
 from jaxsafe.tune.settings import Setting
 
 Rows = dict[int, dict[str, Any]]
-"""The results of settings, by their place in the sweep."""
+"""The results of settings, by the index of the setting in the sweep."""
 
 SHOWN = 20
-"""Lines of the printed table."""
+"""The largest number of settings in the printed table."""
 
 NONE = {"80 % after": "never"}
-"""What the table shows, by column, where there is no value; a dash elsewhere."""
+"""What a column of the table shows where there is no value. Other columns show a dash."""
 
 LONGEST = 36
-"""Letters of a legend's entry."""
+"""The largest number of characters of a setting's values in the legend of the figure.
+
+If they are longer, the legend has only the number of the setting.
+"""
 
 
 def create(out: str | None, request: Mapping[str, Any], first: Setting) -> Path:
-    """Make the directory of a sweep and write down what was asked for, and what its first setting is in full."""
+    """Make the directory of a sweep, and write `sweep.yaml`.
+
+    The file holds what was asked for, the first setting in full, and versions.
+
+    Args:
+        out: the directory. None makes one under `runs`.
+        request: the options that the user gave.
+        first: the first setting of the sweep.
+
+    Returns:
+        The directory.
+    """
     path = run_directory.make(out, Path("runs"), f"tune_{Path(str(request['env'])).stem}")
     whole = run_directory.described(first.config, first.env)
     write_text(
@@ -45,10 +59,13 @@ def create(out: str | None, request: Mapping[str, Any], first: Setting) -> Path:
 
 
 def read_request(path: Path) -> Arguments:
-    """The options of a sweep that was begun.
+    """Return the options of a sweep that was begun.
+
+    Args:
+        path: the directory of the sweep.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is no sweep in this directory.
     """
     if not (path / "sweep.yaml").is_file():
         raise ConfigError(f"resume: no sweep in {str(path)!r} (a directory with sweep.yaml)")
@@ -59,15 +76,22 @@ def read_request(path: Path) -> Arguments:
 
 
 def refuse_other(path: Path, first: Setting) -> None:
-    """Results by another recipe, or of another environment, must not stand in one table with these.
+    """Refuse to resume a sweep after its recipe or environment has changed.
+
+    Results of another recipe or environment must not stand in one table with those there are.
+
+    Args:
+        path: the directory of the sweep.
+        first: the first setting, as it is now.
 
     Raises:
-        ConfigError: what the sweep was begun with has changed.
+        ConfigError: the recipe or the environment has changed since the sweep was begun.
     """
     now = yaml12.write(run_directory.described(first.config, first.env))
     if _content(path)["first"] != yaml12.parse(now, "first"):
         raise ConfigError(
-            f"resume: the recipe or the environment of {path} has changed since it was begun; begin it anew"
+            f"resume: the recipe or the environment of {path} has changed since it was begun;"
+            " begin it anew"
         )
 
 
@@ -78,21 +102,22 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def read(path: Path, found: Sequence[Setting]) -> Rows:
-    """Read the results so far; a line that a kill cut short is cut off.
+    """Return the results so far. A last line that was cut short by a kill is removed from the file.
 
     Args:
-        path: of the sweep.
-        found: its settings.
+        path: the directory of the sweep.
+        found: the settings of the sweep.
 
     Raises:
-        ConfigError: a line is broken, or is not of one of these settings.
+        ConfigError: a line is broken, or does not belong to one of these settings.
     """
     file, rows = path / "settings.jsonl", {}
     for number, row in enumerate(keep_rows(file, lambda _: True, {"setting": COUNT}), start=1):
         index, place = row.pop("setting"), f"{file}, row {number}"
         if index >= len(found) or index in rows:
             raise ConfigError(
-                f"{place}: setting: expected one of the {len(found)} settings, each once, found {index}"
+                f"{place}: setting: expected one of the {len(found)} settings, each once,"
+                f" found {index}"
             )
         check(row, _form(found[index]), place)
         check(
@@ -106,14 +131,15 @@ def read(path: Path, found: Sequence[Setting]) -> Rows:
         for name, value in found[index].changes.items():
             if row.get(name) != json.loads(json.dumps(value)):
                 raise ConfigError(
-                    f"{place}: {name}: expected {show(value)} in setting {index}, found {show(row.get(name))}"
+                    f"{place}: {name}: expected {show(value)} in setting {index},"
+                    f" found {show(row.get(name))}"
                 )
         rows[index] = row
     return rows
 
 
 def _form(setting: Setting) -> dict[str, Any]:
-    """Return the form of the results of a setting, as far as they are read."""
+    """Return the form that the results of a setting must have. It has only what is read of them."""
     seeds, updates = setting.config.seeds, setting.config.num_updates
     rate, curve = numbers(seeds, SHARE | NULL), numbers(updates, SHARE | NULL)
     metrics = {
@@ -141,19 +167,33 @@ def _form(setting: Setting) -> dict[str, Any]:
 
 
 def add(path: Path, rows: Mapping[int, dict[str, Any]]) -> None:
-    """Write down results as they come, so that a killed sweep goes on after them."""
+    """Append results to the file of the sweep, so that a killed sweep can go on after them.
+
+    Args:
+        path: the directory of the sweep.
+        rows: the results, by the index of the setting.
+    """
     append_rows(path / "settings.jsonl", ({"setting": index, **row} for index, row in rows.items()))
 
 
 def finish(path: Path, rows: Rows, swept: Sequence[str], rank: str) -> str:
-    """Write `results.json`, `results.csv` and the figure; return the table, best first."""
+    """Write `results.json`, `results.csv` and the figure of a sweep.
+
+    Args:
+        path: the directory of the sweep.
+        rows: the results of all settings.
+        swept: names of the options that the sweep varies.
+        rank: what the settings are ranked by: `steps`, `success` or `deterministic`.
+
+    Returns:
+        The table to print, with the best setting first.
+    """
     from jaxsafe.plot.sweep import sweep_curves
 
     order = sorted(rows, key=lambda index: (_key(rows[index], rank), index))
     flat = [{"setting": index, **_flat(rows[index], swept)} for index in order]
-    names = dict.fromkeys(
-        name for one in flat for name in one
-    )  # settings with seeds that diverged have other columns
+    # Settings of which a seed has diverged have other columns.
+    names = dict.fromkeys(name for one in flat for name in one)
     flat = [{name: one.get(name) for name in names} for one in flat]
     write_json(
         path / "results.json",
@@ -172,7 +212,13 @@ def finish(path: Path, rows: Rows, swept: Sequence[str], rank: str) -> str:
 
 
 def line(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
-    """One setting in short, as it is finished."""
+    """Return a line that sums up a setting that is finished.
+
+    Args:
+        index: the index of the setting.
+        row: the results of the setting.
+        swept: names of the options that the sweep varies.
+    """
     facts = _flat(row, swept)
     values = ", ".join(f"{name} {facts[name]}" for name in swept)
     reached = _cell(facts["80 % after"], NONE["80 % after"])
@@ -184,11 +230,22 @@ def _given_up(row: dict[str, Any]) -> str:
     """Say how many evaluation episodes of a setting had not ended."""
     counts = dict(row["given_up"])
     steps = counts.pop("after_steps")
-    return f"{sum(counts.values()):,} episodes still running after {steps:,} steps, given up and counted as failures"
+    return (
+        f"{sum(counts.values()):,} episodes still running after {steps:,} steps,"
+        " given up and counted as failures"
+    )
 
 
 def _key(row: dict[str, Any], rank: str) -> tuple[float, ...]:
-    """Small is good: settings of which no seed diverged first, then the chosen quantity, then the others."""
+    """Return the key by which settings are sorted. Small is good.
+
+    Settings of which no seed diverged come first, then those with the fewest. Among equals the
+    chosen quantity decides, and then the other quantities.
+
+    Args:
+        row: the results of the setting.
+        rank: the chosen quantity: `steps`, `success` or `deterministic`.
+    """
     steps = row["interaction_efficiency"]["timesteps"] or float("inf")
     success, deterministic = (
         -(_mean(row, kind, "success_rate") or 0.0) for kind in ("stochastic", "deterministic")
@@ -203,6 +260,7 @@ def _key(row: dict[str, Any], rank: str) -> tuple[float, ...]:
 
 
 def _flat(row: dict[str, Any], swept: Sequence[str]) -> dict[str, Any]:
+    """Return the cells of a setting in the table, by column."""
     each = row["interaction_efficiency"]["per_seed"]
     known = _known(row, "stochastic", "success_rate")
     return {
@@ -234,7 +292,14 @@ def _measured(row: dict[str, Any]) -> bool:
 
 
 def _mean(row: dict[str, Any], kind: str, metric: str, digits: int | None = None) -> float | None:
-    """Return the average of a metric over the seeds that have it, perhaps rounded; None if none has."""
+    """Return the average of a metric over the seeds that have it, or None if none has.
+
+    Args:
+        row: the results of the setting.
+        kind: the kind of evaluation, `stochastic` or `deterministic`.
+        metric: the name of the metric.
+        digits: number of decimals to which the average is rounded. None does not round.
+    """
     known = _known(row, kind, metric)
     mean = float(np.mean(known)) if known else None
     return mean if mean is None or digits is None else round(mean, digits)
@@ -245,7 +310,7 @@ def _known(row: dict[str, Any], kind: str, metric: str) -> list[float]:
 
 
 def _label(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
-    """The setting's number, and its values where they fit."""
+    """Return the entry of a setting in the legend: its number, and its values where they fit."""
     values = ", ".join(f"{'.'.join(name.split('.')[-2:])} {row[name]}" for name in swept)
     return f"{index}: {values}" if len(values) <= LONGEST else f"setting {index}"
 

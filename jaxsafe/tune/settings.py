@@ -1,4 +1,7 @@
-"""What a sweep tries: grids and random draws of options, each a complete command line of `jaxsafe.train`."""
+"""The settings of a sweep, from grids or random draws of options.
+
+Each setting is a complete command line of `jaxsafe.train`.
+"""
 
 from __future__ import annotations
 
@@ -18,45 +21,62 @@ from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.train.host.options import TrainConfig, resolve
 
 PREFIX = "sweep."
+"""What stands on the command line before the name of an option that is swept."""
+
 COMMON = ("env", "seeds", "seed", "episodes", "out", "preset")
 """Options that all settings of a sweep share."""
 
 MAX_SETTINGS = 10_000
-"""The largest sweep. Each setting is a training, and checking as many takes half a minute before the first begins."""
+"""The largest number of settings of a sweep.
+
+Each setting is a training. Checking this many takes half a minute before the first training begins.
+"""
 
 MANY_SETTINGS = 500
-"""From so many on the user is told that they are being checked."""
+"""Number of settings from which on the user is told that they are being checked."""
 
 _RANGE = re.compile(r"(log|uniform)\(\s*([^,\s]+)\s*,\s*([^,\s]+)\s*\)")
 
 
 class Span(NamedTuple):
-    """An interval from which values are drawn, uniformly or uniformly in the logarithm."""
+    """An interval from which values are drawn."""
 
     low: float
     high: float
     log: bool
+    """Whether the logarithm of a value is drawn uniformly, and not the value."""
 
     def draw(self, generator: np.random.Generator) -> float:
-        """One value, rounded to four digits, so that the table says what was tried."""
+        """Draw a value. It is rounded to four digits, so that the table says what was tried."""
         low, high = (math.log(self.low), math.log(self.high)) if self.log else (self.low, self.high)
         value = generator.uniform(low, high)
         return float(f"{math.exp(value) if self.log else value:.4g}")
 
 
 class Setting(NamedTuple):
-    """One point of a sweep: what it changes, and the training that this gives."""
+    """One point of a sweep."""
 
     changes: dict[str, Any]
+    """The values of the options that the sweep varies, by name of the option."""
+
     config: TrainConfig
+    """The configuration of the training, with these options."""
+
     env: Environment
+    """The environment, with these options."""
 
 
 def pop_sweep(arguments: Arguments) -> dict[str, list[Any] | Span]:
-    """Take the `sweep.<option>=…` options out, without their prefix: lists of values, or ranges.
+    """Take the options `sweep.<option>=…` out of the arguments.
+
+    Args:
+        arguments: the arguments. These options are removed from them.
+
+    Returns:
+        The list of values or the range of each option, by its name without the prefix.
 
     Raises:
-        ConfigError: there is none, or one is neither a list nor a range.
+        ConfigError: there is no such option, or one is neither a list nor a range.
     """
     names = [key for key in arguments.options if key.startswith(PREFIX)]
     if not names:
@@ -67,17 +87,18 @@ def pop_sweep(arguments: Arguments) -> dict[str, list[Any] | Span]:
 def settings(
     arguments: Arguments, sweep: Mapping[str, list[Any] | Span], samples: int | None, draw: int
 ) -> list[Setting]:
-    """Every setting of a grid, or `samples` random ones.
+    """Return every setting of a grid, or some random settings.
 
     Args:
         arguments: the options that all settings share, as for `jaxsafe.train`.
         sweep: what `pop_sweep` returns.
-        samples: how many settings to draw; None tries all combinations of the lists.
+        samples: how many settings to draw at random. None takes all combinations of the lists.
         draw: seed of the draws.
 
     Raises:
-        ConfigError: a value is refused as it would be on the command line, a range needs `samples`, or an option cannot
-            differ within a sweep.
+        ConfigError: a value is refused as it would be on the command line; an option cannot differ
+            within a sweep, or is also given outside it; there is a range but no `samples`; or there
+            are too many combinations.
     """
     for name in sweep:
         if name in COMMON:
@@ -95,7 +116,8 @@ def settings(
         count = math.prod(map(len, sweep.values()))
         if count > MAX_SETTINGS:
             raise ConfigError(
-                f"sweep: expected at most {MAX_SETTINGS:,} settings, found {count:,}; samples=N draws some"
+                f"sweep: expected at most {MAX_SETTINGS:,} settings, found {count:,};"
+                " samples=N draws some"
             )
         points = list(itertools.product(*sweep.values()))
     else:
@@ -112,7 +134,14 @@ def settings(
 
 
 def alike(found: Sequence[Setting], chosen: Sequence[int]) -> list[list[int]]:
-    """The chosen indices in groups that one compiled training serves: settings that differ in numbers only."""
+    """Return the chosen indices in groups, each of which is compiled once.
+
+    The settings of a group differ in numbers only.
+
+    Args:
+        found: all settings of the sweep.
+        chosen: indices of settings.
+    """
     groups: dict[Any, list[int]] = {}
     for index in chosen:
         leaves, structure = jax.tree.flatten(lane(found[index]))
@@ -122,17 +151,30 @@ def alike(found: Sequence[Setting], chosen: Sequence[int]) -> list[list[int]]:
 
 
 def lane(setting: Setting) -> tuple[Any, Any, Any]:
-    """Environment, agent and hyperparameters: all that a training is made from, but for its seed."""
+    """Return environment, agent and hyperparameters of a setting.
+
+    They are all that a training is made from, except its seed.
+    """
     return setting.env, setting.config.agent, setting.config.ppo
 
 
 def _choices(key: str, value: Any) -> list[Any] | Span:
+    """Return the values of a swept option, or the range that they are drawn from.
+
+    Args:
+        key: the name of the option with its prefix, for error messages.
+        value: the value on the command line.
+
+    Raises:
+        ConfigError: the value is neither a list nor a range.
+    """
     if isinstance(value, list) and value:
         return value
     match = _RANGE.fullmatch(value) if isinstance(value, str) else None
     if match is None:
         raise ConfigError(
-            f"{key}: expected a list [a,b,…], uniform(low,high) or log(low,high), found {show(value)}"
+            f"{key}: expected a list [a,b,…], uniform(low,high) or log(low,high),"
+            f" found {show(value)}"
         )
     try:
         low, high = float(match[2]), float(match[3])

@@ -1,6 +1,8 @@
-"""Checkpoints with orbax: a step directory appears whole or not at all, so a kill leaves the one before.
+"""Checkpoints with orbax.
 
-That one also if it is of the same step: it is moved aside, and goes only when the new one is there.
+The directory of a step appears whole or not at all. So a kill leaves the checkpoint before. That
+holds even where a checkpoint takes the place of one of the same step. The old one is moved aside,
+and is removed only when the new one is there.
 """
 
 from __future__ import annotations
@@ -32,26 +34,37 @@ logging.getLogger("absl").setLevel(logging.ERROR)
 
 
 QUIET_S = 0.5
-"""The threads of a failed read count as ended when none of them has complained for so long."""
+"""The threads of a failed read or write count as ended after this time without complaints [s]."""
 
 SETTLE_S = 10.0
-"""How long they get for that at most."""
+"""Longest time to wait for the threads of a failed read or write to end [s]."""
 
 MAX_REASON = 120
-"""Letters of an error of orbax or tensorstore that a message repeats."""
+"""Most letters that a message repeats of an error of orbax or tensorstore."""
 
 PRECISION, DIGEST = "precision", "sha256"
-"""Facts that are added to those of a checkpoint: the type of its numbers, and the digest of all else in it."""
+"""Names of the facts that are added to those of a checkpoint.
+
+They are the type of its numbers, and the digest of all else in it.
+"""
 
 ASIDE = ".before"
-"""Ends the name of a checkpoint while the one that takes its place is written."""
+"""End of the name of a checkpoint while the one that takes its place is written."""
 
 
 class Checkpoints:
-    """The numbered checkpoints in `<run>/checkpoints/`, by environment steps of each seed. All are kept."""
+    """The checkpoints in `<run>/checkpoints/`. All are kept.
+
+    Their numbers are the environment steps of each seed.
+    """
 
     def __init__(self, run: Path, create: bool = False) -> None:
-        """Open the directory; `create` makes it where it is missing."""
+        """Open the directory of checkpoints.
+
+        Args:
+            run: the run directory.
+            create: whether to make the directory if it is missing, and to write to it.
+        """
         import orbax.checkpoint as ocp
 
         self._ocp = ocp
@@ -70,9 +83,14 @@ class Checkpoints:
         return sorted(self._manager.all_steps()) if hasattr(self, "_manager") else []
 
     def save(self, step: int, state: Any, facts: dict[str, Any]) -> None:
-        """Write one checkpoint, or write it anew: a pytree of arrays on the host, of keys their words, and some JSON.
+        """Write one checkpoint, or write it anew.
 
-        A digest of both is written with them, which `restore` compares.
+        A digest of the state and the facts is written with them, and `restore` compares it.
+
+        Args:
+            step: environment steps of each seed.
+            state: a pytree of arrays on the host. PRNG keys are given as their words.
+            facts: some data of JSON.
 
         Raises:
             ConfigError: there is no room for it, or it cannot be written for another reason.
@@ -95,7 +113,7 @@ class Checkpoints:
                 self._manager.save(step, args=args, force=True)
             except (OSError, ValueError, RuntimeError) as error:
                 if jax.process_count() > 1 and "os_error_code" not in str(error):
-                    raise  # by the loss of another process, perhaps
+                    raise  # perhaps another process was lost
                 reason = (
                     str(error).strip().rpartition(": ")[2].partition(" [")[0][:MAX_REASON]
                     or type(error).__name__
@@ -114,13 +132,16 @@ class Checkpoints:
             )
 
     def _recover(self) -> None:
-        """In one process take back what was not finished; the others wait."""
+        """Take back what was not finished. One process does this, and the others wait."""
         if processes.leads():
             self._take_back()
         processes.wait_for_all("taken back")
 
     def _take_back(self) -> None:
-        """Take a checkpoint back whose successor of the same step was never written, and remove what is left of that."""
+        """Put a checkpoint back if its successor of the same step was never completely written.
+
+        What is left of the successor is removed.
+        """
         for part in self.directory.glob("*.orbax-checkpoint-tmp*"):
             shutil.rmtree(part, ignore_errors=True)
         for before in self.directory.glob(f"*{ASIDE}"):
@@ -130,22 +151,27 @@ class Checkpoints:
                 before.rename(before.with_suffix(""))
 
     def facts(self, step: int) -> dict[str, Any]:
-        """Read the JSON of one checkpoint, as it stands there.
+        """Read the JSON of one checkpoint, as it was written.
 
         Raises:
-            ConfigError: there is none at this step, or it is broken.
+            ConfigError: there is no checkpoint at this step, or it is broken.
         """
         facts = self._read(step, facts=self._ocp.args.JsonRestore())["facts"]
         check(facts, {}, f"{self.directory / str(step)}: facts")
         return facts
 
     def restore(self, step: int, like: Any) -> Any:
-        """Read one checkpoint, as arrays on the host, into the structure and shapes of `like`.
+        """Read the arrays of one checkpoint, on the host.
 
         A checkpoint that was written before there were digests is read without comparing one.
 
+        Args:
+            step: environment steps of each seed.
+            like: shapes of the arrays, in the structure that the result has.
+
         Raises:
-            ConfigError: there is none at this step, or it is broken, damaged or of another run.
+            ConfigError: there is no checkpoint at this step, or it is broken, damaged or of another
+                run.
         """
         facts, place, now = (
             self.facts(step),
@@ -185,7 +211,9 @@ class Checkpoints:
             except Exception as error:  # orbax and tensorstore raise whatever their layers raise
                 lines = [line for line in str(error).splitlines() if line.strip()]
                 reason = (lines or [type(error).__name__])[0][:MAX_REASON]
-            if reason:  # outside the except clause: the error keeps the failed tasks, which complain when they go
+            # This stands outside the except clause, because the error keeps the failed tasks alive,
+            # and they complain when they go.
+            if reason:
                 _ignore_late_complaints()
                 _settle(complaints)
         if reason:
@@ -195,7 +223,10 @@ class Checkpoints:
 
 @contextlib.contextmanager
 def _silence() -> Iterator[io.StringIO]:
-    """Nothing on standard error: threads and tasks of what fails complain one by one, also through loggers."""
+    """Keep standard error silent, and collect what would have been written to it.
+
+    Threads and tasks of a failed read or write complain one by one, also through loggers.
+    """
     loggers = [logging.getLogger(name) for name in ("asyncio", "absl")]
     before = [logger.disabled for logger in loggers]
     for logger in loggers:
@@ -210,7 +241,10 @@ def _silence() -> Iterator[io.StringIO]:
 
 @functools.cache
 def _ignore_late_complaints() -> None:
-    """From now on say nothing of what comes to an event loop after its end: threads of a failed read may take long."""
+    """Silence, from now on, complaints about calls to an event loop that has ended.
+
+    The threads of a failed read may take long to end.
+    """
     previous = sys.unraisablehook
 
     def hook(what: sys.UnraisableHookArgs) -> None:
@@ -224,6 +258,7 @@ def _ignore_late_complaints() -> None:
 
 
 def _settle(complaints: io.StringIO) -> None:
+    """Wait until the threads of a failed read or write have ended, then free what they leave."""
     end, said = time.monotonic() + SETTLE_S, -1
     while time.monotonic() < end and said != complaints.tell():
         said = complaints.tell()

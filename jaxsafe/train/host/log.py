@@ -1,4 +1,8 @@
-"""What a run tells while it goes on: progress rows in files, a bar or plain lines on the terminal, TensorBoard if asked."""
+"""What a run tells while it goes on.
+
+It writes progress rows to files, shows a bar or plain lines on the terminal, and writes to
+TensorBoard if asked.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +26,18 @@ NEEDS = {
     **dict.fromkeys(("success_rate", "return", "length"), NUMBER_OR_NULL),
     OTHERS: NUMBER_OR_NULL | FLAG,
 }
-"""The form of every row of the progress log: columns that all have, and what the others hold."""
+"""The form of every row of the progress log.
+
+It says which columns all logs have, and what the other columns hold.
+"""
 
 
 def read_progress(run: Path) -> list[dict[str, Any]]:
-    """Return the rows of a run's progress log, none if it has not begun.
+    """Return the rows of a run's progress log. There are none if it has not begun.
 
     Raises:
-        ConfigError: a row is broken, has not the columns of the first, or stands in the wrong place.
+        ConfigError: a row is broken, has other columns than the first row, or stands in the wrong
+            place.
     """
     rows = read_rows(run / "progress.jsonl", NEEDS)
     check_order(rows, run / "progress.jsonl")
@@ -37,7 +45,18 @@ def read_progress(run: Path) -> list[dict[str, Any]]:
 
 
 def check_order(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Raise a ConfigError unless rows of a progress log have the same columns and come update by update, seed by seed."""
+    """Check the rows of a progress log.
+
+    All must have the same columns. They must come update by update, and within an update seed by
+    seed.
+
+    Args:
+        rows: the rows.
+        path: the file, for the message.
+
+    Raises:
+        ConfigError: they do not.
+    """
     seeds = [row["seed"] for row in rows if row["step"] == rows[0]["step"]]
     for index, row in enumerate(rows):
         place = f"{path}, row {index + 1}"
@@ -46,7 +65,7 @@ def check_order(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
             raise ConfigError(
                 f"{place}: expected the columns of the first row, they differ in {different}"
             )
-        first = rows[index - index % len(seeds)]  # of the same update
+        first = rows[index - index % len(seeds)]  # the first row of the same update
         if row["seed"] != seeds[index % len(seeds)] or row["step"] != first["step"]:
             wanted = f"seed {seeds[index % len(seeds)]} at step {first['step']}"
             raise ConfigError(
@@ -59,22 +78,32 @@ def check_order(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def filter_name(env: Environment) -> str:
-    """Return the kind of the run time assurance that acts in an environment."""
+    """Return the kind of run time assurance that acts in an environment, or `none`."""
     return "none" if env.rta is None else env.rta.type_name or type(env.rta).__name__
 
 
 def headline(facts: Mapping[str, Any]) -> str:
-    """Say in short what a run is, for the title of a table or a figure."""
+    """Return in short what a run is, for the title of a table or a figure.
+
+    Args:
+        facts: the facts about the run that its results hold.
+    """
     count = facts["seeds"]
     what = f"{facts['env']}, preset {facts['preset']}, {facts['algorithm']}, rta {facts['rta']}"
     return f"{what}, {count} seed{'s' * (count != 1)}"
 
 
 class ProgressLog:
-    """`progress.jsonl` and `progress.csv`: a row for every update of every seed."""
+    """`progress.jsonl` and `progress.csv`, with a row for every update of every seed."""
 
     def __init__(self, run: Path, resume_step: int, expected: int, tensorboard: bool) -> None:
-        """Open the logs, cut back to the `expected` rows up to the step from which the run goes on.
+        """Open the logs, and cut them back to the step from which the run goes on.
+
+        Args:
+            run: the run directory.
+            resume_step: environment steps of each seed from which the run goes on.
+            expected: number of rows up to that step.
+            tensorboard: whether to write to TensorBoard too.
 
         Raises:
             ConfigError: rows are missing or broken.
@@ -126,7 +155,7 @@ class ProgressLog:
             self._board.close()
 
     def curve(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Steps (updates,) and one column as (updates, seeds)."""
+        """Return steps [updates] and one column [updates, seeds]. Unknown values are NaN."""
         steps = np.unique([row["step"] for row in self.rows])
         values = np.array([np.nan if row[name] is None else row[name] for row in self.rows], float)
         return steps, values.reshape(len(steps), -1)
@@ -135,7 +164,17 @@ class ProgressLog:
 def progress_rows(
     env: Environment, curves: dict[str, np.ndarray], seed: int, batch_size: int, wall_s: float
 ) -> list[dict]:
-    """Rows from the arrays [seeds, updates] that a chunk returns, update after update."""
+    """Return the rows of the progress log for a chunk of updates, update by update.
+
+    What is not known, or belongs to a seed that has diverged, is None.
+
+    Args:
+        env: the environment.
+        curves: the arrays [seeds, updates] that the chunk returns.
+        seed: the first seed.
+        batch_size: environment steps of each seed in an update.
+        wall_s: seconds spent on the run so far.
+    """
     num_seeds, num_updates = curves["count"].shape
     known = (curves["count"] > 0) & ~curves["diverged"]
     measured = columns(env) + (["multiplier"] if "multiplier" in curves else [])
@@ -158,7 +197,10 @@ def progress_rows(
 
 
 def columns(env: Environment) -> list[str]:
-    """The measured columns of the progress log, averages over the window, in order; none for what is not measured."""
+    """Return the measured columns of the progress log, in order.
+
+    They are averages over the window. What an environment does not measure has no column.
+    """
     measured = measures(env)
     first = [
         "success_rate",
@@ -176,10 +218,10 @@ def columns(env: Environment) -> list[str]:
 
 
 class Display:
-    """A live bar on a terminal, otherwise a plain line every tenth of the run."""
+    """A live bar on a terminal. Elsewhere it is a plain line at every tenth of the run."""
 
     def __init__(self, steps: int, done: int) -> None:
-        """Show progress towards `steps` environment steps per seed, of which some are done."""
+        """Show progress towards `steps` environment steps of each seed. `done` of them are done."""
         self._steps, self._done = steps, done
         self._bar = None
         if sys.stderr.isatty():
@@ -191,13 +233,13 @@ class Display:
             self._bar.set_postfix_str("compiling")
 
     def start(self) -> None:
-        """Begin to count time: what came before is not a rate of training."""
+        """Begin to count time. What came before does not count for the rate of training."""
         self._begin = self._done, time.monotonic()
         if self._bar is not None:
             self._bar.unpause()
 
     def show(self, step: int, rows: list[dict[str, Any]]) -> None:
-        """Show the state after `step` steps, from the latest row of each seed."""
+        """Show the state after `step` steps, given the latest row of each seed."""
         means = {name: _mean([row[name] for row in rows]) for name in ("success_rate", "return")}
         facts = (
             f"success {_text(means['success_rate'], '.1%')}, return {_text(means['return'], '.2f')}"
@@ -236,10 +278,10 @@ def _text(value: float | None, form: str) -> str:
 
 
 def tensorboard_writer() -> Any:
-    """The class that writes TensorBoard's files.
+    """Return the class that writes TensorBoard's files.
 
     Raises:
-        ConfigError: the extra is not installed.
+        ConfigError: the extra is not installed, or cannot be imported.
     """
     try:
         from tensorboardX import SummaryWriter
@@ -247,7 +289,7 @@ def tensorboard_writer() -> Any:
         raise ConfigError(
             f"tensorboard: tensorboardX is not installed; {install_hint('tensorboard')}"
         ) from None
-    except Exception as error:  # an old one beside a new protobuf
+    except Exception as error:  # for instance with an old tensorboardX beside a new protobuf
         reason = next(iter(str(error).splitlines()), "")
         raise ConfigError(
             f"tensorboard: tensorboardX cannot be imported: {type(error).__name__}: {reason}"

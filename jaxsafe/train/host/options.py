@@ -1,4 +1,7 @@
-"""What a training run is: the options of the command line, resolved over a recipe from `configs/` and checked."""
+"""The options of a training run.
+
+The options of the command line are resolved over a recipe from `configs/`, and checked.
+"""
 
 from __future__ import annotations
 
@@ -25,62 +28,90 @@ from jaxsafe.train.ppo import MAX_COUNT, PPO
 from jaxsafe.types import Dimensionless, Positive
 
 Count = Annotated[int, Range(1, largest=MAX_COUNT)]
+"""A number of devices or episodes."""
+
 Steps = Annotated[int, Range(1, largest=10**15)]
-"""A number of environment steps, or an interval that users raise to mean never; double precision counts as far."""
+"""A number of environment steps. Users raise an interval of steps to mean never.
+
+Double precision counts as far as the largest one.
+"""
 
 MAX_SEEDS = 100_000
 MAX_LAYERS = 64
-"""Of a network. Each is compiled by itself."""
+"""Largest number of hidden layers of a network. Each layer is compiled by itself."""
 
 WORTHWHILE = 128
-"""Samples of a minibatch for each device that shares a seed, at least: fewer take less time than to exchange gradients."""
+"""Least number of samples of a minibatch for each device that shares a seed.
+
+Fewer samples take less time than exchanging their gradients.
+"""
 
 
 class TrainConfig(Component):
-    """Options of `python -m jaxsafe.train`; steps and episodes are per seed."""
+    """Options of `python -m jaxsafe.train`. Steps and episodes are counted for each seed."""
 
     preset: str = "features"
     algorithm: Literal["ppo", "ppo_lagrangian"] = "ppo"
-    cost_limit: Annotated[Dimensionless, Positive] | None = (
-        None  # of ppo_lagrangian: violating steps per episode
-    )
+    cost_limit: Annotated[Dimensionless, Positive] | None = None
+    """Number of violating steps that an episode may have, with `algorithm=ppo_lagrangian`."""
     seeds: Annotated[int, Range(1, largest=MAX_SEEDS)] = 1
-    seed: Annotated[int, Range(0, 2**31 - 1)] = 0  # the first; seeds=10 is seed … seed + 9
-    devices_per_seed: Count | None = (
-        None  # that share its environments; None: as many as there are, while each has work
-    )
+    seed: Annotated[int, Range(0, 2**31 - 1)] = 0
+    """The first seed. With `seeds=10` the seeds are seed … seed + 9."""
+    devices_per_seed: Count | None = None
+    """Number of devices that share the environments of a seed.
+
+    None stands for as many as there are, while each has work.
+    """
     steps: Steps = 500_000
-    actions: Literal["continuous", "discrete"] | None = None  # None: as the environment says
-    variant: Literal["paper", "released"] | None = None  # None: paper
-    rta: str | None = None  # None: as the environment says; default, or another preset of the task
-    rta_training: Literal["punished", "unpunished", "corrected"] | None = (
-        None  # None: punished, where there is a filter
-    )
-    out: str | None = None  # None: a new directory in runs/
-    eval_every: Steps | None = None  # steps; None: a tenth of the run
-    eval_episodes: Count = 100  # of each evaluation during training
-    episodes: Count = 1000  # of the evaluation at the end
-    checkpoint_every: Steps | None = None  # steps; None: a tenth of the run
-    log_every: Steps = 100  # every how many evaluation episodes one is logged step by step; before the first, some too
+    actions: Literal["continuous", "discrete"] | None = None
+    """The kind of actions. None stands for what the environment says."""
+    variant: Literal["paper", "released"] | None = None
+    """The variant of the environment. None stands for `paper`."""
+    rta: str | None = None
+    """The run time assurance: `default`, or another preset of the task.
+
+    None stands for what the environment says.
+    """
+    rta_training: Literal["punished", "unpunished", "corrected"] | None = None
+    """How training treats interventions of run time assurance.
+
+    `punished` adds a reward term for them, and `corrected` learns from the control that acted. None
+    stands for `punished`, where there is a filter.
+    """
+    out: str | None = None
+    """The run directory. None stands for a new directory in runs/."""
+    eval_every: Steps | None = None
+    """Number of steps between two evaluations. None stands for a tenth of the run."""
+    eval_episodes: Count = 100
+    """Number of episodes of each evaluation during training."""
+    episodes: Count = 1000
+    """Number of episodes of the evaluation at the end."""
+    checkpoint_every: Steps | None = None
+    """Number of steps between two checkpoints. None stands for a tenth of the run."""
+    log_every: Steps = 100
+    """One of so many evaluation episodes is logged step by step.
+
+    Some episodes are logged before the first evaluation too.
+    """
     tensorboard: bool = False
     agent: Agent = Agent()
     ppo: PPO = PPO()
 
     @property
     def num_updates(self) -> int:
-        """Updates of each seed: `steps`, rounded up to whole batches."""
+        """Number of updates of each seed: `steps`, rounded up to whole batches."""
         return -(-self.steps // self.ppo.batch_size)
 
     @property
     def shares(self) -> list[int]:
-        """Numbers of devices that may share a seed."""
+        """The numbers of devices that may share a seed."""
         if self.devices_per_seed is not None:
             return [self.devices_per_seed]
         minibatch = self.ppo.batch_size // self.ppo.num_minibatches
         return [count for count in self.ppo.shares if count == 1 or minibatch >= count * WORTHWHILE]
 
     def every(self, steps: int | None) -> int:
-        """An interval in updates; a tenth of the run without one."""
+        """Return an interval of environment steps in updates. None is a tenth of the run."""
         return (
             -(-self.num_updates // 10)
             if steps is None
@@ -89,10 +120,14 @@ class TrainConfig(Component):
 
 
 def resolve_all(options: Mapping[str, Any]) -> list[tuple[TrainConfig, Environment, str]]:
-    """Return what `resolve` returns; with `env=all`, for each task.
+    """Return what `resolve` returns. With `env=all` return it for each task.
+
+    Args:
+        options: those of `python -m jaxsafe.train`, as `resolve` takes them.
 
     Raises:
-        ConfigError: as `resolve`, with the task in front where the same options do not fit all tasks.
+        ConfigError: as `resolve`. Its message begins with the task if the same options do not fit
+            all tasks.
     """
     if options.get("env") != "all":
         return [resolve(options)]
@@ -108,14 +143,15 @@ def resolve_all(options: Mapping[str, Any]) -> list[tuple[TrainConfig, Environme
 def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     """Return the complete configuration of a training, its environment, and the environment's name.
 
-    Later wins: defaults, the task's recipe for the preset, the options.
+    The options win over the task's recipe for the preset, and that wins over the defaults.
 
     Args:
-        options: those of `python -m jaxsafe.train` by name, for instance
-            `{"env": "docking3d", "seeds": 10, "ppo.gamma": 0.99, "env.reward.delta_v.scale": -0.02}`.
+        options: the options of `python -m jaxsafe.train` by name, for instance `{"env":
+            "docking3d", "seeds": 10, "ppo.gamma": 0.99, "env.reward.delta_v.scale": -0.02}`.
 
     Raises:
-        ConfigError: naming the option, what was found and what is allowed.
+        ConfigError: an option is wrong. The message names the option, what was found and what is
+            allowed.
     """
     arguments = Arguments(dict(options))
     task = arguments.pop_text("env")
@@ -126,10 +162,8 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         if name in arguments.options:
             raise ConfigError(f"{name}: name one of its options, for instance {name}.{example}=…")
     config = TrainConfig()
-    for (
-        path,
-        value,
-    ) in arguments.options.items():  # first, so that a misspelt option is told before a slow start
+    # This comes first, so that a misspelt option is told before a slow start.
+    for path, value in arguments.options.items():
         config = set_path(config, path, value, to_value)
     env = make(task, actions=config.actions, variant=config.variant, rta=config.rta)
     told = config.rta_training or ("punished" if env.rta is not None else None)
@@ -191,13 +225,21 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
             f"agent.log_std: expected one number or {count}, one for each action, found {found}"
         )
     observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
-    jax.eval_shape(
-        lambda o: config.agent.inputs(env, o), observation
-    )  # refuses features that this task cannot have
+    # This refuses features that the task cannot have.
+    jax.eval_shape(lambda o: config.agent.inputs(env, o), observation)
     return config, env, short_name(task)
 
 
 def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfig:
+    """Return the configuration with what follows from its algorithm.
+
+    Args:
+        config: the configuration.
+        given: the options that the user gave.
+
+    Raises:
+        ConfigError: the options do not fit the algorithm.
+    """
     for path, instead in (
         ("agent.cost_critic", "algorithm=ppo_lagrangian"),
         ("ppo.cost_limit", "cost_limit=N"),
@@ -238,10 +280,17 @@ def _check_rta(config: TrainConfig, env: Environment) -> None:
 
 
 def recipe(task: str, preset: str | None) -> dict[str, Any]:
-    """Settings by dotted path from the recipe of a task; for an environment without one there is only `plain`.
+    """Return settings by dotted path from the recipe of a task.
+
+    For an environment without a recipe there is only the preset `plain`.
+
+    Args:
+        task: the name of the task.
+        preset: a preset of the recipe. None stands for `features`, or for `plain` if the recipe has
+            no `features`.
 
     Raises:
-        ConfigError: the preset is not in the file.
+        ConfigError: the recipe does not have the preset.
     """
     registered = TASKS.get(task.rpartition(":")[2])
     known = (
@@ -258,10 +307,10 @@ def recipe(task: str, preset: str | None) -> dict[str, Any]:
 
 
 def configs() -> Path:
-    """The directory of recipes: inside the installed package, or beside it in a checkout.
+    """Return the directory of recipes. It is in the installed package, or beside it in a checkout.
 
     Raises:
-        ConfigError: there is none, as in a zipped package.
+        ConfigError: there is no such directory, as in a zipped package.
     """
     package = Path(__file__).resolve().parents[2]
     for path in (package / "configs", package.parent / "configs"):
@@ -273,7 +322,7 @@ def configs() -> Path:
 
 
 def usage() -> str:
-    """Every option with its default and what it takes."""
+    """Return text that names every option, what it takes, and its default."""
     lines = ["usage: python -m jaxsafe.train env=TASK [key=value …]      or      resume=RUN", ""]
     lines += [
         "  distributed=true, beside either: this is one of several processes that srun or mpirun started"

@@ -1,4 +1,7 @@
-"""Reading checkpoints back: the structure comes from the configuration, the numbers from the files."""
+"""Reading checkpoints back.
+
+The structure comes from the configuration, and the numbers come from the files.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,11 @@ from jaxsafe.train.host.options import TrainConfig
 
 
 def structure(env: Environment, config: TrainConfig) -> dict[str, Any]:
-    """Shapes and types of what a checkpoint holds, [seeds]: the training state and the best parameters of each seed."""
+    """Return shapes and types of what a checkpoint holds.
+
+    That is the training state and the best parameters of each seed. All have a leading axis of
+    seeds.
+    """
 
     def seeds(keys: jax.Array) -> ppo.TrainState:
         return jax.vmap(lambda one: ppo.init(env, config.agent, config.ppo, one))(keys)
@@ -48,11 +55,17 @@ MAY_CHANGE = (
     "log_every",
     "tensorboard",
 )
-"""Options that may differ from those of a checkpoint: how long to train, on what, and when to look at it."""
+"""Options that may differ from those of a checkpoint.
+
+They say how long to train, on which devices, where the run is, and when to look at the training.
+"""
 
 
 def made_from(env: Environment, config: TrainConfig) -> dict[str, Any]:
-    """Return what a checkpoint is tied to, as JSON has it: the environment and the options that decide the numbers."""
+    """Return what a checkpoint belongs to, as data of JSON.
+
+    That is the environment, and the options that decide the numbers.
+    """
     content = json.loads(json.dumps(finite(run_directory.described(config, env))))
     for name in MAY_CHANGE:
         del content["training"][name]
@@ -62,7 +75,16 @@ def made_from(env: Environment, config: TrainConfig) -> dict[str, Any]:
 def restore(
     checkpoints: Checkpoints, step: int, env: Environment, config: TrainConfig
 ) -> tuple[Any, dict[str, Any]]:
-    """Read a checkpoint of this environment and configuration: its arrays and its facts.
+    """Read a checkpoint of this environment and configuration.
+
+    Args:
+        checkpoints: the checkpoints of the run.
+        step: environment steps of each seed at the checkpoint.
+        env: the environment of the run.
+        config: the configuration of the run.
+
+    Returns:
+        The arrays of the checkpoint, with the structure that `structure` returns, and its facts.
 
     Raises:
         ConfigError: it cannot be read, or another environment or configuration made it.
@@ -84,7 +106,10 @@ def restore(
 
 
 def _difference(before: Any, now: Any, place: str = "") -> tuple[str, Any, Any]:
-    """Return the dotted path to the first place where two trees of data differ, and what both have there."""
+    """Return where two trees of data first differ, as a dotted path, and what both have there.
+
+    The path is empty if they are equal.
+    """
     if isinstance(before, dict) and isinstance(now, dict):
         names = [*dict.fromkeys([*before, *now])]
         pairs = [(name, before.get(name, "nothing"), now.get(name, "nothing")) for name in names]
@@ -102,7 +127,15 @@ def _difference(before: Any, now: Any, place: str = "") -> tuple[str, Any, Any]:
 def load_params(
     mapper: SeedMapper, run: Path, config: TrainConfig, env: Environment, which: str
 ) -> tuple[Params, int]:
-    """The networks of every seed from a checkpoint, `last`, `best` or a step, and the step of that checkpoint.
+    """Return the networks of every seed from a checkpoint, and the step of that checkpoint.
+
+    Args:
+        mapper: the mapper of the seeds.
+        run: the run directory.
+        config: the configuration of the run.
+        env: the environment of the run.
+        which: the checkpoint: `last`, or a step. `best` stands for the best parameters of each seed
+            in the last checkpoint.
 
     Raises:
         ConfigError: there is no such checkpoint, or it cannot be read.

@@ -42,6 +42,7 @@ _ROWS = (
     ("episode_violation_severity_max", "violation severity, max", "%"),
     ("intervention_rate", "steps with an intervention", "%"),
 )
+"""The rows of the table: the name of a metric, its label, and its unit if that is a percentage."""
 
 _METRICS = {
     **{name: AMOUNT for name, *_ in _ROWS},
@@ -56,11 +57,11 @@ _METRICS = {
         SHARE,
     ),
 }
-"""The form of the values of each metric that every evaluation has."""
+"""The form of the values of each metric. Every evaluation has these metrics."""
 
 
 def finish(training: Training) -> dict[str, Any]:
-    """Evaluate, write policies and results, and return the results."""
+    """Evaluate a training, write its policies and results, and return the results."""
     config, env, name = training.config, training.env, training.name
     with training.clock:
         episodes = training.evaluate_finally()
@@ -76,14 +77,12 @@ def finish(training: Training) -> dict[str, Any]:
         "steps": training.step,
         "wall_s": round(training.clock.seconds, 2),
         "compile_s": round(training.compile_s, 2),
-        "training_computation_time": training.log.rows[-1][
-            "wall_s"
-        ],  # [s] to the last update, and all before it
+        # Seconds spent on everything up to the last update.
+        "training_computation_time": training.log.rows[-1]["wall_s"],
         "versions": versions(),
         "interaction_efficiency": _efficiency(training),
-        "training_cost": over_sound_seeds(
-            training.log.curve("cost")[1][-1].tolist(), left_out
-        ),  # violating steps
+        # In violating steps.
+        "training_cost": over_sound_seeds(training.log.curve("cost")[1][-1].tolist(), left_out),
         "evaluation": evaluation(env, episodes, left_out),
         **given_up(env, episodes),
         **diverged_seeds(training.diverged),
@@ -93,7 +92,7 @@ def finish(training: Training) -> dict[str, Any]:
 
 
 def facts(config: TrainConfig, env: Environment, name: str) -> dict[str, Any]:
-    """What every result says about the run that it belongs to."""
+    """Return what all results say about the run to which they belong."""
     how = {
         "env": name,
         "preset": config.preset,
@@ -106,7 +105,13 @@ def facts(config: TrainConfig, env: Environment, name: str) -> dict[str, Any]:
 def evaluation(
     env: Environment, episodes: dict[str, Episode], left_out: Collection[int] = ()
 ) -> dict[str, Any]:
-    """Return the metrics of each kind of evaluation. Seeds whose place is in `left_out` have None and are in no average."""
+    """Return the metrics of each kind of evaluation.
+
+    Args:
+        env: the environment.
+        episodes: the episodes of all seeds, by kind of evaluation.
+        left_out: places of seeds in the batch whose values are None and in no average.
+    """
     each = {kind: metrics_per_seed(env, one) for kind, one in episodes.items()}
     return {
         kind: {name: over_sound_seeds(values, left_out) for name, values in metrics.items()}
@@ -115,20 +120,36 @@ def evaluation(
 
 
 def over_sound_seeds(per_seed: Sequence[float | None], left_out: Collection[int]) -> dict[str, Any]:
-    """Return what `over_seeds` does, of the seeds that are not `left_out`; those stay among the values, as None."""
+    """Return what `over_seeds` returns, without some seeds.
+
+    Args:
+        per_seed: the values of all seeds.
+        left_out: places of the seeds to leave out. Their values are None among those of all seeds.
+    """
     shown = [None if place in left_out else value for place, value in enumerate(per_seed)]
     sound = [value for place, value in enumerate(per_seed) if place not in left_out]
     return {**over_seeds(sound or [None]), "per_seed": shown}
 
 
 def diverged_seeds(steps: Mapping[int, int | None]) -> dict[str, Any]:
-    """Return the entry of the results about seeds that diverged: each with the step by which it had. Empty if none has."""
+    """Return the entry of the results about seeds that diverged. It is empty if none has.
+
+    Args:
+        steps: for each of these seeds the step by which it had diverged, if that is known.
+    """
     found = [{"seed": seed, "step": step} for seed, step in sorted(steps.items())]
     return {"diverged": found} if found else {}
 
 
 def table(results: dict[str, Any], path: Path) -> str:
-    """The results as text: a column for each kind, mean and 95 % interval over seeds."""
+    """Return the results as text.
+
+    A column for each kind of evaluation has mean and 95 % interval over seeds.
+
+    Args:
+        results: the results.
+        path: the file that holds them.
+    """
     found = results["evaluation"]
     lines = [f"{headline(results)}, {results['steps']:,} steps each", ""]
     sound = results["seeds"] - len(results.get("diverged", ()))
@@ -167,7 +188,7 @@ def read_results(path: Path) -> dict[str, Any]:
     """Read the `results.json` of a run.
 
     Raises:
-        ConfigError: it is missing, broken, or not what a run writes.
+        ConfigError: the file is missing, broken, or not what a run writes.
     """
     results = read_json(path)
     check_results(results, str(path), training=True)
@@ -175,12 +196,15 @@ def read_results(path: Path) -> dict[str, Any]:
 
 
 def check_results(results: Any, place: str, training: bool) -> None:
-    """Raise a ConfigError unless these are the results of a training, or of an evaluation of its policies.
+    """Check the results of a training, or of an evaluation of its policies.
 
     Args:
         results: what a file holds.
-        place: of the results, for the message.
+        place: the place of the results, for the message.
         training: whether they are those of a training.
+
+    Raises:
+        ConfigError: they have another form.
     """
     check(
         results,
@@ -210,13 +234,19 @@ def check_results(results: Any, place: str, training: bool) -> None:
 
 
 def _metric(seeds: int, kind: Kind) -> dict[str, Any]:
-    """Return the form of a metric over seeds, some of which may not be known."""
+    """Return the form of a metric over seeds. The values of some seeds may be unknown."""
     unknown = kind | NULL
     return {"mean": unknown, "ci95": numbers(2, kind) | NULL, "per_seed": numbers(seeds, unknown)}
 
 
 def summary(runs: Mapping[str, Path]) -> str:
-    """A line for each of several runs, by name: success after training, and violating steps during and after it."""
+    """Return a line for each of several runs, given their directories by name.
+
+    A line has the success after training, and the violating steps during and after it.
+
+    Raises:
+        ConfigError: the results of a run cannot be read.
+    """
     heads = (
         "", "steps", "80 % after", "stochastic", "deterministic", "worst seed", "cost/episode", "cost of training",
         "wall [s]", "algorithm", "rta",
@@ -242,7 +272,8 @@ def summary(runs: Mapping[str, Path]) -> str:
                 known(cost, ".2f"),
                 known(results["training_cost"]["mean"], ",.0f"),
                 f"{results['wall_s']:.1f}",
-                str(results.get("algorithm", "–")),  # results of older versions do not say
+                # Results of older versions have neither of these.
+                str(results.get("algorithm", "–")),
                 str(results.get("rta", "–")),
             )
         )
@@ -250,7 +281,10 @@ def summary(runs: Mapping[str, Path]) -> str:
 
 
 def told_diverged(results: Mapping[str, Any]) -> list[str]:
-    """Say which seeds diverged, and that no average has them; nothing if none did."""
+    """Return a line that names the seeds that diverged and says that no average has them.
+
+    Return no line if none diverged.
+    """
     diverged = results.get("diverged", [])
     if not diverged:
         return []
@@ -261,7 +295,7 @@ def told_diverged(results: Mapping[str, Any]) -> list[str]:
 
 
 def least(metrics: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the worst seed's value of several metrics, of those seeds that have one."""
+    """Return the smallest value of any seed in several metrics, or None if none is known."""
     return min(
         (value for metric in metrics for value in metric["per_seed"] if value is not None),
         default=None,
@@ -269,12 +303,12 @@ def least(metrics: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def percent(value: float | None, digits: int) -> str:
-    """Return a share as text, a dash where there is none."""
+    """Return a share as text in percent, or a dash if it is None."""
     return known(value, f".{digits}%")
 
 
 def known(value: float | None, form: str) -> str:
-    """Return a number as text, a dash where it is not known."""
+    """Return a number as text, or a dash if it is not known."""
     return "–" if value is None else format(value, form)
 
 

@@ -1,4 +1,4 @@
-"""The run directory: made once, never overwritten, and complete enough to go on from."""
+"""The run directory. It is made once, never overwritten, and complete enough to go on from."""
 
 from __future__ import annotations
 
@@ -23,7 +23,13 @@ from jaxsafe.train.host.options import TrainConfig
 
 
 def create(config: TrainConfig, env: Environment, name: str) -> Path:
-    """Make a directory for a new run, by default the next free name in `runs/`, and write `config.yaml`.
+    """Make a directory for a new run, and write `config.yaml`.
+
+    Args:
+        config: the configuration of the run. Without `out`, the directory gets the next free name
+            in `runs/`.
+        env: the environment.
+        name: the name of the environment.
 
     Raises:
         ConfigError: `out` already holds something, or cannot be written.
@@ -31,9 +37,8 @@ def create(config: TrainConfig, env: Environment, name: str) -> Path:
     path = make(config.out, Path("runs"), name)
     content = {"env": name, **described(config, env), "commit": commit(), "versions": versions()}
     module = user_module(name)
-    if (
-        module
-    ):  # where the run is read, it registers the task, so that its filters are known by name
+    # Where the run is read, the module registers the task. So its filters are known by name.
+    if module:
         environment = content["environment"]
         content["environment"] = {"imports": [], **environment}
         content["environment"]["imports"] = sorted({module, *environment.get("imports", [])})
@@ -45,12 +50,19 @@ def create(config: TrainConfig, env: Environment, name: str) -> Path:
 
 
 def described(config: TrainConfig, env: Environment) -> dict[str, Any]:
-    """All that decides a training, as data."""
+    """Return all that decides a training, as data."""
     return {"training": to_data(config), "environment": jaxsafe.config.describe(env)}
 
 
 def create_all(resolved: Sequence[tuple[TrainConfig, Environment, str]]) -> Path:
-    """Make the directory of one run, or of several with a directory for each in it; see `create`."""
+    """Make the directory of one run, or one for several runs with a directory for each in it.
+
+    Args:
+        resolved: configuration, environment and name of each run, as `create` takes them.
+
+    Raises:
+        ConfigError: `out` already holds something, or cannot be written.
+    """
     if len(resolved) == 1:
         return create(*resolved[0])
     path = make(resolved[0][0].out, Path("runs"), "all")
@@ -60,7 +72,10 @@ def create_all(resolved: Sequence[tuple[TrainConfig, Environment, str]]) -> Path
 
 
 def runs(path: Path) -> list[Path]:
-    """The runs in a directory, first the tasks in their order, then others by name; the path itself if there are none."""
+    """Return the runs in a directory, or the path itself if it is a run or has none.
+
+    The tasks come first, in their order. Other runs follow by name.
+    """
     inside = sorted(found.parent for found in path.glob("*/config.yaml"))
     if (path / "config.yaml").is_file() or not inside:
         return [path]
@@ -71,9 +86,14 @@ def runs(path: Path) -> list[Path]:
 
 
 def make(out: str | None, parent: Path, name: str) -> Path:
-    """Make the directory that `out` asks for, or else the next free one of a name in `parent`.
+    """Make a directory for a run.
 
-    What a kill left of a file that was being written is nothing.
+    A file that a kill left half written does not count as something in the directory.
+
+    Args:
+        out: the directory that the user asks for. None stands for the next free one.
+        parent: where to look for the next free one.
+        name: the name of the next free one. It gets a number if it is taken.
 
     Raises:
         ConfigError: `out` already holds something, or cannot be written.
@@ -102,10 +122,14 @@ def make(out: str | None, parent: Path, name: str) -> Path:
 
 
 def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
-    """The configuration, environment and name of an existing run.
+    """Return the configuration of an existing run, its environment and the environment's name.
+
+    Args:
+        path: the run directory.
+        option: the option by which the user named it, for the message.
 
     Raises:
-        ConfigError: there is no run; `option` is what the user called it.
+        ConfigError: there is no run, or its `config.yaml` cannot be read.
     """
     if not (path / "config.yaml").is_file():
         beside = (
@@ -127,7 +151,7 @@ def read_content(path: Path) -> dict[str, Any]:
     """Return what `config.yaml` of a run holds, as data.
 
     Raises:
-        ConfigError: it cannot be read, or is that of no run.
+        ConfigError: it cannot be read, or does not belong to a run.
     """
     file = path / "config.yaml"
     content = yaml12.read(file)
@@ -139,7 +163,10 @@ def read_content(path: Path) -> dict[str, Any]:
 
 
 def discard_unused(path: Path) -> None:
-    """Remove a directory to which nothing has come since it was made: what failed before it began is no run."""
+    """Remove the directory of a run if nothing was written to it since it was made.
+
+    What failed before it began is no run.
+    """
     if all(
         found.is_dir() or found.name in ("config.yaml", "sweep.yaml") for found in path.rglob("*")
     ):
@@ -147,7 +174,10 @@ def discard_unused(path: Path) -> None:
 
 
 def _next_free(parent: Path, name: str) -> Path:
-    """Made here, so that no other process takes it too."""
+    """Make and return the next free directory.
+
+    It is made here, so that no other process takes it too.
+    """
     parent.mkdir(parents=True, exist_ok=True)
     number = 1
     while True:

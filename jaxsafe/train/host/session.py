@@ -1,8 +1,8 @@
-"""The host's side of training: compiled chunks of updates, and between them logs, evaluations and checkpoints.
+"""The session: compiled chunks of updates, and between them logs, evaluations and checkpoints.
 
-All that decides the numbers is a function of the configuration and of the state in the checkpoint, and chunks begin at the
-same updates however often a run is interrupted: a resumed run ends bit for bit where the uninterrupted one ends, if it has
-as many processor cores or accelerators as before.
+All that decides the numbers is a function of the configuration and of the state in the checkpoint.
+Chunks begin at the same updates however often a run is interrupted. So a resumed run ends bit for
+bit where the uninterrupted one ends, if it has as many processor cores or accelerators as before.
 """
 
 from __future__ import annotations
@@ -37,16 +37,19 @@ from jaxsafe.train.train import STATE, programs
 
 
 class Clock:
-    """Seconds spent on a run, over all its sessions: those inside `with`. Runs of a command have one each."""
+    """A clock that counts the seconds spent on a run, over all its sessions.
+
+    Time counts inside `with`. Each run of a command has a clock of its own.
+    """
 
     def __init__(self, spent: float = 0.0) -> None:
-        """Begin with what was spent already."""
+        """Begin with the seconds that were spent already."""
         self.spent = spent
         self._since: float | None = None
 
     @property
     def seconds(self) -> float:
-        """So far."""
+        """The seconds spent so far."""
         return self.spent + (0.0 if self._since is None else time.monotonic() - self._since)
 
     def __enter__(self) -> None:
@@ -68,15 +71,15 @@ class Training:
         clock: Clock,
         checkpoints: Path | None = None,
     ) -> None:
-        """Say what to train, as yet without compiling anything.
+        """Set up a training without compiling anything yet.
 
         Args:
-            config: of the run.
-            env: of the run.
-            name: of the environment.
+            config: the configuration of the run.
+            env: the environment of the run.
+            name: the name of the environment.
             run: the directory for logs and results.
-            clock: with what was spent on the run before.
-            checkpoints: the run directory that holds the checkpoints, if it is another.
+            clock: a clock that begins with what was spent on the run before.
+            checkpoints: the run directory that holds the checkpoints, if it is another one.
         """
         self.config, self.env, self.name, self.run, self.clock = config, env, name, run, clock
         self.mapper = SeedMapper(config.seeds, config.shares)
@@ -89,13 +92,19 @@ class Training:
         self.checkpoints = Checkpoints(checkpoints or run, create=True)
         self.compile_s = 0.0
         self.updates = 0
-        self.diverged: dict[
-            int, int
-        ] = {}  # by seed, the step after which its networks or returns were not finite
+        # For each seed that diverged, the step after which its networks or returns were not finite.
+        self.diverged: dict[int, int] = {}
         self._prepared = False
 
     def prepare(self) -> None:
-        """Have the state, fresh or from the latest checkpoint, and begin to compile; the second call does nothing."""
+        """Make the state, fresh or from the latest checkpoint, and begin to compile.
+
+        A second call does nothing.
+
+        Raises:
+            ConfigError: the training does not fit into memory, or the logs or checkpoints of the
+                run cannot be read.
+        """
         if self._prepared:
             return
         with self.clock, without_collection():
@@ -112,16 +121,26 @@ class Training:
 
     @property
     def step(self) -> int:
-        """Environment steps that each seed has taken."""
+        """Number of environment steps that each seed has taken."""
         return self.updates * self.config.ppo.batch_size
 
     @property
     def num_steps(self) -> int:
-        """Environment steps that each seed is to take."""
+        """Number of environment steps that each seed is to take."""
         return self.config.num_updates * self.config.ppo.batch_size
 
     def train(self) -> bool:
-        """Train to the end; False if the user asked to stop meanwhile. Either way the state is in a checkpoint."""
+        """Train to the end, or until the user asks to stop.
+
+        The state is in a checkpoint either way.
+
+        Returns:
+            False if the user asked to stop.
+
+        Raises:
+            ConfigError: the program does not fit into memory, or logs or a checkpoint cannot be
+                written.
+        """
         display = Display(self.num_steps, self.step)
         with self.clock:
             self._await_compiled()
@@ -129,7 +148,8 @@ class Training:
                 self._record(1, final=False)
         display.start()
         with self.clock, _StopRequest() as stop:
-            stopping = False  # as all hosts agree: a signal may come to one of them at any time
+            # All hosts agree on this, because a signal may come to one of them at any time.
+            stopping = False
             while self.updates < self.config.num_updates and not stopping:
                 before, (self.state, curves) = self.updates, self.advance(self.shared, self.state)
                 self.updates = min(before + self.chunk, self.config.num_updates)
@@ -143,25 +163,30 @@ class Training:
                 stopping = processes.any_process(stop.requested)
                 if self._due(before, self.config.checkpoint_every) or stopping:
                     self._save()
-            stopping = stopping or processes.any_process(
-                stop.requested
-            )  # it may have come with the last of them
+            # A signal may have come with the last chunk.
+            stopping = stopping or processes.any_process(stop.requested)
         display.close()
         self.log.close()
         return not stopping
 
     def params(self) -> list[Any]:
-        """The networks of each seed, on the host."""
+        """Return the networks of each seed, on the host. They are the averaged ones."""
         stacked = self.mapper.gather(self.state.average)
         return [jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(self.config.seeds)]
 
     def prepare_evaluation(self) -> None:
-        """Compile, while other work goes on, what `evaluate_finally` needs."""
+        """Compile what `evaluate_finally` needs, while other work goes on."""
         with self.clock, without_collection():
             self.evaluator.prepare(self.state.average)
 
     def evaluate_finally(self) -> dict[str, Episode]:
-        """The last evaluation on the way, then that which stands in the results, by kind; the rows go to the logs."""
+        """Run the last periodic evaluation, then the one that stands in the results.
+
+        The rows of both go to the logs.
+
+        Returns:
+            The episodes of the evaluation in the results, by kind.
+        """
         self._evaluate()
         self._save()
         found = {}
@@ -171,7 +196,7 @@ class Training:
         return found
 
     def _begin(self) -> None:
-        """Have the state, fresh or restored, while all programs are compiled side by side."""
+        """Make the state, fresh or restored, while all programs are compiled side by side."""
         content = structure(self.env, self.config)
         each = (
             memory.size(content) // self.config.seeds * self.mapper.padded // self.mapper.mesh.size
@@ -182,21 +207,24 @@ class Training:
         begin, keys = time.monotonic(), self.mapper.keys(self.config.seed)
         fresh, advance = programs(self.mapper, self.chunk, self.config.num_updates)
         like = self.mapper.like(jax.eval_shape(fresh, self.shared, keys), STATE)
-        self.advance = CompiledInBackground(advance, self.shared, like)  # the longest first
+        # The program that takes longest to compile comes first.
+        self.advance = CompiledInBackground(advance, self.shared, like)
         if self.checkpoints.steps:
             self._restore()
         else:
             self.state = fresh(self.shared, keys)
             never = self.mapper.place(np.full(self.config.seeds, -1.0, np.float32))
             self.best = {"params": self.state.average, "success": never}
-        if (
-            self.config.every(self.config.eval_every) < self.config.num_updates
-        ):  # else it can wait for the cores
+        # Without an evaluation before the end, its program can wait until the cores are free.
+        if self.config.every(self.config.eval_every) < self.config.num_updates:
             self.evaluator.prepare(like.average)
         self.compile_s += time.monotonic() - begin
 
     def _restore(self) -> None:
-        """Go back to the newest checkpoint that the progress log covers: a loss of power may have cut off its end."""
+        """Go back to the newest checkpoint that the progress log covers.
+
+        A loss of power may have cut off the end of the log.
+        """
         steps = self.checkpoints.steps
         rows = Counter(row["step"] for row in read_progress(self.run))
         done = {step: sum(count for at, count in rows.items() if at <= step) for step in steps}
@@ -205,9 +233,8 @@ class Training:
             for step in steps
             if done[step] == step // self.config.ppo.batch_size * self.config.seeds
         ]
-        newest = max(
-            covered, default=steps[-1]
-        )  # without one, the log is refused when it is opened
+        # If the log covers no checkpoint, it is refused when it is opened.
+        newest = max(covered, default=steps[-1])
         if newest != steps[-1]:
             print(
                 f"{self.run / 'progress.jsonl'} ends before the checkpoint of step {steps[-1]:,}: going on from {newest:,}"
@@ -221,7 +248,10 @@ class Training:
         self.clock.spent += facts["wall_s"]
 
     def _keep_copies(self) -> None:
-        """If the logs are further on than a kill can explain, checkpoints are missing: copy the logs, then cut."""
+        """Copy the logs, before they are cut, if checkpoints are missing.
+
+        Checkpoints are missing if the logs are further on than a kill can explain.
+        """
         interval = self.config.every(self.config.checkpoint_every)
         due = (self.updates // interval + 1) * interval
         reached = -(-due // self.chunk) * self.chunk * self.config.ppo.batch_size
@@ -233,10 +263,14 @@ class Training:
                 shutil.copy(log, log.with_suffix(".jsonl.bak"))
 
     def _await_compiled(self) -> None:
-        """Wait for the program of the updates, and see whether it fits."""
+        """Wait for the program of the updates, and check that it fits into memory.
+
+        Raises:
+            ConfigError: it does not fit.
+        """
         begin, compiled = time.monotonic(), self.advance.compiled()
         self.compile_s += time.monotonic() - begin
-        has = memory.size(self.state) // self.mapper.mesh.size  # which is there already
+        has = memory.size(self.state) // self.mapper.mesh.size  # the state is in memory already
         memory.require(
             memory.footprint(compiled) - has,
             self.mapper.num_local_devices,
@@ -245,19 +279,30 @@ class Training:
         )
 
     def _due(self, before: int, every: int | None) -> bool:
-        """Whether a chunk that began at update `before` passed a multiple of the interval or the end."""
+        """Return whether a chunk passed a multiple of an interval, or the end.
+
+        Args:
+            before: the update at which the chunk began.
+            every: the interval in environment steps, as `TrainConfig.every` takes it.
+        """
         interval = self.config.every(every)
         return (
             self.updates // interval > before // interval or self.updates == self.config.num_updates
         )
 
     def _early_due(self) -> bool:
-        """Whether to log an episode to see early learning: after 0, 1, 2, 4, … chunks, if evaluations come later."""
+        """Return whether to log an episode that shows early learning.
+
+        That is after 0, 1, 2, 4, … chunks of updates, if evaluations come later.
+        """
         chunks, first = self.updates // self.chunk, self.config.every(self.config.eval_every)
         return self.updates < first < self.config.num_updates and chunks & (chunks - 1) == 0
 
     def _known(self, row: dict[str, Any]) -> bool:
-        """Whether training, as it goes on from here, will not write this row of the evaluations."""
+        """Return whether a row of the evaluations is kept.
+
+        It is kept if training, as it goes on from here, will not write it again.
+        """
         return self.updates > 0 and row["step"] <= self.step and row["step"] < self.num_steps
 
     def _write_progress(self, curves: dict[str, jax.Array], count: int, display: Display) -> None:
@@ -274,7 +319,7 @@ class Training:
         display.show(self.step, rows[-self.config.seeds :])
 
     def _find_diverged(self, rows: list[dict[str, Any]]) -> list[int]:
-        """Note the seeds that have diverged according to rows of the progress log; return those that are new."""
+        """Note the seeds that have diverged by rows of the progress log. Return the new ones."""
         before = set(self.diverged)
         for row in rows:
             if row.get("diverged"):
@@ -282,7 +327,11 @@ class Training:
         return [seed for seed in self.diverged if seed not in before]
 
     def _evaluate(self) -> None:
-        """Periodic evaluation: rows, one logged episode, and the best parameters of each seed so far."""
+        """Run a periodic evaluation.
+
+        It writes rows, logs some episodes step by step, and keeps the best parameters of each seed
+        so far.
+        """
         episodes = self._run_episodes("deterministic", self.config.eval_episodes, final=False)
         self._record(self.config.eval_episodes, final=False)
         rate = np.mean(np.asarray(episodes.outcome) == self.env.success, axis=1)
@@ -304,7 +353,7 @@ class Training:
         return episodes
 
     def _record(self, num_episodes: int, final: bool) -> None:
-        """Log some episodes of the first seed that has not diverged step by step."""
+        """Log some episodes step by step. The first seed that has not diverged flies them."""
         index = next(
             (i for i in range(self.config.seeds) if self.config.seed + i not in self.diverged), None
         )
@@ -325,7 +374,8 @@ class Training:
 
     def _save(self) -> None:
         for log in self.run.glob("*.jsonl"):
-            sync(log)  # a checkpoint outlives a loss of power, so the rows before it must
+            # A checkpoint outlives a loss of power, so the rows before it must outlive it too.
+            sync(log)
         facts = {
             "updates": self.updates,
             "wall_s": self.clock.seconds,
@@ -339,16 +389,20 @@ class Training:
 
 @jax.jit
 def _keep_best(best: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
-    """Per seed, whichever succeeded more often; the later one if equal, but never one that is not finite."""
+    """Return for each seed the parameters that succeeded more often, and the later ones if equal.
+
+    Parameters that are not finite are never taken.
+    """
     finite = jax.tree.map(lambda x: jnp.all(jnp.isfinite(x), axis=range(1, x.ndim)), now["params"])
     better = (now["success"] >= best["success"]) & jax.tree.reduce(jnp.logical_and, finite)
     return choose(better, now, best)
 
 
 class _StopRequest:
-    """Turns the first Ctrl-C or termination into a flag, so that the run stops between chunks; the second acts as usual.
+    """A context that turns the first Ctrl-C or termination into a flag.
 
-    Signals come to the main thread: a training in another one leaves them alone.
+    So the run stops between chunks. The second signal acts as usual. Signals come to the main
+    thread, and a training in another thread leaves them alone.
     """
 
     def __enter__(self) -> _StopRequest:
