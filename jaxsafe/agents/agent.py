@@ -51,8 +51,8 @@ class Agent(Component):
     critic_sees_totals: bool = False
     """Whether the critic also sees what each reward term has summed to in the episode.
 
-    What a term will still pay may depend on its sum, and the observation hides the sum. Only
-    training needs the critic, so the policy never sees it.
+    What a term will still pay may depend on its sum, and the observation hides the sum. The policy
+    never sees it, because only training needs the critic.
     """
     cost_critic: bool = False
     """Whether a second critic expects the cost to come. `algorithm=ppo_lagrangian` needs it."""
@@ -108,7 +108,7 @@ class Agent(Component):
         out, points = mlp(params["actor"], inputs), env.num_action_points
         if not points:
             return Gaussian(mean=out, log_std=params["log_std"])
-        # The sharpness is first that of each actuator, then that of each of its logits.
+        # There is one sharpness for each actuator. Below it is repeated for each of its logits.
         sharpness = (self.prior_std * jnp.exp(-params["log_std"])) ** 2
         sharpness = jnp.sum(
             sharpness[:, None] * np.repeat(np.eye(len(points), dtype=np.float32), points, axis=1),

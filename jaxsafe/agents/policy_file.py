@@ -69,7 +69,7 @@ _PRETRAINED = Path(__file__).resolve().parent.parent / "pretrained"
 
 
 class SavedPolicy(NamedTuple):
-    """What a policy file holds."""
+    """The content of a policy file."""
 
     env: Environment
     agent: Agent
@@ -127,7 +127,7 @@ def load_policy(policy: str | os.PathLike, deterministic: bool = True) -> Policy
     """
     saved = read_policy(find_policy(policy))
     act = saved.agent.policy(saved.env, saved.params, deterministic)
-    # Compiled once. Otherwise each call would work out anew what the inputs are.
+    # It is compiled, or each call would work out the inputs of the networks anew.
     return jax.jit(act)
 
 

@@ -143,7 +143,7 @@ class Transition(NamedTuple):
 
 
 class Batch(NamedTuple):
-    """What the loss needs of each sample. All fields are [samples, …]."""
+    """The samples of an update, with what the loss needs of each."""
 
     inputs: Array
     totals: Mapping[str, Array]
@@ -352,11 +352,11 @@ def gae(
     that terminated does not.
 
     Args:
-        reward: rewards r [t, n].
-        value: values V(s_t) [t, n].
-        next_value: values V(s_{t+1}) [t, n].
-        terminated: whether the task ended with the step, [t, n].
-        done: whether the episode ended with the step, terminated or truncated, [t, n].
+        reward: rewards r [t, …].
+        value: values V(s_t) [t, …].
+        next_value: values V(s_{t+1}) [t, …].
+        terminated: whether the task ended with the step, [t, …].
+        done: whether the episode ended with the step, terminated or truncated, [t, …].
         gamma: the discount factor γ.
         lam: λ of the estimates.
     """

@@ -166,7 +166,8 @@ def progress_rows(
 ) -> list[dict]:
     """Return the rows of the progress log for a chunk of updates, update by update.
 
-    What is not known, or belongs to a seed that has diverged, is None.
+    The measured columns are None before the first episode of a seed has ended, and once the seed
+    has diverged.
 
     Args:
         env: the environment.

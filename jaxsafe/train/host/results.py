@@ -81,7 +81,7 @@ def finish(training: Training) -> dict[str, Any]:
         "training_computation_time": training.log.rows[-1]["wall_s"],
         "versions": versions(),
         "interaction_efficiency": _efficiency(training),
-        # In violating steps.
+        # The number of violating steps in the whole training.
         "training_cost": over_sound_seeds(training.log.curve("cost")[1][-1].tolist(), left_out),
         "evaluation": evaluation(env, episodes, left_out),
         **given_up(env, episodes),

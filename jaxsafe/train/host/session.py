@@ -138,8 +138,8 @@ class Training:
             False if the user asked to stop.
 
         Raises:
-            ConfigError: the program does not fit into memory, or logs or a checkpoint cannot be
-                written.
+            ConfigError: the program does not fit into memory, the progress log was begun with other
+                columns, or a checkpoint cannot be written.
         """
         display = Display(self.num_steps, self.step)
         with self.clock:
@@ -215,7 +215,7 @@ class Training:
             self.state = fresh(self.shared, keys)
             never = self.mapper.place(np.full(self.config.seeds, -1.0, np.float32))
             self.best = {"params": self.state.average, "success": never}
-        # Without an evaluation before the end, its program can wait until the cores are free.
+        # If the only evaluation is at the end, its program can wait until the cores are free.
         if self.config.every(self.config.eval_every) < self.config.num_updates:
             self.evaluator.prepare(like.average)
         self.compile_s += time.monotonic() - begin
