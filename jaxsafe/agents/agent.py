@@ -88,7 +88,7 @@ class Agent(Component):
     def inputs(
         self, env: Environment, observation: Float[Array, "*batch o"]
     ) -> Float[Array, "*batch i"]:
-        """Return what the networks see of observations [*batch, o]: inputs [*batch, i].
+        """Return what the networks see of observations `[*batch, o]`: inputs `[*batch, i]`.
 
         Raises:
             ConfigError: the environment does not observe what the features need.
@@ -103,7 +103,7 @@ class Agent(Component):
         Args:
             env: the environment.
             params: the parameters.
-            inputs: what `inputs` returns, [*batch, i].
+            inputs: what `inputs` returns, `[*batch, i]`.
         """
         out, points = mlp(params["actor"], inputs), env.num_action_points
         if not points:
@@ -125,8 +125,8 @@ class Agent(Component):
         """Return what the critic sees: the inputs of the actor, and perhaps the totals.
 
         Args:
-            inputs: the inputs of the actor, [*batch, i].
-            reward_totals: what each reward term has summed to in the episode, [*batch] each. They
+            inputs: the inputs of the actor, `[*batch, i]`.
+            reward_totals: what each reward term has summed to in the episode, `[*batch]` each. They
                 are seen with `critic_sees_totals`.
         """
         # The totals are sorted by name, because the order of a dict does not survive compilation.
@@ -138,13 +138,13 @@ class Agent(Component):
     def value(
         self, params: Params, critic_inputs: Float[Array, "*batch c"]
     ) -> Float[Array, "*batch"]:
-        """Return the critic's V(s) [*batch], given what `critic_inputs` returns."""
+        """Return the critic's V(s) `[*batch]`, given what `critic_inputs` returns."""
         return mlp(params["critic"], critic_inputs)[..., 0]
 
     def cost_rate(
         self, params: Params, critic_inputs: Float[Array, "*batch c"]
     ) -> Float[Array, "*batch"]:
-        """Return the cost critic's (1 − γ)·V_C(s) [*batch], given what `critic_inputs` returns.
+        """Return the cost critic's (1 − γ)·V_C(s) `[*batch]`, given what `critic_inputs` returns.
 
         It is what a step costs on the average from here on, whatever the horizon.
         """
@@ -164,7 +164,7 @@ class Agent(Component):
             env: the environment.
             params: the parameters.
             key: a PRNG key.
-            observation: observations [*batch, o].
+            observation: observations `[*batch, o]`.
             deterministic: whether the actions are the mode of the distribution. Otherwise they are
                 a sample.
         """
@@ -185,7 +185,7 @@ def mlp(layers: Sequence[Params], x: Float[Array, "*batch i"]) -> Float[Array, "
 
     Args:
         layers: for each layer its `kernel` [inputs, outputs] and `bias` [outputs].
-        x: the inputs [*batch, i].
+        x: the inputs `[*batch, i]`.
     """
     for layer in layers[:-1]:
         x = jnp.tanh(_affine(layer, x))

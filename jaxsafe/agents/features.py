@@ -39,10 +39,10 @@ def docking(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Ar
 
     Args:
         env: the environment, which must observe a position.
-        observation: observations [*batch, o].
+        observation: observations `[*batch, o]`.
 
     Returns:
-        The observation and its features, [*batch, i].
+        The observation and its features, `[*batch, i]`.
 
     Raises:
         ConfigError: the environment does not observe a position.
@@ -67,10 +67,10 @@ def approach(env: Environment, observation: Float[Array, "*batch o"]) -> Float[A
 
     Args:
         env: the environment, which must observe position, velocity, speed and speed limit.
-        observation: observations [*batch, o].
+        observation: observations `[*batch, o]`.
 
     Returns:
-        The observation and its features, [*batch, i].
+        The observation and its features, `[*batch, i]`.
 
     Raises:
         ConfigError: the environment does not observe one of them.
@@ -116,10 +116,10 @@ def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Arr
         env: the environment, which must observe the magnitudes and directions of the positions of
             lead and rejoin point and of both velocities, and in space also flight path angle and
             roll.
-        observation: observations [*batch, o].
+        observation: observations `[*batch, o]`.
 
     Returns:
-        The observation and its features, [*batch, i].
+        The observation and its features, `[*batch, i]`.
 
     Raises:
         ConfigError: the environment does not observe one of them.
@@ -204,7 +204,7 @@ def _elements(
 
     Args:
         env: the environment.
-        observation: observations [*batch, o].
+        observation: observations `[*batch, o]`.
         name: name of the element.
         features: name of the features that need it, for the message.
 
