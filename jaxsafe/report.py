@@ -4,5 +4,6 @@ import sys
 
 if __name__ == "__main__":
     sys.exit(
-        "error: jaxsafe.report: in a clone of jaxsafe, python benchmarks/baselines trains, evaluates and reports"
+        "error: jaxsafe.report: in a clone of jaxsafe, python benchmarks/baselines trains, "
+        "evaluates and reports"
     )

@@ -119,7 +119,8 @@ def _check(path: Path, env: Environment, network: Network, weights: Mapping[str,
         ) from None
     if found.shape != (wanted,):
         raise ConfigError(
-            f"{path}: expected {wanted} outputs ({', '.join(env.action_names)}), found shape {found.shape}"
+            f"{path}: expected {wanted} outputs ({', '.join(env.action_names)}), "
+            f"found shape {found.shape}"
         )
     if not jnp.issubdtype(found.dtype, jnp.floating):
         raise ConfigError(f"{path}: expected outputs that are real numbers, found {found.dtype}")

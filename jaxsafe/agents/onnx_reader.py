@@ -75,7 +75,8 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
     inputs = [one for one in graph.input if one.name not in weights]
     if len(inputs) != 1 or len(graph.output) != 1:
         raise ConfigError(
-            f"{path}: expected one input and one output, found {len(inputs)} and {len(graph.output)}"
+            f"{path}: expected one input and one output, "
+            f"found {len(inputs)} and {len(graph.output)}"
         )
     [declared] = inputs
     kind = declared.type.tensor_type.elem_type
@@ -251,14 +252,37 @@ def _clip(x: list[Any], a: Mapping[str, Any]) -> Array:
 
 
 _ELEMENTWISE = {
-    "Add": jnp.add, "Sub": jnp.subtract, "Mul": jnp.multiply, "Pow": jnp.power,
-    "Neg": jnp.negative, "Exp": jnp.exp, "Log": jnp.log, "Sqrt": jnp.sqrt, "Tanh": jnp.tanh,
-    "Abs": jnp.abs, "Sin": jnp.sin, "Cos": jnp.cos, "Atan": jnp.arctan, "Relu": jax.nn.relu, "Sigmoid": jax.nn.sigmoid,
-    "Softplus": jax.nn.softplus, "Identity": lambda x: x, "Where": jnp.where, "Not": jnp.logical_not,
-    "And": jnp.logical_and, "Or": jnp.logical_or, "Less": jnp.less, "Greater": jnp.greater, "LessOrEqual": jnp.less_equal,
-    "GreaterOrEqual": jnp.greater_equal, "Equal": jnp.equal, "Sign": jnp.sign, "Round": jnp.round, "Floor": jnp.floor,
+    "Add": jnp.add,
+    "Sub": jnp.subtract,
+    "Mul": jnp.multiply,
+    "Pow": jnp.power,
+    "Neg": jnp.negative,
+    "Exp": jnp.exp,
+    "Log": jnp.log,
+    "Sqrt": jnp.sqrt,
+    "Tanh": jnp.tanh,
+    "Abs": jnp.abs,
+    "Sin": jnp.sin,
+    "Cos": jnp.cos,
+    "Atan": jnp.arctan,
+    "Relu": jax.nn.relu,
+    "Sigmoid": jax.nn.sigmoid,
+    "Softplus": jax.nn.softplus,
+    "Identity": lambda x: x,
+    "Where": jnp.where,
+    "Not": jnp.logical_not,
+    "And": jnp.logical_and,
+    "Or": jnp.logical_or,
+    "Less": jnp.less,
+    "Greater": jnp.greater,
+    "LessOrEqual": jnp.less_equal,
+    "GreaterOrEqual": jnp.greater_equal,
+    "Equal": jnp.equal,
+    "Sign": jnp.sign,
+    "Round": jnp.round,
+    "Floor": jnp.floor,
     "MatMul": jnp.matmul,
-}  # fmt: skip
+}
 _OPERATORS: Mapping[str, Callable[[list[Any], Mapping[str, Any]], Any]] = {
     **{name: lambda x, a, f=function: f(*x) for name, function in _ELEMENTWISE.items()},
     "Div": _divide,

@@ -99,7 +99,8 @@ def read_policy(path: str | os.PathLike) -> SavedPolicy:
     )
     if len(agent.hidden) > MAX_LAYERS:
         raise ConfigError(
-            f"{path}: agent.hidden: expected at most {MAX_LAYERS} layers, found {len(agent.hidden):,}"
+            f"{path}: agent.hidden: expected at most {MAX_LAYERS} layers, "
+            f"found {len(agent.hidden):,}"
         )
     try:
         like = jax.eval_shape(lambda key: agent.init(key, env), jax.random.key(0))
@@ -158,7 +159,8 @@ def find_policy(policy: str | os.PathLike) -> Path:
     name = str(policy).removeprefix(PRETRAINED)
     if name not in known:
         raise ConfigError(
-            f"policy: {str(policy)!r} is no .npz file and not pretrained; choose from {nearest(name, known)}"
+            f"policy: {str(policy)!r} is no .npz file and not pretrained; "
+            f"choose from {nearest(name, known)}"
         )
     return known[name]
 

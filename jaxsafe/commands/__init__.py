@@ -19,7 +19,7 @@ COMMANDS = {
 
 
 def main() -> None:
-    """Run `jaxsafe COMMAND [key=value …]`, which is `python -m jaxsafe.COMMAND` in fewer letters."""
+    """Run `jaxsafe COMMAND [key=value …]`, a shorter form of `python -m jaxsafe.COMMAND`."""
     name, *words = sys.argv[1:] or ["help"]
     if name in ("help", "-h", "--help"):
         width = max(map(len, COMMANDS))

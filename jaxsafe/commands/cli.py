@@ -25,7 +25,10 @@ There is no result for such a seed.
 """
 
 
-IMPORTS = "  imports=false          refuse files that name modules to import: that runs the code of whoever wrote them"
+IMPORTS = (
+    "  imports=false          refuse files that name modules to import: "
+    "that runs the code of whoever wrote them"
+)
 """Help text of an option that every command has."""
 
 

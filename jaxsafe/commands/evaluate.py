@@ -44,7 +44,8 @@ def main(argv: Sequence[str]) -> int:
         raise ConfigError(f"render: found {render!r}; choose from gif")
     if elsewhere and deterministic is False:
         raise ConfigError(
-            "deterministic: expected true or nothing, found False; a policy from elsewhere acts by its mode"
+            "deterministic: expected true or nothing, found False; "
+            "a policy from elsewhere acts by its mode"
         )
     deterministic = True if elsewhere else deterministic
     kinds = {
@@ -79,19 +80,26 @@ def usage() -> str:
     return (
         "usage: python -m jaxsafe.evaluate run=RUN [key=value …]\n\n"
         "  run=RUN                a run directory, a policy file (.npz), or pretrained/TASK\n"
-        "  run=FILE env=TASK      a policy from elsewhere: .onnx, or .npz with kernel_0, bias_0, … (activation=tanh);\n"
+        "  run=FILE env=TASK      a policy from elsewhere: .onnx, "
+        "or .npz with kernel_0, bias_0, … (activation=tanh);\n"
         "                         actions=discrete if it gives logits; it acts by its mode\n"
-        "  env=TASK|FILE.yaml     another environment of the same observation and action (default: that of the training)\n"
-        "  variant=paper|released   what the variants of a task differ in (default as in training)\n"
+        "  env=TASK|FILE.yaml     another environment of the same observation and action "
+        "(default: that of the training)\n"
+        "  variant=paper|released   what the variants of a task differ in "
+        "(default as in training)\n"
         "  episodes=N             episodes of each seed (default 1000)\n"
-        "  seed=N                 evaluation key: other starts and other noise (default 0, as in the run's own results)\n"
-        "  checkpoint=last|best|N best is per seed by success in the evaluations during training (default last)\n"
+        "  seed=N                 evaluation key: other starts and other noise "
+        "(default 0, as in the run's own results)\n"
+        "  checkpoint=last|best|N best is per seed by success "
+        "in the evaluations during training (default last)\n"
         "  rta=none|default|…     run time assurance (default as in training)\n"
         "  rta=FILE.yaml          a filter, or an environment whose filter is taken\n"
         "  deterministic=true|false   one kind only (default both)\n"
         "  render=gif             draw the first episode of the first seed as an animation\n"
-        "  env.PATH=VALUE         change the environment, for instance 'env.deputy.start.position.distance=[1000,1000]'\n"
-        "  out=DIR                where to write (default: a new directory in RUN/evaluations, or in evaluations/)"
+        "  env.PATH=VALUE         change the environment, "
+        "for instance 'env.deputy.start.position.distance=[1000,1000]'\n"
+        "  out=DIR                where to write "
+        "(default: a new directory in RUN/evaluations, or in evaluations/)"
     )
 
 

@@ -86,11 +86,13 @@ def main(argv: Sequence[str]) -> int:
             or target.with_suffix(".onnx").resolve() == Path(run).resolve()
         ):
             raise ConfigError(
-                f"out: expected NAME.vnnlib, for which NAME.onnx is written too and is not {run}, found {target}"
+                "out: expected NAME.vnnlib, for which NAME.onnx is written too "
+                f"and is not {run}, found {target}"
             )
         if not saved.env.constraints:
             raise ConfigError(
-                "format: vnnlib asks whether a safety constraint holds, and this environment has none"
+                "format: vnnlib asks whether a safety constraint holds, "
+                "and this environment has none"
             )
         loops = (
             functions.closed_loop(saved, steps, unrolled=True),
@@ -155,7 +157,8 @@ def _policy(arguments: Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy
         known = {int(stem) for stem in stems if stem.isdecimal()}
         if not known:
             raise ConfigError(
-                f"run: {run} has no policies yet; finish it with: python -m jaxsafe.train resume={run}"
+                f"run: {run} has no policies yet; "
+                f"finish it with: python -m jaxsafe.train resume={run}"
             )
         if seed not in known:
             raise ConfigError(
@@ -200,7 +203,8 @@ def _require_finite(run: str, saved: SavedPolicy | ForeignPolicy) -> None:
         if wrong(np.asarray(leaf, np.float64)).any():
             name = jax.tree_util.keystr(path, simple=True, separator="/")
             raise ConfigError(
-                f"{run}: {name}: not all parameters are finite numbers, so there is no policy to export"
+                f"{run}: {name}: not all parameters are finite numbers, "
+                "so there is no policy to export"
             )
 
 
@@ -275,7 +279,8 @@ def _box(names: Sequence[str], given: dict[str, object]) -> list[tuple[float, fl
         interval = bounds.get(key) if key else None
         if not _is_interval(interval):
             raise ConfigError(
-                f"box.{parts[1]}: expected [low, high] for {name}, each within ±{MAX_BOUND:.0e}, found {interval!r}"
+                f"box.{parts[1]}: expected [low, high] for {name}, "
+                f"each within ±{MAX_BOUND:.0e}, found {interval!r}"
             )
         used.add(key)
         box.append((float(interval[0]), float(interval[1])))
@@ -300,20 +305,28 @@ def usage() -> str:
         "usage: python -m jaxsafe.export run=RUN [key=value …]\n\n"
         "  run=RUN             a run directory, a policy file (.npz), or pretrained/TASK\n"
         "  seed=N              which policy of a run (default 0)\n"
-        "  run=FILE env=TASK   a policy from elsewhere: .onnx, or .npz with kernel_0, bias_0, … (activation=tanh);\n"
+        "  run=FILE env=TASK   a policy from elsewhere: .onnx, "
+        "or .npz with kernel_0, bias_0, … (activation=tanh);\n"
         "                      actions=discrete if it gives logits\n"
-        "  env=TASK|FILE.yaml  another environment of the same observation and action (default: that of the training)\n"
+        "  env=TASK|FILE.yaml  another environment of the same observation and action "
+        "(default: that of the training)\n"
         "  env.PATH=VALUE, variant=…, rta=…   change it, as in jaxsafe.evaluate\n"
-        "  format=onnx         a graph of opset 17 with a fixed batch (default); needs the extra `export`\n"
+        "  format=onnx         a graph of opset 17 with a fixed batch (default); "
+        "needs the extra `export`\n"
         "  format=stablehlo    a jax.export artefact, any batch\n"
-        "  format=vnnlib       the closed loop over steps as ONNX, the property that no safety margin is negative from\n"
-        "                      any start in the box as VNN-LIB, and the worst start that a search finds\n"
-        "  inputs=observation  from the paper's observation to the action, features included (default)\n"
-        "  inputs=network      from the features to the output of the network: matrix products and tanh\n"
+        "  format=vnnlib       the closed loop over steps as ONNX, "
+        "the property that no safety margin is negative from\n"
+        "                      any start in the box as VNN-LIB, "
+        "and the worst start that a search finds\n"
+        "  inputs=observation  from the paper's observation to the action, "
+        "features included (default)\n"
+        "  inputs=network      from the features to the output of the network: "
+        "matrix products and tanh\n"
         "  inputs=state        from the state at a start to the control in physical units\n"
         "  batch=N             (default 1)\n"
         "  steps=N             of the closed loop (default 40)\n"
-        "  box.FIELD=[a,b]     starts of the property (default position [70, 106], velocity [-0.28, 0.28])\n"
+        "  box.FIELD=[a,b]     starts of the property "
+        "(default position [70, 106], velocity [-0.28, 0.28])\n"
         "  out=FILE            (default: the policy's name)"
     )
 

@@ -34,13 +34,14 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
         rows: the result of `attack` for each adversary.
     """
     lines = [
-        f"{'policy':12} {'steps':>10} {'violating':>10} {'inside':>8} {'worst h':>10} {'inside':>10}"
-        f" {'altered':>8} {'‖Δu‖':>8}"
+        f"{'policy':12} {'steps':>10} {'violating':>10} {'inside':>8} "
+        f"{'worst h':>10} {'inside':>10} {'altered':>8} {'‖Δu‖':>8}"
     ]
     lines += [
-        f"{row['policy']:12} {row['steps']:>10,} {row['violating_steps']:>10,} {row['violating_steps_inside']:>8,}"
-        f" {_number(row['worst_margin']):>10} {_number(row['worst_margin_inside']):>10} {row['intervention_rate']:>8.2%}"
-        f" {row['mean_correction']:>8.3g}"
+        f"{row['policy']:12} {row['steps']:>10,} {row['violating_steps']:>10,} "
+        f"{row['violating_steps_inside']:>8,} {_number(row['worst_margin']):>10} "
+        f"{_number(row['worst_margin_inside']):>10} {row['intervention_rate']:>8.2%} "
+        f"{row['mean_correction']:>8.3g}"
         for row in rows
     ]
     bounded = [row for row in rows if row["violation_bound"] is not None]
@@ -49,8 +50,9 @@ def report(rows: Sequence[dict[str, Any]]) -> str:
         cut = "" if all(row["whole_episodes"] for row in bounded) else ", which were cut off,"
         clean = sum(not violated(row) for row in rows)
         lines.append(
-            f"{clean} of {len(rows)} without a violation: against each random one less than a share of {share:.1g}"
-            f" of the episodes{cut} has one, with 95 % confidence"
+            f"{clean} of {len(rows)} without a violation: "
+            f"against each random one less than a share of {share:.1g} "
+            f"of the episodes{cut} has one, with 95 % confidence"
         )
     return "\n".join(lines)
 
@@ -133,9 +135,11 @@ def usage() -> str:
     """Return the help text."""
     return (
         "usage: python -m jaxsafe.rta.falsify env=TASK [key=value …]\n\n"
-        "  rta=default            the filter to attack (that of a file: its own); none attacks the bare task\n"
+        "  rta=default            the filter to attack (that of a file: its own); "
+        "none attacks the bare task\n"
         "  lanes=N                episodes at once (default 64)\n"
-        "  steps=N                steps of each adversary over all of them (default: whole episodes, up to a million)\n"
+        "  steps=N                steps of each adversary over all of them "
+        "(default: whole episodes, up to a million)\n"
         "  policies=[a,b]         some adversaries only\n"
         "  seed=N                 (default 0)\n"
         "  env.PATH=VALUE         change the environment\n"

@@ -66,7 +66,8 @@ def _compare(runs: Sequence[Any], x: str, out: Path) -> None:
     paths = {Path(str(run)).name: Path(str(run)) for run in runs}
     if len(paths) < len(runs) or len(runs) < 2:
         raise ConfigError(
-            f"run: expected several directories of different names, found {', '.join(map(str, runs))}"
+            "run: expected several directories of different names, "
+            f"found {', '.join(map(str, runs))}"
         )
     tasks = {run_directory.read(path, "run")[2] for path in paths.values()}
     if len(tasks) > 1:
@@ -74,7 +75,8 @@ def _compare(runs: Sequence[Any], x: str, out: Path) -> None:
     for path in paths.values():
         if not (path / "results.json").exists():
             raise ConfigError(
-                f"run: {path} has no results.json; finish it with python -m jaxsafe.train resume={path}"
+                f"run: {path} has no results.json; "
+                f"finish it with python -m jaxsafe.train resume={path}"
             )
     figure = compare_curves({name: progress(path) for name, path in paths.items()}, tasks.pop(), x)
     print(summary(paths))
@@ -86,7 +88,8 @@ def usage() -> str:
     return (
         "usage: python -m jaxsafe.plot run=RUN [x=steps|wall]\n"
         "       python -m jaxsafe.plot 'run=[RUN,RUN,…]' [x=steps|wall] [out=comparison.png]\n\n"
-        "  draws into RUN/figures from RUN's log files; or the curves of several runs of one task, with a table of results"
+        "  draws into RUN/figures from RUN's log files; "
+        "or the curves of several runs of one task, with a table of results"
     )
 
 

@@ -83,8 +83,8 @@ def load(run: str, checkpoint: str | None) -> Subject:
     Args:
         run: a run directory, a policy file, or `pretrained/<task>` for a policy that comes with the
             package.
-        checkpoint: `last`, `best` or the step of a checkpoint of a run. None stands for `last`. A single
-            policy has no checkpoints, so only None is possible for it.
+        checkpoint: `last`, `best` or the step of a checkpoint of a run. None stands for `last`.
+            A single policy has no checkpoints, so only None is possible for it.
 
     Raises:
         ConfigError: there is no such run, policy or checkpoint.

@@ -56,8 +56,10 @@ def usage() -> str:
     return (
         "usage: python -m jaxsafe.plot.safe_set env=TASK [key=value …]\n\n"
         "  rta=default            the filter, one that certifies states\n"
-        "  x=[LOW,HIGH]           ends of the first axis: distance [m], or how far ahead of the lead [ft]\n"
-        "  y=[LOW,HIGH]           ends of the second axis: speed [m/s], or how far to the left of the lead [ft]\n"
+        "  x=[LOW,HIGH]           ends of the first axis: distance [m], "
+        "or how far ahead of the lead [ft]\n"
+        "  y=[LOW,HIGH]           ends of the second axis: speed [m/s], "
+        "or how far to the left of the lead [ft]\n"
         "  points=N               states along each axis (default 161)\n"
         "  env.PATH=VALUE         change the environment\n"
         "  out=FILE.png           where to write (default safe_set_TASK.png)"

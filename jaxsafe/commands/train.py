@@ -115,7 +115,8 @@ def _train(runs: Sequence[Path], path: Path) -> bool:
             training = upcoming or _open(run, files, BEGAN)
             config = training.config
             print(
-                f"{training.name}: {config.seeds} seeds × {training.num_steps:,} steps, preset {config.preset}, in {run}"
+                f"{training.name}: {config.seeds} seeds × {training.num_steps:,} steps, "
+                f"preset {config.preset}, in {run}"
             )
             training.prepare()
             upcoming = following and _open(following, files, time.monotonic())
@@ -123,7 +124,8 @@ def _train(runs: Sequence[Path], path: Path) -> bool:
                 upcoming.prepare()
             if not training.train():
                 print(
-                    f"stopped at step {training.step:,}; go on with: python -m jaxsafe.train resume={path}"
+                    f"stopped at step {training.step:,}; "
+                    f"go on with: python -m jaxsafe.train resume={path}"
                 )
                 return False
             trained.append((run, training))

@@ -57,7 +57,8 @@ def main(argv: Sequence[str]) -> int:
     rows = results.read(path, found)
     left = [i for i in range(len(found)) if i not in rows]
     print(
-        f"{len(found)} settings × {found[0].config.seeds} seeds, {len(alike(found, left))} to compile, in {path}",
+        f"{len(found)} settings × {found[0].config.seeds} seeds, "
+        f"{len(alike(found, left))} to compile, in {path}",
         flush=True,
     )
     total = sum(found[i].config.num_updates for i in left)
@@ -74,7 +75,8 @@ def main(argv: Sequence[str]) -> int:
         raise
     except KeyboardInterrupt:
         print(
-            f"stopped with {len(rows)} of {len(found)} settings; go on with: python -m jaxsafe.tune resume={path}"
+            f"stopped with {len(rows)} of {len(found)} settings; "
+            f"go on with: python -m jaxsafe.tune resume={path}"
         )
         return cli.INTERRUPTED
     print(results.finish(path, rows, list(sweep), rank))
@@ -84,11 +86,16 @@ def main(argv: Sequence[str]) -> int:
 def usage() -> str:
     """Return the help text."""
     return (
-        "usage: python -m jaxsafe.tune env=TASK 'sweep.OPTION=[a,b,…]' [key=value …]      or      resume=DIR\n\n"
-        "  sweep.OPTION=[a,b]     values of an option of jaxsafe.train, or of env.PATH; several make a grid\n"
-        "  sweep.OPTION='log(1e-4,1e-2)' or 'uniform(0.9,1)'   an interval to draw from, with samples=N\n"
-        "  samples=N              draw N settings instead of trying all combinations; draw=SEED chooses others\n"
-        "  rank=steps|success|deterministic   order of the table (default steps to 80 % success in training)\n"
+        "usage: python -m jaxsafe.tune env=TASK 'sweep.OPTION=[a,b,…]' [key=value …]"
+        "      or      resume=DIR\n\n"
+        "  sweep.OPTION=[a,b]     values of an option of jaxsafe.train, or of env.PATH; "
+        "several make a grid\n"
+        "  sweep.OPTION='log(1e-4,1e-2)' or 'uniform(0.9,1)'   an interval to draw from, "
+        "with samples=N\n"
+        "  samples=N              draw N settings instead of trying all combinations; "
+        "draw=SEED chooses others\n"
+        "  rank=steps|success|deterministic   order of the table "
+        "(default steps to 80 % success in training)\n"
         "  seeds, steps, episodes, …   any option of jaxsafe.train, the same for all settings\n"
         "  out=DIR                where to write (default: a new directory in runs/)"
     )

@@ -118,7 +118,8 @@ def _reference(place: str, name: str, known: Iterable[str], which: str = "") -> 
     known = list(known)
     if name not in known:
         raise ConfigError(
-            f"{place}: nothing{which} is called {show(name)}; choose from {nearest(name, known) or 'none'}"
+            f"{place}: nothing{which} is called {show(name)}; "
+            f"choose from {nearest(name, known) or 'none'}"
         )
 
 
@@ -152,8 +153,8 @@ def _check_space(env: Environment) -> None:
         if space in (2, 3) and space not in region.dimensions:
             fitting = [name for name, kind in choices(Region).items() if space in kind.dimensions]
             raise ConfigError(
-                f"regions.{region.name}: a {region.type_name} is no part of a space of {space} dimensions;"
-                f" choose from {nearest('', sorted(fitting))}"
+                f"regions.{region.name}: a {region.type_name} is no part "
+                f"of a space of {space} dimensions; choose from {nearest('', sorted(fitting))}"
             )
         for status in env.status:
             if (
@@ -161,7 +162,8 @@ def _check_space(env: Environment) -> None:
                 and getattr(status, "of", None) == region.on
             ):
                 raise ConfigError(
-                    f"status.{status.name}.of: region {region.name!r} is on {region.on!r} itself; choose another"
+                    f"status.{status.name}.of: region {region.name!r} is on {region.on!r} itself; "
+                    "choose another"
                 )
 
 
@@ -181,7 +183,8 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
         )
     if controller.takes_actions and not is_agent:
         raise ConfigError(
-            f"{place}.controller ({controller.type_name}): only the agent takes actions; choose from scripted, uncontrolled"
+            f"{place}.controller ({controller.type_name}): only the agent takes actions; "
+            "choose from scripted, uncontrolled"
         )
     _once(f"{place}.start", platform.random_fields)
     rest = vars(platform.rest())
@@ -195,8 +198,9 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
             drawn = 1 + len(initializer.direction.intervals)  # type: ignore[attr-defined]
             if (drawn,) != rest[initializer.name].shape:
                 raise ConfigError(
-                    f"{here}.direction: draws {drawn} numbers, the platform has {platform.dimension} dimensions;"
-                    " give a polar range in space, none in the plane"
+                    f"{here}.direction: draws {drawn} numbers, "
+                    f"the platform has {platform.dimension} dimensions; "
+                    "give a polar range in space, none in the plane"
                 )
 
 
@@ -324,7 +328,8 @@ def _check_tracing(env: Environment) -> None:
         for name, first in memory[section].items():
             if jax.tree.structure(first) != jax.tree.structure(later[section][name]):
                 raise ConfigError(
-                    f"{section}.{name}: its memory has another structure after a step than after reset"
+                    f"{section}.{name}: its memory has another structure "
+                    "after a step than after reset"
                 )
     if jax.tree.structure(memory["rta"]) != jax.tree.structure(later["rta"]):
         raise ConfigError("rta: its memory has another structure after a step than after reset")
@@ -335,7 +340,8 @@ def _check_tracing(env: Environment) -> None:
             # The first entry of the path only says in which record the leaf is.
             place = jax.tree_util.keystr(path[1:], simple=True, separator=".").removeprefix("sim.")
             raise ConfigError(
-                f"{place}: is {old.dtype}{list(old.shape)} after reset and {new.dtype}{list(new.shape)} after a step"
+                f"{place}: is {old.dtype}{list(old.shape)} after reset "
+                f"and {new.dtype}{list(new.shape)} after a step"
             )
 
 

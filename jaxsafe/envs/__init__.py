@@ -92,7 +92,8 @@ def make(
     ):
         if value is not None and not isinstance(value, kinds):
             raise ConfigError(
-                f"{option}: expected {'paths with values' if kinds is Mapping else 'a name'}, found {show(value)}"
+                f"{option}: expected {'paths with values' if kinds is Mapping else 'a name'}, "
+                f"found {show(value)}"
             )
     name = os.fspath(task)
     env = load(name) if name.endswith((".yaml", ".yml")) else build(find_task(name).environment())

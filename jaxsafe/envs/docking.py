@@ -1,4 +1,4 @@
-"""Spacecraft docking: fly the deputy to within 0.5 m of the chief without exceeding the speed limit.
+"""Spacecraft docking: fly the deputy to within 0.5 m of the chief and keep to the speed limit.
 
 Sections 3 and 4, Tables 4, 6, 8 and 10 of the paper. Lengths in m, speeds in m/s, forces in N.
 """

@@ -4,8 +4,8 @@ A package adds a task of its own with one call:
 
     register(Task(name="hover", environment=hover))
 
-Then `make("hover")` knows it, Gymnasium knows its id, and `python -m jaxsafe.train env=MODULE:hover`
-imports the module that registers it and trains it.
+Then `make("hover")` knows it, Gymnasium knows its id, and
+`python -m jaxsafe.train env=MODULE:hover` imports the module that registers it and trains it.
 """
 
 from __future__ import annotations
@@ -85,7 +85,8 @@ def find_task(name: str) -> Task:
         import_modules([module], "env")
     if task not in TASKS:
         raise ConfigError(
-            f"env: unknown task {show(task)} and not a .yaml file; choose from {nearest(task, TASKS)}"
+            f"env: unknown task {show(task)} and not a .yaml file; "
+            f"choose from {nearest(task, TASKS)}"
         )
     return TASKS[task]
 
@@ -103,7 +104,7 @@ def short_name(name: str) -> str:
 
 
 def user_module(name: str) -> str | None:
-    """Return the module that a user's task comes from; None for a task of this package or a file."""
+    """Return the module of a user's task; None for a task of this package or a file."""
     task = TASKS.get(name)
     if task is None or task.environment.__module__.partition(".")[0] == "jaxsafe":
         return None

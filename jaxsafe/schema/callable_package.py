@@ -1,4 +1,4 @@
-"""Packages that are also the function of their name: `python -m jaxsafe.train` and `jaxsafe.train(…)`."""
+"""Packages that are also functions: `python -m jaxsafe.train` and `jaxsafe.train(…)`."""
 
 from __future__ import annotations
 

@@ -227,9 +227,13 @@ def update(
         lambda old, new: (1.0 - share) * old + share * new, state.average, params
     )
     return state.replace(
-        params=params, optimizer=optimizer, window=window, num_updates=state.num_updates + 1, average=average,
+        params=params,
+        optimizer=optimizer,
+        window=window,
+        num_updates=state.num_updates + 1,
+        average=average,
         multiplier=multiplier,
-    )  # fmt: skip
+    )
 
 
 def diverged(state: TrainState) -> Bool[Array, ""]:
@@ -309,9 +313,17 @@ def collect(
             action = _acted(env, action, timestep)
         done, episode = timestep.done, accumulate(episode, timestep)
         transition = Transition(
-            inputs, totals, action, policy.log_prob(action), timestep.reward, timestep.terminated, done,
-            agent.inputs(env, timestep.observation), episode, timestep.cost if agent.cost_critic else (),
-        )  # fmt: skip
+            inputs,
+            totals,
+            action,
+            policy.log_prob(action),
+            timestep.reward,
+            timestep.terminated,
+            done,
+            agent.inputs(env, timestep.observation),
+            episode,
+            timestep.cost if agent.cost_critic else (),
+        )
         return (
             env_state,
             observation,

@@ -180,7 +180,8 @@ class Checkpoints:
         )
         if facts.get(PRECISION, now) != now:
             raise ConfigError(
-                f"{place}: checkpoint was written in {facts[PRECISION]}, this process computes in {now}"
+                f"{place}: checkpoint was written in {facts[PRECISION]}, "
+                f"this process computes in {now}"
             )
         abstract = jax.tree.map(_empty, like)
         state = self._read(step, state=self._ocp.args.StandardRestore(abstract))["state"]
@@ -190,7 +191,8 @@ class Checkpoints:
             if found.shape != wanted.shape:
                 name = jax.tree_util.keystr(path, simple=True, separator="/")
                 raise ConfigError(
-                    f"{place}: checkpoint is of another run: {name} has shape {found.shape}, expected {wanted.shape}"
+                    f"{place}: checkpoint is of another run: "
+                    f"{name} has shape {found.shape}, expected {wanted.shape}"
                 )
         digest = facts.pop(DIGEST, None)
         if (digest is not None or PRECISION in facts) and digest != _digest(state, facts):
@@ -202,7 +204,8 @@ class Checkpoints:
     def _read(self, step: int, **args: Any) -> Any:
         if step not in self.steps:
             raise ConfigError(
-                f"checkpoint: no step {step} in {self.directory}; choose from {nearest(step, self.steps) or 'none'}"
+                f"checkpoint: no step {step} in {self.directory}; "
+                f"choose from {nearest(step, self.steps) or 'none'}"
             )
         read, reason = {}, ""
         with _silence() as complaints:

@@ -112,7 +112,8 @@ class ProgressLog:
         self.rows = [row for row in read_progress(run) if row["step"] <= resume_step]
         if len(self.rows) != expected:
             raise ConfigError(
-                f"{self._jsonl}: expected {expected} rows up to step {resume_step}, found {len(self.rows)}"
+                f"{self._jsonl}: expected {expected} rows up to step {resume_step}, "
+                f"found {len(self.rows)}"
             )
         if self._jsonl.exists():
             write_rows(self._jsonl, self.rows)
@@ -136,7 +137,8 @@ class ProgressLog:
         if different:
             names = ", ".join(sorted(different))
             raise ConfigError(
-                f"{self._jsonl}: another version of jaxsafe began it; columns differ in {names}; begin a new run"
+                f"{self._jsonl}: another version of jaxsafe began it; "
+                f"columns differ in {names}; begin a new run"
             )
         self.rows += rows
         append_rows(self._jsonl, rows)

@@ -184,13 +184,14 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     _check_rta(config, env)
     if config.ppo.batch_size % config.ppo.num_minibatches:
         raise ConfigError(
-            f"ppo.num_minibatches: expected a divisor of ppo.num_envs × ppo.num_steps = {config.ppo.batch_size},"
-            f" found {config.ppo.num_minibatches}"
+            "ppo.num_minibatches: expected a divisor of ppo.num_envs × ppo.num_steps = "
+            f"{config.ppo.batch_size}, found {config.ppo.num_minibatches}"
         )
     if config.devices_per_seed is not None and config.devices_per_seed not in config.ppo.shares:
         raise ConfigError(
-            f"devices_per_seed: expected one of {', '.join(map(str, config.ppo.shares))}, which divide ppo.num_envs and the"
-            f" samples of a minibatch, found {config.devices_per_seed}"
+            f"devices_per_seed: expected one of {', '.join(map(str, config.ppo.shares))}, "
+            "which divide ppo.num_envs and the samples of a minibatch, "
+            f"found {config.devices_per_seed}"
         )
     if config.ppo.batch_size >= 2**31:
         raise ConfigError(
@@ -198,7 +199,8 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         )
     if config.num_updates >= 2**31:
         raise ConfigError(
-            f"steps: expected less than 2³¹ updates of {config.ppo.batch_size:,}, found {config.steps:,} steps"
+            f"steps: expected less than 2³¹ updates of {config.ppo.batch_size:,}, "
+            f"found {config.steps:,} steps"
         )
     if len(config.agent.hidden) > MAX_LAYERS:
         raise ConfigError(
@@ -206,8 +208,9 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         )
     if float(config.ppo.horizon_growth) < 1.0 - float(config.ppo.gamma):
         raise ConfigError(
-            f"ppo.horizon_growth: expected at least 1 − ppo.gamma = {1.0 - float(config.ppo.gamma):.3g}, or the discount"
-            f" factor falls below 0; found {float(config.ppo.horizon_growth):g}"
+            "ppo.horizon_growth: expected at least 1 − ppo.gamma = "
+            f"{1.0 - float(config.ppo.gamma):.3g}, "
+            f"or the discount factor falls below 0; found {float(config.ppo.horizon_growth):g}"
         )
     if config.ppo.learning_rate_decay == "exponential" and not config.ppo.final_learning_rate > 0.0:
         raise ConfigError(
@@ -255,11 +258,13 @@ def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfi
         return config
     if config.cost_limit is None:
         raise ConfigError(
-            "cost_limit: missing; the violating steps that an episode may have, for instance cost_limit=5"
+            "cost_limit: missing; the violating steps that an episode may have, "
+            "for instance cost_limit=5"
         )
     if float(config.ppo.gamma) >= 1.0:
         raise ConfigError(
-            f"ppo.gamma: expected less than 1 with algorithm=ppo_lagrangian, found {float(config.ppo.gamma)}"
+            "ppo.gamma: expected less than 1 with algorithm=ppo_lagrangian, "
+            f"found {float(config.ppo.gamma)}"
         )
     agent, ppo = (
         config.agent.replace(cost_critic=True),
@@ -271,11 +276,13 @@ def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfi
 def _check_rta(config: TrainConfig, env: Environment) -> None:
     if config.rta_training is not None and env.rta is None:
         raise ConfigError(
-            f"rta_training: {config.rta_training!r} needs run time assurance, for instance rta=default"
+            f"rta_training: {config.rta_training!r} needs run time assurance, "
+            "for instance rta=default"
         )
     if config.ppo.learns_from == "actual" and env.num_action_points:
         raise ConfigError(
-            "ppo.learns_from: the actual control is no choice of discrete actions; use actions=continuous"
+            "ppo.learns_from: the actual control is no choice of discrete actions; "
+            "use actions=continuous"
         )
 
 
@@ -325,7 +332,8 @@ def usage() -> str:
     """Return text that names every option, what it takes, and its default."""
     lines = ["usage: python -m jaxsafe.train env=TASK [key=value …]      or      resume=RUN", ""]
     lines += [
-        "  distributed=true, beside either: this is one of several processes that srun or mpirun started"
+        "  distributed=true, beside either: "
+        "this is one of several processes that srun or mpirun started"
     ]
     lines += [
         "  env=TASK, env=FILE.yaml, or env=all for the five tasks one after another, then evaluated"

@@ -95,8 +95,9 @@ def restore(
         path, before, now = _difference(facts["made_from"], made_from(env, config))
         if path:
             raise ConfigError(
-                f"{checkpoints.directory.parent / 'config.yaml'}: {path}: found {now}, but the checkpoints were made with"
-                f" {before}; put that back, or begin a new run"
+                f"{checkpoints.directory.parent / 'config.yaml'}: {path}: "
+                f"found {now}, but the checkpoints were made with "
+                f"{before}; put that back, or begin a new run"
             )
     if facts["updates"] * config.ppo.batch_size != step:
         raise ConfigError(

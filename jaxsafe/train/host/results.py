@@ -168,7 +168,8 @@ def table(results: dict[str, Any], path: Path) -> str:
         counts, limit = results["given_up"], results["given_up"]["after_steps"]
         told = ", ".join(f"{counts[kind]:,} {kind}" for kind in found)
         lines.append(
-            f"episodes still running after {limit:,} steps, given up and counted as failures: {told}"
+            f"episodes still running after {limit:,} steps, "
+            f"given up and counted as failures: {told}"
         )
     if "interaction_efficiency" in results:
         steps = results["interaction_efficiency"]["timesteps"]
@@ -179,7 +180,8 @@ def table(results: dict[str, Any], path: Path) -> str:
             else "80 % training success not reached",
         ]
         lines += [
-            f"{results['wall_s']:.1f} s in total, {results['compile_s']:.1f} s of it compiling the training"
+            f"{results['wall_s']:.1f} s in total, "
+            f"{results['compile_s']:.1f} s of it compiling the training"
         ]
     return "\n".join([*lines, f"results in {path}"])
 
@@ -248,9 +250,18 @@ def summary(runs: Mapping[str, Path]) -> str:
         ConfigError: the results of a run cannot be read.
     """
     heads = (
-        "", "steps", "80 % after", "stochastic", "deterministic", "worst seed", "cost/episode", "cost of training",
-        "wall [s]", "algorithm", "rta",
-    )  # fmt: skip
+        "",
+        "steps",
+        "80 % after",
+        "stochastic",
+        "deterministic",
+        "worst seed",
+        "cost/episode",
+        "cost of training",
+        "wall [s]",
+        "algorithm",
+        "rta",
+    )
     rows: list[Sequence[str]] = [heads]
     diverged: list[str] = []
     for name, run in runs.items():

@@ -100,7 +100,8 @@ def make(out: str | None, parent: Path, name: str) -> Path:
     """
     if os.sep == "/" and "\\" in os.path.abspath(out or parent / name):
         raise ConfigError(
-            f"out: expected a path without \\, which checkpoints take for /, found {out or parent / name}"
+            "out: expected a path without \\, which checkpoints take for /, "
+            f"found {out or parent / name}"
         )
     try:
         path = Path(out) if out else _next_free(parent, name)

@@ -237,7 +237,8 @@ class Training:
         newest = max(covered, default=steps[-1])
         if newest != steps[-1]:
             print(
-                f"{self.run / 'progress.jsonl'} ends before the checkpoint of step {steps[-1]:,}: going on from {newest:,}"
+                f"{self.run / 'progress.jsonl'} ends before the checkpoint of step {steps[-1]:,}: "
+                f"going on from {newest:,}"
             )
         content, facts = restore(self.checkpoints, newest, self.env, self.config)
         self.state, self.best = (
@@ -257,7 +258,8 @@ class Training:
         reached = -(-due // self.chunk) * self.chunk * self.config.ppo.batch_size
         if any(row["step"] > reached for row in read_progress(self.run)):
             print(
-                f"checkpoints after step {self.step:,} are missing: going on from there, the longer logs kept as *.bak"
+                f"checkpoints after step {self.step:,} are missing: "
+                "going on from there, the longer logs kept as *.bak"
             )
             for log in self.run.glob("*.jsonl"):
                 shutil.copy(log, log.with_suffix(".jsonl.bak"))
@@ -314,7 +316,8 @@ class Training:
         for seed in self._find_diverged(rows):
             step = self.diverged[seed]
             display.tell(
-                f"seed {seed} has diverged by step {step:,}: networks or returns are not finite. It is stopped"
+                f"seed {seed} has diverged by step {step:,}: "
+                "networks or returns are not finite. It is stopped"
             )
         display.show(self.step, rows[-self.config.seeds :])
 
