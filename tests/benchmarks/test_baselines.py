@@ -325,7 +325,7 @@ def test_every_command_of_the_plan_is_valid() -> None:
     items = plan([*TASKS], [*KINDS], ["seeds=10"])
     assert len({item.name for item in items}) == 40
     for item in items:
-        [(config, env, _)] = resolve_all(Arguments.parse(item.words))
+        [(config, env, _)] = resolve_all(Arguments.parse(item.words).options)
         assert config.seeds == 10
         for words in item.evaluations.values():
             arguments = Arguments.parse(words)
@@ -387,7 +387,7 @@ def test_the_best_policy_succeeds_most_then_violates_least_then_has_the_highest_
 def test_trainings_with_a_filter_start_where_it_promises_safety() -> None:
     begin = jax.jit(reset_batch, static_argnums=2)
     for item in plan(["docking2d_oriented"], ["rta", "unpunished"], ["seeds=2"]):
-        [(_, env, _)] = resolve_all(Arguments.parse(item.words))
+        [(_, env, _)] = resolve_all(Arguments.parse(item.words).options)
         [deputy] = [platform for platform in env.platforms if platform.name == "deputy"]
         [share] = [start.share for start in deputy.start if start.name == "velocity"]
         fastest = override(env, {"deputy.start.velocity.share": [share[1], share[1]]})
