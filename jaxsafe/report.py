@@ -3,7 +3,6 @@
 import sys
 
 if __name__ == "__main__":
-    sys.exit(
-        "error: jaxsafe.report: in a clone of jaxsafe, python benchmarks/baselines trains, "
-        "evaluates and reports"
-    )
+    successor = "in a clone of jaxsafe, python benchmarks/baselines trains, evaluates and reports"
+    print(f"error: jaxsafe.report: {successor}", file=sys.stderr)
+    sys.exit(2)
