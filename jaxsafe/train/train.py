@@ -69,15 +69,13 @@ def train(
         The state and the curves. `state.average` holds the parameters for `agent.policy`.
     """
     shared = (env, normalise(agent), normalise(hyperparameters))
-    start = jax.jit(isolated(begin))
-    piece = jax.jit(isolated(chunk), static_argnums=(2, 3))
-    state = start(shared, key)
+    state = _begin(shared, key)
     if callback is None:
-        return piece(shared, state, num_updates, num_updates)
+        return _chunk(shared, state, num_updates, num_updates)
     every = every or max(1, num_updates // CALLS)
     pieces: list[Curves] = []
     for done in range(0, num_updates, every):
-        state, curves = piece(shared, state, min(every, num_updates - done), num_updates)
+        state, curves = _chunk(shared, state, min(every, num_updates - done), num_updates)
         pieces.append(curves)
         if callback(state, curves):
             break
@@ -154,3 +152,8 @@ def chunk(
         return state, {**counts, **recent_episodes.means(state.window, env.outcomes)}
 
     return jax.lax.scan(one, state, None, length=length)
+
+
+# Made once: every call of `isolated` is a new function, which JAX would compile anew.
+_begin = jax.jit(isolated(begin))
+_chunk = jax.jit(isolated(chunk), static_argnums=(2, 3))
