@@ -1,8 +1,9 @@
 """Settings for all tests: two devices, one thread each, and compiled programs kept between runs.
 
-Tests compile far more than they run, so LLVM optimises little, which takes a third less time (not at all: then a seed among
-many is no longer the seed alone, bit for bit). XLA's older emitter of kernels takes less time too; only some versions can
-choose it, and others stop at an unknown flag.
+Tests compile far more than they run. So LLVM optimises little, which takes a third less time.
+Without any optimisation a seed among many would no longer be the seed alone, bit for bit. XLA's
+older emitter of kernels takes less time too. Only some versions can choose it, and others stop at
+an unknown flag.
 """
 
 import os
@@ -26,9 +27,8 @@ import jax  # noqa: E402
 _cache = Path(
     os.environ.get("JAXSAFE_TEST_CACHE", Path(__file__).parent.parent / ".pytest_cache" / "jax")
 )
-if (
-    accelerator_installed()
-):  # XLA tunes programs by measuring them, and those of another process may round otherwise
+# XLA tunes programs by measuring them, so the programs of another process may round otherwise.
+if accelerator_installed():
     _cache /= os.environ.get("PYTEST_XDIST_WORKER", "main")
 jax.config.update("jax_compilation_cache_dir", str(_cache))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
@@ -36,7 +36,7 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished training run that nobody interrupted."""
+    """Return the directory of a finished training run that nobody interrupted."""
     from tiny_run import TINY
 
     from jaxsafe.commands.train import main
@@ -48,6 +48,6 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def x64() -> Iterator[None]:
-    """Double precision for one test; environments are built inside it."""
+    """Use double precision in one test. Environments are built inside it."""
     with jax.enable_x64(True):
         yield

@@ -1,4 +1,7 @@
-"""Environments so small that the right value and the right action are known: each finds one kind of bug in PPO."""
+"""Environments so small that the right value and the right action are known.
+
+Each finds one kind of bug in PPO.
+"""
 
 from typing import Any
 
@@ -25,7 +28,7 @@ class PointState(Record):
 
 
 class Point(Platform):
-    """Stays where it starts and remembers the last push."""
+    """A platform that stays where it starts and remembers the last push."""
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -39,7 +42,7 @@ class Point(Platform):
 
 
 class Sign(Initializer):
-    """±1 with equal probability."""
+    """An initializer that draws ±1 with equal probability."""
 
     def draw(self, key: Key, drawn: Any, sim: Sim) -> Array:
         return jax.random.rademacher(key, (1,), jnp.float32)
@@ -58,7 +61,7 @@ class Position(Reward):
 
 
 class Match(Reward):
-    """1 − (push − position)²: the best action is the observation."""
+    """A reward of 1 − (push − position)², so the best action is the observation."""
 
     def process(self, memory: Any, sim: Sim) -> Array:
         point = sim.platforms["point"]
@@ -66,7 +69,7 @@ class Match(Reward):
 
 
 class Hard(Status):
-    """How hard the last push was."""
+    """A status: how hard the last push was."""
 
     def process(self, memory: Any, sim: Sim) -> Array:
         return jnp.abs(sim.platforms["point"].push)
@@ -86,7 +89,10 @@ def probe(
     discrete: bool = False,
     most: float | None = None,
 ) -> Environment:
-    """An episode of `steps` steps at a random sign; to push harder than `most` costs."""
+    """Return an environment whose episodes have `steps` steps at a random sign.
+
+    A push harder than `most` costs.
+    """
     actuators = (Actuator(name="push", low=-1.0, high=1.0, points=5),)
     controller = Discrete(actuators=actuators) if discrete else Continuous(actuators=actuators)
     return build(

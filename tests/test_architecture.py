@@ -11,7 +11,10 @@ FACE = "__init__"
 
 
 def imports(tree: ast.Module) -> Iterator[str]:
-    """Yield the modules of jaxsafe that a file imports, but for types only and for running it as a command."""
+    """Yield the modules of jaxsafe that a file imports.
+
+    Imports for types only, and those for running the file as a command, are left out.
+    """
     skipped = {
         id(inner)
         for node in ast.walk(tree)
@@ -31,16 +34,16 @@ def imports(tree: ast.Module) -> Iterator[str]:
 
 
 def rooms() -> dict[str, set[str]]:
-    """Return the packages and the modules beside them, each with those that it imports."""
-    found: dict[str, set[str]] = {}
+    """Return the packages and the modules beside them, each with the others that it imports."""
+    used: dict[str, set[str]] = {}
     for file in PACKAGE.rglob("*.py"):
         room = file.relative_to(PACKAGE).with_suffix("").parts[0]
         names = [name.split(".") for name in imports(ast.parse(file.read_text(encoding="utf-8")))]
-        found.setdefault(room, set()).update(
+        used.setdefault(room, set()).update(
             name[1] for name in names if name[0] == "jaxsafe" and len(name) > 1
         )
-        found[room].discard(room)
-    return {room: others for room, others in found.items() if room != FACE}
+        used[room].discard(room)
+    return {room: others for room, others in used.items() if room != FACE}
 
 
 def test_no_two_rooms_import_each_other_even_through_others() -> None:
@@ -53,10 +56,10 @@ def test_no_two_rooms_import_each_other_even_through_others() -> None:
 
 
 def test_the_lowest_and_the_highest_floor() -> None:
-    found = rooms()
-    assert not found["schema"]
-    assert not [room for room, others in found.items() if "commands" in others]
-    assert not found["evaluate"] & {"train", "plot", "tune"}
-    assert not found["plot"] & {"train", "evaluate"}
-    assert not found["rta"] & {"environment", "rollout"}
-    assert found["transition"] <= {"schema", "simulation", "types"}
+    packages = rooms()
+    assert not packages["schema"]
+    assert not [room for room, others in packages.items() if "commands" in others]
+    assert not packages["evaluate"] & {"train", "plot", "tune"}
+    assert not packages["plot"] & {"train", "evaluate"}
+    assert not packages["rta"] & {"environment", "rollout"}
+    assert packages["transition"] <= {"schema", "simulation", "types"}

@@ -1,4 +1,7 @@
-"""New starts for some lanes of a batch: the same as a draw for every lane, however many there are."""
+"""Some environments of a batch get new starts.
+
+Each start is the one of a draw for every environment, however many need one.
+"""
 
 from __future__ import annotations
 
@@ -18,25 +21,38 @@ SIZES = (24, SPARSE_RESETS_FROM, 1000, 1031)  # few, many, no power of two, a pr
 
 @pytest.mark.parametrize("axis", [0, -1])
 @pytest.mark.parametrize("size", SIZES)
-def test_lanes_are_renewed_alike_however_many_they_are(size: int, axis: Literal[0, -1]) -> None:
+def test_environments_are_renewed_alike_however_many_they_are(
+    size: int, axis: Literal[0, -1]
+) -> None:
     def turned(x: jax.Array) -> jax.Array:
         return jnp.moveaxis(x, 0, axis)
 
-    def draw(offset: jax.Array, lanes: jax.Array) -> dict[str, jax.Array]:
-        return {"a": turned(offset + lanes[:, None] + jnp.zeros((len(lanes), 3))), "b": -lanes}
+    def draw(offset: jax.Array, indices: jax.Array) -> dict[str, jax.Array]:
+        return {
+            "a": turned(offset + indices[:, None] + jnp.zeros((len(indices), 3))),
+            "b": -indices,
+        }
 
     old = {"a": turned(jnp.zeros((size, 3))), "b": jnp.arange(size)}
-    lanes, program = np.arange(size), jax.jit(renew, static_argnums=(1, 4))
+    indices = np.arange(size)
+    program = jax.jit(renew, static_argnums=(1, 4))
     order = np.random.default_rng(0).permutation(size)
     chunk = max(MIN_RESETS_PER_ROUND, int(size * RESETS_PER_ROUND))
-    for chosen in (order[:0], order[:1], order[:chunk], order[: chunk + 1], lanes[-chunk:], lanes):
-        where = np.isin(lanes, chosen)
-        found = program(jnp.asarray(where), draw, jnp.ones(()), old, axis)
+    for chosen in (
+        order[:0],
+        order[:1],
+        order[:chunk],
+        order[: chunk + 1],
+        indices[-chunk:],
+        indices,
+    ):
+        where = np.isin(indices, chosen)
+        computed = program(jnp.asarray(where), draw, jnp.ones(()), old, axis)
         np.testing.assert_array_equal(
-            jnp.moveaxis(found["a"], axis, 0),
-            np.where(where, 1.0 + lanes, 0.0)[:, None] * np.ones(3),
+            jnp.moveaxis(computed["a"], axis, 0),
+            np.where(where, 1.0 + indices, 0.0)[:, None] * np.ones(3),
         )
-        np.testing.assert_array_equal(found["b"], np.where(where, -lanes, lanes))
+        np.testing.assert_array_equal(computed["b"], np.where(where, -indices, indices))
 
 
 @pytest.mark.parametrize("num_envs", [16, SPARSE_RESETS_FROM])
@@ -58,6 +74,5 @@ def test_gradients_reach_the_starts_of_batches_of_any_size(num_envs: int) -> Non
     for derivative in (jax.grad, jax.jacfwd):
         slope, distances = derivative(total, has_aux=True)(jnp.float32(100.0))
         assert len(distances) == num_envs // 2
-        np.testing.assert_allclose(
-            slope, np.sum((150.0 - distances) / 50.0), rtol=1e-4
-        )  # d = low + (high − low) u
+        # The derivative follows from d = low + (high − low) u.
+        np.testing.assert_allclose(slope, np.sum((150.0 - distances) / 50.0), rtol=1e-4)

@@ -1,4 +1,7 @@
-"""Values and derivatives at the points where a norm, a quotient or a root has none of its own: all are finite."""
+"""Values and derivatives are finite where they are hard to define.
+
+These are the points where a norm, a quotient or a root has none of its own.
+"""
 
 from typing import Any
 
@@ -29,7 +32,7 @@ REJOIN = {
 
 
 def starts(task: str, env: jaxsafe.Environment) -> dict[str, dict[str, Any]]:
-    """The starts of a task at which something is zero or has no direction."""
+    """Return the starts of a task at which something is zero or has no direction."""
 
     def full(platform: str, **given: Any) -> dict[str, jax.Array]:
         rest = vars(env.platform(platform).rest())
@@ -59,7 +62,8 @@ def assert_finite(tree: Any, what: str) -> None:
 @pytest.mark.parametrize("task", TASKS)
 def test_an_episode_has_derivatives_wherever_it_may_be(task: str) -> None:
     saved = read_policy(find_policy(task))
-    env, act = saved.env, saved.agent.policy(saved.env, saved.params, True)
+    env = saved.env
+    act = saved.agent.policy(saved.env, saved.params, True)
 
     def numbers(start: Any) -> list[jax.Array]:
         state, before = jaxsafe.reset_to(env, start)
@@ -78,14 +82,15 @@ def test_an_episode_has_derivatives_wherever_it_may_be(task: str) -> None:
     def total(start: Any) -> jax.Array:
         return jnp.sum(jnp.stack([jnp.sum(leaf) for leaf in numbers(start)]))
 
-    found = jax.jit(lambda start: (numbers(start), jax.grad(total)(start)))
+    computed = jax.jit(lambda start: (numbers(start), jax.grad(total)(start)))
     for name, start in starts(task, env).items():
-        assert_finite(found(start), f"{task} {name}")
+        assert_finite(computed(start), f"{task} {name}")
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_a_policy_has_a_value_and_a_jacobian_for_every_observation(task: str) -> None:
-    policy, size = jaxsafe.load_policy(task), read_policy(find_policy(task)).env.observation_size
+    policy = jaxsafe.load_policy(task)
+    size = read_policy(find_policy(task)).env.observation_size
     function = jax.jit(
         lambda o: (
             policy(jax.random.key(0), o),
@@ -118,11 +123,13 @@ def test_the_loss_and_its_gradient_are_finite_however_far_the_policies_are_apart
     old: float, advantage: float, discrete: bool
 ) -> None:
     env = jaxsafe.make("docking2d", actions="discrete" if discrete else "continuous")
-    agent, ppo = normalise(Agent(hidden=(4,))), normalise(PPO())
+    agent = normalise(Agent(hidden=(4,)))
+    ppo = normalise(PPO())
     params = agent.init(jax.random.key(0), env)
-    one = jnp.ones(1)
     action = jnp.zeros((1, 2), int if discrete else float)
-    batch = Batch(jnp.zeros((1, 6)), {}, action, old * one, advantage * one, 0.0 * one)
+    batch = Batch(
+        jnp.zeros((1, 6)), {}, action, jnp.full(1, old), jnp.full(1, advantage), jnp.zeros(1)
+    )
     value, gradient = jax.value_and_grad(loss)(params, env, agent, ppo, batch)
     assert_finite((value, gradient), f"{old}, {advantage}")
 
@@ -130,7 +137,8 @@ def test_the_loss_and_its_gradient_are_finite_however_far_the_policies_are_apart
 @pytest.mark.parametrize("old", [-90.0, -1e30])
 def test_a_bad_action_that_became_far_likelier_is_still_made_less_likely(old: float) -> None:
     env = jaxsafe.make("docking2d")
-    agent, ppo = normalise(Agent(hidden=(4,))), normalise(PPO())
+    agent = normalise(Agent(hidden=(4,)))
+    ppo = normalise(PPO())
     params = agent.init(jax.random.key(0), env)
     action = jnp.array([[0.5, -0.5]])
 
@@ -142,15 +150,15 @@ def test_a_bad_action_that_became_far_likelier_is_still_made_less_likely(old: fl
     assert float(value) > 1e8
     towards = jax.grad(log_prob)(params)["actor"]
     product = jax.tree.map(lambda a, b: jnp.sum(a * b), gradient["actor"], towards)
-    assert (
-        float(jax.tree.reduce(jnp.add, product)) > 0.0
-    )  # down the gradient is down in probability
+    # A step down the gradient lowers the probability.
+    assert float(jax.tree.reduce(jnp.add, product)) > 0.0
 
 
 @pytest.mark.parametrize("old", [-10.0, -1.0, 0.3])
 def test_ordinary_ratios_are_what_they_were(old: float) -> None:
     env = jaxsafe.make("docking2d")
-    agent, ppo = normalise(Agent(hidden=(4,))), normalise(PPO())
+    agent = normalise(Agent(hidden=(4,)))
+    ppo = normalise(PPO())
     params = agent.init(jax.random.key(0), env)
     key = jax.random.key(1)
     action = jax.random.normal(key, (50, 2))
@@ -175,5 +183,5 @@ def test_ordinary_ratios_are_what_they_were(old: float) -> None:
             - ppo.entropy_coefficient * policy.entropy()
         )
 
-    found = jax.value_and_grad(loss)(params, env, agent, ppo, batch)
-    jax.tree.map(np.testing.assert_array_equal, found, jax.value_and_grad(plain)(params))
+    computed = jax.value_and_grad(loss)(params, env, agent, ppo, batch)
+    jax.tree.map(np.testing.assert_array_equal, computed, jax.value_and_grad(plain)(params))

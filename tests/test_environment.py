@@ -1,4 +1,4 @@
-"""`reset`, `reset_to` and `step`: structure, chosen starts, and what an environment says about itself."""
+"""`reset`, `reset_to` and `step`: structure, chosen starts, and the facts about an environment."""
 
 import re
 from typing import Any
@@ -36,15 +36,14 @@ def shapes(tree: Any) -> Any:
 
 
 def test_reset_to_agrees_with_reset(env: Environment) -> None:
-    drawn, given = (
-        jax.eval_shape(jaxsafe.reset, env, jax.random.key(0)),
-        jaxsafe.reset_to(env, START),
-    )
+    drawn = jax.eval_shape(jaxsafe.reset, env, jax.random.key(0))
+    given = jaxsafe.reset_to(env, START)
     assert shapes(drawn) == shapes(jax.eval_shape(lambda: given))
 
 
 def test_the_methods_are_the_functions(env: Environment) -> None:
-    key, action = jax.random.key(1), jnp.ones(2)
+    key = jax.random.key(1)
+    action = jnp.ones(2)
     chex.assert_trees_all_equal(env.reset(key), jaxsafe.reset(env, key))
     state, _ = env.reset(key)
     chex.assert_trees_all_equal(env.step(state, action), jaxsafe.step(env, state, action))
@@ -69,7 +68,8 @@ def test_reset_to_starts_where_it_is_told(env: Environment) -> None:
     np.testing.assert_array_equal(state.sim.platforms["deputy"].position, np.float32([100.0, 50.0]))
     np.testing.assert_array_equal(state.sim.platforms["deputy"].velocity, np.float32([0.1, -0.2]))
     np.testing.assert_array_equal(state.sim.platforms["chief"].position, [0.0, 0.0])
-    distance, speed = np.hypot(100, 50), np.hypot(0.1, 0.2)
+    distance = np.hypot(100, 50)
+    speed = np.hypot(0.1, 0.2)
     expected = [1.0, 0.5, 0.2, -0.4, speed, 0.2 + 2 * 0.001027 * distance]
     np.testing.assert_allclose(timestep.observation, expected, rtol=1e-6)
 
@@ -98,7 +98,10 @@ def test_reset_to_may_move_the_chief(env: Environment) -> None:
         ({"deputy": {"position": [1, 2]}}, r"^reset_to: deputy\.velocity is missing"),
         (
             {"deputi": {}},
-            r"^reset_to: unknown platform 'deputi'; choose from chief, deputy\. Did you mean 'deputy'\?$",
+            (
+                r"^reset_to: unknown platform 'deputi'; choose from chief, deputy\. Did you mean"
+                r" 'deputy'\?$"
+            ),
         ),
         (
             {"deputy": {"positon": [1, 2]}},
@@ -286,28 +289,27 @@ def test_a_variant_orders_its_actions_and_outcomes(
 
 
 def test_discrete_actions_change_the_controller_and_nothing_else() -> None:
-    continuous, discrete = jaxsafe.make("docking3d"), jaxsafe.make("docking3d", actions="discrete")
+    continuous = jaxsafe.make("docking3d")
+    discrete = jaxsafe.make("docking3d", actions="discrete")
     assert discrete.num_action_points == (11, 11, 11)
     assert discrete.action_names == continuous.action_names
     state, _ = jaxsafe.reset_to(
         continuous, {"deputy": {"position": [100.0, 50.0, 0.0], "velocity": [0.1, 0.0, 0.0]}}
     )
-    pushed, chosen = (
-        step(continuous, state, jnp.asarray([-1.0, 0, 1])),
-        step(discrete, state, jnp.asarray([0, 5, 10])),
-    )
+    pushed = step(continuous, state, jnp.asarray([-1.0, 0, 1]))
+    chosen = step(discrete, state, jnp.asarray([0, 5, 10]))
     chex.assert_trees_all_close(pushed, chosen, atol=1e-7)
     assert jaxsafe.make("docking3d", actions="continuous") == continuous
     assert discrete != continuous
 
 
-# Ends
+# Terminal conditions
 
 
 def ends(
     env: Environment, position: Any, velocity: Any = (0.0, 0.0)
 ) -> tuple[list[str], str, TimeStep]:
-    """What ended on the first step from a start, and the outcome."""
+    """Return what ended on the first step from a start, and the outcome."""
     state, _ = jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})
     state, timestep = step(env, state, jnp.zeros(2))
     return (
@@ -337,8 +339,8 @@ def test_a_condition_that_stands_apart_neither_hides_nor_is_hidden() -> None:
         env = jaxsafe.make(
             "docking2d", numbers | {"terminal": names, "terminal.success.apart": True}
         )
-        found, first, timestep = ends(env, [0.3, 0.0])
-        assert (set(found), first) == ({"success", "distance"}, outcome)
+        outcomes, first, timestep = ends(env, [0.3, 0.0])
+        assert (set(outcomes), first) == ({"success", "distance"}, outcome)
         assert timestep.terminated
         assert float(timestep.info.reward_terms["success"]) == pytest.approx(2.0 - 1.0 / 2000.0)
         assert float(timestep.info.reward_terms["failure"]) == -1.0
@@ -362,12 +364,13 @@ def test_a_bound_is_hidden_by_ends_but_not_by_those_that_stand_apart() -> None:
 
 
 def test_a_released_docking_that_crashes_too_late_is_a_timeout() -> None:
-    numbers, found = {"terminal.timeout.limit": 0.5}, {}
+    numbers = {"terminal.timeout.limit": 0.5}
+    outcomes = {}
     for variant in ("paper", "released"):
-        found[variant] = ends(
+        outcomes[variant] = ends(
             jaxsafe.make("docking2d", numbers, variant=variant), [0.3, -1.0], [0.0, 1.0]
         )[1]
-    assert found == {"paper": "crash", "released": "timeout"}
+    assert outcomes == {"paper": "crash", "released": "timeout"}
 
 
 @pytest.mark.parametrize("how", ["terminated", "truncated"])
@@ -376,7 +379,8 @@ def test_any_reward_term_may_carry_a_bound(how: str) -> None:
     env = jaxsafe.make("docking2d", {"reward.delta_v.bound": bound, "reward.delta_v.scale": -0.3})
     assert env.outcomes == (*OUTCOMES[:-1], "thirst", "diverged")
     state, _ = jaxsafe.reset_to(env, START)
-    over, kind = [], []
+    over = []
+    kind = []
     for _ in range(4):  # each pays 0.3 √2/12 = 0.0354
         state, timestep = step(env, state, jnp.ones(2))
         over.append(env.outcomes[int(timestep.info.outcome)])
@@ -397,7 +401,8 @@ def test_a_state_holds_the_numbers_drawn_for_its_episode(env: Environment) -> No
 
 def test_reset_to_takes_arrays_inside_a_compiled_function() -> None:
     env = jaxsafe.make("docking2d")
-    position, velocity = jnp.array([100.0, 0.0]), jnp.array([0.0, 0.1])
+    position = jnp.array([100.0, 0.0])
+    velocity = jnp.array([0.0, 0.1])
     state = jax.jit(
         lambda env: jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})[
             0
@@ -407,7 +412,7 @@ def test_reset_to_takes_arrays_inside_a_compiled_function() -> None:
 
 
 class Broken(Status, type="broken_for_this_test"):
-    """A number that is none near the chief."""
+    """A status that is not finite near the chief."""
 
     distance: StatusName
 

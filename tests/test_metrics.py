@@ -28,7 +28,8 @@ from jaxsafe.metrics import (
 )
 from jaxsafe.types import Info, TimeStep
 
-SUCCESS, CRASH = 1, 2
+SUCCESS = 1
+CRASH = 2
 
 
 def time_step(
@@ -37,7 +38,7 @@ def time_step(
     severity: tuple[float, ...] = (0.0, 0.0),
     outcome: int = 0,
 ) -> TimeStep:
-    """A step with two safety constraints; its totals are not used but carried along."""
+    """Return a step with two safety constraints. Its totals are carried along but not used."""
     margins = {name: jnp.asarray(-share) for name, share in zip("ab", severity, strict=True)}
     info = Info(
         outcome=jnp.asarray(outcome),
@@ -46,7 +47,7 @@ def time_step(
         reward_totals={"term": jnp.asarray(10.0 * reward)},
         control_desired=jnp.zeros(1),
         control_actual=jnp.zeros(1),
-        intervening=jnp.asarray(severity[0] > 0.0),  # so that some are
+        intervening=jnp.asarray(severity[0] > 0.0),  # so that some steps intervene
         margins=margins,
         severity={name: jnp.asarray(share) for name, share in zip("ab", severity, strict=True)},
         rta=None,
@@ -65,7 +66,10 @@ def follow(*timesteps: TimeStep) -> Episode:
 
 @pytest.fixture
 def episodes() -> Episode:
-    """Three episodes: a safe success, a success with two violating steps, a crash on its only step."""
+    """Return three episodes.
+
+    They are a safe success, a success with two violating steps, and a crash on its only step.
+    """
     safe = follow(time_step(1.0, (0.1, 0.2)), time_step(3.0, (0.2, 0.3), outcome=SUCCESS))
     unsafe = follow(
         time_step(-1.0, severity=(0.5, 0.25)),
@@ -124,17 +128,17 @@ def test_sums_work_on_batches_and_without_delta_v() -> None:
 
 
 def test_the_metrics_of_three_episodes_are_those_worked_out_by_hand(episodes: Episode) -> None:
-    found = summarise(episodes, SUCCESS, has_rta=True)
-    assert tuple(found) == METRICS
-    assert found == pytest.approx(
+    computed = summarise(episodes, SUCCESS, has_rta=True)
+    assert tuple(computed) == METRICS
+    assert computed == pytest.approx(
         {
             "average_return": 3.0 / 3,
             "episode_length": 7.0 / 3,
             "success_rate": 2.0 / 3,
             "control_usage": 0.6 / 3,
             "control_usage_l1": 0.9 / 3,
-            "safety_violation_rate": 2.0 / 3,  # episodes
-            "episode_safety_violation_rate": 3.0 / 7,  # steps
+            "safety_violation_rate": 2.0 / 3,  # per episode
+            "episode_safety_violation_rate": 3.0 / 7,  # per step
             "episode_cost": 3.0 / 3,
             "episode_violation_severity_mean": 2.6 / 3,  # over the three violating steps
             "episode_violation_severity_max": 2.0,
@@ -147,26 +151,30 @@ def test_the_metrics_of_three_episodes_are_those_worked_out_by_hand(episodes: Ep
 
 def test_without_violations_severity_is_zero() -> None:
     episode = follow(time_step(1.0, outcome=SUCCESS))
-    found = summarise(jax.tree.map(lambda leaf: leaf[None], episode), SUCCESS)
+    computed = summarise(jax.tree.map(lambda leaf: leaf[None], episode), SUCCESS)
     for name in ("safety_violation_rate", "episode_safety_violation_rate"):
-        assert found[name] == 0.0
+        assert computed[name] == 0.0
     assert (
-        found["episode_violation_severity_mean"] == found["episode_violation_severity_max"] == 0.0
+        computed["episode_violation_severity_mean"]
+        == computed["episode_violation_severity_max"]
+        == 0.0
     )
-    assert found["success_rate"] == 1.0
+    assert computed["success_rate"] == 1.0
 
 
 def test_control_usage_is_none_where_there_is_no_delta_v(episodes: Episode) -> None:
-    found = summarise(episodes, SUCCESS, has_delta_v=False)
-    assert found["intervention_rate"] is None
-    assert found["control_usage"] is None
-    assert found["control_usage_l1"] is None
+    computed = summarise(episodes, SUCCESS, has_delta_v=False)
+    assert computed["intervention_rate"] is None
+    assert computed["control_usage"] is None
+    assert computed["control_usage_l1"] is None
 
 
 def test_what_an_environment_does_not_measure_is_none(episodes: Episode) -> None:
-    found = summarise(episodes, -1, has_delta_v=True, has_delta_v_l1=False, has_constraints=False)
+    computed = summarise(
+        episodes, -1, has_delta_v=True, has_delta_v_l1=False, has_constraints=False
+    )
     known = {"average_return", "episode_length", "control_usage", "mean_reward"}
-    assert {name for name, value in found.items() if value is not None} == known
+    assert {name for name, value in computed.items() if value is not None} == known
     assert (
         summarise(episodes, SUCCESS, has_delta_v=False, has_delta_v_l1=True)["control_usage_l1"]
         is not None
@@ -175,20 +183,26 @@ def test_what_an_environment_does_not_measure_is_none(episodes: Episode) -> None
 
 def test_an_environment_says_what_it_measures() -> None:
     assert measures(jaxsafe.make("docking2d", rta="default")) == {
-        "has_delta_v": True, "has_delta_v_l1": True, "has_constraints": True, "has_rta": True,
-    }  # fmt: skip
+        "has_delta_v": True,
+        "has_delta_v_l1": True,
+        "has_constraints": True,
+        "has_rta": True,
+    }
     custom = jaxsafe.make(str(Path(__file__).parent.parent / "configs" / "custom_env.yaml"))
     assert measures(custom) | {"has_rta": False} == {
-        "has_delta_v": True, "has_delta_v_l1": False, "has_constraints": True, "has_rta": False,
-    }  # fmt: skip
+        "has_delta_v": True,
+        "has_delta_v_l1": False,
+        "has_constraints": True,
+        "has_rta": False,
+    }
     assert not measures(jaxsafe.make("rejoin2d"))["has_delta_v"]
 
 
 def test_a_figure_that_is_not_finite_is_none(episodes: Episode) -> None:
     broken = episodes.replace(episode_return=episodes.episode_return.at[1].set(jnp.nan))
-    found = summarise(broken, SUCCESS)
-    assert found["average_return"] is found["mean_reward"] is None
-    assert found["success_rate"] == pytest.approx(2.0 / 3)
+    computed = summarise(broken, SUCCESS)
+    assert computed["average_return"] is computed["mean_reward"] is None
+    assert computed["success_rate"] == pytest.approx(2.0 / 3)
 
 
 def test_the_metrics_of_a_real_episode_agree_with_its_steps() -> None:
@@ -197,30 +211,35 @@ def test_the_metrics_of_a_real_episode_agree_with_its_steps() -> None:
     state, timestep = jaxsafe.reset_to(
         env, {"deputy": {"position": [120.0, 0.0], "velocity": [0.0, 0.4]}}
     )
-    episode, taken, step = begin(timestep), [], jax.jit(jaxsafe.step)
+    episode = begin(timestep)
+    taken = []
+    step = jax.jit(jaxsafe.step)
     for action in actions:
         state, timestep = step(env, state, action)
-        episode, taken = accumulate(episode, timestep), [*taken, timestep]
-    found = summarise(jax.tree.map(lambda leaf: leaf[None], episode), env.outcomes.index("success"))
+        episode = accumulate(episode, timestep)
+        taken = [*taken, timestep]
+    computed = summarise(
+        jax.tree.map(lambda leaf: leaf[None], episode), env.outcomes.index("success")
+    )
     limits = np.asarray([timestep.info.status["velocity_limit"] for timestep in taken], float)
     over = np.maximum([timestep.info.status["speed"] for timestep in taken] - limits, 0.0) / limits
     assert 0 < (over > 0).sum() < 20
-    assert found["control_usage"] == pytest.approx(
+    assert computed["control_usage"] == pytest.approx(
         np.linalg.norm(actions, axis=1).sum() / 12, rel=1e-5
     )
-    assert found["control_usage_l1"] == pytest.approx(np.abs(actions).sum() / 12, rel=1e-5)
-    assert found["episode_safety_violation_rate"] == pytest.approx((over > 0).mean())
-    assert found["episode_violation_severity_mean"] == pytest.approx(
+    assert computed["control_usage_l1"] == pytest.approx(np.abs(actions).sum() / 12, rel=1e-5)
+    assert computed["episode_safety_violation_rate"] == pytest.approx((over > 0).mean())
+    assert computed["episode_violation_severity_mean"] == pytest.approx(
         over[over > 0].mean(), rel=1e-3
     )
-    assert found["episode_violation_severity_max"] == pytest.approx(over.max(), rel=1e-3)
-    assert found["mean_reward"] == pytest.approx(
+    assert computed["episode_violation_severity_max"] == pytest.approx(over.max(), rel=1e-3)
+    assert computed["mean_reward"] == pytest.approx(
         np.mean([float(timestep.reward) for timestep in taken]), rel=1e-4
     )
-    assert found["average_return"] == pytest.approx(
+    assert computed["average_return"] == pytest.approx(
         sum(map(float, state.reward_totals.values())), rel=1e-4
     )
-    assert found["episode_length"] == 20.0
+    assert computed["episode_length"] == 20.0
 
 
 # Interaction efficiency
@@ -233,9 +252,7 @@ def efficiency(success: Any, episodes: Any, **options: Any) -> dict[str, Any]:
     )
 
 
-def test_interaction_efficiency_is_the_first_step_at_which_the_average_over_seeds_reaches_four_fifths() -> (
-    None
-):
+def test_interaction_efficiency_is_the_first_step_at_which_the_seeds_average_80_percent() -> None:
     success = [[0.9, 0.0], [0.7, 0.7], [1.0, 0.6], [0.5, 0.8], [1.0, 1.0]]
     assert efficiency(success, np.full((5, 2), 50)) == {"timesteps": 300, "per_seed": [100, 400]}
 
@@ -243,11 +260,10 @@ def test_interaction_efficiency_is_the_first_step_at_which_the_average_over_seed
 def test_a_rate_of_exactly_four_fifths_counts() -> None:
     assert efficiency([[0.79], [0.8]], [[100], [100]]) == {"timesteps": 200, "per_seed": [200]}
     rates = [0.97, 0.61, 0.74, 0.85, 0.64, 0.8, 0.85, 0.9, 0.97, 0.67]
-    assert np.mean([rates], axis=1)[0] < 0.8  # as floats
+    assert np.mean([rates], axis=1)[0] < 0.8  # rounding of floats brings the mean below
     assert efficiency([rates], [[100] * 10])["timesteps"] == 100
-    single = np.full(
-        (1, 1), 80 * np.float32(0.01) - np.float32(6e-8), np.float32
-    )  # as a sum of hundredths may end
+    # A sum of hundredths may end this far below.
+    single = np.full((1, 1), 80 * np.float32(0.01) - np.float32(6e-8), np.float32)
     assert efficiency(single, [[100]]) == {"timesteps": 100, "per_seed": [100]}
     assert efficiency([[0.79999]], [[100]])["timesteps"] is None
 
@@ -291,31 +307,31 @@ def test_a_seed_without_a_rate_yet_does_not_count_as_a_success() -> None:
 
 def test_the_mean_of_ten_seeds_has_the_interval_of_scipys_percentile_bootstrap() -> None:
     values = np.random.default_rng(3).normal(5.0, 2.0, 10)
-    found = over_seeds([float(value) for value in values])
+    computed = over_seeds([float(value) for value in values])
     expected = bootstrap(
         (values,), np.mean, method="percentile", n_resamples=20_000, rng=np.random.default_rng(1)
     )
-    assert found["mean"] == pytest.approx(values.mean())
-    assert found["iqm"] == pytest.approx(trim_mean(values, 0.25))
-    assert found["per_seed"] == pytest.approx(list(values))
-    assert found["ci95"] == pytest.approx(list(expected.confidence_interval), abs=0.1)
-    assert found["ci95"][0] < values.mean() < found["ci95"][1]
+    assert computed["mean"] == pytest.approx(values.mean())
+    assert computed["iqm"] == pytest.approx(trim_mean(values, 0.25))
+    assert computed["per_seed"] == pytest.approx(list(values))
+    assert computed["ci95"] == pytest.approx(list(expected.confidence_interval), abs=0.1)
+    assert computed["ci95"][0] < values.mean() < computed["ci95"][1]
 
 
 def test_the_bootstrap_interval_is_row_by_row() -> None:
     rows = np.random.default_rng(4).normal(size=(3, 10))
-    found = bootstrap_interval(rows)
-    assert found.shape == (2, 3)
+    computed = bootstrap_interval(rows)
+    assert computed.shape == (2, 3)
     for i in range(3):
-        np.testing.assert_array_equal(found[:, i], bootstrap_interval(rows[i : i + 1])[:, 0])
+        np.testing.assert_array_equal(computed[:, i], bootstrap_interval(rows[i : i + 1])[:, 0])
     np.testing.assert_array_equal(bootstrap_interval(np.full((1, 5), 0.3)), np.full((2, 1), 0.3))
 
 
 @settings(deadline=None, max_examples=20)
 @given(st.lists(st.floats(-1e3, 1e3), min_size=3, max_size=10))
 def test_the_interval_lies_within_the_values(values: list[float]) -> None:
-    found = over_seeds(values)
-    low, high = found["ci95"]
+    computed = over_seeds(values)
+    low, high = computed["ci95"]
     slack = 1e-9 * (1.0 + max(map(abs, values)))
     assert min(values) - slack <= low <= high <= max(values) + slack
 
@@ -339,14 +355,15 @@ def test_a_metric_without_a_meaning_stays_none() -> None:
 
 
 def test_the_interquartile_mean_drops_the_outer_quarters_over_all_tasks() -> None:
-    found = stratified_iqm([[0.0, 0.8, 0.9, 1.0], [0.9, 0.9, 0.9, 0.9]])
-    assert found["iqm"] == pytest.approx(0.9)  # of 0, 0.8, 0.9 × 5, 1 the middle four
-    low, high = found["ci95"]
+    computed = stratified_iqm([[0.0, 0.8, 0.9, 1.0], [0.9, 0.9, 0.9, 0.9]])
+    assert computed["iqm"] == pytest.approx(0.9)  # the middle four of 0, 0.8, 0.9 × 5, 1
+    low, high = computed["ci95"]
     assert 0.6 <= low <= 0.9 <= high <= 1.0
 
 
 def test_the_stratified_bootstrap_resamples_within_tasks() -> None:
+    # Every resample has five of each.
     assert stratified_iqm([[0.0] * 5, [1.0] * 5])["ci95"] == [
         0.5,
         0.5,
-    ]  # every resample has five of each
+    ]

@@ -1,4 +1,7 @@
-"""Everything works in the modes that JAX offers for debugging, for other random numbers and for double precision."""
+"""Everything works in the modes that JAX offers.
+
+These are modes for debugging, for other random numbers and for double precision.
+"""
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
@@ -36,13 +39,17 @@ TRAININGS: dict[str, dict[str, Any]] = {
     "corrected": {"rta": "default", "rta_training": "corrected"},
 }
 SMALL = {
-    "agent.hidden": [4], "ppo.num_envs": 2, "ppo.num_steps": 2, "ppo.num_epochs": 1, "ppo.num_minibatches": 1,
+    "agent.hidden": [4],
+    "ppo.num_envs": 2,
+    "ppo.num_steps": 2,
+    "ppo.num_epochs": 1,
+    "ppo.num_minibatches": 1,
     "env.terminal.timeout.limit": 1,
-}  # fmt: skip
+}
 
 
 def core(env: jaxsafe.Environment, key: jax.Array, num_envs: int) -> Any:
-    """A start, a step, and a rollout long enough for a second start."""
+    """Return a start, a step, and a rollout long enough for a second start."""
     key_reset, key_rollout = jax.random.split(key)
     state, timestep = jaxsafe.reset(env, key_reset)
     action = jnp.zeros(
@@ -57,7 +64,7 @@ def core(env: jaxsafe.Environment, key: jax.Array, num_envs: int) -> Any:
 
 
 def learn(words: dict[str, Any], key: jax.Array, run: Callable[..., Any]) -> Any:
-    """Two updates, and an evaluation of what they learn."""
+    """Make two updates and evaluate what they learn."""
     config, env, _ = resolve({"env": "docking2d", **SMALL, **words})
     shared = env, config.agent, config.ppo
     keys = jax.random.split(key)
@@ -102,7 +109,8 @@ def test_every_filter_can_be_traced(mode: str, task: str, rta: str) -> None:
 def test_everything_runs(mode: str) -> None:
     with CHECKED_WHILE_RUNNING[mode]():
         *keys, key = jax.random.split(jax.random.key(0), 3)
-        plain, filtered = jaxsafe.make("docking2d"), jaxsafe.make("docking2d", rta="default")
+        plain = jaxsafe.make("docking2d")
+        filtered = jaxsafe.make("docking2d", rta="default")
         for env, key_core in zip((plain, filtered), keys, strict=True):
             _, timestep, _ = jax.jit(lambda env, key: core(env, key, 2))(env, key_core)
             assert bool(jnp.isfinite(timestep.observation).all())
@@ -116,7 +124,8 @@ def test_everything_runs(mode: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("rta", [None, "default", "explicit_simplex"])
 def test_steps_and_filters_run_without_compilation(rta: str | None) -> None:
-    env, key = jaxsafe.make("docking2d", rta=rta), jax.random.key(0)
+    env = jaxsafe.make("docking2d", rta=rta)
+    key = jax.random.key(0)
     compiled = jax.jit(lambda env, key: core(env, key, 2))(env, key)
     with jax.disable_jit():
         eager = core(env, key, 2)

@@ -1,4 +1,7 @@
-"""Numbers of the environment drawn anew for each episode: where they are drawn, kept and used, and which are refused."""
+"""Numbers of the environment are drawn anew for each episode.
+
+The tests say where they are drawn, kept and used, and which are refused.
+"""
 
 import re
 from typing import Any
@@ -53,12 +56,11 @@ def test_numbers_lie_in_their_intervals_and_fill_them(env: Environment) -> None:
         share = (np.asarray(drawn[path]) - low) / (high - low)
         assert share.min() >= -1e-6
         assert share.max() <= 1.0 + 1e-6
-        np.testing.assert_allclose(
-            np.sort(share), np.linspace(0, 1, 256), atol=0.12
-        )  # Kolmogorov and Smirnov's distance
+        # The tolerance is Kolmogorov and Smirnov's distance.
+        np.testing.assert_allclose(np.sort(share), np.linspace(0, 1, 256), atol=0.12)
 
 
-def test_numbers_differ_by_lane_by_reset_and_by_path(env: Environment) -> None:
+def test_numbers_differ_by_environment_by_reset_and_by_path(env: Environment) -> None:
     masses, scales = (np.asarray(value) for value in reset_many(env, keys())[0].parameters.values())
     assert len(np.unique(masses)) == len(np.unique(scales)) == 64
     assert abs(np.corrcoef(masses, scales)[0, 1]) < 0.4
@@ -69,7 +71,8 @@ def test_numbers_differ_by_lane_by_reset_and_by_path(env: Environment) -> None:
 
 def test_numbers_are_independent_of_the_start(env: Environment) -> None:
     state, _ = reset_many(env, keys(256))
-    masses, position = state.parameters["deputy.mass"], state.sim.platforms["deputy"].position
+    masses = state.parameters["deputy.mass"]
+    position = state.sim.platforms["deputy"].position
     for drawn in (np.hypot(*position.T), np.arctan2(*position.T)):
         assert abs(np.corrcoef(masses, drawn)[0, 1]) < 0.2
 
@@ -113,7 +116,8 @@ def test_a_randomized_episode_is_the_episode_with_the_numbers_written_in(env: En
     plain = jaxsafe.make("docking2d", dict(state.parameters))
     other = state.replace(parameters={})
     for action in jax.random.uniform(jax.random.key(0), (5, 2), minval=-1.0):
-        (state, timestep), (other, expected) = step(env, state, action), step(plain, other, action)
+        (state, timestep) = step(env, state, action)
+        (other, expected) = step(plain, other, action)
         chex.assert_trees_all_close(timestep, expected, rtol=1e-6, atol=1e-6)
 
 
@@ -121,10 +125,8 @@ def test_a_randomized_episode_is_the_episode_with_the_numbers_written_in(env: En
     "task", ["docking2d", "docking3d", "docking2d_oriented", "rejoin2d", "rejoin3d"]
 )
 def test_starts_are_bitwise_those_without_random_numbers(task: str) -> None:
-    plain, random = (
-        jaxsafe.make(task),
-        jaxsafe.make(task, randomize={"dt": [0.5, 2.0], "terminal.timeout.limit": [9, 99]}),
-    )
+    plain = jaxsafe.make(task)
+    random = jaxsafe.make(task, randomize={"dt": [0.5, 2.0], "terminal.timeout.limit": [9, 99]})
     (before, first), (after, second) = (reset_many(env, keys(8)) for env in (plain, random))
     chex.assert_trees_all_equal(before.sim.platforms, after.sim.platforms)
     chex.assert_trees_all_equal(first.observation, second.observation)
@@ -173,7 +175,10 @@ def test_reset_to_takes_the_numbers_that_are_random(env: Environment) -> None:
         ),
         (
             {"dt": 1.0},
-            r"^reset_to: parameter 'dt' is not random; choose from deputy\.mass, reward\.delta_v\.scale",
+            (
+                r"^reset_to: parameter 'dt' is not random; choose from deputy\.mass,"
+                r" reward\.delta_v\.scale"
+            ),
         ),
     ],
 )
@@ -204,22 +209,43 @@ def test_reset_to_refuses_what_is_not_one_number(env: Environment, value: Any) -
     [
         ({"deputy.mas": [1, 2]}, r"deputy\.mas: unknown field 'mas'.* Did you mean 'mass'\?"),
         ({"deputi.mass": [1, 2]}, r"deputi: unknown field 'deputi'.* Did you mean 'deputy'\?"),
-        ({"reward.delta.scale": [1, 2]}, r"reward\.delta: unknown name 'delta'.* Did you mean 'delta_v'\?"),
+        (
+            {"reward.delta.scale": [1, 2]},
+            r"reward\.delta: unknown name 'delta'.* Did you mean 'delta_v'\?",
+        ),
         ({"reward.delta_v": [1, 2]}, r"reward\.delta_v: name one of its fields"),
         ({"deputy": [1, 2]}, r"deputy: name one of its fields"),
         ({"": [1, 2]}, r"unknown field ''"),
         ({"deputy.mass.x": [1, 2]}, r"deputy\.mass\.x: deputy\.mass has no fields"),
-        ({"regions.docking_region.offset.angle": [1, 2]}, r"offset has no fields because it is not set"),
+        (
+            {"regions.docking_region.offset.angle": [1, 2]},
+            r"offset has no fields because it is not set",
+        ),
         ({"agent": [1, 2]}, r"agent: expected the path of one number"),
         ({"deputy.dimension": [2, 3]}, r"deputy\.dimension: expected the path of one number"),
-        ({"status.delta_v.norm": [1, 2]}, r"status\.delta_v\.norm: expected the path of one number"),
-        ({"terminal.success.apart": [0, 1]}, r"terminal\.success\.apart: expected the path of one number"),
+        (
+            {"status.delta_v.norm": [1, 2]},
+            r"status\.delta_v\.norm: expected the path of one number",
+        ),
+        (
+            {"terminal.success.apart": [0, 1]},
+            r"terminal\.success\.apart: expected the path of one number",
+        ),
         ({"terminal": [1, 2]}, r"terminal: expected the path of one number"),
-        ({"deputy.start.position.distance": [1, 2]}, r"distance: expected the path of one number, found that of a list"),
+        (
+            {"deputy.start.position.distance": [1, 2]},
+            r"distance: expected the path of one number, found that of a list",
+        ),
         ({"reward.failure.values": [1, 2]}, r"reward\.failure\.values: expected"),
-        ({"reward.failure.values.crsh": [1, 2]}, r"reward\.failure\.values: unknown name 'crsh'.* Did you mean 'crash'\?"),
+        (
+            {"reward.failure.values.crsh": [1, 2]},
+            r"reward\.failure\.values: unknown name 'crsh'.* Did you mean 'crash'\?",
+        ),
         ({"deputy.mass": [0, 1]}, r"deputy\.mass: expected a number in kg > 0, found 0"),
-        ({"regions.docking_region.radius": [-1, 1]}, r"regions\.docking_region\.radius: expected .* ≥ 0, found -1"),
+        (
+            {"regions.docking_region.radius": [-1, 1]},
+            r"regions\.docking_region\.radius: expected .* ≥ 0, found -1",
+        ),
         ({"deputy.mass": [14, 10]}, r"deputy\.mass: expected low ≤ high"),
         ({"deputy.mass": 12}, r"deputy\.mass: expected a list \[low, high\]"),
         ({"deputy.mass": [1, 2, 3]}, r"deputy\.mass: expected a list \[low, high\]"),
@@ -230,7 +256,7 @@ def test_reset_to_refuses_what_is_not_one_number(env: Environment, value: Any) -
         ({"randomize.dt": [1, 2]}, r"randomize\.dt: expected the path of a number outside"),
         ({3: [1, 2]}, r"3: unknown field '3'"),
     ],
-)  # fmt: skip
+)
 def test_a_path_that_leads_to_no_number_in_range_is_refused(randomize: Any, message: str) -> None:
     with pytest.raises(ConfigError) as caught:
         jaxsafe.make("docking2d", randomize=randomize)
@@ -278,7 +304,7 @@ def test_a_rollout_draws_anew_at_every_automatic_reset(num_envs: int | None) -> 
     assert len(np.unique(episodes[:, 0].round(3))) == 4 * (num_envs or 1)
 
 
-def test_only_the_lanes_that_end_draw_anew() -> None:
+def test_only_the_environments_that_end_draw_anew() -> None:
     env = jaxsafe.make(
         "docking2d", {"terminal.distance.limit": 125.0}, randomize={"deputy.mass": [5, 50]}
     )
@@ -316,9 +342,9 @@ def test_numbers_may_be_overridden_by_traced_values(env: Environment) -> None:
         state, _ = jaxsafe.reset(changed, jax.random.key(0))
         return jaxsafe.step(changed, state, jnp.ones(2))[1].info.reward_terms["distance_change"]
 
-    found = jax.jit(jax.vmap(first_cost))(jnp.asarray([1.0, 2.0]))
-    assert float(found[0]) != 0.0
-    np.testing.assert_allclose(found[1], 2.0 * found[0], rtol=1e-4)
+    computed = jax.jit(jax.vmap(first_cost))(jnp.asarray([1.0, 2.0]))
+    assert float(computed[0]) != 0.0
+    np.testing.assert_allclose(computed[1], 2.0 * computed[0], rtol=1e-4)
 
 
 def test_leads_turn_differently() -> None:
@@ -336,12 +362,13 @@ def test_leads_turn_differently() -> None:
 def test_equal_environments_start_alike_whatever_order_their_numbers_were_written_in() -> None:
     intervals = {"deputy.mean_motion": [0.001, 0.002], "deputy.mass": [10, 14], "dt": [0.5, 2.0]}
     backwards = dict(reversed(intervals.items()))
-    first, second = (jaxsafe.make("docking2d", randomize=one) for one in (intervals, backwards))
+    first, second = (
+        jaxsafe.make("docking2d", randomize=randomize) for randomize in (intervals, backwards)
+    )
     assert first == second
     assert dump(first) == dump(second)
-    bare = first.replace(
-        randomize=dict(reversed(first.randomize.items()))
-    )  # as no check has seen it
+    # No check has seen this order of the intervals.
+    bare = first.replace(randomize=dict(reversed(first.randomize.items())))
     expected = reset(first, keys()[0])[0].parameters
     for env in (first, second, bare):
         chex.assert_trees_all_equal(jaxsafe.reset(env, keys()[0])[0].parameters, expected)

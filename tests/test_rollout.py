@@ -1,4 +1,7 @@
-"""Episodes back to back: fresh starts, true last observations, and batches that are many single environments."""
+"""Episodes back to back: fresh starts and true last observations.
+
+A batch is many single environments.
+"""
 
 from typing import Any
 
@@ -14,7 +17,9 @@ from jaxsafe.rollout import reset_batch, step_or_reset, step_or_reset_batch
 from jaxsafe.simulation.cwh import cwh_flow
 from jaxsafe.types import State, TimeStep
 
-NUM_STEPS, NUM_ENVS, LENGTH = 30, 6, 4
+NUM_STEPS = 30
+NUM_ENVS = 6
+LENGTH = 4
 TRACED: list[tuple[int, ...]] = []
 
 step = jax.jit(jaxsafe.step)
@@ -22,14 +27,17 @@ rollout = jax.jit(jaxsafe.rollout, static_argnames=("policy", "num_steps", "num_
 
 
 def policy(key: jax.Array | None, observation: jax.Array) -> jax.Array:
-    """A deterministic function of the observation, for one environment and for many."""
+    """Return an action that is a deterministic function of the observation.
+
+    It works for one environment and for many.
+    """
     TRACED.append(observation.shape)
     return jnp.sin(7.0 * observation[..., :2])
 
 
 @pytest.fixture(scope="module")
 def env() -> Environment:
-    """Every episode times out after four steps."""
+    """Return an environment in which every episode times out after four steps."""
     return jaxsafe.make("docking2d", {"terminal.timeout.limit": LENGTH - 1})
 
 
@@ -44,13 +52,14 @@ def batch(env: Environment) -> TimeStep:
 
 
 def state_at(env: Environment, observation: jax.Array) -> State:
-    """The state of which this is the docking observation."""
-    position, velocity = 100.0 * observation[:2], 0.5 * observation[2:4]
+    """Return the state whose docking observation is given."""
+    position = 100.0 * observation[:2]
+    velocity = 0.5 * observation[2:4]
     return jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})[0]
 
 
 def is_start(observation: jax.Array) -> bool:
-    """Whether this may be the observation of a start: 100-150 m away within the speed limit."""
+    """Return whether a start may have this observation: 100-150 m away within the speed limit."""
     return (
         99.99 <= 100 * np.hypot(*observation[:2]) <= 150.01
         and observation[4] <= observation[5] + 1e-6
@@ -58,20 +67,28 @@ def is_start(observation: jax.Array) -> bool:
 
 
 def before(env: Environment, observation: jax.Array, action: jax.Array) -> np.ndarray:
-    """The observation from which a step with this action led here: the flow, which is linear, run backwards."""
+    """Return the observation from which a step with this action led here.
+
+    The flow is linear, so it can be run backwards.
+    """
     with jax.enable_x64(True):
         there = np.asarray(observation[:4], float) * [100, 100, 0.5, 0.5]
         back = cwh_flow(there[:2], there[2:], np.asarray(action, float) / 12.0, 0.001027, -1.0)
         position, velocity = (np.asarray(part) for part in back)
-    speed, limit = np.linalg.norm(velocity), 0.2 + 2 * 0.001027 * np.linalg.norm(position)
+    speed = np.linalg.norm(velocity)
+    limit = 0.2 + 2 * 0.001027 * np.linalg.norm(position)
     return np.concatenate([position / 100, velocity / 0.5, [speed, limit]])
 
 
 def assert_is_a_run(env: Environment, timesteps: TimeStep) -> None:
-    """Inside an episode each observation follows from the last; after an end the next comes from a random start."""
+    """Check that each observation inside an episode follows from the last.
+
+    After an end the next observation comes from a random start.
+    """
     starts = []
     for t in range(1, NUM_STEPS):
-        last, following = timesteps.observation[t - 1], timesteps.observation[t]
+        last = timesteps.observation[t - 1]
+        following = timesteps.observation[t]
         if timesteps.terminated[t - 1]:
             start = before(env, following, timesteps.info.control_actual[t])
             assert is_start(start)
@@ -168,21 +185,21 @@ def test_environments_may_be_the_last_axis(env: Environment) -> None:
     begin = jax.jit(reset_batch, static_argnames=("num_envs", "axis"))
     advance = jax.jit(step_or_reset_batch, static_argnames="axis")
     action = jax.random.uniform(jax.random.key(3), (300, 2), minval=-1.0)
-    found = []
+    computed = []
     for axis in (0, -1):
         state, _ = begin(env, jax.random.key(1), num_envs=300, axis=axis)
         state = state.replace(num_steps=jnp.arange(300) % LENGTH)
-        found.append(
+        computed.append(
             advance(env, state, action if axis == 0 else action.T, jax.random.key(2), axis=axis)
         )
-    assert 0 < found[0][1].done.sum() < 300
+    assert 0 < computed[0][1].done.sum() < 300
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, jnp.moveaxis(b, -1, 0), rtol=1e-5, atol=1e-5),
-        *found,
+        *computed,
     )
 
 
-def test_the_starts_of_a_large_batch_are_those_of_its_lanes() -> None:
+def test_the_starts_of_a_large_batch_are_those_of_its_environments() -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": LENGTH - 1})
     state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(1), 256)
     state = state.replace(num_steps=state.num_steps.at[jnp.array([3, 200])].set(LENGTH - 1))
@@ -190,17 +207,16 @@ def test_the_starts_of_a_large_batch_are_those_of_its_lanes() -> None:
     (after, _), timestep = jax.jit(step_or_reset_batch)(env, state, jnp.zeros((256, 2)), key)
     assert np.flatnonzero(timestep.done).tolist() == [3, 200]
     fresh, _ = jax.jit(reset_batch, static_argnums=2)(env, key, 256)
-    for lane in (3, 200):
+    for index in (3, 200):
         jax.tree.map(
-            lambda a, b, i=lane: np.testing.assert_allclose(a[i], b[i], rtol=1e-6), after, fresh
+            lambda a, b, i=index: np.testing.assert_allclose(a[i], b[i], rtol=1e-6), after, fresh
         )
 
 
 def test_a_limit_truncates_what_still_runs(env: Environment) -> None:
     state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(1), 4)
-    state = state.replace(
-        num_steps=jnp.asarray([0, 1, 2, LENGTH - 1])
-    )  # the last one's own time is over
+    # The last episode has reached its own limit.
+    state = state.replace(num_steps=jnp.asarray([0, 1, 2, LENGTH - 1]))
     (after, _), timestep = jax.jit(step_or_reset_batch)(
         env, state, jnp.zeros((4, 2)), jax.random.key(2), 2
     )

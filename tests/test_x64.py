@@ -1,4 +1,4 @@
-"""The commands in double precision, each in a process of its own as users start them."""
+"""The commands in double precision. Each runs in a process of its own, as users start it."""
 
 import json
 import os
@@ -17,8 +17,11 @@ RUNS = [word for word in TINY if not word.startswith(("seeds", "env="))]
 def command(module: str, *words: str, code: int = 0) -> str:
     done = subprocess.run(
         [sys.executable, "-m", f"jaxsafe.{module}", *words],
-        env={**os.environ, "JAX_ENABLE_X64": "1"}, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        env={**os.environ, "JAX_ENABLE_X64": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == code, done.stderr[-2000:]
     return done.stdout
 

@@ -21,7 +21,8 @@ def brax() -> Any:
 
 
 def test_a_step_is_ours(brax: Any) -> None:
-    env, core = brax.BraxEnv("docking2d", SHORT), jaxsafe.make("docking2d", SHORT)
+    env = brax.BraxEnv("docking2d", SHORT)
+    core = jaxsafe.make("docking2d", SHORT)
     state = env.reset(jax.random.key(0))
     expected, _ = core.reset(jax.random.key(0))
     action = jnp.array([0.5, -0.5])
@@ -38,7 +39,8 @@ def test_a_step_is_ours(brax: Any) -> None:
 def test_episodes_start_anew_each_time(brax: Any) -> None:
     env = brax.wrap(brax.BraxEnv("docking2d", SHORT), episode_length=100)
     state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
-    starts, step = [state.obs], jax.jit(env.step)
+    starts = [state.obs]
+    step = jax.jit(env.step)
     for _ in range(12):
         state = step(state, jnp.zeros((3, 2)))
         if state.done.all():
@@ -70,7 +72,10 @@ FACTS = (
 def flown(
     brax: Any, action_repeat: int, start: Any, episode_length: int = 1000
 ) -> tuple[Any, dict[str, float]]:
-    """The last state of an episode that drifts from a start, and the sums over it by Brax's count and by ours."""
+    """Return the last state of an episode that drifts from a start, and two sums over the episode.
+
+    One sum is by Brax's count, the other by ours.
+    """
     env = brax.wrap(brax.BraxEnv("docking2d"), episode_length, action_repeat)
     state = env.reset(jax.random.split(jax.random.PRNGKey(0), 1))
     first, timestep = jaxsafe.reset_to(env.unwrapped.env, {"deputy": start})
@@ -88,8 +93,10 @@ def flown(
             break
     facts = {name: float(state.info["episode_metrics"][name][0]) for name in FACTS}
     assert (facts["sum_reward"], facts["cost"], facts["length"]) == (
-        pytest.approx(reward), cost, float(state.info["steps"][0]),
-    )  # fmt: skip
+        pytest.approx(reward),
+        cost,
+        float(state.info["steps"][0]),
+    )
     return state, facts
 
 

@@ -23,7 +23,7 @@ from jaxsafe.adapters.safety_gymnasium import SafetyEnv
 from jaxsafe.envs import TASKS
 
 SOON = {"terminal.distance.limit": 130.0}
-"""Starts are 100 to 150 m away, so some episodes end with the first step and others last."""
+"""Some episodes end with the first step and others last, because starts are 100 to 150 m away."""
 
 
 def actions(env: Any, steps: int) -> list[np.ndarray]:
@@ -32,7 +32,7 @@ def actions(env: Any, steps: int) -> list[np.ndarray]:
 
 
 def same(ours: Any, theirs: Any, where: np.ndarray, name: str) -> None:
-    """Infos alike, in the lanes that have them."""
+    """Compare infos, in the environments of the batch that have them."""
     if isinstance(theirs, dict):
         assert ours.keys() == theirs.keys(), name
         for key in theirs:
@@ -70,23 +70,25 @@ def test_gymnasiums_own_checks_find_nothing(name: str, kind: str) -> None:
 
 
 def step_by_step(ours: GymVectorEnv, theirs: SyncVectorEnv, steps: int) -> int:
-    """Hold a batch to single environments; returns how many episodes ended."""
+    """Compare a batch with single environments. Return how many episodes ended."""
     mode = ours.metadata["autoreset_mode"]
     assert ours.single_observation_space == theirs.single_observation_space
     assert (ours.action_space, mode) == (theirs.action_space, theirs.metadata["autoreset_mode"])
-    everywhere, ends = np.ones(ours.num_envs, bool), 0
+    everywhere = np.ones(ours.num_envs, bool)
+    ends = 0
     for (observation, infos), (expected, their_infos) in [
         (ours.reset(seed=5), theirs.reset(seed=5))
     ]:
         np.testing.assert_allclose(observation, expected, rtol=1e-6)
         same(infos, their_infos, everywhere, "reset")
     for action in actions(theirs, steps):
-        (*found, infos), (*expected, their_infos) = ours.step(action), theirs.step(action)
-        for one, other in zip(found, expected, strict=True):
-            assert one.dtype == other.dtype
-            np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+        (*result, infos) = ours.step(action)
+        (*expected, their_infos) = theirs.step(action)
+        for value, other in zip(result, expected, strict=True):
+            assert value.dtype == other.dtype
+            np.testing.assert_allclose(value, other, rtol=1e-5, atol=1e-6)
         same(infos, their_infos, everywhere, "step")
-        done = found[2] | found[3]
+        done = result[2] | result[3]
         ends += int(done.sum())
         if mode is AutoresetMode.DISABLED and done.any():
             with pytest.raises(ResetNeeded, match="episodes of lanes"):
@@ -133,9 +135,8 @@ def test_final_observations_may_be_written_to_and_wrappers_count_episodes() -> N
     env.reset(seed=0)
     zero = np.zeros((4, 2), np.float32)
     *_, infos = [env.step(zero) for _ in range(3)][-1]
-    assert (
-        infos["final_info"]["outcome"].tolist() == ["running"] * 4
-    )  # cut short by the limit alone
+    # The limit alone cut the episodes short.
+    assert infos["final_info"]["outcome"].tolist() == ["running"] * 4
     infos["final_obs"][:] = 0.0
     assert infos["episode"]["l"].tolist() == [3] * 4
 
@@ -177,8 +178,9 @@ def test_every_seed_has_a_start_of_its_own_however_big_it_is() -> None:
     "build", [lambda: gym.make("jaxsafe/Docking2D-v0"), lambda: GymVectorEnv("docking2d", 2)]
 )
 def test_a_generator_of_ones_own_decides_the_starts(build: Any) -> None:
-    env, starts = build(), []
-    for seed in (3, 4, 3):  # at first, and in the middle of a chain
+    env = build()
+    starts = []
+    for seed in (3, 4, 3):  # as the first seed, and in the middle of a chain
         env.np_random = np.random.default_rng(seed)
         starts.append(np.stack([env.reset()[0] for _ in range(2)]))
     assert np.array_equal(starts[0], starts[2])
@@ -190,8 +192,9 @@ def test_a_generator_of_ones_own_decides_the_starts(build: Any) -> None:
         env.np_random = 3
 
 
-def test_a_generator_of_ones_own_waits_for_the_lanes_that_go_on() -> None:
-    env, other = GymVectorEnv("docking2d", 2), GymVectorEnv("docking2d", 2)
+def test_a_generator_of_ones_own_waits_for_the_environments_that_go_on() -> None:
+    env = GymVectorEnv("docking2d", 2)
+    other = GymVectorEnv("docking2d", 2)
     first, _ = env.reset(seed=0)
     env.np_random = np.random.default_rng(3)
     only, _ = env.reset(options={"reset_mask": np.array([True, False])})
@@ -202,9 +205,10 @@ def test_a_generator_of_ones_own_waits_for_the_lanes_that_go_on() -> None:
 
 
 @pytest.mark.parametrize("kind", ["rbg", "unsafe_rbg"])
-def test_lanes_start_as_single_environments_with_other_kinds_of_keys(kind: str) -> None:
+def test_a_batch_starts_as_single_environments_with_other_kinds_of_keys(kind: str) -> None:
     with jax.default_prng_impl(kind):
-        env, single = GymVectorEnv("docking2d", 3), GymEnv("docking2d")
+        env = GymVectorEnv("docking2d", 3)
+        single = GymEnv("docking2d")
         single.reset(seed=1)
         expected = [single.reset(seed=1)[0], *(single.reset()[0] for _ in range(2))]
         starts = [env.reset(seed=0)[0]]
@@ -213,7 +217,7 @@ def test_lanes_start_as_single_environments_with_other_kinds_of_keys(kind: str) 
     np.testing.assert_allclose([start[1] for start in starts], expected, rtol=1e-6, atol=1e-6)
 
 
-def test_lanes_are_seeded_one_by_one() -> None:
+def test_environments_of_a_batch_are_seeded_one_by_one() -> None:
     env = gym.make_vec("jaxsafe/Docking2D-v0", num_envs=3)
     observation, _ = env.reset(seed=[4, 5, 6])
     assert np.array_equal(env.reset(seed=4)[0], observation)
@@ -247,7 +251,8 @@ def test_a_copy_goes_on_alike_and_compiles_nothing(build: Any, copied: Any) -> N
         ]
 
     env = build()
-    expected, before = fly(env), programs()
+    expected = fly(env)
+    before = programs()
     other = copied(env)
     assert np.array_equal(other.reset()[0], env.reset()[0])
     assert np.array_equal(fly(other), expected)
@@ -270,7 +275,8 @@ MODES = {
 def test_the_modes_of_jax_change_nothing(mode: str) -> None:
     def fly() -> list[np.ndarray]:
         options: dict[str, Any] = {"autoreset_mode": "SameStep", "max_episode_steps": 2}
-        env, batch = GymEnv("docking2d"), GymVectorEnv("docking2d", 2, **options)
+        env = GymEnv("docking2d")
+        batch = GymVectorEnv("docking2d", 2, **options)
         zero = np.zeros((2, 2), np.float32)
         placed = [
             env.reset(seed=3, options=FAST)[0],
@@ -282,12 +288,13 @@ def test_the_modes_of_jax_change_nothing(mode: str) -> None:
 
     expected = fly()
     with MODES[mode]():
-        found = fly()
-    for one, other in list(zip(found, expected, strict=True))[
+        result = fly()
+    # Double precision draws other starts, so the last ones are not compared there.
+    for first, other in list(zip(result, expected, strict=True))[
         : 4 if mode == "double_precision" else None
-    ]:  # other starts
-        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
-        assert one.dtype == (np.float64 if mode == "double_precision" else np.float32)
+    ]:
+        np.testing.assert_allclose(first, other, rtol=1e-4, atol=1e-5)
+        assert first.dtype == (np.float64 if mode == "double_precision" else np.float32)
 
 
 FAST = {"start": {"deputy": {"position": [30.0, 0.0], "velocity": [-0.9, 0.0]}}}
@@ -335,9 +342,12 @@ def test_an_action_that_is_no_number_ends_the_episode_as_a_failure_that_costs(ta
 
 def test_every_option_of_make_is_understood() -> None:
     options: dict[str, Any] = {
-        "actions": "discrete", "variant": "released", "rta": "explicit_simplex", "randomize": {"deputy.mass": [10, 14]},
+        "actions": "discrete",
+        "variant": "released",
+        "rta": "explicit_simplex",
+        "randomize": {"deputy.mass": [10, 14]},
         "overrides": {"reward.delta_v.scale": -0.5},
-    }  # fmt: skip
+    }
     env = gym.make("jaxsafe/Docking2D-v0", **options)
     expected = jaxsafe.make("docking2d", **options)
     assert jax.tree.all(
@@ -350,9 +360,12 @@ def test_every_option_of_make_is_understood() -> None:
 
 
 def test_the_whole_action_space_and_no_more_reaches_the_actuators() -> None:
-    physical = {f"deputy.controller.actuators.thrust_x.{name}": value for name, value in
-                {"rescale": False, "low": -3.0, "high": 0.5}.items()}  # fmt: skip
-    env, batch = GymEnv("docking2d", physical), GymVectorEnv("docking2d", 2, physical)
+    physical = {
+        f"deputy.controller.actuators.thrust_x.{name}": value
+        for name, value in {"rescale": False, "low": -3.0, "high": 0.5}.items()
+    }
+    env = GymEnv("docking2d", physical)
+    batch = GymVectorEnv("docking2d", 2, physical)
     assert np.array_equal(batch.action_space.low, [[-3.0, -1.0]] * 2)
     assert (
         batch.single_action_space
@@ -389,7 +402,7 @@ def test_an_episode_can_be_watched() -> None:
         "docking2d", 1, autoreset_mode="SameStep", render_mode="rgb_array", max_episode_steps=3
     )
     batch.reset(seed=0)
-    for _ in range(4):  # the third ends the episode and shows the start of the next
+    for _ in range(4):  # the third step ends the episode and shows the start of the next
         batch.step(np.zeros((1, 2), np.float32))
     assert len(batch._frames[0]._past) == 2
 
@@ -406,9 +419,9 @@ def test_a_batch_starts_where_single_environments_do() -> None:
     ours = GymVectorEnv("docking2d", 3, autoreset_mode="SameStep", **options)
     theirs = SyncVectorEnv([lambda: GymEnv("docking2d", **options)] * 3, autoreset_mode="SameStep")
     for seed in (5, None):
-        found, expected = (env.reset(seed=seed, options=dict(START)) for env in (ours, theirs))
-        np.testing.assert_allclose(found[0], expected[0], rtol=1e-6)
-        same(found[1], expected[1], np.ones(3, bool), "reset")
+        result, expected = (env.reset(seed=seed, options=dict(START)) for env in (ours, theirs))
+        np.testing.assert_allclose(result[0], expected[0], rtol=1e-6)
+        same(result[1], expected[1], np.ones(3, bool), "reset")
         for action in actions(theirs, 5):  # an episode that follows starts at random
             np.testing.assert_allclose(
                 ours.step(action)[0], theirs.step(action)[0], rtol=1e-5, atol=1e-6
@@ -416,7 +429,7 @@ def test_a_batch_starts_where_single_environments_do() -> None:
     before = ours.reset(seed=0)[0]
     after, infos = ours.reset(options={**START, "reset_mask": np.array([False, True, False])})
     assert np.array_equal(after[[0, 2]], before[[0, 2]])
-    assert np.array_equal(after[1], found[0][1])
+    assert np.array_equal(after[1], result[0][1])
     assert infos["_cost"].tolist() == [False, True, False]
     with pytest.raises(ConfigError, match="reset_to: unknown platform 'deputi'"):
         ours.reset(options={**START, "start": {"deputi": {}}})
@@ -536,10 +549,11 @@ def test_mistakes_are_named(build: Any, message: str) -> None:
 
 
 def test_wrong_actions_and_wrong_order_are_named() -> None:
-    env, batch = GymEnv("docking2d", actions="discrete"), GymVectorEnv("docking2d", 2)
-    for one in (env, batch):
+    env = GymEnv("docking2d", actions="discrete")
+    batch = GymVectorEnv("docking2d", 2)
+    for first in (env, batch):
         with pytest.raises(ResetNeeded, match="step: call reset first"):
-            one.step(one.action_space.sample())
+            first.step(first.action_space.sample())
     with pytest.raises(ResetNeeded, match="first reset takes no reset_mask"):
         batch.reset(options={"reset_mask": np.array([True, False])})
     env.reset(seed=0), batch.reset(seed=0)
@@ -550,7 +564,10 @@ def test_wrong_actions_and_wrong_order_are_named() -> None:
 
 
 def test_importing_jaxsafe_is_enough() -> None:
-    code = "import jaxsafe, gymnasium; print(gymnasium.spec('jaxsafe/Docking2DOriented-v0').kwargs['task'])"
+    code = (
+        "import jaxsafe, gymnasium;"
+        " print(gymnasium.spec('jaxsafe/Docking2DOriented-v0').kwargs['task'])"
+    )
     assert (
         subprocess.check_output([sys.executable, "-c", code], text=True).strip()
         == "docking2d_oriented"

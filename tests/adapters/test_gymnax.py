@@ -20,10 +20,8 @@ def make() -> Any:
 
 
 def test_a_step_is_ours_and_resets_by_itself(make: Any) -> None:
-    env, core = (
-        make("docking2d", {"terminal.timeout.limit": 3.0}),
-        jaxsafe.make("docking2d", {"terminal.timeout.limit": 3.0}),
-    )
+    env = make("docking2d", {"terminal.timeout.limit": 3.0})
+    core = jaxsafe.make("docking2d", {"terminal.timeout.limit": 3.0})
     params = env.default_params
     observation, state = env.reset(jax.random.key(0), params)
     expected, timestep = core.reset(jax.random.key(0))
@@ -64,12 +62,12 @@ def test_instances_share_compiled_programs(make: Any) -> None:
     for mass in (12.0, 12.0, 13.0):
         env = make("docking2d", {"deputy.mass": mass})
         _, state = env.reset(jax.random.key(0))
-        found = env.step(jax.random.key(1), state, jnp.ones(2))
-        assert len(found) == 6
+        result = env.step(jax.random.key(1), state, jnp.ones(2))
+        assert len(result) == 6
         sizes.append((gymnax._reset._cache_size(), gymnax._step._cache_size()))
     assert sizes[0] == sizes[1] == sizes[2]
     expected = jaxsafe.step(env.env, state, jnp.ones(2))[1].observation
-    np.testing.assert_allclose(found[5]["final_observation"], expected, rtol=1e-5)
+    np.testing.assert_allclose(result[5]["final_observation"], expected, rtol=1e-5)
 
 
 def test_older_libraries_get_five_values(make: Any) -> None:
@@ -90,7 +88,7 @@ def test_parameters_are_a_pytree_to_map_over(make: Any) -> None:
     observation, *_ = jax.vmap(env.step, in_axes=(None, None, None, 0))(
         jax.random.key(1), state, jnp.ones(2), params
     )
-    assert observation[0, 2] > observation[1, 2]  # the lighter one is faster
+    assert observation[0, 2] > observation[1, 2]  # the lighter spacecraft is faster
 
 
 def test_a_limit_of_its_own_truncates(make: Any) -> None:
@@ -108,19 +106,19 @@ def test_a_limit_that_no_program_can_count_to_is_refused(make: Any) -> None:
         match="max_steps_in_episode: expected a whole number from 1 to 2,147,483,647, found 1000",
     ):
         env.default_params.replace(max_steps_in_episode=10**10)
-    assert (
-        jax.tree.map(lambda _: 0, env.default_params).max_steps_in_episode == 0
-    )  # axes to map over
+    # Axes to map over are allowed as parameters.
+    assert jax.tree.map(lambda _: 0, env.default_params).max_steps_in_episode == 0
 
 
 def test_discrete_actions_are_one_choice(make: Any) -> None:
-    env, core = make("docking2d", actions="discrete"), jaxsafe.make("docking2d", actions="discrete")
+    env = make("docking2d", actions="discrete")
+    core = jaxsafe.make("docking2d", actions="discrete")
     assert env.action_space().n == env.num_actions == 121
     _, state = env.reset(jax.random.key(0))
     expected, _ = core.reset(jax.random.key(0))
-    found = env.step(jax.random.key(1), state, jnp.int32(3 * 11 + 7))
+    result = env.step(jax.random.key(1), state, jnp.int32(3 * 11 + 7))
     np.testing.assert_allclose(
-        found[2], core.step(expected, jnp.array([3, 7]))[1].reward, rtol=1e-5
+        result[2], core.step(expected, jnp.array([3, 7]))[1].reward, rtol=1e-5
     )
 
 
@@ -148,10 +146,12 @@ MODES = CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING
 @pytest.mark.parametrize("mode", MODES)
 def test_it_works_in_every_mode_of_jax(make: Any, mode: str) -> None:
     with MODES[mode]():
-        env, chosen = make("docking2d"), make("docking2d", actions="discrete", legacy=True)
+        env = make("docking2d")
+        chosen = make("docking2d", actions="discrete", legacy=True)
         params = env.default_params.replace(max_steps_in_episode=1)
         starts, steps, first = jax.random.split(jax.random.key(0), 3)
-        starts, steps = jax.random.split(starts, 4), jax.random.split(steps, 5)
+        starts = jax.random.split(starts, 4)
+        steps = jax.random.split(steps, 5)
         _, state = jax.vmap(env.reset, (0, None))(starts, params)
         zero = np.zeros((4, 2), np.float32)
         observation, *_, truncated, _ = jax.vmap(env.step, (0, 0, 0, None))(

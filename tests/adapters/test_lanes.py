@@ -17,22 +17,24 @@ def test_packing_loses_no_bit() -> None:
     layout = packing(tree, lanes=1)
     words = jax.jit(layout.pack)(tree)
     assert words.shape == (1 + 1 + 3 + 6, 2)
-    for found in (layout.receive(words), jax.jit(layout.unpack)(words)):
-        for ours, expected in zip(jax.tree.leaves(found), jax.tree.leaves(tree), strict=True):
+    for unpacked in (layout.receive(words), jax.jit(layout.unpack)(words)):
+        for ours, expected in zip(jax.tree.leaves(unpacked), jax.tree.leaves(tree), strict=True):
             assert (ours.shape, ours.dtype) == (expected.shape, expected.dtype)
             assert np.asarray(ours).tobytes() == np.asarray(expected).tobytes()
 
 
 def test_environments_of_one_structure_share_a_layout() -> None:
-    env, other = jaxsafe.make("docking2d"), jaxsafe.make("docking2d", {"deputy.mass": 11.0})
+    env = jaxsafe.make("docking2d")
+    other = jaxsafe.make("docking2d", {"deputy.mass": 11.0})
     assert packing(env) is packing(other)
     assert packing(env) is not packing(jaxsafe.make("docking2d", rta="explicit_simplex"))
 
 
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
-def test_lanes_do_what_the_pure_functions_do(actions: str) -> None:
+def test_a_batch_does_what_the_pure_functions_do(actions: str) -> None:
     env = jaxsafe.make("docking2d", actions=actions)
-    lanes, seeds = Lanes(env, 3, np.inf), [4, 5, 6]
+    lanes = Lanes(env, 3, np.inf)
+    seeds = [4, 5, 6]
     lanes.seed(np.ones(3, bool), seeds)
     lanes.restart(np.ones(3, bool))
     action = (
@@ -45,7 +47,7 @@ def test_lanes_do_what_the_pure_functions_do(actions: str) -> None:
     for _ in range(3):
         lanes.step(action)
         expected = [
-            Episodes(*env.step(one.state, a)) for one, a in zip(expected, action, strict=True)
+            Episodes(*env.step(member.state, a)) for member, a in zip(expected, action, strict=True)
         ]
     lanes.restart(np.array([False, True, False]))
     expected[1] = Episodes(*env.reset(jax.random.split(keys[1][0])[1]))

@@ -19,16 +19,16 @@ def test_the_cost_stands_between_reward_and_end() -> None:
     assert isinstance(reward, float)
 
 
-def test_the_cost_of_a_lane_is_that_of_the_step_even_where_it_starts_anew() -> None:
+def test_the_cost_in_a_batch_is_that_of_the_step_even_where_an_environment_starts_anew() -> None:
     ends = {"terminal.timeout.limit": 1.0, "reward.velocity_constraint.scale": -0.01}
-    env = SafetyEnv(
-        "docking2d", 8, {**ends, "deputy.start.velocity.share": [1.5, 1.6]}
-    )  # every start is too fast
+    # Every start is too fast.
+    env = SafetyEnv("docking2d", 8, {**ends, "deputy.start.velocity.share": [1.5, 1.6]})
     assert env.single_action_space.shape == (2,)
     assert env.single_observation_space.shape == (6,)
     env.reset(seed=0)
     zero = np.zeros((8, 2), np.float32)
-    costs, infos = [], []
+    costs = []
+    infos = []
     for _ in range(4):
         *_, cost, terminated, _, info = env.step(zero)
         costs.append(cost)
@@ -38,7 +38,7 @@ def test_the_cost_of_a_lane_is_that_of_the_step_even_where_it_starts_anew() -> N
     assert terminated.all()
     assert info["final_observation"].shape == (8, 6)
     assert info["_final_observation"].all()
-    assert (info["cost"] == 0.0).all()  # of the new start
+    assert (info["cost"] == 0.0).all()  # the cost of the new start
 
 
 @pytest.mark.parametrize("num_envs", [None, 2])
@@ -59,9 +59,8 @@ def test_an_action_that_is_no_number_costs_and_ends_the_episode(num_envs: int | 
 def test_omnisafe_learns_to_dock_within_the_budget(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    if (
-        importlib.util.find_spec("omnisafe") is None
-    ):  # importing it needs what the example puts in place first
+    # Importing OmniSafe needs what the example puts in place first.
+    if importlib.util.find_spec("omnisafe") is None:
         pytest.skip("needs omnisafe")
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
     monkeypatch.chdir(tmp_path)
@@ -70,6 +69,7 @@ def test_omnisafe_learns_to_dock_within_the_budget(
     train()
     [log] = tmp_path.glob("runs/*/*/progress.csv")
     rows = list(csv.DictReader(log.open(encoding="utf-8")))
-    early, late = rows[3], rows[-1]
+    early = rows[3]
+    late = rows[-1]
     assert float(late["Metrics/EpRet"]) > float(early["Metrics/EpRet"]) + 3.0
     assert float(late["Metrics/EpCost"]) <= 25.0

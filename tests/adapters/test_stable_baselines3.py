@@ -27,13 +27,13 @@ def test_the_end_of_an_episode_is_told_as_the_library_wants_it(make: Any) -> Non
     assert done.all()
     assert reward.dtype == np.float32
     assert (observation != first).any()
-    for lane, info in enumerate(infos):
+    for index, info in enumerate(infos):
         assert (info["outcome"], info["is_success"], info["TimeLimit.truncated"]) == (
             "timeout",
             False,
             False,
         )
-        assert (info["terminal_observation"] != observation[lane]).any()
+        assert (info["terminal_observation"] != observation[index]).any()
     env.seed(5)
     assert np.array_equal(env.reset(), first)
 
@@ -57,7 +57,7 @@ def test_an_action_that_is_no_number_is_a_failure_that_costs(make: Any) -> None:
     assert np.isfinite(observation).all()
 
 
-def test_options_place_lanes_and_the_infos_of_starts_are_kept(make: Any) -> None:
+def test_options_place_environments_and_the_infos_of_starts_are_kept(make: Any) -> None:
     from stable_baselines3.common.vec_env import DummyVecEnv
 
     from jaxsafe import ConfigError
@@ -69,9 +69,9 @@ def test_options_place_lanes_and_the_infos_of_starts_are_kept(make: Any) -> None
     env = make("docking2d", 3, max_episode_steps=2)
     expected = DummyVecEnv([lambda: GymEnv("docking2d", max_episode_steps=2)] * 3)
     for options in (placed(30.0), [placed(20.0), {}, placed(40.0)], None):
-        for one in (env, expected):
-            one.seed(5)
-            one.set_options(options)
+        for batch in (env, expected):
+            batch.seed(5)
+            batch.set_options(options)
         np.testing.assert_allclose(env.reset(), expected.reset(), rtol=1e-6)
         for _ in range(5):  # options are for one reset
             np.testing.assert_allclose(

@@ -37,7 +37,10 @@ REST = [word for word in TINY if not word.startswith("env=")]
 
 @pytest.fixture
 def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[list[str]]:
-    """The commands that a report runs; they run in this process, which has their programs already."""
+    """Return the commands that a report runs.
+
+    They run in this process, which has compiled their programs already.
+    """
     made: list[list[str]] = []
 
     def call(module: str, words: Sequence[str]) -> None:
@@ -81,9 +84,9 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
     assert f"| docking2d | {best} | {100 * rate['mean']:.2f} % |" in page
     assert len(rate["per_seed"]) == 1
     assert (
-        f"python -m jaxsafe.evaluate run=runs/docking2d-features/policy/seed_{best}.npz episodes=6 seed=1\n"
-        in page
-    )
+        f"python -m jaxsafe.evaluate run=runs/docking2d-features/policy/seed_{best}.npz"
+        f" episodes=6 seed=1\n"
+    ) in page
     for file in (
         "docking2d_training.png",
         "docking2d_seeds.png",
@@ -100,7 +103,7 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
     ]
     assert {"success_rate", "return", "cost"} <= rows[0].keys()
     assert [module for module, *_ in calls] == ["jaxsafe.train", *3 * ["jaxsafe.evaluate"]]
-    assert command.main(words) == 0  # all is there
+    assert command.main(words) == 0  # all records are there
     assert len(calls) == 4
 
 
@@ -120,9 +123,9 @@ def test_a_report_in_parts_makes_the_page_of_one(
     assert sum(module == "jaxsafe.train" for module, *_ in calls) == 2
 
     record = Path("parts/baselines/docking2d-features.json")
-    found = json.loads(record.read_text())
-    found["options"]["training"]["ppo"]["gamma"] = 0.5
-    record.write_text(json.dumps(found))
+    content = json.loads(record.read_text())
+    content["options"]["training"]["ppo"]["gamma"] = 0.5
+    record.write_text(json.dumps(content))
     capsys.readouterr()
     assert command.main([*words, "kinds=plain", "out=parts"]) == 0
     assert (
@@ -145,8 +148,8 @@ def test_an_evaluation_with_other_options_than_today_s_is_left_out_and_made_anew
     records, old = kept(plan(["docking2d"], ["features"], REST), Path("report/baselines"))
     assert list(records[0].evaluations) == [SHIPPED]
     assert old == [
-        "report/baselines/docking2d-features.json: its evaluation 'heavy' was made with other options and is left out;"
-        " report it again"
+        "report/baselines/docking2d-features.json: its evaluation 'heavy' was made with other"
+        " options and is left out; report it again"
     ]
     assert command.main(words) == 0
     assert calls[-1][:2] == ["jaxsafe.evaluate", "run=runs/report/docking2d-features"]
@@ -163,9 +166,9 @@ def test_a_record_is_of_the_commit_that_trained_it(
         monkeypatch.setattr(run_directory, "commit", lambda now=now: now)
         assert command.main(words) == 0
         assert (
-            f"`python benchmarks/baselines {shlex.join(words)}` on commit {trained}: docking2d-plain"
-            in (Path("report/baselines.md").read_text())
-        )
+            f"`python benchmarks/baselines {shlex.join(words)}` on commit {trained}:"
+            f" docking2d-plain"
+        ) in (Path("report/baselines.md").read_text())
     assert len(calls) == 1
 
 
@@ -182,17 +185,15 @@ def test_an_interrupted_report_goes_on(calls: list[list[str]], whole: Path) -> N
     assert train.main([*TINY, f"out={run}"]) == 0
     (run / "results.json").unlink()
     (run / "evaluations" / "heavy").mkdir(parents=True)
-    (run / "evaluations" / "heavy" / "eval.jsonl").write_text("")  # of a kill
+    (run / "evaluations" / "heavy" / "eval.jsonl").write_text("")  # left by a run that was killed
     assert command.main(["tasks=docking2d", "kinds=features", "film=false", *REST]) == 0
     assert calls[0] == ["jaxsafe.train", f"resume={run}"]
     assert len(calls) == 3
 
 
 def test_a_report_killed_while_its_figures_were_drawn_draws_them(calls: list[list[str]]) -> None:
-    run, words = (
-        Path("runs/report/docking2d-features"),
-        ["tasks=docking2d", "kinds=features", "film=false", *REST],
-    )
+    run = Path("runs/report/docking2d-features")
+    words = ["tasks=docking2d", "kinds=features", "film=false", *REST]
     assert train.main([*TINY, f"out={run}"]) == 0
     pictures = {file.name: file.read_bytes() for file in (run / "figures").iterdir()}
     (run / "figures").rename(run / "figures.part")
@@ -305,8 +306,8 @@ def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:
         (["tasks=docking4d"], "tasks: found 'docking4d'; choose from rejoin2d"),
         (
             ["kinds=[features,plane]"],
-            "kinds: found 'plane'; choose from features, plain, lanes, quick, discrete, plain_discrete, rta, unpunished."
-            " Did you mean 'plain'?",
+            "kinds: found 'plane'; choose from features, plain, lanes, quick, discrete,"
+            " plain_discrete, rta, unpunished. Did you mean 'plain'?",
         ),
         (["tasks=[]"], "tasks: expected at least one of rejoin2d"),
         (["film=gif"], "film: expected true or false, found 'gif'"),
@@ -374,7 +375,11 @@ def test_the_best_policy_succeeds_most_then_violates_least_then_has_the_highest_
     ) -> dict:
         names = ("success_rate", "episode_safety_violation_rate", "average_return")
         columns = dict(
-            zip(names, ({"per_seed": one} for one in (success, violating, value)), strict=True)
+            zip(
+                names,
+                ({"per_seed": per_seed} for per_seed in (success, violating, value)),
+                strict=True,
+            )
         )
         return {"seed": 5, "evaluation": {"deterministic": columns}}
 

@@ -83,7 +83,7 @@ def test_a_rounded_value_never_looks_as_if_it_reached_the_goal(tables: ModuleTyp
 
 @pytest.fixture
 def accelerator(tables: ModuleType) -> ModuleType:
-    del tables  # which puts the benchmarks on the path
+    del tables  # the fixture puts the benchmarks on the path
     return importlib.import_module("accelerator")
 
 
@@ -102,15 +102,15 @@ def test_the_accelerator_script_measures_and_says_what_it_skips(
     monkeypatch.setattr(sys, "argv", ["accelerator.py", *words])
     accelerator.main()
     content = json.loads(out.read_text())
-    found = content["parts"]["environments"]
+    environments = content["parts"]["environments"]
     measured = {
         row["environments"]: row["steps_per_s"]
-        for row in found["rows"]
+        for row in environments["rows"]
         if row["task"] == "docking2d"
     }
     assert set(measured) == {1, 8}
     assert all(rate > 0 for rate in measured.values())
-    assert all("Pendulum" in reason for reason in found["skipped"])
+    assert all("Pendulum" in reason for reason in environments["skipped"])
     assert any(
         line.startswith("| docking2d |")
         for line in tables.accelerator_environments(content).splitlines()

@@ -1,4 +1,7 @@
-"""Environments as YAML and overrides: what is written reads back, and every fault is one line with its place."""
+"""Environments as YAML and overrides.
+
+What is written reads back, and every fault is one line with its place.
+"""
 
 import copy
 import re
@@ -48,12 +51,12 @@ def env() -> Environment:
 
 @pytest.fixture
 def tree(env: Environment) -> dict[str, Any]:
-    """The plain data of docking2d, a fresh copy to break."""
+    """Return the plain data of docking2d, a fresh copy to break."""
     return parse(dump(env), "docking2d")
 
 
 def fault(act: Callable[[], Any]) -> str:
-    """The message of the ConfigError that `act` raises, after checking that it is one line."""
+    """Return the message of the ConfigError that `act` raises. Check that it is one line."""
     with pytest.raises(ConfigError) as caught:
         act()
     message = str(caught.value)
@@ -67,12 +70,12 @@ def fault_in(tree: Any) -> str:
 
 
 def compose(tree: Any) -> Environment:
-    """What `load` does with a file's content, without the text."""
+    """Do what `load` does with a file's content, without the text."""
     return build(to_component(tree, Environment, ""))
 
 
 def put(tree: Any, path: str, value: Any) -> Any:
-    """Set the value at a path such as `status.3.floor`."""
+    """Return the tree with the value at a path such as `status.3.floor` replaced."""
     *parents, last = [int(part) if part.isdigit() else part for part in path.split(".")]
     inner = tree
     for part in parents:
@@ -82,7 +85,7 @@ def put(tree: Any, path: str, value: Any) -> Any:
 
 
 def mappings(tree: Any) -> Iterator[dict[str, Any]]:
-    """Every mapping in plain data."""
+    """Yield every mapping in plain data."""
     if isinstance(tree, dict):
         yield tree
     for inner in (
@@ -222,7 +225,7 @@ def test_a_component_is_taken_as_it_is_written(env: Environment) -> None:
     written = Failure(name="failure", values={"crash": -1, "distance": -2.0})
     read = {"type": "failure", "name": "failure", "values": {"crash": -1, "distance": -2.0}}
     as_component, as_data = (
-        jaxsafe.override(env, {"reward": [*env.reward[:4], one]}) for one in (written, read)
+        jaxsafe.override(env, {"reward": [*env.reward[:4], reward]}) for reward in (written, read)
     )
     assert as_component == as_data
     assert {type(leaf) for leaf in jax.tree.leaves(as_component)} == {type(env.dt)}
@@ -472,7 +475,13 @@ def test_overrides_take_traced_values(env: Environment) -> None:
             lambda: jaxsafe.make("docking2d", {"deputy.mas": 1}),
             r"deputy\.mas: .* Did you mean 'mass'\?",
         ),
-        (lambda: jaxsafe.make(3), r"env: expected the name of a task or a \.yaml file, found 3"),  # type: ignore[arg-type]
+        (
+            lambda: jaxsafe.make(3),
+            (
+                r"env: expected the name of a task or a \.yaml file, found"
+                r" 3"
+            ),
+        ),  # type: ignore[arg-type]
         (lambda: jaxsafe.make("docking2d", ["deputy.mass=1"]), r"override"),  # type: ignore[arg-type]
         (
             lambda: jaxsafe.make("docking2d", variant="releasd"),
@@ -571,9 +580,8 @@ def test_every_misspelt_type_choice_or_reference_is_refused(task: str) -> None:
         mapping[key] = f"{right}x"
         message = fault(lambda: compose(tree))
         mapping[key] = right
-        if key == "outcome" and mapping.get(
-            "below"
-        ):  # a bound brings its outcome; what refers to it is then wrong
+        # A bound brings its outcome, so what refers to the misspelt outcome is then wrong.
+        if key == "outcome" and mapping.get("below"):
             assert "nothing is called 'velocity'" in message
         else:
             assert f"'{right}x'" in message
@@ -622,7 +630,7 @@ def test_every_missing_field_without_a_default_is_named(tree: dict[str, Any]) ->
 
 
 def refusal_without(tree: dict[str, Any], mapping: dict[str, Any], key: str) -> bool:
-    """Whether the tree is refused without one key, which is then put back where it was."""
+    """Return whether the tree is refused without one key. The key is put back where it was."""
     before = dict(mapping)
     del mapping[key]
     try:
@@ -638,9 +646,9 @@ def refusal_without(tree: dict[str, Any], mapping: dict[str, Any], key: str) -> 
 def test_a_missing_field_is_named_with_what_it_takes(tree: dict[str, Any]) -> None:
     del tree["status"][3]["floor"]
     message = fault_in(tree)
-    assert (
-        message
-        == "status.velocity_limit (velocity_limit): field 'floor' is missing; it takes a number in m/s ≥ 0"
+    assert message == (
+        "status.velocity_limit (velocity_limit): field 'floor' is missing; it takes a number"
+        " in m/s ≥ 0"
     )
 
 
@@ -684,63 +692,215 @@ def test_every_number_replaced_by_a_word_a_truth_value_or_nan_is_refused(
         ("platforms", [], r"agent: nothing is called 'deputy'; choose from none"),
         ("reward", [], r"reward: an environment needs at least one"),
         ("observation", [], r"observation: an environment needs at least one"),
-        ("platforms.0.type", "ancor", r"platforms\.chief: unknown type 'ancor'.* Did you mean 'anchor'\?"),
-        ("platforms.0.type", 3, r"platforms\.chief: unknown type 3; choose from anchor, .*, spacecraft$"),
+        (
+            "platforms.0.type",
+            "ancor",
+            r"platforms\.chief: unknown type 'ancor'.* Did you mean 'anchor'\?",
+        ),
+        (
+            "platforms.0.type",
+            3,
+            r"platforms\.chief: unknown type 3; choose from anchor, .*, spacecraft$",
+        ),
         ("platforms.0.type", ["anchor"], r"platforms\.chief: unknown type \['anchor'\]"),
         ("platforms.0.name", 3, r"platforms\.\[0\]\.name: expected a name, found 3"),
-        ("platforms.0.dimension", 3, r"platforms: expected the same dimension for all, found chief 3, deputy 2"),
-        ("platforms.1.start.0.about", "deputy", r"nothing listed before it is called 'deputy'; choose from chief"),
-        ("platforms.1.start.0.name", "positon", r"positon: no such state field;.* Did you mean 'position'\?"),
-        ("platforms.1.start.1.name", "position", r"platforms\.deputy\.start: the name 'position' stands twice"),
-        ("platforms.1.start.0.direction.polar", [0, 3], r"direction: draws 3 numbers, the platform has 2 dimensions"),
-        ("platforms.1.controller", {"type": "uncontrolled"}, r"agent: 'deputy' cannot be .*: its controller takes no act"),
-        ("platforms.1.controller.actuators", [], r"agent: 'deputy' cannot be the agent: its controller takes no actions"),
-        ("platforms.1.controller.type", "uncontrolled", r"controller \(uncontrolled\): unknown field 'actuators'"),
-        ("platforms.1.controller", {"type": "scripted"}, r"agent: 'deputy' cannot be .*: its controller takes no actions"),
-        ("platforms.1.controller.actuators.0.name", "thrust", r"spacecraft has no control 'thrust'; choose from thrust_x"),
-        ("platforms.1.controller.actuators.0.name", "thrust_y", r"actuators: the name 'thrust_y' stands twice"),
-        ("platforms.1.controller.actuators.0.name", "a.b", r"actuators: expected a name without dots, found 'a\.b'"),
-        ("platforms.0.controller", {"type": "continuous", "actuators": []},
-         r"platforms\.chief\.controller \(continuous\): only the agent takes actions; choose from scripted, uncontrolled"),
-        ("platforms.0.controller", {"type": "scripted", "commands": [{"type": "constant", "name": "thrust_x", "at": 1}]},
-         r"platforms\.chief\.controller\.commands: anchor has no control 'thrust_x'; choose from none"),
-        ("regions.0.on", "chef", r"regions\.docking_region\.on: nothing is called 'chef'.* Did you mean 'chief'\?"),
-        ("regions.0.radius", -1, r"regions\.docking_region\.radius: expected a number in m or ft ≥ 0, found -1"),
-        ("regions.0.name", "dock", r"status\.in_docking\.region: nothing is called 'docking_region'; choose from dock"),
+        (
+            "platforms.0.dimension",
+            3,
+            r"platforms: expected the same dimension for all, found chief 3, deputy 2",
+        ),
+        (
+            "platforms.1.start.0.about",
+            "deputy",
+            r"nothing listed before it is called 'deputy'; choose from chief",
+        ),
+        (
+            "platforms.1.start.0.name",
+            "positon",
+            r"positon: no such state field;.* Did you mean 'position'\?",
+        ),
+        (
+            "platforms.1.start.1.name",
+            "position",
+            r"platforms\.deputy\.start: the name 'position' stands twice",
+        ),
+        (
+            "platforms.1.start.0.direction.polar",
+            [0, 3],
+            r"direction: draws 3 numbers, the platform has 2 dimensions",
+        ),
+        (
+            "platforms.1.controller",
+            {"type": "uncontrolled"},
+            r"agent: 'deputy' cannot be .*: its controller takes no act",
+        ),
+        (
+            "platforms.1.controller.actuators",
+            [],
+            r"agent: 'deputy' cannot be the agent: its controller takes no actions",
+        ),
+        (
+            "platforms.1.controller.type",
+            "uncontrolled",
+            r"controller \(uncontrolled\): unknown field 'actuators'",
+        ),
+        (
+            "platforms.1.controller",
+            {"type": "scripted"},
+            r"agent: 'deputy' cannot be .*: its controller takes no actions",
+        ),
+        (
+            "platforms.1.controller.actuators.0.name",
+            "thrust",
+            r"spacecraft has no control 'thrust'; choose from thrust_x",
+        ),
+        (
+            "platforms.1.controller.actuators.0.name",
+            "thrust_y",
+            r"actuators: the name 'thrust_y' stands twice",
+        ),
+        (
+            "platforms.1.controller.actuators.0.name",
+            "a.b",
+            r"actuators: expected a name without dots, found 'a\.b'",
+        ),
+        (
+            "platforms.0.controller",
+            {"type": "continuous", "actuators": []},
+            (
+                r"platforms\.chief\.controller \(continuous\): only the agent takes actions; choose"
+                r" from scripted, uncontrolled"
+            ),
+        ),
+        (
+            "platforms.0.controller",
+            {"type": "scripted", "commands": [{"type": "constant", "name": "thrust_x", "at": 1}]},
+            (
+                r"platforms\.chief\.controller\.commands: anchor has no control 'thrust_x'; choose"
+                r" from none"
+            ),
+        ),
+        (
+            "regions.0.on",
+            "chef",
+            r"regions\.docking_region\.on: nothing is called 'chef'.* Did you mean 'chief'\?",
+        ),
+        (
+            "regions.0.radius",
+            -1,
+            r"regions\.docking_region\.radius: expected a number in m or ft ≥ 0, found -1",
+        ),
+        (
+            "regions.0.name",
+            "dock",
+            r"status\.in_docking\.region: nothing is called 'docking_region'; choose from dock",
+        ),
         ("status.1.name", "speed", r"status: the name 'speed' stands twice"),
-        ("status.3.distance", "delta_v", r"velocity_limit\.distance: nothing listed before it is called 'delta_v'"),
-        ("status.3.distance", "velocity_limit", r"nothing listed before it is called 'velocity_limit'"),
+        (
+            "status.3.distance",
+            "delta_v",
+            r"velocity_limit\.distance: nothing listed before it is called 'delta_v'",
+        ),
+        (
+            "status.3.distance",
+            "velocity_limit",
+            r"nothing listed before it is called 'velocity_limit'",
+        ),
         ("status.3.distance", "docking_distanc", r"Did you mean 'docking_distance'\?"),
-        ("constraints.0.speed", "spee", r"constraints\.velocity_limit\.speed: nothing is called 'spee'.* 'speed'\?"),
+        (
+            "constraints.0.speed",
+            "spee",
+            r"constraints\.velocity_limit\.speed: nothing is called 'spee'.* 'speed'\?",
+        ),
         ("status.0.name", "a.b", r"status: expected a name without dots, found 'a\.b'"),
         ("observation.0.name", "", r"observation: expected a name without dots, found ''"),
         ("platforms.0.name", "a.b", r"platforms: expected a name without dots, found 'a\.b'"),
         ("reward.1.bound.outcome", "a.b", r"outcomes: expected a name without dots, found 'a\.b'"),
-        ("status.1.of", "chief", r"in_docking\.of: region 'docking_region' is on 'chief' itself; choose another"),
-        ("observation.0.relative_to", "chef", r"observation\.position\.relative_to: .* Did you mean 'chief'\?"),
-        ("observation.0.frame", "deputi", r"observation\.position\.frame: .* Did you mean 'deputy'\?"),
-        ("observation.0.form", "magnom", r"observation\.position\.form: found 'magnom'.* Did you mean 'magnorm'\?"),
-        ("observation.0.what", "orientation", r"deputy has no quantity 'orientation'; choose from position, velocity"),
-        ("observation.0.what", "roll", r"observation\.position\.what: deputy has no quantity 'roll'; choose from position"),
-        ("randomize", {"deputy.mas": [1, 2]}, r"randomize: deputy\.mas: unknown field 'mas'.* Did you mean 'mass'\?"),
+        (
+            "status.1.of",
+            "chief",
+            r"in_docking\.of: region 'docking_region' is on 'chief' itself; choose another",
+        ),
+        (
+            "observation.0.relative_to",
+            "chef",
+            r"observation\.position\.relative_to: .* Did you mean 'chief'\?",
+        ),
+        (
+            "observation.0.frame",
+            "deputi",
+            r"observation\.position\.frame: .* Did you mean 'deputy'\?",
+        ),
+        (
+            "observation.0.form",
+            "magnom",
+            r"observation\.position\.form: found 'magnom'.* Did you mean 'magnorm'\?",
+        ),
+        (
+            "observation.0.what",
+            "orientation",
+            r"deputy has no quantity 'orientation'; choose from position, velocity",
+        ),
+        (
+            "observation.0.what",
+            "roll",
+            r"observation\.position\.what: deputy has no quantity 'roll'; choose from position",
+        ),
+        (
+            "randomize",
+            {"deputy.mas": [1, 2]},
+            r"randomize: deputy\.mas: unknown field 'mas'.* Did you mean 'mass'\?",
+        ),
         ("imports", "mine", r"imports: expected a list of modules, found 'mine'"),
         ("imports", [3], r"imports: expected a list of modules, found \[3\]"),
         ("imports", None, r"imports: expected a list of modules, found None"),
-        ("imports", ["no.such.module"], r"imports: cannot import 'no\.such\.module': ModuleNotFoundError: No module named"),
+        (
+            "imports",
+            ["no.such.module"],
+            r"imports: cannot import 'no\.such\.module': ModuleNotFoundError: No module named",
+        ),
         ("imports", [""], r"imports: cannot import '': ValueError"),
         ("terminal.0.name", "running", r"outcomes: the name 'running' stands twice"),
-        ("terminal.0.in_docking", "indocking", r"terminal\.success\.in_docking: .* Did you mean 'in_docking'\?"),
-        ("reward.1.bound", -5, r"reward\.velocity_constraint\.bound: expected a mapping of fields, found -5"),
+        (
+            "terminal.0.in_docking",
+            "indocking",
+            r"terminal\.success\.in_docking: .* Did you mean 'in_docking'\?",
+        ),
+        (
+            "reward.1.bound",
+            -5,
+            r"reward\.velocity_constraint\.bound: expected a mapping of fields, found -5",
+        ),
         ("reward.1.bound.outcome", "crash", r"outcomes: the name 'crash' stands twice"),
-        ("reward.1.bound.outcom", "crash", r"bound: unknown field 'outcom'.* Did you mean 'outcome'\?"),
-        ("reward.4.values", 3, r"reward\.failure\.values: expected a mapping of names to values, found 3"),
-        ("observation.0.what", "positon", r"observation\.position\.what: .* Did you mean 'position'\?"),
-        ("observation.0.scale", 0, r"position\.scale: expected a number or a list of numbers other than 0, found 0"),
-        ("observation.0.clip", [1, -1], r"observation\.position\.clip: expected low ≤ high, found \[1, -1\]"),
+        (
+            "reward.1.bound.outcom",
+            "crash",
+            r"bound: unknown field 'outcom'.* Did you mean 'outcome'\?",
+        ),
+        (
+            "reward.4.values",
+            3,
+            r"reward\.failure\.values: expected a mapping of names to values, found 3",
+        ),
+        (
+            "observation.0.what",
+            "positon",
+            r"observation\.position\.what: .* Did you mean 'position'\?",
+        ),
+        (
+            "observation.0.scale",
+            0,
+            r"position\.scale: expected a number or a list of numbers other than 0, found 0",
+        ),
+        (
+            "observation.0.clip",
+            [1, -1],
+            r"observation\.position\.clip: expected low ≤ high, found \[1, -1\]",
+        ),
         ("observation.2.status", "sped", r"observation\.speed\.status: .* Did you mean 'speed'\?"),
         ("agent", "deputi", r"agent: nothing is called 'deputi'.* Did you mean 'deputy'\?"),
     ],
-)  # fmt: skip
+)
 def test_a_broken_environment_is_refused(
     tree: dict[str, Any], path: str, value: Any, message: str
 ) -> None:
@@ -769,7 +929,7 @@ def test_the_direction_of_a_spatial_start_needs_a_polar_range() -> None:
 
 
 class ChangesShape(Status, type="changes_shape_of_test"):
-    """A status whose memory after a step is not what it was at reset."""
+    """A status whose memory changes its shape between reset and the first step."""
 
     how: Literal["shape", "dtype", "structure"]
 
@@ -814,18 +974,46 @@ CYLINDER = {"type": "cylinder", "name": "docking_region", "on": "chief", "radius
         ("docking2d", {"terminal.crash.in_docking": "delta_v"}, "terminal.crash"),
         ("docking2d", {"reward.failure.values": {}}, "reward.failure"),
         ("docking2d", {"regions": [CYLINDER]}, "regions.docking_region"),
-        ("docking2d", {"regions.docking_region.offset": {"type": "displacement", "by": [1, 2, 3]}}, "regions"),
-        ("docking2d", {"regions.docking_region.offset": {"type": "displacement", "by": [1]}}, "regions.docking_region"),
+        (
+            "docking2d",
+            {"regions.docking_region.offset": {"type": "displacement", "by": [1, 2, 3]}},
+            "regions",
+        ),
+        (
+            "docking2d",
+            {"regions.docking_region.offset": {"type": "displacement", "by": [1]}},
+            "regions.docking_region",
+        ),
         ("docking2d", {"deputy.start": ["velocity", "position"]}, "platforms.deputy"),
         ("docking3d", {"observation.velocity.scale": [1, 2]}, "observation.velocity"),
-        ("docking2d", {"observation.position.relative_to": "chief", "observation.position.scale": [1, 2, 3, 4]},
-         "observation.position"),
-        ("rejoin2d", {"status.rejoin_time.status": "in_rejoin", "reward.in_rejoin_first_time.status": "lead_distance"},
-         "reward.in_rejoin_first_time"),
-        ("rejoin2d", {"lead.start.position.low": [1, 1, 1], "lead.start.position.high": [2, 2, 2]}, "platforms.lead"),
-        ("rejoin3d", {"wingman.start.heading.low": [1], "wingman.start.heading.high": [2]}, "platforms.wingman"),
+        (
+            "docking2d",
+            {
+                "observation.position.relative_to": "chief",
+                "observation.position.scale": [1, 2, 3, 4],
+            },
+            "observation.position",
+        ),
+        (
+            "rejoin2d",
+            {
+                "status.rejoin_time.status": "in_rejoin",
+                "reward.in_rejoin_first_time.status": "lead_distance",
+            },
+            "reward.in_rejoin_first_time",
+        ),
+        (
+            "rejoin2d",
+            {"lead.start.position.low": [1, 1, 1], "lead.start.position.high": [2, 2, 2]},
+            "platforms.lead",
+        ),
+        (
+            "rejoin3d",
+            {"wingman.start.heading.low": [1], "wingman.start.heading.high": [2]},
+            "platforms.wingman",
+        ),
     ],
-)  # fmt: skip
+)
 def test_parts_that_cannot_be_computed_are_told_with_their_place(
     task: str, changes: dict[str, Any], place: str
 ) -> None:
@@ -896,7 +1084,10 @@ class Aside(Initializer, type="aside_of_test"):
 
 @pytest.fixture
 def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The current directory, from which modules are found; what a test imports is forgotten after it."""
+    """Return the current directory.
+
+    Modules are found in it, and what a test imports is forgotten after it.
+    """
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.setattr(sys, "modules", dict(sys.modules))
@@ -949,7 +1140,10 @@ def test_an_environment_of_the_house_s_own_parts_needs_no_imports(env: Environme
 
 
 def test_parts_within_parts_are_imported_too(env: Environment, directory: Path) -> None:
-    text = "from jaxsafe.simulation.scripted import Command\nclass Nod(Command, type='nod_of_test'):\n    pass\n"
+    text = (
+        "from jaxsafe.simulation.scripted import Command\nclass Nod(Command,"
+        " type='nod_of_test'):\n    pass\n"
+    )
     (directory / "nested_of_test.py").write_text(text)
     import_modules(["nested_of_test"], "")
     nod = sys.modules["nested_of_test"].Nod(name="thrust_x")
@@ -960,18 +1154,42 @@ def test_parts_within_parts_are_imported_too(env: Environment, directory: Path) 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("raise RuntimeError('first line\\nsecond line')",
-         r"cannot import 'bad_of_test': RuntimeError: first line \(bad_of_test\.py, line 1\)$"),
-        ("x = 1 / 0", r"cannot import 'bad_of_test': ZeroDivisionError: division by zero \(bad_of_test\.py, line 1\)$"),
-        ("\n\ndef f():\n    import json\n    return json.loads('{')\nf()",
-         r"cannot import 'bad_of_test': JSONDecodeError: .* \(bad_of_test\.py, line 5\)$"),
+        (
+            "raise RuntimeError('first line\\nsecond line')",
+            r"cannot import 'bad_of_test': RuntimeError: first line \(bad_of_test\.py, line 1\)$",
+        ),
+        (
+            "x = 1 / 0",
+            (
+                r"cannot import 'bad_of_test': ZeroDivisionError: division by zero"
+                r" \(bad_of_test\.py, line 1\)$"
+            ),
+        ),
+        (
+            "\n\ndef f():\n    import json\n    return json.loads('{')\nf()",
+            r"cannot import 'bad_of_test': JSONDecodeError: .* \(bad_of_test\.py, line 5\)$",
+        ),
         ("def", r"cannot import 'bad_of_test': SyntaxError: [^(]*\(bad_of_test\.py, line 1\)$"),
-        ("import no_such_module_of_test", r"cannot import 'bad_of_test': ModuleNotFoundError: No module named 'no_such"),
-        ("raise ValueError", r"cannot import 'bad_of_test': ValueError:  \(bad_of_test\.py, line 1\)$"),
-        ("from jaxsafe.processors.status import Status\nclass Mine(Status, type='speed'):\n    pass",
-         r"type 'speed' of bad_of_test\.Mine: taken by jaxsafe\.processors\.status\.Speed; choose another name$"),
+        (
+            "import no_such_module_of_test",
+            r"cannot import 'bad_of_test': ModuleNotFoundError: No module named 'no_such",
+        ),
+        (
+            "raise ValueError",
+            r"cannot import 'bad_of_test': ValueError:  \(bad_of_test\.py, line 1\)$",
+        ),
+        (
+            (
+                "from jaxsafe.processors.status import Status\nclass Mine(Status, type='speed'):\n"
+                "    pass"
+            ),
+            (
+                r"type 'speed' of bad_of_test\.Mine: taken by jaxsafe\.processors\.status\.Speed;"
+                r" choose another name$"
+            ),
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_module_that_cannot_be_imported_is_told_in_one_line(
     tree: dict[str, Any], directory: Path, text: str, message: str
 ) -> None:
@@ -1022,7 +1240,10 @@ def test_an_error_in_the_code_of_a_user_names_its_line(
 def test_a_misspelt_type_of_a_user_s_module_is_refused(
     tree: dict[str, Any], directory: Path
 ) -> None:
-    text = "from jaxsafe.processors.status import Status\nclass Odd(Status, type='odd_one_of_test'):\n    pass\n"
+    text = (
+        "from jaxsafe.processors.status import Status\nclass Odd(Status,"
+        " type='odd_one_of_test'):\n    pass\n"
+    )
     (directory / "odd_of_test.py").write_text(text)
     tree["status"].append({"type": "odd_on_of_test", "name": "odd"})
     assert "Did you mean 'odd_one_of_test'?" in fault_in(tree | {"imports": ["odd_of_test"]})
@@ -1121,7 +1342,8 @@ def test_a_repeated_key_is_refused_deep_in_an_environment(env: Environment) -> N
 
 
 def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
-    missing, binary = tmp_path / "missing.yaml", tmp_path / "binary.yaml"
+    missing = tmp_path / "missing.yaml"
+    binary = tmp_path / "binary.yaml"
     binary.write_bytes(b"\xff\xfe\x00\x81")
     assert fault(lambda: load(missing)) == f"{missing}: cannot be read: No such file or directory"
     assert fault(lambda: load(tmp_path)).startswith(f"{tmp_path}: cannot be read: ")
@@ -1184,20 +1406,37 @@ LAUGHS = "\n".join([f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in ra
         ("!!map x", r"expected a mapping after the tag !!map$"),
         ("!!seq x", r"expected a sequence node, but found scalar$"),
         ("!!str [x]", r"expected a scalar node, but found sequence$"),
-        *((f"!!{tag} x", rf"could not determine a constructor for the tag '.*{tag}'$") for tag in
-          ("timestamp", "binary", "set", "omap", "pairs", "merge", "value", "python/none")),
+        *(
+            (f"!!{tag} x", rf"could not determine a constructor for the tag '.*{tag}'$")
+            for tag in (
+                "timestamp",
+                "binary",
+                "set",
+                "omap",
+                "pairs",
+                "merge",
+                "value",
+                "python/none",
+            )
+        ),
         ("!mine x", r"could not determine a constructor for the tag '!mine'$"),
         ("&a [*a]", r"an alias stands inside what it is the alias of$"),
         ("&a {b: {c: *a}}", r"an alias stands inside what it is the alias of$"),
-        (f"{{a0: &a0 [1, 1],\n{LAUGHS}".replace("\n", " ").replace("] a", "], a") + "}",
-         r"its aliases stand for more than 1,000,000 values$"),
+        (
+            f"{{a0: &a0 [1, 1],\n{LAUGHS}".replace("\n", " ").replace("] a", "], a") + "}",
+            r"its aliases stand for more than 1,000,000 values$",
+        ),
         ('"\\ud800"', r"found a control character in '\\ud800'$"),
         ('"a\\0b"', r"found a control character in 'a\\x00b'$"),
-        ('"\\UFFFFFFFF"', r"^key: not valid YAML: (Python int too large|chr)"),  # Python's own words, which differ
+        (
+            '"\\UFFFFFFFF"',
+            r"^key: not valid YAML: (Python int too large|chr)",
+            # These are Python's own words, and they differ between versions.
+        ),
         ("9" * 5000, r"not valid YAML: Exceeds the limit"),
         ("x" * (2**20 + 1), r"^key: expected at most 1,048,576 letters$"),
     ],
-)  # fmt: skip
+)
 def test_yaml_that_is_hard_to_read_is_refused(text: str, message: str) -> None:
     assert re.search(message, fault(lambda: parse(text, "key")))
 
@@ -1279,7 +1518,10 @@ def test_a_region_is_refused_in_a_space_where_its_name_says_something_else(
     else:
         message = fault(lambda: jaxsafe.override(env, {"regions": regions}))
         assert re.search(
-            rf"^regions\.{env.regions[0].name}: a {region['type']} is no part of a space of {fitting}",
+            (
+                rf"^regions\.{env.regions[0].name}: a {region['type']} is no part of a space of"
+                rf" {fitting}"
+            ),
             message,
         )
 
@@ -1287,29 +1529,60 @@ def test_a_region_is_refused_in_a_space_where_its_name_says_something_else(
 @pytest.mark.parametrize(
     ("task", "path", "value", "message"),
     [
-        *(("docking2d", path, value, "of a magnitude|that is finite") for path, value in [
-            ("dt", 1e30), ("dt", 1e-30), ("dt", float("inf")), ("deputy.mass", 1e-30), ("deputy.mass", 1e39),
-            ("deputy.mean_motion", float("inf")), ("deputy.start.position.distance", [0, 1e38]),
-            ("deputy.start.position.direction.azimuth", [0, float("inf")]), ("deputy.start.velocity.share", [0, 1e38]),
-            ("deputy.controller.actuators.thrust_x.low", -float("inf")), ("regions.docking_region.radius", 1e38),
-            ("deputy.controller.actuators.thrust_x.points", 1e30), ("terminal.distance.limit", 1e39),
-            ("terminal.timeout.limit", float("inf")), ("reward.delta_v.scale", float("inf")),
-            ("reward.success.value", -1e39), ("reward.success.time_scale", 1e-38), ("observation.position.scale", 1e-38),
-            ("reward.velocity_constraint.offset", float("inf")), ("reward.velocity_constraint.bound.below", -float("inf")),
-            ("reward.failure.values.crash", -float("inf")), ("reward.distance_change.half_distance", 1e-38),
-            ("status.velocity_limit.slope", 1e38),
-        ]),
+        *(
+            ("docking2d", path, value, "of a magnitude|that is finite")
+            for path, value in [
+                ("dt", 1e30),
+                ("dt", 1e-30),
+                ("dt", float("inf")),
+                ("deputy.mass", 1e-30),
+                ("deputy.mass", 1e39),
+                ("deputy.mean_motion", float("inf")),
+                ("deputy.start.position.distance", [0, 1e38]),
+                ("deputy.start.position.direction.azimuth", [0, float("inf")]),
+                ("deputy.start.velocity.share", [0, 1e38]),
+                ("deputy.controller.actuators.thrust_x.low", -float("inf")),
+                ("regions.docking_region.radius", 1e38),
+                ("deputy.controller.actuators.thrust_x.points", 1e30),
+                ("terminal.distance.limit", 1e39),
+                ("terminal.timeout.limit", float("inf")),
+                ("reward.delta_v.scale", float("inf")),
+                ("reward.success.value", -1e39),
+                ("reward.success.time_scale", 1e-38),
+                ("observation.position.scale", 1e-38),
+                ("reward.velocity_constraint.offset", float("inf")),
+                ("reward.velocity_constraint.bound.below", -float("inf")),
+                ("reward.failure.values.crash", -float("inf")),
+                ("reward.distance_change.half_distance", 1e-38),
+                ("status.velocity_limit.slope", 1e38),
+            ]
+        ),
         ("docking2d", "terminal.distance.limit", -1, r"expected a number in m or ft > 0, found -1"),
         ("docking2d", "terminal.distance.limit", 0, r"expected a number in m or ft > 0, found 0"),
-        ("docking2d", "observation.position.clip", [float("inf")] * 2, "low < high where a bound is infinite"),
+        (
+            "docking2d",
+            "observation.position.clip",
+            [float("inf")] * 2,
+            "low < high where a bound is infinite",
+        ),
         ("rejoin3d", "lead.gravity", 0, r"lead\.gravity: expected a number in ft/s² > 0, found 0"),
         ("rejoin3d", "wingman.roll_limits", [-1.5707, 1.5707], "of a magnitude up to 1.57"),
         ("rejoin3d", "wingman.speed_limits", [1e-30, 400], "of a magnitude from 0.001 to 1e[+]09"),
         ("rejoin2d", "lead.start.position.low", [1e38, 1e38], "of a magnitude up to 1e[+]12"),
-        ("rejoin2d", "regions.rejoin_region.offset.angle", float("inf"), "of a magnitude up to 10000"),
-        ("docking2d_oriented", "deputy.attitude_rate_limits", [1e38, 1e38], "of a magnitude up to 1e[+]06"),
+        (
+            "rejoin2d",
+            "regions.rejoin_region.offset.angle",
+            float("inf"),
+            "of a magnitude up to 10000",
+        ),
+        (
+            "docking2d_oriented",
+            "deputy.attitude_rate_limits",
+            [1e38, 1e38],
+            "of a magnitude up to 1e[+]06",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_number_from_which_no_finite_state_follows_is_refused(
     task: str, path: str, value: Any, message: str
 ) -> None:
@@ -1345,24 +1618,61 @@ def test_the_horizon_of_a_filter_has_an_end() -> None:
 
 # Numbers that belong together
 
-SLOPES = "status.velocity_limit.slope and deputy.start.velocity.slope, which were twice it, keep their values"
+SLOPES = (
+    "status.velocity_limit.slope and deputy.start.velocity.slope, which were twice it,"
+    " keep their values"
+)
 
 
 @pytest.mark.parametrize(
     ("task", "changes", "message"),
     [
         ("docking2d", {"deputy.mean_motion": 0.002}, f"deputy.mean_motion changes alone: {SLOPES}"),
-        ("docking2d_oriented", {"platforms.deputy.mean_motion": 0.002}, f"deputy.mean_motion changes alone: {SLOPES}"),
-        ("docking3d", {"randomize": {"deputy.mean_motion": [1e-3, 2e-3]}}, f"deputy.mean_motion is random alone: {SLOPES}"),
-        ("docking3d", {"randomize": {"platforms.deputy.mean_motion": [0, 1e-3]}}, "deputy.mean_motion is random alone"),
-        ("docking2d", {"terminal.timeout.limit": 6000},
-         "terminal.timeout.limit changes alone: reward.success.time_scale, which was equal to it, keeps its value"),
-        ("docking2d", {"reward.success.time_scale": 6000}, "reward.success.time_scale changes alone: terminal.timeout"),
-        ("rejoin2d", {"terminal.crash.limit": 200}, "terminal.crash.limit changes alone: constraints.collision.minimum"),
-        ("rejoin3d", {"constraints.collision.minimum": 200}, "constraints.collision.minimum changes alone"),
-        ("docking2d", {"status.velocity_limit.floor": 0.1}, "status.velocity_limit.floor changes alone: deputy.start.velo"),
+        (
+            "docking2d_oriented",
+            {"platforms.deputy.mean_motion": 0.002},
+            f"deputy.mean_motion changes alone: {SLOPES}",
+        ),
+        (
+            "docking3d",
+            {"randomize": {"deputy.mean_motion": [1e-3, 2e-3]}},
+            f"deputy.mean_motion is random alone: {SLOPES}",
+        ),
+        (
+            "docking3d",
+            {"randomize": {"platforms.deputy.mean_motion": [0, 1e-3]}},
+            "deputy.mean_motion is random alone",
+        ),
+        (
+            "docking2d",
+            {"terminal.timeout.limit": 6000},
+            (
+                "terminal.timeout.limit changes alone: reward.success.time_scale, which was equal"
+                " to it, keeps its value"
+            ),
+        ),
+        (
+            "docking2d",
+            {"reward.success.time_scale": 6000},
+            "reward.success.time_scale changes alone: terminal.timeout",
+        ),
+        (
+            "rejoin2d",
+            {"terminal.crash.limit": 200},
+            "terminal.crash.limit changes alone: constraints.collision.minimum",
+        ),
+        (
+            "rejoin3d",
+            {"constraints.collision.minimum": 200},
+            "constraints.collision.minimum changes alone",
+        ),
+        (
+            "docking2d",
+            {"status.velocity_limit.floor": 0.1},
+            "status.velocity_limit.floor changes alone: deputy.start.velo",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_number_that_is_changed_without_those_that_follow_from_it_is_told(
     task: str, changes: dict[str, Any], message: str
 ) -> None:

@@ -1,4 +1,4 @@
-"""What programs do otherwise on an accelerator has the same results."""
+"""Programs take other paths on an accelerator, and the results are the same."""
 
 import os
 from collections.abc import Callable
@@ -23,10 +23,10 @@ def as_accelerated(monkeypatch: pytest.MonkeyPatch) -> Callable[[Any], None]:
     return lambda module: monkeypatch.setattr(module, "accelerated", lambda: True)
 
 
-def same(one: Any, other: Any) -> bool:
-    return jax.tree.structure(one) == jax.tree.structure(other) and all(
+def same(first: Any, second: Any) -> bool:
+    return jax.tree.structure(first) == jax.tree.structure(second) and all(
         np.array_equal(a, b)
-        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
+        for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True)
     )
 
 
@@ -41,7 +41,8 @@ def test_a_packed_scan_returns_what_a_scan_returns() -> None:
             "none": (),
         }
 
-    start, xs = jnp.zeros(3), jnp.arange(12.0).reshape(4, 3)
+    start = jnp.zeros(3)
+    xs = jnp.arange(12.0).reshape(4, 3)
     assert same(scan_packed(step, start, xs), jax.lax.scan(step, start, xs))
 
 
@@ -79,17 +80,18 @@ def test_an_accelerator_learns_the_same(as_accelerated: Callable[[Any], None]) -
     from jaxsafe.agents.agent import Agent
     from jaxsafe.schema.component import normalise
 
-    env, agent = jaxsafe.make("docking2d"), normalise(Agent(hidden=(8,)))
+    env = jaxsafe.make("docking2d")
+    agent = normalise(Agent(hidden=(8,)))
     hyper = normalise(ppo.PPO(num_envs=4, num_steps=8, num_epochs=2))
     start = ppo.init(env, agent, hyper, jax.random.key(0))
     expected = jax.jit(lambda state: ppo.update(env, agent, hyper, 4, state))(start)
     for module in (backend, ppo, shuffle):
         as_accelerated(module)
     found = jax.jit(lambda state: ppo.update(env, agent, hyper, 4, state))(start)
-    for one, other in zip(
+    for first, second in zip(
         jax.tree.leaves(found.params), jax.tree.leaves(expected.params), strict=True
     ):
-        np.testing.assert_allclose(one, other, atol=1e-5)
+        np.testing.assert_allclose(first, second, atol=1e-5)
 
 
 @pytest.mark.parametrize(

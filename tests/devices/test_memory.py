@@ -41,9 +41,8 @@ def test_the_batch_of_an_update_is_counted(
 ) -> None:
     monkeypatch.setattr(memory, "COMPILE_BYTES", 0)
     monkeypatch.setattr(memory, "RUN_BYTES", 0)
-    monkeypatch.setattr(
-        memory, "available", lambda: 4 * 2**20
-    )  # enough for the state, not for the update
+    # This is enough for the state, but not for the update.
+    monkeypatch.setattr(memory, "available", lambda: 4 * 2**20)
     sizes = [
         "ppo.num_envs=1024",
         "ppo.num_steps=32",
@@ -65,9 +64,8 @@ def test_the_batch_of_an_update_is_counted(
 def test_what_compiling_takes_is_counted(
     command: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        memory, "available", lambda: memory.GIB
-    )  # a hundred times the state and the update
+    # This is a hundred times the size of the state and the update.
+    monkeypatch.setattr(memory, "available", lambda: memory.GIB)
     words = ["env=docking2d", "seeds=1", f"out={tmp_path / 'run'}", "steps=4096"]
     if command is tune:
         words.append("sweep.ppo.gamma=[0.9,0.95]")
@@ -115,11 +113,12 @@ print(compiled - begun, compiling, peak - compiled, running)
 @pytest.mark.parametrize("task", ["docking2d", "rejoin3d"])
 def test_a_training_takes_no_more_than_was_predicted(task: str, tmp_path: Path) -> None:
     words = [f"env={task}", "seeds=2", "steps=16384", "ppo.num_epochs=1", f"out={tmp_path / 'run'}"]
+    # The empty cache makes the training compile everything.
     environment = {
         **os.environ,
         "XDG_CACHE_HOME": str(tmp_path),
         "XLA_FLAGS": "",
-    }  # nothing is compiled already
+    }
     words += ["eval_episodes=1", "episodes=1"]
     done = subprocess.run(
         [sys.executable, "-c", TRAINING, *words],
@@ -173,9 +172,9 @@ def test_the_limit_of_the_process_is_known(monkeypatch: pytest.MonkeyPatch) -> N
     )
     left = memory.GIB - 100 * resource.getpagesize()
     assert memory._process() == left
-    found = memory.available()
-    assert found is not None
-    assert found <= left
+    available = memory.available()
+    assert available is not None
+    assert available <= left
     monkeypatch.setattr(resource, "getrlimit", lambda _: 2 * (resource.RLIM_INFINITY,))
     assert memory._process() is None
 

@@ -1,4 +1,4 @@
-"""Processes that train together, found by what Slurm tells them."""
+"""Processes that train together. They find each other by what Slurm tells them."""
 
 import os
 import random
@@ -19,7 +19,7 @@ LONG += ["steps=4000000", "checkpoint_every=12800"]
 
 
 def start(place: Path, *words: str, devices: tuple[int, ...] = (1, 1)) -> list[subprocess.Popen]:
-    job = str(random.SystemRandom().randrange(1, 4000))  # decides the port
+    job = str(random.SystemRandom().randrange(1, 4000))  # the job decides the port
     processes = []
     for rank, count in enumerate(devices):
         slurm = {
@@ -43,7 +43,7 @@ def test_two_processes_train_what_one_trains(whole: Path, tmp_path: Path) -> Non
     assert [process.wait(300) for process in processes] == [0, 0], (tmp_path / "log0").read_text()
     assert_same_end(run, whole)
     assert "results in" in (tmp_path / "log0").read_text()
-    assert "steps" not in (tmp_path / "log1").read_text()  # only process 0 tells
+    assert "steps" not in (tmp_path / "log1").read_text()  # only process 0 reports
     again = start(tmp_path, *TINY, f"out={run}")
     assert [process.wait(300) for process in again] == [2, 2]
     for rank in range(2):
@@ -55,29 +55,33 @@ def test_two_processes_train_what_one_trains(whole: Path, tmp_path: Path) -> Non
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("seeds", "devices"), [(1, (1, 1)), (2, (2, 2))]
-)  # between processes; in each, which is faster
+    ("seeds", "devices"),
+    [(1, (1, 1)), (2, (2, 2))],
+    # One seed is shared between the two processes. Two seeds are shared within each process, which
+    # is faster.
+)
 def test_two_processes_whose_devices_share_seeds(
     seeds: int, devices: tuple[int, ...], tmp_path: Path
 ) -> None:
+    # These options make five updates.
     shared = [
         f"seeds={seeds}",
         "steps=320",
         "ppo.num_minibatches=1",
         "devices_per_seed=2",
-    ]  # five updates
+    ]
     words = [word for word in TINY if not word.startswith(("seeds=", "steps="))] + shared
     processes = start(tmp_path, *words, f"out={tmp_path / 'two'}", devices=devices)
     assert [process.wait(300) for process in processes] == [0, 0], (tmp_path / "log0").read_text()
     assert main([*words, f"out={tmp_path / 'one'}"]) == 0
     for seed in range(seeds):
-        found, expected = (
+        gathered, expected = (
             np.load(tmp_path / name / "policy" / f"seed_{seed}.npz") for name in ("two", "one")
         )
-        assert list(found) == list(expected)
-        for name in found:
-            if found[name].dtype.kind == "f":
-                np.testing.assert_allclose(found[name], expected[name], atol=1e-4)
+        assert list(gathered) == list(expected)
+        for name in gathered:
+            if gathered[name].dtype.kind == "f":
+                np.testing.assert_allclose(gathered[name], expected[name], atol=1e-4)
 
 
 def test_a_lost_process_ends_the_run(tmp_path: Path) -> None:
@@ -96,12 +100,15 @@ def test_another_number_goes_on_after_a_process_is_lost(tmp_path: Path) -> None:
     assert "stopped at step" in alone.communicate(timeout=60)[0]
     three = start(tmp_path, f"resume={run}", devices=(1, 1, 1))
     grows(run, three[0])
-    three[2].send_signal(signal.SIGTERM)  # one of them is asked to stop: all do
+    three[2].send_signal(signal.SIGTERM)  # one process is asked to stop, and all do
     assert [process.wait(60) for process in three] == [130] * 3
 
 
 def lose_one(place: Path, run: Path) -> None:
-    """Two processes train until the second is killed; the first ends with one line that says how to go on."""
+    """Train with two processes until the second is killed.
+
+    The first ends with one line that tells how to go on.
+    """
     processes = start(place, *LONG, f"out={run}")
     grows(run, processes[0])
     processes[1].kill()
@@ -113,7 +120,7 @@ def lose_one(place: Path, run: Path) -> None:
 
 
 def grows(run: Path, process: subprocess.Popen) -> None:
-    """Wait for a checkpoint more."""
+    """Wait until the run has one more checkpoint."""
     before = len(list(run.glob("checkpoints/*/state")))
     while len(list(run.glob("checkpoints/*/state"))) == before:
         assert process.poll() is None

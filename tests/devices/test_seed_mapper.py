@@ -51,7 +51,9 @@ def three() -> TrainState:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_seed_of_many_is_bit_for_bit_the_seed_alone(three: TrainState, seed: int) -> None:
     alone = seeds(seed, 1)
-    jax.tree.map(lambda many, one: np.testing.assert_array_equal(many[seed], one[0]), three, alone)
+    jax.tree.map(
+        lambda many, single: np.testing.assert_array_equal(many[seed], single[0]), three, alone
+    )
 
 
 STARTS = """
@@ -62,16 +64,20 @@ from jaxsafe.schema.component import normalise
 from jaxsafe.agents.agent import Agent
 from jaxsafe.train.train import programs
 from jaxsafe.train.ppo import PPO
-shared = jaxsafe.make("docking2d_oriented"), normalise(Agent(features="approach")), normalise(PPO(num_envs=32))
+env = jaxsafe.make("docking2d_oriented")
+shared = env, normalise(Agent(features="approach")), normalise(PPO(num_envs=32))
 def starts(count):
     mapper = SeedMapper(count)
     return mapper.gather(programs(mapper, 1, 1)[0](mapper.replicate(shared), mapper.keys(0)))
-jax.tree.map(lambda many, one: np.testing.assert_array_equal(many[0], one[0]), starts(3), starts(1))
+jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b[0]), starts(3), starts(1))
 """
 
 
 def test_oriented_docking_starts_bit_for_bit_where_the_seed_alone_starts() -> None:
-    """Compiled as the command does, which the settings of the tests do not."""
+    """The program is compiled as the command compiles it.
+
+    The settings of the tests compile it otherwise.
+    """
     subprocess.run([sys.executable, "-c", STARTS], check=True, env={**os.environ, "XLA_FLAGS": ""})
 
 
@@ -79,7 +85,8 @@ def test_oriented_docking_starts_bit_for_bit_where_the_seed_alone_starts() -> No
 def test_devices_that_share_a_seed_train_what_one_trains_to_rounding(
     updates: int, share: int
 ) -> None:
-    alone, shared = seeds(0, 1, 1, updates), seeds(0, 1, share, updates)
+    alone = seeds(0, 1, 1, updates)
+    shared = seeds(0, 1, share, updates)
     if not updates:
         jax.tree.map(np.testing.assert_array_equal, alone, shared)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), alone, shared)
@@ -101,7 +108,7 @@ def test_seeds_differ(three: TrainState) -> None:
 
 def test_seeds_are_spread_over_devices_and_padded() -> None:
     mapper = SeedMapper(3)
-    assert len(jax.devices()) == 2  # as the test settings ask
+    assert len(jax.devices()) == 2  # as the settings of the tests ask
     assert mapper.mesh.size == 2
     assert mapper.num_local_devices == 2
     assert mapper.padded == 4

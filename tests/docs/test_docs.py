@@ -1,4 +1,7 @@
-"""The pages that are written from the code are current, and the code in the tutorials runs and prints what they say."""
+"""The pages that are written from the code are current.
+
+The code in the tutorials runs and prints what they say.
+"""
 
 import os
 import re
@@ -84,7 +87,8 @@ def test_the_site_builds_without_a_warning_twice_and_with_its_own_extra_alone(
         )
         assert (ran.returncode, ran.stderr) == (0, "")
     first = (copy / "docs" / "_site" / "index.html").read_text(encoding="utf-8")
-    assert 'href="tasks/docking3d.html"' in first  # what the README calls docs/tasks/docking3d.md
+    # The README calls this page docs/tasks/docking3d.md.
+    assert 'href="tasks/docking3d.html"' in first
     assert "jaxsafe.environment.reset_to" in (copy / "docs" / "_site" / "api.html").read_text(
         encoding="utf-8"
     )
@@ -120,11 +124,15 @@ def test_flying_straight_through_the_zone_fails() -> None:
 
 
 def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """First outcome, and up to it the cost and the smallest margin to the zone, under a policy with a way-point."""
+    """Return the first outcome, and up to it the cost and the smallest margin to the zone.
+
+    The policy flies by a way-point.
+    """
 
     def one_step(carry: tuple, _: None) -> tuple[tuple, tuple]:
         state, outcome = carry
-        deputy, status = state.sim.platforms["deputy"], state.sim.status
+        deputy = state.sim.platforms["deputy"]
+        status = state.sim.status
         beside = jnp.array([jnp.where(deputy.position[0] < 0.0, -40.0, 40.0), 45.0])
         away = jnp.where(deputy.position[1] > 50.0, beside, 0.0) - deputy.position
         limit = jnp.minimum(status["velocity_limit"], status["keep_out_speed_limit"])
@@ -142,20 +150,29 @@ def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax
 @pytest.mark.parametrize(
     "page",
     [
-        "compose", "extend", "extend_rta", "rta", "deviations", "adapters/gymnasium", "adapters/safety_gymnasium",
+        "compose",
+        "extend",
+        "extend_rta",
+        "rta",
+        "deviations",
+        "adapters/gymnasium",
+        "adapters/safety_gymnasium",
         pytest.param("adapters/gymnax", marks=pytest.mark.peer),
     ],
-)  # fmt: skip
+)
 def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_path: Path) -> None:
-    """Blocks that begin with the name of a file are written to it; the others run in one program, in their order.
+    """Blocks that begin with the name of a file are written to it.
 
-    Output follows its block as `text`. YAML without a name is quoted from the composed environment. A `console` block is a
-    command and what it prints.
+    The others run in one program, in their order.
+
+    Output follows its block as `text`. YAML without a name is quoted from the composed environment.
+    A `console` block is a command and what it prints.
     """
     shutil.copy(CUSTOM, tmp_path)
     if page == "adapters/gymnax":
         pytest.importorskip("gymnax")
-    program, expected = "", []
+    program = ""
+    expected = []
     for kind, text in BLOCK.findall((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8")):
         named = re.match(r"# (\w+\.(?:py|yaml))\n", text)
         if named:
@@ -183,7 +200,8 @@ def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:
         for kind, text in BLOCK.findall((ROOT / "README.md").read_text(encoding="utf-8"))
         if kind == "python"
     ]
-    shown = "assert safe.info.intervening.mean() > 0.9 and safe.cost.sum() == 0"  # what the filter is there for
+    # This is what the filter is there for.
+    shown = "assert safe.info.intervening.mean() > 0.9 and safe.cost.sum() == 0"
     (tmp_path / "program.py").write_text("\n".join([*blocks, shown]), encoding="utf-8")
     process = run(["program.py"], tmp_path)
     assert process.returncode == 0, process.stderr
@@ -220,7 +238,8 @@ def test_terminal_sets_hold_where_the_page_says_so(tmp_path: Path) -> None:
 def run(arguments: list[str], directory: Path) -> subprocess.CompletedProcess[str]:
     """Run Python on one device, with the tests' compilation cache."""
     cache = {"JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir)}  # type: ignore[attr-defined]
-    cache["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"  # many small programs
+    # the pages compile many small programs
+    cache["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
     environment = {**os.environ, **cache, "PYTHONUTF8": "1", "XLA_FLAGS": ""}
     command = [sys.executable, *arguments]
     return subprocess.run(

@@ -16,7 +16,7 @@ def execute(folder: Path) -> Any:
     return notebook
 
 
-@pytest.mark.filterwarnings("default")  # of jupyter's packages
+@pytest.mark.filterwarnings("default")  # warnings of Jupyter's packages
 def test_the_notebook_reads_the_log_of_a_run(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

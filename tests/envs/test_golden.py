@@ -1,9 +1,12 @@
-"""Everything recorded from the released implementation is reproduced by `variant="released"`; see `golden/README.md`.
+"""`variant="released"` reproduces everything recorded from the released implementation.
 
-In x64: statuses, observations, rewards and ends from the recorded states, over whole episodes with their memories, within
-1e-9; motion over one step from every recorded state, within 1e-10 m (docking), 1e-8 m (oriented), 1e-6 ft (rejoin2d) and
-1e-3 ft (rejoin3d), but on steps on which the recorded integrator met a limit. In float32, in which training runs, docking
-episodes of up to 2001 steps stay within 5 mm of the recordings, and rejoin steps within 0.1 ft, 3e5 ft from the origin.
+`golden/README.md` says what was recorded. In x64, statuses, observations, rewards and ends from the
+recorded states agree within 1e-9, over whole episodes with their memories. Motion over one step
+from every recorded state agrees within 1e-10 m (docking), 1e-8 m (oriented), 1e-6 ft (rejoin2d) and
+1e-3 ft (rejoin3d). Steps on which the recorded integrator met a limit are left out.
+
+In float32, in which training runs, docking episodes of up to 2001 steps stay within 5 mm of the
+recordings. Rejoin steps stay within 0.1 ft, 3e5 ft from the origin.
 """
 
 import functools
@@ -54,7 +57,8 @@ COLUMNS: dict[str, dict[str, Any]] = {
         "attitude_rate": 5,
     },
 }
-PLATFORMS = {"rejoin": ("lead", "wingman"), "docking": ("deputy",)}  # the chief rests at the origin
+# The chief rests at the origin and is not recorded.
+PLATFORMS = {"rejoin": ("lead", "wingman"), "docking": ("deputy",)}
 REWARDS = {
     "rejoin": ("in_rejoin", "in_rejoin_first_time", "distance_change", "failure", "success"),
     "docking": ("distance_change", "delta_v", "velocity_constraint", "failure", "success"),
@@ -72,7 +76,8 @@ STATUSES = {
         "max_vel_limit": "velocity_limit",
     },
 }
-MOTION = {  # within which one step agrees, by state field; positions in m or ft
+# One step agrees within these tolerances, by state field. Positions are in m or ft.
+MOTION = {
     "rejoin2d": {"position": 1e-6, "heading": 1e-12, "speed": 1e-12},
     "rejoin3d": {
         "position": 1e-3,
@@ -97,7 +102,7 @@ Fields = dict[str, dict[str, Any]]
 
 
 class Replayed(Platform, type="replayed_of_test"):
-    """Moves as another platform does, then to where it was recorded."""
+    """A platform that moves as another one does and is then put where it was recorded."""
 
     inner: Platform
     recorded: Mapping[str, Any]
@@ -135,17 +140,23 @@ def state_fields(recording: str, data: Mapping[str, np.ndarray], suffix: str = "
 
 @functools.cache
 def episodes(recording: str) -> dict[str, np.ndarray]:
-    """Recorded episodes, padded to the longest: steps [episodes, steps], states [episodes, steps + 1]; `taken` is real."""
+    """Return the recorded episodes, padded to the longest.
+
+    Steps are [episodes, steps] and states [episodes, steps + 1]. `taken` marks the steps that are
+    real.
+    """
     data = np.load(GOLDEN / f"{recording}.npz")
-    begins, lengths = data["ep_start"], np.diff(data["ep_start"])
+    begins = data["ep_start"]
+    lengths = np.diff(data["ep_start"])
 
     def pad(name: str) -> np.ndarray:
         array = data[name]
-        extra = len(array) - begins[-1]  # states have one row more an episode
+        extra = len(array) - begins[-1]  # states have one more row per episode
         out = np.zeros((len(lengths), lengths.max() + bool(extra), *array.shape[1:]), array.dtype)
         for i, length in enumerate(lengths):
             rows = array[begins[i] + i * bool(extra) :][: length + bool(extra)]
-            out[i] = rows[-1]  # padding repeats the last row, which keeps every number ordinary
+            # Padding repeats the last row, so every number stays ordinary.
+            out[i] = rows[-1]
             out[i, : len(rows)] = rows
         return out
 
@@ -155,40 +166,45 @@ def episodes(recording: str) -> dict[str, np.ndarray]:
 
 @functools.cache
 def transitions(recording: str) -> dict[str, np.ndarray]:
-    """Every recorded step as one transition: `_t0` before, `_t1` after."""
+    """Return every recorded step as one transition: `_t0` is before it, `_t1` after it."""
     if recording in SCATTERED:
         return dict(np.load(GOLDEN / f"{recording}.npz"))
     data = episodes(recording)
-    taken, flat = data["taken"], {}
+    taken = data["taken"]
+    flat = {}
     for name, array in data.items():
         if name in ("names", "taken"):
             continue
         if array.shape[1] == taken.shape[1]:
             flat[name] = array[taken]
         else:
-            flat[name + "_t0"], flat[name + "_t1"] = array[:, :-1][taken], array[:, 1:][taken]
+            flat[name + "_t0"] = array[:, :-1][taken]
+            flat[name + "_t1"] = array[:, 1:][taken]
     return flat
 
 
 @jax.jit
 def start(env: Environment, fields: Fields) -> tuple[State, TimeStep]:
-    return jax.vmap(lambda one: jaxsafe.reset_to(env, one))(fields)
+    return jax.vmap(lambda state: jaxsafe.reset_to(env, state))(fields)
 
 
 @jax.jit
 def single_steps(env: Environment, fields: Fields, actions: jax.Array) -> tuple[Any, TimeStep]:
-    """One step from each state: the platforms and the time step after it."""
+    """Make one step from each state. Return the platforms and the time step after it."""
 
-    def one(fields: Fields, action: jax.Array) -> tuple[Any, TimeStep]:
+    def single_step(fields: Fields, action: jax.Array) -> tuple[Any, TimeStep]:
         state, timestep = jaxsafe.step(env, jaxsafe.reset_to(env, fields)[0], action)
         return state.sim.platforms, timestep
 
-    return jax.vmap(one)(fields, actions)
+    return jax.vmap(single_step)(fields, actions)
 
 
 @jax.jit
 def replay(env: Environment, fields: Fields, actions: jax.Array) -> tuple[TimeStep, Any]:
-    """Whole episodes through the recorded states: time steps and simulations after each step, [episodes, steps]."""
+    """Replay whole episodes through the recorded states.
+
+    Return time steps and simulations after each step, [episodes, steps].
+    """
 
     def episode(fields: Fields, actions: jax.Array) -> tuple[TimeStep, Any]:
         first = jaxsafe.reset_to(env, jax.tree.map(lambda leaf: leaf[0], fields))[0]
@@ -199,15 +215,15 @@ def replay(env: Environment, fields: Fields, actions: jax.Array) -> tuple[TimeSt
             after, action = inputs
             platforms = [
                 Replayed(
-                    name=one.name,
-                    dimension=one.dimension,
-                    controller=one.controller,
-                    inner=one,
-                    recorded=after[one.name],
+                    name=platform.name,
+                    dimension=platform.dimension,
+                    controller=platform.controller,
+                    inner=platform,
+                    recorded=after[platform.name],
                 )
-                if one.name in after
-                else one
-                for one in env.platforms
+                if platform.name in after
+                else platform
+                for platform in env.platforms
             ]
             state, timestep = jaxsafe.step(env.replace(platforms=tuple(platforms)), state, action)
             return state, (timestep, state.sim.replace(platforms={}))
@@ -219,8 +235,8 @@ def replay(env: Environment, fields: Fields, actions: jax.Array) -> tuple[TimeSt
     return jax.vmap(episode)(fields, actions)
 
 
-def assert_same(found: Any, expected: Any, message: str, tolerance: float = 1e-9) -> None:
-    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance, err_msg=message)
+def assert_same(computed: Any, expected: Any, message: str, tolerance: float = 1e-9) -> None:
+    np.testing.assert_allclose(computed, expected, rtol=0, atol=tolerance, err_msg=message)
 
 
 def assert_as_recorded(
@@ -231,15 +247,17 @@ def assert_as_recorded(
     rows: np.ndarray,
     suffix: str,
 ) -> None:
-    """Statuses, observation, every reward term, ends and outcome on the chosen rows."""
-    kind, info = kind_of(recording), timestep.info
+    """Compare statuses, observation, every reward term, ends and outcome on the chosen rows."""
+    kind = kind_of(recording)
+    info = timestep.info
     for theirs, ours in STATUSES[kind].items():
         assert_same(info.status[ours][rows], data[f"status_{theirs}{suffix}"][rows], ours)
     assert_same(timestep.observation[rows], data[f"obs{suffix}"][rows], "observation")
     for column, name in enumerate(REWARDS[kind]):
         assert_same(info.reward_terms[name][rows], data["reward_components"][rows][:, column], name)
     assert_same(timestep.reward[rows], data["reward"][rows], "reward")
-    success, failure = data[f"status_success{suffix}"][rows], data[f"status_failure{suffix}"][rows]
+    success = data[f"status_success{suffix}"][rows]
+    failure = data[f"status_failure{suffix}"][rows]
     np.testing.assert_array_equal(sim.ended["success"][rows], success)
     for code, name in enumerate(FAILURES[kind][1:], start=1):
         np.testing.assert_array_equal(sim.ended[name][rows], failure == code, err_msg=name)
@@ -294,12 +312,16 @@ def test_whole_episodes_are_judged_as_recorded(recording: str) -> None:
 
 
 def test_the_released_filter_decides_as_recorded() -> None:
-    """At every step of every episode, with its hysteresis: whether it intervenes, and the control that acts."""
+    """The decision to intervene and the control that acts agree at every step of every episode.
+
+    The filter has hysteresis, so its memory takes part.
+    """
     data = episodes("rejoin2d_rta")
     timestep, _ = replay(
         released("rejoin2d_rta"), state_fields("rejoin2d_rta", data), data["action"]
     )
-    rows, info = data["taken"], timestep.info
+    rows = data["taken"]
+    info = timestep.info
     np.testing.assert_array_equal(info.intervening[rows], data["rta_intervening"][rows])
     assert_same(info.control_desired[rows], data["rta_control_desired"][rows], "desired", 1e-15)
     assert_same(info.control_actual[rows], data["control"][rows], "actual", 1e-15)
@@ -310,10 +332,10 @@ def test_the_released_filter_decides_as_recorded() -> None:
 @pytest.mark.parametrize("recording", [*RECORDINGS, *SCATTERED])
 def test_one_step_from_every_recorded_state_is_the_recorded_step(recording: str) -> None:
     data = transitions(recording)
-    env, actions = released(recording), data["action"]
-    if recording.endswith(
-        "_rta"
-    ):  # the filter remembers what single steps do not know: take the control that acted
+    env = released(recording)
+    actions = data["action"]
+    # Single steps do not know what the filter remembers. So they take the control that acted.
+    if recording.endswith("_rta"):
         env, actions = jaxsafe.override(env, {"rta": None}), data["control"] / bounds(env)[1]
     platforms, timestep = single_steps(env, state_fields(recording, data, "_t0"), actions)
     assert_same(timestep.info.control_desired, data["control"], "control", 1e-14)
@@ -359,7 +381,8 @@ def test_every_state_on_a_boundary_is_judged_as_recorded() -> None:
     edges = json.loads((GOLDEN / "edges.json").read_text())
     judged = []
     for edge in edges:
-        task, status = edge["task"], edge["status_at_reset"]
+        task = edge["task"]
+        status = edge["status_at_reset"]
         data = {f"{name}_state": np.array(values) for name, values in edge["states"].items()}
         state, timestep = jaxsafe.reset_to(released(task), state_fields(task, data))
         ended = {name: bool(flag) for name, flag in state.sim.ended.items()}
@@ -381,31 +404,35 @@ def test_every_state_on_a_boundary_is_judged_as_recorded() -> None:
 
 
 def measures(recording: str, data: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The independent numbers that a start is drawn from."""
-    found: dict[str, np.ndarray] = {}
+    """Return the independent numbers that a start is drawn from."""
+    computed: dict[str, np.ndarray] = {}
     fields = state_fields(recording, data)
     for name, state in fields.items():
         for field, values in state.items():
             for axis, column in zip("xyz", np.atleast_2d(values.T), strict=False):
-                found[f"{name}.{field}.{axis}"] = column
+                computed[f"{name}.{field}.{axis}"] = column
     other = fields["lead"]["position"] if "lead" in fields else 0.0
     apart = (fields["wingman"] if "lead" in fields else fields["deputy"])["position"] - other
     planar = np.hypot(apart[:, 0], apart[:, 1])
-    found |= {"distance": planar, "azimuth": np.arctan2(apart[:, 1], apart[:, 0])}
+    computed |= {"distance": planar, "azimuth": np.arctan2(apart[:, 1], apart[:, 0])}
     if "deputy" in fields:
-        velocity, distance = fields["deputy"]["velocity"], np.linalg.norm(apart, axis=1)
+        velocity = fields["deputy"]["velocity"]
+        distance = np.linalg.norm(apart, axis=1)
         share = np.linalg.norm(velocity, axis=1) / (0.2 + 2 * 0.001027 * distance)
-        found |= {
+        computed |= {
             "range": distance,
             "share": share,
             "course": np.arctan2(velocity[:, 1], velocity[:, 0]),
         }
-    return found
+    return computed
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_starts_are_drawn_from_the_recorded_distribution(task: str) -> None:
-    """Kolmogorov-Smirnov on every number of 1 000 recorded and 20 000 of our starts, at a level of 1e-4 a task."""
+    """Kolmogorov-Smirnov's test compares every number of 1 000 recorded and 20 000 drawn starts.
+
+    The level is 1e-4 for a task.
+    """
     data = np.load(GOLDEN / f"{task}_init.npz")
     env = released(task)
     states, _ = jax.jit(jax.vmap(jaxsafe.reset, in_axes=(None, 0)))(
@@ -413,50 +440,55 @@ def test_starts_are_drawn_from_the_recorded_distribution(task: str) -> None:
     )
     ours = {}
     for name in PLATFORMS[kind_of(task)]:
-        record, columns = states.sim.platforms[name], COLUMNS[task]
+        record = states.sim.platforms[name]
+        columns = COLUMNS[task]
         width = 1 + max(
             where.stop - 1 if isinstance(where, slice) else where for where in columns.values()
         )
         ours[f"{name}_state"] = np.zeros((20_000, width))
         for field, where in columns.items():
             ours[f"{name}_state"][:, where] = np.asarray(getattr(record, field))
-    expected, found = measures(task, data), measures(task, ours)
+    expected = measures(task, data)
+    computed = measures(task, ours)
     drawn = {name: values for name, values in expected.items() if np.ptp(values) > 1e-9}
     for name, values in expected.items():
         if name not in drawn:
-            assert_same(found[name], values[0], name)
+            assert_same(computed[name], values[0], name)
     level = 1e-4 / len(drawn)
     for name, values in drawn.items():
-        assert stats.ks_2samp(found[name], values).pvalue > level, name
-    pairs = np.abs(correlations(found, drawn) - correlations(expected, drawn))
-    assert pairs.max() < 0.2  # of 1 000 samples: 6 standard deviations
+        assert stats.ks_2samp(computed[name], values).pvalue > level, name
+    pairs = np.abs(correlations(computed, drawn) - correlations(expected, drawn))
+    assert pairs.max() < 0.2  # 6 standard deviations for 1 000 samples
 
 
-def correlations(found: Mapping[str, np.ndarray], names: Mapping[str, Any]) -> np.ndarray:
-    return np.corrcoef([found[name] for name in names])
+def correlations(computed: Mapping[str, np.ndarray], names: Mapping[str, Any]) -> np.ndarray:
+    return np.corrcoef([computed[name] for name in names])
 
 
 @pytest.mark.parametrize("task", ["docking2d", "docking3d"])
 def test_whole_docking_episodes_run_freely_as_recorded(task: str) -> None:
     data = episodes(task)
-    found, timestep = free_run(released(task), state_fields(task, data), data["action"])
+    computed, timestep = free_run(released(task), state_fields(task, data), data["action"])
     rows = data["taken"]
     for field, values in state_fields(task, data)["deputy"].items():
-        assert_same(getattr(found["deputy"], field)[rows], values[:, 1:][rows], field)
+        assert_same(getattr(computed["deputy"], field)[rows], values[:, 1:][rows], field)
     assert_same(timestep.reward[rows], data["reward"][rows], "reward")
     np.testing.assert_array_equal(timestep.terminated[rows], data["done"][rows])
 
 
 @jax.jit
 def free_run(env: Environment, fields: Fields, actions: jax.Array) -> tuple[Any, TimeStep]:
-    """Whole episodes from their starts: platforms and time steps after each step, [episodes, steps]."""
+    """Fly whole episodes freely from their starts.
+
+    Return platforms and time steps after each step, [episodes, steps].
+    """
 
     def advance(state: State, action: jax.Array) -> tuple[State, tuple[Any, TimeStep]]:
         state, timestep = jaxsafe.step(env, state, action)
         return state, (state.sim.platforms, timestep)
 
     first, _ = start(env, jax.tree.map(lambda leaf: leaf[:, 0], fields))
-    return jax.vmap(lambda one, taken: jax.lax.scan(advance, one, taken)[1])(first, actions)
+    return jax.vmap(lambda start, taken: jax.lax.scan(advance, start, taken)[1])(first, actions)
 
 
 @pytest.mark.parametrize(
@@ -470,9 +502,13 @@ def free_run(env: Environment, fields: Fields, actions: jax.Array) -> tuple[Any,
     ],
 )
 def test_float32_stays_close_over_whole_episodes(task: str, tolerance: float) -> None:
-    """Positions relative to the lead or chief [ft, m], up to 2001 or 3001 steps, 5e5 ft or 4e4 m from the origin."""
+    """Positions relative to the lead [ft] or chief [m] stay close.
+
+    Episodes have up to 2001 or 3001 steps and go 5e5 ft or 4e4 m away from the origin.
+    """
     data = episodes(task)
-    fields, rows = state_fields(task, data), data["taken"]
+    fields = state_fields(task, data)
+    rows = data["taken"]
     precise, expected = free_run(released(task), fields, data["action"])
     with jax.enable_x64(False):
         single = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), (fields, data["action"]))
@@ -480,8 +516,8 @@ def test_float32_stays_close_over_whole_episodes(task: str, tolerance: float) ->
     assert timestep.reward.dtype == jnp.float32
     other, agent = PLATFORMS["rejoin"] if "rejoin" in task else ("chief", "deputy")
     apart = [
-        np.asarray(each[agent].position, float) - each[other].position
-        for each in (platforms, precise)
+        np.asarray(states[agent].position, float) - states[other].position
+        for states in (platforms, precise)
     ]
     assert np.abs(apart[0] - apart[1])[rows].max() < tolerance
     np.testing.assert_array_equal(timestep.info.outcome[rows], expected.info.outcome[rows])

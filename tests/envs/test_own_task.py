@@ -1,4 +1,7 @@
-"""A user's package adds a task with one call; everything that takes the name of a task then knows it."""
+"""A user's package adds a task with one call.
+
+Everything that takes the name of a task then knows it.
+"""
 
 import json
 import os
@@ -21,7 +24,7 @@ OPTIONS = [word for word in TINY if not word.startswith("env=")]
 
 @pytest.fixture
 def directory(tmp_path: Path) -> Path:
-    """An empty directory with the module of the tutorial, and a recipe for its task."""
+    """Return an empty directory with the module of the tutorial and a recipe for its task."""
     module = re.search(
         r"```python\n# my_tasks\.py\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL
     )

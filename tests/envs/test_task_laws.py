@@ -1,4 +1,7 @@
-"""The laws that every task keeps, with continuous and with discrete actions, and one environment composed in YAML."""
+"""The laws that every task keeps, with continuous and with discrete actions.
+
+One more environment, composed in YAML, keeps them too.
+"""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -23,10 +26,11 @@ VARIANTS = [(task, actions) for task in (*TASKS, CUSTOM) for actions in ("contin
     :-1
 ]
 REJOIN = [task for task in TASKS if task.startswith("rejoin")]
-NUM_STEPS, NUM_ENVS = 40, 5
+NUM_STEPS = 40
+NUM_ENVS = 5
 
 REJOIN_POINT = 500.0 * np.asarray([np.cos(4 * np.pi / 3), np.sin(4 * np.pi / 3)])
-"""Eq. (6) for a lead that flies along x."""
+"""The rejoin point of Eq. (6) for a lead that flies along x."""
 
 DIVISORS = {
     "rejoin2d": [1000, 1, 1, 1000, 1, 1, 400, 1, 1, 400, 1, 1],
@@ -36,10 +40,13 @@ DIVISORS = {
     "docking2d_oriented": [100, 100, 0.5, 0.5, -1, -1, np.pi / 90, 1, 1],
     CUSTOM: [100, 100, 0.5, 0.5, 1, 1, 100, 1, 1, 1],
 }
-"""Tables 5 and 6."""
+"""Divisors of the observations, from Tables 5 and 6."""
 
 OWN_DIRECTION = {"wingman_velocity.x", "wingman_velocity.y", "wingman_velocity.z"}
-"""An aircraft flies forwards: in its own frame the direction of its velocity is x."""
+"""Elements that are constant.
+
+An aircraft flies forwards, so in its own frame its velocity points along x.
+"""
 
 ALIKE_AT_START = {
     "rejoin2d": {
@@ -51,7 +58,11 @@ ALIKE_AT_START = {
     | {"lead_velocity.z", "roll", "flight_path_angle"},
     "docking2d_oriented": {"attitude_rate"},
 }
-"""Far away distances are clipped to 1; aircraft start level and with wings level, the deputy without spin."""
+"""Elements that do not vary among starts.
+
+Far away distances are clipped to 1. Aircraft start in level flight with level wings. The deputy
+starts without spin.
+"""
 
 TRACED: list[str] = []
 
@@ -70,7 +81,10 @@ def step(env: Environment, state: State, action: jax.Array) -> tuple[State, Time
 
 @jax.jit
 def run(env: Environment, state: State, actions: jax.Array) -> tuple[State, TimeStep]:
-    """States and time steps of one action after the other, without resets, [envs, steps]."""
+    """Take one action after the other, without resets.
+
+    Return states and time steps [envs, steps].
+    """
 
     def advance(state: State, action: jax.Array) -> tuple[State, tuple[State, TimeStep]]:
         state, timestep = jaxsafe.step(env, state, action)
@@ -106,19 +120,23 @@ def env(variant: tuple[str, str]) -> Environment:
 
 @pytest.fixture(scope="module")
 def started(env: Environment) -> tuple[State, TimeStep]:
-    """Random starts, [NUM_ENVS]."""
+    """Return random starts, [NUM_ENVS]."""
     return reset_many(env, keys())
 
 
 @pytest.fixture(scope="module")
 def first(env: Environment, task: str, started: tuple[State, TimeStep]) -> tuple[State, TimeStep]:
-    """Starts of the random rollouts: random for docking; close to the lead, where no distance is clipped, for rejoin."""
+    """Return the starts of the random rollouts.
+
+    They are random for docking. For rejoin they are close to the lead, where no distance is
+    clipped.
+    """
     if task not in REJOIN:
         return started
     offsets = ([-20.0, 5.0], [-300.0, 40.0], REJOIN_POINT, [-200.0, 300.0], [-800.0, -300.0])
     starts = [
-        rejoin_start(env, *each)
-        for each in zip(offsets, np.linspace(0.0, 0.4, NUM_ENVS), strict=True)
+        rejoin_start(env, offset, angle)
+        for offset, angle in zip(offsets, np.linspace(0.0, 0.4, NUM_ENVS), strict=True)
     ]
     for start, speed in zip(starts, np.linspace(250.0, 300.0, NUM_ENVS), strict=True):
         start["lead"]["speed"] = speed
@@ -127,7 +145,7 @@ def first(env: Environment, task: str, started: tuple[State, TimeStep]) -> tuple
 
 @pytest.fixture(scope="module")
 def rollouts(env: Environment, first: tuple[State, TimeStep]) -> tuple[State, TimeStep]:
-    """Random actions from these starts, without resets, [NUM_ENVS, NUM_STEPS]."""
+    """Take random actions from these starts, without resets. Return [NUM_ENVS, NUM_STEPS]."""
     return run(env, first[0], random_actions(env, NUM_ENVS, NUM_STEPS))
 
 
@@ -141,14 +159,15 @@ def keys() -> jax.Array:
 
 
 def random_actions(env: Environment, *shape: int) -> jax.Array:
-    key, shape = jax.random.key(11), (*shape, env.action_size)
+    key = jax.random.key(11)
+    shape = (*shape, env.action_size)
     if env.num_action_points:
         return jax.random.randint(key, shape, 0, jnp.asarray(env.num_action_points))
     return jax.random.uniform(key, shape, minval=-1.0)
 
 
 def action(env: Environment, share: Any) -> jax.Array:
-    """The action at these shares, in [−1, 1], of the actuators' ranges."""
+    """Return the action at these shares, in [−1, 1], of the actuators' ranges."""
     share = jnp.broadcast_to(jnp.asarray(share, float), (env.action_size,))
     points = jnp.asarray(env.num_action_points)
     return jnp.round((share + 1.0) / 2.0 * (points - 1)).astype(int) if points.size else share
@@ -159,7 +178,7 @@ def item(tree: Any, index: int) -> Any:
 
 
 def pad(env: Environment, vector: Any) -> np.ndarray:
-    """A vector of the plane in the environment's space."""
+    """Return a vector of the plane in the environment's space."""
     return np.append(vector, np.zeros(env.agent_platform.dimension - 2))
 
 
@@ -182,7 +201,10 @@ def docking_start(
 def rejoin_start(
     env: Environment, offset: Any, heading: float = 0.0, speed: float = 300.0, **angles: float
 ) -> Any:
-    """The lead at the origin, flying along x at 300 ft/s; the wingman at an offset from it."""
+    """Return a start with the lead at the origin and the wingman at an offset from it.
+
+    The lead flies along x at 300 ft/s.
+    """
     angles = (
         {"roll": 0.0, "flight_path_angle": 0.0} | angles
         if env.agent_platform.dimension == 3
@@ -196,14 +218,15 @@ def rejoin_start(
 
 
 def inside(env: Environment, task: str) -> dict[str, Any]:
-    """A start in the region, from which a step without control stays in it."""
+    """Return a start in the region from which a step without control stays in it."""
     return rejoin_start(env, REJOIN_POINT) if task in REJOIN else docking_start(env, [0.45, 0.0])
 
 
 def edges(env: Environment, task: str) -> list[dict[str, Any]]:
-    """Starts at which something is 0, or on a limit, or far away."""
+    """Return starts at which something is 0, or on a limit, or far away."""
     if task in REJOIN:
-        roll, gamma = np.pi / 3, np.pi / 9
+        roll = np.pi / 3
+        gamma = np.pi / 9
         return [
             rejoin_start(env, [0.0, 0.0]),
             rejoin_start(env, REJOIN_POINT),
@@ -224,7 +247,8 @@ def test_with_and_without_jit_are_the_same(env: Environment) -> None:
     chex.assert_trees_all_close(
         jaxsafe.reset(env, keys()[0]), reset(env, keys()[0]), rtol=1e-5, atol=1e-5
     )
-    state, taken = reset(env, keys()[0])[0], random_actions(env)
+    state = reset(env, keys()[0])[0]
+    taken = random_actions(env)
     chex.assert_trees_all_close(
         jaxsafe.step(env, state, taken), step(env, state, taken), rtol=1e-5, atol=1e-5
     )
@@ -244,7 +268,8 @@ def test_a_batch_of_states_is_a_loop_over_states(
 def test_a_batch_of_parameters_is_a_loop_over_overrides(
     env: Environment, started: tuple[State, TimeStep]
 ) -> None:
-    state, taken = item(started[0], 0), action(env, 1.0)
+    state = item(started[0], 0)
+    taken = action(env, 1.0)
     actuator = f"{env.agent}.controller.actuators.{env.action_names[0]}.high"
 
     def changed(high: Any, dt: Any, farthest: Any) -> Environment:
@@ -253,12 +278,12 @@ def test_a_batch_of_parameters_is_a_loop_over_overrides(
         )
 
     numbers = [0.1, 0.2, 0.3], [0.5, 1.0, 2.0], [1.0, 1e6, 10.0]
-    batch = jax.jit(jax.vmap(lambda *each: jaxsafe.step(changed(*each), state, taken)))(
+    batch = jax.jit(jax.vmap(lambda *values: jaxsafe.step(changed(*values), state, taken)))(
         *map(jnp.asarray, numbers)
     )
-    for i, each in enumerate(zip(*numbers, strict=True)):
+    for i, values in enumerate(zip(*numbers, strict=True)):
         chex.assert_trees_all_close(
-            item(batch, i), step(changed(*each), state, taken), rtol=1e-5, atol=1e-5
+            item(batch, i), step(changed(*values), state, taken), rtol=1e-5, atol=1e-5
         )
     np.testing.assert_allclose(batch[1].info.control_desired[:, 0], numbers[0], rtol=1e-6)
     np.testing.assert_array_equal(batch[0].sim.time, numbers[1])
@@ -272,12 +297,13 @@ def test_a_batch_of_environments_steps_as_each_of_them(
         {"reward.distance_change.scale": scale, "dt": dt}
         for scale, dt in ((6, 1), (12, 2), (24, 0.5))
     ]
-    each = [jaxsafe.override(env, change) for change in changes]
-    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
-    states, actions = jax.tree.map(lambda leaf: leaf[:3], started[0]), random_actions(env, 3)
+    changed_envs = [jaxsafe.override(env, change) for change in changes]
+    batch = jax.tree.map(lambda *leaves: jnp.stack(leaves), *changed_envs)
+    states = jax.tree.map(lambda leaf: leaf[:3], started[0])
+    actions = random_actions(env, 3)
     stepped = jax.jit(jax.vmap(jaxsafe.step))(batch, states, actions)
     for i in range(3):
-        alone = step(each[i], item(states, i), actions[i])
+        alone = step(changed_envs[i], item(states, i), actions[i])
         chex.assert_trees_all_close(item(stepped, i), alone, rtol=1e-5, atol=1e-5)
 
 
@@ -285,7 +311,8 @@ def test_the_same_key_and_actions_give_the_same_bits(
     env: Environment, started: tuple[State, TimeStep]
 ) -> None:
     chex.assert_trees_all_equal(reset_many(env, keys()), started)
-    state, taken = item(started[0], 0), random_actions(env)
+    state = item(started[0], 0)
+    taken = random_actions(env)
     chex.assert_trees_all_equal(step(env, state, taken), step(env, state, taken))
 
 
@@ -322,10 +349,10 @@ def test_any_numbers_compile_once(env: Environment, task: str) -> None:
     ]
     step(env, reset(env, keys()[0])[0], random_actions(env))
     num_traces = len(TRACED)
-    for one in (env, *changed, jax.tree.map(lambda leaf: leaf * 1.5, env)):
-        state, _ = reset(one, keys()[0])
+    for variant in (env, *changed, jax.tree.map(lambda leaf: leaf * 1.5, env)):
+        state, _ = reset(variant, keys()[0])
         for taken in random_actions(env, 2):
-            state, _ = step(one, state, taken)
+            state, _ = step(variant, state, taken)
     state, _ = jaxsafe.reset_to(env, inside(env, task), dict.fromkeys(env.randomize, 12))
     step(env, state, np.asarray(random_actions(env)))
     assert len(TRACED) == num_traces > 0
@@ -362,9 +389,8 @@ def test_no_element_of_the_observation_is_constant(timesteps: TimeStep, env: Env
         if name in OWN_DIRECTION:
             np.testing.assert_allclose(column, float(name.endswith("x")), atol=1e-5)
         else:
-            assert (column.std(axis=1) > 1e-4).all() or name == "lead_velocity.magnitude", (
-                name
-            )  # the lead keeps its speed
+            # The lead keeps its speed, so its magnitude does not vary.
+            assert (column.std(axis=1) > 1e-4).all() or name == "lead_velocity.magnitude", name
             assert column.std(axis=0).max() > 1e-3, name
 
 
@@ -373,19 +399,20 @@ def test_normalisation_undone_returns_the_raw_vector(
 ) -> None:
     states, timesteps = jax.tree.map(np.asarray, rollouts)
     divisors = np.asarray(DIVISORS[task])
-    for lane in range(NUM_ENVS):
+    for index in range(NUM_ENVS):
         for t in range(0, NUM_STEPS, 7):
-            raw = raw_observation(task, item(item(states, lane), t))
+            raw = raw_observation(task, item(item(states, index), t))
             seen = np.clip(raw, -np.abs(divisors), np.abs(divisors)) if task in REJOIN else raw
             np.testing.assert_allclose(
-                timesteps.observation[lane, t] * divisors, seen, rtol=1e-5, atol=1e-5
+                timesteps.observation[index, t] * divisors, seen, rtol=1e-5, atol=1e-5
             )
 
 
 def raw_observation(task: str, state: State) -> np.ndarray:
-    """Tables 5 and 6 in physical units."""
+    """Return the observation of Tables 5 and 6 in physical units."""
     if task in REJOIN:
-        lead, wingman = state.sim.platforms["lead"], state.sim.platforms["wingman"]
+        lead = state.sim.platforms["lead"]
+        wingman = state.sim.platforms["wingman"]
         behind = lead.heading + 4 * np.pi / 3
         offset = np.append(
             500 * np.asarray([np.cos(behind), np.sin(behind)]), np.zeros(lead.position.size - 2)
@@ -398,7 +425,8 @@ def raw_observation(task: str, state: State) -> np.ndarray:
     speed = np.linalg.norm(deputy.velocity)
     limits = [speed, 0.2 + 2 * 0.001027 * np.linalg.norm(deputy.position)]
     if task == "docking2d_oriented":
-        c, s = np.cos(deputy.attitude), np.sin(deputy.attitude)
+        c = np.cos(deputy.attitude)
+        s = np.sin(deputy.attitude)
         turn = np.asarray([[c, s], [-s, c]])
         return np.concatenate(
             [-turn @ deputy.position, turn @ deputy.velocity, [c, s, deputy.attitude_rate], limits]
@@ -413,13 +441,17 @@ def flight(aircraft: Any) -> np.ndarray:
 
 
 def axes(aircraft: Any) -> np.ndarray:
-    """R_z(ψ)·R_y(γ)·R_x(φ); the columns are the axes of the body."""
-    c, s = np.cos(float(aircraft.heading)), np.sin(float(aircraft.heading))
+    """Return R_z(ψ)·R_y(γ)·R_x(φ). Its columns are the axes of the body."""
+    c = np.cos(float(aircraft.heading))
+    s = np.sin(float(aircraft.heading))
     if aircraft.position.size == 2:
         return np.asarray([[c, -s], [s, c]])
-    cp, sp = np.cos(float(aircraft.flight_path_angle)), np.sin(float(aircraft.flight_path_angle))
-    cr, sr = np.cos(float(aircraft.roll)), np.sin(float(aircraft.roll))
-    yaw, pitch = [[c, -s, 0], [s, c, 0], [0, 0, 1]], [[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]
+    cp = np.cos(float(aircraft.flight_path_angle))
+    sp = np.sin(float(aircraft.flight_path_angle))
+    cr = np.cos(float(aircraft.roll))
+    sr = np.sin(float(aircraft.roll))
+    yaw = [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+    pitch = [[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]]
     return np.asarray(yaw) @ np.asarray(pitch) @ np.asarray([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
 
 
@@ -460,8 +492,8 @@ def test_limits_are_reached_and_never_exceeded(task: str, actions: str) -> None:
     if task == "rejoin3d":
         limits |= {"flight_path_angle": (-np.pi / 9, np.pi / 9), "roll": (-np.pi / 3, np.pi / 3)}
     for name, (low, high) in limits.items():
-        found = getattr(agent, name)
-        assert (found.min(), found.max()) == (np.float32(low), np.float32(high)), name
+        computed = getattr(agent, name)
+        assert (computed.min(), computed.max()) == (np.float32(low), np.float32(high)), name
     if task == "docking2d_oriented":
         assert agent.attitude.min() >= -np.float32(np.pi)
         assert agent.attitude.max() < np.float32(np.pi)
@@ -512,7 +544,10 @@ def test_cost_is_one_exactly_where_a_margin_is_negative(
 
 
 def coinciding(env: Environment, task: str) -> Environment:
-    """Success, distance and timeout, and near the lead the crash too, hold on the first step from `inside`."""
+    """Return an environment in which several conditions hold on the first step from `inside`.
+
+    They are success, distance and timeout, and near the lead the crash too.
+    """
     changes = {"terminal.timeout.limit": 0.5, "terminal.distance.limit": 0.1}
     return jaxsafe.override(
         env, changes | ({"terminal.success.duration": 0.5} if task in REJOIN else {})
@@ -534,7 +569,7 @@ def test_at_most_one_outcome_ends_an_episode(env: Environment, task: str) -> Non
 
 
 def without(env: Environment, outcome: str, task: str) -> Environment:
-    """The same environment in which this outcome does not hold any more."""
+    """Return the same environment, in which this outcome does not hold any more."""
     docked = {"regions.docking_region.radius": 0.0}
     success = {"terminal.success.duration": 100.0} if task in REJOIN else docked
     never = {
@@ -547,7 +582,7 @@ def without(env: Environment, outcome: str, task: str) -> Environment:
 
 @pytest.mark.parametrize("task", TASKS)
 def test_success_and_timeout_are_both_paid_in_the_released_variant(task: str) -> None:
-    found = []
+    computed = []
     for variant in ("released", "paper"):
         env = build(task, variant=variant)
         together = jaxsafe.override(coinciding(env, task), {"terminal.distance.limit": 1e4})
@@ -557,14 +592,17 @@ def test_success_and_timeout_are_both_paid_in_the_released_variant(task: str) ->
         assert env.outcomes[int(timestep.info.outcome)] == "success"
         scale = float(next(term.time_scale for term in env.reward if term.name == "success"))
         assert float(timestep.info.reward_terms["success"]) == pytest.approx(2.0 - 1.0 / scale)
-        found.append(float(timestep.info.reward_terms["failure"]))
-    assert found == [-1.0, 0.0]
+        computed.append(float(timestep.info.reward_terms["failure"]))
+    assert computed == [-1.0, 0.0]
 
 
 def visits(
     task: str, variant: str, offset: Any, accelerations: list[float]
 ) -> dict[str, np.ndarray]:
-    """Facts of a wingman that flies along x beside the lead: inside or not, and its rewards by step."""
+    """Fly a wingman along x beside the lead.
+
+    Return whether it was inside and its rewards, by step.
+    """
     env = build(task, variant=variant)
     state, timestep = place(env, [rejoin_start(env, np.add(REJOIN_POINT, offset))])
     actions = jnp.stack(
@@ -642,8 +680,8 @@ def test_planar_rejoin_is_spatial_rejoin_in_straight_level_flight() -> None:
     actions = random_actions(envs[0], 1, 30).at[..., 0].set(0.0)
     starts = [rejoin_start(env, REJOIN_POINT - 100.0, heading=0.2) for env in envs]
     runs = [
-        run(env, place(env, [one])[0], pad_actions(env, actions, 1))
-        for env, one in zip(envs, starts, strict=True)
+        run(env, place(env, [start])[0], pad_actions(env, actions, 1))
+        for env, start in zip(envs, starts, strict=True)
     ]
     planar, spatial = runs
     _agree(planar, spatial, "wingman", ["heading", "speed"])
@@ -655,7 +693,10 @@ def test_planar_rejoin_is_spatial_rejoin_in_straight_level_flight() -> None:
 
 
 def pad_actions(env: Environment, actions: jax.Array, at: int) -> jax.Array:
-    """Zeros for the actuators that only space has: the third of docking, the second of rejoin."""
+    """Add zeros for the actuators that only space has.
+
+    They are the third of docking and the second of rejoin.
+    """
     if env.action_size == 2:
         return actions
     return jnp.insert(actions, 2 if at == 0 else 1, 0.0, axis=-1)
@@ -667,7 +708,8 @@ def _agree(
     flat, deep = (states.sim.platforms[agent] for states in (planar[0], spatial[0]))
     np.testing.assert_allclose(flat.position, deep.position[..., :2], rtol=1e-5, atol=1e-3)
     for name in names:
-        here, there = getattr(flat, name), getattr(deep, name)
+        here = getattr(flat, name)
+        there = getattr(deep, name)
         np.testing.assert_allclose(
             here, there[..., :2] if there.ndim == 3 else there, rtol=1e-5, atol=1e-5
         )
@@ -683,7 +725,8 @@ def test_rejoin_does_not_change_when_the_whole_world_is_moved_and_turned(
     task: str, x64: bool, tolerance: float
 ) -> None:
     with jax.enable_x64(x64):
-        env, draw = build(task), np.random.default_rng(3)
+        env = build(task)
+        draw = np.random.default_rng(3)
         start = rejoin_start(env, [-600.0, -300.0], heading=0.3, roll=0.2, flight_path_angle=-0.1)
         motions = [(0.0, pad(env, [0.0, 0.0]))]
         motions += [
@@ -693,19 +736,22 @@ def test_rejoin_does_not_change_when_the_whole_world_is_moved_and_turned(
         state, begun = place(env, [moved(start, *motion) for motion in motions])
         actions = jnp.broadcast_to(random_actions(env, 20), (len(motions), 20, env.action_size))
         timesteps = run(env, state, actions)[1]
-        for found in (
+        for computed in (
             begun.observation,
             timesteps.observation,
             timesteps.reward,
             timesteps.info.margins["collision"] / 100,
         ):
             np.testing.assert_allclose(
-                found, np.broadcast_to(found[:1], found.shape), rtol=tolerance, atol=tolerance
+                computed,
+                np.broadcast_to(computed[:1], computed.shape),
+                rtol=tolerance,
+                atol=tolerance,
             )
 
 
 def moved(start: dict[str, Any], turn: float, shift: np.ndarray) -> dict[str, Any]:
-    """The same start after turning the world about the origin's vertical axis, and shifting it."""
+    """Return the start after turning the world about the origin's vertical axis and shifting it."""
     matrix = np.eye(shift.size)
     matrix[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     return {
@@ -719,7 +765,10 @@ def moved(start: dict[str, Any], turn: float, shift: np.ndarray) -> dict[str, An
 
 
 def slopes_at(env: Environment, task: str) -> tuple[dict[str, Any], dict[str, float]]:
-    """A start and parameters where every term but the ends has a slope and nothing is clipped."""
+    """Return a start and parameters where every term but the ends has a slope.
+
+    Nothing is clipped there.
+    """
     shared = {"dt": 0.9, "reward.distance_change.scale": 3.0}
     if task in REJOIN:
         angles = {"roll": 0.2, "flight_path_angle": 0.1}
@@ -765,11 +814,10 @@ def test_derivatives_of_a_return_are_those_of_finite_differences(task: str, acti
     value = jax.jit(jax.vmap(lambda point: episode_return(unravel(point))))
     nudges = 1e-6 * jnp.eye(point.size)
     expected = (value(point + nudges) - value(point - nudges)) / 2e-6
-    found = jax.jit(jax.grad(lambda point: episode_return(unravel(point))))(point)
-    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6)
-    assert (
-        np.abs(found) > 1e-6
-    ).sum() >= found.size - env.action_size  # the last turns have yet to tell
+    computed = jax.jit(jax.grad(lambda point: episode_return(unravel(point))))(point)
+    np.testing.assert_allclose(computed, expected, rtol=1e-5, atol=1e-6)
+    # The last turns cannot change the return any more.
+    assert (np.abs(computed) > 1e-6).sum() >= computed.size - env.action_size
 
 
 @pytest.mark.parametrize("task", [*TASKS, CUSTOM])
@@ -794,15 +842,15 @@ def test_derivatives_are_finite_at_the_edges(task: str) -> None:
         values, pull_back = jax.vjp(
             outputs, env, state.sim, jnp.broadcast_to(share, env.action_size)
         )
-        found = jax.tree.leaves(pull_back([jnp.ones_like(value) for value in values]))
-        return [leaf for leaf in found if jnp.issubdtype(leaf.dtype, jnp.floating)]
+        computed = jax.tree.leaves(pull_back([jnp.ones_like(value) for value in values]))
+        return [leaf for leaf in computed if jnp.issubdtype(leaf.dtype, jnp.floating)]
 
-    found = jax.jit(jax.vmap(jax.vmap(slopes, (None, 0)), (0, None)))(
+    computed = jax.jit(jax.vmap(jax.vmap(slopes, (None, 0)), (0, None)))(
         states, jnp.asarray([0.0, 1.0, -1.0, 0.5])
     )
-    assert len(found) > 30
-    assert any(leaf.any() for leaf in found)
-    chex.assert_tree_all_finite(found)
+    assert len(computed) > 30
+    assert any(leaf.any() for leaf in computed)
+    chex.assert_tree_all_finite(computed)
 
 
 # States that are not finite
@@ -832,9 +880,9 @@ def test_an_episode_whose_state_is_not_finite_ends_as_a_violation_and_a_failure(
         assert all(0.0 <= float(severity) <= 1.0 for severity in timestep.info.severity.values())
         assert timestep.info.outcome != env.success
         sums = metrics.accumulate(metrics.begin(first), timestep)
-        found = metrics.summarise(jax.tree.map(lambda leaf: leaf[None], sums), env.success)
-        assert found["success_rate"] == 0.0
-        assert found["safety_violation_rate"] == found["episode_safety_violation_rate"] == 1.0
+        computed = metrics.summarise(jax.tree.map(lambda leaf: leaf[None], sums), env.success)
+        assert computed["success_rate"] == 0.0
+        assert computed["safety_violation_rate"] == computed["episode_safety_violation_rate"] == 1.0
 
 
 def test_an_action_that_is_not_a_number_ends_the_episode(env: Environment) -> None:
@@ -862,7 +910,8 @@ def test_a_number_at_either_end_of_what_is_allowed_gives_finite_states(task: str
         ]
         return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in floats]))
 
-    env, keys = jaxsafe.make(task), jax.random.split(jax.random.key(0), 4)
+    env = jaxsafe.make(task)
+    keys = jax.random.split(jax.random.key(0), 4)
     accepted = 0
     for path, shape in paths_of_numbers(env):
         for size in (1e12, 1e9, 1e5, 1e3, 1e-3, 1e-6, 0.0):
@@ -879,9 +928,10 @@ def test_a_number_at_either_end_of_what_is_allowed_gives_finite_states(task: str
 def paths_of_numbers(
     component: Component, place: str = ""
 ) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """The dotted path and the shape of every number of an environment."""
+    """Return the dotted path and the shape of every number of an environment."""
     for name, field in fields(type(component)).items():
-        value, here = getattr(component, name), f"{place}{name}"
+        value = getattr(component, name)
+        here = f"{place}{name}"
         if field.unit:
             yield from [] if value is None else [(here, value.shape)]
         elif isinstance(value, Component):

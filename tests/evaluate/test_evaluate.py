@@ -50,11 +50,11 @@ def test_a_policy_file_gives_the_results_of_its_seed_and_a_film(
     told = capsys.readouterr().out
     assert "docking2d, preset features, ppo, rta none, 1 seed, 1,280 steps each" in told
     assert f"films: {(place / 'episode_deterministic.gif').relative_to(tmp_path)}" in told
-    found = json.loads((place / "results.json").read_text())
+    results = json.loads((place / "results.json").read_text())
     own = json.loads((whole / "results.json").read_text())["evaluation"]["deterministic"]
-    assert found["seed"] == 2
-    assert found["steps"] == 1280
-    for name, metric in found["evaluation"]["deterministic"].items():
+    assert results["seed"] == 2
+    assert results["steps"] == 1280
+    for name, metric in results["evaluation"]["deterministic"].items():
         assert metric["per_seed"] == [own[name]["per_seed"][2]]
     with Image.open(place / "episode_deterministic.gif") as image:
         assert image.n_frames > 10  # type: ignore[attr-defined]
@@ -112,7 +112,7 @@ def test_a_corrupt_checkpoint_is_told_in_one_line(whole: Path, tmp_path: Path, d
 
 @jax.tree_util.register_static
 class Idle:
-    """Never pushes."""
+    """A policy that never pushes."""
 
     def policy(self, env: Any, params: Any, deterministic: Any) -> Any:
         return zero
@@ -163,7 +163,10 @@ def test_an_episode_that_does_not_end_is_given_up_and_that_is_told(
         "env.terminal.timeout.limit=1e10",
     ]
     assert main([*words, f"out={tmp_path / 'x'}"]) == 0
-    told = "episodes still running after 45 steps, given up and counted as failures: 2 stochastic, 2 deterministic"
+    told = (
+        "episodes still running after 45 steps, given up and counted as failures: 2"
+        " stochastic, 2 deterministic"
+    )
     assert told in capsys.readouterr().out
     results = json.loads((tmp_path / "x" / "results.json").read_text())
     assert results["given_up"] == {"after_steps": 45, "stochastic": 2, "deterministic": 2}
@@ -201,7 +204,8 @@ def chosen(*words: str) -> EnvironmentChoice:
 
 
 def test_a_policy_acts_in_another_environment_that_fits_it(tmp_path: Path) -> None:
-    own, name = jaxsafe.make("docking2d", {"deputy.mass": 14.0}), "docking2d"
+    own = jaxsafe.make("docking2d", {"deputy.mass": 14.0})
+    name = "docking2d"
     file = tmp_path / "mine.yaml"
     file.write_text(
         dump(jaxsafe.make("docking2d", {"deputy.mass": 24.0, "terminal.timeout.limit": 100.0}))
@@ -320,7 +324,8 @@ def test_another_environment_is_the_change_that_makes_it(
 
 
 def test_every_episode_is_counted_once_however_short() -> None:
-    # A biased evaluation would run the same number of steps in each lane and so see more of the short episodes.
+    # A biased evaluation would run the same number of steps in each environment of the batch. So it
+    # would see more of the short episodes.
     env = jaxsafe.make(
         "docking2d", {"terminal.timeout.limit": 200.0, "terminal.distance.limit": 130.0}
     )

@@ -1,4 +1,4 @@
-"""The file that the falsifier writes says what it was made by."""
+"""The falsifier writes a file that says what it was made by."""
 
 import json
 import shlex
@@ -26,12 +26,12 @@ def test_the_numbers_name_the_command_and_the_versions_that_made_them(tmp_path: 
         f"out={tmp_path / 'found.json'}",
     ]
     assert main(argv) == 0
-    found = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
-    assert found["command"] == f"python -m jaxsafe.rta.falsify {shlex.join(argv)}"
-    assert {"jaxsafe", "jax", "device", "processor"} <= set(found["versions"])
-    assert [(row["policy"], row["steps"], row["violating_steps"]) for row in found["policies"]] == [
-        ("uniform", 40, 0)
-    ]
+    results = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
+    assert results["command"] == f"python -m jaxsafe.rta.falsify {shlex.join(argv)}"
+    assert {"jaxsafe", "jax", "device", "processor"} <= set(results["versions"])
+    assert [
+        (row["policy"], row["steps"], row["violating_steps"]) for row in results["policies"]
+    ] == [("uniform", 40, 0)]
 
 
 def test_a_violation_is_the_exit_code_and_bounds_nothing(tmp_path: Path) -> None:
@@ -53,15 +53,14 @@ def test_a_violation_is_the_exit_code_and_bounds_nothing(tmp_path: Path) -> None
     assert row["violating_steps"] > 0
     assert row["violation_bound"] is None
     assert "without a violation" not in report([row])
-    assert "without a violation" not in report(
-        [{**row, "violating_steps": 0}]
-    )  # inside steps they count as well
+    # Violations inside steps count as well.
+    assert "without a violation" not in report([{**row, "violating_steps": 0}])
 
 
 def test_episodes_are_what_is_counted_and_whole_ones_unless_told_otherwise(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Steps of an episode depend on each other, so a million of them bound nothing a step."""
+    """Steps of an episode depend on each other. So a million of them bound nothing for a step."""
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 30.0}, rta="default")
     assert longest_episode(env) == 32
     whole = attack(env, "uniform", longest_episode(env), 5, jax.random.key(0))
@@ -99,11 +98,13 @@ def test_a_random_time_limit_is_read_as_each_episode_has_it() -> None:
     )
     assert time_limit(env.replace(terminal=env.terminal[:1])) is None
     sim = jaxsafe.reset(env, jax.random.key(0))[0].sim
-    key, away = jax.random.key(1), ADVERSARIES["outward"](env, sim, jax.random.key(1))
+    key = jax.random.key(1)
+    away = ADVERSARIES["outward"](env, sim, jax.random.key(1))
+    # The time is 4 s. Whether the agent has turned by then depends on the limit of the episode.
     for limit, turned in (
         (5.0, True),
         (30.0, False),
-    ):  # at 4 s, as an episode with this limit has it
+    ):
         now = drawn(env, {"terminal.timeout.limit": jnp.float32(limit)})
         control = ADVERSARIES["there_and_back"](now, sim.replace(time=jnp.float32(4.0)), key)
         assert bool((control == away).all()) is not turned
@@ -145,7 +146,10 @@ def test_adversaries_that_turn_back_and_that_take_the_least_certificate(policy: 
 
 
 def test_what_an_episode_draws_is_the_plant_that_is_counted_on() -> None:
-    """The nominal limit is exceeded all the time; the one that every episode draws never is."""
+    """The nominal limit is exceeded all the time.
+
+    The limit that every episode draws is never exceeded.
+    """
     loose = "env.randomize={status.velocity_limit.floor: [50, 60]}"
     argv = [
         "env=docking2d",

@@ -12,7 +12,7 @@ from jaxsafe.plot.animation import Scene, animate
 
 
 def recorded(env: jaxsafe.Environment, steps: int) -> Any:
-    """An episode of random actions."""
+    """Return the record of an episode of random actions."""
     policy = lambda key, o: jax.random.uniform(key, (*o.shape[:-1], env.action_size), minval=-1.0)  # noqa: E731
     key = jax.random.key(0)
     position, start = jax.jit(begin_recording, static_argnums=2)(env, key, 1)
@@ -28,7 +28,8 @@ def test_a_scene_shows_the_agent_where_it_is(task: str, maps: int) -> None:
     states, timesteps = recorded(env, 12)
     scene = Scene(env, states.sim, timesteps.info.margins, task)
     assert len(scene.maps) == maps
-    first, last = scene.draw(0), scene.draw(12)
+    first = scene.draw(0)
+    last = scene.draw(12)
     assert first.dtype == np.uint8
     assert first.shape == last.shape
     assert (first != last).any()
@@ -44,9 +45,9 @@ def test_names_and_titles_are_drawn_letter_by_letter() -> None:
     env = jaxsafe.make("docking2d")
     regions = tuple(region.replace(name="$\\frac{$") for region in env.regions)
     status = tuple(
-        one.replace(region="$\\frac{$") if hasattr(one, "region") else one for one in env.status
+        part.replace(region="$\\frac{$") if hasattr(part, "region") else part for part in env.status
     )
-    constraints = tuple(one.replace(name="_$\\frac{$") for one in env.constraints)
+    constraints = tuple(part.replace(name="_$\\frac{$") for part in env.constraints)
     env = jaxsafe.config.build(env.replace(regions=regions, status=status, constraints=constraints))
     states, timesteps = recorded(env, 2)
     scene = Scene(env, states.sim, timesteps.info.margins, "$\\frac{$")

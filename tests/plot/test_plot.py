@@ -45,14 +45,13 @@ def test_curves_show_each_seed_their_mean_and_its_interval() -> None:
     assert panel.get_xlabel() == "environment steps per seed"
     assert panel.get_ylabel() == "success rate [%]"
     mean = next(line for line in panel.lines if line.get_label() == "mean")
-    values = np.array([row["success_rate"] or np.nan for row in rows()]).reshape(50, 4)[
-        3:
-    ]  # nothing finished before
+    # No episode has finished in the first three updates.
+    values = np.array([row["success_rate"] or np.nan for row in rows()]).reshape(50, 4)[3:]
     np.testing.assert_allclose(mean.get_ydata(), 100 * values.mean(axis=1))
     np.testing.assert_allclose(mean.get_xdata(), 100 * np.arange(4, 51))
     shaded = panel.collections[0].get_paths()[0].vertices
     assert shaded[:, 1].max() == pytest.approx(100 * bootstrap_interval(values)[1].max())
-    assert len(panel.lines) == 4 + 1 + 1 + 1  # seeds, the label, the mean, the 80 % line
+    assert len(panel.lines) == 4 + 1 + 1 + 1  # seeds, the label, the mean and the 80 % line
 
 
 def test_a_run_in_which_no_episode_ended_has_curves_that_say_so() -> None:
@@ -137,7 +136,8 @@ def test_a_platform_alone_is_drawn_where_it_is_and_a_training_that_diverged_leav
     for row in rows[5:]:
         row["platforms"]["deputy"]["position"] = [None, None]
         row["status"] = dict.fromkeys(row["status"])
-    assert len(trajectories([(step, rows)], "title", "m").axes) == 3  # the colour bar too
+    # the colour bar is an axis too
+    assert len(trajectories([(step, rows)], "title", "m").axes) == 3
     assert speed_distance([(step, rows)], "title").axes[0].get_xlim()[1] > 113.0
     rests = [{"platforms": {name: {"position": [0.0, 0.0]} for name in ("chief", "deputy")}}] * 3
     assert trajectories([(0, rests)], "title", "m").axes[0].get_xlim() == (-1.0, 1.0)
@@ -157,14 +157,11 @@ def test_early_policies_that_go_far_away_do_not_set_the_scale() -> None:
 
 def test_paths_are_seen_from_the_lead_along_its_heading_with_the_region_that_it_carries() -> None:
     env = jaxsafe.make("rejoin2d")
-    heading = np.linspace(
-        0.0, 2.0, 30
-    )  # the lead flies a turn, the wingman keeps 300 ft behind and 100 ft aside of it
+    # The lead flies a turn. The wingman keeps 300 ft behind and 100 ft aside of it.
+    heading = np.linspace(0.0, 2.0, 30)
     lead = 1e4 * np.stack([np.sin(heading), 1.0 - np.cos(heading)], axis=1)
-    ahead, aside = (
-        np.stack([np.cos(heading), np.sin(heading)], 1),
-        np.stack([-np.sin(heading), np.cos(heading)], 1),
-    )
+    ahead = np.stack([np.cos(heading), np.sin(heading)], 1)
+    aside = np.stack([-np.sin(heading), np.cos(heading)], 1)
     rows = [
         {
             "platforms": {
@@ -202,20 +199,21 @@ def test_figures_come_from_the_log_files_alone(whole: Path, tmp_path: Path) -> N
     assert drawn == {"training_wall.png", "trajectories.png", "speed_distance.png"}
     image = imread(run / "figures" / "training_wall.png")
     assert image.shape[0] > 300
-    assert image[..., :3].std() > 0.05  # not blank
+    assert image[..., :3].std() > 0.05  # the picture is not blank
 
 
 def test_the_agent_is_drawn_whatever_it_and_the_others_are_called(
     whole: Path, tmp_path: Path
 ) -> None:
-    """Logs have the platforms in the order of the alphabet."""
+    """Logs have the platforms in alphabetical order."""
     for name in ("config.yaml", "progress.jsonl", "episodes.jsonl"):
         text = (whole / name).read_text()
         (tmp_path / name).write_text(
             re.sub(r"\bchief\b", "target", re.sub(r"\bdeputy\b", "chaser", text))
         )
     rows = [json.loads(line) for line in (tmp_path / "episodes.jsonl").read_text().splitlines()]
-    assert [*rows[0]["platforms"]] == ["target", "chaser"]  # chief, deputy
+    # the target is the chief, the chaser the deputy
+    assert [*rows[0]["platforms"]] == ["target", "chaser"]
     swapped = [
         {**row, "platforms": {name: row["platforms"][name] for name in ("chaser", "target")}}
         for row in rows
@@ -257,9 +255,9 @@ def test_an_interval_is_drawn_and_named_only_where_there_are_seeds_enough() -> N
         )
         figure = compare_curves({"one": rows(num_seeds=count)}, "docking2d")
         title = figure.get_suptitle()
-        assert (
-            title
-            == f"docking2d: the last 100 training episodes, mean{' and 95 % interval' * interval} over seeds"
+        assert title == (
+            "docking2d: the last 100 training episodes,"
+            f" mean{' and 95 % interval' * interval} over seeds"
         )
         assert bool(figure.axes[0].collections) == interval
 
@@ -287,13 +285,13 @@ def test_a_run_whose_every_name_is_a_formula_is_drawn(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Names of the environment, of its platforms and regions, and of the run."""
+    """The names are those of the environment, of its platforms and regions, and of the run."""
 
     def renamed(value: Any) -> Any:
         if isinstance(value, dict):
-            return {renamed(key): renamed(one) for key, one in value.items()}
+            return {renamed(key): renamed(item) for key, item in value.items()}
         if isinstance(value, list):
-            return [renamed(one) for one in value]
+            return [renamed(item) for item in value]
         return (
             f"{value}{nasty}"
             if value in ("docking2d", "chief", "deputy", "docking_region")
@@ -448,7 +446,8 @@ def test_comparison_is_logarithmic_only_where_runs_differ_much_in_length():
 
 
 def test_curves_of_a_comparison_begin_when_every_seed_has_finished_enough_episodes() -> None:
-    known = [{**row, "success_rate": 0.5} for row in rows()]  # 10 more episodes after each update
+    # each update finishes 10 more episodes
+    known = [{**row, "success_rate": 0.5} for row in rows()]
     panel = compare_curves({"one": known}, "docking2d", mark=("the paper's 80 %", 3000.0)).axes[0]
     curve = next(line for line in panel.lines if line.get_label() == "one")
     assert curve.get_xdata()[0] == 300
@@ -458,7 +457,8 @@ def test_curves_of_a_comparison_begin_when_every_seed_has_finished_enough_episod
         for line in compare_curves({"one": few}, "docking2d").axes[0].lines
         if line.get_label() == "one"
     )
-    assert 0 < len(curve.get_xdata()) < 10  # those with all 9 episodes that the run finished
+    # only rows in which the run has finished all its 9 episodes
+    assert 0 < len(curve.get_xdata()) < 10
     (mark,) = [line for line in panel.lines if line.get_label() == "the paper's 80 %"]
     assert mark.get_xydata().tolist() == [[3000.0, 80.0]]
 
@@ -472,7 +472,9 @@ def test_every_seed_has_its_line_and_those_that_failed_are_named() -> None:
         {"one": failing, "other": rows(500)}, "docking2d", {"one": [8], "other": []}
     )
     seeds = {row["seed"] for row in failing}
-    assert [len(panel.lines) for panel in figure.axes] == [len(seeds) + 1] * 2  # and the 80 % line
+    assert [len(panel.lines) for panel in figure.axes] == [
+        len(seeds) + 1
+    ] * 2  # one more: the 80 % line
     assert [panel.get_title() for panel in figure.axes] == [
         "one: seed 8 failed",
         "other: no seed failed",

@@ -22,7 +22,10 @@ from jaxsafe.schema.errors import ConfigError
 
 
 def episode(env: jaxsafe.Environment, altered: tuple[int, ...]) -> list[dict]:
-    """A log of eight steps, of which some are altered: there the control that acts is half of the desired one."""
+    """Return a log of eight steps, some of them altered.
+
+    In an altered step the control that acts is half of the desired one.
+    """
     names = env.action_names
     rows = []
     for k in range(9):
@@ -34,7 +37,7 @@ def episode(env: jaxsafe.Environment, altered: tuple[int, ...]) -> list[dict]:
                 "control_actual": {
                     name: value / (2.0 if k in altered else 1.0) for name, value in asked.items()
                 },
-                "margins": {one.name: 1.0 - 0.1 * k for one in env.constraints},
+                "margins": {constraint.name: 1.0 - 0.1 * k for constraint in env.constraints},
                 "rta": {"intervening": k in altered, "predicted_margin": 0.9 - 0.1 * k},
                 "outcome": "success" if k == 8 else "running",
             }
@@ -72,9 +75,8 @@ def test_interventions_show_what_was_asked_for_and_what_acted() -> None:
     figure = interventions(episode(env, (3, 4, 7)), env, "title")
     panel = figure.axes[0]
     steps = {patch.get_label(): patch.get_data() for patch in panel.patches}  # type: ignore[attr-defined]
-    np.testing.assert_allclose(
-        steps["desired"].values, 0.02 * np.arange(1, 9)
-    )  # of the start there is no control
+    # The start has no control.
+    np.testing.assert_allclose(steps["desired"].values, 0.02 * np.arange(1, 9))
     np.testing.assert_allclose(steps["actual"].values[[1, 2, 3, 4]], [0.04, 0.03, 0.04, 0.10])
     np.testing.assert_allclose(steps["actual"].edges, np.arange(9))
     spans = [path.get_extents().intervalx for path in panel.collections[0].get_paths()]
@@ -85,15 +87,19 @@ def test_interventions_show_what_was_asked_for_and_what_acted() -> None:
     np.testing.assert_allclose(predicted.get_ydata(), 0.9 - 0.1 * np.arange(9))
     assert list(zero.get_ydata()) == [0.0, 0.0]
     assert [text.get_text() for text in figure.legends[0].get_texts()] == [
-        "altered", "desired", "actual", "h", "h, predicted",
-    ]  # fmt: skip
+        "altered",
+        "desired",
+        "actual",
+        "h",
+        "h, predicted",
+    ]
 
 
 def test_a_prediction_about_something_else_has_a_panel_of_its_own() -> None:
     env = jaxsafe.make("rejoin2d", rta="released")
     figure = interventions(episode(env, ()), env, "title")
     assert labels(figure)[-2:] == ["h of collision [ft]", "predicted margin"]
-    assert len(figure.axes[-2].lines) == 2  # h and zero
+    assert len(figure.axes[-2].lines) == 2  # h and the line at zero
 
 
 def test_a_null_of_the_log_leaves_a_gap() -> None:
@@ -124,17 +130,21 @@ def test_only_a_run_with_a_filter_draws_interventions(whole: Path, tmp_path: Pat
     content = {"env": "docking2d", "training": {"preset": "features"}, "environment": describe(env)}
     (run / "config.yaml").write_text(yaml12.write(content))
     common = {
-        "step": 1280, "final": True, "episode": 0,
+        "step": 1280,
+        "final": True,
+        "episode": 0,
         "platforms": {"chief": {"position": [0.0, 0.0]}, "deputy": {"position": [9.0, 0.0]}},
         "status": {"docking_distance": 9.0, "speed": 0.1, "velocity_limit": 0.2},
-    }  # fmt: skip
+    }
     (run / "episodes.jsonl").write_text(
         "".join(json.dumps(common | row) + "\n" for row in episode(env, (3,)))
     )
     draw_all(run)
     names = {"training_steps.png", "trajectories.png", "speed_distance.png"}
     assert {path.name for path in (run / "figures").iterdir()} == {*names, "interventions.png"}
-    assert imread(run / "figures" / "interventions.png")[..., :3].std() > 0.05  # not blank
+    assert (
+        imread(run / "figures" / "interventions.png")[..., :3].std() > 0.05
+    )  # the picture is not blank
 
 
 @pytest.mark.parametrize(
@@ -144,7 +154,8 @@ def test_only_a_run_with_a_filter_draws_interventions(whole: Path, tmp_path: Pat
 def test_what_is_drawn_as_certified_is_what_the_filter_certifies(task: str, rta: str) -> None:
     env = jaxsafe.make(task, rta=rta)
     plane = safe_set.planes(env)
-    x, y = np.linspace(*plane.x_ends, 9), np.linspace(*plane.y_ends, 7)
+    x = np.linspace(*plane.x_ends, 9)
+    y = np.linspace(*plane.y_ends, 7)
     starts = jax.jit(lambda env, start: jaxsafe.reset_to(env, start)[1].info)
     for start in plane.panels.values():
         best, h = safe_set.survey(env, start, x, y)
@@ -156,12 +167,15 @@ def test_what_is_drawn_as_certified_is_what_the_filter_certifies(task: str, rta:
             info = starts(env, at(env, start, x[j], y[i]))
             assert bool(info.rta.certified) == certified[i, j]
             np.testing.assert_allclose(
-                h[i, j], min(float(one) for one in info.margins.values()), rtol=1e-5, atol=1e-5
+                h[i, j],
+                min(float(constraint) for constraint in info.margins.values()),
+                rtol=1e-5,
+                atol=1e-5,
             )
 
 
 def at(env: jaxsafe.Environment, start: safe_set.Start, x: float, y: float) -> dict:
-    """A start of `reset_to`, with the fields that a plane leaves as at rest."""
+    """Return a start for `reset_to`. Fields that a plane leaves out are as at rest."""
     sim = safe_set.place(env, start(jnp.asarray(x), jnp.asarray(y)))
     return {name: vars(state) for name, state in sim.platforms.items()}
 
@@ -169,7 +183,8 @@ def at(env: jaxsafe.Environment, start: safe_set.Start, x: float, y: float) -> d
 def test_without_a_horizon_the_safe_set_is_that_of_h() -> None:
     env = jaxsafe.make("docking2d", rta="default")
     plane = safe_set.planes(env)
-    distance, speed = np.linspace(0.0, 150.0, 4), np.linspace(0.0, 0.6, 5)
+    distance = np.linspace(0.0, 150.0, 4)
+    speed = np.linspace(0.0, 0.6, 5)
     for start in plane.panels.values():
         best, h = safe_set.survey(env, start, distance, speed)
         np.testing.assert_array_equal(best, h)
@@ -189,9 +204,8 @@ def test_head_on_the_filter_keeps_farther_away_than_the_constraint() -> None:
 def test_the_safe_set_has_a_panel_for_each_plane(task: str) -> None:
     env = jaxsafe.make(task, {"rta.margin": 0.0} if task == "docking2d" else None, rta="default")
     required = float(env.rta.required_margin(env))
-    assert (required > float(env.rta.margin)) == (
-        task == "docking2d"
-    )  # a speed limit needs more, for between the samples
+    # A speed limit needs a larger margin, for the time between samples.
+    assert (required > float(env.rta.margin)) == (task == "docking2d")
     plane = safe_set.planes(env)
     figure = safe_set.draw(env, task, y=None if task == "docking2d" else (-300.0, 300.0), points=13)
     panels = [panel for panel in figure.axes if panel.get_title()]
@@ -200,7 +214,9 @@ def test_the_safe_set_has_a_panel_for_each_plane(task: str) -> None:
     assert (panels[0].get_ylabel(), figure.axes[-1].get_ylabel()) == (
         ("speed [m/s]", "H [m/s]") if task == "docking2d" else ("to its left [ft]", "H [ft]")
     )
-    lines = [one for one in panels[0].collections if isinstance(one, ContourSet)]
+    lines = [
+        constraint for constraint in panels[0].collections if isinstance(constraint, ContourSet)
+    ]
     assert [line.levels[0] for line in lines] == pytest.approx([0.0, required])
 
 

@@ -1,4 +1,7 @@
-"""Statuses, constraints, ends, rewards and observations against numbers worked out by hand from Tables 5 to 10."""
+"""Statuses, constraints, terminal conditions, rewards and observations of Tables 5 to 10.
+
+The expected numbers are worked out by hand.
+"""
 
 import math
 from typing import Any
@@ -60,7 +63,10 @@ def env() -> Environment:
 
 
 def world(*, time: float = 0.0, ended: str | None = None, **status: Any) -> Sim:
-    """A world with chosen statuses; the deputy at (3, 4) m with (0.6, −0.8) m/s after a Δv of (0.03, −0.04) m/s."""
+    """Return a simulation with chosen statuses.
+
+    The deputy is at (3, 4) m with a velocity of (0.6, −0.8) m/s after a Δv of (0.03, −0.04) m/s.
+    """
     deputy = SpacecraftState(
         jnp.asarray([3.0, 4.0]), jnp.asarray([0.6, -0.8]), jnp.asarray([0.03, -0.04])
     )
@@ -133,8 +139,8 @@ def test_delta_v_is_the_norm_of_the_velocity_change_bought_with_thrust() -> None
 
 def test_the_speed_limit_may_begin_to_grow_at_a_distance() -> None:
     limit = normalise(VelocityLimit(name="v", distance="d", floor=0.2, slope=0.1, constant_to=0.5))
-    found = [float(limit.process((), world(d=distance))) for distance in (0.0, 0.5, 1.5)]
-    np.testing.assert_allclose(found, [0.2, 0.2, 0.3], rtol=1e-6)
+    computed = [float(limit.process((), world(d=distance))) for distance in (0.0, 0.5, 1.5)]
+    np.testing.assert_allclose(computed, [0.2, 0.2, 0.3], rtol=1e-6)
 
 
 def test_region_distance_is_from_the_centre() -> None:
@@ -144,7 +150,10 @@ def test_region_distance_is_from_the_centre() -> None:
 
 
 def held_for(inside: str, dt: float = 1.0, **options: bool) -> list[float]:
-    """The time held at reset and after each step, given whether the status holds: `1` or `0` for each sample."""
+    """Return the time held at reset and after each step.
+
+    `inside` has a letter for each sample: `1` where the status holds, `0` where it does not.
+    """
     status = normalise(TimeHeld(name="t", status="in", **options))
     samples = [world(**{"in": flag == "1"}) for flag in inside]
     memory = status.init(samples[0])
@@ -199,7 +208,7 @@ def test_separation_is_the_distance_beyond_its_minimum() -> None:
     assert constraint.limit(world(d=40.0)) == 100.0
 
 
-# Ends
+# Terminal conditions
 
 
 @pytest.mark.parametrize(
@@ -279,7 +288,8 @@ def test_the_distance_reward_is_twice_the_change_of_the_exponential_potential() 
 @given(st.lists(st.floats(0.0, 1000.0), min_size=2, max_size=20))
 def test_the_distance_reward_telescopes(distances: list[float]) -> None:
     reward = normalise(DistanceChange(name="x", distance="d", half_distance=100.0, scale=2.0))
-    memory, total = reward.init(world(d=distances[0])), 0.0
+    memory = reward.init(world(d=distances[0]))
+    total = 0.0
     for distance in distances[1:]:
         memory = reward.increment(memory, world(d=distance), 1.0)
         total += float(reward.process(memory, world(d=distance)))
@@ -320,8 +330,12 @@ def test_failure_pays_by_outcome(ended: str | None, value: float) -> None:
 
 
 def paid(reward: Any, inside: str) -> list[float]:
-    """What a reward pays at reset and after each step, given whether its status holds: `1` or `0` for each sample."""
-    reward, samples = normalise(reward), [world(s=flag == "1") for flag in inside]
+    """Return what a reward pays at reset and after each step.
+
+    `inside` has a letter for each sample: `1` where the status holds, `0` where it does not.
+    """
+    reward = normalise(reward)
+    samples = [world(s=flag == "1") for flag in inside]
     memory = reward.init(samples[0])
     values = [float(reward.process(memory, samples[0]))]
     for sim in samples[1:]:
@@ -419,7 +433,11 @@ def test_every_element_of_an_observation_has_a_name() -> None:
 
 
 def pair() -> Sim:
-    """A wingman at (1, 2) m heading along y, a lead at (1, 7) heading along −x, and a region 3 m above the lead."""
+    """Return a simulation with a wingman, a lead and a region.
+
+    The wingman is at (1, 2) m and flies along y. The lead is at (1, 7) m and flies along −x. The
+    region is 3 m above the lead.
+    """
     wingman = Dubins2DState(jnp.asarray([1.0, 2.0]), jnp.asarray(jnp.pi / 2), jnp.asarray(4.0))
     lead = Dubins2DState(jnp.asarray([1.0, 7.0]), jnp.asarray(-jnp.pi), jnp.asarray(2.0))
     platforms = {"lead": lead, "wingman": wingman}
@@ -453,8 +471,8 @@ def measured(observation: Observation, sim: Sim) -> np.ndarray:
 def test_a_position_is_observed_in_any_frame_and_form(
     options: dict[str, Any], expected: list[float]
 ) -> None:
-    found = measured(Observe(name="x", of="lead", what="position", **options), pair())
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    computed = measured(Observe(name="x", of="lead", what="position", **options), pair())
+    np.testing.assert_allclose(computed, expected, atol=1e-6)
 
 
 def test_a_velocity_is_observed_in_any_frame() -> None:
@@ -463,10 +481,12 @@ def test_a_velocity_is_observed_in_any_frame() -> None:
         ({"frame": "lead"}, [2.0, 0.0]),
         ({"frame": "wingman"}, [0.0, 2.0]),
     ):
-        found = measured(Observe(name="x", of="lead", what="velocity", **options), pair())
-        np.testing.assert_allclose(found, expected, atol=1e-6)
-    found = measured(Observe(name="x", of="lead", what="velocity", relative_to="wingman"), pair())
-    np.testing.assert_allclose(found, [-2.0, -4.0], atol=1e-6)
+        computed = measured(Observe(name="x", of="lead", what="velocity", **options), pair())
+        np.testing.assert_allclose(computed, expected, atol=1e-6)
+    computed = measured(
+        Observe(name="x", of="lead", what="velocity", relative_to="wingman"), pair()
+    )
+    np.testing.assert_allclose(computed, [-2.0, -4.0], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -482,16 +502,16 @@ def test_a_velocity_is_observed_in_any_frame() -> None:
     ],
 )
 def test_a_region_is_observed_by_its_centre(options: dict[str, Any], expected: list[float]) -> None:
-    found = measured(ObserveRegion(name="x", region="region", **options), pair())
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    computed = measured(ObserveRegion(name="x", region="region", **options), pair())
+    np.testing.assert_allclose(computed, expected, atol=1e-6)
 
 
 def test_an_angle_is_observed_as_cosine_and_sine_and_does_not_jump() -> None:
     angle = ObserveAngle(name="x", of="craft", what="attitude", scale=-1.0)
     for attitude in (0.3, -2.0, math.pi, -math.pi):
         craft = OrientedState(REST, REST, jnp.zeros(1), jnp.asarray(attitude), jnp.zeros(()))
-        found = measured(angle, world().replace(platforms={"craft": craft}))
-        np.testing.assert_allclose(found, [-math.cos(attitude), -math.sin(attitude)], atol=1e-6)
+        computed = measured(angle, world().replace(platforms={"craft": craft}))
+        np.testing.assert_allclose(computed, [-math.cos(attitude), -math.sin(attitude)], atol=1e-6)
 
 
 def test_a_body_frame_in_space_takes_heading_flight_path_and_roll_into_account() -> None:
@@ -535,22 +555,51 @@ def test_a_scale_of_the_wrong_length_is_told_with_its_observation(
     [
         (
             "rejoin2d",
-            [f"{item}.{part}" for item in ("lead_position", "rejoin_position", "wingman_velocity", "lead_velocity")
-             for part in ("magnitude", "x", "y")],
+            [
+                f"{item}.{part}"
+                for item in (
+                    "lead_position",
+                    "rejoin_position",
+                    "wingman_velocity",
+                    "lead_velocity",
+                )
+                for part in ("magnitude", "x", "y")
+            ],
         ),
         (
             "rejoin3d",
-            [f"{item}.{part}" for item in ("lead_position", "rejoin_position", "wingman_velocity", "lead_velocity")
-             for part in ("magnitude", "x", "y", "z")] + ["roll", "flight_path_angle"],
+            [
+                f"{item}.{part}"
+                for item in (
+                    "lead_position",
+                    "rejoin_position",
+                    "wingman_velocity",
+                    "lead_velocity",
+                )
+                for part in ("magnitude", "x", "y", "z")
+            ]
+            + ["roll", "flight_path_angle"],
         ),
-        ("docking2d", ["position.x", "position.y", "velocity.x", "velocity.y", "speed", "velocity_limit"]),
+        (
+            "docking2d",
+            ["position.x", "position.y", "velocity.x", "velocity.y", "speed", "velocity_limit"],
+        ),
         (
             "docking2d_oriented",
-            ["position.x", "position.y", "velocity.x", "velocity.y", "attitude.cos", "attitude.sin", "attitude_rate",
-             "speed", "velocity_limit"],
+            [
+                "position.x",
+                "position.y",
+                "velocity.x",
+                "velocity.y",
+                "attitude.cos",
+                "attitude.sin",
+                "attitude_rate",
+                "speed",
+                "velocity_limit",
+            ],
         ),
     ],
-)  # fmt: skip
+)
 def test_the_elements_of_each_task_s_observation_have_these_names(
     task: str, names: list[str]
 ) -> None:
@@ -563,7 +612,8 @@ def test_the_elements_of_each_task_s_observation_have_these_names(
 def test_a_docking_step_pays_what_table_8_says(env: Environment) -> None:
     (timestep,) = run(env, start(env, (200.0, 0.0), (-0.4, 0.3)), (0.6, -0.8), 1)
     info = timestep.info
-    distance, speed = float(info.status["docking_distance"]), float(info.status["speed"])
+    distance = float(info.status["docking_distance"])
+    speed = float(info.status["speed"])
     assert float(info.status["velocity_limit"]) == pytest.approx(0.2 + 2 * N * distance, rel=1e-6)
     assert float(info.status["delta_v"]) == pytest.approx(1.0 / 12.0, rel=1e-6)
     assert float(info.status["delta_v_l1"]) == pytest.approx(1.4 / 12.0, rel=1e-6)
@@ -595,7 +645,8 @@ def test_a_step_above_the_limit_costs_and_its_severity_is_a_share_of_the_limit(
 ) -> None:
     (timestep,) = run(env, start(env, (100.0, 0.0), (0.0, 2.0)), (0.0, 0.0), 1)
     info = timestep.info
-    limit, speed = float(info.status["velocity_limit"]), float(info.status["speed"])
+    limit = float(info.status["velocity_limit"])
+    speed = float(info.status["speed"])
     assert timestep.cost == 1.0
     assert float(info.margins["velocity_limit"]) == pytest.approx(limit - speed, rel=1e-6)
     assert float(info.severity["velocity_limit"]) == pytest.approx(
@@ -668,7 +719,7 @@ def test_time_counts_steps_times_their_length() -> None:
 
 
 def bounded(offset: float, **more: Any) -> Environment:
-    """docking2d in which every step above the limit pays `offset` and nothing else."""
+    """Return docking2d in which every step above the limit pays `offset` and nothing else."""
     changes = {"reward.velocity_constraint.offset": offset, "reward.velocity_constraint.scale": 0.0}
     return jaxsafe.make("docking2d", changes | more)
 
@@ -730,7 +781,7 @@ def test_an_earlier_end_on_the_same_step_is_kept_by_the_bound() -> None:
     assert timestep.info.reward_terms["failure"] == -1.0
 
 
-# Several ends at once
+# Several terminal conditions at once
 
 
 def test_the_first_end_in_the_list_is_the_outcome() -> None:

@@ -1,4 +1,7 @@
-"""Projections and the small quadratic program against independent solvers: random, degenerate, infeasible problems."""
+"""Projections and the small quadratic program against independent solvers.
+
+Problems are random, degenerate or infeasible.
+"""
 
 from typing import Any
 
@@ -18,12 +21,13 @@ TOLERANCES = [(np.float64, 1e-12), (np.float32, 5e-6)]
 
 
 def boxes(m: int, dtype: Any) -> tuple[np.ndarray, ...]:
-    """Points inside boxes about 0."""
+    """Return points inside boxes about 0, and the bounds of the boxes."""
     rng = np.random.default_rng(m)
-    low, high = -rng.uniform(0.5, 1.0, (NUM, m)), rng.uniform(0.5, 2.0, (NUM, m))
+    low = -rng.uniform(0.5, 1.0, (NUM, m))
+    high = rng.uniform(0.5, 2.0, (NUM, m))
     return tuple(
-        each.astype(dtype)
-        for each in (np.clip(rng.uniform(-1.5, 1.5, (NUM, m)), low, high), low, high)
+        array.astype(dtype)
+        for array in (np.clip(rng.uniform(-1.5, 1.5, (NUM, m)), low, high), low, high)
     )
 
 
@@ -35,7 +39,7 @@ def oracle(
     offsets: np.ndarray,
     solver: str = "quadprog",
 ) -> np.ndarray | None:
-    u, low, high, rows, offsets = (each.astype(float) for each in (u, low, high, rows, offsets))
+    u, low, high, rows, offsets = (array.astype(float) for array in (u, low, high, rows, offsets))
     return solve_qp(np.eye(len(u)), -u, G=-rows, h=-offsets, lb=low, ub=high, solver=solver)
 
 
@@ -47,20 +51,20 @@ def test_box_and_half_space_are_projected_on_as_by_quadprog(
 ) -> None:
     rng = np.random.default_rng(10 + m)
     u, low, high = boxes(m, dtype)
-    a, b = rng.normal(size=(NUM, m)).astype(dtype), rng.normal(size=NUM).astype(dtype)
+    a = rng.normal(size=(NUM, m)).astype(dtype)
+    b = rng.normal(size=NUM).astype(dtype)
     a[:50, 0] = 0.0  # an element without authority
-    found, feasible = jax.jit(jax.vmap(project_box_halfspace))(u, low, high, a, b)
-    assert found.dtype == dtype
+    control, feasible = jax.jit(jax.vmap(project_box_halfspace))(u, low, high, a, b)
+    assert control.dtype == dtype
     for i in range(NUM):
         expected = oracle(u[i], low[i], high[i], a[i, None], b[i, None])
         if abs(np.sum(np.maximum(a[i] * low[i], a[i] * high[i])) - b[i]) < 1e-5:
-            continue  # neither clearly feasible nor clearly not
+            continue  # neither clearly feasible nor clearly infeasible
         assert bool(feasible[i]) == (expected is not None)
         if expected is None:
-            expected = np.where(
-                a[i] > 0, high[i], np.where(a[i] < 0, low[i], u[i])
-            )  # closest to the half-space
-        np.testing.assert_allclose(found[i], expected, rtol=0, atol=tolerance)
+            # The expected control is the one closest to the half-space.
+            expected = np.where(a[i] > 0, high[i], np.where(a[i] < 0, low[i], u[i]))
+        np.testing.assert_allclose(control[i], expected, rtol=0, atol=tolerance)
     assert 0.5 < np.mean(feasible) < 1.0
 
 
@@ -73,11 +77,15 @@ def test_box_and_ball_are_projected_on_at_least_as_well_as_by_slsqp(
     rng = np.random.default_rng(20 + m)
     u, low, high = boxes(m, dtype)
     beta, p, k = (
-        each.astype(dtype)
-        for each in (rng.uniform(0.5, 2.0, NUM), rng.normal(size=(NUM, m)), rng.uniform(-1, 1, NUM))
+        array.astype(dtype)
+        for array in (
+            rng.uniform(0.5, 2.0, NUM),
+            rng.normal(size=(NUM, m)),
+            rng.uniform(-1, 1, NUM),
+        )
     )
-    found, feasible = (
-        np.asarray(each) for each in jax.jit(jax.vmap(project_box_ball))(u, low, high, beta, p, k)
+    control, feasible = (
+        np.asarray(array) for array in jax.jit(jax.vmap(project_box_ball))(u, low, high, beta, p, k)
     )
     for i in range(150):
         centre = np.clip(-p[i] / beta[i], low[i], high[i]).astype(float)
@@ -87,10 +95,10 @@ def test_box_and_ball_are_projected_on_at_least_as_well_as_by_slsqp(
 
         assert feasible[i] == (q(centre) <= 0)
         if not feasible[i]:
-            np.testing.assert_allclose(found[i], centre, rtol=0, atol=tolerance)
+            np.testing.assert_allclose(control[i], centre, rtol=0, atol=tolerance)
             continue
-        assert q(found[i].astype(float)) < 2 * tolerance
-        assert ((found[i] >= low[i]) & (found[i] <= high[i])).all()
+        assert q(control[i].astype(float)) < 2 * tolerance
+        assert ((control[i] >= low[i]) & (control[i] <= high[i])).all()
         best = minimize(
             lambda w, i=i: np.sum((w - u[i]) ** 2),
             centre,
@@ -99,14 +107,15 @@ def test_box_and_ball_are_projected_on_at_least_as_well_as_by_slsqp(
             method="SLSQP",
             options={"ftol": 1e-14, "maxiter": 500},
         )
-        assert np.linalg.norm(found[i] - u[i]) <= np.linalg.norm(best.x - u[i]) + 2e-6
+        assert np.linalg.norm(control[i] - u[i]) <= np.linalg.norm(best.x - u[i]) + 2e-6
     assert 0.5 < feasible.mean() < 1.0
 
 
 def rows_for(m: int, count: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """Random rows, some of them twice, and one that says nothing about the control."""
+    """Return random rows. Some of them occur twice, and one says nothing about the control."""
     rng = np.random.default_rng(30 + m)
-    rows, offsets = rng.normal(size=(NUM, count, m)), 0.7 * rng.normal(size=(NUM, count))
+    rows = rng.normal(size=(NUM, count, m))
+    offsets = 0.7 * rng.normal(size=(NUM, count))
     rows[:100, 1] = rows[:100, 0]
     offsets[:50, 1] = offsets[:50, 0]
     rows[100:150, 1] = 0.0
@@ -119,33 +128,37 @@ def rows_for(m: int, count: int = 2) -> tuple[np.ndarray, np.ndarray]:
 def test_the_nearest_control_is_that_of_other_solvers(m: int, solver: str) -> None:
     u, low, high = boxes(m, np.float64)
     rows, offsets = rows_for(m)
-    found, feasible = (
-        np.asarray(each) for each in jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets)
+    control, feasible = (
+        np.asarray(array)
+        for array in jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets)
     )
     for i in range(NUM):
         expected = oracle(u[i], low[i], high[i], rows[i], offsets[i], solver)
         assert bool(feasible[i]) == (expected is not None)
         if expected is not None:
             np.testing.assert_allclose(
-                found[i], expected, rtol=0, atol=1e-9 if solver == "quadprog" else 1e-5
+                control[i], expected, rtol=0, atol=1e-9 if solver == "quadprog" else 1e-5
             )
     assert 0.4 < feasible.mean() < 1.0
-    assert (found[~feasible] == u[~feasible]).all()
+    assert (control[~feasible] == u[~feasible]).all()
 
 
 @pytest.mark.parametrize("m", [2, 3])
 @pytest.mark.usefixtures("x64")
 def test_float32_finds_the_same_nearest_control(m: int) -> None:
-    """In all but a few in ten thousand problems, in which the active rows are nearly parallel, within 5e-6."""
+    """Controls agree within 5e-6 in all but a few of ten thousand problems.
+
+    In those few the active rows are nearly parallel.
+    """
     rng = np.random.default_rng(60 + m)
-    problem = [each.astype(np.float32) for each in (*boxes(m, np.float64), *rows_for(m))]
-    problem = [np.concatenate([each] * 10) for each in problem]
+    problem = [array.astype(np.float32) for array in (*boxes(m, np.float64), *rows_for(m))]
+    problem = [np.concatenate([array] * 10) for array in problem]
     problem[-1] = (problem[-1] + 0.3 * rng.normal(size=problem[-1].shape)).astype(np.float32)
     solve = jax.jit(jax.vmap(nearest_control))
-    found, feasible = solve(*problem)
-    assert found.dtype == np.float32
-    expected, possible = solve(*(each.astype(float) for each in problem))
-    error = np.abs(found - expected).max(axis=1)[np.asarray(feasible & possible)]
+    control, feasible = solve(*problem)
+    assert control.dtype == np.float32
+    expected, possible = solve(*(array.astype(float) for array in problem))
+    error = np.abs(control - expected).max(axis=1)[np.asarray(feasible & possible)]
     assert np.mean(np.asarray(feasible != possible)) < 1e-3
     assert np.quantile(error, 0.998) < 5e-6
 
@@ -154,38 +167,35 @@ def test_float32_finds_the_same_nearest_control(m: int) -> None:
 def test_the_nearest_control_meets_the_conditions_of_karush_kuhn_and_tucker() -> None:
     u, low, high = boxes(3, np.float64)
     rows, offsets = rows_for(3)
-    found, feasible = (
-        np.asarray(each) for each in jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets)
+    control, feasible = (
+        np.asarray(array)
+        for array in jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets)
     )
     identity = np.eye(3)
     for i in np.flatnonzero(feasible):
-        sides, ends = (
-            np.concatenate([rows[i], identity, -identity]),
-            np.concatenate([offsets[i], low[i], -high[i]]),
-        )
-        slack = sides @ found[i] - ends
+        sides = np.concatenate([rows[i], identity, -identity])
+        ends = np.concatenate([offsets[i], low[i], -high[i]])
+        slack = sides @ control[i] - ends
         assert slack.min() > -1e-9
         active = slack < 1e-8
         if not active.any():
-            np.testing.assert_array_equal(found[i], u[i])
+            np.testing.assert_array_equal(control[i], u[i])
             continue
-        multipliers, *_ = nnls(sides[active].T, found[i] - u[i])  # λ ≥ 0
-        np.testing.assert_allclose(sides[active].T @ multipliers, found[i] - u[i], atol=1e-7)
+        multipliers, *_ = nnls(sides[active].T, control[i] - u[i])  # λ ≥ 0
+        np.testing.assert_allclose(sides[active].T @ multipliers, control[i] - u[i], atol=1e-7)
 
 
 @pytest.mark.parametrize(("m", "count"), [(1, 2), (2, 1), (3, 1), (3, 2), (2, 3)])
 @pytest.mark.usefixtures("x64")
 def test_slack_costs_what_it_should(m: int, count: int) -> None:
-    """Against quadprog with the slack as variables of its own."""
+    """The expected control is quadprog's, with the slack as variables of its own."""
     u, low, high = boxes(m, np.float64)
     rng = np.random.default_rng(70 + m)
-    rows, offsets, cost = (
-        rng.normal(size=(NUM, count, m)),
-        rng.normal(size=(NUM, count)),
-        rng.uniform(0.1, 100.0, NUM),
-    )
+    rows = rng.normal(size=(NUM, count, m))
+    offsets = rng.normal(size=(NUM, count))
+    cost = rng.uniform(0.1, 100.0, NUM)
     rows[:50, -1] = 0.0
-    found, _ = jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets, cost)
+    control, _ = jax.jit(jax.vmap(nearest_control))(u, low, high, rows, offsets, cost)
     for i in range(300):
         hessian = np.diag([1.0] * m + [cost[i]] * count)
         expected = solve_qp(
@@ -198,7 +208,7 @@ def test_slack_costs_what_it_should(m: int, count: int) -> None:
             solver="quadprog",
         )
         assert expected is not None
-        np.testing.assert_allclose(found[i], expected[:m], rtol=0, atol=1e-7)
+        np.testing.assert_allclose(control[i], expected[:m], rtol=0, atol=1e-7)
 
 
 @pytest.mark.usefixtures("x64")
@@ -206,9 +216,13 @@ def test_derivatives_are_finite_differences_where_something_is_active() -> None:
     rng = np.random.default_rng(50)
     u, low, high = boxes(2, np.float64)
     u = 0.99 * u  # on a bound there are two derivatives
-    a, b = rng.normal(size=(NUM, 2)), rng.normal(size=NUM) + 0.5
-    beta, p, k = rng.uniform(0.5, 2.0, NUM), rng.normal(size=(NUM, 2)), rng.uniform(-1, 1, NUM)
-    rows, offsets = rng.normal(size=(NUM, 2, 2)), 0.5 * rng.normal(size=(NUM, 2))
+    a = rng.normal(size=(NUM, 2))
+    b = rng.normal(size=NUM) + 0.5
+    beta = rng.uniform(0.5, 2.0, NUM)
+    p = rng.normal(size=(NUM, 2))
+    k = rng.uniform(-1, 1, NUM)
+    rows = rng.normal(size=(NUM, 2, 2))
+    offsets = 0.5 * rng.normal(size=(NUM, 2))
     cases = [
         (project_box_halfspace, (u, low, high, a, b)),
         (project_box_ball, (u, low, high, beta, p, k)),
@@ -217,8 +231,8 @@ def test_derivatives_are_finite_differences_where_something_is_active() -> None:
     ]
     for project, problem in cases:
 
-        def value(*one: jax.Array, project: Any = project) -> jax.Array:
-            return jnp.sum(project(*one)[0] * jnp.array([1.0, -2.0]))
+        def value(*arguments: jax.Array, project: Any = project) -> jax.Array:
+            return jnp.sum(project(*arguments)[0] * jnp.array([1.0, -2.0]))
 
         _, feasible = jax.vmap(project)(*problem)
         slopes = jax.jit(jax.vmap(jax.grad(value, argnums=tuple(range(len(problem))))))(*problem)
@@ -230,24 +244,27 @@ def test_derivatives_are_finite_differences_where_something_is_active() -> None:
                 [*problem[:j], leaf + sign * nudge, *problem[j + 1 :]] for sign in (1, -1)
             )
             expected = (jax.vmap(value)(*ahead) - jax.vmap(value)(*behind)) / 2.0
-            found = np.sum(np.reshape(slopes[j] * nudge, (NUM, -1)), axis=1)
-            close = np.abs(found - np.asarray(expected)) < 1e-5 * 1e-6 + 1e-4 * np.abs(expected)
-            assert (
-                close[np.asarray(feasible)].mean() > 0.99
-            )  # the rest changes its active set within the nudge
-            good += int(np.sum(np.abs(found) > 1e-9))
+            control = np.sum(np.reshape(slopes[j] * nudge, (NUM, -1)), axis=1)
+            close = np.abs(control - np.asarray(expected)) < 1e-5 * 1e-6 + 1e-4 * np.abs(expected)
+            # The other problems change their active set within the nudge.
+            assert close[np.asarray(feasible)].mean() > 0.99
+            good += int(np.sum(np.abs(control) > 1e-9))
         assert good > NUM
 
 
 def test_a_point_that_meets_everything_passes_unaltered() -> None:
-    u, low, high = jnp.array([0.3, -0.2]), -jnp.ones(2), jnp.ones(2)
+    u = jnp.array([0.3, -0.2])
+    low = -jnp.ones(2)
+    high = jnp.ones(2)
     assert (project_box_halfspace(u, low, high, jnp.array([1.0, 0.0]), 0.3)[0] == u).all()
     assert (project_box_ball(u, low, high, 1.0, jnp.zeros(2), -0.5)[0] == u).all()
     assert (nearest_control(u, low, high, jnp.eye(2), jnp.array([0.3, -1.0]))[0] == u).all()
 
 
 def test_degenerate_problems_give_numbers() -> None:
-    low, high, zero = -jnp.ones(2), jnp.ones(2), jnp.zeros(2)
+    low = -jnp.ones(2)
+    high = jnp.ones(2)
+    zero = jnp.zeros(2)
     problems = [
         (project_box_halfspace, (zero, low, high, zero, 1.0), False),
         (project_box_halfspace, (zero, low, high, zero, -1.0), True),
@@ -261,18 +278,19 @@ def test_degenerate_problems_give_numbers() -> None:
         (nearest_control, (zero, low, high, jnp.zeros((1, 2)), jnp.ones(1), 1.0), False),
     ]
     for project, problem, expected in problems:
-        found, feasible = project(*problem)
+        control, feasible = project(*problem)
         assert bool(feasible) == expected
         slopes = jax.jacrev(lambda u, project=project, rest=problem[1:]: project(u, *rest)[0])(
             problem[0]
         )
-        assert np.isfinite(found).all()
+        assert np.isfinite(control).all()
         assert np.isfinite(slopes).all()
 
 
 @pytest.mark.parametrize("slack", [None, 1.0])
 def test_a_row_of_zeros_has_derivatives(slack: float | None) -> None:
-    low, high = -jnp.ones(2), jnp.ones(2)
+    low = -jnp.ones(2)
+    high = jnp.ones(2)
 
     def value(rows: jax.Array) -> jax.Array:
         return jnp.sum(
@@ -287,7 +305,9 @@ def test_a_row_of_zeros_has_derivatives(slack: float | None) -> None:
 
 
 def test_a_control_on_its_bound_keeps_its_derivative() -> None:
-    low, high, corner = -jnp.ones(2), jnp.ones(2), jnp.array([1.0, -1.0])
+    low = -jnp.ones(2)
+    high = jnp.ones(2)
+    corner = jnp.array([1.0, -1.0])
     problems = [
         (project_box_halfspace, (jnp.array([1.0, 0.0]), -5.0)),
         (project_box_ball, (1.0, jnp.zeros(2), -9.0)),

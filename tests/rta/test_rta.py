@@ -1,4 +1,4 @@
-"""Run time assurance inside the step: what it guarantees, what it lets pass, and what it does with nonsense."""
+"""Run time assurance inside the step: guarantees, what it lets pass, and nonsense as input."""
 
 from functools import partial
 from typing import Annotated, Any
@@ -25,7 +25,7 @@ from jaxsafe.simulation.scripted import Command
 from jaxsafe.transition import advance, bounds, constraint, judge, others_later
 from jaxsafe.types import Length, PlatformName, Positive, Sim
 
-slow = partial(pytest.param, marks=pytest.mark.slow)  # to compile
+slow = partial(pytest.param, marks=pytest.mark.slow)  # slow to compile
 
 DOCKING = ("docking2d", "docking3d")
 SHORT = [
@@ -38,7 +38,7 @@ SHORT = [
     slow("implicit_simplex", "docking2d_oriented", ("greedy",)),
     slow("implicit_simplex", "rejoin2d", ("search",)),
 ]
-COMPARED = ("explicit_asif", "released")  # of the literature; they guarantee nothing
+COMPARED = ("explicit_asif", "released")  # filters of the literature, which guarantee nothing
 LONG = [
     (preset, task)
     for task in TASKS
@@ -61,7 +61,10 @@ def test_no_adversary_breaks_the_filter(preset: str, task: str, policies: tuple[
 
 
 def test_an_oriented_spacecraft_across_its_velocity_turns_rather_than_pushes_it_away() -> None:
-    """A start with less than the margin, met in training: thrust that no longer holds the limit kept it above for 109 s."""
+    """The start has less than the margin and was met in training.
+
+    Thrust that no longer holds the limit kept the speed above it for 109 s.
+    """
     env = jaxsafe.make("docking2d_oriented", rta="default")
     start = {
         "position": [7.8028517, -148.32379],
@@ -79,10 +82,15 @@ def test_an_oriented_spacecraft_across_its_velocity_turns_rather_than_pushes_it_
 
 
 def test_far_from_the_chief_an_oriented_spacecraft_is_not_certified() -> None:
-    """15 km away the thrust of 1 N that is there at 75° cannot hold the limit, whatever the backup controller does."""
+    """At 15 km the thrust of 1 N that is left at 75° cannot hold the limit.
+
+    No backup controller can change that.
+    """
     env = jaxsafe.make("docking2d_oriented", rta="default")
-    distance, where = 15_000.0, 1.356068
-    course, speed = where + np.pi + 0.408682, 0.2 + 0.002054 * distance - 0.806556
+    distance = 15_000.0
+    where = 1.356068
+    course = where + np.pi + 0.408682
+    speed = 0.2 + 0.002054 * distance - 0.806556
     start = {
         "position": [distance * np.cos(where), distance * np.sin(where)],
         "attitude": course + np.radians(86.421369),
@@ -102,7 +110,10 @@ def test_far_from_the_chief_an_oriented_spacecraft_is_not_certified() -> None:
 
 
 def test_in_its_terminal_set_an_oriented_spacecraft_holds_the_limit_for_long() -> None:
-    """The set itself, up to where it ends, also at the limit: no horizon covers what is not proved."""
+    """The set itself is tested up to where it ends, also at the limit.
+
+    No horizon covers what is not proved.
+    """
     env = jaxsafe.make("docking2d_oriented", rta="default")
 
     def one(key: jax.Array) -> tuple[jax.Array, ...]:
@@ -226,7 +237,7 @@ UNCERTIFIED = [
 
 
 def changed(env: Environment, changes: dict[str, Any]) -> Environment:
-    """Return what `override` returns for traced numbers, where it cannot refuse a filter."""
+    """Return what `override` returns, for traced numbers. With them it cannot refuse a filter."""
     for path, value in changes.items():
         env = set_path(env, path, jnp.asarray(value, float))
     return env
@@ -236,7 +247,7 @@ def changed(env: Environment, changes: dict[str, Any]) -> Environment:
 def test_a_certificate_checks_the_numbers_that_its_proof_assumes(
     task: str, changes: dict[str, Any], start: dict[str, Any]
 ) -> None:
-    """Where the numbers of an environment change while programs run, nothing can be refused."""
+    """The numbers of an environment change while programs run, so nothing can be refused."""
     env = changed(jaxsafe.make(task, rta="default"), changes)
     state, first = jaxsafe.reset_to(env, {"deputy": start})
     assert not first.info.rta.certified
@@ -266,7 +277,7 @@ def test_the_margin_of_a_speed_limit_follows_the_step(dt: float) -> None:
     assert float(env.rta.required_margin(env)) == pytest.approx(max(2.5e-4, 2.07e-4 * dt), rel=0.15)
 
 
-def test_a_start_that_is_not_certified_becomes_so_under_an_agent_that_asks_for_nothing_sensible() -> (
+def test_an_uncertified_start_becomes_certified_under_an_agent_that_asks_for_nothing_sensible() -> (
     None
 ):
     env = jaxsafe.make("docking2d", rta="implicit_simplex")
@@ -286,7 +297,10 @@ def test_a_start_that_is_not_certified_becomes_so_under_an_agent_that_asks_for_n
 
 
 def test_a_certificate_that_is_not_renewed_ends_before_anything_is_violated() -> None:
-    """A lead that turns faster than it was certified for, from the step on at which the environment is another."""
+    """A lead turns faster than it was certified for.
+
+    The environment changes between two steps.
+    """
     env = jaxsafe.make("rejoin2d", rta="default")
     lead = {"position": [0.0, 0.0], "heading": 0.0, "speed": 275.0}
     state, first = jaxsafe.reset_to(
@@ -332,9 +346,8 @@ def assert_unbroken(env: Environment, row: dict[str, Any]) -> None:
     assert env.rta is not None
     assert row["worst_margin"] >= float(env.rta.margin) - 1e-4
     if env.constraints[0].between:
-        assert (
-            row["worst_margin_inside"] >= float(env.rta.margin) - 0.5
-        )  # ft; the bound is looser on shorter steps
+        # The tolerance is in ft. The bound is looser on shorter steps.
+        assert row["worst_margin_inside"] >= float(env.rta.margin) - 0.5
 
 
 @pytest.mark.parametrize(
@@ -372,17 +385,14 @@ def test_a_control_that_is_certified_passes_unaltered(task: str) -> None:
     assert not info.intervening
     assert info.rta.correction == 0.0
     assert info.rta.certified
-    np.testing.assert_allclose(
-        info.rta.predicted_margin, min(info.margins.values()), rtol=1e-4
-    )  # a bound in between
+    # A bound between two instants enters both.
+    np.testing.assert_allclose(info.rta.predicted_margin, min(info.margins.values()), rtol=1e-4)
 
 
 def fast(env: Environment) -> Any:
-    """A start at the speed limit, moving across."""
-    position, velocity = (
-        100.0 * np.eye(env.action_size)[0],
-        (0.2 + 2 * 0.001027 * 100.0) * np.eye(env.action_size)[1],
-    )
+    """Return a start at the speed limit, moving across."""
+    position = 100.0 * np.eye(env.action_size)[0]
+    velocity = (0.2 + 2 * 0.001027 * 100.0) * np.eye(env.action_size)[1]
     return jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": 0.999 * velocity}})[
         0
     ]
@@ -399,7 +409,8 @@ def test_an_intervention_is_reported_in_full(task: str) -> None:
     np.testing.assert_allclose(
         info.rta.correction, np.linalg.norm(info.control_actual - info.control_desired), rtol=1e-6
     )
-    delta_v = np.linalg.norm(info.control_actual) / 12.0  # the reward is for the thrust that acted
+    # The reward counts the thrust that acted.
+    delta_v = np.linalg.norm(info.control_actual) / 12.0
     np.testing.assert_allclose(info.status["delta_v"], delta_v, rtol=1e-5)
     _, bare = step(jaxsafe.make(task), fast(env), jnp.eye(env.action_size)[1])
     assert bare.info.margins["velocity_limit"] < 0.0
@@ -451,7 +462,7 @@ def test_reset_and_step_agree_in_structure(task: str) -> None:
 @pytest.mark.parametrize("task", DOCKING)
 @pytest.mark.usefixtures("x64")
 def test_the_sampled_data_filter_changes_no_more_than_it_must(task: str) -> None:
-    """Against the true optimum, whose constraint h(x′) ≥ margin is not convex."""
+    """The reference is the true optimum, whose constraint h(x′) ≥ margin is not convex."""
     env = jaxsafe.make(task, rta="discrete_asif")
     rng = np.random.default_rng(0)
     altered = 0
@@ -463,22 +474,22 @@ def test_the_sampled_data_filter_changes_no_more_than_it_must(task: str) -> None
         state = jaxsafe.reset_to(env, {"deputy": start})[0]
         desired = rng.uniform(-1, 1, env.action_size)
         _, timestep = step(env, state, desired)
-        found = np.asarray(timestep.info.control_actual)
+        actual = np.asarray(timestep.info.control_actual)
 
         def h(u: np.ndarray, state: Any = state) -> float:
             later = judge(env, advance(env, state.sim, jnp.asarray(u)))
             return float(constraint(env, "velocity_limit").margin(later) - env.rta.margin)
 
-        assert h(found) > -1e-9
+        assert h(actual) > -1e-9
         best = minimize(
             lambda u, desired=desired: np.sum((u - desired) ** 2),
-            found,
+            actual,
             constraints=[{"type": "ineq", "fun": h}],
             bounds=[(-1, 1)] * env.action_size,
             method="SLSQP",
             options={"ftol": 1e-14},
         )
-        assert np.linalg.norm(found - desired) <= np.linalg.norm(best.x - desired) + 1e-6
+        assert np.linalg.norm(actual - desired) <= np.linalg.norm(best.x - desired) + 1e-6
         altered += bool(timestep.info.intervening)
     assert 5 < altered < 25
 
@@ -487,8 +498,9 @@ def test_the_sampled_data_filter_changes_no_more_than_it_must(task: str) -> None
     "task", [*DOCKING, "rejoin2d", slow("docking2d_oriented"), slow("rejoin3d")]
 )
 def test_a_batch_of_any_size_is_filtered_alike(task: str) -> None:
-    """jaxlib 0.10.2 went wrong beyond 32 768 numbers, silently."""
-    env, num = jaxsafe.make(task, rta="default"), 20_480
+    """jaxlib 0.10.2 silently gave wrong results beyond 32 768 numbers."""
+    env = jaxsafe.make(task, rta="default")
+    num = 20_480
     low, high = bounds(env)
     states, _ = jax.jit(jax.vmap(reset, in_axes=(None, 0)))(
         env, jax.random.split(jax.random.key(0), num)
@@ -498,13 +510,14 @@ def test_a_batch_of_any_size_is_filtered_alike(task: str) -> None:
     @jax.jit
     def both(env: Any, state: Any, desired: jax.Array) -> Any:
         backups = [
-            one.control(env, state.sim, others_later(env, state.sim)) for one in env.rta.backups
+            backup.control(env, state.sim, others_later(env, state.sim))
+            for backup in env.rta.backups
         ]
         return backups, env.rta.propose(env, state.sim, desired, desired)[0]
 
     batched = jax.vmap(both, in_axes=(None, 0, 0))
     apart = jax.tree.map(lambda x: x.reshape(20, -1, *x.shape[1:]), (states, desired))
-    small = jax.jit(lambda lanes: jax.lax.map(lambda part: batched(env, *part), lanes))(apart)
+    small = jax.jit(lambda parts: jax.lax.map(lambda part: batched(env, *part), parts))(apart)
     small = jax.tree.map(lambda x: x.reshape(num, *x.shape[2:]), small)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4),
@@ -576,7 +589,8 @@ def test_barrier_rows_are_the_change_of_h_along_the_plant(task: str, degree: int
     sim = jaxsafe.reset(env, jax.random.key(1))[0].sim
     rows, offsets = rta.rows(env, sim, env.action_size)
     low, high = bounds(env)
-    u, t = low + 0.8 * (high - low), 1e-3
+    u = low + 0.8 * (high - low)
+    t = 1e-3
 
     def h(duration: float) -> float:
         moved = advance(jaxsafe.override(env, {"dt": duration}), sim, u)
@@ -586,7 +600,8 @@ def test_barrier_rows_are_the_change_of_h_along_the_plant(task: str, degree: int
     if degree == 1:
         expected = (4 * h(t) - h(2 * t) - 3 * now) / (2 * t) + 0.3 * now  # ḣ + α(h)
     else:
-        slope, bend = (h(2 * t) - now) / (2 * t), (h(2 * t) - 2 * h(t) + now) / t**2
+        slope = (h(2 * t) - now) / (2 * t)
+        bend = (h(2 * t) - 2 * h(t) + now) / t**2
         expected = bend + 2 * 0.3 * (slope - bend * t) + 0.09 * now  # ψ̇₁ + α(ψ₁), ψ₁ = ḣ + αh
     np.testing.assert_allclose(float(rows[0] @ u - offsets[0]), expected, rtol=2e-3, atol=1e-4)
 
@@ -595,7 +610,8 @@ def test_barrier_rows_are_the_change_of_h_along_the_plant(task: str, degree: int
 def test_derivatives_through_the_filter_are_numbers_at_every_kink(task: str) -> None:
     env = jaxsafe.make(task, rta="default")
     size = env.action_size
-    zero, unit = np.zeros(size), np.eye(size)[0]
+    zero = np.zeros(size)
+    unit = np.eye(size)[0]
     starts = [
         (zero, zero),
         (zero, 0.2 * unit),
@@ -623,7 +639,10 @@ def test_derivatives_through_the_filter_are_numbers_at_every_kink(task: str) -> 
 )
 @pytest.mark.usefixtures("x64")
 def test_no_distance_within_a_step_is_below_its_bound(task: str, dt: float) -> None:
-    """Extreme controls near a lead that reverses its turn, also such that reach a limit within the step."""
+    """Controls are extreme and act near a lead that reverses its turn.
+
+    Some reach a limit within the step.
+    """
     turn = {"type": "constant", "name": "heading_rate", "at": -0.17}
     env = jaxsafe.make(
         task, {"dt": dt, "lead.controller": {"type": "scripted", "commands": [turn]}}
@@ -647,18 +666,21 @@ def test_no_distance_within_a_step_is_below_its_bound(task: str, dt: float) -> N
         shares = jnp.linspace(0.0, 1.0, 101)[1:]
         way = jax.vmap(lambda share: within_step(env, sim, control, share))(shares)
         true = jnp.min(
-            jax.vmap(lambda one: constraint(env, "collision").margin(judge(env, one)))(way)
+            jax.vmap(lambda sim: constraint(env, "collision").margin(judge(env, sim)))(way)
         )
         return true, constraint(env, "collision").margin(judge(env, after, sim))
 
     true, bound = jax.jit(jax.vmap(both))(sims, controls)
     assert (true >= bound - 1e-9).all()
-    assert (true <= bound + 40.0 * dt**2).all()  # ft
+    assert (true <= bound + 40.0 * dt**2).all()  # in ft
 
 
 @pytest.mark.parametrize("task", ["rejoin2d", slow("rejoin3d")])
 def test_backing_up_for_long_far_from_the_origin_does_not_drift_into_the_lead(task: str) -> None:
-    """Where rounding is some 0.03 ft, two of equal velocity came up to 10 ft closer in 1000 steps."""
+    """Rounding is some 0.03 ft here.
+
+    Without care two aircraft of equal velocity came up to 10 ft closer in 1000 steps.
+    """
     env = jaxsafe.make(task, rta="default")
     clearance = env.rta.terminal.clearance - constraint(env, "collision").minimum
     low, high = bounds(env)
@@ -704,7 +726,7 @@ def test_release_holds_control_back_for_longer(release: float, held: bool) -> No
     state, timestep = step(env, fast(env), jnp.array([0.0, 1.0]))
     assert timestep.info.intervening
     assert 0.0 < timestep.info.margins["velocity_limit"] < 0.1
-    _, timestep = step(env, state, jnp.zeros(2))  # would be safe by itself
+    _, timestep = step(env, state, jnp.zeros(2))  # this control would be safe by itself
     assert bool(timestep.info.intervening) == held
 
 
@@ -750,13 +772,16 @@ def test_a_filter_that_does_not_fit_is_told_in_one_line(
 
 
 def test_the_filters_of_the_literature_are_there_to_be_broken() -> None:
-    """The continuous-time barrier against a control that is held, and a monitor that never looks at the desired control."""
+    """Both filters fail.
+
+    One is the continuous-time barrier with a control that is held over a step. The other is a
+    monitor that never looks at the desired control.
+    """
     row = attack(
         jaxsafe.make("docking2d", rta="explicit_asif"), "intercept", 150, 32, jax.random.key(1)
     )
-    assert (
-        row["uncertified_steps"] >= row["violating_steps_inside"] >= row["violating_steps"] > 0
-    )  # and the filter knows
+    # The filter knows that it is not certified.
+    assert row["uncertified_steps"] >= row["violating_steps_inside"] >= row["violating_steps"] > 0
     env = jaxsafe.make("docking2d", {"rta.enforce": True}, rta="explicit_asif")
     assert attack(env, "intercept", 150, 32, jax.random.key(1))["violating_steps"] == 0
     row = attack(jaxsafe.make("rejoin2d", rta="released"), "head_on", 150, 32, jax.random.key(1))
@@ -769,7 +794,8 @@ def test_a_blend_takes_the_largest_share_that_is_certified(share: int) -> None:
     desired = jnp.array([0.0, 1.0])
     _, timestep = step(env, fast(env), desired)
     _, simplex = step(jaxsafe.make("docking2d", rta="explicit_simplex"), fast(env), desired)
-    backup, actual = simplex.info.control_actual, timestep.info.control_actual
+    backup = simplex.info.control_actual
+    actual = timestep.info.control_actual
     part = (actual - backup)[1] / (desired - backup)[1]
     np.testing.assert_allclose(part * share, np.round(part * share), atol=1e-4)
     assert (share == 1) == (part == 0.0)
@@ -779,7 +805,10 @@ def test_a_blend_takes_the_largest_share_that_is_certified(share: int) -> None:
 
 
 def test_an_implicit_asif_changes_less_than_simplex() -> None:
-    """And no more than half a percent more than the exact projection, which linearising in rounds approaches."""
+    """It changes at most half a percent more than the exact projection.
+
+    Linearising in rounds approaches that projection.
+    """
     desired = jnp.array([0.0, 1.0])
     corrections = {}
     for preset in ("implicit_simplex", "implicit_asif", "discrete_asif"):
@@ -793,7 +822,7 @@ def test_an_implicit_asif_changes_less_than_simplex() -> None:
 
 
 def test_stages_follow_each_other() -> None:
-    """The last stage has the last word, and where it intervenes the certificate of the first is void."""
+    """The last stage decides. Where it intervenes the certificate of the first is void."""
     loose = Stage(name="loose", rta=Simplex(**DOCKING_FILTER))
     tight = Stage(name="tight", rta=Simplex(**{**DOCKING_FILTER, "margin": 0.05}))
     env = jaxsafe.make("docking2d", rta=Cascade(stages=(loose, tight)))
@@ -819,7 +848,10 @@ def test_stages_follow_each_other() -> None:
 
 
 def test_rejoin_needs_barriers_of_a_higher_degree() -> None:
-    """A turn moves the distance only after two derivatives: of degree 1 the row is empty, which is told at once."""
+    """A turn changes the distance only after two derivatives.
+
+    Of degree 1 the row is empty, which is told at once.
+    """
     with pytest.raises(
         ConfigError, match=r"^rta: of degree 1 the control has no influence on 'collision'"
     ):
@@ -855,14 +887,14 @@ def test_a_filter_and_the_constraint_that_it_needs_come_together() -> None:
     }
     rta = Simplex(**{**DOCKING_FILTER, "constraints": ("slow",)})
     env = jaxsafe.make("docking2d", {"constraints": [renamed], "rta.margin": 0.01}, rta=rta)
-    assert [one.name for one in env.constraints] == ["slow"]
+    assert [constraint.name for constraint in env.constraints] == ["slow"]
     _, timestep = step(env, fast(env), jnp.array([0.0, 1.0]))
     assert timestep.info.intervening
     assert timestep.info.margins["slow"] >= 0.01
 
 
 class Shy(Command, type="of_tests_shy"):
-    """Turns away from another platform that comes near."""
+    """A command that turns away from another platform that comes near."""
 
     other: PlatformName
     radius: Annotated[Length, Positive] = 500.0
@@ -890,7 +922,8 @@ def test_a_certificate_is_the_least_h_on_the_way_of_each_backup(
     task: str, changes: dict[str, Any], reacts: bool
 ) -> None:
     env = jaxsafe.make(task, changes, rta="default")
-    rta, away = env.rta, jnp.zeros(2 if task == "rejoin2d" else 3)
+    rta = env.rta
+    away = jnp.zeros(2 if task == "rejoin2d" else 3)
     assert isinstance(rta, Simplex)
     lead = {"position": away, "heading": 0.0, "speed": 250.0}
     wingman = {
@@ -923,5 +956,5 @@ def test_a_certificate_is_the_least_h_on_the_way_of_each_backup(
         return values
 
     certified = jax.jit(lambda env, sim: env.rta.certify(env, sim, sim))(env, sim)
-    np.testing.assert_allclose(certified, follow(env, sim), rtol=0.0, atol=0.02)  # ft
+    np.testing.assert_allclose(certified, follow(env, sim), rtol=0.0, atol=0.02)  # in ft
     assert np.isfinite(certified).any()

@@ -1,4 +1,4 @@
-"""Components: what is structure, what is a leaf, and that a change of numbers never compiles anew."""
+"""Components: what is structure and what is a leaf. A change of numbers never compiles anew."""
 
 import dataclasses
 import types
@@ -27,21 +27,19 @@ class Part(Component):
 
 
 class SmallPart(Part, type="small"):
-    """One kind of part."""
+    pass
 
 
 class LargePart(Part, type="large"):
-    """Another kind of part."""
-
     extra: Length = 2.0
 
 
 class Twin(Part):
-    """Another class with the same fields."""
+    """A class with the same fields as `SmallPart`."""
 
 
 class Whole(Component):
-    """One field of every kind."""
+    """A component with one field of every kind."""
 
     name: str
     count: Annotated[int, Range(1)] = 1
@@ -242,9 +240,10 @@ def test_a_change_of_structure_compiles_anew() -> None:
 
 
 def test_two_classes_with_the_same_fields_are_different_structures() -> None:
-    one, other = normalise(SmallPart(name="x")), normalise(Twin(name="x"))
-    assert jax.tree.structure(one) != jax.tree.structure(other)
-    assert jax.tree.structure((one, one)) != jax.tree.structure((one, other))
+    small = normalise(SmallPart(name="x"))
+    twin = normalise(Twin(name="x"))
+    assert jax.tree.structure(small) != jax.tree.structure(twin)
+    assert jax.tree.structure((small, small)) != jax.tree.structure((small, twin))
 
 
 def test_a_class_never_runs_the_program_compiled_for_another() -> None:
@@ -286,7 +285,7 @@ def test_a_component_has_no_problem_unless_it_says_so(whole: Whole) -> None:
 def define(
     base: type[Component], name: str, type_name: str, module: str = __name__
 ) -> type[Component]:
-    """Define a subclass as a module of that name would."""
+    """Define a subclass in the way a module of that name would."""
     return types.new_class(
         name, (base,), {"type": type_name}, lambda body: body.update(__module__=module)
     )
@@ -294,7 +293,10 @@ def define(
 
 @pytest.fixture
 def kind() -> type[Component]:
-    """A base of its own with one named class, so that what a test defines is seen by no other."""
+    """Return a base class with one named class.
+
+    What a test defines below it is seen by no other test.
+    """
     base = types.new_class("Kind", (Component,))
     define(base, "Taken", "taken")
     return base
@@ -319,7 +321,8 @@ def test_a_taken_type_name_is_refused_below_another_class_of_the_kind(
     before = choices(kind)
     with pytest.raises(ConfigError, match="taken by") as caught:
         define(named, "Mine", "taken")
-    assert choices(kind) == before  # though the traceback keeps the refused class alive
+    # The traceback keeps the refused class alive, and it is still not a choice.
+    assert choices(kind) == before
     del caught
 
 
@@ -339,10 +342,10 @@ def test_the_same_class_may_be_defined_again_and_replaces_the_first(kind: type[C
 
 
 def test_different_kinds_may_share_a_type_name(kind: type[Component]) -> None:
-    other = types.new_class("OtherKind", (Component,))
-    assert choices(other) == {}
-    taken = define(other, "Mine", "taken")
-    assert choices(other) == {"taken": taken}
+    twin = types.new_class("OtherKind", (Component,))
+    assert choices(twin) == {}
+    taken = define(twin, "Mine", "taken")
+    assert choices(twin) == {"taken": taken}
     assert choices(kind)["taken"] is not taken
 
 

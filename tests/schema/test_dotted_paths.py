@@ -1,4 +1,4 @@
-"""Dotted paths into components: what they reach, what they pick, and what is said when they lead nowhere."""
+"""Dotted paths into components: what they reach, what they pick, and messages where they fail."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -19,7 +19,7 @@ class Wheel(Component):
 
 
 class Engine(Component):
-    """A part with parts, none of which is a shorthand."""
+    """A part with parts. None of them is a shorthand."""
 
     name: str = "engine"
     power: Length = 2.0
@@ -27,7 +27,7 @@ class Engine(Component):
 
 
 class Car(Component):
-    """Every kind of field that a path may walk through."""
+    """A component with every kind of field that a path may walk through."""
 
     shorthand: ClassVar[str | None] = "wheels"
 
@@ -120,18 +120,27 @@ def test_picked_parts_pass_no_conversion_and_other_values_do(car: Car) -> None:
         (
             "lenth",
             1,
-            r"^lenth: unknown field 'lenth'; choose from name, .*, left, right\. Did you mean 'length'\?$",
+            (
+                r"^lenth: unknown field 'lenth'; choose from name, .*, left, right\. Did you mean"
+                r" 'length'\?$"
+            ),
         ),
         ("rigt.radius", 1, r"^rigt: unknown field 'rigt'; .* Did you mean 'right'\?$"),
         (
             "wheels.rigt.radius",
             1,
-            r"^wheels\.rigt: unknown name 'rigt'; choose from left, right\. Did you mean 'right'\?$",
+            (
+                r"^wheels\.rigt: unknown name 'rigt'; choose from left, right\. Did you mean"
+                r" 'right'\?$"
+            ),
         ),
         (
             "right.radus",
             1,
-            r"^right\.radus: unknown field 'radus'; choose from name, radius\. Did you mean 'radius'\?$",
+            (
+                r"^right\.radus: unknown field 'radus'; choose from name, radius\. Did you mean"
+                r" 'radius'\?$"
+            ),
         ),
         ("engine.wheels.left.radus", 1, r"^engine\.wheels\.left\.radus: unknown field 'radus'"),
         ("wheels.left", 1, r"^wheels\.left: name one of its fields: name, radius$"),

@@ -1,4 +1,7 @@
-"""Times are whole numbers of steps: a limit is met after as many steps as it is long, whatever dt rounds to."""
+"""Times are whole numbers of steps.
+
+A limit is met after as many steps as it is long, whatever dt rounds to.
+"""
 
 from decimal import Decimal
 from typing import Any

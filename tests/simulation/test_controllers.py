@@ -1,4 +1,4 @@
-"""From actions to named controls."""
+"""Controllers turn actions into named controls."""
 
 import jax
 import jax.numpy as jnp
@@ -62,9 +62,11 @@ def test_a_control_never_exceeds_its_limits(
 def test_a_control_leads_back_to_the_action_that_gives_it(
     share: float, zero_centred: bool, rescale: bool
 ) -> None:
-    one = actuator(-1.0, 2.0, zero_centred=zero_centred, rescale=rescale)
+    limits = actuator(-1.0, 2.0, zero_centred=zero_centred, rescale=rescale)
     control = jnp.float32(-1.0 + 3.0 * share)
-    np.testing.assert_allclose(one.from_continuous(one.to_continuous(control)), control, atol=5e-7)
+    np.testing.assert_allclose(
+        limits.from_continuous(limits.to_continuous(control)), control, atol=5e-7
+    )
     still = actuator(0.0, 0.0, zero_centred=zero_centred, rescale=rescale)
     assert jnp.isfinite(still.to_continuous(jnp.float32(0.0)))
 
@@ -108,10 +110,8 @@ def test_actions_are_positional_and_controls_are_named() -> None:
         Actuator(name="b", low=0.0, high=1.0, points=3),
         Actuator(name="a", low=-10.0, high=10.0, points=5),
     )
-    continuous, discrete = (
-        normalise(Continuous(actuators=actuators)),
-        normalise(Discrete(actuators=actuators)),
-    )
+    continuous = normalise(Continuous(actuators=actuators))
+    discrete = normalise(Discrete(actuators=actuators))
     assert continuous.names == discrete.names == ("b", "a")
     assert continuous.control(jnp.asarray([1.0, 0.5]), SIM) == {"b": 1.0, "a": 5.0}
     assert discrete.control(jnp.asarray([1, 4]), SIM) == {"b": 0.5, "a": 10.0}
@@ -164,9 +164,9 @@ def test_each_task_has_its_actuators_in_order_and_their_points_reach_from_end_to
     }
     for env, actions in ends.items():
         for index, action in enumerate(actions):
-            found = env.agent_platform.controller.control(action, SIM)
+            computed = env.agent_platform.controller.control(action, SIM)
             expected = {name: limits[index] for name, limits in LIMITS[task].items()}
-            assert {name: float(value) for name, value in found.items()} == pytest.approx(
+            assert {name: float(value) for name, value in computed.items()} == pytest.approx(
                 expected, rel=1e-6
             )
 
@@ -176,6 +176,6 @@ def test_no_action_in_the_middle_is_no_control_and_the_oriented_thrust_is_zero_c
     task: str,
 ) -> None:
     env = jaxsafe.make(task)
-    found = env.agent_platform.controller.control(jnp.zeros(env.action_size), SIM)
-    assert list(found) == list(LIMITS[task])
-    np.testing.assert_allclose([float(value) for value in found.values()], 0.0, atol=1e-8)
+    computed = env.agent_platform.controller.control(jnp.zeros(env.action_size), SIM)
+    assert list(computed) == list(LIMITS[task])
+    np.testing.assert_allclose([float(value) for value in computed.values()], 0.0, atol=1e-8)

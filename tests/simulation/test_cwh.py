@@ -1,4 +1,7 @@
-"""Clohessy-Wiltshire motion: the closed form against the matrix exponential, and the laws of the orbit."""
+"""Clohessy-Wiltshire motion: the closed form and the laws of the orbit.
+
+The closed form is compared with the matrix exponential.
+"""
 
 import math
 
@@ -29,40 +32,47 @@ acceleration = jax.jit(cwh_acceleration)
 
 
 def random_vectors(seed: int, dimension: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A position [m], a velocity [m/s] and a thrust acceleration [m/s²] as in docking."""
+    """Draw a position [m], a velocity [m/s] and a thrust acceleration [m/s²] as in docking."""
     rng = np.random.default_rng(seed)
     return tuple(rng.uniform(-size, size, dimension) for size in (150.0, 0.5, 1.0 / 12.0))
 
 
 def system(n: float) -> np.ndarray:
-    """M of d/dt [r, v, a] = M [r, v, a] in space, a constant, from Eqs. (12), (16)."""
+    """Return M of d/dt [r, v, a] = M [r, v, a] in space, from Eqs. (12) and (16).
+
+    The thrust acceleration a is constant.
+    """
     M = np.zeros((9, 9))
     M[:3, 3:6] = np.eye(3)
     M[3:6, 6:] = np.eye(3)
-    M[3, 0], M[3, 4] = 3.0 * n**2, 2.0 * n
+    M[3, 0] = 3.0 * n**2
+    M[3, 4] = 2.0 * n
     M[4, 3] = -2.0 * n
     M[5, 2] = -(n**2)
     return M
 
 
 def exact_flow(r: np.ndarray, v: np.ndarray, a: np.ndarray, n: float, t: float) -> np.ndarray:
-    """Position and velocity after a time t, [2, 3], by the matrix exponential."""
+    """Return position and velocity after a time t, [2, 3], by the matrix exponential."""
     return (expm(system(n) * t) @ np.concatenate([r, v, a]))[:6].reshape(2, 3)
 
 
 def exact_flow_by_mean_motion(
     r: np.ndarray, v: np.ndarray, a: np.ndarray, n: float, t: float
 ) -> np.ndarray:
-    """The derivative of `exact_flow` by n: the Fréchet derivative of the exponential along dM/dn."""
+    """Return the derivative of `exact_flow` by n.
+
+    It is the Fréchet derivative of the matrix exponential along dM/dn.
+    """
     along = system(n + 0.5) - system(n - 0.5)  # M is quadratic in n, so this is dM/dn exactly
     derivative = expm_frechet(system(n) * t, along * t, compute_expm=False)
     return (derivative @ np.concatenate([r, v, a]))[:6].reshape(2, 3)
 
 
-def assert_close(found: jax.Array, expected: np.ndarray, tolerance: float) -> None:
-    """Compare relative to the largest element."""
+def assert_close(computed: jax.Array, expected: np.ndarray, tolerance: float) -> None:
+    """Compare two arrays relative to the largest element."""
     scale = max(1.0, float(np.max(np.abs(expected))))
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=tolerance * scale)
+    np.testing.assert_allclose(computed, expected, rtol=0.0, atol=tolerance * scale)
 
 
 @pytest.mark.parametrize("n", [0.0, 1e-9, 1e-5, MEAN_MOTION, 0.01])
@@ -70,8 +80,8 @@ def assert_close(found: jax.Array, expected: np.ndarray, tolerance: float) -> No
 @pytest.mark.usefixtures("x64")
 def test_the_closed_form_is_the_matrix_exponential(n: float, t: float) -> None:
     r, v, a = random_vectors(seed=1)
-    for found, expected in zip(flow(r, v, a, n, t), exact_flow(r, v, a, n, t), strict=True):
-        assert_close(found, expected, 1e-11)
+    for computed, expected in zip(flow(r, v, a, n, t), exact_flow(r, v, a, n, t), strict=True):
+        assert_close(computed, expected, 1e-11)
 
 
 @pytest.mark.parametrize("tau", [0.9, 1.0 - 1e-9, 1.0, 1.0 + 1e-9, 1.1, -1.0, 3.0, 50.0])
@@ -79,21 +89,21 @@ def test_the_closed_form_is_the_matrix_exponential(n: float, t: float) -> None:
 def test_the_closed_form_is_smooth_where_the_series_ends(tau: float) -> None:
     r, v, a = random_vectors(seed=2)
     t = tau / MEAN_MOTION
-    for found, expected in zip(
+    for computed, expected in zip(
         flow(r, v, a, MEAN_MOTION, t), exact_flow(r, v, a, MEAN_MOTION, t), strict=True
     ):
-        assert_close(found, expected, 1e-11)
+        assert_close(computed, expected, 1e-11)
 
 
 @pytest.mark.parametrize("t", [1.0, 10.0, 100.0, 1000.0])
 def test_in_float32_the_error_is_at_most_five_parts_in_ten_million(t: float) -> None:
     for seed in range(20):
         r, v, a = random_vectors(seed)
-        for found, expected in zip(
+        for computed, expected in zip(
             flow(r, v, a, MEAN_MOTION, t), exact_flow(r, v, a, MEAN_MOTION, t), strict=True
         ):
-            assert found.dtype == jnp.float32
-            assert_close(found, expected, 5e-7)
+            assert computed.dtype == jnp.float32
+            assert_close(computed, expected, 5e-7)
 
 
 @pytest.mark.usefixtures("x64")
@@ -139,10 +149,8 @@ def test_planar_motion_is_spatial_motion_with_z_zero(t: float) -> None:
     for two, three in zip(planar, spatial, strict=True):
         np.testing.assert_allclose(two, three[:2], rtol=1e-14)
         assert three[2] == 0.0
-    plane, space = (
-        acceleration(*(vector[:2] for vector in vectors), MEAN_MOTION),
-        acceleration(*vectors, MEAN_MOTION),
-    )
+    plane = acceleration(*(vector[:2] for vector in vectors), MEAN_MOTION)
+    space = acceleration(*vectors, MEAN_MOTION)
     np.testing.assert_allclose(plane, space[:2], rtol=1e-14)
     assert space[2] == 0.0
 
@@ -159,8 +167,8 @@ def test_two_flows_in_a_row_are_one(seed: int, first: float, second: float, n: f
         r, v, a = random_vectors(seed)
         in_two = flow(*flow(r, v, a, n, first), a, n, second)
         at_once = flow(r, v, a, n, first + second)
-        for found, expected in zip(in_two, at_once, strict=True):
-            assert_close(found, np.asarray(expected), 1e-10)
+        for computed, expected in zip(in_two, at_once, strict=True):
+            assert_close(computed, np.asarray(expected), 1e-10)
 
 
 @settings(deadline=None, max_examples=25)
@@ -179,10 +187,11 @@ def test_the_rate_of_the_flow_is_velocity_and_acceleration(seed: int, t: float, 
 
 @pytest.mark.usefixtures("x64")
 def test_the_flow_is_linear_in_state_and_thrust() -> None:
-    one, other = random_vectors(seed=6), random_vectors(seed=7)
-    both = [2.0 * x - 3.0 * y for x, y in zip(one, other, strict=True)]
-    expected = 2.0 * np.stack(flow(*one, MEAN_MOTION, 50.0)) - 3.0 * np.stack(
-        flow(*other, MEAN_MOTION, 50.0)
+    first = random_vectors(seed=6)
+    second = random_vectors(seed=7)
+    both = [2.0 * x - 3.0 * y for x, y in zip(first, second, strict=True)]
+    expected = 2.0 * np.stack(flow(*first, MEAN_MOTION, 50.0)) - 3.0 * np.stack(
+        flow(*second, MEAN_MOTION, 50.0)
     )
     np.testing.assert_allclose(np.stack(flow(*both, MEAN_MOTION, 50.0)), expected, atol=1e-11)
 
@@ -203,15 +212,15 @@ def test_the_derivative_by_mean_motion_is_that_of_the_matrix_exponential(
     n: float, t: float
 ) -> None:
     vectors = random_vectors(seed=9)
-    found = np.stack([jacobian[3] for jacobian in jacobians(*vectors, n, t)])
-    assert_close(found, exact_flow_by_mean_motion(*vectors, n, t), 1e-9)
+    computed = np.stack([jacobian[3] for jacobian in jacobians(*vectors, n, t)])
+    assert_close(computed, exact_flow_by_mean_motion(*vectors, n, t), 1e-9)
 
 
 @pytest.mark.parametrize("t", [1.0, 1000.0])
 def test_in_float32_the_derivative_by_mean_motion_has_six_digits(t: float) -> None:
     vectors = random_vectors(seed=9)
-    found = np.stack([jacobian[3] for jacobian in jacobians(*vectors, MEAN_MOTION, t)])
-    assert_close(found, exact_flow_by_mean_motion(*vectors, MEAN_MOTION, t), 1e-6)
+    computed = np.stack([jacobian[3] for jacobian in jacobians(*vectors, MEAN_MOTION, t)])
+    assert_close(computed, exact_flow_by_mean_motion(*vectors, MEAN_MOTION, t), 1e-6)
 
 
 def test_a_spacecraft_feels_thrust_over_mass_and_remembers_its_delta_v() -> None:

@@ -1,4 +1,7 @@
-"""Aircraft: one step against scipy's integrator, split where a limit is reached, and the laws of Eqs. (5) and (9)."""
+"""Aircraft: one step against scipy's integrator, and the laws of Eqs. (5) and (9).
+
+The reference is split where a limit is reached.
+"""
 
 import math
 from collections.abc import Sequence
@@ -24,7 +27,7 @@ ROLLS = (-math.pi / 3, math.pi / 3)
 
 
 def step2d(x: Any, controls: Any, dt: Any = 1.0) -> jax.Array:
-    """One step of [x, y, ψ, v] under [ψ̇, v̇], both as vectors."""
+    """Return [x, y, ψ, v] one step later under the controls [ψ̇, v̇]."""
     aircraft = normalise(Dubins2D(name="aircraft"))
     state = Dubins2DState(x[:2], x[2], x[3])
     after = aircraft.step(state, {"heading_rate": controls[0], "acceleration": controls[1]}, dt)
@@ -32,7 +35,7 @@ def step2d(x: Any, controls: Any, dt: Any = 1.0) -> jax.Array:
 
 
 def step3d(x: Any, controls: Any, dt: Any = 1.0) -> jax.Array:
-    """One step of [x, y, z, ψ, v, γ, φ] under [φ̇, γ̇, v̇], both as vectors."""
+    """Return [x, y, z, ψ, v, γ, φ] one step later under the controls [φ̇, γ̇, v̇]."""
     aircraft = normalise(Dubins3D(name="aircraft"))
     state = Dubins3DState(x[:3], x[3], x[4], x[5], x[6])
     names = ("roll_rate", "flight_path_angle_rate", "acceleration")
@@ -52,7 +55,10 @@ jacobian3d = jax.jit(jax.vmap(jax.jacfwd(step3d, argnums=(0, 1))))
 
 
 def rate_of_change(y: np.ndarray, rates: np.ndarray) -> np.ndarray:
-    """Eq. (9) for [x, y, z, ψ, v, γ, φ, unused heading rate]; Eq. (5) is γ = φ = 0 with a heading rate."""
+    """Return the rate of change in Eq. (9) of [x, y, z, ψ, v, γ, φ, unused heading rate].
+
+    Eq. (5) is the case γ = φ = 0 with a heading rate.
+    """
     _, _, _, psi, v, gamma, phi = y
     turn = rates[3] + GRAVITY / v * np.tan(phi)
     forward = [np.cos(psi) * np.cos(gamma), np.sin(psi) * np.cos(gamma), -np.sin(gamma)]
@@ -60,9 +66,10 @@ def rate_of_change(y: np.ndarray, rates: np.ndarray) -> np.ndarray:
 
 
 def exact(x: np.ndarray, rates: np.ndarray, dt: float) -> np.ndarray:
-    """The flow over dt of states [7, n] under (v̇, γ̇, φ̇, ψ̇) [4, n] by solve_ivp, restarted wherever a limit is reached.
+    """Return the flow over dt by `solve_ivp`. The integration restarts wherever a limit is reached.
 
-    All samples at once: each piece between two stops is mapped to the unit interval.
+    States are [7, n], and the rates (v̇, γ̇, φ̇, ψ̇) are [4, n]. All samples are integrated at
+    once: each piece between two stops is mapped to the unit interval.
     """
     stops = np.full((3, x.shape[1]), dt)
     for k, (low, high) in enumerate((SPEEDS, GAMMAS, ROLLS)):
@@ -89,12 +96,17 @@ def exact(x: np.ndarray, rates: np.ndarray, dt: float) -> np.ndarray:
 
 
 def random_aircraft(seed: int, num: int = NUM) -> tuple[np.ndarray, np.ndarray]:
-    """States [7, num] and rates (v̇, γ̇, φ̇, ψ̇) [4, num]; a fifth of them each on a limit, just off one, at a zero rate."""
+    """Draw states [7, num] and rates (v̇, γ̇, φ̇, ψ̇)
+
+    [4, num]. For each limit a fifth of the samples are on it, a fifth just off it, and in a fifth
+    the rate is zero.
+    """
     rng = np.random.default_rng(seed)
     limits = (SPEEDS, GAMMAS, ROLLS)
     angles = [rng.uniform(low, high, num) for low, high in limits]
     for sample, (low, high) in zip(angles, limits, strict=True):
-        kind, end = rng.integers(5, size=num), rng.choice([low, high], num)
+        kind = rng.integers(5, size=num)
+        end = rng.choice([low, high], num)
         sample[kind == 0] = end[kind == 0]
         sample[kind == 1] = (end + 1e-4 * ((low + high) / 2 - end))[kind == 1]
     x = np.stack([*rng.uniform(-1e4, 1e4, (3, num)), rng.uniform(-10.0, 10.0, num), *angles])
@@ -104,15 +116,16 @@ def random_aircraft(seed: int, num: int = NUM) -> tuple[np.ndarray, np.ndarray]:
 
 
 def flat(x: np.ndarray, rates: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same samples at one altitude without roll, and the controls that planar flight takes."""
-    level, turning = x.copy(), rates.copy()
+    """Return the same samples at one altitude without roll, with the controls of planar flight."""
+    level = x.copy()
+    turning = rates.copy()
     level[[2, 5, 6]] = 0.0
     turning[[1, 2]] = 0.0
     return level, turning
 
 
 def crossings(x: np.ndarray, rates: np.ndarray, dt: float) -> np.ndarray:
-    """How many limits each sample reaches inside the step."""
+    """Return how many limits each sample reaches inside the step."""
     ends = zip(x[4:7], rates[:3], (SPEEDS, GAMMAS, ROLLS), strict=True)
     return sum(
         (value + dt * rate < low) | (value + dt * rate > high) for value, rate, (low, high) in ends
@@ -128,15 +141,13 @@ def test_a_planar_step_of_any_length_is_within_a_millionth_of_a_foot(dt: float) 
     x, rates = flat(*random_aircraft(seed=1))
     assert np.sum(crossings(x, rates, dt) > 0) > 0.01 * NUM
     expected = exact(x, rates, dt)[[0, 1, 3, 4]]
-    found = np.asarray(steps2d(x[[0, 1, 3, 4]].T, rates[[3, 0]].T, dt)).T
-    np.testing.assert_allclose(found[:2], expected[:2], rtol=0.0, atol=1e-6)
-    np.testing.assert_allclose(found[2:], expected[2:], rtol=0.0, atol=1e-8)
+    computed = np.asarray(steps2d(x[[0, 1, 3, 4]].T, rates[[3, 0]].T, dt)).T
+    np.testing.assert_allclose(computed[:2], expected[:2], rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(computed[2:], expected[2:], rtol=0.0, atol=1e-8)
 
 
 @pytest.mark.usefixtures("x64")
-def test_a_spatial_step_is_within_a_thousandth_of_a_foot_and_mostly_within_a_hundred_thousandth() -> (
-    None
-):
+def test_a_spatial_step_is_within_1e_3_ft_and_mostly_within_1e_5_ft() -> None:
     x, rates = random_aircraft(seed=2)
     rates[3] = 0.0
     assert [np.sum(crossings(x, rates, 1.0) == count) > 10 for count in range(3)] == [
@@ -145,11 +156,11 @@ def test_a_spatial_step_is_within_a_thousandth_of_a_foot_and_mostly_within_a_hun
         True,
     ]
     expected = exact(x, rates, 1.0)
-    found = np.asarray(steps3d(x.T, rates[[2, 1, 0]].T, 1.0)).T
-    np.testing.assert_allclose(found[:3], expected[:3], rtol=0.0, atol=1e-3)
-    np.testing.assert_allclose(found[3], expected[3], rtol=0.0, atol=2e-6)
-    np.testing.assert_allclose(found[4:], expected[4:], rtol=0.0, atol=1e-9)
-    assert np.mean(np.abs(found - expected)[:3].max(axis=0) < 1e-5) > 0.85
+    computed = np.asarray(steps3d(x.T, rates[[2, 1, 0]].T, 1.0)).T
+    np.testing.assert_allclose(computed[:3], expected[:3], rtol=0.0, atol=1e-3)
+    np.testing.assert_allclose(computed[3], expected[3], rtol=0.0, atol=2e-6)
+    np.testing.assert_allclose(computed[4:], expected[4:], rtol=0.0, atol=1e-9)
+    assert np.mean(np.abs(computed - expected)[:3].max(axis=0) < 1e-5) > 0.85
 
 
 @pytest.mark.usefixtures("x64")
@@ -170,14 +181,17 @@ def test_a_spatial_step_that_reaches_all_three_limits_is_as_close() -> None:
     )
     rates = np.append(rates, np.zeros((1, NUM)), axis=0)
     assert np.mean(crossings(x, rates, 1.0) == 3) > 0.99
-    found = np.asarray(steps3d(x.T, rates[[2, 1, 0]].T, 1.0)).T
-    np.testing.assert_allclose(found[:3], exact(x, rates, 1.0)[:3], rtol=0.0, atol=1e-3)
-    np.testing.assert_allclose(found[4:], ends, rtol=1e-12)
+    computed = np.asarray(steps3d(x.T, rates[[2, 1, 0]].T, 1.0)).T
+    np.testing.assert_allclose(computed[:3], exact(x, rates, 1.0)[:3], rtol=0.0, atol=1e-3)
+    np.testing.assert_allclose(computed[4:], ends, rtol=1e-12)
 
 
 @pytest.mark.usefixtures("x64")
 def test_the_spatial_integrator_has_order_six() -> None:
-    """Global error over 8 s of smooth flight that reaches no limit, at steps of 4, 2, 1 and 0.5 s."""
+    """The global error is measured over 8 s of smooth flight that reaches no limit.
+
+    Steps are 4, 2, 1 and 0.5 s long.
+    """
     start = np.array([[0.0, 0.0, 10_000.0, 0.3, 260.0, -0.2, -0.6]])
     controls = np.array([[0.14, 0.04, 12.0]])
     expected = exact(start.T, np.array([[12.0], [0.04], [0.14], [0.0]]), 8.0)
@@ -196,34 +210,39 @@ def test_the_spatial_integrator_has_order_six() -> None:
 def test_in_float32_a_step_far_out_errs_by_less_than_the_spacing_of_its_position(
     model: int,
 ) -> None:
-    """At 3e5 ft neighbouring floats are 1/32 ft apart: half of that is lost in storing the result."""
+    """Half of the spacing between floats is lost in storing the result.
+
+    At 3e5 ft neighbouring floats are 1/32 ft apart.
+    """
     x, rates = random_aircraft(seed=4)
     x[:3] += 3e5
-    x, rates = x.astype(np.float32), rates.astype(np.float32)
+    x = x.astype(np.float32)
+    rates = rates.astype(np.float32)
     if model == 2:
         x, rates = flat(x, rates)
-        found = np.asarray(steps2d(x[[0, 1, 3, 4]].T, rates[[3, 0]].T, 1.0)).T[:2]
+        computed = np.asarray(steps2d(x[[0, 1, 3, 4]].T, rates[[3, 0]].T, 1.0)).T[:2]
     else:
         rates[3] = 0.0
-        found = np.asarray(steps3d(x.T, rates[[2, 1, 0]].T, 1.0)).T[:3]
-    assert found.dtype == np.float32
-    expected = exact(x.astype(float), rates.astype(float), 1.0)[: len(found)]
-    assert 0.9 * 2.0**-6 < np.max(np.abs(found - expected)) < 1.1 * 2.0**-6
+        computed = np.asarray(steps3d(x.T, rates[[2, 1, 0]].T, 1.0)).T[:3]
+    assert computed.dtype == np.float32
+    expected = exact(x.astype(float), rates.astype(float), 1.0)[: len(computed)]
+    assert 0.9 * 2.0**-6 < np.max(np.abs(computed - expected)) < 1.1 * 2.0**-6
 
 
 @pytest.mark.parametrize("model", [2, 3])
 def test_in_float32_the_way_flown_has_six_digits(model: int) -> None:
     x, rates = random_aircraft(seed=5)
     x[:3] = 0.0
-    x, rates = x.astype(np.float32), rates.astype(np.float32)
+    x = x.astype(np.float32)
+    rates = rates.astype(np.float32)
     if model == 2:
         x, rates = flat(x, rates)
-        found = np.asarray(steps2d(x[[0, 1, 3, 4]].T, rates[[3, 0]].T, 1.0)).T[:2]
+        computed = np.asarray(steps2d(x[[0, 1, 3, 4]].T, rates[[3, 0]].T, 1.0)).T[:2]
     else:
         rates[3] = 0.0
-        found = np.asarray(steps3d(x.T, rates[[2, 1, 0]].T, 1.0)).T[:3]
-    expected = exact(x.astype(float), rates.astype(float), 1.0)[: len(found)]
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=400.0 * 2e-6)
+        computed = np.asarray(steps3d(x.T, rates[[2, 1, 0]].T, 1.0)).T[:3]
+    expected = exact(x.astype(float), rates.astype(float), 1.0)[: len(computed)]
+    np.testing.assert_allclose(computed, expected, rtol=0.0, atol=400.0 * 2e-6)
 
 
 # Laws
@@ -232,7 +251,7 @@ def test_in_float32_the_way_flown_has_six_digits(model: int) -> None:
 def fly(
     aircraft: Any, state: Any, controls: dict[str, float], num_steps: int, dt: float = 1.0
 ) -> list[Any]:
-    """The states of a flight with constant controls, the start first."""
+    """Return the states of a flight with constant controls, the start first."""
     step = jax.jit(lambda state: aircraft.step(state, controls, dt))
     states = [state]
     for _ in range(num_steps):
@@ -358,16 +377,16 @@ def test_a_step_that_reaches_no_limit_before_its_end_may_be_taken_in_one_piece(
         "speed": "acceleration",
     }
     rng = np.random.default_rng(0)
-    for share in (0.0, 0.5, 1.0):  # of the way to a limit; 1 ends the step on it
-        state, controls = aircraft.rest(), {}
+    for share in (0.0, 0.5, 1.0):  # share of the way to a limit; a share of 1 ends the step on it
+        state = aircraft.rest()
+        controls = {}
         for name, (low, high) in (
             (name.removesuffix("_limits"), value) for name, value in limits.items()
         ):
-            x, goal = rng.uniform(low, high), rng.choice([low, high])
-            state, controls = (
-                state.replace(**{name: jnp.asarray(x)}),
-                controls | {rates[name]: share * (goal - x)},
-            )
+            x = rng.uniform(low, high)
+            goal = rng.choice([low, high])
+            state = state.replace(**{name: jnp.asarray(x)})
+            controls = controls | {rates[name]: share * (goal - x)}
         if isinstance(aircraft, Dubins2D):
             controls["heading_rate"] = 0.17
         both = (
@@ -405,7 +424,7 @@ def test_a_heading_rate_in_space_is_held_as_a_coordinated_turn(rate: float) -> N
     assert float(states[1].roll) == pytest.approx(math.atan(rate * 300.0 / GRAVITY), rel=1e-12)
     turned = np.diff([state.heading for state in states])
     np.testing.assert_allclose(turned[1:], rate, rtol=1e-12)
-    assert 0.0 < turned[0] / rate < 1.0  # it banks first
+    assert 0.0 < turned[0] / rate < 1.0  # the aircraft banks first
     flat_turn = fly(normalise(Dubins2D(name="a")), planar(), {"heading_rate": rate}, 19)
     flown = np.linalg.norm(np.diff([state.position for state in states[1:]], axis=0), axis=1)
     chords = np.linalg.norm(np.diff([state.position for state in flat_turn], axis=0), axis=1)
@@ -434,7 +453,8 @@ def test_a_heading_rate_of_zero_keeps_level_flight_straight_and_takes_bank_out()
 @pytest.mark.usefixtures("x64")
 def test_two_steps_with_held_controls_are_one_in_the_plane() -> None:
     x, rates = flat(*random_aircraft(seed=7))
-    state, controls = x[[0, 1, 3, 4]].T, rates[[3, 0]].T
+    state = x[[0, 1, 3, 4]].T
+    controls = rates[[3, 0]].T
     np.testing.assert_allclose(
         steps2d(steps2d(state, controls, 0.7), controls, 1.6),
         steps2d(state, controls, 2.3),
@@ -451,7 +471,7 @@ def test_motion_does_not_depend_on_where_it_is_and_which_way_it_points() -> None
     turned[:3] += np.array([[300.0], [-20.0], [7.0]])
     turned[3] += 1.1
     here, there = (
-        np.asarray(steps3d(one.T, rates[[2, 1, 0]].T, 1.0)).T - one for one in (x, turned)
+        np.asarray(steps3d(states.T, rates[[2, 1, 0]].T, 1.0)).T - states for states in (x, turned)
     )
     rotation = np.array([[math.cos(1.1), -math.sin(1.1)], [math.sin(1.1), math.cos(1.1)]])
     np.testing.assert_allclose(there[:2], rotation @ here[:2], rtol=0.0, atol=1e-9)
@@ -475,10 +495,15 @@ def test_the_state_s_velocity_and_orientation_point_along_its_path() -> None:
 
 
 def differences(step: Any, x: np.ndarray, controls: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Finite differences [sample, output, input] by all states and controls, to the left and to the right."""
-    both, size = np.concatenate([x, controls], axis=1), 1e-6
+    """Return finite differences to the left and to the right, by all states and controls.
+
+    Both are [sample, output, input].
+    """
+    both = np.concatenate([x, controls], axis=1)
+    size = 1e-6
     middle = np.asarray(step(x, controls, 1.0))
-    left, right = [], []
+    left = []
+    right = []
     for k in range(both.shape[1]):
         for side, columns in ((-size, left), (size, right)):
             moved = both + side * (np.arange(both.shape[1]) == k)
@@ -492,29 +517,38 @@ def differences(step: Any, x: np.ndarray, controls: np.ndarray) -> tuple[np.ndar
 @pytest.mark.parametrize("model", [2, 3])
 @pytest.mark.usefixtures("x64")
 def test_derivatives_are_finite_differences(model: int) -> None:
-    """On a limit, and at a zero rate there, the derivative lies between the differences to both sides.
+    """The derivative lies between the finite differences to both sides.
 
-    In space the nodes of the quadrature move with the times at which limits are reached, which derivatives leave out: a
-    few hundredths of a foot per radian where a radian is worth hundreds of feet.
+    The two differ on a limit and at a zero rate there.
+
+    In space the nodes of the quadrature move with the times at which limits are reached. The
+    derivatives leave that out. The error is a few hundredths of a foot per radian where a radian is
+    worth hundreds of feet.
     """
     x, rates = random_aircraft(seed=9, num=1000)
     x[:3] = 0.0
     if model == 2:
         x, rates = flat(x, rates)
-        step, jacobian, x, controls = steps2d, jacobian2d, x[[0, 1, 3, 4]].T, rates[[3, 0]].T
+        step = steps2d
+        jacobian = jacobian2d
+        x = x[[0, 1, 3, 4]].T
+        controls = rates[[3, 0]].T
         slack = np.array([1e-3, 1e-3, 1e-6, 1e-6])[None, :, None]
     else:
         rates[3] = 0.0
-        step, jacobian, x, controls = steps3d, jacobian3d, x.T, rates[[2, 1, 0]].T
+        step = steps3d
+        jacobian = jacobian3d
+        x = x.T
+        controls = rates[[2, 1, 0]].T
         slack = np.array([0.04, 0.04, 0.04, 1e-4, 1e-6, 1e-6, 1e-6])[None, :, None]
-    found = np.concatenate(jacobian(x, controls), axis=-1)
+    computed = np.concatenate(jacobian(x, controls), axis=-1)
     left, right = differences(step, x, controls)
     slack = slack + 1e-5 * np.maximum(np.abs(left), np.abs(right))
-    assert (found >= np.minimum(left, right) - slack).all()
-    assert (found <= np.maximum(left, right) + slack).all()
+    assert (computed >= np.minimum(left, right) - slack).all()
+    assert (computed <= np.maximum(left, right) + slack).all()
     smooth = np.abs(left - right) < slack
     assert smooth.mean() > 0.9
-    assert (np.abs(found) > 10.0 * slack)[smooth].mean() > 0.2  # the slack hides little
+    assert (np.abs(computed) > 10.0 * slack)[smooth].mean() > 0.2  # the slack hides little
 
 
 def test_in_float32_derivatives_are_finite_on_limits_and_at_zero_rates() -> None:

@@ -113,12 +113,12 @@ def test_a_region_moves_with_its_platform_and_lists_the_others() -> None:
 def test_mag_norm_is_the_magnitude_and_a_unit_vector_that_give_the_vector_back(
     vector: list[float],
 ) -> None:
-    found = mag_norm(jnp.asarray(vector))
-    assert found.shape == (len(vector) + 1,)
-    assert float(found[0]) == pytest.approx(np.linalg.norm(vector), rel=1e-6, abs=1e-18)
-    np.testing.assert_allclose(found[0] * found[1:], vector, rtol=1e-5, atol=1e-18)
-    assert float(safe_norm(found[1:])) == pytest.approx(
-        1.0 if float(found[0]) > 0.0 else 0.0, abs=1e-6
+    computed = mag_norm(jnp.asarray(vector))
+    assert computed.shape == (len(vector) + 1,)
+    assert float(computed[0]) == pytest.approx(np.linalg.norm(vector), rel=1e-6, abs=1e-18)
+    np.testing.assert_allclose(computed[0] * computed[1:], vector, rtol=1e-5, atol=1e-18)
+    assert float(safe_norm(computed[1:])) == pytest.approx(
+        1.0 if float(computed[0]) > 0.0 else 0.0, abs=1e-6
     )
 
 
@@ -162,7 +162,8 @@ def test_a_spatial_rotation_is_yaw_times_pitch_times_roll(
     def turn(angle: float, first: int, second: int) -> np.ndarray:
         matrix = np.eye(3)
         matrix[[first, second], [first, second]] = np.cos(angle)
-        matrix[second, first], matrix[first, second] = np.sin(angle), -np.sin(angle)
+        matrix[second, first] = np.sin(angle)
+        matrix[first, second] = -np.sin(angle)
         return matrix
 
     expected = turn(yaw, 0, 1) @ turn(pitch, 2, 0) @ turn(roll, 1, 2)
@@ -184,7 +185,8 @@ def test_a_planar_rotation_turns_x_into_the_heading_and_is_the_spatial_one_from_
 def test_what_is_seen_from_a_body_turned_back_is_the_vector(
     yaw: float, pitch: float, roll: float
 ) -> None:
-    matrix, vector = rotation(*map(jnp.float32, (yaw, pitch, roll))), jnp.asarray([3.0, -4.0, 12.0])
+    matrix = rotation(*map(jnp.float32, (yaw, pitch, roll)))
+    vector = jnp.asarray([3.0, -4.0, 12.0])
     seen = to_body(matrix, vector)
     np.testing.assert_allclose(seen, matrix.T @ vector, atol=1e-4)
     np.testing.assert_allclose(matrix @ seen, vector, atol=1e-4)

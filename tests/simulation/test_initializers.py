@@ -1,7 +1,8 @@
-"""Random starts: ranges, distributions (Kolmogorov-Smirnov) and independence, Tables 3 and 4.
+"""Random starts against Tables 3 and 4: ranges, distributions and independence.
 
-The keys are fixed, so a test either always passes or always fails; at the level used here a right sampler with other
-keys would fail one comparison in a thousand.
+The statistics are Kolmogorov-Smirnov's and Spearman's. The keys are fixed, so a test either always
+passes or always fails. At the level used here a correct sampler with other keys would fail one
+comparison in a thousand.
 """
 
 from itertools import combinations
@@ -29,11 +30,16 @@ draw_starts = jax.jit(jax.vmap(jaxsafe.reset, in_axes=(None, 0)))
 
 
 def measure(env: Environment, seed: int = 0) -> dict[str, np.ndarray]:
-    """What is drawn at each of many starts, from the positions and velocities alone."""
+    """Return what is drawn at each of many starts.
+
+    It is computed from the positions and velocities alone.
+    """
     state, _ = draw_starts(env, jax.random.split(jax.random.key(seed), NUM_STARTS))
     deputy = state.sim.platforms["deputy"]
-    position, velocity = np.asarray(deputy.position, float), np.asarray(deputy.velocity, float)
-    distance, speed = np.linalg.norm(position, axis=1), np.linalg.norm(velocity, axis=1)
+    position = np.asarray(deputy.position, float)
+    velocity = np.asarray(deputy.velocity, float)
+    distance = np.linalg.norm(position, axis=1)
+    speed = np.linalg.norm(velocity, axis=1)
     drawn = {"distance": distance, "share": speed / (0.2 + 2 * N * distance)}
     for name, vector, norm in (("position", position, distance), ("velocity", velocity, speed)):
         drawn[f"{name} azimuth"] = np.arctan2(vector[:, 1], vector[:, 0]) % (2 * np.pi)
@@ -85,17 +91,17 @@ def test_a_spatial_start_has_six_random_numbers_and_a_planar_one_four() -> None:
 
 
 def test_what_is_drawn_is_drawn_independently(starts: dict[str, np.ndarray]) -> None:
-    for one, other in combinations(starts, 2):
-        assert spearmanr(starts[one], starts[other]).pvalue > LEVEL, (one, other)
+    for first, second in combinations(starts, 2):
+        assert spearmanr(starts[first], starts[second]).pvalue > LEVEL, (first, second)
 
 
 def test_all_starts_differ_and_other_keys_give_other_starts(starts: dict[str, np.ndarray]) -> None:
     for sample in starts.values():
         assert len(np.unique(sample)) > 0.99 * NUM_STARTS
     env = jaxsafe.make("docking2d")
-    one, again, other = (measure(env, seed)["distance"] for seed in (5, 5, 6))
-    np.testing.assert_array_equal(one, again)
-    assert not np.isin(one, other).any()
+    first, again, second = (measure(env, seed)["distance"] for seed in (5, 5, 6))
+    np.testing.assert_array_equal(first, again)
+    assert not np.isin(first, second).any()
 
 
 def test_the_chief_starts_at_rest_at_the_origin_and_no_thrust_has_acted() -> None:
@@ -108,7 +114,8 @@ def test_the_chief_starts_at_rest_at_the_origin_and_no_thrust_has_acted() -> Non
 def test_ranges_can_be_overridden_without_compiling_anew() -> None:
     chex.clear_trace_counter()
     reset = jax.jit(chex.assert_max_traces(jaxsafe.reset, n=1))
-    env, key = jaxsafe.make("docking2d"), jax.random.key(3)
+    env = jaxsafe.make("docking2d")
+    key = jax.random.key(3)
     reset(env, key)
     changes = {
         "deputy.start.position.distance": [7, 7],
@@ -166,7 +173,8 @@ def test_a_uniform_scalar_is_uniform_between_its_bounds() -> None:
 
 
 def test_a_uniform_vector_is_uniform_and_independent_in_each_component() -> None:
-    low, high = (-1.0, 5.0, 12_000.0), (1.0, 5.0, 14_000.0)
+    low = (-1.0, 5.0, 12_000.0)
+    high = (1.0, 5.0, 14_000.0)
     sample = draw(Uniform(name="position", low=low, high=high))
     assert is_uniform(sample[:, 0], -1.0, 1.0)
     assert is_uniform(sample[:, 2], 12_000.0, 14_000.0)
@@ -198,7 +206,8 @@ def test_around_at_altitude_is_uniform_in_horizontal_distance_azimuth_and_altitu
         name="position", about="lead", distance=(5.0, 10.0), altitude=(-3.0, 16.0)
     )
     sample = draw(around, NOWHERE.replace(platforms={"lead": lead}))
-    x, y = sample[:, 0] - 300.0, sample[:, 1] + 200.0
+    x = sample[:, 0] - 300.0
+    y = sample[:, 1] + 200.0
     drawn = {
         "distance": np.hypot(x, y),
         "azimuth": np.arctan2(y, x) % (2 * np.pi),
@@ -210,8 +219,8 @@ def test_around_at_altitude_is_uniform_in_horizontal_distance_azimuth_and_altitu
         "altitude": (-3, 16),
     }.items():
         assert is_uniform(drawn[name], low, high), name
-    for one, other in combinations(drawn, 2):
-        assert spearmanr(drawn[one], drawn[other]).pvalue > LEVEL, (one, other)
+    for first, second in combinations(drawn, 2):
+        assert spearmanr(drawn[first], drawn[second]).pvalue > LEVEL, (first, second)
 
 
 # The rejoin and oriented tasks
@@ -220,7 +229,8 @@ def test_around_at_altitude_is_uniform_in_horizontal_distance_azimuth_and_altitu
 @pytest.mark.parametrize("task", ["rejoin2d", "rejoin3d"])
 def test_a_rejoin_starts_as_in_table_3(task: str) -> None:
     state, _ = draw_starts(jaxsafe.make(task), jax.random.split(jax.random.key(7), NUM_STARTS))
-    lead, wingman = state.sim.platforms["lead"], state.sim.platforms["wingman"]
+    lead = state.sim.platforms["lead"]
+    wingman = state.sim.platforms["wingman"]
     x, y = np.asarray(wingman.position - lead.position, float).T[:2]
     drawn = {
         "lead x": (lead.position[:, 0], 5000.0, 10_000.0),
@@ -240,8 +250,8 @@ def test_a_rejoin_starts_as_in_table_3(task: str) -> None:
             assert not craft.flight_path_angle.any()
     for name, (sample, low, high) in drawn.items():
         assert is_uniform(np.asarray(sample, float), low, high), name
-    for one, other in combinations(drawn, 2):
-        assert spearmanr(drawn[one][0], drawn[other][0]).pvalue > LEVEL, (one, other)
+    for first, second in combinations(drawn, 2):
+        assert spearmanr(drawn[first][0], drawn[second][0]).pvalue > LEVEL, (first, second)
 
 
 def test_an_oriented_start_has_any_attitude_and_no_turn_rate() -> None:

@@ -1,4 +1,7 @@
-"""Ratios of sines, ramps that rest at a limit, and Gauss-Legendre quadrature, against scipy and exact fractions."""
+"""Ratios of sines, ramps that rest at a limit, and Gauss-Legendre quadrature.
+
+They are compared with scipy and with exact fractions.
+"""
 
 import math
 from fractions import Fraction
@@ -42,9 +45,13 @@ EDGES = [
 
 
 def series(tau: float, first: int) -> float:
-    """Σ (−1)ᵏ τ²ᵏ/(2k + first)! in exact fractions: sin τ/τ, (1 − cos τ)/τ² and (τ − sin τ)/τ³ for first = 1, 2, 3."""
+    """Return Σ (−1)ᵏ τ²ᵏ/(2k + first)! in exact fractions.
+
+    For first = 1, 2, 3 it is sin τ/τ, (1 − cos τ)/τ² and (τ − sin τ)/τ³.
+    """
     term = Fraction(1, math.factorial(first))
-    total, square = term, Fraction(tau) ** 2
+    total = term
+    square = Fraction(tau) ** 2
     for k in range(1, 400):
         term *= -square / ((2 * k + first - 1) * (2 * k + first))
         total += term
@@ -57,13 +64,13 @@ def series(tau: float, first: int) -> float:
 @pytest.mark.usefixtures("x64")
 def test_the_ratios_of_sines_are_their_series(tau: float) -> None:
     for sign in (1.0, -1.0):
-        for found, first in zip(sine_ratios(jnp.float64(sign * tau)), (1, 2, 3), strict=True):
-            np.testing.assert_allclose(found, series(tau, first), rtol=1e-14, atol=1e-16)
+        for computed, first in zip(sine_ratios(jnp.float64(sign * tau)), (1, 2, 3), strict=True):
+            np.testing.assert_allclose(computed, series(tau, first), rtol=1e-14, atol=1e-16)
 
 
 @pytest.mark.usefixtures("x64")
 def test_the_derivatives_of_the_ratios_satisfy_their_recurrence() -> None:
-    """Each ratio c_k has τ c_k′ = c_(k−1) − k c_k, with c₀ = cos τ."""
+    """Each ratio c_k obeys τ c_k′ = c_(k−1) − k c_k, with c₀ = cos τ."""
     taus = jnp.asarray([*EDGES, *(-edge for edge in EDGES)])
     values = jax.vmap(sine_ratios)(taus)
     first, second = (
@@ -79,10 +86,10 @@ def test_the_derivatives_of_the_ratios_satisfy_their_recurrence() -> None:
 
 def test_in_float32_the_ratios_keep_six_digits_near_zero_and_beyond() -> None:
     for tau in (0.0, 1e-20, 1e-6, 1e-3, 0.03, 0.99, 1.01, 3.0):
-        for found, first in zip(sine_ratios(jnp.float32(tau)), (1, 2, 3), strict=True):
-            assert found.dtype == jnp.float32
+        for computed, first in zip(sine_ratios(jnp.float32(tau)), (1, 2, 3), strict=True):
+            assert computed.dtype == jnp.float32
             np.testing.assert_allclose(
-                found, series(float(np.float32(tau)), first), rtol=1e-6, atol=1e-7
+                computed, series(float(np.float32(tau)), first), rtol=1e-6, atol=1e-7
             )
 
 

@@ -1,4 +1,7 @@
-"""Oriented spacecraft: one step against scipy's integrator, split where the turn rate reaches its limit, Eqs. (18)-(20)."""
+"""Oriented spacecraft, Eqs. (18)-(20): one step against scipy's integrator.
+
+The reference is split where the turn rate reaches its limit.
+"""
 
 import math
 from typing import Any
@@ -20,7 +23,7 @@ TURN = math.pi / 180.0
 
 
 def step(x: Any, controls: Any, dt: Any = 1.0) -> jax.Array:
-    """One step of [x, y, ẋ, ẏ, θ, θ̇] under [thrust, θ̈], both as vectors."""
+    """Return [x, y, ẋ, ẏ, θ, θ̇] one step later under the controls [thrust, θ̈]."""
     craft = normalise(OrientedSpacecraft(name="craft"))
     state = OrientedState(x[:2], x[2:4], jnp.zeros(1), x[4], x[5])
     after = craft.step(state, {"thrust": controls[0], "attitude_acceleration": controls[1]}, dt)
@@ -34,7 +37,12 @@ jacobian = jax.jit(jax.vmap(jax.jacfwd(step, argnums=(0, 1))))
 
 
 def exact(x: np.ndarray, controls: np.ndarray, dt: float) -> np.ndarray:
-    """The flow of Eq. (20) over dt of states [6, n] under [2, n] by solve_ivp, restarted where the turn rate rests."""
+    """Return the flow of Eq. (20) over dt by `solve_ivp`.
+
+    The integration restarts where the turn rate reaches its limit and rests there.
+
+    States are [6, n] and controls [2, n].
+    """
     thrust, turn = controls
     to_go = np.where(turn > 0.0, RATE_LIMIT, -RATE_LIMIT) - x[5]
     stop = np.clip(np.divide(to_go, turn, out=np.full_like(turn, dt), where=turn != 0.0), 0.0, dt)
@@ -58,12 +66,14 @@ def exact(x: np.ndarray, controls: np.ndarray, dt: float) -> np.ndarray:
 
 
 def random_craft(seed: int, num: int = NUM) -> tuple[np.ndarray, np.ndarray]:
-    """States [6, num] and controls [2, num]; a fifth of each on the rate's limit, just off it, with a zero control."""
+    """Draw states [6, num] and controls [2, num].
+
+    In a fifth of the samples the turn rate is on its limit, in a fifth just off it, and in a fifth
+    a control is zero.
+    """
     rng = np.random.default_rng(seed)
-    rate, end = (
-        rng.uniform(-RATE_LIMIT, RATE_LIMIT, num),
-        rng.choice([-RATE_LIMIT, RATE_LIMIT], num),
-    )
+    rate = rng.uniform(-RATE_LIMIT, RATE_LIMIT, num)
+    end = rng.choice([-RATE_LIMIT, RATE_LIMIT], num)
     kind = rng.integers(5, size=num)
     rate[kind == 0], rate[kind == 1] = end[kind == 0], 0.9999 * end[kind == 1]
     planar = np.concatenate([rng.uniform(-150, 150, (2, num)), rng.uniform(-0.5, 0.5, (2, num))])
@@ -73,7 +83,7 @@ def random_craft(seed: int, num: int = NUM) -> tuple[np.ndarray, np.ndarray]:
 
 
 def unwrapped(difference: np.ndarray) -> np.ndarray:
-    """The angle in [−π, π) that is a difference of angles but for whole turns."""
+    """Return the angle in [−π, π) that differs from a difference of angles by whole turns."""
     return (difference + math.pi) % (2.0 * math.pi) - math.pi
 
 
@@ -82,27 +92,27 @@ def test_a_step_is_within_a_hundredth_of_a_millionth_of_a_metre() -> None:
     x, controls = random_craft(seed=1)
     assert np.mean(np.abs(x[5] + controls[1]) > RATE_LIMIT) > 0.1
     expected = exact(x, controls, 1.0)
-    found = np.asarray(steps(x.T, controls.T, 1.0)).T
-    np.testing.assert_allclose(found[:4], expected[:4], rtol=0.0, atol=1e-8)
-    np.testing.assert_allclose(unwrapped(found[4] - expected[4]), 0.0, atol=1e-12)
-    np.testing.assert_allclose(found[5], expected[5], rtol=0.0, atol=1e-15)
+    computed = np.asarray(steps(x.T, controls.T, 1.0)).T
+    np.testing.assert_allclose(computed[:4], expected[:4], rtol=0.0, atol=1e-8)
+    np.testing.assert_allclose(unwrapped(computed[4] - expected[4]), 0.0, atol=1e-12)
+    np.testing.assert_allclose(computed[5], expected[5], rtol=0.0, atol=1e-15)
 
 
 @pytest.mark.usefixtures("x64")
 def test_a_step_of_ten_seconds_reaches_the_limit_from_anywhere_and_is_still_close() -> None:
     x, controls = random_craft(seed=2)
-    found, expected = np.asarray(steps(x.T, controls.T, 10.0)).T, exact(x, controls, 10.0)
-    np.testing.assert_allclose(found[:4], expected[:4], rtol=0.0, atol=5e-5)
-    np.testing.assert_allclose(unwrapped(found[4] - expected[4]), 0.0, atol=1e-11)
+    computed = np.asarray(steps(x.T, controls.T, 10.0)).T
+    expected = exact(x, controls, 10.0)
+    np.testing.assert_allclose(computed[:4], expected[:4], rtol=0.0, atol=5e-5)
+    np.testing.assert_allclose(unwrapped(computed[4] - expected[4]), 0.0, atol=1e-11)
 
 
 @pytest.mark.usefixtures("x64")
 def test_the_error_falls_with_the_sixth_power_of_the_step() -> None:
-    start, controls = (
-        np.array([[90.0, -40.0, 0.2, 0.1, 0.3, -RATE_LIMIT]]),
-        np.array([[2.0, RATE_LIMIT / 100.0]]),
-    )
-    expected, errors = exact(start.T, controls.T, 160.0), []
+    start = np.array([[90.0, -40.0, 0.2, 0.1, 0.3, -RATE_LIMIT]])
+    controls = np.array([[2.0, RATE_LIMIT / 100.0]])
+    expected = exact(start.T, controls.T, 160.0)
+    errors = []
     for num_steps in (4, 8, 16):
         x = start
         for _ in range(num_steps):
@@ -115,19 +125,18 @@ def test_the_error_falls_with_the_sixth_power_of_the_step() -> None:
 
 def test_in_float32_a_step_has_six_digits() -> None:
     x, controls = (array.astype(np.float32) for array in random_craft(seed=3))
-    found, expected = (
-        np.asarray(steps(x.T, controls.T, 1.0)).T,
-        exact(x.astype(float), controls.astype(float), 1.0),
-    )
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found[:2], expected[:2], rtol=0.0, atol=150 * 4e-7)
-    np.testing.assert_allclose(found[2:4], expected[2:4], rtol=0.0, atol=4e-7)
+    computed = np.asarray(steps(x.T, controls.T, 1.0)).T
+    expected = exact(x.astype(float), controls.astype(float), 1.0)
+    assert computed.dtype == np.float32
+    np.testing.assert_allclose(computed[:2], expected[:2], rtol=0.0, atol=150 * 4e-7)
+    np.testing.assert_allclose(computed[2:4], expected[2:4], rtol=0.0, atol=4e-7)
 
 
 @pytest.mark.usefixtures("x64")
 def test_without_a_turn_it_is_a_spacecraft_with_the_thrust_rotated() -> None:
     x, controls = random_craft(seed=4, num=500)
-    x[5], controls[1] = 0.0, 0.0
+    x[5] = 0.0
+    controls[1] = 0.0
     point = normalise(Spacecraft(name="point", dimension=2))
 
     def plain(x: jax.Array, thrust: jax.Array) -> jax.Array:
@@ -135,11 +144,11 @@ def test_without_a_turn_it_is_a_spacecraft_with_the_thrust_rotated() -> None:
         after = point.step(SpacecraftState(x[:2], x[2:4], jnp.zeros(2)), thrusts, 1.0)
         return jnp.concatenate([after.position, after.velocity])
 
-    found = steps(x.T, controls.T, 1.0)
+    computed = steps(x.T, controls.T, 1.0)
     np.testing.assert_allclose(
-        found[:, :4], jax.vmap(plain)(x.T, controls[0]), rtol=0.0, atol=1e-12
+        computed[:, :4], jax.vmap(plain)(x.T, controls[0]), rtol=0.0, atol=1e-12
     )
-    np.testing.assert_allclose(found[:, 4], x[4], rtol=0.0, atol=1e-14)
+    np.testing.assert_allclose(computed[:, 4], x[4], rtol=0.0, atol=1e-14)
 
 
 @pytest.mark.usefixtures("x64")
@@ -160,16 +169,17 @@ def at(attitude: float, rate: float) -> OrientedState:
 
 
 def test_the_turn_rate_rests_at_its_limit() -> None:
-    craft, state = normalise(OrientedSpacecraft(name="craft")), at(0.0, 0.0)
-    rates, attitudes = [], []
+    craft = normalise(OrientedSpacecraft(name="craft"))
+    state = at(0.0, 0.0)
+    rates = []
+    attitudes = []
     for _ in range(5):
         state = craft.step(state, {"attitude_acceleration": 0.75 * RATE_LIMIT}, 1.0)
         rates.append(float(state.attitude_rate))
         attitudes.append(float(state.attitude))
     np.testing.assert_allclose(np.array(rates) / RATE_LIMIT, [0.75, 1, 1, 1, 1], rtol=1e-6)
-    second = (
-        0.75 / 3 + 0.75 / 3 / 6 + 2 / 3
-    )  # a third of a second until the limit, at it afterwards
+    # The turn rate takes a third of a second to reach its limit and stays on it afterwards.
+    second = 0.75 / 3 + 0.75 / 3 / 6 + 2 / 3
     np.testing.assert_allclose(
         np.array(attitudes) / RATE_LIMIT, np.cumsum([0.375, second, 1, 1, 1]), rtol=1e-5
     )
@@ -234,11 +244,15 @@ def test_a_quarter_turn_of_the_attitude_points_the_body_along_y() -> None:
 
 @pytest.mark.usefixtures("x64")
 def test_derivatives_are_finite_differences() -> None:
-    """On the limit, and at a zero control there, the derivative lies between the differences to both sides."""
+    """The derivative lies between the finite differences to both sides.
+
+    The two differ on the limit and at a zero control there.
+    """
     x, controls = random_craft(seed=6, num=500)
-    x[4] *= 0.99  # no wrapping in between
-    both, size = np.concatenate([x, controls]).T, 1e-6
-    found = np.concatenate(jacobian(both[:, :6], both[:, 6:]), axis=-1)
+    x[4] *= 0.99  # so that no angle wraps in between
+    both = np.concatenate([x, controls]).T
+    size = 1e-6
+    computed = np.concatenate(jacobian(both[:, :6], both[:, 6:]), axis=-1)
     middle = np.asarray(steps(both[:, :6], both[:, 6:], 1.0))
     for k in range(8):
         sides = []
@@ -246,8 +260,8 @@ def test_derivatives_are_finite_differences() -> None:
             moved = both + side * (np.arange(8) == k)
             sides.append((np.asarray(steps(moved[:, :6], moved[:, 6:], 1.0)) - middle) / side)
         slack = 1e-7 + 1e-5 * np.abs(sides[0])
-        assert (found[..., k] >= np.minimum(*sides) - slack).all(), k
-        assert (found[..., k] <= np.maximum(*sides) + slack).all(), k
+        assert (computed[..., k] >= np.minimum(*sides) - slack).all(), k
+        assert (computed[..., k] <= np.maximum(*sides) + slack).all(), k
 
 
 def test_in_float32_derivatives_are_finite_on_the_limit_and_at_zero_controls() -> None:

@@ -1,4 +1,4 @@
-"""Scripted platforms: commands as functions of time, and what is wrong with them."""
+"""Scripted platforms: their commands are functions of time, and faulty commands are refused."""
 
 import math
 from typing import Any
@@ -16,7 +16,7 @@ from jaxsafe.types import Sim
 
 
 def at(time: float) -> Sim:
-    """A world of which commands see the time alone."""
+    """Return a simulation at a time. Commands see nothing else of it."""
     return Sim(jnp.asarray(time), {}, {}, {}, {}, jnp.zeros((), bool))
 
 
@@ -59,8 +59,8 @@ def test_a_script_names_its_commands_and_takes_no_actions() -> None:
     assert script.names == ("b", "a")
     assert script.points == ()
     assert not script.takes_actions
-    found = script.control(jnp.zeros(0), at(1.0))
-    assert {name: float(value) for name, value in found.items()} == pytest.approx(
+    computed = script.control(jnp.zeros(0), at(1.0))
+    assert {name: float(value) for name, value in computed.items()} == pytest.approx(
         {"b": 1.0, "a": 2.0}
     )
     assert Scripted().control(jnp.zeros(0), at(0.0)) == {}
@@ -88,13 +88,14 @@ def test_a_schedule_in_ascending_order_has_no_problem() -> None:
 
 
 def follow(controller: Any, num_steps: int) -> list[Any]:
-    """The lead's states along an episode of rejoin2d, the start first."""
+    """Return the lead's states along an episode of rejoin2d, the start first."""
     env = jaxsafe.make("rejoin2d", {"lead.controller": normalise(controller)})
     start = {"position": [0.0, 0.0], "heading": 0.0, "speed": 300.0}
     state, _ = jaxsafe.reset_to(
         env, {"lead": start, "wingman": start | {"position": [5000.0, 0.0]}}
     )
-    step, states = jax.jit(jaxsafe.step), [state.sim.platforms["lead"]]
+    step = jax.jit(jaxsafe.step)
+    states = [state.sim.platforms["lead"]]
     for _ in range(num_steps):
         state, _ = step(env, state, jnp.zeros(2))
         states.append(state.sim.platforms["lead"])
@@ -122,18 +123,56 @@ def test_a_weaving_lead_comes_back_to_its_heading_after_a_period() -> None:
 @pytest.mark.parametrize(
     ("controller", "message"),
     [
-        ({"type": "scripted", "commands": [{"type": "constant", "name": "heading_rat", "at": 0}]},
-         r"platforms\.lead\.controller\.commands: dubins2d has no control 'heading_rat'; .* Did you mean 'heading_rate'\?"),
-        ({"type": "scripted", "commands": [{"type": "constant", "name": "heading_rate", "at": 0}] * 2},
-         r"platforms\.lead\.controller\.commands: the name 'heading_rate' stands twice"),
-        ({"type": "scripted", "commands": [{"type": "sinusoid", "name": "heading_rate", "amplitude": 1, "period": 0}]},
-         r"lead\.controller\.commands\.heading_rate\.period: expected a number in s > 0, found 0"),
-        ({"type": "scripted", "commands": [{"type": "constat", "name": "heading_rate", "at": 0}]},
-         r"heading_rate: unknown type 'constat'; choose from constant, .*schedule, sinusoid\. Did you mean 'constant'\?"),
-        ({"type": "scripted", "commands": [{"type": "schedule", "name": "heading_rate", "times": 1, "values": [1]}]},
-         r"heading_rate\.times: expected a list of numbers in s, found 1"),
+        (
+            {
+                "type": "scripted",
+                "commands": [{"type": "constant", "name": "heading_rat", "at": 0}],
+            },
+            (
+                r"platforms\.lead\.controller\.commands: dubins2d has no control 'heading_rat'; .*"
+                r" Did you mean 'heading_rate'\?"
+            ),
+        ),
+        (
+            {
+                "type": "scripted",
+                "commands": [{"type": "constant", "name": "heading_rate", "at": 0}] * 2,
+            },
+            r"platforms\.lead\.controller\.commands: the name 'heading_rate' stands twice",
+        ),
+        (
+            {
+                "type": "scripted",
+                "commands": [
+                    {"type": "sinusoid", "name": "heading_rate", "amplitude": 1, "period": 0}
+                ],
+            },
+            (
+                r"lead\.controller\.commands\.heading_rate\.period: expected a number in s > 0,"
+                r" found 0"
+            ),
+        ),
+        (
+            {
+                "type": "scripted",
+                "commands": [{"type": "constat", "name": "heading_rate", "at": 0}],
+            },
+            (
+                r"heading_rate: unknown type 'constat'; choose from constant, .*schedule,"
+                r" sinusoid\. Did you mean 'constant'\?"
+            ),
+        ),
+        (
+            {
+                "type": "scripted",
+                "commands": [
+                    {"type": "schedule", "name": "heading_rate", "times": 1, "values": [1]}
+                ],
+            },
+            r"heading_rate\.times: expected a list of numbers in s, found 1",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_bad_script_is_told_in_one_line(controller: Any, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as caught:
         jaxsafe.make("rejoin2d", {"lead.controller": controller})

@@ -103,10 +103,10 @@ def test_a_wrapped_angle_is_in_its_range_and_differs_by_whole_periods(
     low: float, period: float
 ) -> None:
     x = np.random.default_rng(0).uniform(-50.0, 50.0, 10_000).astype(np.float32)
-    found = np.asarray(wrap(x, low, period), float)
-    assert (found >= low - 1e-5).all()
-    assert (found < low + period + 1e-5).all()
-    turns = (x - found) / period
+    computed = np.asarray(wrap(x, low, period), float)
+    assert (computed >= low - 1e-5).all()
+    assert (computed < low + period + 1e-5).all()
+    turns = (x - computed) / period
     np.testing.assert_allclose(turns, np.round(turns), atol=1e-5)
     inside = x[(x > low + 0.01) & (x < low + period - 0.01)]
     np.testing.assert_array_equal(wrap(inside, low, period), inside)

@@ -57,11 +57,11 @@ def test_a_line_that_is_no_row_of_the_log_is_an_error_that_names_it(tmp_path: Pa
     ],
 )
 def test_a_row_of_another_form_is_told_with_its_line_and_place(
-    tmp_path: Path, row: dict, found: str
+    tmp_path: Path, row: dict, fault: str
 ) -> None:
     log = tmp_path / "log.jsonl"
     log.write_text('{"step": 0, "at": [], "more": [1, null]}\n' + json.dumps(row) + "\n")
-    with pytest.raises(ConfigError, match=rf"log\.jsonl, line 2: not a row of this log: {found}"):
+    with pytest.raises(ConfigError, match=rf"log\.jsonl, line 2: not a row of this log: {fault}"):
         read_rows(log, {"step": COUNT, "at": [{OTHERS: NUMBER_OR_NULL}], "more": numbers(2)})
 
 

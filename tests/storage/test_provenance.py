@@ -1,4 +1,4 @@
-"""What a result is said to be made by."""
+"""Provenance: the record of what made a result."""
 
 import platform
 import subprocess
@@ -73,13 +73,18 @@ def test_a_package_inside_another_repository_has_no_commit(
 @pytest.mark.parametrize(
     ("text", "name"),
     [
-        ("processor\t: 0\ncpu family\t: 25\nmodel\t\t: 17\nmodel name\t: AMD EPYC\n\nmodel name: other\n",
-         "AMD EPYC, family 25, model 17"),
+        (
+            (
+                "processor\t: 0\ncpu family\t: 25\nmodel\t\t: 17\nmodel name\t: AMD EPYC\n\nmodel"
+                " name: other\n"
+            ),
+            "AMD EPYC, family 25, model 17",
+        ),
         ("model name\t: Some: Core\n", "Some: Core"),
         ("BogoMIPS\t: 50.00\n", "that of the platform"),
         (None, "that of the platform"),
     ],
-)  # fmt: skip
+)
 def test_a_processor_is_named_with_what_tells_kinds_of_one_name_apart(
     text: str | None, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -46,13 +46,13 @@ def test_a_grid_has_every_combination() -> None:
     arguments = options(
         "sweep.ppo.gamma=[0.9,0.95,1]", "sweep.env.reward.delta_v.scale=[-0.01,-0.02]"
     )
-    found = settings(arguments, pop_sweep(arguments), None, 0)
-    assert len({tuple(each.changes.values()) for each in found}) == 6
-    for each in found:
-        assert float(each.config.ppo.gamma) == pytest.approx(each.changes["ppo.gamma"])
-        term = next(term for term in each.env.reward if term.name == "delta_v")
-        assert float(term.scale) == pytest.approx(each.changes["env.reward.delta_v.scale"])  # type: ignore[attr-defined]
-    assert alike(found, range(6)) == [list(range(6))]
+    chosen = settings(arguments, pop_sweep(arguments), None, 0)
+    assert len({tuple(setting.changes.values()) for setting in chosen}) == 6
+    for setting in chosen:
+        assert float(setting.config.ppo.gamma) == pytest.approx(setting.changes["ppo.gamma"])
+        term = next(term for term in setting.env.reward if term.name == "delta_v")
+        assert float(term.scale) == pytest.approx(setting.changes["env.reward.delta_v.scale"])  # type: ignore[attr-defined]
+    assert alike(chosen, range(6)) == [list(range(6))]
 
 
 def test_draws_lie_in_their_range_and_can_be_repeated() -> None:
@@ -60,19 +60,20 @@ def test_draws_lie_in_their_range_and_can_be_repeated() -> None:
     sweep = pop_sweep(arguments)
     assert sweep["ppo.learning_rate"] == Span(1e-4, 1e-2, log=True)
     first, again, other = (settings(arguments, sweep, 30, draw) for draw in (0, 0, 1))
-    assert [each.changes for each in first] == [each.changes for each in again]
-    assert [each.changes for each in first] != [each.changes for each in other]
-    rates = np.array([each.changes["ppo.learning_rate"] for each in first])
+    assert [setting.changes for setting in first] == [setting.changes for setting in again]
+    assert [setting.changes for setting in first] != [setting.changes for setting in other]
+    rates = np.array([setting.changes["ppo.learning_rate"] for setting in first])
     assert ((rates >= 1e-4) & (rates <= 1e-2)).all()
-    assert 6 < (rates < 1e-3).sum() < 24  # half of them, as the logarithm is uniform
-    assert {each.changes["ppo.gamma"] for each in first} == {0.9, 0.99}
+    # half of the rates are below, because the logarithm is uniform
+    assert 6 < (rates < 1e-3).sum() < 24
+    assert {setting.changes["ppo.gamma"] for setting in first} == {0.9, 0.99}
 
 
 def test_settings_that_differ_in_sizes_are_compiled_apart() -> None:
     arguments = options("sweep.agent.hidden=[[8],[8,8]]", "sweep.ppo.clip=[0.1,0.2]")
-    found = settings(arguments, pop_sweep(arguments), None, 0)
-    assert alike(found, range(4)) == [[0, 1], [2, 3]]
-    assert alike(found, [1, 2]) == [[1], [2]]
+    chosen = settings(arguments, pop_sweep(arguments), None, 0)
+    assert alike(chosen, range(4)) == [[0, 1], [2, 3]]
+    assert alike(chosen, [1, 2]) == [[1], [2]]
 
 
 @pytest.mark.parametrize(
@@ -81,7 +82,10 @@ def test_settings_that_differ_in_sizes_are_compiled_apart() -> None:
         ([], "sweep: nothing to sweep; for instance sweep.ppo.gamma=[0.95,0.97,0.99]"),
         (
             ["sweep.ppo.gamma=0.9"],
-            "sweep.ppo.gamma: expected a list [a,b,…], uniform(low,high) or log(low,high), found 0.9",
+            (
+                "sweep.ppo.gamma: expected a list [a,b,…], uniform(low,high) or log(low,high),"
+                " found 0.9"
+            ),
         ),
         (["sweep.ppo.gamma=[]"], "sweep.ppo.gamma: expected a list"),
         (
@@ -120,7 +124,10 @@ def test_what_cannot_be_swept_is_said_in_one_line(words: list[str], message: str
 
 
 def test_a_setting_learns_what_the_same_training_learns(swept: Path, whole: Path) -> None:
-    """Of the fixture `whole`: the same options, γ and batches of 16 steps as in the recipe and in `TINY`."""
+    """The other training is that of the fixture `whole`.
+
+    It has the same options. γ and batches of 16 steps are as in the recipe and in `TINY`.
+    """
     row = next(
         row
         for row in results(swept).values()
@@ -128,11 +135,11 @@ def test_a_setting_learns_what_the_same_training_learns(swept: Path, whole: Path
     )
     progress = [json.loads(line) for line in (whole / "progress.jsonl").read_text().splitlines()]
     for seed in range(3):
-        own = [each for each in progress if each["seed"] == seed]
-        assert row["curve"]["steps"] == [each["step"] for each in own]
+        own = [setting for setting in progress if setting["seed"] == seed]
+        assert row["curve"]["steps"] == [setting["step"] for setting in own]
         np.testing.assert_allclose(
             row["curve"]["success_rate"][seed],
-            [each["success_rate"] or 0.0 for each in own],
+            [setting["success_rate"] or 0.0 for setting in own],
             atol=1e-4,
         )
         assert row["training_return"][seed] == pytest.approx(own[-1]["return"], rel=1e-4)
@@ -143,11 +150,11 @@ def test_a_setting_learns_what_the_same_training_learns(swept: Path, whole: Path
     evaluation = json.loads((whole / "results.json").read_text())["evaluation"]
     for kind, metrics in evaluation.items():
         for name, metric in metrics.items():
-            found, expected = (
+            chosen, expected = (
                 np.array(values, float)
                 for values in (row["evaluation"][kind][name], metric["per_seed"])
             )
-            np.testing.assert_allclose(found, expected, rtol=1e-4, err_msg=name)
+            np.testing.assert_allclose(chosen, expected, rtol=1e-4, err_msg=name)
     other = next(
         row
         for row in results(swept).values()
@@ -172,12 +179,16 @@ def test_the_table_ranks_every_setting(swept: Path) -> None:
 )
 def test_each_rank_has_its_best_first(rank: str, order: list[int]) -> None:
     def row(steps: int | None, success: float, deterministic: float) -> dict[str, Any]:
-        found = {
+        chosen = {
             "stochastic": {"success_rate": [success]},
             "deterministic": {"success_rate": [deterministic]},
         }
         curve = {"success_rate": [[0.5]]}
-        return {"interaction_efficiency": {"timesteps": steps}, "evaluation": found, "curve": curve}
+        return {
+            "interaction_efficiency": {"timesteps": steps},
+            "evaluation": chosen,
+            "curve": curve,
+        }
 
     rows = [row(200, 0.8, 1.0), row(None, 0.9, 0.7), row(100, 0.7, 0.9)]
     assert sorted(range(3), key=lambda index: _key(rows[index], rank)) == order
@@ -193,8 +204,8 @@ def test_the_table_leaves_out_violations_that_were_not_counted(swept: Path) -> N
 
 def test_a_group_of_one_trains_once() -> None:
     arguments = options("sweep.agent.hidden=[[8],[8,8]]")
-    found = settings(arguments, pop_sweep(arguments), None, 0)
-    assert Lanes(found[0], 1).at_once == 1
+    chosen = settings(arguments, pop_sweep(arguments), None, 0)
+    assert Lanes(chosen[0], 1).at_once == 1
 
 
 def test_a_sweep_does_not_go_on_by_another_recipe(swept: Path, tmp_path: Path) -> None:
@@ -286,7 +297,7 @@ def test_an_interrupted_sweep_says_how_to_go_on(
     monkeypatch.setattr("jaxsafe.tune.lanes.train_all", interrupted)
     assert command.main([*SWEEP, f"out={tmp_path / 'sweep'}"]) == cli.INTERRUPTED
     said = capsys.readouterr().out.splitlines()[-1]
-    assert (
-        said
-        == f"stopped with 0 of 4 settings; go on with: python -m jaxsafe.tune resume={tmp_path / 'sweep'}"
+    assert said == (
+        "stopped with 0 of 4 settings; go on with:"
+        f" python -m jaxsafe.tune resume={tmp_path / 'sweep'}"
     )
