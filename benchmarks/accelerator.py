@@ -142,10 +142,8 @@ def main() -> None:
         out=str(OUT),
         seconds="",
     )
-    chosen, tasks = (
-        several("parts", options["parts"], PARTS),
-        several("tasks", options["tasks"], TASKS),
-    )
+    chosen = several("parts", options["parts"], PARTS)
+    tasks = several("tasks", options["tasks"], TASKS)
     if "probe" in options:
         probe(options, tasks)
         return
@@ -263,10 +261,8 @@ def numbers(request: Request) -> Iterator[dict[str, Any]]:
         overdue.start()
         for line in process.stdout or ():
             print(line, end="", file=sys.stderr)
-            outcome, name = (
-                re.search(r"\b(PASSED|FAILED|ERROR|SKIPPED)\b", line),
-                re.search(r"tests/\S+::\S+", line),
-            )
+            outcome = re.search(r"\b(PASSED|FAILED|ERROR|SKIPPED)\b", line)
+            name = re.search(r"tests/\S+::\S+", line)
             if outcome and name:
                 counts[outcome.group()] = counts.get(outcome.group(), 0) + 1
                 if outcome.group() in ("FAILED", "ERROR"):
@@ -351,7 +347,8 @@ def ppo(request: Request) -> Iterator[dict[str, Any]]:
         seconds = timed(built.call, request.repeats)
         return {"samples_per_s": samples / statistics.median(seconds)}
 
-    jobs, peers = [], {"jaxsafe": ours, "rejax": rejax, "usual way": usual}
+    jobs = []
+    peers = {"jaxsafe": ours, "rejax": rejax, "usual way": usual}
     small, *large = sizes_here().ppo
     for num_envs, seeds in ((small, 1), (small, request.seeds), *((size, 1) for size in large)):
         for peer, prepare in peers.items():
@@ -379,7 +376,8 @@ def learning(request: Request) -> Iterator[dict[str, Any]]:
     def prepare(task: str, preset: str) -> Any:
         config, env, _ = resolve({"env": task, "preset": preset, "seeds": request.seeds})
         mapper = SeedMapper(config.seeds, config.shares)
-        shared, keys = mapper.replicate((env, config.agent, config.ppo)), mapper.keys(config.seed)
+        shared = mapper.replicate((env, config.agent, config.ppo))
+        keys = mapper.keys(config.seed)
         fresh, advance = programs(mapper, 1, config.num_updates)
         built = Built(
             advance.lower(shared, mapper.like(jax.eval_shape(fresh, shared, keys), STATE)).compile
@@ -390,23 +388,32 @@ def learning(request: Request) -> Iterator[dict[str, Any]]:
         return built.calling(lambda state: built.program(shared, start if state is None else state))
 
     def measure(built: Built, request: Request) -> dict[str, Any]:
-        config, state, begin = built.config, None, time.monotonic()
+        config = built.config
+        state = None
+        begin = time.monotonic()
         reached: list[float | None] = [None] * config.seeds
-        mean, updates, seconds = 0.0, 0, 0.0
+        mean = 0.0
+        updates = 0
+        seconds = 0.0
         while updates < config.num_updates and mean < LEVEL and request.left > 0.0:
             state, curves = built.call(state)
             rates = np.asarray(curves["success_rate"])[: config.seeds, -1]
-            updates, mean, seconds = updates + 1, float(rates.mean()), time.monotonic() - begin
+            updates = updates + 1
+            mean = float(rates.mean())
+            seconds = time.monotonic() - begin
             reached = [
                 at if at is not None or rate < LEVEL else seconds
                 for at, rate in zip(reached, rates, strict=True)
             ]
         return {
-            "environments": config.ppo.num_envs, "reached": mean >= LEVEL,
-            "success": mean, "seconds": seconds,
-            "each_seed": reached, "steps": updates * config.ppo.batch_size,
+            "environments": config.ppo.num_envs,
+            "reached": mean >= LEVEL,
+            "success": mean,
+            "seconds": seconds,
+            "each_seed": reached,
+            "steps": updates * config.ppo.batch_size,
             "samples_per_s": config.seeds * updates * config.ppo.batch_size / max(seconds, 1e-9),
-        }  # fmt: skip
+        }
 
     jobs = []
     for task in request.tasks:
@@ -429,7 +436,8 @@ def filters(request: Request) -> Iterator[dict[str, Any]]:
     import jaxsafe
     from jaxsafe.envs import TASKS
 
-    batches, pool = sizes_here().filters, ThreadPoolExecutor(len(request.tasks))
+    batches = sizes_here().filters
+    pool = ThreadPoolExecutor(len(request.tasks))
     met = {task: pool.submit(rta.met, jaxsafe.make(task), max(batches)) for task in request.tasks}
 
     def prepare(task: str, preset: str) -> Any:
@@ -479,7 +487,8 @@ class Built:
 
     def __init__(self, compile_: Callable[[], Any]) -> None:
         """Compile; `compile_` returns a program or a list of them."""
-        begin, found = time.monotonic(), compile_()
+        begin = time.monotonic()
+        found = compile_()
         self.programs = found if isinstance(found, list) else [found]
         self.compile_s = time.monotonic() - begin
         sizes = [
@@ -508,9 +517,11 @@ def measured(
     time is too short for another round like the one before, the rest is skipped. Rows are marked
     that were measured although some program of their round was still compiling.
     """
-    size, longest = min(size, 2 * usable_cores()), 0.0
+    size = min(size, 2 * usable_cores())
+    longest = 0.0
     for first in range(0, len(jobs), size):
-        turn, begin = jobs[first : first + size], time.monotonic()
+        turn = jobs[first : first + size]
+        begin = time.monotonic()
         if longest > request.left or request.left <= 0.0:
             yield from ({"skipped": f"{named(job)}: out of time"} for job in jobs[first:])
             return

@@ -44,7 +44,8 @@ Step = Callable[[], Any]
 def main() -> None:
     """Run, write, print."""
     options = words(task="docking2d", repeats="5", envs="1,64,1024,4096")
-    task, repeats = options["task"], int(options["repeats"])
+    task = options["task"]
+    repeats = int(options["repeats"])
     numbers = [int(number) for number in options["envs"].split(",")]
     here = about()
     results = [
@@ -84,10 +85,8 @@ def pure(task: str, number: int) -> Step:
     env = jaxsafe.make(task)
     step = jax.jit(step_or_reset_batch)
     state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(0), number)
-    action, key = (
-        np.random.default_rng(0).uniform(-1, 1, (number, env.action_size)).astype(np.float32),
-        jax.random.key(1),
-    )
+    action = np.random.default_rng(0).uniform(-1, 1, (number, env.action_size)).astype(np.float32)
+    key = jax.random.key(1)
 
     def one() -> Any:
         nonlocal state
@@ -130,12 +129,11 @@ def envpool_cartpole(task: str, number: int) -> Step:
 def gymnax_env(task: str, number: int) -> Step:
     """The gymnax adapter, mapped over lanes."""
     env = importlib.import_module("jaxsafe.adapters.gymnax").GymnaxEnv(task)
-    params, keys = env.default_params, jax.random.split(jax.random.key(0), number)
+    params = env.default_params
+    keys = jax.random.split(jax.random.key(0), number)
     _, state = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
-    step, action = (
-        jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None))),
-        jnp.zeros((number, env.env.action_size)),
-    )
+    step = jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
+    action = jnp.zeros((number, env.env.action_size))
 
     def one() -> Any:
         nonlocal state
@@ -150,7 +148,8 @@ def brax_env(task: str, number: int) -> Step:
     brax = importlib.import_module("jaxsafe.adapters.brax")
     env = brax.wrap(brax.BraxEnv(task), 10_000)
     state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), number))
-    step, action = jax.jit(env.step), jnp.zeros((number, env.action_size))
+    step = jax.jit(env.step)
+    action = jnp.zeros((number, env.action_size))
 
     def one() -> Any:
         nonlocal state
@@ -170,12 +169,14 @@ def sb3_env(task: str, number: int) -> Step:
 
 def measure(found: dict[str, Step], number: int, repeats: int) -> dict[str, Any]:
     """Steps a second of each, in turns so that a slow moment of the machine hits all."""
-    counts, first = {}, {}
+    counts = {}
+    first = {}
     for name, step in found.items():
         begin = time.perf_counter()
         step()
         first[name] = time.perf_counter() - begin
-        begin, taken = time.perf_counter(), 0
+        begin = time.perf_counter()
+        taken = 0
         while taken < 10 and time.perf_counter() - begin < SECONDS:
             step()
             taken += 1

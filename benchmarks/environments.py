@@ -48,7 +48,8 @@ def main() -> None:
     """Run, write, print."""
     options = words(lanes="1,1024,4096,16384", names=",".join(RUNS), repeats="5")
     lanes = [int(number) for number in options["lanes"].split(",")]
-    names, repeats = several("names", options["names"], RUNS), int(options["repeats"])
+    names = several("names", options["names"], RUNS)
+    repeats = int(options["repeats"])
     if "probe" in options:
         print(json.dumps(RUNS[options["probe"]](lanes[0], repeats)))
         return
@@ -227,7 +228,8 @@ def compiled(
 
 def called(step: Callable[[], Any], num_envs: int, repeats: int) -> dict[str, Any]:
     """Time what is called from Python."""
-    num_steps, seconds = max(10, min(SLOW_STEPS // num_envs, 20_000)), []
+    num_steps = max(10, min(SLOW_STEPS // num_envs, 20_000))
+    seconds = []
     for _ in range(repeats + 1):
         begin = time.perf_counter()
         for _ in range(num_steps):

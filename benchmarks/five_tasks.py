@@ -91,7 +91,8 @@ def watched(
         "XDG_CACHE_HOME": str(cache)
     }
     logs = [run / "progress.jsonl" for run in runs]
-    began, sizes = time.monotonic(), []
+    began = time.monotonic()
+    sizes = []
     process = subprocess.Popen(
         [sys.executable, "-m", "jaxsafe.train", *asked], env=environment, stdout=subprocess.DEVNULL
     )

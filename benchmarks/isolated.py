@@ -14,8 +14,10 @@ from typing import Any
 
 HERE = Path(__file__).parent
 CACHE = (
-    "JAX_COMPILATION_CACHE_DIR", "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES",
-)  # fmt: skip
+    "JAX_COMPILATION_CACHE_DIR",
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
+    "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES",
+)
 """Variables that say whether JAX keeps compiled programs, and from which time and size on."""
 
 
@@ -43,7 +45,8 @@ def words(**defaults: str) -> dict[str, str]:
 
 def several(option: str, value: str, known: Iterable[str]) -> list[str]:
     """The names in a list with commas; one that is not known ends the command with one line."""
-    names, allowed = [name for name in value.split(",") if name], list(known)
+    names = [name for name in value.split(",") if name]
+    allowed = list(known)
     for name in names:
         if name not in allowed:
             sys.exit(f"{option}: found {name!r}; choose from {', '.join(allowed)}")
@@ -71,7 +74,10 @@ def interpreter(name: str) -> str:
 def versions(names: Iterable[str]) -> dict[str, dict[str, str]]:
     """Of each peer's environment: what pip installed there for it, and what that computes with."""
     ask = "import json, sys; from importlib.metadata import distributions as all; "
-    ask += "print(json.dumps({one.name.lower(): one.version for one in all() if one.name.lower() in sys.argv[1:]}))"
+    ask += (
+        "print(json.dumps({one.name.lower(): one.version for one in all() if"
+        " one.name.lower() in sys.argv[1:]}))"
+    )
     found = {}
     for name in sorted(set(names) & set(PEERS)):
         wanted = [re.split("[=<>]", word)[0] for word in PEERS[name] if not word.startswith("-")]
@@ -103,10 +109,8 @@ def probe(
 
     `cache` keeps what JAX compiles, however small; without it nothing is kept.
     """
-    command, environment = (
-        [python, script, *request],
-        {key: value for key, value in os.environ.items() if key not in CACHE},
-    )
+    command = [python, script, *request]
+    environment = {key: value for key, value in os.environ.items() if key not in CACHE}
     if cache:
         environment |= dict(zip(CACHE, (str(cache), "0", "-1"), strict=True))
     before = os.sched_getaffinity(0)

@@ -34,7 +34,8 @@ def main() -> None:
 
     from jaxsafe.envs import TASKS
 
-    here, tasks = about(), several("tasks", options["tasks"], TASKS)
+    here = about()
+    tasks = several("tasks", options["tasks"], TASKS)
     rows = [
         {
             "task": task,

@@ -25,7 +25,12 @@ from typing import Any
 from isolated import interpreter, probe, several, versions, words
 
 OUT = Path(__file__).parent / "results" / "ppo.json"
-NUM_ENVS, NUM_STEPS, NUM_EPOCHS, NUM_MINIBATCHES, HIDDEN, UPDATES = 2048, 32, 4, 8, (64, 64), 8
+NUM_ENVS = 2048
+NUM_STEPS = 32
+NUM_EPOCHS = 4
+NUM_MINIBATCHES = 8
+HIDDEN = (64, 64)
+UPDATES = 8
 BATCH = NUM_ENVS * NUM_STEPS
 NETWORKS = "networks only"
 PEERS = ("rejax", "brax", "sb3")
@@ -34,14 +39,16 @@ PEERS = ("rejax", "brax", "sb3")
 def main() -> None:
     """Run, write, print."""
     options = words(task="docking2d", peers=",".join(PEERS), repeats="3")
-    task, repeats = options["task"], int(options["repeats"])
+    task = options["task"]
+    repeats = int(options["repeats"])
     if "probe" in options:
         print(json.dumps(PROBES[options["probe"]](task)))
         return
     import tables
     from machine import about, usable_cores
 
-    here, peers = about(), several("peers", options["peers"], PEERS)
+    here = about()
+    peers = several("peers", options["peers"], PEERS)
     python = {name: interpreter(name) for name in PROBES if name in peers}
     cores = [1, usable_cores()]
     names = [name for name in PROBES if name in peers or name not in PEERS]
@@ -132,7 +139,8 @@ def networks_only(task: str) -> float:
     from jaxsafe.train import ppo
 
     config, env = settings(task)
-    agent, hyper = config.agent, config.ppo
+    agent = config.agent
+    hyper = config.ppo
     normal = lambda *shape: jax.random.normal(jax.random.key(len(shape)), (BATCH, *shape))  # noqa: E731
     batch = ppo.Batch(
         normal(env.observation_size), {}, normal(env.action_size), normal(), normal(), normal()
@@ -221,13 +229,21 @@ def rejax_trainer(task: str, updates: int, num_envs: int = NUM_ENVS) -> Any:
 
     from jaxsafe.adapters.gymnax import GymnaxEnv
 
-    env, steps = GymnaxEnv(task, legacy=True), updates * num_envs * NUM_STEPS
+    env = GymnaxEnv(task, legacy=True)
+    steps = updates * num_envs * NUM_STEPS
     algorithm = PPO.create(
-        env=env, env_params=env.default_params, total_timesteps=steps, eval_freq=steps,
-        skip_initial_evaluation=True, num_envs=num_envs, num_steps=NUM_STEPS,
-        num_epochs=NUM_EPOCHS, num_minibatches=NUM_MINIBATCHES, learning_rate=3e-4,
+        env=env,
+        env_params=env.default_params,
+        total_timesteps=steps,
+        eval_freq=steps,
+        skip_initial_evaluation=True,
+        num_envs=num_envs,
+        num_steps=NUM_STEPS,
+        num_epochs=NUM_EPOCHS,
+        num_minibatches=NUM_MINIBATCHES,
+        learning_rate=3e-4,
         agent_kwargs={"hidden_layer_sizes": HIDDEN, "activation": "tanh"},
-    )  # fmt: skip
+    )
     return jax.jit(algorithm.replace(eval_callback=lambda *_: ()).train)
 
 
@@ -248,10 +264,20 @@ def brax(task: str) -> float:
         value_hidden_layer_sizes=HIDDEN,
     )
     ppo.train(
-        BraxEnv(task), 2 * UPDATES * BATCH, wrap_env_fn=wrap, episode_length=2000, num_envs=NUM_ENVS, num_evals=3,
-        unroll_length=NUM_STEPS, batch_size=NUM_ENVS // NUM_MINIBATCHES, num_minibatches=NUM_MINIBATCHES, num_eval_envs=1,
-        num_updates_per_batch=NUM_EPOCHS, network_factory=networks, progress_fn=lambda _, metrics: seen.append(metrics),
-    )  # fmt: skip
+        BraxEnv(task),
+        2 * UPDATES * BATCH,
+        wrap_env_fn=wrap,
+        episode_length=2000,
+        num_envs=NUM_ENVS,
+        num_evals=3,
+        unroll_length=NUM_STEPS,
+        batch_size=NUM_ENVS // NUM_MINIBATCHES,
+        num_minibatches=NUM_MINIBATCHES,
+        num_eval_envs=1,
+        num_updates_per_batch=NUM_EPOCHS,
+        network_factory=networks,
+        progress_fn=lambda _, metrics: seen.append(metrics),
+    )
     return float(seen[-1]["training/sps"])
 
 
@@ -264,9 +290,13 @@ def sb3(task: str) -> float:
 
     torch.set_num_threads(len(os.sched_getaffinity(0)))
     model = PPO(
-        "MlpPolicy", SB3VecEnv(task, 64), n_steps=BATCH // 64, batch_size=BATCH // NUM_MINIBATCHES, n_epochs=NUM_EPOCHS,
+        "MlpPolicy",
+        SB3VecEnv(task, 64),
+        n_steps=BATCH // 64,
+        batch_size=BATCH // NUM_MINIBATCHES,
+        n_epochs=NUM_EPOCHS,
         policy_kwargs={"net_arch": list(HIDDEN)},
-    )  # fmt: skip
+    )
     model.learn(BATCH)
     start = time.perf_counter()
     model.learn(2 * BATCH)

@@ -52,7 +52,8 @@ def main() -> None:
         "training": training,
     }
     options = words(repeats="7", parts=",".join(parts))
-    repeats, chosen = int(options["repeats"]), several("parts", options["parts"], parts)
+    repeats = int(options["repeats"])
+    chosen = several("parts", options["parts"], parts)
     known = json.loads(OUT.read_text()) if OUT.exists() else {}
     for name in chosen:
         here = about()
@@ -70,7 +71,8 @@ def timed(run: Callable[[], Any], repeats: int) -> tuple[float, float]:
     """Median wall time of a run and that of the first, in seconds."""
     began = time.perf_counter()
     jax.block_until_ready(run())
-    first, times = time.perf_counter() - began, []
+    first = time.perf_counter() - began
+    times = []
     for _ in range(repeats):
         began = time.perf_counter()
         jax.block_until_ready(run())
@@ -112,7 +114,8 @@ def memories(env: jaxsafe.Environment, sims: Any) -> Any:
 
 def met(env: jaxsafe.Environment, batch: int = BATCH) -> tuple[Any, Any, jax.Array]:
     """Simulations after 100 steps of random actions without a filter, the filter's memories, and random controls."""
-    size, (low, high) = env.action_size, bounds(env)
+    size = env.action_size
+    (low, high) = bounds(env)
 
     @jax.jit
     def run(env: Any, key: jax.Array) -> Any:
@@ -165,7 +168,8 @@ def cbfpy_calls(repeats: int) -> list[dict[str, Any]]:
         cbfpy = importlib.import_module("cbfpy")
     except ImportError:
         return []
-    n, mass = 0.001027, 12.0
+    n = 0.001027
+    mass = 12.0
 
     class Docking(cbfpy.CBFConfig):
         def __init__(self) -> None:
@@ -199,13 +203,17 @@ def cbfpy_calls(repeats: int) -> list[dict[str, Any]]:
 
 def programs(repeats: int) -> list[dict[str, Any]]:
     """The small quadratic program: solutions a second, and its distance from the same in float64."""
-    rng, rows = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    rows = []
     solve = jax.jit(jax.vmap(nearest_control))
     for m in range(1, 7):
         problem = [
-            rng.uniform(-1.0, 1.0, (BATCH, m)), -np.ones((BATCH, m)), np.ones((BATCH, m)),
-            rng.normal(size=(BATCH, 2, m)), 0.5 * rng.normal(size=(BATCH, 2)),
-        ]  # fmt: skip
+            rng.uniform(-1.0, 1.0, (BATCH, m)),
+            -np.ones((BATCH, m)),
+            np.ones((BATCH, m)),
+            rng.normal(size=(BATCH, 2, m)),
+            0.5 * rng.normal(size=(BATCH, 2)),
+        ]
         single = [each.astype(np.float32) for each in problem]
         seconds, _ = timed(lambda single=single: solve(*single), repeats)
         found, feasible = solve(*single)
@@ -247,7 +255,8 @@ def changes(repeats: int) -> list[dict[str, Any]]:
 def starts(repeats: int) -> list[dict[str, Any]]:
     """What becomes of the starts of oriented docking that are not certified, in 400 steps; and without the fastest ones."""
     del repeats
-    keys, rows = jax.random.split(jax.random.key(7), 200_000), []
+    keys = jax.random.split(jax.random.key(7), 200_000)
+    rows = []
 
     def uncertified(env: jaxsafe.Environment) -> Any:
         state, timestep = jax.jit(jax.vmap(jaxsafe.reset, in_axes=(None, 0)))(env, keys)
@@ -285,7 +294,9 @@ def starts(repeats: int) -> list[dict[str, Any]]:
 
 def training(repeats: int) -> list[dict[str, Any]]:
     """Wall time of an update of PPO with a filter in the loop, as a share of that without."""
-    agent, ppo, rows = normalise(Agent()), normalise(PPO(num_envs=64, num_steps=128)), []
+    agent = normalise(Agent())
+    ppo = normalise(PPO(num_envs=64, num_steps=128))
+    rows = []
     step = jax.jit(lambda env, state: update(env, agent, ppo, 100, state))
     for task, presets in {
         "docking2d": ("explicit_simplex", "discrete_asif"),

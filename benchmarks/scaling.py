@@ -30,7 +30,8 @@ import ppo
 from isolated import probe, words
 
 OUT = Path(__file__).parent / "results" / "scaling.json"
-LANES, NUM_STEPS = 4096, 1000
+LANES = 4096
+NUM_STEPS = 1000
 SHARED = (1, 8, 64)
 """Numbers of devices that share a seed, in the projection."""
 
@@ -40,7 +41,8 @@ DEVICES = 1000
 def main() -> None:
     """Run, write, print."""
     options = words(task="docking3d", repeats="3")
-    task, repeats = options["task"], int(options["repeats"])
+    task = options["task"]
+    repeats = int(options["repeats"])
     if "probe" in options:
         print(PROBES[options["probe"]](task))
         return
@@ -69,7 +71,9 @@ def main() -> None:
 
 def projection(rates: dict[tuple[str, int], float], cores: int) -> list[dict[str, float]]:
     """Samples a second of `DEVICES` such cores, some of them for each seed."""
-    alone, busy, shared = rates[ONE_EACH, 1], rates[ONE_EACH, cores] / cores, rates[SHARING, cores]
+    alone = rates[ONE_EACH, 1]
+    busy = rates[ONE_EACH, cores] / cores
+    shared = rates[SHARING, cores]
     update = ppo.BATCH / alone  # seconds, of one seed on one core
     exchange = max(0.0, ppo.BATCH / shared - ppo.BATCH / busy / cores) / math.log2(cores)
     rows = []
@@ -100,13 +104,17 @@ def steps(task: str) -> float:
 
     import jaxsafe
 
-    env, mesh = jaxsafe.make(task), Mesh(np.array(jax.devices()), ("lanes",))
+    env = jaxsafe.make(task)
+    mesh = Mesh(np.array(jax.devices()), ("lanes",))
     run = jax.jit(
         jax.shard_map(
             lambda key: environments.episode_steps(env, key[0], LANES, NUM_STEPS)[None],
-            mesh=mesh, in_specs=PartitionSpec("lanes"), out_specs=PartitionSpec("lanes"), check_vma=False,
+            mesh=mesh,
+            in_specs=PartitionSpec("lanes"),
+            out_specs=PartitionSpec("lanes"),
+            check_vma=False,
         )
-    )  # fmt: skip
+    )
     keys = jax.random.split(jax.random.key(0), mesh.size)
     run(keys).block_until_ready()
     start = time.perf_counter()
@@ -119,11 +127,9 @@ def one_each(task: str) -> float:
     return ppo.ours(task, seeds=len(os.sched_getaffinity(0)))
 
 
-STEPS, ONE_EACH, SHARING = (
-    "environment steps, 4,096 a core",
-    "samples, a seed for each core",
-    "samples, one seed",
-)
+STEPS = "environment steps, 4,096 a core"
+ONE_EACH = "samples, a seed for each core"
+SHARING = "samples, one seed"
 PROBES = {STEPS: steps, ONE_EACH: one_each, SHARING: ppo.ours}
 
 if __name__ == "__main__":

@@ -51,7 +51,8 @@ def main() -> None:
 
     tasks = several("tasks", options["tasks"] or ",".join(TASKS), TASKS)
     chosen = [(task, rta) for rta in options["rta"].split(",") for task in tasks]
-    here, repeats = about(), int(options["repeats"])
+    here = about()
+    repeats = int(options["repeats"])
     rows = [measured(name, rta, repeats) for name, rta in chosen]
     rows.append(measured("Pendulum-v1", "gymnax", repeats, interpreter("gymnax")))
     first = [first_result(name, name, repeats) for name in FIRST]
@@ -222,9 +223,11 @@ def profile(result: Callable[[], Any]) -> dict[str, float]:
 
 def _covered(spans: list[tuple[str, float, float]]) -> float:
     """Seconds in which at least one of the spans was under way."""
-    total, until = 0.0, 0.0
+    total = 0.0
+    until = 0.0
     for _, begin, end in sorted(spans, key=lambda span: span[1]):
-        total, until = total + max(0.0, end - max(begin, until)), max(until, end)
+        total = total + max(0.0, end - max(begin, until))
+        until = max(until, end)
     return total
 
 
@@ -236,7 +239,8 @@ def our_step() -> None:
     import jaxsafe
     from jaxsafe.rollout import reset_batch, step_or_reset_batch
 
-    env, key = jaxsafe.make("docking3d"), jax.random.key(0)
+    env = jaxsafe.make("docking3d")
+    key = jax.random.key(0)
     state, _ = jax.jit(reset_batch, static_argnums=2)(env, key, LANES)
     jax.block_until_ready(jax.jit(step_or_reset_batch)(env, state, jnp.zeros((LANES, 3)), key))
 

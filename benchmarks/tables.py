@@ -21,7 +21,8 @@ from jaxsafe.metrics import with_interval
 from jaxsafe.storage.files import write_text
 
 ROOT = Path(__file__).parent.parent
-RESULTS, BASELINES = ROOT / "benchmarks" / "results", ROOT / "docs" / "baselines"
+RESULTS = ROOT / "benchmarks" / "results"
+BASELINES = ROOT / "docs" / "baselines"
 
 Found = Mapping[str, Any]
 """The content of a file of results."""
@@ -194,14 +195,16 @@ def learning(found: Found) -> str:
         sampled, modes = (row["evaluation"][kind] for kind in ("stochastic", "deterministic"))
         worst = min(sampled["success_rate"]["per_seed"] + modes["success_rate"]["per_seed"])
         first = row["variant"] not in VARIANTS
-        rows.append([
-            f"{row['task']}, as it is" if first else VARIANTS[row["variant"]],
-            _until(row["steps_to_80"]) + " steps" * first,
-            _interval(sampled["success_rate"], 100.0, 2),
-            f"{100 * modes['success_rate']['mean']:.2f}",
-            f"{worst:.1%}".replace("%", " %"),
-            _interval(modes["episode_length"], 1.0, 1),
-        ])  # fmt: skip
+        rows.append(
+            [
+                f"{row['task']}, as it is" if first else VARIANTS[row["variant"]],
+                _until(row["steps_to_80"]) + " steps" * first,
+                _interval(sampled["success_rate"], 100.0, 2),
+                f"{100 * modes['success_rate']['mean']:.2f}",
+                f"{worst:.1%}".replace("%", " %"),
+                _interval(modes["episode_length"], 1.0, 1),
+            ]
+        )
     return markdown(
         [
             "",
@@ -221,7 +224,8 @@ def scaling(found: Found) -> str:
     cores = max(count for _, count in rates)
     rows = []
     for name in dict.fromkeys(name for name, _ in rates):
-        one, all_ = rates[name, 1], rates[name, cores]
+        one = rates[name, 1]
+        all_ = rates[name, cores]
         cells = [
             f"{rate / 1e6:.1f} million" if "environment" in name else f"{rate / 1e3:,.0f},000"
             for rate in (one, all_)
@@ -235,11 +239,15 @@ def projection(found: Found) -> str:
     return markdown(
         ["1,000 devices", "seeds", "million samples/s", "of a perfect split"],
         (
-            [f"{row['shared']} a seed", f"{row['seeds']:,}", f"{row['samples_per_s'] / 1e6:.3g}",
-             f"{100 * row['efficiency']:.0f} %"]
+            [
+                f"{row['shared']} a seed",
+                f"{row['seeds']:,}",
+                f"{row['samples_per_s'] / 1e6:.3g}",
+                f"{100 * row['efficiency']:.0f} %",
+            ]
             for row in found["projection"]
         ),
-    )  # fmt: skip
+    )
 
 
 def memory(found: Found) -> str:
@@ -291,9 +299,13 @@ def filter_changes(found: Found) -> str:
     tasks = [*dict.fromkeys(row["task"] for row in rows)]
     cells: dict[tuple[str, str], list[str]] = {}
     for row in rows:
-        cells.setdefault((row["filter"], row["actions"]), []).extend([
-            f"{row['violating_steps']:,}", f"{row['intervention_rate']:.1%}", f"{row['mean_correction']:.3f}",
-        ])  # fmt: skip
+        cells.setdefault((row["filter"], row["actions"]), []).extend(
+            [
+                f"{row['violating_steps']:,}",
+                f"{row['intervention_rate']:.1%}",
+                f"{row['mean_correction']:.3f}",
+            ]
+        )
     heads = [head for task in tasks for head in (f"{task}: violating", "altered", "‖Δu‖")]
     return markdown(
         ["filter", "actions", *heads],
@@ -337,12 +349,23 @@ def adversaries(_: Found) -> str:
     for task in DOCKING_FIRST:
         found = json.loads((RESULTS / "falsify" / f"{task}.json").read_text(encoding="utf-8"))
         for row in found["policies"]:
-            rows.append([
-                task, row["policy"],
-                *(f"{row[name]:,}" for name in ("steps", "violating_steps", "violating_steps_inside")),
-                f"{row['worst_margin_inside']:.2g}", f"{row['intervention_rate']:.1%}", f"{row['mean_correction']:.3g}",
-            ])  # fmt: skip
-    heads = "task | policy | steps | violating, at samples | inside | least h inside | altered | mean ‖Δu‖"
+            rows.append(
+                [
+                    task,
+                    row["policy"],
+                    *(
+                        f"{row[name]:,}"
+                        for name in ("steps", "violating_steps", "violating_steps_inside")
+                    ),
+                    f"{row['worst_margin_inside']:.2g}",
+                    f"{row['intervention_rate']:.1%}",
+                    f"{row['mean_correction']:.3g}",
+                ]
+            )
+    heads = (
+        "task | policy | steps | violating, at samples | inside | least h inside | altered"
+        " | mean ‖Δu‖"
+    )
     return markdown(heads.split(" | "), rows)
 
 
@@ -359,21 +382,30 @@ def filtered_training(_: Found) -> str:
             record = _record(task, kind)
             own = record["results"]
             mode = own["evaluation"]["deterministic"]
-            rows.append([
-                task if kind == "features" else "", label,
-                _until(own["interaction_efficiency"]["timesteps"]), f"{own['training_cost']['mean']:,.0f}",
-                f"{100 * mode['success_rate']['mean']:.4g}%", _share(mode["episode_safety_violation_rate"]),
-                f"{mode['episode_length']['mean']:.0f}",
-            ])  # fmt: skip
+            rows.append(
+                [
+                    task if kind == "features" else "",
+                    label,
+                    _until(own["interaction_efficiency"]["timesteps"]),
+                    f"{own['training_cost']['mean']:,.0f}",
+                    f"{100 * mode['success_rate']['mean']:.4g}%",
+                    _share(mode["episode_safety_violation_rate"]),
+                    f"{mode['episode_length']['mean']:.0f}",
+                ]
+            )
             if kind == "features":
                 rows[-1] += ["–"] * 3
                 continue
             alone = record["evaluations"][WITHOUT_RTA]["evaluation"]["deterministic"]
             rows[-1] += [
                 _share(mode["intervention_rate"]),
-                f"{100 * alone['success_rate']['mean']:.4g}%", _share(alone["episode_safety_violation_rate"]),
-            ]  # fmt: skip
-    heads = "task | option | 80 % in training after | violations in training | success | violating steps | length [steps]"
+                f"{100 * alone['success_rate']['mean']:.4g}%",
+                _share(alone["episode_safety_violation_rate"]),
+            ]
+    heads = (
+        "task | option | 80 % in training after | violations in training | success |"
+        " violating steps | length [steps]"
+    )
     return markdown(
         f"{heads} | steps altered | alone: success | alone: violating steps".split(" | "), rows
     )
@@ -385,11 +417,20 @@ def readme_results(_: Found) -> str:
     for task in TASKS:
         own = _record(task, "features")["results"]
         each = [own["evaluation"][way]["success_rate"] for way in ("stochastic", "deterministic")]
-        rows.append([
-            task, f"{TASKS[task].paper_steps:,}", _until(own["interaction_efficiency"]["timesteps"]), f"{own['steps']:,}",
-            *(f"{100 * one['mean']:.2f} %" for one in each), f"{100 * min(min(one['per_seed']) for one in each):.1f} %",
-        ])  # fmt: skip
-    heads = "task | 80 % in training, paper | here | trained for | success, stochastic | deterministic | worst seed"
+        rows.append(
+            [
+                task,
+                f"{TASKS[task].paper_steps:,}",
+                _until(own["interaction_efficiency"]["timesteps"]),
+                f"{own['steps']:,}",
+                *(f"{100 * one['mean']:.2f} %" for one in each),
+                f"{100 * min(min(one['per_seed']) for one in each):.1f} %",
+            ]
+        )
+    heads = (
+        "task | 80 % in training, paper | here | trained for | success, stochastic |"
+        " deterministic | worst seed"
+    )
     return markdown(heads.split(" | "), rows)
 
 
@@ -399,12 +440,11 @@ def goals(_: Found) -> str:
     found = {
         name: json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")) for name in names
     }
-    steps, samples, scaled = (
-        _steps(found["environments"]),
-        _samples(found["ppo"]),
-        _rates(found["scaling"]),
-    )
-    many, all_ = sorted({lanes for _, lanes in steps})[1:], max(count for _, count in samples)
+    steps = _steps(found["environments"])
+    samples = _samples(found["ppo"])
+    scaled = _rates(found["scaling"])
+    many = sorted({lanes for _, lanes in steps})[1:]
+    all_ = max(count for _, count in samples)
     slow, fast = sorted(found["environments"]["released_steps_per_s"])
     first = {
         row["name"]: {kind: statistics.median(row[kind]) for kind in ("cold", "warm")}
@@ -558,11 +598,17 @@ def accelerator_learning(found: Found) -> str:
     lines = []
     for row in found["parts"]["learning"]["rows"]:
         each = [seconds for seconds in row["each_seed"] if seconds is not None]
-        lines.append([
-            row["task"], f"{row['seeds']} × {row['environments']:,}",
-            f"{row['seconds']:.2g}" if row["reached"] else f"not in {row['seconds']:.0f}",
-            f"{row['steps']:,}", f"{_three(row['samples_per_s'] / 1e6)}", f"{len(each)}", *_program(row),
-        ])  # fmt: skip
+        lines.append(
+            [
+                row["task"],
+                f"{row['seeds']} × {row['environments']:,}",
+                f"{row['seconds']:.2g}" if row["reached"] else f"not in {row['seconds']:.0f}",
+                f"{row['steps']:,}",
+                f"{_three(row['samples_per_s'] / 1e6)}",
+                f"{len(each)}",
+                *_program(row),
+            ]
+        )
     heads = [
         "95 % in training on the accelerator",
         "seeds × environments",

@@ -52,20 +52,26 @@ class Proof:
 
     def __init__(self, env: jaxsafe.Environment, angle: float, cells: int) -> None:
         plant: Any = env.agent_platform
-        backup, wheel = TURN["backups"][0], plant.controller.actuators[1]
+        backup = TURN["backups"][0]
+        wheel = plant.controller.actuators[1]
         facts = speed_limit_facts(env, "velocity_limit")
         assert facts is not None
         self.margin = max(float(facts.least_margin), backup.margin)
-        self.dt, self.n = float(env.dt), float(facts.mean_motion)
-        self.floor, self.slope = float(facts.floor), float(facts.slope)
-        self.weakest, self.strongest = float(facts.weakest), float(facts.strongest)
+        self.dt = float(env.dt)
+        self.n = float(facts.mean_motion)
+        self.floor = float(facts.floor)
+        self.slope = float(facts.slope)
+        self.weakest = float(facts.weakest)
+        self.strongest = float(facts.strongest)
         self.wheel = math.degrees(float(wheel.high))
         self.spin = math.degrees(float(plant.attitude_rate_limits[1]))
-        self.angle, self.aligned = angle, math.degrees(backup.aligned)
+        self.angle = angle
+        self.aligned = math.degrees(backup.aligned)
         edges = np.linspace(-90.0, 90.0, cells + 1)
         spins = np.linspace(-self.spin, self.spin, 161)
         self.low, self.high = (grid[..., None] for grid in (edges[:-1], edges[1:]))
-        self.slower, self.faster = spins[None, :-1], spins[None, 1:]
+        self.slower = spins[None, :-1]
+        self.faster = spins[None, 1:]
         self.width = 180.0 / cells
         self.num = (cells, 160)
 
@@ -82,7 +88,8 @@ class Proof:
     def thrust_turn(self, error: np.ndarray, first: bool) -> np.ndarray:
         """How far the least thrust that holds the limit turns the course in a step; infinite where none holds it."""
         error = np.radians(np.minimum(error, 90.0))
-        sine, cosine = np.sin(error), np.maximum(np.cos(error), 1e-9)
+        sine = np.sin(error)
+        cosine = np.maximum(np.cos(error), 1e-9)
         root = (
             cosine**2 - 2.0 * self.needed(first) * sine**2
         )  # thrust across the velocity lengthens it
@@ -115,7 +122,8 @@ class Proof:
 
         Those beyond ±90°, where the angle is one from the other end of the axis, stand apart.
         """
-        slowest, fastest = self.after(self.low, self.slower), self.after(self.high, self.faster)
+        slowest = self.after(self.low, self.slower)
+        fastest = self.after(self.high, self.faster)
         least = self.low - (self.faster + fastest) / 2.0 * self.dt - course
         most = self.high - (self.slower + slowest) / 2.0 * self.dt + course
         step = 2.0 * self.spin / self.num[1]
@@ -149,13 +157,12 @@ class Proof:
 
     def closure(self) -> np.ndarray | None:
         """The cells that are ever reached from `angle` or less at any spin; None if the axis escapes."""
-        begin, aligned, first = (
-            self.within(self.angle),
-            self.within(self.aligned),
-            self.course(first=True),
-        )
+        begin = self.within(self.angle)
+        aligned = self.within(self.aligned)
+        first = self.course(first=True)
         known = begin | np.logical_or(*self.image(begin & ~aligned, first))
-        fresh, later = known & ~aligned, self.course(first=False)
+        fresh = known & ~aligned
+        later = self.course(first=False)
         while fresh.any():
             if not np.isfinite(later[np.nonzero(fresh)[0]]).all():
                 return None
@@ -170,10 +177,8 @@ class Proof:
 
     def steps(self, begin: np.ndarray, goal: float, course: np.ndarray | float) -> int | None:
         """The steps until all cells have been within an angle, if the nearer end changes `FLIPS` times; None if never."""
-        goals, layers = (
-            self.within(goal),
-            [begin, *(np.zeros(self.num, bool) for _ in range(FLIPS))],
-        )
+        goals = self.within(goal)
+        layers = [begin, *(np.zeros(self.num, bool) for _ in range(FLIPS))]
         for count in range(MOST_STEPS):
             layers = [cells & ~goals for cells in layers]
             if not any(cells.any() for cells in layers):
@@ -192,23 +197,29 @@ class Proof:
 
     def lines(self) -> list[str]:
         """What was proved, in words."""
-        known, swing = self.closure(), self.swing()
+        known = self.closure()
+        swing = self.swing()
         if known is None or swing > self.angle:
             return [f"not proved: from {self.angle:g}° the angle may escape (swing {swing:.1f}°)"]
         largest = self.largest(known)
-        every, drift, later = (
-            np.ones(self.num, bool),
-            self.gravity(LOW_SHARE),
-            self.course(first=False),
-        )
-        turned, within = (
-            self.steps(every, self.angle, drift),
-            self.steps(known, self.aligned, later),
-        )
+        every = np.ones(self.num, bool)
+        drift = self.gravity(LOW_SHARE)
+        later = self.course(first=False)
+        turned = self.steps(every, self.angle, drift)
+        within = self.steps(known, self.aligned, later)
         return [
-            f"dt {self.dt:g} s, margin {self.margin:g} m/s, wheel {self.wheel:g}°/s², spin {self.spin:g}°/s",
-            f"from {self.angle:g}° at any spin: never above {largest:.2f}°; braking swings it to {swing:.1f}° at most",
-            f"from any angle and spin: within {self.angle:g}° after {turned} steps, then {self.aligned:g}° after {within}",
+            (
+                f"dt {self.dt:g} s, margin {self.margin:g} m/s, wheel {self.wheel:g}°/s², spin"
+                f" {self.spin:g}°/s"
+            ),
+            (
+                f"from {self.angle:g}° at any spin: never above {largest:.2f}°; braking swings it"
+                f" to {swing:.1f}° at most"
+            ),
+            (
+                f"from any angle and spin: within {self.angle:g}° after {turned} steps, then"
+                f" {self.aligned:g}° after {within}"
+            ),
             f"the limit is held up to {self.hold(largest):.0f} m",
         ]
 

@@ -18,14 +18,12 @@ from jaxtyping import Array
 import jaxsafe
 from jaxsafe.rollout import step_or_reset
 
-GAMMA, LAMBDA, CLIP, VALUE_COEFFICIENT, LEARNING_RATE, MAX_GRAD_NORM = (
-    0.99,
-    0.95,
-    0.2,
-    0.5,
-    3e-4,
-    0.5,
-)
+GAMMA = 0.99
+LAMBDA = 0.95
+CLIP = 0.2
+VALUE_COEFFICIENT = 0.5
+LEARNING_RATE = 3e-4
+MAX_GRAD_NORM = 0.5
 
 
 class Sample(NamedTuple):
@@ -62,10 +60,8 @@ def update(
     def step(carry: Any, _: None) -> tuple[Any, Sample]:
         state, observation, key = carry
         key, key_act, key_step = jax.random.split(key, 3)
-        mean, value = (
-            _network(params["actor"], observation),
-            _network(params["critic"], observation)[:, 0],
-        )
+        mean = _network(params["actor"], observation)
+        value = _network(params["critic"], observation)[:, 0]
         action = mean + jnp.exp(params["log_std"]) * jax.random.normal(key_act, mean.shape)
         keys = jax.random.split(key_step, len(observation))
         (state, following), timestep = jax.vmap(step_or_reset, in_axes=(None, 0, 0, 0))(

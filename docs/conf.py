@@ -5,7 +5,8 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-project, author = "jaxsafe", "The jaxsafe authors"
+project = "jaxsafe"
+author = "The jaxsafe authors"
 copyright = "The jaxsafe authors, MIT licence"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["_site", "jupyter_execute"]  # what a build makes

@@ -15,7 +15,10 @@ from matplotlib.patches import Annulus, Circle, Rectangle
 
 import jaxsafe
 
-BLUE, ORANGE, GREEN, GREY = "#0072B2", "#D55E00", "#009E73", "#6E6E6E"  # of the Okabe-Ito palette
+BLUE = "#0072B2"  # of the Okabe-Ito palette
+ORANGE = "#D55E00"
+GREEN = "#009E73"
+GREY = "#6E6E6E"
 PALETTE = ("#3B2F8F", "#C2568F", "#A67C00")
 SEEDS = {
     "rejoin2d": (5, 2),
@@ -64,7 +67,8 @@ def episode(env: Any, seed: int, pace: float) -> tuple[Any, str]:
 
 def steer_spacecraft(env: Any, sim: Any, pace: float) -> dict[str, Any]:
     """Thrust towards a share of the speed limit in the direction of the chief."""
-    deputy, status = sim.platforms["deputy"], sim.status
+    deputy = sim.platforms["deputy"]
+    status = sim.status
     wish = -pace * status["velocity_limit"] * deputy.position / jnp.linalg.norm(deputy.position)
     thrust = env.platforms[1].mass * (wish - deputy.velocity)
     if env.action_names[0] != "thrust":
@@ -82,7 +86,8 @@ def steer_spacecraft(env: Any, sim: Any, pace: float) -> dict[str, Any]:
 
 def steer_aircraft(env: Any, sim: Any, pace: float) -> dict[str, Any]:
     """Fly at the lead's velocity, and up to 100 ft/s besides towards the rejoin point."""
-    lead, wingman = sim.platforms["lead"], sim.platforms["wingman"]
+    lead = sim.platforms["lead"]
+    wingman = sim.platforms["wingman"]
     away = sim.regions["rejoin_region"].position - wingman.position
     wish = lead.velocity + away * jnp.minimum(0.05, 100.0 / (jnp.linalg.norm(away) + 1e-6))
     speed = jnp.linalg.norm(wish)
@@ -122,7 +127,8 @@ def draw_docking(env: Any, episodes: list[tuple[Any, str]]) -> Figure:
         zoom.set(xlim=(-1.5, 1.5), ylim=(-1.5, 1.5), aspect="equal", xticks=[], yticks=[])
         zoom.set_title(f"docking region, {radius:g} m", fontsize=8)
     for colour, (sim, outcome) in zip(PALETTE, episodes, strict=False):
-        deputy, status = sim.platforms["deputy"], sim.status
+        deputy = sim.platforms["deputy"]
+        status = sim.status
         left.plot(*deputy.position.T, color=colour, linewidth=1.6)
         left.plot(*deputy.position[:1].T, "o", color=colour, markersize=5)
         if zoom:
@@ -213,7 +219,8 @@ def draw_rejoin(env: Any, episodes: list[tuple[Any, str]]) -> Figure:
         ground.plot(*wingman.position[:, :2].T / 1e3, color=colour, linewidth=1.6)
         ground.plot(*wingman.position[:1, :2].T / 1e3, "o", color=colour, markersize=5)
         x, y = (wingman.position - lead.position)[:, :2].T
-        c, s = np.cos(lead.heading), np.sin(lead.heading)
+        c = np.cos(lead.heading)
+        s = np.sin(lead.heading)
         close.plot(c * x + s * y, c * y - s * x, color=colour, linewidth=1.6, label=outcome)
         for axes in height:
             axes.plot(

@@ -36,10 +36,16 @@ REJOIN = (
     " keep 100 ft away from the lead, which flies straight on unless its script says otherwise."
 )
 TEXT = {
-    "rejoin2d": f"{REJOIN} Both fly at one altitude. The wingman commands its heading rate and its acceleration.",
+    "rejoin2d": (
+        f"{REJOIN} Both fly at one altitude. The wingman commands its heading rate and"
+        f" its acceleration."
+    ),
     "rejoin3d": f"{REJOIN} The wingman commands its roll rate, the rate of its flight path angle and its acceleration;"
     " it turns because it banks. A positive flight path angle lowers z.",
-    "docking2d": f"{DOCKING} The motion is in the plane of the orbit; one thruster pair acts along each axis.",
+    "docking2d": (
+        f"{DOCKING} The motion is in the plane of the orbit; one thruster pair acts"
+        f" along each axis."
+    ),
     "docking3d": f"{DOCKING} The motion is in space; one thruster pair acts along each axis.",
     "docking2d_oriented": f"{DOCKING} The motion is in the plane of the orbit. One thruster acts along the body's x axis,"
     " stronger forwards than backwards, and a reaction wheel turns the body, so the deputy must first point and then push.",
@@ -80,7 +86,10 @@ def page(task: str) -> str:
     """The Markdown page of a task."""
     env = jaxsafe.make(task)
     length = length_unit(env) or ""
-    paths = f"A path is what `jaxsafe.make({task!r}, {{path: value}})` takes, followed by a dot and the number's name."
+    paths = (
+        f"A path is what `jaxsafe.make({task!r}, {{path: value}})` takes, followed by a dot"
+        f" and the number's name."
+    )
     blocks = [
         f"<!-- Written by docs/make_tasks.py. -->\n# {task}",
         TEXT[task],
@@ -93,7 +102,10 @@ def page(task: str) -> str:
         "## Platforms",
         *(block for platform in env.platforms for block in platform_blocks(platform, length)),
         "## Actions",
-        f"Continuous actions lie in [−1, 1]; with `jaxsafe.make({task!r}, actions='discrete')` they are indices of points.",
+        (
+            f"Continuous actions lie in [−1, 1]; with `jaxsafe.make({task!r}, actions='discrete')`"
+            f" they are indices of points."
+        ),
         table(
             ("index", "actuator", "unit", "low", "high", "[−1, 1] maps to", "points"), actions(env)
         ),

@@ -22,7 +22,8 @@ from jaxsafe.adapters.brax import BraxEnv, mend_brax, wrap
 def train(algorithm: str, scale: float = 1.0) -> dict[str, Any]:
     """The metrics of the last evaluation; `scale` shortens the training."""
     mend_brax()  # Brax 0.14.2 with JAX 0.10 or newer
-    env, seen = BraxEnv("docking2d"), []
+    env = BraxEnv("docking2d")
+    seen = []
 
     def progress(step: int, metrics: dict[str, Any]) -> None:
         seen.append(metrics)
@@ -39,25 +40,57 @@ def train(algorithm: str, scale: float = 1.0) -> dict[str, Any]:
     }
     if algorithm == "ppo":
         networks = partial(
-            make_ppo_networks, distribution_type="normal", noise_std_type="log", init_noise_std=0.5, activation=tanh,
-            policy_hidden_layer_sizes=(64, 64), value_hidden_layer_sizes=(64, 64),
-        )  # fmt: skip
+            make_ppo_networks,
+            distribution_type="normal",
+            noise_std_type="log",
+            init_noise_std=0.5,
+            activation=tanh,
+            policy_hidden_layer_sizes=(64, 64),
+            value_hidden_layer_sizes=(64, 64),
+        )
         ppo.train(
-            env, int(1_000_000 * scale), num_envs=16, unroll_length=128, batch_size=8, num_minibatches=2, num_evals=5,
-            num_updates_per_batch=10, learning_rate=1e-3, discounting=0.97, gae_lambda=0.97, entropy_cost=0.0,
-            clipping_epsilon=0.2, network_factory=networks, **common,
-        )  # fmt: skip
+            env,
+            int(1_000_000 * scale),
+            num_envs=16,
+            unroll_length=128,
+            batch_size=8,
+            num_minibatches=2,
+            num_evals=5,
+            num_updates_per_batch=10,
+            learning_rate=1e-3,
+            discounting=0.97,
+            gae_lambda=0.97,
+            entropy_cost=0.0,
+            clipping_epsilon=0.2,
+            network_factory=networks,
+            **common,
+        )
     elif algorithm == "sac":
         sac.train(
-            env, int(200_000 * scale), num_envs=16, batch_size=256, grad_updates_per_step=8, learning_rate=6e-4,
-            discounting=0.98, min_replay_size=8192, max_replay_size=262_144, num_evals=5,
-            network_factory=partial(make_sac_networks, hidden_layer_sizes=(64, 64)), **common,
-        )  # fmt: skip
+            env,
+            int(200_000 * scale),
+            num_envs=16,
+            batch_size=256,
+            grad_updates_per_step=8,
+            learning_rate=6e-4,
+            discounting=0.98,
+            min_replay_size=8192,
+            max_replay_size=262_144,
+            num_evals=5,
+            network_factory=partial(make_sac_networks, hidden_layer_sizes=(64, 64)),
+            **common,
+        )
     elif algorithm == "apg":
         apg.train(
-            env, policy_updates=int(400 * scale), horizon_length=64, num_envs=64, learning_rate=1e-3, num_evals=9,
-            normalize_observations=True, **common,
-        )  # fmt: skip
+            env,
+            policy_updates=int(400 * scale),
+            horizon_length=64,
+            num_envs=64,
+            learning_rate=1e-3,
+            num_evals=9,
+            normalize_observations=True,
+            **common,
+        )
     else:
         sys.exit(f"algorithm: found {algorithm!r}; choose from ppo, sac, apg")
     return seen[-1]

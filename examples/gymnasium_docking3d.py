@@ -17,13 +17,12 @@ def fly(rta: str = "none", num_envs: int = 64) -> dict[str, float]:
     env = gym.make_vec(
         "jaxsafe/Docking3D-v0", num_envs=num_envs, autoreset_mode="SameStep", rta=rta
     )
-    policy, key = jax.jit(jaxsafe.load_policy("docking3d")), jax.random.key(0)
+    policy = jax.jit(jaxsafe.load_policy("docking3d"))
+    key = jax.random.key(0)
     observation, _ = env.reset(seed=0)
-    running, success, violated = (
-        np.ones(num_envs, bool),
-        np.zeros(num_envs, bool),
-        np.zeros(num_envs, bool),
-    )
+    running = np.ones(num_envs, bool)
+    success = np.zeros(num_envs, bool)
+    violated = np.zeros(num_envs, bool)
     while running.any():
         key, key_now = jax.random.split(key)
         observation, _, terminated, truncated, info = env.step(

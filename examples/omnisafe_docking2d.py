@@ -82,15 +82,37 @@ def train(steps: int = 1_000_000, cost_limit: float = 25.0) -> Any:
     OmniSafe starts all environments anew in each epoch: with 8 of them its 16,384 steps hold an episode of 2,001.
     """
     rate = {"lr": 2e-3}
-    agent = omnisafe.Agent("PPOLag", "jaxsafe-docking2d", custom_cfgs={
-        "train_cfgs": {"total_steps": steps, "vector_env_nums": 8, "torch_threads": 1},
-        "algo_cfgs": {"steps_per_epoch": 16384, "update_iters": 10, "batch_size": 1024, "gamma": 0.98, "cost_gamma": 0.98,
-                      "lam": 0.98, "lam_c": 0.98, "obs_normalize": False, "use_critic_norm": False, "max_grad_norm": 0.5,
-                      "kl_early_stop": False},
-        "model_cfgs": {"weight_initialization_mode": "orthogonal", "actor": rate, "critic": rate},
-        "lagrange_cfgs": {"cost_limit": cost_limit, "lambda_lr": 0.01},
-        "logger_cfgs": {"use_wandb": False, "use_tensorboard": False, "save_model_freq": 10_000},
-    })  # fmt: skip
+    agent = omnisafe.Agent(
+        "PPOLag",
+        "jaxsafe-docking2d",
+        custom_cfgs={
+            "train_cfgs": {"total_steps": steps, "vector_env_nums": 8, "torch_threads": 1},
+            "algo_cfgs": {
+                "steps_per_epoch": 16384,
+                "update_iters": 10,
+                "batch_size": 1024,
+                "gamma": 0.98,
+                "cost_gamma": 0.98,
+                "lam": 0.98,
+                "lam_c": 0.98,
+                "obs_normalize": False,
+                "use_critic_norm": False,
+                "max_grad_norm": 0.5,
+                "kl_early_stop": False,
+            },
+            "model_cfgs": {
+                "weight_initialization_mode": "orthogonal",
+                "actor": rate,
+                "critic": rate,
+            },
+            "lagrange_cfgs": {"cost_limit": cost_limit, "lambda_lr": 0.01},
+            "logger_cfgs": {
+                "use_wandb": False,
+                "use_tensorboard": False,
+                "save_model_freq": 10_000,
+            },
+        },
+    )
     agent.learn()
     return agent
 

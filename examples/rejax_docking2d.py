@@ -21,10 +21,21 @@ def train(steps: int = 500_000) -> tuple[jax.Array, jax.Array]:
     """Length and return of the evaluations, (seeds, evaluations, episodes)."""
     env = GymnaxEnv("docking2d", legacy=True)
     ppo = PPO.create(
-        env=env, env_params=env.default_params, total_timesteps=steps, eval_freq=steps // 4, num_envs=16, num_steps=128,
-        num_epochs=10, num_minibatches=2, learning_rate=1e-3, gamma=0.97, gae_lambda=0.97, ent_coef=0.0, max_grad_norm=0.5,
+        env=env,
+        env_params=env.default_params,
+        total_timesteps=steps,
+        eval_freq=steps // 4,
+        num_envs=16,
+        num_steps=128,
+        num_epochs=10,
+        num_minibatches=2,
+        learning_rate=1e-3,
+        gamma=0.97,
+        gae_lambda=0.97,
+        ent_coef=0.0,
+        max_grad_norm=0.5,
         agent_kwargs={"hidden_layer_sizes": (64, 64), "activation": "tanh"},
-    )  # fmt: skip
+    )
     return jax.jit(jax.vmap(ppo.train))(jax.random.split(jax.random.PRNGKey(0), NUM_SEEDS))[1]
 
 

@@ -21,7 +21,8 @@ class GrowingHorizon(BaseCallback):
 
     def __init__(self, factor: float, steps: int) -> None:
         super().__init__()
-        self.factor, self.steps = factor, steps
+        self.factor = factor
+        self.steps = steps
 
     def _on_training_start(self) -> None:
         self.first = 1.0 - self.model.gamma
@@ -39,11 +40,18 @@ def train(steps: int = 1_000_000, seed: int = 0) -> PPO:
     torch.set_num_threads(1)  # these networks are too small for more
     env = VecMonitor(SB3VecEnv("docking2d", 64))  # counts returns and lengths of episodes
     model = PPO(
-        "MlpPolicy", env, seed=seed, verbose=1,
-        n_steps=128, batch_size=1024, n_epochs=10, gamma=0.965, gae_lambda=0.98,
+        "MlpPolicy",
+        env,
+        seed=seed,
+        verbose=1,
+        n_steps=128,
+        batch_size=1024,
+        n_epochs=10,
+        gamma=0.965,
+        gae_lambda=0.98,
         learning_rate=lambda remaining: 1e-4 + remaining * (2e-3 - 1e-4),
         policy_kwargs={"log_std_init": -0.35, "net_arch": [64, 64]},
-    )  # fmt: skip
+    )
     return model.learn(steps, callback=GrowingHorizon(4.0, steps))
 
 
@@ -51,7 +59,8 @@ def success_rate(model: PPO, deterministic: bool, episodes: int = 100) -> float:
     """From starts of their own, with sampled actions or with the modes."""
     env = SB3VecEnv("docking2d", episodes)
     env.seed(1000)
-    observation, successes = env.reset(), np.full(episodes, np.nan)
+    observation = env.reset()
+    successes = np.full(episodes, np.nan)
     while np.isnan(successes).any():
         observation, _, done, infos = env.step(
             model.predict(observation, deterministic=deterministic)[0]

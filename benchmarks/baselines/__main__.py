@@ -31,10 +31,8 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.train.host.options import resolve
 
     arguments = Arguments.parse(argv)
-    out, runs = (
-        Path(arguments.pop_text("out") or "report"),
-        Path(arguments.pop_text("runs") or "runs/report"),
-    )
+    out = Path(arguments.pop_text("out") or "report")
+    runs = Path(arguments.pop_text("runs") or "runs/report")
     tasks, kinds = (
         _names(name, arguments.pop(name), [*known])
         for name, known in (("tasks", TASKS), ("kinds", KINDS))

@@ -26,7 +26,10 @@ KINDS: Mapping[str, Kind] = {
     ),
     "plain": Kind(
         ("preset=plain",),
-        "the paper's observation straight into the networks; in rejoin3d training episodes end after 300 steps",
+        (
+            "the paper's observation straight into the networks; in rejoin3d training episodes end"
+            " after 300 steps"
+        ),
     ),
     "lanes": Kind(
         ("preset=lanes",),
@@ -71,7 +74,8 @@ _REJOIN_STARTS = {
 STARTS = {task: _REJOIN_STARTS if task.startswith("rejoin") else _DOCKING_STARTS for task in TASKS}
 """Starts outside those of training, by task and name."""
 
-WITH_RTA, WITHOUT_RTA = "filtered", "unfiltered"
+WITH_RTA = "filtered"
+WITHOUT_RTA = "unfiltered"
 
 BEST = "best.npz"
 """In a run of the `features` kind: its best policy, see `best_seed`."""

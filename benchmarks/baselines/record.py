@@ -70,7 +70,8 @@ def keep(item: Item, run: Path, files: Path, command: str) -> None:
 
 def kept(items: Iterable[Item], files: Path) -> tuple[list[Record], list[str]]:
     """Load the records of these items. For each made with other options, or broken, return a warning instead."""
-    records, left_out = [], []
+    records = []
+    left_out = []
     for item in items:
         path = files / f"{item.name}.json"
         if not path.exists():
@@ -87,7 +88,10 @@ def kept(items: Iterable[Item], files: Path) -> tuple[list[Record], list[str]]:
             left_out.append(f"{error}; it is left out, report it again")
             continue
         left_out += [
-            f"{path}: its evaluation {name!r} was made with other options and is left out; report it again"
+            (
+                f"{path}: its evaluation {name!r} was made with other options and is left out;"
+                f" report it again"
+            )
             for name in found["evaluations"].keys() - record.evaluations.keys()
         ]
         records.append(record)
