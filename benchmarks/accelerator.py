@@ -65,7 +65,7 @@ class Sizes(NamedTuple):
 
 
 ACCELERATOR = Sizes("1,1024,16384,262144,1048576", ppo=(2048, 32768), filters=(4096, 65536))
-"""For PPO: as many environments as in `ppo.py`, and as many as an accelerator has room for."""
+"""PPO has as many environments as in `ppo.py`, and as many as an accelerator has room for."""
 
 CPU = Sizes("1,64,1024", ppo=(64,), filters=(64,))
 
@@ -99,10 +99,10 @@ TESTS = (
     "tests/simulation/test_dubins.py::test_in_float32_the_way_flown_has_six_digits",
     "tests/simulation/test_trig.py",
 )
-"""Those of `numbers`, the most telling first."""
+"""The tests of `numbers`, the most telling first."""
 
 WORKERS = 8
-"""Processes that run tests side by side, where there are as many cores and pytest-xdist."""
+"""Processes that run tests side by side, if there are as many cores and pytest-xdist."""
 
 
 class Request(NamedTuple):
@@ -116,7 +116,7 @@ class Request(NamedTuple):
 
     @property
     def left(self) -> float:
-        """Seconds that are left."""
+        """The seconds that are left."""
         return self.until - time.monotonic()
 
 
@@ -124,14 +124,14 @@ class Job(NamedTuple):
     """One row to be measured."""
 
     row: dict[str, Any]
-    prepare: Callable[
-        [], Any
-    ]  # compiles on a thread; the function that is measured, which takes a number to begin from
-    measure: Callable[[Any, Request], dict[str, Any]]  # what a row says beside that
+    # Compiles on a thread. Returns the function that is measured, which takes a number to begin
+    # from.
+    prepare: Callable[[], Any]
+    measure: Callable[[Any, Request], dict[str, Any]]  # returns what a row says besides
 
 
 def main() -> None:
-    """Run, write, print."""
+    """Run the parts, write the results and print the tables."""
     options = words(
         minutes="10",
         parts=",".join(PARTS),
@@ -221,7 +221,7 @@ def probe(options: dict[str, str], tasks: Sequence[str]) -> None:
 
 
 def numbers(request: Request) -> Iterator[dict[str, Any]]:
-    """Test by test, whether it passed."""
+    """Run the tests. Yield a row for each that did not pass, and one with all counts."""
     command = [
         sys.executable,
         "-m",
@@ -234,11 +234,12 @@ def numbers(request: Request) -> Iterator[dict[str, Any]]:
         "-p",
         "no:benchmark",
     ]
+    # Warnings about other versions of packages are no question of numbers.
     command += [
         "-W",
         "default",
         *TESTS,
-    ]  # what other versions of packages warn of is no question of numbers
+    ]
     workers = min(WORKERS, usable_cores())
     if workers > 2 and importlib.util.find_spec("xdist"):
         command += [f"-n{workers}", f"--maxprocesses={workers}"]
@@ -274,7 +275,7 @@ def numbers(request: Request) -> Iterator[dict[str, Any]]:
 
 
 def environments(request: Request) -> Iterator[dict[str, Any]]:
-    """Steps a second; large batches of all tasks before small ones."""
+    """Measure steps a second. Large batches of all tasks come before small ones."""
     import environments as peers
     import jax
 
@@ -315,7 +316,7 @@ def environments(request: Request) -> Iterator[dict[str, Any]]:
 
 
 def ppo(request: Request) -> Iterator[dict[str, Any]]:
-    """Samples a second of one seed and of several at once."""
+    """Measure samples a second of one seed and of several at once."""
     import jax
     import ppo as settings
 
@@ -363,7 +364,7 @@ def ppo(request: Request) -> Iterator[dict[str, Any]]:
 
 
 def learning(request: Request) -> Iterator[dict[str, Any]]:
-    """Seconds to `LEVEL` of all seeds of a task."""
+    """Measure the seconds until all seeds of a task have reached `LEVEL`."""
     import jax
     import numpy as np
 
@@ -429,7 +430,7 @@ def learning(request: Request) -> Iterator[dict[str, Any]]:
 
 
 def filters(request: Request) -> Iterator[dict[str, Any]]:
-    """Calls a second; the recommended filter of each task first."""
+    """Measure calls a second. The recommended filter of each task comes first."""
     import jax
     import rta
 
@@ -455,7 +456,7 @@ def filters(request: Request) -> Iterator[dict[str, Any]]:
         ]
         return {
             "calls_per_s": {
-                str(batch): batch / each for batch, each in zip(batches, seconds, strict=True)
+                str(batch): batch / median for batch, median in zip(batches, seconds, strict=True)
             }
         }
 
@@ -463,7 +464,7 @@ def filters(request: Request) -> Iterator[dict[str, Any]]:
     named = {
         task: [name for name in TASKS[task].filters if name != "default"] for task in request.tasks
     }
-    for turn in zip_longest(*named.values()):  # the first of each task is its default
+    for turn in zip_longest(*named.values()):  # the first filter of each task is its default
         for task, preset in zip(named, turn, strict=True):
             if preset:
                 jobs.append(
@@ -473,23 +474,26 @@ def filters(request: Request) -> Iterator[dict[str, Any]]:
 
 
 def sizes_here() -> Sizes:
-    """How large the measurements are on this device."""
+    """Return how large the measurements are on this device."""
     import jax
 
     return CPU if jax.default_backend() == "cpu" else ACCELERATOR
 
 
 class Built:
-    """Compiled programs, what compiling took, the memory of the last one, and how to call them."""
+    """Compiled programs and how to call them.
+
+    It also has the time of compiling and the memory of the last program.
+    """
 
     call: Callable[[Any], Any]
     config: Any = None
 
     def __init__(self, compile_: Callable[[], Any]) -> None:
-        """Compile; `compile_` returns a program or a list of them."""
+        """Compile. `compile_` returns a program or a list of them."""
         begin = time.monotonic()
-        found = compile_()
-        self.programs = found if isinstance(found, list) else [found]
+        built = compile_()
+        self.programs = built if isinstance(built, list) else [built]
         self.compile_s = time.monotonic() - begin
         sizes = [
             getattr(program.memory_analysis(), "temp_size_in_bytes", None)
@@ -503,7 +507,7 @@ class Built:
         return self.programs[0]
 
     def calling(self, call: Callable[[Any], Any]) -> Built:
-        """Return this with how it is called."""
+        """Set how the programs are called, and return this object."""
         self.call = call
         return self
 
@@ -513,9 +517,9 @@ def measured(
 ) -> Iterator[dict[str, Any]]:
     """Compile some jobs side by side, at most two a core, then measure them one after another.
 
-    The next jobs follow in the same way, so nothing is measured while something compiles. Where the
-    time is too short for another round like the one before, the rest is skipped. Rows are marked
-    that were measured although some program of their round was still compiling.
+    The next jobs follow in the same way, so nothing is measured while something compiles. If the
+    time is too short for another round like the one before, the rest is skipped. Rows are marked if
+    they were measured although some program of their round was still compiling.
     """
     size = min(size, 2 * usable_cores())
     longest = 0.0
@@ -547,26 +551,26 @@ def measured(
 
 
 def row_of(job: Job, built: Built, request: Request) -> dict[str, Any]:
-    """Measure a job that is compiled; an error of the device ends its row, not the others."""
+    """Measure a job that is compiled. An error of the device ends its row, but not the others."""
     try:
-        found = job.measure(built, request)
+        measurements = job.measure(built, request)
     except Exception as error:
         return {"skipped": f"{named(job)}: {type(error).__name__}: {str(error)[:300]}"}
     return {
         **job.row,
-        **found,
+        **measurements,
         "compile_s": round(built.compile_s, 1),
         "temporary_bytes": built.temporary,
     }
 
 
 def named(job: Job) -> str:
-    """Return how a job is called where it is skipped."""
+    """Return the name of a job where it is skipped."""
     return ", ".join(f"{key} {value}" for key, value in job.row.items())
 
 
 def timed(run: Callable[[int], Any], repeats: int) -> list[float]:
-    """Seconds of some calls, after one that is not counted."""
+    """Return the seconds of some calls. A first call is not counted."""
     import jax
 
     seconds = []
@@ -578,7 +582,7 @@ def timed(run: Callable[[int], Any], repeats: int) -> list[float]:
 
 
 def largest(recipes: Path) -> str:
-    """The name of the recipe with the most environments."""
+    """Return the name of the recipe with the most environments."""
     from jaxsafe.schema import yaml12
 
     known = yaml12.read(recipes)
@@ -586,7 +590,7 @@ def largest(recipes: Path) -> str:
 
 
 class Part(NamedTuple):
-    """One of the script's questions, and its share of the time."""
+    """One of the script's questions and its share of the time."""
 
     run: Callable[[Request], Iterator[dict[str, Any]]]
     share: float

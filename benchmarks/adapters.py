@@ -1,10 +1,17 @@
-"""How fast are the tasks through Gymnasium, and what does each adapter cost beside the pure functions?
+"""Measure how fast the tasks are through Gymnasium, and what each adapter costs.
 
-Steps a second with actions chosen beforehand: `GymVectorEnv` at some numbers of environments; Gymnasium's SyncVectorEnv of
-the same task; Gymnasium's NumPy-vectorised CartPole; EnvPool's CartPole, where it is installed; the pure step with
-automatic reset called from Python in the same way; `SafetyEnv`, and the adapters for gymnax, Brax and Stable-Baselines3
-where those are installed. Compile time apart; the median of some repeats, in turns. Writes
-`benchmarks/results/adapters.json` and prints a table:
+Adapters are compared with the pure functions, in steps a second with actions chosen beforehand:
+
+- `GymVectorEnv` at some numbers of environments,
+- Gymnasium's SyncVectorEnv of the same task,
+- Gymnasium's NumPy-vectorised CartPole,
+- EnvPool's CartPole, where it is installed,
+- the pure step with automatic reset, called from Python in the same way,
+- `SafetyEnv`,
+- the adapters for gymnax, Brax and Stable-Baselines3, where those are installed.
+
+Compile time is measured apart. Numbers are the median of some repeats, in turns. Results are
+written to `benchmarks/results/adapters.json`, and a table is printed:
 
     python benchmarks/adapters.py [task=docking2d] [envs=1,64,1024,4096] [repeats=5]
 """
@@ -42,7 +49,7 @@ Step = Callable[[], Any]
 
 
 def main() -> None:
-    """Run, write, print."""
+    """Measure, write the results and print the table."""
     options = words(task="docking2d", repeats="5", envs="1,64,1024,4096")
     task = options["task"]
     repeats = int(options["repeats"])
@@ -58,9 +65,9 @@ def main() -> None:
 
 
 def peers(task: str, number: int) -> dict[str, Step]:
-    """A function that takes one step of all environments, by name."""
+    """Return, by name, a function that takes one step of all environments."""
     env = jaxsafe.make(task)  # made once, not for each of thousands of single environments
-    found = {
+    steps = {
         "pure functions, called from Python": pure(task, number),
         "GymVectorEnv": vector(GymVectorEnv(task, number, autoreset_mode="SameStep")),
         "SafetyEnv": vector(SafetyEnv(task, number)),
@@ -68,7 +75,7 @@ def peers(task: str, number: int) -> dict[str, Step]:
         "Gymnasium CartPole, NumPy": vector(gym.make_vec("CartPole-v1", num_envs=number)),
     }
     if number == 1:
-        found["GymEnv"] = single(GymEnv(task))
+        steps["GymEnv"] = single(GymEnv(task))
     for name, package, build in (
         ("EnvPool CartPole", "envpool", envpool_cartpole),
         ("GymnaxEnv", "gymnax", gymnax_env),
@@ -76,28 +83,28 @@ def peers(task: str, number: int) -> dict[str, Step]:
         ("SB3VecEnv", "stable_baselines3", sb3_env),
     ):
         if importlib.util.find_spec(package):
-            found[name] = build(task, number)
-    return found
+            steps[name] = build(task, number)
+    return steps
 
 
 def pure(task: str, number: int) -> Step:
-    """The compiled step with automatic reset."""
+    """Return the compiled step with automatic reset."""
     env = jaxsafe.make(task)
     step = jax.jit(step_or_reset_batch)
     state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(0), number)
     action = np.random.default_rng(0).uniform(-1, 1, (number, env.action_size)).astype(np.float32)
     key = jax.random.key(1)
 
-    def one() -> Any:
+    def step_all() -> Any:
         nonlocal state
         (state, observation), timestep = step(env, state, action, key)
         return np.asarray(observation), np.asarray(timestep.reward), np.asarray(timestep.terminated)
 
-    return one
+    return step_all
 
 
 def vector(env: Any) -> Step:
-    """A Gymnasium vector environment."""
+    """Return the step of a Gymnasium vector environment."""
     env.reset(seed=0)
     env.action_space.seed(0)
     action = env.action_space.sample()
@@ -105,20 +112,20 @@ def vector(env: Any) -> Step:
 
 
 def single(env: gym.Env) -> Step:
-    """A single Gymnasium environment, reset where its episode ends."""
+    """Return the step of a single Gymnasium environment, which is reset where its episode ends."""
     env.reset(seed=0)
     action = env.action_space.sample()
 
-    def one() -> None:
+    def step_once() -> None:
         *_, terminated, truncated, _ = env.step(action)
         if terminated or truncated:
             env.reset()
 
-    return one
+    return step_once
 
 
 def envpool_cartpole(task: str, number: int) -> Step:
-    """CartPole-v1 in C++ threads."""
+    """Return the step of EnvPool's CartPole-v1, in C++ threads."""
     envpool = importlib.import_module("envpool")
     env = envpool.make("CartPole-v1", env_type="gymnasium", num_envs=number, seed=0)
     env.reset()
@@ -127,7 +134,7 @@ def envpool_cartpole(task: str, number: int) -> Step:
 
 
 def gymnax_env(task: str, number: int) -> Step:
-    """The gymnax adapter, mapped over lanes."""
+    """Return the step of the gymnax adapter, mapped over environments."""
     env = importlib.import_module("jaxsafe.adapters.gymnax").GymnaxEnv(task)
     params = env.default_params
     keys = jax.random.split(jax.random.key(0), number)
@@ -135,43 +142,43 @@ def gymnax_env(task: str, number: int) -> Step:
     step = jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))
     action = jnp.zeros((number, env.env.action_size))
 
-    def one() -> Any:
+    def step_all() -> Any:
         nonlocal state
         observation, state, reward, *_ = step(keys, state, action, params)
         return np.asarray(observation), np.asarray(reward)
 
-    return one
+    return step_all
 
 
 def brax_env(task: str, number: int) -> Step:
-    """The Brax adapter with fresh starts."""
+    """Return the step of the Brax adapter with fresh starts."""
     brax = importlib.import_module("jaxsafe.adapters.brax")
     env = brax.wrap(brax.BraxEnv(task), 10_000)
     state = jax.jit(env.reset)(jax.random.split(jax.random.PRNGKey(0), number))
     step = jax.jit(env.step)
     action = jnp.zeros((number, env.action_size))
 
-    def one() -> Any:
+    def step_all() -> Any:
         nonlocal state
         state = step(state, action)
         return np.asarray(state.obs), np.asarray(state.reward)
 
-    return one
+    return step_all
 
 
 def sb3_env(task: str, number: int) -> Step:
-    """The adapter for Stable-Baselines3."""
+    """Return the step of the adapter for Stable-Baselines3."""
     env = importlib.import_module("jaxsafe.adapters.stable_baselines3").SB3VecEnv(task, number)
     env.reset()
     action = np.zeros((number, *env.action_space.shape), np.float32)
     return lambda: env.step(action)
 
 
-def measure(found: dict[str, Step], number: int, repeats: int) -> dict[str, Any]:
-    """Steps a second of each, in turns so that a slow moment of the machine hits all."""
+def measure(steps: dict[str, Step], number: int, repeats: int) -> dict[str, Any]:
+    """Measure steps a second of each, in turns so that a slow moment of the machine hits all."""
     counts = {}
     first = {}
-    for name, step in found.items():
+    for name, step in steps.items():
         begin = time.perf_counter()
         step()
         first[name] = time.perf_counter() - begin
@@ -181,9 +188,9 @@ def measure(found: dict[str, Step], number: int, repeats: int) -> dict[str, Any]
             step()
             taken += 1
         counts[name] = max(1, int(SECONDS / repeats * taken / (time.perf_counter() - begin)))
-    rates: dict[str, list[float]] = {name: [] for name in found}
+    rates: dict[str, list[float]] = {name: [] for name in steps}
     for _ in range(repeats):
-        for name, step in found.items():
+        for name, step in steps.items():
             begin = time.perf_counter()
             for _ in range(counts[name]):
                 step()

@@ -1,15 +1,23 @@
-"""How many steps a second do the five tasks take on one core, beside environments of other libraries?
+"""Measure how many steps a second the five tasks take on one core, beside other libraries.
 
-Random continuous actions, automatic reset, everything inside one compiled scan; compile time apart; the median of some
-repeats. Each row is a process of its own, pinned to one core; peers run in Python environments that this script builds in
-`benchmarks/peers`. `docking3d:usual_way` is the same task with what most JAX environments do: a key for every environment
-at every step, and a start drawn whether it is needed or not. Rows that end in `:one_action` draw actions once and take
-them at every step, so that the environment is alone in the loop; `docking3d:no_reset` does so too and goes on where an
-episode ended. Peers are other and mostly smaller tasks: gymnax's
-CartPole and Pendulum, Brax's inverted pendulum (spring), and CartPole of Gymnasium (NumPy) and EnvPool (one thread), which
-get the same actions at every step. Writes `benchmarks/results/environments.json` and prints the README's table:
+Actions are random and continuous, resets are automatic, and everything is inside one compiled scan.
+Compile time is measured apart. Numbers are the median of some repeats. Each row is a process of its
+own, pinned to one core. Peers run in Python environments that this script builds in
+`benchmarks/peers`.
 
-    python benchmarks/environments.py [lanes=1,1024,4096,16384] [names=docking3d,gymnax:Pendulum-v1,…] [repeats=5]
+- `docking3d:usual_way` is the same task with what most JAX environments do: a key for every
+  environment at every step, and a start drawn whether it is needed or not.
+- Rows that end in `:one_action` draw actions once and take them at every step, so that the
+  environment is alone in the loop.
+- `docking3d:no_reset` does so too, and goes on where an episode ended.
+- Peers are other and mostly smaller tasks: gymnax's CartPole and Pendulum, Brax's inverted pendulum
+  (spring), and CartPole of Gymnasium (NumPy) and EnvPool (one thread). The last two get the same
+  actions at every step.
+
+Results are written to `benchmarks/results/environments.json`, and the README's table is printed:
+
+    python benchmarks/environments.py [envs=1,1024,4096,16384] [names=docking3d,…]
+        [repeats=5]
 """
 
 from __future__ import annotations
@@ -35,23 +43,29 @@ from jaxsafe.rollout import reset_batch, step_or_reset, step_or_reset_batch
 
 OUT = Path(__file__).parent / "results" / "environments.json"
 RELEASED = (1800.0, 3000.0)
-"""Steps a second of the released SafeRL code in one process, slowest and fastest task: a figure from elsewhere."""
+"""Steps a second of the released SafeRL code in one process, for its slowest and fastest task.
+
+The figures come from elsewhere.
+"""
 
 NUM_STEPS = 1000
-"""Steps of each lane in one measurement, so that resets have their share; 200 times as many for one."""
+"""Steps of each environment in one measurement, so that resets have their share.
+
+A single environment takes 200 times as many.
+"""
 
 SLOW_STEPS = 2_000_000
 """Steps of all environments together in one measurement of what is called from Python."""
 
 
 def main() -> None:
-    """Run, write, print."""
-    options = words(lanes="1,1024,4096,16384", names=",".join(RUNS), repeats="5")
-    lanes = [int(number) for number in options["lanes"].split(",")]
+    """Measure, write the results and print the table."""
+    options = words(envs="1,1024,4096,16384", names=",".join(RUNS), repeats="5")
+    sizes = [int(number) for number in options["envs"].split(",")]
     names = several("names", options["names"], RUNS)
     repeats = int(options["repeats"])
     if "probe" in options:
-        print(json.dumps(RUNS[options["probe"]](lanes[0], repeats)))
+        print(json.dumps(RUNS[options["probe"]](sizes[0], repeats)))
         return
     import tables
     from machine import about
@@ -61,12 +75,12 @@ def main() -> None:
         library: interpreter(library) for library in {name.partition(":")[0] for name in names}
     }
     results = []
-    for num in lanes:
+    for num in sizes:
         for name in names:
-            request = [f"probe={name}", f"lanes={num}", f"repeats={repeats}"]
-            found = probe(__file__, request, 1, python[name.partition(":")[0]])
-            results.append({"task": name, "lanes": num, **found})
-            print(f"{name} × {num:,}: {found['steps_per_s']:,.0f}", file=sys.stderr)
+            request = [f"probe={name}", f"envs={num}", f"repeats={repeats}"]
+            rate = probe(__file__, request, 1, python[name.partition(":")[0]])
+            results.append({"task": name, "lanes": num, **rate})
+            print(f"{name} × {num:,}: {rate['steps_per_s']:,.0f}", file=sys.stderr)
     content = {
         **here,
         "peers": versions(python),
@@ -81,7 +95,7 @@ def main() -> None:
 def task(
     name: str, num_envs: int, repeats: int, one_action: bool = False, reset: bool = True
 ) -> dict[str, Any]:
-    """One of the five."""
+    """Measure one of the five tasks."""
     run = functools.partial(episode_steps, jaxsafe.make(name), one_action=one_action, reset=reset)
     return compiled(run, num_envs, repeats)
 
@@ -94,12 +108,15 @@ def episode_steps(
     one_action: bool = False,
     reset: bool = True,
 ) -> jax.Array:
-    """Steps with random actions; the sum of rewards, costs and of what a policy would see, so that none is left out."""
+    """Take steps with random actions. Return a sum, so that nothing is left out.
+
+    It is the sum of rewards, costs and of what a policy would see.
+    """
     state, timestep = reset_batch(env, key, num_envs, axis=-1)
     draw = lambda key: jax.random.uniform(key, (env.action_size, num_envs), minval=-1.0)  # noqa: E731
     first = draw(key)
 
-    def one(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+    def one_step(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
         key_action, key_reset = jax.random.split(key)
         action = first if one_action else draw(key_action)
         if reset:
@@ -112,16 +129,16 @@ def episode_steps(
         return carry, jnp.sum(timestep.reward) + jnp.sum(timestep.cost) + jnp.sum(carry[1])
 
     return jnp.sum(
-        jax.lax.scan(one, (state, timestep.observation), jax.random.split(key, num_steps))[1]
+        jax.lax.scan(one_step, (state, timestep.observation), jax.random.split(key, num_steps))[1]
     )
 
 
 def usual_way(num_envs: int, repeats: int) -> dict[str, Any]:
-    """docking3d one environment at a time, mapped."""
+    """Measure docking3d, one environment at a time, mapped."""
     env = jaxsafe.make("docking3d")
 
     def run(key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
-        def one(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+        def one_step(carry: Any, key: jax.Array) -> tuple[Any, jax.Array]:
             key_action, key_step = jax.random.split(key)
             action = jax.random.uniform(key_action, (num_envs, env.action_size), minval=-1.0)
             keys = jax.random.split(key_step, num_envs)
@@ -131,18 +148,21 @@ def usual_way(num_envs: int, repeats: int) -> dict[str, Any]:
             return state, jnp.sum(timestep.reward) + jnp.sum(timestep.cost) + jnp.sum(observation)
 
         state, _ = jax.vmap(jaxsafe.reset, in_axes=(None, 0))(env, jax.random.split(key, num_envs))
-        return jnp.sum(jax.lax.scan(one, state, jax.random.split(key, num_steps))[1])
+        return jnp.sum(jax.lax.scan(one_step, state, jax.random.split(key, num_steps))[1])
 
     return compiled(run, num_envs, repeats)
 
 
 def gymnax(name: str, num_envs: int, repeats: int, one_action: bool = False) -> dict[str, Any]:
-    """An environment of gymnax, which resets by itself."""
+    """Measure an environment of gymnax, which resets by itself."""
     return compiled(gymnax_steps(name, one_action), num_envs, repeats)
 
 
 def gymnax_steps(name: str, one_action: bool = False) -> Callable[[jax.Array, int, int], jax.Array]:
-    """Steps of gymnax's environment as `episode_steps` takes them of ours: of a key, environments and steps."""
+    """Return a function that steps gymnax's environment as `episode_steps` steps ours.
+
+    It takes a key and the numbers of environments and steps.
+    """
     env, params = importlib.import_module("gymnax").make(name)
     space = env.action_space(params)
 
@@ -156,7 +176,7 @@ def gymnax_steps(name: str, one_action: bool = False) -> Callable[[jax.Array, in
     def run(key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
         first = draw(key, num_envs)
 
-        def one(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+        def one_step(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
             key_action, key_step = jax.random.split(key)
             action = first if one_action else draw(key_action, num_envs)
             keys = jax.random.split(key_step, num_envs)
@@ -166,31 +186,31 @@ def gymnax_steps(name: str, one_action: bool = False) -> Callable[[jax.Array, in
             return state, jnp.sum(reward) + jnp.sum(observation)
 
         _, state = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(key, num_envs), params)
-        return jnp.sum(jax.lax.scan(one, state, jax.random.split(key, num_steps))[1])
+        return jnp.sum(jax.lax.scan(one_step, state, jax.random.split(key, num_steps))[1])
 
     return run
 
 
 def brax(num_envs: int, repeats: int) -> dict[str, Any]:
-    """Brax's inverted pendulum by its spring method, in its own wrappers."""
+    """Measure Brax's inverted pendulum by its spring method, in its own wrappers."""
     env = importlib.import_module("brax.envs").create(
         "inverted_pendulum", backend="spring", batch_size=num_envs
     )
 
     def run(key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
-        def one(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+        def one_step(state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
             state = env.step(
                 state, jax.random.uniform(key, (num_envs, env.action_size), minval=-1.0)
             )
             return state, jnp.sum(state.reward) + jnp.sum(state.obs)
 
-        return jnp.sum(jax.lax.scan(one, env.reset(key), jax.random.split(key, num_steps))[1])
+        return jnp.sum(jax.lax.scan(one_step, env.reset(key), jax.random.split(key, num_steps))[1])
 
     return compiled(run, num_envs, repeats, NUM_STEPS // 10)  # far slower than the tasks
 
 
 def gymnasium(num_envs: int, repeats: int) -> dict[str, Any]:
-    """CartPole of Gymnasium, written for NumPy."""
+    """Measure CartPole of Gymnasium, written for NumPy."""
     env = importlib.import_module("gymnasium").make_vec("CartPole-v1", num_envs=num_envs)
     env.reset(seed=0)
     action = env.action_space.sample()
@@ -198,7 +218,7 @@ def gymnasium(num_envs: int, repeats: int) -> dict[str, Any]:
 
 
 def envpool(num_envs: int, repeats: int) -> dict[str, Any]:
-    """CartPole of EnvPool, in C++."""
+    """Measure CartPole of EnvPool, in C++."""
     env = importlib.import_module("envpool").make(
         "CartPole-v1", env_type="gymnasium", num_envs=num_envs, num_threads=1
     )
@@ -210,7 +230,10 @@ def envpool(num_envs: int, repeats: int) -> dict[str, Any]:
 def compiled(
     run: Callable, num_envs: int, repeats: int, num_steps: int = NUM_STEPS
 ) -> dict[str, Any]:
-    """Compile once, then time; each lane makes so many steps, 200 times as many if it is the only one."""
+    """Compile once, then measure. Each environment makes `num_steps` steps.
+
+    A single environment makes 200 times as many.
+    """
     num_steps *= 200 if num_envs == 1 else 1
     begin = time.perf_counter()
     program = (
@@ -227,7 +250,7 @@ def compiled(
 
 
 def called(step: Callable[[], Any], num_envs: int, repeats: int) -> dict[str, Any]:
-    """Time what is called from Python."""
+    """Measure what is called from Python."""
     num_steps = max(10, min(SLOW_STEPS // num_envs, 20_000))
     seconds = []
     for _ in range(repeats + 1):
@@ -239,12 +262,15 @@ def called(step: Callable[[], Any], num_envs: int, repeats: int) -> dict[str, An
 
 
 def rates(steps: int, seconds: list[float], compile_s: float) -> dict[str, Any]:
-    """Median, slowest and fastest; the first time warms caches."""
-    found = sorted(steps / each for each in seconds[1:])
+    """Return the median, the slowest and the fastest rate.
+
+    The first time warms caches and is left out.
+    """
+    per_second = sorted(steps / spent for spent in seconds[1:])
     return {
-        "steps_per_s": statistics.median(found),
-        "slowest": found[0],
-        "fastest": found[-1],
+        "steps_per_s": statistics.median(per_second),
+        "slowest": per_second[0],
+        "fastest": per_second[-1],
         "compile_s": round(compile_s, 2),
     }
 

@@ -1,9 +1,10 @@
-"""How long does it take until ten seeds of all five tasks are learnt, nothing compiled before?
+"""Measure how long it takes until ten seeds of all five tasks are learnt.
 
-`python -m jaxsafe.train env=all preset=quick` in a process of its own with an empty cache of compiled programs, and the
-same five trainings as five commands, one after another. Learnt is when 95 % of the last 100 training episodes succeeded,
-on the average over seeds, as Table 2 of the paper counts 80 %. Writes `benchmarks/results/five_tasks.json` and prints a
-table of medians:
+Nothing is compiled before. One way is `python -m jaxsafe.train env=all preset=quick` in a process
+of its own with an empty cache of compiled programs. The other is the same five trainings as five
+commands, one after another. A task is learnt when 95 % of the last 100 training episodes succeeded,
+on the average over seeds. Table 2 of the paper counts 80 % in this way. Results are written to
+`benchmarks/results/five_tasks.json`, and a table of medians is printed:
 
     python benchmarks/five_tasks.py [seeds=10] [seed=0] [preset=quick] [repeats=3]
 """
@@ -33,7 +34,7 @@ POLL = 0.1
 
 
 def main() -> None:
-    """Run, write, print."""
+    """Measure, write the results and print the table."""
     options = words(seeds="10", seed="0", preset="quick", repeats="3")
     import tables
     from machine import about
@@ -50,7 +51,7 @@ def main() -> None:
 
 
 def together(asked: Sequence[str]) -> dict[str, Any]:
-    """All five by one command: when the last of them is learnt."""
+    """Train all five tasks by one command. Return when the last of them is learnt."""
     with tempfile.TemporaryDirectory() as place:
         runs = {task: Path(place, "all", task) for task in TASKS}
         whole, sizes = watched(
@@ -61,12 +62,15 @@ def together(asked: Sequence[str]) -> dict[str, Any]:
             "learnt": max(numbers) if (numbers := all_known(at)) else None,
             "each": at,
             "whole": whole,
-            **found(runs),
+            **evaluated(runs),
         }
 
 
 def apart(asked: Sequence[str]) -> dict[str, Any]:
-    """Each by a command of its own: the seconds until it is learnt, added up."""
+    """Train each task by a command of its own.
+
+    Return the sum of the seconds until each is learnt.
+    """
     with tempfile.TemporaryDirectory() as place:
         runs = {task: Path(place, task) for task in TASKS}
         cache = Path(place, "cache")
@@ -79,14 +83,17 @@ def apart(asked: Sequence[str]) -> dict[str, Any]:
             "learnt": sum(numbers) if (numbers := all_known(at)) else None,
             "each": at,
             "whole": whole,
-            **found(runs),
+            **evaluated(runs),
         }
 
 
 def watched(
     asked: Sequence[str], runs: Iterable[Path], cache: Path
 ) -> tuple[float, list[tuple[float, dict[Path, int]]]]:
-    """The seconds that a training command takes, and on the way how long the progress logs of its runs are, in bytes."""
+    """Run a training command. Return the seconds that it takes and how its progress logs grew.
+
+    The lengths of the logs are in bytes.
+    """
     environment = {key: value for key, value in os.environ.items() if key not in CACHE} | {
         "XDG_CACHE_HOME": str(cache)
     }
@@ -107,7 +114,10 @@ def watched(
 
 
 def when(run: Path, sizes: Sequence[tuple[float, dict[Path, int]]]) -> float | None:
-    """Seconds from the start of the command until the log of a run had the row with which it was learnt."""
+    """Return the seconds from the start of the command until a task was learnt.
+
+    The log of its run then had the row with which it was learnt.
+    """
     log = run / "progress.jsonl"
     rows = read_rows(log)
     reached = wall_to(LEVEL, rows)
@@ -120,21 +130,24 @@ def when(run: Path, sizes: Sequence[tuple[float, dict[Path, int]]]) -> float | N
     return next(at for at, size in sizes if size.get(log, 0) >= needed)
 
 
-def found(runs: dict[str, Path]) -> dict[str, Any]:
-    """Of the evaluation after training: success with sampled actions, the mean over seeds, and which seeds failed."""
+def evaluated(runs: dict[str, Path]) -> dict[str, Any]:
+    """Return the mean success over seeds with sampled actions, and the failed seeds.
+
+    They are those of the evaluation after training.
+    """
     results = {task: read_json(run / "results.json") for task, run in runs.items()}
     success = {
-        task: one["evaluation"]["stochastic"]["success_rate"]["mean"]
-        for task, one in results.items()
+        task: result["evaluation"]["stochastic"]["success_rate"]["mean"]
+        for task, result in results.items()
     }
     return {
         "success": success,
-        "failed": {task: failed_seeds(one) for task, one in results.items()},
+        "failed": {task: failed_seeds(result) for task, result in results.items()},
     }
 
 
 def all_known(values: Sequence[float | None]) -> list[float]:
-    """The values, or nothing if one of them was never reached."""
+    """Return the values, or nothing if one of them was never reached."""
     known = [value for value in values if value is not None]
     return known if len(known) == len(values) else []
 

@@ -1,4 +1,7 @@
-"""Measurements in processes of their own: on chosen cores, and with peers whose versions exclude each other."""
+"""Measurements in processes of their own.
+
+They run on chosen cores, and with peers whose versions exclude each other.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ CACHE = (
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS",
     "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES",
 )
-"""Variables that say whether JAX keeps compiled programs, and from which time and size on."""
+"""Variables that decide whether JAX keeps compiled programs, and from which time and size on."""
 
 
 PEERS = {
@@ -28,13 +31,17 @@ PEERS = {
     "rejax": ["rejax", "gymnax==0.0.9", "six", "--pre", "tfp-nightly"],
     "sb3": ["stable-baselines3"],
 }
-"""What pip installs for each beside jaxsafe, which brings Gymnasium itself; gymnax imports six without asking for it."""
+"""Packages that pip installs for each peer beside jaxsafe, which brings Gymnasium itself.
+
+Gymnax imports six without asking for it.
+"""
 
 
 def words(**defaults: str) -> dict[str, str]:
-    """What the command says, `name=value`, over its defaults; a name that has none ends it with one line.
+    """Return the options of the command, `name=value`, over their defaults.
 
-    `probe` asks for a single measurement.
+    A name that has no default ends the command with one line. `probe` asks for a single
+    measurement.
     """
     given = {name: value for name, _, value in (word.partition("=") for word in sys.argv[1:])}
     for name in given:
@@ -44,7 +51,7 @@ def words(**defaults: str) -> dict[str, str]:
 
 
 def several(option: str, value: str, known: Iterable[str]) -> list[str]:
-    """The names in a list with commas; one that is not known ends the command with one line."""
+    """Return the names in a list with commas. An unknown name ends the command with one line."""
     names = [name for name in value.split(",") if name]
     allowed = list(known)
     for name in names:
@@ -54,7 +61,10 @@ def several(option: str, value: str, known: Iterable[str]) -> list[str]:
 
 
 def interpreter(name: str) -> str:
-    """Python with a peer beside jaxsafe, in `benchmarks/peers`, built the first time; this Python for what is no peer."""
+    """Return Python with a peer beside jaxsafe. It is built in `benchmarks/peers` the first time.
+
+    For what is no peer, it is this Python.
+    """
     if name not in PEERS:
         return sys.executable
     place = HERE / "peers" / name
@@ -72,13 +82,16 @@ def interpreter(name: str) -> str:
 
 
 def versions(names: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Of each peer's environment: what pip installed there for it, and what that computes with."""
+    """Return the versions in each peer's environment.
+
+    They are those of what pip installed for it, and of what that computes with.
+    """
     ask = "import json, sys; from importlib.metadata import distributions as all; "
     ask += (
-        "print(json.dumps({one.name.lower(): one.version for one in all() if"
-        " one.name.lower() in sys.argv[1:]}))"
+        "print(json.dumps({package.name.lower(): package.version for package in all()"
+        " if package.name.lower() in sys.argv[1:]}))"
     )
-    found = {}
+    versions_of = {}
     for name in sorted(set(names) & set(PEERS)):
         wanted = [re.split("[=<>]", word)[0] for word in PEERS[name] if not word.startswith("-")]
         command = [
@@ -92,10 +105,10 @@ def versions(names: Iterable[str]) -> dict[str, dict[str, str]]:
             "gymnasium",
             "torch",
         ]
-        found[name] = json.loads(
+        versions_of[name] = json.loads(
             subprocess.run(command, capture_output=True, text=True, check=True).stdout
         )
-    return found
+    return versions_of
 
 
 def probe(
@@ -105,18 +118,18 @@ def probe(
     python: str = sys.executable,
     cache: Path | None = None,
 ) -> Any:
-    """What a script prints last, as JSON, when it runs with such words pinned to some cores, or on all.
+    """Run a script pinned to some cores, or on all. Return what it prints last, as JSON.
 
-    `cache` keeps what JAX compiles, however small; without it nothing is kept.
+    `request` are its words. `cache` keeps what JAX compiles, however small. Without it nothing is
+    kept.
     """
     command = [python, script, *request]
     environment = {key: value for key, value in os.environ.items() if key not in CACHE}
     if cache:
         environment |= dict(zip(CACHE, (str(cache), "0", "-1"), strict=True))
     before = os.sched_getaffinity(0)
-    os.sched_setaffinity(
-        0, sorted(before)[:cores]
-    )  # a child has that of the thread which starts it
+    # A child inherits the cores of the thread that starts it.
+    os.sched_setaffinity(0, sorted(before)[:cores])
     try:
         ran = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     finally:

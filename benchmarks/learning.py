@@ -1,9 +1,15 @@
-"""Does what makes this PPO fast change what it learns?
+"""Measure whether what makes this PPO fast changes what it learns.
 
-Each variant trains ten seeds by the task's recipe in a process of its own: as it is; its shuffle replaced by the sort of
-`jax.random.permutation`; the gradient of a minibatch at once instead of in chunks; and every seed shared by two devices, on
-a CPU two cores. All draw the same starts and noise, but rounding or order differ, so that each ends elsewhere: what may not
-differ beyond noise is how good the policies are. Writes `benchmarks/results/learning.json` and prints a table:
+Each variant trains ten seeds by the task's recipe in a process of its own:
+
+- as it is,
+- with its shuffle replaced by the sort of `jax.random.permutation`,
+- with the gradient of a minibatch at once instead of in chunks,
+- with every seed shared by two devices, on a CPU two cores.
+
+All draw the same starts and noise, but rounding or order differ, so that each ends elsewhere. How
+good the policies are must not differ beyond noise. Results are written to
+`benchmarks/results/learning.json`, and a table is printed:
 
     python benchmarks/learning.py [tasks=docking2d,rejoin2d] [seeds=10] [seed=0]
 """
@@ -23,7 +29,7 @@ VARIANTS = ("as it is", "sorting shuffle", "whole gradients", "two devices a see
 
 
 def main() -> None:
-    """Run, write, print."""
+    """Train, write the results and print the table."""
     options = words(tasks="docking2d,rejoin2d", seeds="10", seed="0")
     seeds = [f"{name}={options[name]}" for name in ("seeds", "seed")]
     if "probe" in options:
@@ -51,7 +57,10 @@ def main() -> None:
 
 
 def trained(variant: str, asked: list[str]) -> dict[str, Any]:
-    """Steps to 80 % success, and of the final evaluation the success and the length of episodes."""
+    """Train a variant.
+
+    Return the steps to 80 % success, and success and length of final episodes.
+    """
     from jaxsafe.commands import train as train
     from jaxsafe.devices.seed_mapper import claim_cores
     from jaxsafe.train import ppo
@@ -73,8 +82,8 @@ def trained(variant: str, asked: list[str]) -> dict[str, Any]:
     return {
         "steps_to_80": results["interaction_efficiency"]["timesteps"],
         "evaluation": {
-            kind: {name: found[name] for name in keep}
-            for kind, found in results["evaluation"].items()
+            kind: {name: metrics[name] for name in keep}
+            for kind, metrics in results["evaluation"].items()
         },
     }
 

@@ -15,7 +15,10 @@ from jaxsafe.storage.provenance import processor
 
 
 def about() -> dict[str, Any]:
-    """Commit, versions, device and number of cores that may be used; to be asked before what is measured begins."""
+    """Return commit, versions, device and the number of cores that may be used.
+
+    Ask before anything is measured.
+    """
     return {
         "commit": _git("rev-parse", "HEAD"),
         "changed": bool(
@@ -31,7 +34,7 @@ def about() -> dict[str, Any]:
 
 
 def usable_cores() -> int:
-    """How many cores this process may run on."""
+    """Return how many cores this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

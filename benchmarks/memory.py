@@ -1,10 +1,14 @@
-"""How much memory does a training take, for each environment and for each seed?
+"""Measure how much memory a training takes, for each environment and for each seed.
 
-Stated: the bytes of a state of the task, and of what a seed keeps between updates without its environments. Predicted: what
-the compiled update needs in all, by XLA. A training compares that with the memory that is free before it starts, and adds
-what a process takes once: for compiling, for code and for the programs of its evaluations (`jaxsafe/devices/memory.py`).
-Measured: how far the resident memory of the process rises during two updates. Each row is a process of its own; on Linux.
-Writes `benchmarks/results/memory.json` and prints the table of docs/scaling.md:
+- Stated: the bytes of a state of the task, and of what a seed keeps between updates without its
+  environments.
+- Predicted: what the compiled update needs in all, by XLA. A training compares that with the memory
+  that is free before it starts. It adds what a process takes once: for compiling, for code and for
+  the programs of its evaluations (`jaxsafe/devices/memory.py`).
+- Measured: how far the resident memory of the process rises during two updates.
+
+Each row is a process of its own, on Linux. Results are written to `benchmarks/results/memory.json`,
+and the table of docs/scaling.md is printed:
 
     python benchmarks/memory.py [tasks=rejoin2d,…] [num_envs=1024,4096,16384]
 """
@@ -19,7 +23,7 @@ NUM_STEPS = 32
 
 
 def main() -> None:
-    """Run, write, print."""
+    """Measure, write the results and print the table."""
     from isolated import probe as apart
     from isolated import several, words
     from machine import about
@@ -50,7 +54,7 @@ def main() -> None:
 
 
 def probe(task: str, num_envs: int) -> dict[str, int]:
-    """Train two updates of one seed on one device."""
+    """Train two updates of one seed on one device and return their memory in bytes."""
     from jaxsafe.devices.seed_mapper import SeedMapper, claim_cores
 
     claim_cores()
@@ -67,22 +71,21 @@ def probe(task: str, num_envs: int) -> dict[str, int]:
     fresh, two = programs(mapper, 2, 2)
     state = fresh(shared, mapper.keys(0))
     advance = two.lower(shared, state).compile()
-    lanes = memory.size((state.env_state, state.observation, state.episode))
-    Path("/proc/self/clear_refs").write_text(
-        "5"
-    )  # the peak begins anew: compiling is not what is measured
+    batch_bytes = memory.size((state.env_state, state.observation, state.episode))
+    # The peak begins anew here, because compiling is not what is measured.
+    Path("/proc/self/clear_refs").write_text("5")
     before = resident("VmRSS")
     jax.block_until_ready(advance(shared, state))
     return {
-        "lane": lanes // num_envs,
-        "seed": memory.size(state) - lanes,
+        "lane": batch_bytes // num_envs,
+        "seed": memory.size(state) - batch_bytes,
         "predicted": memory.footprint(advance),
         "measured": resident("VmHWM") - before + memory.size(state),
     }
 
 
 def resident(which: str) -> int:
-    """Bytes of this process in memory, now or at most."""
+    """Return the bytes of this process in memory, now or at most."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     return next(1024 * int(line.split()[1]) for line in lines if line.startswith(which))
 

@@ -1,12 +1,21 @@
-"""How many samples a second does PPO learn from, beside other implementations with the same settings on the same task?
+"""Measure how many samples a second PPO learns from, beside other implementations.
 
-2048 environments × 32 steps, 4 epochs of 8 minibatches, actor and critic of 2 × 64 tanh, on the task's observation. rejax,
-Brax and Stable-Baselines3 (64 × 1024, whose own loop it is) take the task through `jaxsafe.adapters`. Each measurement is a
-process of its own, on one pinned core and on all; peers run in environments that this script builds in `benchmarks/peers`,
-since their versions exclude each other. Compile time apart; the median of some repeats, in turns. Also ten seeds at once
-against one, this PPO with the sort of `jax.random.permutation` for its shuffle, and PPO as it is mostly written in JAX
-(`usual_ppo.py`). `networks only` does nothing but take a batch through the networks, forwards and backwards, and step with
-Adam, on one core: the rest is what this PPO spends elsewhere. Writes `benchmarks/results/ppo.json`:
+All have the same settings on the same task: 2048 environments × 32 steps, 4 epochs of 8
+minibatches, actor and critic of 2 × 64 tanh, on the task's observation. rejax, Brax and
+Stable-Baselines3 take the task through `jaxsafe.adapters`. Stable-Baselines3 has its own loop and
+takes 64 × 1024.
+
+Each measurement is a process of its own, on one pinned core and on all. Peers run in environments
+that this script builds in `benchmarks/peers`, since their versions exclude each other. Compile time
+is measured apart. Numbers are the median of some repeats, in turns. Other rows are:
+
+- ten seeds at once against one,
+- this PPO with the sort of `jax.random.permutation` for its shuffle,
+- PPO as it is mostly written in JAX (`usual_ppo.py`),
+- `networks only`, which does nothing but take a batch through the networks, forwards and backwards,
+  and step with Adam, on one core. The rest is what this PPO spends elsewhere.
+
+Results are written to `benchmarks/results/ppo.json`:
 
     python benchmarks/ppo.py [task=docking2d] [peers=rejax,brax,sb3] [repeats=3]
 """
@@ -37,7 +46,7 @@ PEERS = ("rejax", "brax", "sb3")
 
 
 def main() -> None:
-    """Run, write, print."""
+    """Measure, write the results and print the table."""
     options = words(task="docking2d", peers=",".join(PEERS), repeats="3")
     task = options["task"]
     repeats = int(options["repeats"])
@@ -52,12 +61,12 @@ def main() -> None:
     python = {name: interpreter(name) for name in PROBES if name in peers}
     cores = [1, usable_cores()]
     names = [name for name in PROBES if name in peers or name not in PEERS]
-    found: dict[tuple[str, int], list[float]] = {
+    rates_of: dict[tuple[str, int], list[float]] = {
         (name, count): [] for name in names for count in cores if count == 1 or name != NETWORKS
     }
     for _ in range(repeats):
-        for name, count in found:
-            found[name, count].append(
+        for name, count in rates_of:
+            rates_of[name, count].append(
                 probe(
                     __file__,
                     [f"probe={name}", f"task={task}"],
@@ -67,7 +76,7 @@ def main() -> None:
             )
     rows = [
         {"peer": name, "cores": count, "samples_per_s": rates}
-        for (name, count), rates in found.items()
+        for (name, count), rates in rates_of.items()
     ]
     OUT.parent.mkdir(exist_ok=True)
     content = {**here, "peers": versions(python), "task": task, "repeats": repeats, "runs": rows}
@@ -76,7 +85,10 @@ def main() -> None:
 
 
 def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
-    """Our PPO as `jaxsafe.train` runs it, `seeds` of them; samples of all seeds together."""
+    """Run our PPO as `jaxsafe.train` does, with `seeds` seeds.
+
+    Return the samples a second of all seeds.
+    """
     from jaxsafe.devices.seed_mapper import claim_cores
 
     claim_cores()
@@ -98,7 +110,10 @@ def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
 def our_programs(
     task: str, seeds: int, updates: int, num_envs: int = NUM_ENVS
 ) -> tuple[Any, Any, Any, Any]:
-    """The fresh state and some updates of our PPO, and what both take: keys, and what all seeds share."""
+    """Return the programs of our PPO and their arguments.
+
+    The programs make the fresh state and some updates. Both take keys and what all seeds share.
+    """
     from jaxsafe.devices.seed_mapper import SeedMapper
     from jaxsafe.train.train import programs
 
@@ -109,7 +124,7 @@ def our_programs(
 
 
 def settings(task: str, num_envs: int = NUM_ENVS) -> tuple[Any, Any]:
-    """The configuration of our PPO, and the environment."""
+    """Return the configuration of our PPO and the environment."""
     from jaxsafe.train.host.options import resolve
 
     sizes = {
@@ -129,7 +144,10 @@ def settings(task: str, num_envs: int = NUM_ENVS) -> tuple[Any, Any]:
 
 
 def networks_only(task: str) -> float:
-    """What the networks and Adam need of our updates: no environments, no advantages, no shuffle."""
+    """Measure what the networks and Adam need of our updates.
+
+    There are no environments, no advantages and no shuffle.
+    """
     from jaxsafe.devices.seed_mapper import claim_cores
 
     claim_cores()
@@ -148,7 +166,7 @@ def networks_only(task: str) -> float:
     chunks = jax.tree.map(lambda x: x.reshape(NUM_MINIBATCHES, -1, ppo.CHUNK, *x.shape[1:]), batch)
 
     def forwards(params: Any, part: ppo.Batch) -> Any:
-        """The actor once, as in a step, and the critic twice, of a state and of the next."""
+        """Run the actor once, as in a step, and the critic twice, on a state and on the next."""
         action = agent.distribution(env, params, part.inputs).mode()
         return (
             action.sum(),
@@ -181,7 +199,7 @@ def networks_only(task: str) -> float:
 
 
 def usual_way(task: str) -> float:
-    """`usual_ppo.py`, one seed."""
+    """Measure one seed of `usual_ppo.py`."""
     import jax
 
     run, start = usual_program(task)
@@ -189,7 +207,7 @@ def usual_way(task: str) -> float:
 
 
 def usual_program(task: str, num_envs: int = NUM_ENVS) -> tuple[Callable, Callable]:
-    """Some updates of `usual_ppo.py` from what its start, of a key, returns."""
+    """Return some updates of `usual_ppo.py`, and its start, which takes a key."""
     import jax
     import usual_ppo
 
@@ -206,7 +224,7 @@ def usual_program(task: str, num_envs: int = NUM_ENVS) -> tuple[Callable, Callab
 
 
 def timed(run: Callable, start: Any) -> float:
-    """Samples a second of some updates, called for the second time."""
+    """Return the samples a second of some updates, called for the second time."""
     import jax
 
     jax.block_until_ready(run(start))
@@ -216,14 +234,14 @@ def timed(run: Callable, start: Any) -> float:
 
 
 def rejax(task: str) -> float:
-    """The PPO of rejax, without its evaluations."""
+    """Measure the PPO of rejax, without its evaluations."""
     import jax
 
     return timed(rejax_trainer(task, UPDATES), jax.random.PRNGKey(0))
 
 
 def rejax_trainer(task: str, updates: int, num_envs: int = NUM_ENVS) -> Any:
-    """Some updates from a key, to be compiled."""
+    """Return some updates of rejax from a key, to be compiled."""
     import jax
     from rejax import PPO  # pyright: ignore[reportMissingImports]
 
@@ -248,7 +266,10 @@ def rejax_trainer(task: str, updates: int, num_envs: int = NUM_ENVS) -> Any:
 
 
 def brax(task: str) -> float:
-    """Brax's PPO; what it reports itself, without evaluations and without the first epoch, which compiles."""
+    """Measure Brax's PPO by what it reports itself.
+
+    Evaluations are left out, and so is the first epoch, which compiles.
+    """
     from brax.training.agents.ppo import train as ppo  # pyright: ignore[reportMissingImports]
     from brax.training.agents.ppo.networks import make_ppo_networks  # pyright: ignore[reportMissingImports]
     from jax.nn import tanh
@@ -282,7 +303,7 @@ def brax(task: str) -> float:
 
 
 def sb3(task: str) -> float:
-    """Stable-Baselines3's PPO, two rollouts of 64 × 1024."""
+    """Measure Stable-Baselines3's PPO over two rollouts of 64 × 1024."""
     import torch  # pyright: ignore[reportMissingImports]
     from stable_baselines3 import PPO  # pyright: ignore[reportMissingImports]
 

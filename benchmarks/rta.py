@@ -1,10 +1,15 @@
-"""What does run time assurance cost, and how much does it change?
+"""Measure what run time assurance costs and how much it changes.
 
-Filter calls a second in a batch of 4096 states met on the way under random actions, float32, compiling apart, medians;
-the small quadratic program; how often and how much each docking filter alters random actions; what becomes of starts
-that are not certified; and what a filter in the loop adds to the wall time of training, in turns with training without
-one. Where cbfpy or run-time-assurance are installed their filters run in the same invocation. Writes
-`benchmarks/results/rta.json` and prints the tables:
+- `calls`: filter calls a second in a batch of 4096 states met on the way under random actions, in
+  float32. Compiling is measured apart, and numbers are medians.
+- `qp`: the small quadratic program.
+- `change`: how often and how much each docking filter alters random actions.
+- `starts`: what becomes of starts that are not certified.
+- `training`: what a filter in the loop adds to the wall time of training, in turns with training
+  without one.
+
+Where cbfpy or run-time-assurance are installed their filters run in the same invocation. Results
+are written to `benchmarks/results/rta.json`, and the tables are printed:
 
     python benchmarks/rta.py [parts=calls,qp,change,starts,training] [repeats=7]
 """
@@ -43,7 +48,7 @@ BATCH = 4096
 
 
 def main() -> None:
-    """Run, write, print."""
+    """Measure the chosen parts, write the results and print the tables."""
     parts = {
         "calls": calls,
         "qp": programs,
@@ -68,7 +73,7 @@ def main() -> None:
 
 
 def timed(run: Callable[[], Any], repeats: int) -> tuple[float, float]:
-    """Median wall time of a run and that of the first, in seconds."""
+    """Return the median wall time of a run and that of the first, in seconds."""
     began = time.perf_counter()
     jax.block_until_ready(run())
     first = time.perf_counter() - began
@@ -81,7 +86,7 @@ def timed(run: Callable[[], Any], repeats: int) -> tuple[float, float]:
 
 
 def calls(repeats: int) -> list[dict[str, Any]]:
-    """Filter calls a second."""
+    """Measure filter calls a second."""
     rows = []
     for task in TASKS:
         presets = TASKS[task].filters
@@ -102,18 +107,24 @@ def calls(repeats: int) -> list[dict[str, Any]]:
 
 @jax.jit
 def filter_batch(env: Any, sims: Any, memories: Any, desired: Any) -> Any:
-    """What the filter of an environment lets act, in each of a batch of simulations."""
+    """Return what the filter of an environment lets act, in each of a batch of simulations."""
     return jax.vmap(functools.partial(env.rta.filter, env))(sims, memories, desired)
 
 
 def memories(env: jaxsafe.Environment, sims: Any) -> Any:
-    """What the filter of an environment remembers at the start of an episode, for each simulation; None without one."""
+    """Return the filter's memory at the start of an episode, for each simulation.
+
+    It is None for an environment without a filter.
+    """
     rta = env.rta
     return None if rta is None else jax.jit(jax.vmap(lambda sim: rta.begin(env, sim)[0]))(sims)
 
 
 def met(env: jaxsafe.Environment, batch: int = BATCH) -> tuple[Any, Any, jax.Array]:
-    """Simulations after 100 steps of random actions without a filter, the filter's memories, and random controls."""
+    """Return simulations, the filter's memories, and random controls.
+
+    The simulations are those after 100 steps of random actions without a filter.
+    """
     size = env.action_size
     (low, high) = bounds(env)
 
@@ -121,12 +132,14 @@ def met(env: jaxsafe.Environment, batch: int = BATCH) -> tuple[Any, Any, jax.Arr
     def run(env: Any, key: jax.Array) -> Any:
         state, timestep = reset_batch(env, key, batch)
 
-        def one(carry: Any, key: jax.Array) -> tuple[Any, None]:
+        def one_step(carry: Any, key: jax.Array) -> tuple[Any, None]:
             key_action, key_reset = jax.random.split(key)
             action = jax.random.uniform(key_action, (batch, size), minval=-1.0)
             return step_or_reset_batch(env, carry[0], action, key_reset)[0], None
 
-        return jax.lax.scan(one, (state, timestep.observation), jax.random.split(key, 100))[0][0]
+        return jax.lax.scan(one_step, (state, timestep.observation), jax.random.split(key, 100))[0][
+            0
+        ]
 
     desired = low + (high - low) * jax.random.uniform(jax.random.key(1), (batch, size))
     sims = run(override(env, {"rta": None}), jax.random.key(0)).sim
@@ -134,20 +147,26 @@ def met(env: jaxsafe.Environment, batch: int = BATCH) -> tuple[Any, Any, jax.Arr
 
 
 def docking_states() -> tuple[jax.Array, jax.Array]:
-    """Those of `met` for docking2d as vectors x, y, ẋ, ẏ, and random controls: what peers filter."""
+    """Return the states that peers filter, as vectors x, y, ẋ, ẏ, and random controls.
+
+    They are those of `met` for docking2d.
+    """
     sims, _, desired = met(jaxsafe.make("docking2d"))
     deputy = sims.platforms["deputy"]
     return jnp.concatenate([deputy.position, deputy.velocity], axis=-1), desired
 
 
 def run_time_assurance_calls(repeats: int) -> list[dict[str, Any]]:
-    """The explicit ASIF of run-time-assurance for docking2d, which takes one state at a time, where it is installed."""
+    """Measure the explicit ASIF of run-time-assurance for docking2d, where it is installed.
+
+    It takes one state at a time.
+    """
     try:
         docking = importlib.import_module("run_time_assurance.zoo.cwh.docking_2d")
     except ImportError:
         return []
     rta = docking.Docking2dExplicitOptimizationRTA()
-    states, desired = (np.asarray(each)[:500] for each in docking_states())
+    states, desired = (np.asarray(array)[:500] for array in docking_states())
 
     def run() -> None:
         for state, control in zip(states, desired, strict=True):
@@ -163,7 +182,7 @@ def run_time_assurance_calls(repeats: int) -> list[dict[str, Any]]:
 
 
 def cbfpy_calls(repeats: int) -> list[dict[str, Any]]:
-    """The filter of cbfpy for the docking constraint in a batch, where it is installed."""
+    """Measure the filter of cbfpy for the docking constraint in a batch, where it is installed."""
     try:
         cbfpy = importlib.import_module("cbfpy")
     except ImportError:
@@ -202,7 +221,7 @@ def cbfpy_calls(repeats: int) -> list[dict[str, Any]]:
 
 
 def programs(repeats: int) -> list[dict[str, Any]]:
-    """The small quadratic program: solutions a second, and its distance from the same in float64."""
+    """Measure the small quadratic program: solutions a second, and its distance from float64."""
     rng = np.random.default_rng(0)
     rows = []
     solve = jax.jit(jax.vmap(nearest_control))
@@ -214,12 +233,12 @@ def programs(repeats: int) -> list[dict[str, Any]]:
             rng.normal(size=(BATCH, 2, m)),
             0.5 * rng.normal(size=(BATCH, 2)),
         ]
-        single = [each.astype(np.float32) for each in problem]
+        single = [array.astype(np.float32) for array in problem]
         seconds, _ = timed(lambda single=single: solve(*single), repeats)
-        found, feasible = solve(*single)
+        control, feasible = solve(*single)
         with jax.enable_x64():
-            exact, possible = solve(*(each.astype(np.float64) for each in single))
-        error = np.abs(found - exact).max(axis=1)[np.asarray(feasible & possible)]
+            exact, possible = solve(*(array.astype(np.float64) for array in single))
+        error = np.abs(control - exact).max(axis=1)[np.asarray(feasible & possible)]
         rows.append(
             {
                 "variables": m,
@@ -233,7 +252,10 @@ def programs(repeats: int) -> list[dict[str, Any]]:
 
 
 def changes(repeats: int) -> list[dict[str, Any]]:
-    """How often and how much random actions are altered, and what is violated all the same."""
+    """Count how often and how much random actions are altered.
+
+    Also count what is violated all the same.
+    """
     del repeats
     rows = []
     for task in ("docking2d", "docking3d"):
@@ -253,7 +275,10 @@ def changes(repeats: int) -> list[dict[str, Any]]:
 
 
 def starts(repeats: int) -> list[dict[str, Any]]:
-    """What becomes of the starts of oriented docking that are not certified, in 400 steps; and without the fastest ones."""
+    """Count what becomes of the starts of oriented docking that are not certified, in 400 steps.
+
+    The second row leaves out the fastest starts.
+    """
     del repeats
     keys = jax.random.split(jax.random.key(7), 200_000)
     rows = []
@@ -264,8 +289,8 @@ def starts(repeats: int) -> list[dict[str, Any]]:
 
     @jax.jit
     def margins(env: jaxsafe.Environment, lost: Any, action: jax.Array) -> jax.Array:
-        each = jax.vmap(jaxsafe.step, in_axes=(None, 0, None))
-        return jax.lax.scan(lambda state, _: each(env, state, action), lost, length=400)[
+        array = jax.vmap(jaxsafe.step, in_axes=(None, 0, None))
+        return jax.lax.scan(lambda state, _: array(env, state, action), lost, length=400)[
             1
         ].info.margins["velocity_limit"]
 
@@ -293,7 +318,7 @@ def starts(repeats: int) -> list[dict[str, Any]]:
 
 
 def training(repeats: int) -> list[dict[str, Any]]:
-    """Wall time of an update of PPO with a filter in the loop, as a share of that without."""
+    """Measure the wall time of an update of PPO with a filter, as a share of that without."""
     agent = normalise(Agent())
     ppo = normalise(PPO(num_envs=64, num_steps=128))
     rows = []
@@ -308,7 +333,7 @@ def training(repeats: int) -> list[dict[str, Any]]:
         envs = {name: jaxsafe.make(task, rta=name) for name in ("none", *presets)}
         states = {name: init(env, agent, ppo, jax.random.key(0)) for name, env in envs.items()}
         times: dict[str, list[float]] = {name: [] for name in envs}
-        for _ in range(repeats + 1):  # in turns; the first compiles
+        for _ in range(repeats + 1):  # in turns, and the first turn compiles
             for name, env in envs.items():
                 times[name].append(timed(functools.partial(step, env, states[name]), 1)[0])
         bare = times["none"][1:]

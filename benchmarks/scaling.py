@@ -1,17 +1,20 @@
-"""What do more cores and more seeds gain, and what would a thousand devices?
+"""Measure what more cores and more seeds gain, and project what a thousand devices would.
 
-Each measurement is a process of its own, pinned to one core or on a power of two of them, in turns; compiling apart, the
-median of some:
+Each measurement is a process of its own, pinned to one core or on a power of two of them, in turns.
+Compiling is measured apart. Numbers are the median of some repeats:
 
-- environment steps, 4,096 environments on each core, as in `environments.py`;
-- one seed of the PPO of `ppo.py` for each core;
+- environment steps, 4,096 environments on each core, as in `environments.py`,
+- one seed of the PPO of `ppo.py` for each core,
 - one seed, whose environments and minibatches the cores share.
 
-The projection is for devices such as these cores. A seed on a device of its own takes what it takes here beside other busy
-cores, and nothing goes between devices. Devices that share a seed take their part of that, and besides what sharing was
-seen to add to a perfect split, once for each doubling. It measures no network between machines, and small parts of a batch
-are less efficient than large ones, so for many devices a seed it is the best that can be hoped for. Writes
-`benchmarks/results/scaling.json` and prints two tables:
+The projection is for devices such as these cores. A seed on a device of its own takes what it takes
+here beside other busy cores, and nothing goes between devices. Devices that share a seed take their
+part of that. They also take what sharing was seen to add to a perfect split, once for each
+doubling.
+
+The projection measures no network between machines, and small parts of a batch are less efficient
+than large ones. So for many devices a seed it is the best that can be hoped for. Results are
+written to `benchmarks/results/scaling.json`, and two tables are printed:
 
     python benchmarks/scaling.py [task=docking3d] [repeats=3]
 """
@@ -30,7 +33,7 @@ import ppo
 from isolated import probe, words
 
 OUT = Path(__file__).parent / "results" / "scaling.json"
-LANES = 4096
+NUM_ENVS = 4096
 NUM_STEPS = 1000
 SHARED = (1, 8, 64)
 """Numbers of devices that share a seed, in the projection."""
@@ -39,7 +42,7 @@ DEVICES = 1000
 
 
 def main() -> None:
-    """Run, write, print."""
+    """Measure, write the results and print the tables."""
     options = words(task="docking3d", repeats="3")
     task = options["task"]
     repeats = int(options["repeats"])
@@ -53,16 +56,16 @@ def main() -> None:
     cores = 1 << (usable_cores().bit_length() - 1)
     if cores == 1:
         sys.exit("scaling.py: expected two cores or more, found one")
-    found: dict[tuple[str, int], list[float]] = {
+    measured: dict[tuple[str, int], list[float]] = {
         (name, count): [] for name in PROBES for count in (1, cores)
     }
     for _ in range(repeats):
-        for name, count in found:
-            found[name, count].append(probe(__file__, [f"probe={name}", f"task={task}"], count))
+        for name, count in measured:
+            measured[name, count].append(probe(__file__, [f"probe={name}", f"task={task}"], count))
     rows = [
-        {"what": name, "cores": count, "per_s": rates} for (name, count), rates in found.items()
+        {"what": name, "cores": count, "per_s": rates} for (name, count), rates in measured.items()
     ]
-    rates = {key: statistics.median(values) for key, values in found.items()}
+    rates = {key: statistics.median(values) for key, values in measured.items()}
     projected = projection(rates, cores)
     content = {**here, "task": task, "repeats": repeats, "runs": rows, "projection": projected}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
@@ -70,11 +73,11 @@ def main() -> None:
 
 
 def projection(rates: dict[tuple[str, int], float], cores: int) -> list[dict[str, float]]:
-    """Samples a second of `DEVICES` such cores, some of them for each seed."""
+    """Project the samples a second of `DEVICES` such cores, some of them for each seed."""
     alone = rates[ONE_EACH, 1]
     busy = rates[ONE_EACH, cores] / cores
     shared = rates[SHARING, cores]
-    update = ppo.BATCH / alone  # seconds, of one seed on one core
+    update = ppo.BATCH / alone  # seconds of one seed on one core
     exchange = max(0.0, ppo.BATCH / shared - ppo.BATCH / busy / cores) / math.log2(cores)
     rows = []
     for count in SHARED:
@@ -93,7 +96,7 @@ def projection(rates: dict[tuple[str, int], float], cores: int) -> list[dict[str
 
 
 def steps(task: str) -> float:
-    """Environment steps a second of all cores."""
+    """Measure environment steps a second of all cores."""
     from jaxsafe.devices.seed_mapper import claim_cores
 
     claim_cores()
@@ -105,13 +108,13 @@ def steps(task: str) -> float:
     import jaxsafe
 
     env = jaxsafe.make(task)
-    mesh = Mesh(np.array(jax.devices()), ("lanes",))
+    mesh = Mesh(np.array(jax.devices()), ("envs",))
     run = jax.jit(
         jax.shard_map(
-            lambda key: environments.episode_steps(env, key[0], LANES, NUM_STEPS)[None],
+            lambda key: environments.episode_steps(env, key[0], NUM_ENVS, NUM_STEPS)[None],
             mesh=mesh,
-            in_specs=PartitionSpec("lanes"),
-            out_specs=PartitionSpec("lanes"),
+            in_specs=PartitionSpec("envs"),
+            out_specs=PartitionSpec("envs"),
             check_vma=False,
         )
     )
@@ -119,11 +122,11 @@ def steps(task: str) -> float:
     run(keys).block_until_ready()
     start = time.perf_counter()
     run(keys).block_until_ready()
-    return mesh.size * LANES * NUM_STEPS / (time.perf_counter() - start)
+    return mesh.size * NUM_ENVS * NUM_STEPS / (time.perf_counter() - start)
 
 
 def one_each(task: str) -> float:
-    """Samples a second of as many seeds as there are cores."""
+    """Measure samples a second of as many seeds as there are cores."""
     return ppo.ours(task, seeds=len(os.sched_getaffinity(0)))
 
 

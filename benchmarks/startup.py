@@ -1,15 +1,22 @@
-"""How long does it take until something runs: import, make, trace and compile, and the first result?
+"""Measure how long it takes until something runs.
 
-Every measurement is a process of its own; the median of some. The first table is without a compilation cache. Its first
-program is a step with automatic reset in 64 lanes, of the tasks and of gymnax's Pendulum-v1; the training is ten seeds of
-the task's recipe, its fresh state and its updates together.
+The parts are import, make, trace and compile, and the first result.
 
-The second table is the time from the first import to the first result: a batched reset and step, docking3d beside
-Pendulum-v1 of gymnax, and an update of PPO on docking2d with the settings of `ppo.py`, beside rejax, whose task it is too,
-through `jaxsafe.adapters.gymnax`: so rejax also pays for importing and making ours. Cold is with an empty
-cache of compiled programs, warm with what the process before left there. Peers run in Python environments that this script
-builds in `benchmarks/peers`. The third table is what that time goes into, as JAX's own events and profiler tell it. Writes
-`benchmarks/results/startup.json` and prints the tables:
+Every measurement is a process of its own, and numbers are the median of some. Three tables are
+printed:
+
+- The first is without a compilation cache. Its first program is a step with automatic reset in 64
+  environments, of the tasks and of gymnax's Pendulum-v1. The training is ten seeds of the task's
+  recipe, its fresh state and its updates together.
+- The second is the time from the first import to the first result. One result is a batched reset
+  and step, docking3d beside Pendulum-v1 of gymnax. The other is an update of PPO on docking2d with
+  the settings of `ppo.py`, beside rejax. rejax has the same task through `jaxsafe.adapters.gymnax`,
+  so it also pays for importing and making ours. Cold is with an empty cache of compiled programs.
+  Warm is with what the process before left there. Peers run in Python environments that this script
+  builds in `benchmarks/peers`.
+- The third is what that time goes into, as JAX's own events and profiler tell it.
+
+Results are written to `benchmarks/results/startup.json`:
 
     python benchmarks/startup.py [tasks=rejoin2d,…] [rta=none,default] [repeats=3]
 """
@@ -31,12 +38,12 @@ from isolated import interpreter, several, versions, words
 from isolated import probe as apart
 
 OUT = Path(__file__).parent / "results" / "startup.json"
-LANES = 64
+NUM_ENVS = 64
 COLUMNS = ("import", "make", "trace", "compile", "training: trace", "compile")
 
 
 def main() -> None:
-    """Run, write, print."""
+    """Measure, write the results and print the tables."""
     options = words(tasks="", rta="none,default", repeats="3")
     if "probe" in options:
         word = options["probe"]
@@ -76,28 +83,28 @@ def main() -> None:
 
 
 def first_result(name: str, word: str, repeats: int) -> dict[str, Any]:
-    """What a probe finds with an empty cache, and with a full one."""
-    found: dict[str, Any] = {"name": name, "cold": [], "warm": []}
+    """Return what a probe measures with an empty cache, and with a full one."""
+    result: dict[str, Any] = {"name": name, "cold": [], "warm": []}
     python = interpreter(name.split()[0])
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as cache:
             for kind in ("cold", "warm"):
-                found[kind].append(apart(__file__, [f"probe={word}"], None, python, Path(cache)))
-    return found
+                result[kind].append(apart(__file__, [f"probe={word}"], None, python, Path(cache)))
+    return result
 
 
 def measured(name: str, rta: str, repeats: int, python: str = sys.executable) -> dict[str, Any]:
-    """Medians over fresh processes."""
-    found = [apart(__file__, [f"probe={name},{rta}"], python=python) for _ in range(repeats)]
+    """Return medians over fresh processes."""
+    times = [apart(__file__, [f"probe={name},{rta}"], python=python) for _ in range(repeats)]
     return {
         "name": name,
         "rta": rta,
-        "seconds": [round(statistics.median(one), 3) for one in zip(*found, strict=True)],
+        "seconds": [round(statistics.median(column), 3) for column in zip(*times, strict=True)],
     }
 
 
 def probe(name: str, rta: str) -> list[float]:
-    """Seconds of each column, in this process."""
+    """Return the seconds of each column, in this process."""
     clock = [time.perf_counter()]
     tick: Callable[[], None] = lambda: clock.append(time.perf_counter())  # noqa: E731
     if rta == "gymnax":
@@ -122,8 +129,10 @@ def _jaxsafe(task: str, rta: str, tick: Callable[[], None]) -> None:
     env = jaxsafe.make(task, rta=rta)
     tick()
     key = jax.random.key(0)
-    state = jax.eval_shape(lambda env: reset_batch(env, key, LANES)[0], env)
-    step = jax.jit(step_or_reset_batch).lower(env, state, jnp.zeros((LANES, env.action_size)), key)
+    state = jax.eval_shape(lambda env: reset_batch(env, key, NUM_ENVS)[0], env)
+    step = jax.jit(step_or_reset_batch).lower(
+        env, state, jnp.zeros((NUM_ENVS, env.action_size)), key
+    )
     tick()
     step.compile()
     tick()
@@ -148,9 +157,9 @@ def _gymnax(name: str, tick: Callable[[], None]) -> None:
     tick()
     env, params = gymnax.make(name)
     tick()
-    keys = jax.random.split(jax.random.key(0), LANES)
+    keys = jax.random.split(jax.random.key(0), NUM_ENVS)
     _, state = jax.eval_shape(jax.vmap(env.reset, in_axes=(0, None)), keys, params)
-    action = jax.ShapeDtypeStruct((LANES, 1), "float32")
+    action = jax.ShapeDtypeStruct((NUM_ENVS, 1), "float32")
     step = jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None))).lower(keys, state, action, params)
     tick()
     step.compile()
@@ -158,7 +167,7 @@ def _gymnax(name: str, tick: Callable[[], None]) -> None:
 
 
 def seconds_to(result: Callable[[], Any]) -> float:
-    """From before the first import until the result is there."""
+    """Return the seconds from before the first import until the result is there."""
     start = time.perf_counter()
     result()
     return time.perf_counter() - start
@@ -169,18 +178,24 @@ EVENTS = {
     "lower": "/jax/core/compile/jaxpr_to_mlir_module_duration",
     "compile": "/jax/core/compile/backend_compile_duration",
 }
-"""What JAX reports of its stages, each inside or before the next; reading the cache counts as compiling."""
+"""Events by which JAX reports its stages. Each is inside the next or before it.
+
+Reading the cache counts as compiling.
+"""
 
 REGIONS = {
     "XLA's passes": ("HLO passes through layout assignment", "HLO passes after layout assignment"),
     "emitters": ("FusionCompiler::Compile",),
     "LLVM": ("TaskDispatcher::dispatch",),
 }
-"""What XLA's profiler calls the parts of compiling for a CPU, summed over the threads that do them side by side."""
+"""Names of XLA's profiler for the parts of compiling for a CPU.
+
+Their times are summed over the threads that do them side by side.
+"""
 
 
 def profile(result: Callable[[], Any]) -> dict[str, float]:
-    """Seconds of each of `tables.PARTS` until the result is there."""
+    """Return the seconds of each of `tables.PARTS` until the result is there."""
     start = time.perf_counter()
     import jax
 
@@ -211,18 +226,18 @@ def profile(result: Callable[[], Any]) -> dict[str, float]:
     spent = [
         _covered([span for span in spans if span[0] in stages[i:]]) for i in range(len(stages))
     ]
-    found = {name: spent[i] - sum(spent[i + 1 : i + 2]) for i, name in enumerate(EVENTS)}
-    found |= {"import of JAX": imported - start, "the rest": ended - began - spent[0]}
-    found["whole"] = sum(found.values())
-    found |= {
+    parts = {name: spent[i] - sum(spent[i + 1 : i + 2]) for i, name in enumerate(EVENTS)}
+    parts |= {"import of JAX": imported - start, "the rest": ended - began - spent[0]}
+    parts["whole"] = sum(parts.values())
+    parts |= {
         part: sum(ns for name, ns in events if name in regions) / 1e9
         for part, regions in REGIONS.items()
     }
-    return {name: round(value, 3) for name, value in found.items()}
+    return {name: round(value, 3) for name, value in parts.items()}
 
 
 def _covered(spans: list[tuple[str, float, float]]) -> float:
-    """Seconds in which at least one of the spans was under way."""
+    """Return the seconds in which at least one of the spans was under way."""
     total = 0.0
     until = 0.0
     for _, begin, end in sorted(spans, key=lambda span: span[1]):
@@ -232,7 +247,7 @@ def _covered(spans: list[tuple[str, float, float]]) -> float:
 
 
 def our_step() -> None:
-    """docking3d."""
+    """Reset and step a batch of docking3d."""
     import jax
     import jax.numpy as jnp
 
@@ -241,26 +256,26 @@ def our_step() -> None:
 
     env = jaxsafe.make("docking3d")
     key = jax.random.key(0)
-    state, _ = jax.jit(reset_batch, static_argnums=2)(env, key, LANES)
-    jax.block_until_ready(jax.jit(step_or_reset_batch)(env, state, jnp.zeros((LANES, 3)), key))
+    state, _ = jax.jit(reset_batch, static_argnums=2)(env, key, NUM_ENVS)
+    jax.block_until_ready(jax.jit(step_or_reset_batch)(env, state, jnp.zeros((NUM_ENVS, 3)), key))
 
 
 def gymnax_step() -> None:
-    """Pendulum-v1."""
+    """Reset and step a batch of Pendulum-v1."""
     import jax
     import jax.numpy as jnp
 
     env, params = importlib.import_module("gymnax").make("Pendulum-v1")
-    keys = jax.random.split(jax.random.key(0), LANES)
+    keys = jax.random.split(jax.random.key(0), NUM_ENVS)
     _, state = jax.jit(jax.vmap(env.reset, in_axes=(0, None)))(keys, params)
-    action = jnp.zeros((LANES, 1))
+    action = jnp.zeros((NUM_ENVS, 1))
     jax.block_until_ready(
         jax.jit(jax.vmap(env.step, in_axes=(0, 0, 0, None)))(keys, state, action, params)
     )
 
 
 def our_update() -> None:
-    """PPO."""
+    """Make one update of our PPO."""
     from jaxsafe.devices.seed_mapper import claim_cores
 
     claim_cores()
@@ -272,7 +287,7 @@ def our_update() -> None:
 
 
 def rejax_update() -> None:
-    """PPO of rejax."""
+    """Make one update of the PPO of rejax."""
     import jax
     import ppo
 
@@ -285,7 +300,7 @@ FIRST: dict[str, Callable[[], None]] = {
     "jaxsafe update": our_update,
     "rejax update": rejax_update,
 }
-"""What is timed to its first result; the first word is the library."""
+"""Results whose time is measured. The first word is the library."""
 
 if __name__ == "__main__":
     main()

@@ -1,7 +1,8 @@
-"""The tables of the pages, from the results of the benchmarks and of the report, so that they cannot drift.
+"""The tables of the pages, from the results of the benchmarks and of the report.
 
-Run `python benchmarks/tables.py` after a benchmark or a report: each table replaces the one in its page that has the same
-first row. `tests/benchmarks/test_benchmarks.py` compares the committed pages with it.
+So the pages cannot drift from the results. Run `python benchmarks/tables.py` after a benchmark or a
+report. Each table replaces the one in its page that has the same first row.
+`tests/benchmarks/test_benchmarks.py` compares the committed pages with it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 BASELINES = ROOT / "docs" / "baselines"
 
-Found = Mapping[str, Any]
+Results = Mapping[str, Any]
 """The content of a file of results."""
 
 PENDULUM = "gymnax:Pendulum-v1"
@@ -70,7 +71,7 @@ ADAPTERS = {
     "EnvPool CartPole": "EnvPool CartPole",
 }
 DOCKING_FIRST = sorted(TASKS, key=lambda task: task.startswith("rejoin"))
-"""As docs/rta.md has the tasks."""
+"""The tasks in the order of docs/rta.md."""
 
 PARTS = (
     "whole",
@@ -90,35 +91,35 @@ FILTERS = {
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; empty cells are as short as they can be."""
+    """Return a table. Empty cells are as short as they can be."""
     lines = [[*heads], *rows]
     text = ["|" + "|".join(f" {cell} " if cell else " " for cell in line) + "|" for line in lines]
     return "\n".join([text[0], "|" + "---|" * len(heads), *text[1:]])
 
 
-def environments(found: Found, names: Iterable[str] = tuple(ENVIRONMENTS)) -> str:
-    """Million steps a second, medians."""
-    rates = _steps(found)
-    lanes = sorted({number for _, number in rates})
-    heads = ["million steps/s at … environments", *(f"{number:,}" for number in lanes)]
-    shown = [name for name in names if (name, lanes[0]) in rates]
+def environments(results: Results, names: Iterable[str] = tuple(ENVIRONMENTS)) -> str:
+    """Return the table of million steps a second, medians."""
+    rates = _steps(results)
+    sizes = sorted({size for _, size in rates})
+    heads = ["million steps/s at … environments", *(f"{size:,}" for size in sizes)]
+    shown = [name for name in names if (name, sizes[0]) in rates]
     return markdown(
         heads,
         (
-            [ENVIRONMENTS[name], *(_three(rates[name, number] / 1e6) for number in lanes)]
+            [ENVIRONMENTS[name], *(_three(rates[name, size] / 1e6) for size in sizes)]
             for name in shown
         ),
     )
 
 
-def readme_environments(found: Found) -> str:
-    """The same, of fewer environments."""
-    return environments(found, README_ENVIRONMENTS)
+def readme_environments(results: Results) -> str:
+    """Return the table of `environments` with fewer rows."""
+    return environments(results, README_ENVIRONMENTS)
 
 
-def ppo(found: Found) -> str:
-    """Thousand samples a second, medians."""
-    rates = _samples(found)
+def ppo(results: Results) -> str:
+    """Return the table of thousand samples a second, medians."""
+    rates = _samples(results)
     cores = sorted({count for _, count in rates})
     heads = ["thousand samples/s", *(f"{count} core{'s' * (count > 1)}" for count in cores)]
     shown = [name for name in PPO if (name, 1) in rates]
@@ -134,19 +135,19 @@ def ppo(found: Found) -> str:
     )
 
 
-def startup_parts(found: Found) -> str:
-    """Seconds of each part, without a cache."""
+def startup_parts(results: Results) -> str:
+    """Return the table of seconds of each part, without a cache."""
     rows = []
-    for row in found["rows"]:
+    for row in results["rows"]:
         name = f"gymnax {row['name']}" if row["rta"] == "gymnax" else row["name"]
         cells = [f"{value:.2g}" for value in row["seconds"]]
         filtered = f", `rta={row['rta']}`" if row["rta"] not in ("none", "gymnax") else ""
-        rows.append([name + filtered, *cells, *["–"] * (len(found["columns"]) - len(cells))])
-    return markdown(["s", *found["columns"]], rows)
+        rows.append([name + filtered, *cells, *["–"] * (len(results["columns"]) - len(cells))])
+    return markdown(["s", *results["columns"]], rows)
 
 
-def startup_first(found: Found) -> str:
-    """Seconds to the first result, medians."""
+def startup_first(results: Results) -> str:
+    """Return the table of seconds to the first result, medians."""
     return markdown(
         ["s", "cold", "warm"],
         (
@@ -154,44 +155,44 @@ def startup_first(found: Found) -> str:
                 row["name"].replace(" ", ", "),
                 *(f"{statistics.median(row[kind]):.2g}" for kind in ("cold", "warm")),
             ]
-            for row in found["first"]
+            for row in results["first"]
         ),
     )
 
 
-def startup_profile(found: Found) -> str:
-    """What that time goes into, medians."""
+def startup_profile(results: Results) -> str:
+    """Return the table of what the time to the first result goes into, medians."""
     rows = []
-    for row in found["profiles"]:
+    for row in results["profiles"]:
         for kind in ("cold", "warm"):
-            middle = [statistics.median(one[part] for one in row[kind]) for part in PARTS]
+            middle = [statistics.median(seconds[part] for seconds in row[kind]) for part in PARTS]
             cells = [f"{value:.2g}" if value else "–" for value in middle]
             rows.append([f"{row['name'].removeprefix('jaxsafe ')}, {kind}", *cells])
     return markdown(["s", *(part.replace("compile", "compile, or read") for part in PARTS)], rows)
 
 
-def five_tasks(found: Found) -> str:
-    """Seconds, medians."""
+def five_tasks(results: Results) -> str:
+    """Return the table of seconds until all tasks are learnt, medians."""
     labels = {"one command": "one command, `env=all`", "five commands": "five commands"}
     rows = []
     for way, label in labels.items():
-        each = [[run[way][name] for run in found["runs"]] for name in ("learnt", "whole")]
+        columns = [[run[way][name] for run in results["runs"]] for name in ("learnt", "whole")]
         rows.append(
             [
                 label,
                 *(
                     "never" if None in values else f"{statistics.median(values):.0f}"
-                    for values in each
+                    for values in columns
                 ),
             ]
         )
     return markdown(["s", "all learnt after", "whole, with evaluations and figures"], rows)
 
 
-def learning(found: Found) -> str:
-    """Means and 95 % intervals."""
+def learning(results: Results) -> str:
+    """Return the table of variants of PPO: means and 95 % intervals."""
     rows = []
-    for row in found["runs"]:
+    for row in results["runs"]:
         sampled, modes = (row["evaluation"][kind] for kind in ("stochastic", "deterministic"))
         worst = min(sampled["success_rate"]["per_seed"] + modes["success_rate"]["per_seed"])
         first = row["variant"] not in VARIANTS
@@ -218,24 +219,24 @@ def learning(found: Found) -> str:
     )
 
 
-def scaling(found: Found) -> str:
-    """Medians on one core and on all."""
-    rates = _rates(found)
+def scaling(results: Results) -> str:
+    """Return the table of medians on one core and on all."""
+    rates = _rates(results)
     cores = max(count for _, count in rates)
     rows = []
     for name in dict.fromkeys(name for name, _ in rates):
-        one = rates[name, 1]
+        single = rates[name, 1]
         all_ = rates[name, cores]
         cells = [
             f"{rate / 1e6:.1f} million" if "environment" in name else f"{rate / 1e3:,.0f},000"
-            for rate in (one, all_)
+            for rate in (single, all_)
         ]
-        rows.append([_scaled(name), *cells, f"{all_ / one:.2f}"])
-    return markdown([f"{found['task']}, a second", "1 core", f"{cores} cores", "ratio"], rows)
+        rows.append([_scaled(name), *cells, f"{all_ / single:.2f}"])
+    return markdown([f"{results['task']}, a second", "1 core", f"{cores} cores", "ratio"], rows)
 
 
-def projection(found: Found) -> str:
-    """What a thousand devices would do."""
+def projection(results: Results) -> str:
+    """Return the table of what a thousand devices would do."""
     return markdown(
         ["1,000 devices", "seeds", "million samples/s", "of a perfect split"],
         (
@@ -245,26 +246,26 @@ def projection(found: Found) -> str:
                 f"{row['samples_per_s'] / 1e6:.3g}",
                 f"{100 * row['efficiency']:.0f} %",
             ]
-            for row in found["projection"]
+            for row in results["projection"]
         ),
     )
 
 
-def memory(found: Found) -> str:
-    """MiB, but for the first two columns."""
-    sizes = sorted({row["num_envs"] for row in found["runs"]})
+def memory(results: Results) -> str:
+    """Return the table of memory, in MiB but for the first two columns."""
+    sizes = sorted({row["num_envs"] for row in results["runs"]})
     rows = []
-    for task in dict.fromkeys(row["task"] for row in found["runs"]):
-        mine = [row for row in found["runs"] if row["task"] == task]
+    for task in dict.fromkeys(row["task"] for row in results["runs"]):
+        mine = [row for row in results["runs"] if row["task"] == task]
         cells = [f"{row['predicted'] / 2**20:.0f} / {row['measured'] / 2**20:.0f}" for row in mine]
         rows.append([task, f"{mine[0]['lane']:,} B", f"{mine[0]['seed'] / 1024:.0f} KiB", *cells])
     heads = ["predicted / measured", "an environment", "a seed without them"]
-    return markdown([*heads, *(f"{size:,} × {found['num_steps']}" for size in sizes)], rows)
+    return markdown([*heads, *(f"{size:,} × {results['num_steps']}" for size in sizes)], rows)
 
 
-def adapters(found: Found) -> str:
-    """Thousand steps a second, medians."""
-    runs = found["runs"]
+def adapters(results: Results) -> str:
+    """Return the table of thousand steps a second through each adapter, medians."""
+    runs = results["runs"]
     rows = []
     for name, label in ADAPTERS.items():
         rates = [run["steps_per_s"].get(name) for run in runs]
@@ -273,9 +274,9 @@ def adapters(found: Found) -> str:
     return markdown(["environments", *(f"{run['envs']:,}" for run in runs)], rows)
 
 
-def filter_calls(found: Found) -> str:
-    """Calls a second."""
-    rates = {(row["filter"], row["task"]): row["calls_per_s"] for row in found["calls"]["rows"]}
+def filter_calls(results: Results) -> str:
+    """Return the table of filter calls a second."""
+    rates = {(row["filter"], row["task"]): row["calls_per_s"] for row in results["calls"]["rows"]}
     order = [
         "discrete_asif",
         "explicit_simplex",
@@ -293,9 +294,9 @@ def filter_calls(found: Found) -> str:
     return markdown(["filter", *TASKS], rows)
 
 
-def filter_changes(found: Found) -> str:
-    """Of random actions, a row for each filter and kind of actions."""
-    rows = found["change"]["rows"]
+def filter_changes(results: Results) -> str:
+    """Return the table of altered random actions, a row for each filter and kind of actions."""
+    rows = results["change"]["rows"]
     tasks = [*dict.fromkeys(row["task"] for row in rows)]
     cells: dict[tuple[str, str], list[str]] = {}
     for row in rows:
@@ -316,9 +317,9 @@ def filter_changes(found: Found) -> str:
     )
 
 
-def programs(found: Found) -> str:
-    """Of the quadratic program."""
-    rows = found["qp"]["rows"]
+def programs(results: Results) -> str:
+    """Return the table of the quadratic program."""
+    rows = results["qp"]["rows"]
     return markdown(
         ["variables", *(str(row["variables"]) for row in rows)],
         [
@@ -331,24 +332,24 @@ def programs(found: Found) -> str:
     )
 
 
-def filter_cost(found: Found) -> str:
-    """Of an update of PPO, beside one without a filter."""
+def filter_cost(results: Results) -> str:
+    """Return the table of an update of PPO with a filter, beside one without."""
     filters: dict[str, list[tuple[str, float]]] = {}
-    for row in found["training"]["rows"]:
+    for row in results["training"]["rows"]:
         filters.setdefault(row["task"], []).append((row["filter"], row["ratio"]))
-    names = [", ".join(f"`{name}`" for name, _ in each) for each in filters.values()]
-    ratios = [", ".join(f"{ratio:.2f}" for _, ratio in each) for each in filters.values()]
+    names = [", ".join(f"`{name}`" for name, _ in row) for row in filters.values()]
+    ratios = [", ".join(f"{ratio:.2f}" for _, ratio in row) for row in filters.values()]
     return markdown(
         ["", *filters], [["filter", *names], ["wall time, without a filter = 1", *ratios]]
     )
 
 
-def adversaries(_: Found) -> str:
-    """What each found against each task's filter."""
+def adversaries(_: Results) -> str:
+    """Return the table of what each adversary achieved against each task's filter."""
     rows = []
     for task in DOCKING_FIRST:
-        found = json.loads((RESULTS / "falsify" / f"{task}.json").read_text(encoding="utf-8"))
-        for row in found["policies"]:
+        results = json.loads((RESULTS / "falsify" / f"{task}.json").read_text(encoding="utf-8"))
+        for row in results["policies"]:
             rows.append(
                 [
                     task,
@@ -369,8 +370,11 @@ def adversaries(_: Found) -> str:
     return markdown(heads.split(" | "), rows)
 
 
-def filtered_training(_: Found) -> str:
-    """Policies trained without and with a filter, by their modes, of the records of the report."""
+def filtered_training(_: Results) -> str:
+    """Return the table of policies trained without and with a filter, by their modes.
+
+    It is of the records of the report.
+    """
     labels = {
         "features": "no filter",
         "rta": "`rta=default`",
@@ -411,20 +415,20 @@ def filtered_training(_: Found) -> str:
     )
 
 
-def readme_results(_: Found) -> str:
-    """The recipes of the tasks, of the records of the report."""
+def readme_results(_: Results) -> str:
+    """Return the table of the recipes of the tasks, from the records of the report."""
     rows = []
     for task in TASKS:
         own = _record(task, "features")["results"]
-        each = [own["evaluation"][way]["success_rate"] for way in ("stochastic", "deterministic")]
+        rates = [own["evaluation"][way]["success_rate"] for way in ("stochastic", "deterministic")]
         rows.append(
             [
                 task,
                 f"{TASKS[task].paper_steps:,}",
                 _until(own["interaction_efficiency"]["timesteps"]),
                 f"{own['steps']:,}",
-                *(f"{100 * one['mean']:.2f} %" for one in each),
-                f"{100 * min(min(one['per_seed']) for one in each):.1f} %",
+                *(f"{100 * rate['mean']:.2f} %" for rate in rates),
+                f"{100 * min(min(rate['per_seed']) for rate in rates):.1f} %",
             ]
         )
     heads = (
@@ -434,48 +438,52 @@ def readme_results(_: Found) -> str:
     return markdown(heads.split(" | "), rows)
 
 
-def goals(_: Found) -> str:
-    """Ratios that were aimed for before any of it was written, and those of four files of results; bold: not reached."""
+def goals(_: Results) -> str:
+    """Return the table of ratios that were aimed for, and those of four files of results.
+
+    The goals were set before any of it was written. Bold ratios are not reached.
+    """
     names = ("environments", "ppo", "scaling", "startup")
-    found = {
+    results = {
         name: json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")) for name in names
     }
-    steps = _steps(found["environments"])
-    samples = _samples(found["ppo"])
-    scaled = _rates(found["scaling"])
-    many = sorted({lanes for _, lanes in steps})[1:]
+    steps = _steps(results["environments"])
+    samples = _samples(results["ppo"])
+    scaled = _rates(results["scaling"])
+    many = sorted({size for _, size in steps})[1:]
     all_ = max(count for _, count in samples)
-    slow, fast = sorted(found["environments"]["released_steps_per_s"])
+    slow, fast = sorted(results["environments"]["released_steps_per_s"])
     first = {
         row["name"]: {kind: statistics.median(row[kind]) for kind in ("cold", "warm")}
-        for row in found["startup"]["first"]
+        for row in results["startup"]["first"]
     }
 
     def pendulum(names: Iterable[str], goal: float, way: str = "") -> str:
         return _reached(
             [
-                steps[name + way, lanes] / steps[PENDULUM + way, lanes]
+                steps[name + way, size] / steps[PENDULUM + way, size]
                 for name in names
-                for lanes in many
+                for size in many
             ],
             goal,
         )
 
     def released(names: Iterable[str], goal: float) -> str:
-        rates = [steps[name, lanes] for name in names for lanes in many]
-        return f"{_reached([rate / fast for rate in rates], goal)}; {_reached([rate / slow for rate in rates], goal)}"
+        rates = [steps[name, size] for name in names for size in many]
+        ratios = [[rate / figure for rate in rates] for figure in (fast, slow)]
+        return "; ".join(_reached(values, goal) for values in ratios)
 
     def started(what: str, peer: str, kind: str, goal: float) -> str:
         return _reached(
             [first[f"jaxsafe {what}"][kind] / first[f"{peer} {what}"][kind]], goal, most=True
         )
 
-    one, ten = (
+    single, ten = (
         {n: samples[name, n] for n in (1, all_)} for name in ("jaxsafe", "jaxsafe, ten seeds")
     )
     environment = next(name for name, _ in scaled if "environment" in name)
     cores = scaled[environment, max(count for _, count in scaled)] / scaled[environment, 1]
-    outside = 1 - one[1] / samples["networks only", 1]
+    outside = 1 - single[1] / samples["networks only", 1]
     rows = [
         (
             "docking3d / Pendulum-v1, environment steps, one core, 1,024 to 16,384",
@@ -497,14 +505,19 @@ def goals(_: Found) -> str:
             "PPO samples, jaxsafe / rejax, all cores",
             "≥ 1.5",
             "≥ 2.5",
-            _reached([one[all_] / samples["rejax", all_]], 1.5),
+            _reached([single[all_] / samples["rejax", all_]], 1.5),
         ),
-        ("PPO, all cores / one, one seed", "≥ 1.3", "≥ 1.8", _reached([one[all_] / one[1]], 1.3)),
+        (
+            "PPO, all cores / one, one seed",
+            "≥ 1.3",
+            "≥ 1.8",
+            _reached([single[all_] / single[1]], 1.3),
+        ),
         (
             "ten seeds on all cores / one on one, time",
             "≤ 6.5",
             "≤ 5.3",
-            _reached([10 * one[1] / ten[all_]], 6.5, most=True),
+            _reached([10 * single[1] / ten[all_]], 6.5, most=True),
         ),
         (
             "PPO outside networks and Adam, share of time",
@@ -534,8 +547,8 @@ def goals(_: Found) -> str:
     return markdown(["ratio", "goal", "more", "reached"], rows)
 
 
-def accelerator_tables(found: Found) -> list[str]:
-    """All tables of `accelerator.py` of which there are rows."""
+def accelerator_tables(results: Results) -> list[str]:
+    """Return all tables of `accelerator.py` that have rows."""
     makers = {
         "numbers": accelerator_numbers,
         "environments": accelerator_environments,
@@ -544,21 +557,24 @@ def accelerator_tables(found: Found) -> list[str]:
         "filters": accelerator_filters,
     }
     return [
-        make(found) for part, make in makers.items() if found["parts"].get(part, {}).get("rows")
+        make(results) for part, make in makers.items() if results["parts"].get(part, {}).get("rows")
     ]
 
 
-def accelerator_numbers(found: Found) -> str:
-    """How many tests passed."""
-    counts = next((row for row in found["parts"]["numbers"]["rows"] if "test" not in row), {})
+def accelerator_numbers(results: Results) -> str:
+    """Return the table of how many tests passed."""
+    counts = next((row for row in results["parts"]["numbers"]["rows"] if "test" not in row), {})
     kinds = ("passed", "failed", "error", "skipped")
     cells = [str(counts.get(kind, 0)) for kind in kinds]
-    return markdown(["tests of numbers on the accelerator", *kinds], [[found["device"], *cells]])
+    return markdown(["tests of numbers on the accelerator", *kinds], [[results["device"], *cells]])
 
 
-def accelerator_environments(found: Found) -> str:
-    """Million steps a second, medians; compile time and memory of the largest batch."""
-    rows = found["parts"]["environments"]["rows"]
+def accelerator_environments(results: Results) -> str:
+    """Return the table of million steps a second, medians.
+
+    Compile time and memory are those of the largest batch.
+    """
+    rows = results["parts"]["environments"]["rows"]
     sizes = sorted({row["environments"] for row in rows})
     rates = {(row["task"], row["environments"]): _three(row["steps_per_s"] / 1e6) for row in rows}
     lines = []
@@ -575,9 +591,12 @@ def accelerator_environments(found: Found) -> str:
     return markdown([*heads, *PROGRAM], lines)
 
 
-def accelerator_ppo(found: Found) -> str:
-    """Million samples a second, medians; compile time and memory of the first column."""
-    rows = found["parts"]["ppo"]["rows"]
+def accelerator_ppo(results: Results) -> str:
+    """Return the table of million samples a second, medians.
+
+    Compile time and memory are those of the first column.
+    """
+    rows = results["parts"]["ppo"]["rows"]
     columns = [*dict.fromkeys((row["environments"], row["seeds"]) for row in rows)]
     lines = []
     for peer in dict.fromkeys(row["peer"] for row in rows):
@@ -593,11 +612,14 @@ def accelerator_ppo(found: Found) -> str:
     )
 
 
-def accelerator_learning(found: Found) -> str:
-    """Seconds until the average over seeds reached the level, and how far each seed was by then."""
+def accelerator_learning(results: Results) -> str:
+    """Return the table of seconds until the average over seeds reached the level.
+
+    It also has how many seeds were there by then.
+    """
     lines = []
-    for row in found["parts"]["learning"]["rows"]:
-        each = [seconds for seconds in row["each_seed"] if seconds is not None]
+    for row in results["parts"]["learning"]["rows"]:
+        reached = [seconds for seconds in row["each_seed"] if seconds is not None]
         lines.append(
             [
                 row["task"],
@@ -605,7 +627,7 @@ def accelerator_learning(found: Found) -> str:
                 f"{row['seconds']:.2g}" if row["reached"] else f"not in {row['seconds']:.0f}",
                 f"{row['steps']:,}",
                 f"{_three(row['samples_per_s'] / 1e6)}",
-                f"{len(each)}",
+                f"{len(reached)}",
                 *_program(row),
             ]
         )
@@ -619,9 +641,9 @@ def accelerator_learning(found: Found) -> str:
     return markdown([*heads, "seeds at 95 % by then", *PROGRAM], lines)
 
 
-def accelerator_filters(found: Found) -> str:
-    """Calls a second, medians."""
-    rows = found["parts"]["filters"]["rows"]
+def accelerator_filters(results: Results) -> str:
+    """Return the table of filter calls a second, medians."""
+    rows = results["parts"]["filters"]["rows"]
     lines = [
         [
             row["task"],
@@ -635,9 +657,12 @@ def accelerator_filters(found: Found) -> str:
     return markdown(["filter calls/s on the accelerator", "filter", *heads, *PROGRAM], lines)
 
 
-def accelerator_goals(found: Found) -> str:
-    """What was aimed for on one GPU and what is reached; bold: not reached."""
-    parts = {name: part["rows"] for name, part in found["parts"].items()}
+def accelerator_goals(results: Results) -> str:
+    """Return the table of what was aimed for on one GPU and what is reached.
+
+    Bold numbers are not reached.
+    """
+    parts = {name: part["rows"] for name, part in results["parts"].items()}
     largest = max(row["environments"] for row in parts["environments"])
     rates = {
         row["task"]: row["steps_per_s"] / 1e6
@@ -677,13 +702,16 @@ PROGRAM = ("compile [s]", "memory [MiB]")
 """Columns of `_program`."""
 
 
-def _program(row: Found) -> list[str]:
-    """What compiling took beside other programs, and the memory that the program needs for intermediate results."""
+def _program(row: Results) -> list[str]:
+    """Return the seconds of compiling and the memory for intermediate results.
+
+    Other programs compiled at the same time.
+    """
     memory = row["temporary_bytes"]
     return [f"{row['compile_s']:.2g}", "–" if memory is None else f"{memory / 2**20:.0f}"]
 
 
-TABLES: Sequence[tuple[str, Callable[[Found], str], str]] = (
+TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("environments", environments, "docs/performance.md"),
     ("environments", readme_environments, "README.md"),
     ("ppo", ppo, "docs/performance.md"),
@@ -711,11 +739,11 @@ TABLES: Sequence[tuple[str, Callable[[Found], str], str]] = (
     ("", filtered_training, "docs/rta.md"),
     ("", readme_results, "README.md"),
 )
-"""File of results, what makes a table of it, and the page where it stands."""
+"""The file of results, the function that makes a table of it, and the page of the table."""
 
 
 def pages() -> dict[Path, str]:
-    """Each page with its tables as they should be.
+    """Return each page with its tables as they should be.
 
     Raises:
         ValueError: a page does not have exactly one table with the first row of one of these.
@@ -723,8 +751,8 @@ def pages() -> dict[Path, str]:
     text: dict[Path, str] = {}
     for file, make, name in TABLES:
         page = ROOT / name
-        found = json.loads((RESULTS / f"{file}.json").read_text(encoding="utf-8")) if file else {}
-        table = make(found)
+        results = json.loads((RESULTS / f"{file}.json").read_text(encoding="utf-8")) if file else {}
+        table = make(results)
         head = table.partition("\n")[0]
         before = text.get(page) or page.read_text(encoding="utf-8")
         text[page], count = re.subn(
@@ -746,27 +774,27 @@ def main() -> None:
         sys.exit(str(error))
 
 
-def _record(task: str, kind: str) -> Found:
+def _record(task: str, kind: str) -> Results:
     return json.loads((BASELINES / f"{task}-{kind}.json").read_text(encoding="utf-8"))
 
 
-def _steps(found: Found) -> dict[tuple[str, int], float]:
-    return {(run["task"], run["lanes"]): run["steps_per_s"] for run in found["runs"]}
+def _steps(results: Results) -> dict[tuple[str, int], float]:
+    return {(run["task"], run["lanes"]): run["steps_per_s"] for run in results["runs"]}
 
 
-def _samples(found: Found) -> dict[tuple[str, int], float]:
+def _samples(results: Results) -> dict[tuple[str, int], float]:
     return {
         (run["peer"], run["cores"]): statistics.median(run["samples_per_s"])
-        for run in found["runs"]
+        for run in results["runs"]
     }
 
 
-def _rates(found: Found) -> dict[tuple[str, int], float]:
-    return {(run["what"], run["cores"]): statistics.median(run["per_s"]) for run in found["runs"]}
+def _rates(results: Results) -> dict[tuple[str, int], float]:
+    return {(run["what"], run["cores"]): statistics.median(run["per_s"]) for run in results["runs"]}
 
 
 def _scaled(name: str) -> str:
-    """What the page calls a row of `scaling.py`."""
+    """Return what the page calls a row of `scaling.py`."""
     return (
         name
         if "environment" in name
@@ -775,7 +803,10 @@ def _scaled(name: str) -> str:
 
 
 def _reached(values: Sequence[float], goal: float, most: bool = False) -> str:
-    """The range of some ratios, bold where it misses the goal, the least or the most that they may be."""
+    """Return the range of some ratios, bold where it misses the goal.
+
+    The goal is the least that they may be, or the most.
+    """
 
     def shown(value: float) -> str:
         digits = 0 if value >= 100 else 2 if value < 2 else 1
@@ -783,7 +814,7 @@ def _reached(values: Sequence[float], goal: float, most: bool = False) -> str:
             value > goal,
             value < goal,
         ):
-            digits += 1  # else it would look as if it were on the other side
+            digits += 1  # otherwise it would look as if it were on the other side
         text = f"{value:,.{digits}f}"
         return f"**{text}**" if (value > goal if most else value < goal) else text
 
@@ -794,22 +825,22 @@ def _until(steps: int | None) -> str:
     return "never" if steps is None else f"{steps:,}"
 
 
-def _interval(metric: Found, factor: float, digits: int) -> str:
+def _interval(metric: Results, factor: float, digits: int) -> str:
     interval = metric["ci95"] and [factor * bound for bound in metric["ci95"]]
     return with_interval(factor * metric["mean"], interval, f".{digits}f")
 
 
-def _share(metric: Found) -> str:
+def _share(metric: Results) -> str:
     return f"{100 * metric['mean']:.3g}%" if metric["mean"] else "0"
 
 
 def _three(value: float) -> str:
-    """Three digits, without an exponent."""
+    """Return a number with three digits, without an exponent."""
     return f"{value:.3g}" if value < 1000 else f"{float(f'{value:.3g}'):,.0f}"
 
 
 def _scale(rate: float) -> str:
-    """Calls a second in millions or thousands, with two or three digits."""
+    """Return calls a second in millions or thousands, with two or three digits."""
     scaled, unit = (rate / 1e6, "M") if rate >= 1e6 else (rate / 1e3, "k")
     return (
         f"{scaled:.{2 if scaled < 100 else 3}g} {unit}" if unit == "M" else f"{scaled:.3g} {unit}"

@@ -1,15 +1,19 @@
-"""From which angles does the backup of oriented docking hold the speed limit for ever, and how far from the chief?
+"""Prove from which angles the backup of oriented docking holds the speed limit for ever.
 
-`align_and_brake` turns the thrust axis along the velocity. Let e be the course less the axis and w the turn of the body.
-What e and w become over a step depends on the distance and on the velocity only by how far the course may turn, and that
-has a bound. So the plane of e and w is cut into cells, each cell is mapped with interval arithmetic to all cells that it
-may reach under every course within the bound, and the cells are followed until there are no new ones. Printed are
+`align_and_brake` turns the thrust axis along the velocity. Let e be the course less the axis and w
+the turn of the body. What e and w become over a step depends on the distance and on the velocity
+only by how far the course may turn, and that has a bound. So the plane of e and w is cut into
+cells. Each cell is mapped with interval arithmetic to all cells that it may reach under every
+course within the bound. The cells are followed until there are no new ones. These lines are
+printed:
 
 - the largest angle that is ever reached from `angle` or less at any spin,
-- the steps until the axis is within `angle`, from any angle and spin, and then until it is within `aligned`,
-- the distance up to which the weaker thrust holds the limit at that largest angle, against gravity and the shrinking limit.
+- the steps until the axis is within `angle`, from any angle and spin, and then until it is within
+  `aligned`,
+- the distance up to which the weaker thrust holds the limit at that largest angle, against gravity
+  and the shrinking limit.
 
-`docs/rta.md` has the proof that these are steps of; `jaxsafe/rta/proofs.py` keeps the numbers.
+These are steps of the proof in `docs/rta.md`. `jaxsafe/rta/proofs.py` keeps the numbers.
 
     python benchmarks/terminal_set.py [angle=75] [dt=1] [cells=1440]
 """
@@ -27,7 +31,7 @@ from jaxsafe.envs.docking import TURN
 from jaxsafe.rta.speed_limit import speed_limit_facts
 
 LOW_SHARE = 0.3
-"""Below this share of the speed limit nothing is asked of the angle: the limit is far."""
+"""Below this share of the speed limit the limit is far, and nothing is asked of the angle."""
 
 FLIPS = 6
 """How often the nearer end of the axis may change on the way, see docs/rta.md."""
@@ -35,7 +39,7 @@ FLIPS = 6
 MOST_STEPS = 200
 
 SLACK = 1.01
-"""For the straightened limit, and for speeds a little below it."""
+"""A factor for the straightened limit, and for speeds a little below it."""
 
 
 def main() -> None:
@@ -48,7 +52,7 @@ def main() -> None:
 
 
 class Proof:
-    """Angles in degrees, rates in degrees a second."""
+    """The proof. Angles are in degrees, rates in degrees a second."""
 
     def __init__(self, env: jaxsafe.Environment, angle: float, cells: int) -> None:
         plant: Any = env.agent_platform
@@ -76,35 +80,46 @@ class Proof:
         self.num = (cells, 160)
 
     def gravity(self, share: float) -> float:
-        """How far gravity and the Coriolis force turn the course in a step, at a share of the speed limit."""
+        """Return how far gravity and the Coriolis force turn the course in a step.
+
+        `share` is the speed as a share of the limit.
+        """
         return math.degrees((2.0 * self.n + 1.5 * self.n / share) * self.dt)
 
     def needed(self, first: bool) -> float:
-        """What thrust must take off in a step so that the limit is kept with twice the margin, as a share of the speed."""
+        """Return what thrust must take off in a step, as a share of the speed.
+
+        The limit is then kept with twice the margin.
+        """
         return SLACK * (
             2.0 * self.n * self.dt + first * self.margin / (self.floor - 2.0 * self.margin)
         )
 
     def thrust_turn(self, error: np.ndarray, first: bool) -> np.ndarray:
-        """How far the least thrust that holds the limit turns the course in a step; infinite where none holds it."""
+        """Return how far the least thrust that holds the limit turns the course in a step.
+
+        It is infinite where no thrust holds it.
+        """
         error = np.radians(np.minimum(error, 90.0))
         sine = np.sin(error)
         cosine = np.maximum(np.cos(error), 1e-9)
-        root = (
-            cosine**2 - 2.0 * self.needed(first) * sine**2
-        )  # thrust across the velocity lengthens it
+        # Thrust across the velocity lengthens it.
+        root = cosine**2 - 2.0 * self.needed(first) * sine**2
         push = SLACK * (cosine - np.sqrt(np.maximum(root, 0.0))) / np.maximum(sine, 1e-9) ** 2
         turn = np.degrees(np.arctan2(push * sine, 1.0 - push * cosine))
         return np.where((root > 0.0) & (error > 1e-3), turn, np.where(error > 1e-3, np.inf, 0.0))
 
     def course(self, first: bool) -> np.ndarray:
-        """How far the course may turn in a step, for each cell of the angle."""
+        """Return how far the course may turn in a step, for each cell of the angle."""
         error = np.maximum(np.abs(self.low), np.abs(self.high)) + self.spin * self.dt + 1.0
         near = self.gravity(0.99) + self.thrust_turn(error, first)
         return np.maximum(near, self.gravity(LOW_SHARE))
 
     def swing(self) -> float:
-        """The largest angle after a step of braking along the body from within `aligned`, above `LOW_SHARE`."""
+        """Return the largest angle after a step of braking along the body.
+
+        The step begins within `aligned`, above `LOW_SHARE`.
+        """
         least = LOW_SHARE * self.floor
         across = math.sin(math.radians(self.aligned + self.spin * self.dt + 1.0))
         ratio = (least + self.strongest * self.dt) * across / least
@@ -114,13 +129,14 @@ class Proof:
         return np.sign(error) * np.minimum(self.spin, np.sqrt(1.6 * self.wheel * np.abs(error)))
 
     def after(self, error: np.ndarray, spin: np.ndarray) -> np.ndarray:
-        """The spin after a step: it grows with both."""
+        """Return the spin after a step. It grows with both arguments."""
         return np.clip(self.rate(error), spin - self.wheel * self.dt, spin + self.wheel * self.dt)
 
     def image(self, cells: np.ndarray, course: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-        """All cells that may be reached in a step in which the course turns by up to `course` either way.
+        """Return all cells that may be reached in a step in which the course turns.
 
-        Those beyond ±90°, where the angle is one from the other end of the axis, stand apart.
+        The course turns by up to `course` either way. Cells beyond ±90°, where the angle is one
+        from the other end of the axis, stand apart.
         """
         slowest = self.after(self.low, self.slower)
         fastest = self.after(self.high, self.faster)
@@ -133,9 +149,8 @@ class Proof:
         columns = np.clip(columns, 0, self.num[1] - 1)
         rows = np.floor((np.stack([least, most]) + 90.0) / self.width + [[[-1e-9]], [[1e-9]]])
         rows = np.clip(rows, -self.num[0], 2 * self.num[0] - 1).astype(int)
-        marks = np.zeros(
-            (3 * self.num[0] + 1, self.num[1] + 1), int
-        )  # corners of rectangles; their sums fill them
+        # The marks are corners of rectangles. Their cumulative sums fill the rectangles.
+        marks = np.zeros((3 * self.num[0] + 1, self.num[1] + 1), int)
         chosen = np.nonzero(cells)
         first, last = (side[chosen] + self.num[0] for side in rows)
         left, right = (side[chosen] for side in columns)
@@ -151,12 +166,15 @@ class Proof:
         return same, below | above
 
     def within(self, angle: float) -> np.ndarray:
-        """The cells of an angle or less, at any spin."""
+        """Return the cells of an angle or less, at any spin."""
         inside = np.maximum(np.abs(self.low), np.abs(self.high)) <= angle + 1e-9
         return np.broadcast_to(inside, self.num)
 
     def closure(self) -> np.ndarray | None:
-        """The cells that are ever reached from `angle` or less at any spin; None if the axis escapes."""
+        """Return the cells that are ever reached from `angle` or less at any spin.
+
+        Return None if the axis escapes.
+        """
         begin = self.within(self.angle)
         aligned = self.within(self.aligned)
         first = self.course(first=True)
@@ -172,11 +190,14 @@ class Proof:
         return known
 
     def largest(self, cells: np.ndarray) -> float:
-        """The largest angle of some cells."""
+        """Return the largest angle of some cells."""
         return float(np.maximum(np.abs(self.low), np.abs(self.high))[cells.any(axis=1)].max())
 
     def steps(self, begin: np.ndarray, goal: float, course: np.ndarray | float) -> int | None:
-        """The steps until all cells have been within an angle, if the nearer end changes `FLIPS` times; None if never."""
+        """Return the steps until all cells have been within an angle.
+
+        The nearer end changes `FLIPS` times. Return None if that never happens.
+        """
         goals = self.within(goal)
         layers = [begin, *(np.zeros(self.num, bool) for _ in range(FLIPS))]
         for count in range(MOST_STEPS):
@@ -188,7 +209,10 @@ class Proof:
         return None
 
     def hold(self, largest: float) -> float:
-        """The distance up to which the weaker thrust holds the limit at the largest angle."""
+        """Return the distance up to which the weaker thrust holds the limit.
+
+        The angle is the largest one.
+        """
         angle = math.radians(largest + self.spin * self.dt + 1.0)
         spare = (
             self.weakest * math.cos(angle) / SLACK - self.margin / self.dt - self.slope * self.floor
@@ -196,7 +220,7 @@ class Proof:
         return spare / max(3.0 * self.n**2, self.slope**2)
 
     def lines(self) -> list[str]:
-        """What was proved, in words."""
+        """Return what was proved, in words."""
         known = self.closure()
         swing = self.swing()
         if known is None or swing > self.angle:

@@ -1,8 +1,10 @@
-"""PPO as it is mostly written in JAX: one network call, one gradient and one permutation after the other, all under `vmap`.
+"""PPO as it is mostly written in JAX, all under `vmap`.
 
-It has the parts that PureJaxRL made common, written anew as a peer for `ppo.py`: a key for every environment at every step,
-a start drawn whether it is needed or not, the batch sorted into a random order and gathered whole in each epoch, and the
-gradient of a whole minibatch at once. It ends episodes at the first of termination and truncation, with one `done`.
+There is one network call, one gradient and one permutation after the other. It has the parts that
+PureJaxRL made common, written anew as a peer for `ppo.py`: a key for every environment at every
+step, a start drawn whether it is needed or not, the batch sorted into a random order and gathered
+whole in each epoch, and the gradient of a whole minibatch at once. It ends episodes at the first of
+termination and truncation, with one `done`.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ class Sample(NamedTuple):
 
 
 def init(env: jaxsafe.Environment, hidden: Sequence[int], num_envs: int, key: Array) -> Any:
-    """Networks, optimiser, environments, observations and key."""
+    """Return networks, optimiser, environments, observations and key."""
     key, key_actor, key_critic, key_reset = jax.random.split(key, 4)
     params = {
         "actor": _layers(key_actor, [env.observation_size, *hidden, env.action_size], 0.01),
@@ -54,7 +56,7 @@ def init(env: jaxsafe.Environment, hidden: Sequence[int], num_envs: int, key: Ar
 def update(
     env: jaxsafe.Environment, num_steps: int, num_epochs: int, num_minibatches: int, carry: Any
 ) -> Any:
-    """One batch and what is learnt from it."""
+    """Collect one batch and learn from it."""
     params, optimizer, state, observation, key = carry
 
     def step(carry: Any, _: None) -> tuple[Any, Sample]:

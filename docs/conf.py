@@ -9,8 +9,8 @@ project = "jaxsafe"
 author = "The jaxsafe authors"
 copyright = "The jaxsafe authors, MIT licence"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
-exclude_patterns = ["_site", "jupyter_execute"]  # what a build makes
-nb_execution_mode = "off"  # pages show what is committed; a test runs the notebook
+exclude_patterns = ["_site", "jupyter_execute"]  # a build makes these
+nb_execution_mode = "off"  # pages show what is committed, and a test runs the notebook
 myst_heading_anchors = 3
 myst_links_external_new_tab = True
 
@@ -27,7 +27,10 @@ add_module_names = False
 
 
 def setup(app: Any) -> None:
-    """Links that hold in the repository hold on the site: the README, one folder up, is its first page."""
+    """Make links that hold in the repository hold on the site.
+
+    The README, one folder up, is its first page.
+    """
     app.connect("include-read", lambda _app, _path, _page, content: _each(content, _in_docs))
     app.connect(
         "source-read",

@@ -1,6 +1,7 @@
-"""The figures of `docs/tasks`, drawn by `docs/make_tasks.py`: ranges and regions of a task, and episodes in it.
+"""The figures of `docs/tasks`, drawn by `docs/make_tasks.py`.
 
-Ranges come from the environment, and the episodes are steps of it under simple scripted policies.
+They show ranges and regions of a task, and episodes in it. Ranges come from the environment. The
+episodes are steps of it under simple scripted policies.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from matplotlib.patches import Annulus, Circle, Rectangle
 
 import jaxsafe
 
-BLUE = "#0072B2"  # of the Okabe-Ito palette
+BLUE = "#0072B2"  # a colour of the Okabe-Ito palette
 ORANGE = "#D55E00"
 GREEN = "#009E73"
 GREY = "#6E6E6E"
@@ -34,20 +35,25 @@ PACES = (0.9, 0.6, 1.15)
 
 
 def draw(task: str) -> Figure:
-    """The figure of a task: where it starts, where it may go, and episodes under a scripted policy."""
+    """Return the figure of a task.
+
+    It shows where the task starts, where an agent may go, and episodes under a scripted policy.
+    """
     env = jaxsafe.make(task)
     episodes = [episode(env, seed, pace) for seed, pace in zip(SEEDS[task], PACES, strict=False)]
     return (draw_docking if env.agent == "deputy" else draw_rejoin)(env, episodes)
 
 
 def episode(env: Any, seed: int, pace: float) -> tuple[Any, str]:
-    """The simulation at each step from a random start to the end, stacked, and the outcome."""
+    """Return the simulations from a random start to the end, stacked, and the outcome."""
     lows, highs = (
-        jnp.stack([getattr(one, end) for one in env.agent_platform.controller.actuators])
+        jnp.stack([getattr(actuator, end) for actuator in env.agent_platform.controller.actuators])
         for end in ("low", "high")
     )
     steer = steer_spacecraft if env.agent == "deputy" else steer_aircraft
-    centred = jnp.array([one.zero_centred for one in env.agent_platform.controller.actuators])
+    centred = jnp.array(
+        [actuator.zero_centred for actuator in env.agent_platform.controller.actuators]
+    )
 
     def one_step(state: Any, _: None) -> tuple[Any, Any]:
         wish = jnp.stack([steer(env, state.sim, pace)[name] for name in env.action_names])
@@ -66,7 +72,7 @@ def episode(env: Any, seed: int, pace: float) -> tuple[Any, str]:
 
 
 def steer_spacecraft(env: Any, sim: Any, pace: float) -> dict[str, Any]:
-    """Thrust towards a share of the speed limit in the direction of the chief."""
+    """Return thrust towards the chief, for a speed that is a share of the limit."""
     deputy = sim.platforms["deputy"]
     status = sim.status
     wish = -pace * status["velocity_limit"] * deputy.position / jnp.linalg.norm(deputy.position)
@@ -85,7 +91,10 @@ def steer_spacecraft(env: Any, sim: Any, pace: float) -> dict[str, Any]:
 
 
 def steer_aircraft(env: Any, sim: Any, pace: float) -> dict[str, Any]:
-    """Fly at the lead's velocity, and up to 100 ft/s besides towards the rejoin point."""
+    """Return controls that fly at the lead's velocity and towards the rejoin point.
+
+    The speed towards the point is at most 100 ft/s.
+    """
     lead = sim.platforms["lead"]
     wingman = sim.platforms["wingman"]
     away = sim.regions["rejoin_region"].position - wingman.position
@@ -102,7 +111,7 @@ def steer_aircraft(env: Any, sim: Any, pace: float) -> dict[str, Any]:
 
 
 def draw_docking(env: Any, episodes: list[tuple[Any, str]]) -> Figure:
-    """Paths about the chief, their last metres, and speed against distance."""
+    """Draw paths about the chief, their last metres, and speed against distance."""
     figure = Figure(figsize=(11, 4.6), layout="constrained")
     spatial = env.platforms[0].dimension == 3
     left: Any = figure.add_subplot(1, 2, 1, projection="3d" if spatial else None)
@@ -180,7 +189,10 @@ def draw_docking(env: Any, episodes: list[tuple[Any, str]]) -> Figure:
 
 
 def draw_rejoin(env: Any, episodes: list[tuple[Any, str]]) -> Figure:
-    """Paths over the ground, paths seen from the lead and, in space, altitude over that of the lead."""
+    """Draw paths over the ground and paths seen from the lead.
+
+    In space, also draw the altitude over that of the lead.
+    """
     spatial = env.platforms[0].dimension == 3
     figure = Figure(figsize=(14 if spatial else 11, 4.6), layout="constrained")
     ground, close, *height = figure.subplots(1, 3 if spatial else 2)

@@ -1,7 +1,8 @@
-"""The pages `docs/tasks/<task>.md` and their figures, from the environments themselves, so that they cannot drift.
+"""The pages `docs/tasks/<task>.md` and their figures, from the environments themselves.
 
-Run `python docs/make_tasks.py` after a change to a task; `tests/docs/test_docs.py` compares the committed pages with it.
-The paragraphs above and below the figure are written by hand; every table comes from the components of `jaxsafe.make`.
+So they cannot drift from the environments. Run `python docs/make_tasks.py` after a change to a
+task. `tests/docs/test_docs.py` compares the committed pages with it. The paragraphs above and below
+the figure are written by hand. Every table comes from the components of `jaxsafe.make`.
 """
 
 from __future__ import annotations
@@ -28,54 +29,66 @@ from jaxsafe.types import units
 TARGET = Path(__file__).parent / "tasks"
 
 DOCKING = (
-    "A deputy spacecraft flies to within 0.5 m of a chief that rests at the origin of Hill's frame, on a circular orbit."
-    " Its speed must stay below a limit that falls with the distance; a deputy that arrives faster has crashed."
+    "A deputy spacecraft flies to within 0.5 m of a chief that rests at the origin of Hill's"
+    " frame, on a circular orbit. Its speed must stay below a limit that falls with the distance."
+    " A deputy that arrives faster has crashed."
 )
 REJOIN = (
-    "A wingman flies to a point behind and beside a lead aircraft and stays in a small region about it for 20 s. It must"
-    " keep 100 ft away from the lead, which flies straight on unless its script says otherwise."
+    "A wingman flies to a point behind and beside a lead aircraft and stays in a small region about"
+    " it for 20 s. It must keep 100 ft away from the lead. The lead flies straight on unless its"
+    " script says otherwise."
 )
 TEXT = {
     "rejoin2d": (
-        f"{REJOIN} Both fly at one altitude. The wingman commands its heading rate and"
-        f" its acceleration."
+        f"{REJOIN} Both fly at one altitude. The wingman commands its heading rate and its"
+        " acceleration."
     ),
-    "rejoin3d": f"{REJOIN} The wingman commands its roll rate, the rate of its flight path angle and its acceleration;"
-    " it turns because it banks. A positive flight path angle lowers z.",
+    "rejoin3d": (
+        f"{REJOIN} The wingman commands its roll rate, the rate of its flight path angle and its"
+        " acceleration. It turns because it banks. A positive flight path angle lowers z."
+    ),
     "docking2d": (
-        f"{DOCKING} The motion is in the plane of the orbit; one thruster pair acts"
-        f" along each axis."
+        f"{DOCKING} The motion is in the plane of the orbit. One thruster pair acts along each"
+        " axis."
     ),
-    "docking3d": f"{DOCKING} The motion is in space; one thruster pair acts along each axis.",
-    "docking2d_oriented": f"{DOCKING} The motion is in the plane of the orbit. One thruster acts along the body's x axis,"
-    " stronger forwards than backwards, and a reaction wheel turns the body, so the deputy must first point and then push.",
+    "docking3d": f"{DOCKING} The motion is in space. One thruster pair acts along each axis.",
+    "docking2d_oriented": (
+        f"{DOCKING} The motion is in the plane of the orbit. One thruster acts along the body's x"
+        " axis, stronger forwards than backwards. A reaction wheel turns the body, so the deputy"
+        " must first point and then push."
+    ),
 }
-"""What a task is, in a paragraph."""
+"""A paragraph that says what a task is."""
 
 CAPTION = {
-    "deputy": "Starts are drawn from the blue ranges (dots: three of them). A scripted policy flies to the chief at 90, 60"
-    " and 115 % of the speed limit; the last crashes. x points away from the Earth, y along the orbit.",
-    "wingman": "A scripted policy flies to the rejoin point and ignores the lead: one wingman succeeds, the other crashes"
-    " into the lead on its way. Dots and squares are starts.",
+    "deputy": (
+        "Starts are drawn from the blue ranges (dots: three of them). A scripted policy flies to"
+        " the chief at 90, 60 and 115 % of the speed limit. The last one crashes. x points away"
+        " from the Earth, y along the orbit."
+    ),
+    "wingman": (
+        "A scripted policy flies to the rejoin point and ignores the lead. One wingman succeeds,"
+        " the other crashes into the lead on its way. Dots and squares are starts."
+    ),
 }
-"""What the figure shows, by agent."""
+"""A caption that says what the figure shows, by agent."""
 
 SECTIONS = (
     ("Regions", "", "regions"),
     (
         "Statuses",
-        "Facts about the state, computed in this order; those below may use those above.",
+        "Statuses are facts about the state, in this order. A status may use those above.",
         "status",
     ),
     ("Rewards", "The reward of a step is the sum of these terms.", "reward"),
     (
         "Ends of an episode",
-        "The first condition that holds is the outcome; a bound of a reward term comes last.",
+        "The first condition that holds is the outcome. A bound of a reward term comes last.",
         "terminal",
     ),
     (
         "Safety constraints",
-        "Safe where h ≥ 0; `cost` is 1 on a step on which one is violated.",
+        "A state is safe where h ≥ 0. `cost` is 1 on a step on which a constraint is violated.",
         "constraints",
     ),
 )
@@ -83,28 +96,32 @@ SECTIONS = (
 
 
 def page(task: str) -> str:
-    """The Markdown page of a task."""
+    """Return the Markdown page of a task."""
     env = jaxsafe.make(task)
     length = length_unit(env) or ""
     paths = (
-        f"A path is what `jaxsafe.make({task!r}, {{path: value}})` takes, followed by a dot"
-        f" and the number's name."
+        f"`jaxsafe.make({task!r}, {{path: value}})` takes a path from these tables, followed by a"
+        " dot and the number's name."
     )
     blocks = [
         f"<!-- Written by docs/make_tasks.py. -->\n# {task}",
         TEXT[task],
         f"![Where {task} starts and how it ends]({task}.png)",
         CAPTION[env.agent],
-        "The tables and equations named here are those of the paper (see [the README](../../README.md#development))."
-        f" Lengths are in {length}, the time step is {number(env.dt)} s. {paths} Where the published code differs:"
-        " [deviations](../deviations.md). The same as one file:"
-        f" [configs/envs/{task}.yaml](../../configs/envs/{task}.yaml).",
+        (
+            "The tables and equations named here are those of the paper (see"
+            f" [the README](../../README.md#development)). Lengths are in {length}, and the time"
+            f" step is {number(env.dt)} s. {paths} [Deviations](../deviations.md) says where the"
+            " published code differs."
+            f" [configs/envs/{task}.yaml](../../configs/envs/{task}.yaml) is the same task as one"
+            " file."
+        ),
         "## Platforms",
         *(block for platform in env.platforms for block in platform_blocks(platform, length)),
         "## Actions",
         (
-            f"Continuous actions lie in [−1, 1]; with `jaxsafe.make({task!r}, actions='discrete')`"
-            f" they are indices of points."
+            "Continuous actions lie in [−1, 1]. With"
+            f" `jaxsafe.make({task!r}, actions='discrete')` they are indices of points."
         ),
         table(
             ("index", "actuator", "unit", "low", "high", "[−1, 1] maps to", "points"), actions(env)
@@ -123,14 +140,14 @@ def page(task: str) -> str:
 
 
 def wrapped(block: str) -> str:
-    """A paragraph in lines of the house's width; headings, tables and figures as they are."""
+    """Return a paragraph in lines of the house's width. Other blocks stay as they are."""
     if block.startswith(("#", "|", "<", "!")):
         return block
     return textwrap.fill(block, 124, break_on_hyphens=False, break_long_words=False)
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A Markdown table."""
+    """Return a Markdown table."""
     lines = [list(head), *map(list, rows)]
     lines.insert(1, ["---"] * len(lines[0]))
     return "\n".join(
@@ -139,7 +156,7 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def platform_blocks(platform: Platform, length: str) -> Iterator[str]:
-    """What a platform is, its parameters, and its state with the way in which each field starts."""
+    """Yield what a platform is, its parameters, and its state with how each field starts."""
     yield f"### `{platform.name}`: {platform.type_name}"
     yield summary(platform)
     own = [name for name in fields(type(platform)) if name not in fields(Platform)]
@@ -165,36 +182,39 @@ def platform_blocks(platform: Platform, length: str) -> Iterator[str]:
     commands = getattr(platform.controller, "commands", ())
     if commands:
         script = "; ".join(
-            f"`{one.name}` {one.type_name} {settings(one, length)}" for one in commands
+            f"`{command.name}` {command.type_name} {settings(command, length)}"
+            for command in commands
         )
         yield f"It follows a script: {script}."
 
 
 def state_fields(platform: Platform) -> list[tuple[str, str, int]]:
-    """Name, unit and number of components of each field of a platform's state."""
+    """Return name, unit and number of components of each field of a platform's state."""
     rest = platform.rest()
     return [(name, unit, np.size(getattr(rest, name))) for name, unit in units(type(rest)).items()]
 
 
 def actions(env: jaxsafe.Environment) -> Iterator[tuple[str, ...]]:
-    """A row for each actuator."""
-    for index, one in enumerate(env.agent_platform.controller.actuators):  # type: ignore[attr-defined]
-        unit = control_unit(one.name, length_unit(env))
-        assert unit, f"no unit is known for {one.name}"
-        mapped = "[low, 0] and [0, high], so that 0 stays 0" if one.zero_centred else "[low, high]"
+    """Yield a row for each actuator."""
+    for index, actuator in enumerate(env.agent_platform.controller.actuators):  # type: ignore[attr-defined]
+        unit = control_unit(actuator.name, length_unit(env))
+        assert unit, f"no unit is known for {actuator.name}"
+        mapped = (
+            "[low, 0] and [0, high], so that 0 stays 0" if actuator.zero_centred else "[low, high]"
+        )
         yield (
             str(index),
-            f"`{one.name}`",
+            f"`{actuator.name}`",
             unit,
-            number(one.low),
-            number(one.high),
+            number(actuator.low),
+            number(actuator.high),
             mapped,
-            str(one.points),
+            str(actuator.points),
         )
 
 
 def observation(env: jaxsafe.Environment) -> list[tuple[str, ...]]:
-    """A row for each element of the observation."""
+    """Return a row for each element of the observation."""
     labels: dict[str, tuple[str, ...]] = {}
 
     def probe(key: jax.Array) -> None:
@@ -212,7 +232,7 @@ def observation(env: jaxsafe.Environment) -> list[tuple[str, ...]]:
 
 
 def seen(item: Observation, label: str) -> str:
-    """What one element of an observation is, in words."""
+    """Return what one element of an observation is, in words."""
     element = label.removeprefix(item.name).removeprefix(".")
     if isinstance(item, ObserveAngle):
         return f"{'cosine' if element == 'cos' else 'sine'} of the `{item.what}` of `{item.of}`"
@@ -229,7 +249,7 @@ def seen(item: Observation, label: str) -> str:
 
 
 def parts(env: jaxsafe.Environment, section: str, length: str) -> Iterator[tuple[str, ...]]:
-    """A row for each part of a section: the docstring of its class, and its numbers."""
+    """Yield a row for each part of a section: the docstring of its class, and its numbers."""
     for part in getattr(env, section):
         yield (
             f"`{section}.{part.name}`",
@@ -249,16 +269,19 @@ def parts(env: jaxsafe.Environment, section: str, length: str) -> Iterator[tuple
 
 
 def summary(component: Component) -> str:
-    """The docstring of a component in one line."""
+    """Return the docstring of a component in one line."""
     return " ".join(inspect.cleandoc(type(component).__doc__ or "").split())
 
 
 def settings(
     component: Component, length: str, only: Iterable[str] = (), physical: str = ""
 ) -> str:
-    """The fields of a component in words, with units; what is not set is left out, and what a base class sets."""
+    """Return the fields of a component in words, with units.
+
+    What is not set is left out, and so is what a base class sets.
+    """
     units = {"m or ft": length, "physical": physical, "1": "", "as observed": ""}
-    found = []
+    words = []
     for name, field in fields(type(component)).items():
         value = getattr(component, name)
         inherited = (
@@ -267,24 +290,27 @@ def settings(
         if name == "name" or value is None or inherited or (only and name not in only):
             continue
         if field.unit:
-            found.append(
+            words.append(
                 f"{name} {number(value)} {units.get(field.unit.symbol, field.unit.symbol)}".strip()
             )
         elif isinstance(value, Component):
-            found.append(
+            words.append(
                 f"{name} ({', '.join(filter(None, (value.type_name, settings(value, length))))})"
             )
         elif isinstance(value, dict):
-            found += [f"{key} {number(item)}" for key, item in value.items()]
+            words += [f"{key} {number(item)}" for key, item in value.items()]
         else:
-            found.append(
+            words.append(
                 f"{name} {str(value).lower() if isinstance(value, bool) else f'`{value}`'}"
             )
-    return ", ".join(found)
+    return ", ".join(words)
 
 
 def number(value: Any) -> str:
-    """A number, or a list of them, as one reads it: fractions of π where they are exact in float32."""
+    """Return a number, or a list of them, as one reads it.
+
+    Fractions of π are written as such where they are exact in float32.
+    """
     if np.ndim(value):
         return "[" + ", ".join(map(number, value)) + "]"
     scalar = np.float32(value)

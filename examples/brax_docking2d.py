@@ -2,7 +2,8 @@
 
     pip install '.[brax]' && python examples/brax_docking2d.py [ppo | sac | apg]
 
-APG differentiates the reward through the spacecraft's dynamics. Brax's settings are a start, not tuned.
+APG differentiates the reward through the spacecraft's dynamics. Brax's settings are a start and are
+not tuned.
 """
 
 import sys
@@ -20,8 +21,8 @@ from jaxsafe.adapters.brax import BraxEnv, mend_brax, wrap
 
 
 def train(algorithm: str, scale: float = 1.0) -> dict[str, Any]:
-    """The metrics of the last evaluation; `scale` shortens the training."""
-    mend_brax()  # Brax 0.14.2 with JAX 0.10 or newer
+    """Train, and return the metrics of the last evaluation. `scale` shortens the training."""
+    mend_brax()  # needed by Brax 0.14.2 with JAX 0.10 or newer
     env = BraxEnv("docking2d")
     seen = []
 

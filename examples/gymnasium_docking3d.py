@@ -1,6 +1,8 @@
-"""The policy of the package docks in a batch of Gymnasium's environments, with run time assurance or without.
+"""The policy of the package docks in a batch of Gymnasium's environments.
 
-pip install . && python examples/gymnasium_docking3d.py [none | default]
+It flies with run time assurance or without.
+
+    pip install . && python examples/gymnasium_docking3d.py [none | default]
 """
 
 import sys
@@ -13,7 +15,10 @@ import jaxsafe
 
 
 def fly(rta: str = "none", num_envs: int = 64) -> dict[str, float]:
-    """Share of successes and of episodes with a violation, of one episode in each environment."""
+    """Fly one episode in each environment.
+
+    Return the shares of successes and of episodes with a violation.
+    """
     env = gym.make_vec(
         "jaxsafe/Docking3D-v0", num_envs=num_envs, autoreset_mode="SameStep", rta=rta
     )
@@ -29,7 +34,8 @@ def fly(rta: str = "none", num_envs: int = 64) -> dict[str, float]:
             np.asarray(policy(key_now, observation))
         )
         done = terminated | truncated
-        ended = info.get("final_info", info)  # a lane that starts anew tells of its last step there
+        # An environment that starts anew tells of its last step in `final_info`.
+        ended = info.get("final_info", info)
         success |= running & done & ended["is_success"]
         violated |= running & (np.where(done, ended["cost"], info["cost"]) > 0)
         running &= ~done

@@ -1,6 +1,7 @@
 """OmniSafe's PPO-Lagrangian learns docking2d under a budget of violations.
 
-OmniSafe 0.5 asks for Safety-Gymnasium, which is tied to Gymnasium 0.28.1, and for pandas 2.0.3; neither is needed here:
+OmniSafe 0.5 asks for Safety-Gymnasium, which is tied to Gymnasium 0.28.1, and for pandas 2.0.3.
+Neither is needed here:
 
     pip install . torch tensorboard wandb moviepy typer seaborn pandas gdown rich xmltodict
     pip install --no-deps omnisafe
@@ -17,22 +18,21 @@ import torch
 
 from jaxsafe.adapters.safety_gymnasium import SafetyEnv
 
-sys.modules.setdefault(
-    "safety_gymnasium", types.ModuleType("safety_gymnasium")
-)  # OmniSafe imports it for its own tasks
+# OmniSafe imports it for its own tasks.
+sys.modules.setdefault("safety_gymnasium", types.ModuleType("safety_gymnasium"))
 import omnisafe  # noqa: E402
 from omnisafe.envs.core import CMDP, env_register  # noqa: E402
 
 
 @env_register
 class Docking(CMDP):
-    """The compiled batch with OmniSafe's tensors."""
+    """The compiled batch of environments with OmniSafe's tensors."""
 
     _support_envs: ClassVar[list[str]] = ["jaxsafe-docking2d"]
     need_time_limit_wrapper = False
 
     def __init__(self, env_id: str, num_envs: int = 1, device: str = "cpu", **options: Any) -> None:
-        """Make as many environments; one has no batch axis, and OmniSafe resets it."""
+        """Make `num_envs` environments. A single one has no batch axis, and OmniSafe resets it."""
         super().__init__(env_id)
         self._env = SafetyEnv(
             env_id.removeprefix("jaxsafe-"), num_envs if num_envs > 1 else None, **options
@@ -44,20 +44,20 @@ class Docking(CMDP):
 
     @property
     def max_episode_steps(self) -> int:
-        """Of the task itself."""
+        """The limit of the task itself."""
         return 2001
 
     def step(self, action: torch.Tensor) -> tuple:
-        """Six values."""
-        *found, info = self._env.step(action.detach().cpu().numpy())
+        """Take a step and return OmniSafe's six values."""
+        *values, info = self._env.step(action.detach().cpu().numpy())
         if "final_observation" in info:
             info["final_observation"] = self._tensor(info["final_observation"])
-        return *(self._tensor(x) for x in found), info
+        return *(self._tensor(x) for x in values), info
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[torch.Tensor, dict]:
-        """Start every lane."""
+        """Start every environment."""
         observation, info = self._env.reset(seed=seed, options=options)
         return self._tensor(observation), info
 
@@ -66,20 +66,21 @@ class Docking(CMDP):
         self.reset(seed=seed)
 
     def render(self) -> Any:
-        """Nothing without a render mode."""
+        """Return nothing without a render mode."""
         return self._env.render()
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing, because there is nothing to close."""
 
     def _tensor(self, array: Any) -> torch.Tensor:
         return torch.as_tensor(array, dtype=torch.float32, device=self._device)
 
 
 def train(steps: int = 1_000_000, cost_limit: float = 25.0) -> Any:
-    """PPO-Lagrangian with the batches and rates that suit the task, and a budget of violating steps an episode.
+    """Train PPO-Lagrangian under a budget of violating steps an episode.
 
-    OmniSafe starts all environments anew in each epoch: with 8 of them its 16,384 steps hold an episode of 2,001.
+    Batches and rates suit the task. OmniSafe starts all environments anew in each epoch. With 8
+    environments its 16,384 steps hold an episode of 2,001.
     """
     rate = {"lr": 2e-3}
     agent = omnisafe.Agent(

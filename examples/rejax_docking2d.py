@@ -18,7 +18,7 @@ NUM_SEEDS = 4
 
 
 def train(steps: int = 500_000) -> tuple[jax.Array, jax.Array]:
-    """Length and return of the evaluations, (seeds, evaluations, episodes)."""
+    """Return length and return of the evaluations, (seeds, evaluations, episodes)."""
     env = GymnaxEnv("docking2d", legacy=True)
     ppo = PPO.create(
         env=env,
@@ -41,10 +41,10 @@ def train(steps: int = 500_000) -> tuple[jax.Array, jax.Array]:
 
 if __name__ == "__main__":
     lengths, returns = train(*map(int, sys.argv[1:]))
-    for length, found in zip(lengths.mean(axis=-1).T, returns.mean(axis=-1).T, strict=True):
+    for length, values in zip(lengths.mean(axis=-1).T, returns.mean(axis=-1).T, strict=True):
         print(
             "return of each seed",
-            *(f"{x:6.2f}" for x in found),
+            *(f"{x:6.2f}" for x in values),
             "  length",
             *(f"{x:6.0f}" for x in length),
         )

@@ -1,8 +1,10 @@
-"""Stable-Baselines3's PPO learns docking2d on the compiled batch of environments, on the paper's observation.
+"""Stable-Baselines3's PPO learns docking2d on the compiled batch of environments.
+
+It gets the paper's observation.
 
     pip install '.[sb3]' && python examples/stable_baselines3_docking2d.py [steps] [seed]
 
-Some minutes on two cores; torch needs no GPU.
+The training takes some minutes on two cores. torch needs no GPU.
 """
 
 import sys
@@ -17,7 +19,10 @@ from jaxsafe.adapters.stable_baselines3 import SB3VecEnv
 
 
 class GrowingHorizon(BaseCallback):
-    """The horizon 1/(1 − gamma) grows by this factor: a short one finds the chief, a long one then finds the quick way."""
+    """A horizon 1/(1 − gamma) that grows by a factor.
+
+    A short horizon finds the chief. A long one then finds the quick way.
+    """
 
     def __init__(self, factor: float, steps: int) -> None:
         super().__init__()
@@ -36,7 +41,7 @@ class GrowingHorizon(BaseCallback):
 
 
 def train(steps: int = 1_000_000, seed: int = 0) -> PPO:
-    """PPO from 64 environments."""
+    """Train PPO with 64 environments."""
     torch.set_num_threads(1)  # these networks are too small for more
     env = VecMonitor(SB3VecEnv("docking2d", 64))  # counts returns and lengths of episodes
     model = PPO(
@@ -56,7 +61,7 @@ def train(steps: int = 1_000_000, seed: int = 0) -> PPO:
 
 
 def success_rate(model: PPO, deterministic: bool, episodes: int = 100) -> float:
-    """From starts of their own, with sampled actions or with the modes."""
+    """Return the success rate from other starts, with sampled actions or with the modes."""
     env = SB3VecEnv("docking2d", episodes)
     env.seed(1000)
     observation = env.reset()
@@ -65,8 +70,8 @@ def success_rate(model: PPO, deterministic: bool, episodes: int = 100) -> float:
         observation, _, done, infos = env.step(
             model.predict(observation, deterministic=deterministic)[0]
         )
-        for lane in np.flatnonzero(done & np.isnan(successes)):
-            successes[lane] = infos[lane]["is_success"]
+        for index in np.flatnonzero(done & np.isnan(successes)):
+            successes[index] = infos[index]["is_success"]
     return float(successes.mean())
 
 

@@ -1,1 +1,1 @@
-"""The baselines: train all tasks in every way that the suite offers, evaluate, and write the page that shows it."""
+"""The baselines: train and evaluate all tasks in every way of the suite, and write their page."""

@@ -1,4 +1,4 @@
-"""`python benchmarks/baselines`: train and evaluate the baselines, and write the page with their tables and figures."""
+"""`python benchmarks/baselines`: train and evaluate the baselines and write their page."""
 
 from __future__ import annotations
 
@@ -12,16 +12,15 @@ from jaxsafe.commands import cli
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema.errors import ConfigError
 
-sys.path.insert(
-    0, str(Path(__file__).resolve().parent.parent)
-)  # the package of this file is imported by its name
+# The package of this file is imported by its name.
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 SEEDS = 10
-"""Of every training, unless the user says otherwise."""
+"""Seeds of every training, unless the user says otherwise."""
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the command; returns the exit code."""
+    """Run the command and return the exit code."""
     from baselines.page import DIRECTORY, Report
     from baselines.plan import BEST, KINDS, plan
     from baselines.record import keep, kept
@@ -42,7 +41,7 @@ def main(argv: Sequence[str]) -> int:
     rest = [word for word in argv if word.partition("=")[0] in arguments.options]
     rest = rest if "seeds" in arguments.options else [f"seeds={SEEDS}", *rest]
     items = plan(tasks, kinds, rest)
-    # errors before anything is done
+    # Mistakes in options are found before anything is done.
     episodes = [resolve(Arguments.parse(item.words).options)[0].episodes for item in items]
     command = f"python benchmarks/baselines {shlex.join(argv)}".rstrip()
     try:
@@ -71,16 +70,18 @@ def _names(option: str, value: Any, known: Sequence[str]) -> list[str]:
 
 
 def usage() -> str:
-    """The help text."""
+    """Return the help text."""
     from baselines.plan import KINDS
 
     return (
         "usage: python benchmarks/baselines [key=value …]\n\n"
-        "  trains every task in every way with ten seeds, evaluates, and writes OUT/baselines.md; takes hours.\n"
-        "  May be done in parts: the page has also what was reported into OUT before, with the same options.\n\n"
+        "  Trains every task in every way with ten seeds, evaluates, and writes OUT/baselines.md.\n"
+        "  It takes hours and may be done in parts: the page also has what was reported into OUT\n"
+        "  before, with the same options.\n\n"
         "  tasks=[docking2d,…]    some tasks only\n"
         f"  kinds=[features,…]     some of {', '.join(KINDS)}\n"
-        "  runs=DIR               where the runs are (default runs/report); what is complete there is not done again\n"
+        "  runs=DIR               where the runs are (default runs/report); what is complete\n"
+        "                         there is not done again\n"
         "  out=DIR                where to write the page (default report)\n"
         "  policies=DIR           copy the best policy of each task there, as TASK.npz\n"
         "  film=false             no animations\n"

@@ -1,4 +1,4 @@
-"""What the page says of a run beyond the metrics of its episodes."""
+"""What the page says about a run beyond the metrics of its episodes."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ from jaxsafe.plot.figures import curve_table
 
 
 def failed_seeds(results: Mapping[str, Any]) -> list[int]:
-    """The seeds of a run that succeed in less than 95 % of their episodes after training, stochastic or deterministic.
+    """Return the seeds of a run that failed.
 
-    A seed whose success is not known failed.
+    A failed seed succeeds in less than 95 % of its episodes after training, stochastic or
+    deterministic. A seed whose success is not known failed.
     """
-    each = [
+    rates = [
         results["evaluation"][way]["success_rate"]["per_seed"]
         for way in ("stochastic", "deterministic")
     ]
-    pairs = enumerate(zip(*each, strict=True), start=results["seed"])
+    pairs = enumerate(zip(*rates, strict=True), start=results["seed"])
     return [seed for seed, pair in pairs if any(rate is None or rate < 0.95 for rate in pair)]
 
 
 def finished(curves: Sequence[Mapping[str, Any]], step: int) -> float:
-    """Training episodes that a seed had finished by a step, on the average."""
+    """Return how many training episodes a seed had finished by a step, on the average."""
     latest = max(row["step"] for row in curves if row["step"] <= step)
     counts = [row["episodes"] for row in curves if row["step"] == latest]
     return sum(counts) / len(counts)
@@ -32,7 +33,9 @@ def finished(curves: Sequence[Mapping[str, Any]], step: int) -> float:
 def steps_to(
     level: float, curves: Sequence[Mapping[str, Any]], at_least: int = ENOUGH_EPISODES
 ) -> int | None:
-    """Environment steps per seed until the success rate in training reaches a level, by the definition of Table 2.
+    """Return the environment steps per seed until the success rate in training reaches a level.
+
+    This is the definition of Table 2.
 
     Args:
         level: the success rate, on the average over seeds.
@@ -45,7 +48,10 @@ def steps_to(
 
 
 def wall_to(level: float, curves: Sequence[Mapping[str, Any]]) -> float | None:
-    """Seconds until the success rate in training reaches a level, by the definition of Table 2."""
+    """Return the seconds until the success rate in training reaches a level.
+
+    This is the definition of Table 2.
+    """
     reached = steps_to(level, curves)
     return (
         None if reached is None else max(row["wall_s"] for row in curves if row["step"] == reached)
@@ -53,9 +59,10 @@ def wall_to(level: float, curves: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def samples_per_second(curves: Sequence[Mapping[str, Any]]) -> float | None:
-    """Environment steps of all seeds a second of wall time, between the first time on the clock and the last.
+    """Return environment steps of all seeds a second of wall time.
 
-    None if there is one. Updates that ran as one program have one time, its end.
+    They are counted between the first and the last time on the clock. Updates that ran as one
+    program have one time, its end. Return None if there is only one time.
     """
     times = [pick(row["wall_s"] for row in curves) for pick in (min, max)]
     steps = [max(row["step"] for row in curves if row["wall_s"] == time) for time in times]

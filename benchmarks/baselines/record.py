@@ -1,4 +1,7 @@
-"""What is known of each item: files beside the page, so that a report can be made in parts and at different times."""
+"""Records of the items. They are files beside the page.
+
+So a report can be made in parts and at different times.
+"""
 
 from __future__ import annotations
 
@@ -31,19 +34,19 @@ Results = dict[str, Any]
 
 
 class Record(NamedTuple):
-    """An item that was carried out."""
+    """An item that was carried out, with its results."""
 
     item: Item
-    command: str  # of the report that carried it out
-    commit: str | None  # of the checkout that it was trained in
-    options: dict[str, Any]  # every one
+    command: str  # the command of the report that carried it out
+    commit: str | None  # the commit of the checkout that it was trained in
+    options: dict[str, Any]  # every option
     results: Results
-    evaluations: dict[str, Results]  # the further ones, by name
+    evaluations: dict[str, Results]  # further evaluations, by name
     curves: list[dict[str, Any]]  # rows of the progress log
 
 
 def keep(item: Item, run: Path, files: Path, command: str) -> None:
-    """Write what the page needs of a run, its pictures too, into the directory beside the page."""
+    """Write what the page needs of a run, with its pictures, into the directory beside the page."""
     for figure in ("trajectories", "speed_distance") if item.kind == "features" else ():
         if (run / "figures" / f"{figure}.png").exists():
             _copy(run / "figures" / f"{figure}.png", files / f"{item.task}_{figure}.png")
@@ -69,7 +72,10 @@ def keep(item: Item, run: Path, files: Path, command: str) -> None:
 
 
 def kept(items: Iterable[Item], files: Path) -> tuple[list[Record], list[str]]:
-    """Load the records of these items. For each made with other options, or broken, return a warning instead."""
+    """Load the records of these items. Some are left out, with a warning for each.
+
+    A record is left out if it was made with other options or is broken.
+    """
     records = []
     left_out = []
     for item in items:
@@ -77,13 +83,13 @@ def kept(items: Iterable[Item], files: Path) -> tuple[list[Record], list[str]]:
         if not path.exists():
             continue
         try:
-            found = read_json(path, {"options": {}})
-            if found["options"] != json.loads(json.dumps(finite(options_of(item)))):
+            content = read_json(path, {"options": {}})
+            if content["options"] != json.loads(json.dumps(finite(options_of(item)))):
                 left_out.append(
                     f"{path}: was made with other options and is left out; report it again"
                 )
                 continue
-            record = _record(item, found, path)
+            record = _record(item, content, path)
         except ConfigError as error:
             left_out.append(f"{error}; it is left out, report it again")
             continue
@@ -92,31 +98,34 @@ def kept(items: Iterable[Item], files: Path) -> tuple[list[Record], list[str]]:
                 f"{path}: its evaluation {name!r} was made with other options and is left out;"
                 f" report it again"
             )
-            for name in found["evaluations"].keys() - record.evaluations.keys()
+            for name in content["evaluations"].keys() - record.evaluations.keys()
         ]
         records.append(record)
     return records, left_out
 
 
-def _record(item: Item, found: dict[str, Any], path: Path) -> Record:
-    """Return the record of an item, with those evaluations that have today's options.
+def _record(item: Item, content: dict[str, Any], path: Path) -> Record:
+    """Return the record of an item, with the evaluations that have today's options.
 
     Raises:
         ConfigError: what the page takes from it is not there, or not what it should be.
     """
     form = {"command": TEXT, "commit": TEXT | NULL, "evaluations": {OTHERS: {}}}
-    check(found, form, str(path))
-    check_results(found.get("results"), f"{path}: results", training=True)
-    for name, results in found["evaluations"].items():
+    check(content, form, str(path))
+    check_results(content.get("results"), f"{path}: results", training=True)
+    for name, results in content["evaluations"].items():
         check_results(results, f"{path}: evaluations.{name}", training=False)
     table = path.with_suffix(".csv")
     curves = read_csv(table, {**dict.fromkeys(CURVES, NUMBER_OR_NULL), **NEEDS})
     check_order(curves, table)
     if not curves:
         raise ConfigError(f"{table}: expected a row for every update, found none")
-    values = {name: found[name] for name in ("command", "commit", "options", "results")}
-    every = found["evaluations"].items()
-    current = {name: one for name, one in every if answers(item.evaluations.get(name, []), one)}
+    values = {name: content[name] for name in ("command", "commit", "options", "results")}
+    current = {
+        name: results
+        for name, results in content["evaluations"].items()
+        if answers(item.evaluations.get(name, []), results)
+    }
     return Record(item=item, curves=curves, evaluations=current, **values)
 
 

@@ -1,4 +1,7 @@
-"""Carrying out a plan: every training and evaluation is a process of its own, and what is done is not done again."""
+"""Carry out a plan. Every training and evaluation is a process of its own.
+
+What is done is not done again.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +28,9 @@ FILM_FILE = "episode_deterministic.gif"
 
 
 def train(item: Item, runs: Path) -> Path:
-    """Train, or go on with a training that was interrupted, or do nothing if it is complete; returns the run directory.
+    """Train an item and return its run directory.
+
+    A training that was interrupted goes on, and one that is complete is left alone.
 
     Raises:
         ConfigError: the directory holds a run with other options, or the training failed.
@@ -34,9 +39,8 @@ def train(item: Item, runs: Path) -> Path:
     run = runs / item.name
     if (run / "config.yaml").exists():
         _refuse_other(item, run)
-        if (
-            not (run / "results.json").exists() or not (run / "figures").exists()
-        ):  # figures come last
+        # Figures come last.
+        if not (run / "results.json").exists() or not (run / "figures").exists():
             _call("jaxsafe.train", [f"resume={run}"])
     else:
         _call("jaxsafe.train", [*item.words, f"out={run}"])
@@ -44,7 +48,7 @@ def train(item: Item, runs: Path) -> Path:
 
 
 def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
-    """Do those evaluations of a run that are still to do, and film its best policy.
+    """Do the evaluations of a run that are still to do, and film its best policy.
 
     Raises:
         ConfigError: an evaluation failed.
@@ -58,9 +62,8 @@ def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
         if not (out / "results.json").exists() or not answers(
             options, read_json(out / "results.json", {})
         ):
-            shutil.rmtree(
-                out, ignore_errors=True
-            )  # of an evaluation that was interrupted, or of other options
+            # The directory is that of an evaluation that was interrupted, or of other options.
+            shutil.rmtree(out, ignore_errors=True)
             _call(
                 "jaxsafe.evaluate",
                 [f"run={item.subject(run, name)}", f"episodes={episodes}", *options, f"out={out}"],
@@ -72,7 +75,10 @@ def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
 
 
 def answers(options: Sequence[str], results: Mapping[str, Any]) -> bool:
-    """Whether the results of an evaluation are those of these options, which follow `python -m jaxsafe.evaluate run=…`."""
+    """Return whether the results of an evaluation are those of these options.
+
+    The options follow `python -m jaxsafe.evaluate run=…`.
+    """
     arguments = Arguments.parse(options)
     filters = {"rta": arguments.pop_text("rta")} if "rta" in arguments.options else {}
     return results.get("changes") == {**filters, **arguments.pop_overrides()} and (
@@ -81,15 +87,18 @@ def answers(options: Sequence[str], results: Mapping[str, Any]) -> bool:
 
 
 def options_of(item: Item) -> dict[str, Any]:
-    """Every option of its training and of its environment as `config.yaml` has them, but for the place of the run."""
+    """Return every option of an item's training and environment, as `config.yaml` has them.
+
+    The place of the run is left out.
+    """
     config, env, _ = resolve(Arguments.parse(item.words).options)
-    found = described(config, env)
-    found["training"].pop("out")
-    return found
+    content = described(config, env)
+    content["training"].pop("out")
+    return content
 
 
 def _refuse_other(item: Item, run: Path) -> None:
-    """The numbers of an old run must not pass as those of a new recipe."""
+    """Refuse an old run with other options. Its numbers must not pass as those of a new recipe."""
     content = read_content(run)
     content["training"].pop("out", None)
     if any(content[part] != value for part, value in options_of(item).items()):
@@ -108,7 +117,11 @@ def _call(module: str, words: Sequence[str]) -> None:
 
 
 def _wait(process: subprocess.Popen) -> int:
-    """Its exit code. A termination is passed on; after Ctrl-C, which it gets too, it has the time to save what it has."""
+    """Wait for a process and return its exit code.
+
+    A termination is passed on. After Ctrl-C, which the process gets too, it has the time to save
+    what it has.
+    """
     if not in_main_thread():
         return process.wait()
     previous = signal.signal(signal.SIGTERM, lambda *_: process.terminate())

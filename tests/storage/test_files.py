@@ -39,7 +39,7 @@ def test_a_line_that_is_no_row_of_the_log_is_an_error_that_names_it(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("row", "found"),
+    ("row", "fault"),
     [
         ({"step": "1"}, r"step: expected a whole number ≥ 0, found '1'"),
         ({"step": True}, "step: expected a whole number ≥ 0, found True"),
