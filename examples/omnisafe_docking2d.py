@@ -38,7 +38,9 @@ class Docking(CMDP):
             env_id.removeprefix("jaxsafe-"), num_envs if num_envs > 1 else None, **options
         )
         self.need_auto_reset_wrapper = num_envs == 1
-        self._num_envs, self._device, self._metadata = num_envs, device, self._env.metadata
+        self._num_envs = num_envs
+        self._device = device
+        self._metadata = self._env.metadata
         self._action_space = self._env.single_action_space
         self._observation_space = self._env.single_observation_space
 

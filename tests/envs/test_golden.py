@@ -336,7 +336,8 @@ def test_one_step_from_every_recorded_state_is_the_recorded_step(recording: str)
     actions = data["action"]
     # Single steps do not know what the filter remembers. So they take the control that acted.
     if recording.endswith("_rta"):
-        env, actions = jaxsafe.override(env, {"rta": None}), data["control"] / bounds(env)[1]
+        actions = data["control"] / bounds(env)[1]
+        env = jaxsafe.override(env, {"rta": None})
     platforms, timestep = single_steps(env, state_fields(recording, data, "_t0"), actions)
     assert_same(timestep.info.control_desired, data["control"], "control", 1e-14)
     rows = ~data["limit_crossing"]

@@ -316,7 +316,8 @@ def test_without_controls_flight_is_straight() -> None:
 def test_speed_rests_at_its_limit_and_the_way_follows(
     aircraft: Any, acceleration: float, rest: float
 ) -> None:
-    aircraft, start = normalise(aircraft), planar() if isinstance(aircraft, Dubins2D) else spatial()
+    start = planar() if isinstance(aircraft, Dubins2D) else spatial()
+    aircraft = normalise(aircraft)
     states = fly(aircraft, start, {"acceleration": acceleration}, 4)
     np.testing.assert_allclose(
         [state.speed for state in states], [300, 300 + acceleration, rest, rest, rest]
@@ -342,10 +343,8 @@ def test_a_speed_beyond_its_limits_counts_as_on_the_limit() -> None:
 
 @pytest.mark.parametrize("aircraft", [Dubins2D(name="a"), Dubins3D(name="a")])
 def test_a_control_left_out_is_one_of_zero(aircraft: Any) -> None:
-    aircraft, start = (
-        normalise(aircraft),
-        planar() if isinstance(aircraft, Dubins2D) else spatial(gamma=0.2, roll=0.5),
-    )
+    start = planar() if isinstance(aircraft, Dubins2D) else spatial(gamma=0.2, roll=0.5)
+    aircraft = normalise(aircraft)
     rolling = [{"roll_rate": 0.6}] if isinstance(aircraft, Dubins3D) else []
     for controls in ({}, {"heading_rate": 0.1}, {"acceleration": 96.5}, *rolling):
         zeros = dict.fromkeys(("acceleration", "flight_path_angle_rate", "roll_rate"), 0.0)

@@ -75,7 +75,8 @@ def random_craft(seed: int, num: int = NUM) -> tuple[np.ndarray, np.ndarray]:
     rate = rng.uniform(-RATE_LIMIT, RATE_LIMIT, num)
     end = rng.choice([-RATE_LIMIT, RATE_LIMIT], num)
     kind = rng.integers(5, size=num)
-    rate[kind == 0], rate[kind == 1] = end[kind == 0], 0.9999 * end[kind == 1]
+    rate[kind == 0] = end[kind == 0]
+    rate[kind == 1] = 0.9999 * end[kind == 1]
     planar = np.concatenate([rng.uniform(-150, 150, (2, num)), rng.uniform(-0.5, 0.5, (2, num))])
     controls = np.stack([rng.uniform(-1.0, 2.0, num), rng.uniform(-TURN, TURN, num)])
     controls[rng.integers(5, size=controls.shape) == 0] = 0.0
