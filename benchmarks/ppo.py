@@ -176,10 +176,11 @@ def networks_only(task: str) -> float:
 
     def minibatch(carry: Any, parts: ppo.Batch) -> tuple[Any, None]:
         params, optimizer = carry
-        add = lambda total, part: (  # noqa: E731
-            jax.tree.map(jnp.add, total, jax.grad(ppo.loss)(params, env, agent, hyper, part)),
-            None,
-        )
+
+        def add(total: Any, part: ppo.Batch) -> tuple[Any, None]:
+            gradient, _ = jax.grad(ppo.loss, has_aux=True)(params, env, agent, hyper, part)
+            return jax.tree.map(jnp.add, total, gradient), None
+
         gradient, _ = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), parts)
         step, optimizer = ppo._optimizer(hyper).update(gradient, optimizer)
         return (jax.tree.map(lambda p, s: p - 1e-4 * s, params, step), optimizer), None

@@ -322,7 +322,7 @@ def training(repeats: int) -> list[dict[str, Any]]:
     agent = normalise(Agent())
     ppo = normalise(PPO(num_envs=64, num_steps=128))
     rows = []
-    step = jax.jit(lambda env, state: update(env, agent, ppo, 100, state))
+    step = jax.jit(lambda env, state: update(env, agent, ppo, 100, state)[0])
     for task, presets in {
         "docking2d": ("explicit_simplex", "discrete_asif"),
         "docking3d": ("explicit_simplex", "discrete_asif"),

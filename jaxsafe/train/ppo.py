@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.agents.agent import Agent, Params
@@ -50,6 +51,26 @@ MAX_LOG_RATIO = 20.0
 
 Where a ratio overflows, the loss or its gradient is not a number. This bound also leaves room for
 the squares in the norm of the gradient.
+"""
+
+Diagnostics = dict[str, Array]
+"""Numbers that describe how an update learns, by column of the progress log."""
+
+LOSSES = (
+    "policy_loss",
+    "value_loss",
+    "cost_value_loss",
+    "entropy",
+    "approx_kl",
+    "clip_fraction",
+    "grad_norm",
+)
+"""Diagnostics that are averages over the minibatch steps of an update."""
+
+DIAGNOSTICS = (*LOSSES, "explained_variance", "learning_rate", "gamma", "action_std")
+"""All diagnostics, in the order of the progress log.
+
+Only an agent with a critic of the cost has `cost_value_loss`.
 """
 
 
@@ -196,7 +217,7 @@ def update(
     total_updates: Array | int,
     state: TrainState,
     shard: Shard = WHOLE,
-) -> TrainState:
+) -> tuple[TrainState, Diagnostics]:
     """Collect one batch with the current policy, and improve policy and value on it.
 
     Devices that share the environments share the work. Each runs its own environments and takes its
@@ -209,15 +230,17 @@ def update(
         total_updates: number of updates of the whole training. Schedules run over it.
         state: the state before the update.
         shard: the part of the environments that this device has.
+
+    Returns:
+        The state after the update, and the diagnostics of the update.
     """
     key_collect, key_learn = jax.random.split(jax.random.fold_in(state.key, state.num_updates))
     state, transitions = collect(env, agent, ppo, state, key_collect, shard)
     progress = state.num_updates / total_updates
     gamma = discount(ppo, progress)
-    batch = _to_batch(agent, ppo, gamma, state, transitions, shard)
-    params, optimizer = learn(
-        env, agent, ppo, learning_rate(ppo, progress), state, batch, key_learn, shard
-    )
+    step_size = learning_rate(ppo, progress)
+    batch, explained = _to_batch(agent, ppo, gamma, state, transitions, shard)
+    params, optimizer, losses = learn(env, agent, ppo, step_size, state, batch, key_learn, shard)
     params = {**params, "log_std": params["log_std"] - ppo.noise_decay / total_updates}
     episode, done = shard.join((transitions.episode, transitions.done), axis=1)
     window = push(state.window, episode, done)
@@ -226,7 +249,7 @@ def update(
     average = jax.tree.map(
         lambda old, new: (1.0 - share) * old + share * new, state.average, params
     )
-    return state.replace(
+    state = state.replace(
         params=params,
         optimizer=optimizer,
         window=window,
@@ -234,6 +257,39 @@ def update(
         average=average,
         multiplier=multiplier,
     )
+    diagnostics = {
+        **losses,
+        "explained_variance": explained,
+        "learning_rate": step_size,
+        "gamma": gamma,
+        "action_std": action_std(params),
+    }
+    dtype = jnp.result_type(float)
+    return state, {name: jnp.asarray(value, dtype) for name, value in diagnostics.items()}
+
+
+def no_diagnostics(agent: Agent) -> Diagnostics:
+    """Return the diagnostics of an update that does not take place. All are NaN."""
+    names = [name for name in DIAGNOSTICS if name != "cost_value_loss" or agent.cost_critic]
+    return {name: jnp.full((), jnp.nan) for name in names}
+
+
+def action_std(params: Params) -> Array:
+    """Return the standard deviation of the actions, averaged over the actuators.
+
+    Actions are in units of half their range. For discrete actions it is the standard deviation that
+    an untrained network would give at the present sharpness, because the spread of a trained one
+    differs from state to state.
+    """
+    return jnp.mean(jnp.exp(params["log_std"]))
+
+
+def explained_variance(target: Array, value: Array) -> Array:
+    """Return the share of the targets' variance that the values explain.
+
+    It is 1 for a perfect critic and 0 for one that says the same of all states.
+    """
+    return 1.0 - jnp.var(target - value) / jnp.var(target)
 
 
 def diverged(state: TrainState) -> Bool[Array, ""]:
@@ -392,7 +448,7 @@ def learn(
     batch: Batch,
     key: Key,
     shard: Shard = WHOLE,
-) -> tuple[Params, optax.OptState]:
+) -> tuple[Params, optax.OptState, Diagnostics]:
     """Take some epochs of minibatch steps. Each epoch has a new shuffle of the batch.
 
     Args:
@@ -406,44 +462,62 @@ def learn(
         shard: the part of every minibatch that this device takes.
 
     Returns:
-        The parameters and the optimizer's state after the last step.
+        The parameters and the optimizer's state after the last step, and the diagnostics in
+        `LOSSES`.
     """
     pack, unpack = packing(state.params)
 
-    def gradient(params: Params, rows: Array) -> Params:
-        return jax.grad(loss)(params, env, agent, ppo, jax.tree.map(lambda x: x[rows], batch))
+    def gradient(params: Params, rows: Array) -> tuple[Params, Diagnostics]:
+        samples = jax.tree.map(lambda x: x[rows], batch)
+        return jax.grad(loss, has_aux=True)(params, env, agent, ppo, samples)
 
-    def mean_gradient(params: Params, rows: Array) -> Params:
+    def mean_gradient(params: Params, rows: Array) -> tuple[Params, Diagnostics]:
         parts = _num_chunks(rows.size)
         if parts == 1:
             return gradient(params, rows)
-        add = lambda total, part: (jax.tree.map(jnp.add, total, gradient(params, part)), None)  # noqa: E731
-        total, _ = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), rows.reshape(parts, -1))
-        return jax.tree.map(lambda x: x / parts, total)
+
+        def add(total: Params, part: Array) -> tuple[Params, Diagnostics]:
+            summand, losses = gradient(params, part)
+            return jax.tree.map(jnp.add, total, summand), losses
+
+        zero = jax.tree.map(jnp.zeros_like, params)
+        total, losses = jax.lax.scan(add, zero, rows.reshape(parts, -1))
+        return jax.tree.map(lambda x: x / parts, total), jax.tree.map(jnp.mean, losses)
 
     def minibatch_step(
         carry: tuple[Params, optax.OptState], rows: Array
-    ) -> tuple[tuple[Params, optax.OptState], None]:
+    ) -> tuple[tuple[Params, optax.OptState], Diagnostics]:
         params, optimizer = carry
-        gradient = shard.mean(mean_gradient(unpack(params), shard.own(rows)))
+        gradient, losses = shard.mean(mean_gradient(unpack(params), shard.own(rows)))
         # Adam of optax raises a float to an integer power.
         with jax.numpy_dtype_promotion("standard"):
             step, optimizer = _optimizer(ppo).update(gradient, optimizer)
-        return (jax.tree.map(lambda p, s: p - step_size * s, params, pack(step)), optimizer), None
+        # The optimizer takes the norm of the same vector, so XLA computes it once.
+        losses = {**losses, "grad_norm": optax.tree.norm(ravel_pytree(gradient)[0])}
+        params = jax.tree.map(lambda p, s: p - step_size * s, params, pack(step))
+        return (params, optimizer), losses
 
     def epoch(
         carry: tuple[Params, optax.OptState], key: Key
-    ) -> tuple[tuple[Params, optax.OptState], None]:
+    ) -> tuple[tuple[Params, optax.OptState], Diagnostics]:
         rows = shuffle(key, ppo.batch_size).reshape(ppo.num_minibatches, -1)
-        return jax.lax.scan(minibatch_step, carry, rows)
+        scan = scan_packed if accelerated() else jax.lax.scan
+        return scan(minibatch_step, carry, rows)
 
     start = (pack(state.params), state.optimizer)
-    params, optimizer = jax.lax.scan(epoch, start, jax.random.split(key, ppo.num_epochs))[0]
-    return unpack(params), optimizer
+    keys = jax.random.split(key, ppo.num_epochs)
+    (params, optimizer), losses = jax.lax.scan(epoch, start, keys)
+    return unpack(params), optimizer, jax.tree.map(jnp.mean, losses)
 
 
-def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch) -> Array:
-    """Return the clipped surrogate loss + value error − entropy bonus, averaged over the batch."""
+def loss(
+    params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch
+) -> tuple[Array, Diagnostics]:
+    """Return the clipped surrogate loss + value error − entropy bonus, averaged over the batch.
+
+    The second value has the terms of the loss, and how far the policy is from the one that
+    collected the batch.
+    """
     policy = agent.distribution(env, params, batch.inputs)
     log_ratio = policy.log_prob(batch.action) - batch.log_prob
     bounded = jax.lax.stop_gradient(jnp.minimum(log_ratio, MAX_LOG_RATIO))
@@ -454,12 +528,26 @@ def loss(params: Params, env: Environment, agent: Agent, ppo: PPO, batch: Batch)
     seen = agent.critic_inputs(batch.inputs, batch.totals)
     value = agent.value(params, seen)
     value_error = 0.5 * (value - batch.value_target) ** 2
-    if agent.cost_critic:
-        value_error += 0.5 * (agent.cost_rate(params, seen) - batch.cost_target) ** 2
     entropy = policy.entropy()
-    return jnp.mean(
+    outside = jnp.abs(ratio - 1.0) > ppo.clip
+    # Without the barrier XLA fuses the gradient otherwise, and the last bits of a training change.
+    alone = jax.lax.optimization_barrier(jax.lax.stop_gradient(policy))
+    terms = {
+        "policy_loss": -jnp.mean(surrogate),
+        "value_loss": jnp.mean(value_error),
+        "entropy": jnp.mean(alone.entropy()),
+        # Never negative, and of less variance than the mean of −bounded (Schulman 2020).
+        "approx_kl": jnp.mean(ratio - 1.0 - bounded),
+        "clip_fraction": jnp.mean(outside.astype(ratio.dtype)),
+    }
+    if agent.cost_critic:
+        cost_error = 0.5 * (agent.cost_rate(params, seen) - batch.cost_target) ** 2
+        terms["cost_value_loss"] = jnp.mean(cost_error)
+        value_error += cost_error
+    total = jnp.mean(
         -surrogate + ppo.value_coefficient * value_error - ppo.entropy_coefficient * entropy
     )
+    return total, terms
 
 
 def _to_batch(
@@ -469,10 +557,11 @@ def _to_batch(
     state: TrainState,
     transitions: Transition,
     shard: Shard = WHOLE,
-) -> Batch:
+) -> tuple[Batch, Array]:
     """Return advantages and targets of the critics, with all samples along one axis.
 
-    Advantages are normalised over the whole batch.
+    Advantages are normalised over the whole batch. The second value is the explained variance of
+    the critic on the whole batch.
     """
     t, params = transitions, state.params
     seen = [
@@ -489,12 +578,12 @@ def _to_batch(
         )
         cost_target = cost_advantage + rate
         advantage -= state.multiplier * cost_advantage / (1.0 - gamma)
-    batch = shard.join(
-        Batch(t.inputs, t.totals, t.action, t.log_prob, advantage, target, cost_target), axis=1
-    )
+    part = Batch(t.inputs, t.totals, t.action, t.log_prob, advantage, target, cost_target)
+    batch, value = shard.join((part, value), axis=1)
+    explained = explained_variance(batch.value_target, value)
     advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8)
     batch = batch._replace(advantage=advantage)
-    return jax.tree.map(lambda x: x.reshape(ppo.batch_size, *x.shape[2:]), batch)
+    return jax.tree.map(lambda x: x.reshape(ppo.batch_size, *x.shape[2:]), batch), explained
 
 
 def _in_chunks(

@@ -18,7 +18,7 @@ from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment
 from jaxsafe.schema.component import normalise
 from jaxsafe.train import ppo, recent_episodes
-from jaxsafe.train.ppo import PPO, TrainState
+from jaxsafe.train.ppo import PPO, Diagnostics, TrainState
 from jaxsafe.types import Key
 
 STATE = ppo.over_devices(SPLIT_BY_SEED, SPLIT_BY_ENV)
@@ -26,7 +26,10 @@ STATE = ppo.over_devices(SPLIT_BY_SEED, SPLIT_BY_ENV)
 
 
 Curves = dict[str, jax.Array]
-"""Means over the last 100 episodes, and counts, [updates] each, by column of the progress log."""
+"""Curves of a training, [updates] each, by column of the progress log.
+
+They are means over the last 100 episodes, counts, and the diagnostics of each update.
+"""
 
 Callback = Callable[[TrainState, Curves], bool | None]
 """A function on the host. Its arguments are the state and the curves since the last call.
@@ -129,16 +132,18 @@ def chunk(
         shard: the part of the environments that this device has.
 
     Returns:
-        The state, and the curves: counts and averages over the window after each update.
+        The state, and the curves: counts and averages over the window after each update, and the
+        diagnostics of the update. They are NaN where a seed is left as it is.
     """
     env, agent, hyper = shared
 
-    def leave(state: TrainState) -> TrainState:
-        return state.replace(num_updates=jnp.minimum(state.num_updates + 1, limit))
+    def leave(state: TrainState) -> tuple[TrainState, Diagnostics]:
+        state = state.replace(num_updates=jnp.minimum(state.num_updates + 1, limit))
+        return state, ppo.no_diagnostics(agent)
 
     def one(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
         going = (state.num_updates < limit) & ~ppo.diverged(state)
-        state = jax.lax.cond(
+        state, diagnostics = jax.lax.cond(
             going, lambda s: ppo.update(env, agent, hyper, limit, s, shard), leave, state
         )
         counts = {
@@ -149,7 +154,8 @@ def chunk(
         }
         if agent.cost_critic:
             counts["multiplier"] = state.multiplier
-        return state, {**counts, **recent_episodes.means(state.window, env.outcomes)}
+        means = recent_episodes.means(state.window, env.outcomes)
+        return state, {**counts, **means, **diagnostics}
 
     return jax.lax.scan(one, state, None, length=length)
 

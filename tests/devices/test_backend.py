@@ -84,10 +84,10 @@ def test_an_accelerator_learns_the_same(as_accelerated: Callable[[Any], None]) -
     agent = normalise(Agent(hidden=(8,)))
     hyper = normalise(ppo.PPO(num_envs=4, num_steps=8, num_epochs=2))
     start = ppo.init(env, agent, hyper, jax.random.key(0))
-    expected = jax.jit(lambda state: ppo.update(env, agent, hyper, 4, state))(start)
+    expected = jax.jit(lambda state: ppo.update(env, agent, hyper, 4, state)[0])(start)
     for module in (backend, ppo, shuffle):
         as_accelerated(module)
-    found = jax.jit(lambda state: ppo.update(env, agent, hyper, 4, state))(start)
+    found = jax.jit(lambda state: ppo.update(env, agent, hyper, 4, state)[0])(start)
     for first, second in zip(
         jax.tree.leaves(found.params), jax.tree.leaves(expected.params), strict=True
     ):

@@ -12,8 +12,8 @@ from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.ppo import PPO, TrainState, init, update
-from jaxsafe.train.train import STATE
+from jaxsafe.train.ppo import DIAGNOSTICS, PPO, TrainState, init, update
+from jaxsafe.train.train import STATE, programs
 
 ENV = jaxsafe.make("docking2d")
 AGENT = normalise(Agent(features="docking"))
@@ -27,7 +27,7 @@ def train(
     env, agent, ppo = shared
     begin = init(env, agent, ppo, key, shard)
     return jax.lax.fori_loop(
-        0, updates, lambda _, state: update(env, agent, ppo, UPDATES, state, shard), begin
+        0, updates, lambda _, state: update(env, agent, ppo, UPDATES, state, shard)[0], begin
     )
 
 
@@ -91,6 +91,20 @@ def test_devices_that_share_a_seed_train_what_one_trains_to_rounding(
         jax.tree.map(np.testing.assert_array_equal, alone, shared)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), alone, shared)
     assert alone.num_updates == updates
+
+
+def test_devices_that_share_a_seed_log_the_diagnostics_of_the_whole_batch() -> None:
+    agent = AGENT.replace(cost_critic=True)
+
+    def curves(share: int) -> dict[str, np.ndarray]:
+        mapper = SeedMapper(1, (share,))
+        fresh, advance = programs(mapper, 2, 2)
+        shared = mapper.replicate((ENV, agent, HYPER))
+        return mapper.gather(advance(shared, fresh(shared, mapper.keys(0)))[1])
+
+    alone, shared = curves(1), curves(2)
+    for name in DIAGNOSTICS:
+        np.testing.assert_allclose(shared[name], alone[name], rtol=1e-3, atol=1e-5, err_msg=name)
 
 
 def test_a_seed_is_to_rounding_the_same_run_under_vmap(three: TrainState) -> None:

@@ -25,7 +25,7 @@ from jaxsafe.train.host.checkpoint import Checkpoints
 from jaxsafe.train.host.restore import structure
 from jaxsafe.train.host.results import summary
 from jaxsafe.train.host.session import Training
-from jaxsafe.train.ppo import PPO, diverged, init
+from jaxsafe.train.ppo import DIAGNOSTICS, PPO, diverged, init
 
 AT = 384
 """The step after which the networks of a seed are not finite: between two evaluations."""
@@ -90,6 +90,7 @@ def test_the_seed_stops_and_the_log_says_so(run: Path, whole: Path) -> None:
         assert {
             row[name] for name in ("success_rate", "return", "violating_share", "episode_cost")
         } == {None}
+        assert {row.get(name) for name in DIAGNOSTICS} == {None}
     assert not any(row["diverged"] for row in before)
     assert {row["step"] for row in rows(run, "eval.jsonl", 1)} == {320}
 

@@ -14,6 +14,7 @@ from jaxsafe.train.ppo import (
     collect,
     discount,
     dual_ascent,
+    explained_variance,
     gae,
     init,
     learning_rate,
@@ -40,7 +41,10 @@ def train(
 ) -> TrainState:
     def run(key: jax.Array) -> TrainState:
         return jax.lax.fori_loop(
-            0, updates, lambda _, s: update(env, agent, ppo, updates, s), init(env, agent, ppo, key)
+            0,
+            updates,
+            lambda _, s: update(env, agent, ppo, updates, s)[0],
+            init(env, agent, ppo, key),
         )
 
     return jax.jit(run)(jax.random.key(0))
@@ -158,9 +162,9 @@ def test_the_learning_rate_falls_linearly_to_its_end() -> None:
     env = probe(Match(name="reward"))
     frozen = SMALL.replace(learning_rate=jnp.array(1e-3), final_learning_rate=jnp.array(0.0))
     state = init(env, AGENT, frozen, jax.random.key(0)).replace(num_updates=jnp.array(10))
-    after = update(env, AGENT, frozen, 10, state)  # progress 1: the rate is 0, so nothing moves
+    after = update(env, AGENT, frozen, 10, state)[0]  # progress 1: the rate is 0, so nothing moves
     jax.tree.map(np.testing.assert_array_equal, after.params, state.params)
-    earlier = update(env, AGENT, frozen, 20, state)
+    earlier = update(env, AGENT, frozen, 20, state)[0]
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), earlier.params, state.params)
     assert max(jax.tree.leaves(moved)) > 1e-4
 
@@ -178,8 +182,8 @@ def test_the_learning_rate_falls_as_it_is_told() -> None:
 def test_the_noise_falls_besides_what_is_learnt(discrete: bool) -> None:
     env = probe(Constant(name="reward"), discrete=discrete)
     state = init(env, AGENT, SMALL, jax.random.key(0))
-    kept = update(env, AGENT, SMALL, 10, state).params["log_std"]
-    less = update(env, AGENT, SMALL.replace(noise_decay=jnp.array(2.0)), 10, state).params[
+    kept = update(env, AGENT, SMALL, 10, state)[0].params["log_std"]
+    less = update(env, AGENT, SMALL.replace(noise_decay=jnp.array(2.0)), 10, state)[0].params[
         "log_std"
     ]
     np.testing.assert_allclose(kept - less, 0.2, rtol=1e-5)
@@ -198,7 +202,7 @@ def test_the_discount_of_an_update_is_that_of_its_progress() -> None:
     state = init(env, AGENT, growing, jax.random.key(0)).replace(num_updates=jnp.array(10))
     found, *others = (
         jnp.concatenate(
-            [leaf.ravel() for leaf in jax.tree.leaves(update(env, AGENT, ppo, 10, state).params)]
+            [leaf.ravel() for leaf in jax.tree.leaves(update(env, AGENT, ppo, 10, state)[0].params)]
         )
         for ppo in (
             growing,
@@ -218,7 +222,7 @@ def test_hyperparameters_are_leaves_that_vmap() -> None:
 
     def bias(rate: jax.Array) -> jax.Array:
         ppo = SMALL.replace(learning_rate=rate)
-        return update(env, AGENT, ppo, 10, state).params["critic"][0]["bias"]
+        return update(env, AGENT, ppo, 10, state)[0].params["critic"][0]["bias"]
 
     together = jax.vmap(bias)(rates)
     np.testing.assert_allclose(together, jnp.stack([bias(rate) for rate in rates]), atol=1e-6)
@@ -228,9 +232,65 @@ def test_no_gradient_is_larger_than_allowed() -> None:
     env = probe(Position(name="reward"))
     tiny = SMALL.replace(max_grad_norm=jnp.array(1e-30))
     state = init(env, AGENT, tiny, jax.random.key(0))
-    after = update(env, AGENT, tiny, 10, state)  # clipped below Adam's ε: the networks hardly move
+    # The gradient is clipped below Adam's ε, so the networks hardly move.
+    after, _ = update(env, AGENT, tiny, 10, state)
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), after.params, state.params)
     assert max(jax.tree.leaves(moved)) < 1e-6
+
+
+@pytest.mark.parametrize("discrete", [False, True], ids=["gaussian", "categorical"])
+def test_diagnostics_of_an_update_that_changes_nothing_are_those_of_its_batch(
+    discrete: bool,
+) -> None:
+    env = probe(Position(name="reward"), discrete=discrete)
+    frozen = SMALL.replace(learning_rate=jnp.array(0.0), final_learning_rate=jnp.array(0.0))
+    frozen = frozen.replace(entropy_coefficient=jnp.array(0.3))
+    state = init(env, AGENT, frozen, jax.random.key(0))
+    _, found = update(env, AGENT, frozen, 10, state)
+    key = jax.random.split(jax.random.fold_in(state.key, 0))[0]
+    _, t = collect(env, AGENT, frozen, state, key)
+    values = AGENT.value(state.params, t.inputs)  # an episode has one step, so nothing follows
+    error = t.reward - values
+    entropy = AGENT.distribution(env, state.params, t.inputs).entropy().mean()
+    expected = {
+        "policy_loss": 0.0,  # the mean of the normalised advantages
+        "value_loss": 0.5 * jnp.mean(error**2),
+        "entropy": entropy,
+        "approx_kl": 0.0,
+        "clip_fraction": 0.0,
+        "explained_variance": 1.0 - jnp.var(error) / jnp.var(t.reward),
+        "learning_rate": 0.0,
+        "gamma": 0.9,
+        "action_std": jnp.exp(state.params["log_std"]).mean(),
+    }
+    assert found.keys() == {*expected, "grad_norm"}
+    for name, value in expected.items():
+        assert float(found[name]) == pytest.approx(float(value), rel=1e-4, abs=1e-5), name
+
+
+def test_the_diagnostics_show_how_far_an_update_went() -> None:
+    env, still = probe(Match(name="reward")), SMALL.replace(num_epochs=1, num_minibatches=1)
+    state = init(env, AGENT, SMALL, jax.random.key(0))
+    near, far = (
+        update(env, AGENT, SMALL.replace(learning_rate=jnp.array(rate)), 10, state)[1]
+        for rate in (1e-3, 3e-2)
+    )
+    assert 0.0 < near["approx_kl"] < far["approx_kl"]
+    assert 0.0 <= near["clip_fraction"] < far["clip_fraction"] < 1.0
+    # One step with the whole batch, so the norm is that before clipping whatever is allowed.
+    norms = [
+        float(update(env, AGENT, still.replace(max_grad_norm=most), 10, state)[1]["grad_norm"])
+        for most in (jnp.array(1e-3), jnp.array(1e3))
+    ]
+    assert norms[0] == norms[1] > 1e-3
+
+
+def test_the_explained_variance_is_1_for_a_perfect_critic_and_0_for_a_constant_one() -> None:
+    target = jnp.array([1.0, 2.0, 4.0])
+    assert float(explained_variance(target, target + 5.0)) == 1.0  # a bias is not seen
+    assert float(explained_variance(target, jnp.full(3, 7.0))) == pytest.approx(0.0, abs=1e-6)
+    assert float(explained_variance(target, -target)) == pytest.approx(-3.0)
+    assert not jnp.isfinite(explained_variance(jnp.ones(3), target))
 
 
 class Push(Match):

@@ -1,6 +1,7 @@
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -23,9 +24,11 @@ from jaxsafe.commands import train as command
 from jaxsafe.devices import processes
 from jaxsafe.envs import TASKS
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.storage.files import write_rows
 from jaxsafe.train.host.checkpoint import Checkpoints
 from jaxsafe.train.host.options import recipe
 from jaxsafe.train.host.session import Clock, Training
+from jaxsafe.train.ppo import DIAGNOSTICS
 
 
 def test_a_run_directory_holds_everything(whole: Path) -> None:
@@ -54,9 +57,21 @@ def test_progress_has_a_row_for_every_update_of_every_seed(whole: Path) -> None:
     assert sum(last[f"outcome/{name}"] for name in outcomes) == pytest.approx(1.0, abs=1e-5)
     terms = ("distance_change", "velocity_constraint", "delta_v", "success", "failure")
     assert sum(last[f"reward/{name}"] for name in terms) == pytest.approx(last["return"], abs=1e-4)
+    for row in rows:  # what is learnt is known before an episode has ended
+        learnt = {name: row[name] for name in DIAGNOSTICS if name != "cost_value_loss"}
+        assert all(np.isfinite(value) for value in learnt.values())
+    assert rows[0]["learning_rate"] > last["learning_rate"] > 0.0
+    assert rows[0]["gamma"] < last["gamma"] < 1.0
     csv = (whole / "progress.csv").read_text().splitlines()
     assert len(csv) == len(rows) + 1
     assert csv[0].startswith("seed,step,wall_s")
+
+
+def test_every_column_of_the_progress_log_is_explained(whole: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs" / "logs.md").read_text(encoding="utf-8")
+    columns = {*logs(whole)["progress.jsonl"][0], "wall_s", "multiplier", *DIAGNOSTICS}
+    general = {re.sub("/.*", "/NAME", name) for name in columns}
+    assert {name for name in general if f"`{name}`" not in page} == set()
 
 
 def test_results_follow_the_schema(whole: Path) -> None:
@@ -455,6 +470,22 @@ def test_a_damaged_progress_log_is_told_before_anything_is_done(
         command.main([f"resume={run}"])
 
 
+def test_a_run_that_an_older_version_began_does_not_go_on(tmp_path: Path, whole: Path) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    (run / "results.json").unlink()
+    shutil.rmtree(run / "checkpoints" / "1280")
+    rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
+    older = [{k: v for k, v in row.items() if k not in DIAGNOSTICS} for row in rows]
+    write_rows(run / "progress.jsonl", older)
+    with pytest.raises(
+        ConfigError,
+        match=r"progress\.jsonl: another version of jaxsafe began it; columns differ in action_std, "
+        r"approx_kl, .*; begin a new run$",
+    ):
+        command.main([f"resume={run}"])
+
+
 def test_a_log_that_lost_its_end_is_gone_back_to_the_checkpoint_that_it_covers(
     tmp_path: Path, whole: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -618,6 +649,7 @@ def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(tmp_path: Path) -> 
     rows = logs(straight)["progress.jsonl"]
     assert all(row["multiplier"] > 0.0 for row in rows if row["episodes"])
     assert len({row["multiplier"] for row in rows}) > 3
+    assert all(row["cost_value_loss"] >= 0.0 for row in rows)
     policy = load_policy(straight / "policy" / "seed_0.npz")
     assert policy(jax.random.key(0), np.zeros(6, np.float32)).shape == (2,)
     shutil.copytree(straight, stopped)

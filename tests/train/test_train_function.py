@@ -42,6 +42,8 @@ def test_it_trains_bit_for_bit_what_the_command_trains(tmp_path: Path) -> None:
     for state, curves in (jax.jit(train, static_argnums=4)(*arguments), train(*arguments)):
         jax.tree.map(np.testing.assert_array_equal, jax.device_get(state.average), saved)
         np.testing.assert_allclose(curves["return"], returns, rtol=1e-4)
+        for name in ("value_loss", "approx_kl", "learning_rate"):
+            np.testing.assert_allclose(curves[name], [row[name] for row in rows], rtol=1e-4)
 
 
 def test_seeds_and_hyperparameters_are_mapped(recipe: Recipe) -> None:

@@ -19,6 +19,7 @@ from jaxsafe.metrics import measures
 from jaxsafe.schema.errors import ConfigError, install_hint
 from jaxsafe.storage.files import append_csv, append_rows, read_rows, write_csv, write_rows
 from jaxsafe.storage.forms import COUNT, FLAG, NUMBER, NUMBER_OR_NULL, OTHERS
+from jaxsafe.train.ppo import DIAGNOSTICS
 
 NEEDS = {
     **dict.fromkeys(("seed", "step", "episodes", "cost"), COUNT),
@@ -168,8 +169,8 @@ def progress_rows(
 ) -> list[dict]:
     """Return the rows of the progress log for a chunk of updates, update by update.
 
-    The measured columns are None before the first episode of a seed has ended, and once the seed
-    has diverged.
+    The measured columns are None before the first episode of a seed has ended. They and the
+    diagnostics are None once the seed has diverged.
 
     Args:
         env: the environment.
@@ -179,8 +180,10 @@ def progress_rows(
         wall_s: seconds spent on the run so far.
     """
     num_seeds, num_updates = curves["count"].shape
-    known = (curves["count"] > 0) & ~curves["diverged"]
+    sound = ~curves["diverged"]
+    known = (curves["count"] > 0) & sound
     measured = columns(env) + (["multiplier"] if "multiplier" in curves else [])
+    diagnostics = [name for name in DIAGNOSTICS if name in curves]
     return [
         {
             "seed": seed + i,
@@ -188,15 +191,18 @@ def progress_rows(
             "wall_s": round(wall_s, 3),
             "episodes": int(curves["count"][i, j]),
             "cost": int(curves["cost"][i, j]),
-            **{
-                name: float(f"{curves[name][i, j]:.6g}") if known[i, j] else None
-                for name in measured
-            },
+            **{name: _rounded(curves[name][i, j], known[i, j]) for name in measured},
+            **{name: _rounded(curves[name][i, j], sound[i, j]) for name in diagnostics},
             "diverged": bool(curves["diverged"][i, j]),
         }
         for j in range(num_updates)
         for i in range(num_seeds)
     ]
+
+
+def _rounded(value: np.ndarray, known: np.ndarray) -> float | None:
+    """Return a number with six digits, or None if it is not known or not finite."""
+    return float(f"{value:.6g}") if known and np.isfinite(value) else None
 
 
 def columns(env: Environment) -> list[str]:
