@@ -11,6 +11,7 @@ from typing import Any, Literal
 from jaxsafe.environment import Environment
 from jaxsafe.plot.figures import Episodes, Rows, speed_distance, training_curves, trajectories
 from jaxsafe.plot.interventions import interventions, most_altered
+from jaxsafe.plot.learning import learning_curves
 from jaxsafe.plot.style import kept_out, length_unit, save
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import read_rows
@@ -52,6 +53,9 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
     }
     title = headline({**facts, "seeds": len({row["seed"] for row in rows})})
     figures = {f"training_{x}": training_curves(rows, x, title)}
+    learning = learning_curves(rows, x, title)
+    if learning is not None:
+        figures[f"learning_{x}"] = learning
     others = [platform.name for platform in env.platforms if platform.name != env.agent]
     names = [*others[:1], env.agent]
     episodes = _episodes(run / "episodes.jsonl", names, partial(_row_form, env, names))

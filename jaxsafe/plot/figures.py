@@ -114,11 +114,20 @@ def set_axes(panel: Axes, label: str, quantity: str, name: str) -> None:
         panel.axhline(80.0, color="black", linestyle=":", linewidth=1.0)
 
 
-def panel_grid(count: int, width: float) -> tuple[Figure, np.ndarray]:
-    """Return a figure with `count` panels of a width in inches, three in a row."""
-    rows = -(-count // 3)
-    columns = min(count, 3)
-    figure = Figure(figsize=(width * columns, 3.1 * rows), layout="constrained")
+def panel_grid(
+    count: int, width: float, height: float = 3.1, in_row: int = 3
+) -> tuple[Figure, np.ndarray]:
+    """Return a figure and its panels.
+
+    Args:
+        count: number of panels.
+        width: width of a panel in inches.
+        height: height of a panel in inches.
+        in_row: number of panels in a row.
+    """
+    rows = -(-count // in_row)
+    columns = min(count, in_row)
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
     panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
     for panel in panels[count:]:
         panel.remove()

@@ -17,9 +17,12 @@ from jaxsafe.envs import TASKS
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.compare import compare_curves, seed_curves
 from jaxsafe.plot.figures import speed_distance, training_curves, trajectories
+from jaxsafe.plot.learning import learning_curves
 from jaxsafe.plot.style import GREEN, ORANGE, kept_out, save
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.storage.files import read_rows, write_rows
+from jaxsafe.train.ppo import DIAGNOSTICS
 
 
 def rows(num_updates: int = 50, num_seeds: int = 4) -> list[dict]:
@@ -196,10 +199,75 @@ def test_figures_come_from_the_log_files_alone(whole: Path, tmp_path: Path) -> N
         shutil.copy(whole / name, run / name)
     assert main([f"run={run}", "x=wall"]) == 0
     drawn = {path.name for path in (run / "figures").iterdir()}
-    assert drawn == {"training_wall.png", "trajectories.png", "speed_distance.png"}
-    image = imread(run / "figures" / "training_wall.png")
-    assert image.shape[0] > 300
-    assert image[..., :3].std() > 0.05  # the picture is not blank
+    curves = {"training_wall.png", "learning_wall.png"}
+    assert drawn == {*curves, "trajectories.png", "speed_distance.png"}
+    for name in curves:
+        image = imread(run / "figures" / name)
+        assert image.shape[0] > 300
+        assert image[..., :3].std() > 0.05  # the picture is not blank
+
+
+def diagnostics(num_seeds: int = 4) -> list[dict]:
+    """Return rows of a log with diagnostics. The explained variance is unknown at first."""
+    rng = np.random.default_rng(1)
+    return [
+        {**row, **{name: rng.random() for name in DIAGNOSTICS}, "gamma": 0.9}
+        | ({"explained_variance": None} if row["step"] == 100 else {})
+        for row in rows(num_seeds=num_seeds)
+    ]
+
+
+def test_what_is_learnt_is_drawn_as_the_median_and_the_range_of_the_seeds() -> None:
+    log = diagnostics()
+    figure = learning_curves(log, "steps", "title")
+    assert figure is not None
+    assert len(figure.axes) == len(DIAGNOSTICS)
+    panels = {panel.get_title(): panel for panel in figure.axes}
+    for title, name, factor in (
+        ("value loss", "value_loss", 1),
+        ("clip fraction [%]", "clip_fraction", 100),
+    ):
+        values = factor * np.array([row[name] for row in log]).reshape(50, 4)
+        (line,) = panels[title].lines
+        np.testing.assert_allclose(line.get_ydata(), np.median(values, axis=1))
+        np.testing.assert_array_equal(line.get_xdata(), 100 * np.arange(1, 51))
+        shaded = panels[title].collections[0].get_paths()[0].vertices
+        assert {shaded[:, 1].min(), shaded[:, 1].max()} == {values.min(), values.max()}
+    assert panels["value loss"].get_yscale() == "log"
+    assert panels["explained variance"].lines[0].get_xdata()[0] == 200
+    assert [panel.get_xlabel() for panel in figure.axes[-5:]] == ["environment steps per seed"] * 5
+    assert figure.get_suptitle() == "title\neach update, median and range of the seeds"
+
+
+def test_the_figure_of_what_is_learnt_has_what_the_log_has() -> None:
+    without_cost = [
+        {name: value for name, value in row.items() if name != "cost_value_loss"}
+        for row in diagnostics(num_seeds=1)
+    ]
+    figure = learning_curves(without_cost, "wall", "title")
+    assert figure is not None
+    assert len(figure.axes) == len(DIAGNOSTICS) - 1
+    assert figure.axes[-1].get_xlabel() == "wall time [s]"
+    assert figure.get_suptitle() == "title\neach update, one seed"
+    nothing = [row | dict.fromkeys(DIAGNOSTICS) for row in without_cost]
+    figure = learning_curves(nothing, "steps", "title")
+    assert figure is not None
+    figure.draw_without_rendering()
+    broken = [row | {"diverged": row["seed"] == 8} for row in diagnostics()]
+    figure = learning_curves(broken, "steps", "title")
+    assert figure is not None
+    assert figure.get_suptitle().endswith("range of the seeds, without seed 8, which diverged")
+
+
+def test_a_run_of_an_older_version_is_drawn_without_what_is_learnt(
+    whole: Path, tmp_path: Path
+) -> None:
+    assert learning_curves(rows(), "steps", "title") is None
+    shutil.copy(whole / "config.yaml", tmp_path)
+    log = read_rows(whole / "progress.jsonl")
+    older = [{name: value for name, value in row.items() if name not in DIAGNOSTICS} for row in log]
+    write_rows(tmp_path / "progress.jsonl", older)
+    assert [path.name for path in draw_all(tmp_path)] == ["training_steps.png"]
 
 
 def test_the_agent_is_drawn_whatever_it_and_the_others_are_called(

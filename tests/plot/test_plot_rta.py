@@ -140,7 +140,8 @@ def test_only_a_run_with_a_filter_draws_interventions(whole: Path, tmp_path: Pat
         "".join(json.dumps(common | row) + "\n" for row in episode(env, (3,)))
     )
     draw_all(run)
-    names = {"training_steps.png", "trajectories.png", "speed_distance.png"}
+    curves = {"training_steps.png", "learning_steps.png"}
+    names = {*curves, "trajectories.png", "speed_distance.png"}
     assert {path.name for path in (run / "figures").iterdir()} == {*names, "interventions.png"}
     assert (
         imread(run / "figures" / "interventions.png")[..., :3].std() > 0.05

@@ -43,7 +43,7 @@ def test_a_run_directory_holds_everything(whole: Path) -> None:
         "seed_2.npz",
     }
     assert {path.name for path in (whole / "figures").iterdir()} == {
-        "training_steps.png", "trajectories.png", "speed_distance.png",
+        "training_steps.png", "learning_steps.png", "trajectories.png", "speed_distance.png",
     }  # fmt: skip
 
 
