@@ -35,6 +35,7 @@ class Agent(Component):
     """
 
     hidden: Annotated[tuple[int, ...], Range(1, largest=2**16)] = (64, 64)
+    """Sizes of the hidden layers."""
     features: Literal["none", "docking", "approach", "rejoin"] = "none"
     """Name of the features that are appended to the observation."""
     log_std: Annotated[Number, Unit("1", length=ANY), Range(largest=20.0)] = -0.7
@@ -55,7 +56,7 @@ class Agent(Component):
     never sees it, because only training needs the critic.
     """
     cost_critic: bool = False
-    """Whether a second critic expects the cost to come. `algorithm=ppo_lagrangian` needs it."""
+    """Whether a second critic expects the cost to come. `algorithm=ppo_lagrangian` sets it."""
 
     def init(self, key: Key, env: Environment) -> Params:
         """Return fresh parameters.

@@ -269,12 +269,9 @@ def unwrap_optional(hint: Any) -> tuple[Any, bool]:
 
 def field(name: str, hint: Any, default: Any = dataclasses.MISSING) -> Field:
     """Return the description of a field that follows from its annotation `hint`."""
-    core, _ = unwrap_optional(hint)
-    marks = typing.get_args(core)[1:] if typing.get_origin(core) is Annotated else ()
-    marks += typing.get_args(hint)[1:] if typing.get_origin(hint) is Annotated else ()
 
     def first(kind: type) -> Any:
-        return next((mark for mark in marks if isinstance(mark, kind)), None)
+        return next((mark for mark in marks(hint) if isinstance(mark, kind)), None)
 
     return Field(
         name=name,
@@ -285,6 +282,13 @@ def field(name: str, hint: Any, default: Any = dataclasses.MISSING) -> Field:
         range=first(Range),
         refers=first(Refers),
     )
+
+
+def marks(hint: Any) -> tuple:
+    """Return the marks of an annotation, also of one that is optional."""
+    core, _ = unwrap_optional(hint)
+    inner = typing.get_args(core)[1:] if typing.get_origin(core) is Annotated else ()
+    return inner + (typing.get_args(hint)[1:] if typing.get_origin(hint) is Annotated else ())
 
 
 def _is_static(hint: Any) -> bool:

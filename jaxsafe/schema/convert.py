@@ -104,7 +104,7 @@ def expects(field: Field) -> str:
         symbol = field.unit.symbol
         unit = "" if symbol in _UNITS_WITHOUT_SYMBOL else f" in {symbol}"
         return f"{_SHAPES[field.unit.length]}{unit} {field.range or ''}".rstrip()
-    core = _bare(field.hint)
+    core = bare(field.hint)
     if typing.get_origin(core) is Literal:
         return "one of " + ", ".join(map(str, typing.get_args(core)))
     words = {str: "a name", int: "a whole number", bool: "true or false"}
@@ -140,7 +140,7 @@ def _to_structure(value: Any, hint: Any, field: Field, place: str) -> Any:
         place: where the value stands.
     """
     optional = _is_optional(hint)
-    hint = _bare(hint)
+    hint = bare(hint)
     origin = typing.get_origin(hint)
     arguments = typing.get_args(hint)
     if value is None and optional:
@@ -234,12 +234,12 @@ def _to_array(value: Any, field: Field, place: str) -> jax.Array:
     return jnp.asarray(array, jnp.result_type(float))
 
 
-def _bare(hint: Any) -> Any:
+def bare(hint: Any) -> Any:
     """Return an annotation without its marks and without `| None`."""
     if typing.get_origin(hint) is Annotated:
-        return _bare(typing.get_args(hint)[0])
+        return bare(typing.get_args(hint)[0])
     inner, optional = unwrap_optional(hint)
-    return _bare(inner) if optional else hint
+    return bare(inner) if optional else hint
 
 
 def _is_optional(hint: Any) -> bool:

@@ -84,28 +84,40 @@ class PPO(Component):
     max_episode_steps: Annotated[Dimensionless, Range(1.0)] = 1e6
     """Number of steps after which episodes of training are truncated."""
     num_epochs: Annotated[int, Range(1, largest=10_000)] = 10
+    """Number of times that an update goes through its samples."""
     num_minibatches: Annotated[int, Range(1, largest=MAX_COUNT)] = 2
+    """Number of parts of the samples of an update. Each part gives one step of the optimiser."""
     learning_rate: Annotated[Dimensionless, Positive] = 3e-3
+    """Learning rate at the beginning of the training."""
     final_learning_rate: Annotated[Dimensionless, Range(0.0)] = 3e-4
     """Learning rate at the end of the training."""
     learning_rate_decay: Literal["linear", "exponential"] = "linear"
     """How the learning rate changes from `learning_rate` to `final_learning_rate`."""
     gamma: Annotated[Dimensionless, Share] = 0.97
+    """Discount factor γ."""
     horizon_growth: Annotated[Dimensionless, Positive] = 1.0
     """Factor by which the horizon 1/(1 − γ) has grown at the end. It grows exponentially."""
     gae_lambda: Annotated[Dimensionless, Share] = 1.0
+    """Decay λ of generalised advantage estimation."""
     clip: Annotated[Dimensionless, Positive] = 0.2
+    """Bound on how far the ratio of new to old probabilities counts away from 1."""
     noise_decay: Annotated[Dimensionless, Range(0.0, largest=20.0)] = 0.0
     """How far log_std falls by the end, besides what is learnt."""
     value_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.5
+    """Weight of the critic's loss."""
     entropy_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.0
+    """Weight of the entropy of the policy, which is maximised."""
     max_grad_norm: Annotated[Dimensionless, Positive] = 0.5
+    """Largest norm of a gradient. A longer gradient is scaled down to it."""
     averaging: Annotated[Dimensionless, Share] = 0.0
     """Share of the training over which the networks that are kept are averaged."""
     learns_from: Literal["desired", "actual"] = "desired"
     """The control to learn from where run time assurance changed it: the agent's, or what acted."""
     cost_limit: Annotated[Dimensionless, Positive] = 25.0
-    """Number of violating steps that an episode may have, with PPO-Lagrangian."""
+    """Number of violating steps that an episode may have, with PPO-Lagrangian.
+
+    `jaxsafe train` sets it by the option `cost_limit`.
+    """
     multiplier: Annotated[Dimensionless, Positive] = 0.01
     """Multiplier of the cost at the start, in reward per violating step, with PPO-Lagrangian."""
     multiplier_rate: Annotated[Dimensionless, Range(0.0)] = 0.03

@@ -1,0 +1,36 @@
+"""The texts that explain the fields of a component.
+
+Such a text is the string below the field in the source of its class, which Sphinx shows too.
+"""
+
+from __future__ import annotations
+
+import ast
+import functools
+import inspect
+import textwrap
+from itertools import pairwise
+
+from jaxsafe.schema.component import Component
+
+
+@functools.cache
+def field_docs(cls: type[Component]) -> dict[str, str]:
+    """Return the explanation of each field that has one, by name, also of inherited fields.
+
+    Where Python cannot find the source of a class, the fields of that class have none.
+    """
+    inherited = [field_docs(base) for base in cls.__bases__ if issubclass(base, Component)]
+    docs = {name: text for texts in inherited for name, text in texts.items()}
+    try:
+        tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
+    except OSError:
+        return docs
+    definition = tree.body[0]
+    assert isinstance(definition, ast.ClassDef)
+    for above, below in pairwise(definition.body):
+        if isinstance(above, ast.AnnAssign) and isinstance(below, ast.Expr):
+            text = below.value.value if isinstance(below.value, ast.Constant) else None
+            if isinstance(above.target, ast.Name) and isinstance(text, str):
+                docs[above.target.id] = inspect.cleandoc(text)
+    return docs
