@@ -16,6 +16,7 @@ from typing import Any
 
 from baselines.plan import BEST, FILM, Item, best_seed
 from jaxsafe.commands.cli import INTERRUPTED
+from jaxsafe.commands.evaluate import Options
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.devices.processes import in_main_thread
 from jaxsafe.schema.errors import ConfigError
@@ -79,10 +80,9 @@ def answers(options: Sequence[str], results: Mapping[str, Any]) -> bool:
 
     The options follow `python -m jaxsafe.evaluate run=…`.
     """
-    arguments = Arguments.parse(options)
-    filters = {"rta": arguments.pop_text("rta")} if "rta" in arguments.options else {}
-    return results.get("changes") == {**filters, **arguments.pop_overrides()} and (
-        results.get("evaluation_seed") == arguments.pop_seed()
+    asked = Options.parse(["run=RUN", *options])
+    return results.get("changes") == asked.changes and (
+        results.get("evaluation_seed") == asked.seed
     )
 
 

@@ -17,15 +17,20 @@ COMMANDS = {
 }
 """What each command does, in the order of the list that `jaxsafe` prints."""
 
+HELP = ("help", "-h", "--help")
+"""Words that ask for the help text."""
+
 
 def main() -> None:
     """Run `jaxsafe COMMAND [key=value …]`, a shorter form of `python -m jaxsafe.COMMAND`."""
     name, *words = sys.argv[1:] or ["help"]
-    if name in ("help", "-h", "--help"):
+    if name in HELP and words:
+        name, *words = words[0], HELP[0]
+    if name in HELP:
         width = max(map(len, COMMANDS))
         print("usage: jaxsafe COMMAND [key=value …]\n")
         print("\n".join(f"  {command:{width}}  {about}" for command, about in COMMANDS.items()))
-        print("\njaxsafe COMMAND help lists the options of a command")
+        print("\njaxsafe COMMAND help explains the options of a command")
         return
     if name not in COMMANDS:
         from jaxsafe.schema.errors import nearest, show

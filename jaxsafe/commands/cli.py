@@ -10,8 +10,10 @@ from contextlib import contextmanager
 from typing import Any, NoReturn
 
 from jaxsafe.address_space import is_shortage
+from jaxsafe.commands import HELP
+from jaxsafe.commands.help_text import help_text
+from jaxsafe.commands.options import CommandOptions
 from jaxsafe.commands.streams import lasting_streams
-from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema import user_modules
 from jaxsafe.schema.errors import ConfigError, ConfigWarning
 
@@ -25,16 +27,9 @@ There is no result for such a seed.
 """
 
 
-IMPORTS = (
-    "  imports=false          refuse files that name modules to import: "
-    "that runs the code of whoever wrote them"
-)
-"""Help text of an option that every command has."""
-
-
 def run(
     main: Callable[[Sequence[str]], int | None],
-    usage: Callable[[], str],
+    options: type[CommandOptions],
     leave: Callable[[int], NoReturn] = sys.exit,
 ) -> None:
     """Run a command and leave with its exit code.
@@ -45,14 +40,14 @@ def run(
     Args:
         main: the command. It takes the words of the command line and returns its exit code, or None
             instead of 0.
-        usage: a function that returns the help text.
+        options: the options of the command, for the help text.
         leave: a function that ends the process after an error or Ctrl-C. In all other cases
             `sys.exit` ends it.
     """
     argv = sys.argv[1:]
     with lasting_streams() as stdout:
-        if not argv or argv[0] in ("-h", "--help", "help"):
-            print(f"{usage()}\n{IMPORTS}", file=sys.stdout if argv else sys.stderr)
+        if not argv or any(word in HELP for word in argv):
+            print(help_text(options), file=sys.stdout if argv else sys.stderr)
             code, leave = (0 if argv else 2), sys.exit
         else:
             code, finished = _run(main, argv)
@@ -67,12 +62,10 @@ def run(
 def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tuple[int, bool]:
     """Return the exit code of a command and whether it came to its end."""
     try:
-        flags, words = [], []
-        for word in argv:
-            (flags if word.partition("=")[0] == "imports" else words).append(word)
-        allowed = Arguments.parse(flags).pop_flag("imports") is not False
-        with user_modules.imports_allowed(allowed), _warnings_in_one_line():
-            return main(words) or 0, True
+        flags = [word for word in argv if word.startswith("imports=")]
+        imports = CommandOptions.parse(flags).imports
+        with user_modules.imports_allowed(imports), _warnings_in_one_line():
+            return main(argv) or 0, True
     except ConfigError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2, False

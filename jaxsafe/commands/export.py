@@ -1,18 +1,20 @@
-"""The command `python -m jaxsafe.export run=pretrained/docking2d format=onnx` exports a policy.
+"""Write a policy to a file for other tools: as ONNX, StableHLO or VNN-LIB.
 
-It writes the policy to a file for other tools.
+ONNX needs the extra `export`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeGuard
 
 from jaxsafe.commands import cli
-from jaxsafe.config.arguments import Arguments
+from jaxsafe.commands.options import Count, File, Option, Seed
+from jaxsafe.commands.policy_options import PolicyOptions, differences
+from jaxsafe.schema.component import Range
 from jaxsafe.schema.errors import ConfigError, missing, nearest
 
 if TYPE_CHECKING:
@@ -21,8 +23,6 @@ if TYPE_CHECKING:
     from jaxsafe.environment import Environment
     from jaxsafe.export.functions import Exported
 
-FORMATS = ("onnx", "stablehlo", "vnnlib")
-OPTIONS = ("run", "seed", "activation", "format", "inputs", "batch", "steps", "box.FIELD", "out")
 BOX = {"position": (70.0, 106.0), "velocity": (-0.28, 0.28)}
 """Bounds of the starts by field, in m and m/s.
 
@@ -43,24 +43,52 @@ Squares of larger numbers are infinite in single precision, and so is every marg
 """
 
 
+class Options(PolicyOptions):
+    """The options of `jaxsafe export`."""
+
+    format: Literal["onnx", "stablehlo", "vnnlib"] = "onnx"
+    """The kind of file.
+
+    onnx is a graph of opset 17 with a fixed batch. stablehlo is an artefact of jax.export for any
+    batch. vnnlib gives the closed loop over some steps as ONNX, the property that no safety margin
+    is negative from any start in a box, and the worst start that a search finds.
+    """
+    inputs: Literal["observation", "network", "state"] = "observation"
+    """What the file computes, and from what.
+
+    observation leads from the paper's observation to the action, with the features inside. network
+    leads from the features to the output of the network, by matrix products and tanh only. state
+    leads from the state at a start to the control in physical units.
+    """
+    seed: Seed = 0
+    """Which policy of a run."""
+    batch: Count = 1
+    """Number of inputs at once, with format=onnx."""
+    steps: Annotated[int, Range(1, largest=MAX_STEPS)] = 40
+    """Number of steps of the closed loop, with format=vnnlib."""
+    box: Annotated[
+        Mapping[str, Any], Option(prefix="box.", placeholder="FIELD", takes="a list [low, high]")
+    ]
+    """Starts of the property, with format=vnnlib.
+
+    By default the position is within [70, 106] m and the velocity within [-0.28, 0.28] m/s.
+    """
+    out: File | None = None
+    """Where to write. By default the file has the name of the policy."""
+
+
 def main(argv: Sequence[str]) -> int:
     """Run the command and return its exit code."""
     import jax
     import jax.numpy as jnp
 
-    from jaxsafe.commands import environment_choice
     from jaxsafe.export import functions
     from jaxsafe.storage.files import write_bytes
     from jaxsafe.storage.provenance import versions
 
-    arguments = Arguments.parse(argv)
-    run, form, out = (arguments.pop_text(name) for name in ("run", "format", "out"))
-    if run is None:
-        raise ConfigError(
-            "run: missing; for instance run=runs/docking3d or run=pretrained/docking3d"
-        )
-    form = _one_of("format", form or "onnx", FORMATS)
-    saved, stem = _policy(arguments, run)
+    options = Options.parse(argv)
+    run, form, out = options.run, options.format, options.out
+    saved, stem = _policy(options)
     _require_finite(run, saved)
     kinds = {
         "observation": lambda: functions.action(saved),
@@ -68,16 +96,17 @@ def main(argv: Sequence[str]) -> int:
     }
     if isinstance(saved, functions.SavedPolicy):
         kinds["network"] = lambda: functions.network(saved)
-    boxes = [word for word in arguments.options if word.startswith("box.")]
-    arguments.refuse_beside(
+    options.refuse_beside(
         {"onnx": [], "stablehlo": ["batch"], "vnnlib": ["batch", "inputs"]}[form],
         f"with format={form}",
     )
-    arguments.refuse_beside([] if form == "vnnlib" else ["steps", *boxes], "without format=vnnlib")
-    inputs = _one_of("inputs", arguments.pop_text("inputs") or "observation", [*kinds])
-    batch, steps = arguments.pop_count("batch", 1), arguments.pop_count("steps", 40, most=MAX_STEPS)
-    box = {word[4:]: arguments.pop(word) for word in boxes}
-    arguments.refuse_rest([*OPTIONS, *environment_choice.OPTIONS])
+    if form != "vnnlib":
+        boxes = [f"box.{name}" for name in options.box]
+        options.refuse_beside(["steps", *boxes], "without format=vnnlib")
+    if options.inputs not in kinds:
+        raise ConfigError(
+            f"inputs: found {options.inputs!r}; choose from {nearest(options.inputs, kinds)}"
+        )
     about = {"policy": stem, "jaxsafe": versions()["jaxsafe"]}
     if form == "vnnlib":
         target = Path(out or f"{stem}_closed_loop.vnnlib")
@@ -95,12 +124,12 @@ def main(argv: Sequence[str]) -> int:
                 "and this environment has none"
             )
         loops = (
-            functions.closed_loop(saved, steps, unrolled=True),
-            functions.closed_loop(saved, steps),
+            functions.closed_loop(saved, options.steps, unrolled=True),
+            functions.closed_loop(saved, options.steps),
         )
         with _with_advice(saved.env):
-            return _vnnlib(*loops, box, target, about)
-    exported = kinds[inputs]()
+            return _vnnlib(*loops, given=options.box, path=target, about=about)
+    exported = kinds[options.inputs]()
     if form == "stablehlo":
         try:
             # jax.export needs flatbuffers but does not require it to be installed.
@@ -119,35 +148,28 @@ def main(argv: Sequence[str]) -> int:
         target = Path(out or f"{stem}.onnx")
         facts = {"inputs": ", ".join(exported.inputs), "outputs": ", ".join(exported.outputs)}
         with _with_advice(saved.env):
-            write_onnx(target, exported.function, (batch, len(exported.inputs)), {**about, **facts})
+            shape = (options.batch, len(exported.inputs))
+            write_onnx(target, exported.function, shape, {**about, **facts})
     print(f"{target}: {', '.join(exported.inputs)} -> {', '.join(exported.outputs)}")
     return 0
 
 
-def _policy(arguments: Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy, str]:
-    """Return the policy that the command line names, and the first part of the names of files.
-
-    Args:
-        arguments: the command line, out of which the options about the policy are taken.
-        run: a run directory, a policy file, `pretrained/TASK`, or a policy from elsewhere.
+def _policy(options: Options) -> tuple[SavedPolicy | ForeignPolicy, str]:
+    """Return the policy that the options name, and the first part of the names of files.
 
     Raises:
         ConfigError: there is no such policy, or the options do not fit it.
     """
     from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
-    from jaxsafe.commands.environment_choice import EnvironmentChoice, differences
-    from jaxsafe.commands.policy_source import pop_source
     from jaxsafe.train.host import run_directory
 
-    chosen = EnvironmentChoice.pop(arguments)
-    elsewhere = pop_source(arguments, run, chosen)
+    run, seed = options.run, options.seed
+    foreign = options.is_foreign()
     single = is_single(run)
-    arguments.refuse_beside(
-        ["seed"] if elsewhere or single else [], f"beside {run}, which is a single policy"
-    )
-    seed = arguments.pop_seed()
-    if elsewhere:
-        return elsewhere.read(), f"{Path(run).stem}_{elsewhere.task}"
+    if foreign or single:
+        options.refuse_beside(["seed"], f"beside {run}, which is a single policy")
+    if foreign:
+        return options.read_foreign(), f"{Path(run).stem}_{options.task}"
     if not single:
         # Reading the run imports the modules of which a user's environment is made.
         run_directory.read(Path(run), "run")
@@ -166,7 +188,7 @@ def _policy(arguments: Arguments, run: str) -> tuple[SavedPolicy | ForeignPolicy
             )
     path = find_policy(run) if single else Path(run) / "policy" / f"seed_{seed}.npz"
     saved = read_policy(path)
-    env = chosen.change(saved.env, str(saved.about.get("env", path.stem)), run)
+    env = options.change(saved.env, str(saved.about.get("env", path.stem)))
     if told := differences(saved.env, env):
         print(told)
     return saved._replace(env=env), path.stem if single else f"{Path(run).name}_{path.stem}"
@@ -208,16 +230,10 @@ def _require_finite(run: str, saved: SavedPolicy | ForeignPolicy) -> None:
             )
 
 
-def _one_of(name: str, value: str, known: Sequence[str]) -> str:
-    if value not in known:
-        raise ConfigError(f"{name}: found {value!r}; choose from {nearest(value, known)}")
-    return value
-
-
 def _vnnlib(
     unrolled: Exported,
     looped: Exported,
-    given: dict[str, object],
+    given: Mapping[str, object],
     path: Path,
     about: dict[str, str],
 ) -> int:
@@ -257,7 +273,7 @@ def _vnnlib(
     return 0
 
 
-def _box(names: Sequence[str], given: dict[str, object]) -> list[tuple[float, float]]:
+def _box(names: Sequence[str], given: Mapping[str, object]) -> list[tuple[float, float]]:
     """Return the interval of each element of the state at a start.
 
     An interval is found by the name of the element, by the name of its field, or by the name of the
@@ -299,38 +315,6 @@ def _is_interval(value: Any) -> TypeGuard[Sequence[float]]:
     return numbers and -MAX_BOUND <= value[0] <= value[1] <= MAX_BOUND
 
 
-def usage() -> str:
-    """Return the help text."""
-    return (
-        "usage: python -m jaxsafe.export run=RUN [key=value …]\n\n"
-        "  run=RUN             a run directory, a policy file (.npz), or pretrained/TASK\n"
-        "  seed=N              which policy of a run (default 0)\n"
-        "  run=FILE env=TASK   a policy from elsewhere: .onnx, "
-        "or .npz with kernel_0, bias_0, … (activation=tanh);\n"
-        "                      actions=discrete if it gives logits\n"
-        "  env=TASK|FILE.yaml  another environment of the same observation and action "
-        "(default: that of the training)\n"
-        "  env.PATH=VALUE, variant=…, rta=…   change it, as in jaxsafe.evaluate\n"
-        "  format=onnx         a graph of opset 17 with a fixed batch (default); "
-        "needs the extra `export`\n"
-        "  format=stablehlo    a jax.export artefact, any batch\n"
-        "  format=vnnlib       the closed loop over steps as ONNX, "
-        "the property that no safety margin is negative from\n"
-        "                      any start in the box as VNN-LIB, "
-        "and the worst start that a search finds\n"
-        "  inputs=observation  from the paper's observation to the action, "
-        "features included (default)\n"
-        "  inputs=network      from the features to the output of the network: "
-        "matrix products and tanh\n"
-        "  inputs=state        from the state at a start to the control in physical units\n"
-        "  batch=N             (default 1)\n"
-        "  steps=N             of the closed loop (default 40)\n"
-        "  box.FIELD=[a,b]     starts of the property "
-        "(default position [70, 106], velocity [-0.28, 0.28])\n"
-        "  out=FILE            (default: the policy's name)"
-    )
-
-
 def command() -> None:
     """Run the command on the words of the command line."""
-    cli.run(main, usage)
+    cli.run(main, Options)

@@ -1,8 +1,8 @@
-"""The command `python -m jaxsafe.rta.falsify env=docking2d rta=default` tries to break a filter.
+"""Let adversaries try to break a filter of run time assurance, and count what happens.
 
-It counts what happened. Every adversary acts on whole episodes from the task's own starts. The last
-one searches for sequences of controls that defeat the filter. Violations are counted at the samples
-and inside the steps, see `jaxsafe.evaluate.run_adversaries.attack`.
+Every adversary acts on whole episodes from the task's own starts. The last one searches for
+sequences of controls that defeat the filter. Violations are counted at the samples and inside the
+steps, see `jaxsafe.evaluate.run_adversaries.attack`. The exit code is 1 if there was a violation.
 """
 
 from __future__ import annotations
@@ -11,12 +11,19 @@ import json
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from jaxsafe.commands import cli
-from jaxsafe.config.arguments import Arguments
+from jaxsafe.commands.environment_options import TaskOptions
+from jaxsafe.commands.options import Count, File, Option, Seed
+from jaxsafe.config.arguments import MAX_COUNT
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
+from jaxsafe.evaluate.adversaries import ADVERSARIES
+from jaxsafe.evaluate.run_adversaries import SEARCH, attack, longest_episode
+from jaxsafe.schema.component import Range
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage import provenance
+from jaxsafe.storage.files import write_text
 
 MOST_STEPS = 1_000_000
 """Largest number of steps of each adversary where `steps` is not given.
@@ -24,7 +31,33 @@ MOST_STEPS = 1_000_000
 Episodes that are longer than this allows are cut.
 """
 
-OPTIONS = ("env", "rta", "steps", "lanes", "seed", "policies", "actions", "variant", "out")
+POLICIES = (*ADVERSARIES, SEARCH)
+"""Names of all adversaries."""
+
+
+class Options(TaskOptions):
+    """The options of `jaxsafe falsify`."""
+
+    env: Annotated[str, Option(examples=("env=docking3d",))]
+    """The task to attack, or the file of an environment."""
+    rta: str | None = None
+    """The filter to attack. With none the environment is attacked without a filter.
+
+    By default it is the recommended filter of the task, or the one that the file has.
+    """
+    num_envs: Annotated[int, Range(1, largest=MAX_COUNT), Option(alias="lanes")] = 64
+    """Number of episodes that run side by side."""
+    steps: Count | None = None
+    """Number of steps of each adversary in all episodes together.
+
+    By default the episodes are whole, up to a million steps.
+    """
+    policies: Annotated[tuple[str, ...], Option(kind="policy", names=POLICIES)] | None = None
+    """The adversaries, in brackets if there are several. By default all of them act in turn."""
+    seed: Seed = 0
+    """Seed of the starts and of the adversaries."""
+    out: File | None = None
+    """A .json file for the numbers."""
 
 
 def report(rows: Sequence[dict[str, Any]]) -> str:
@@ -71,47 +104,29 @@ def main(argv: Sequence[str]) -> int:
     enable_compilation_cache()
     import jax
 
-    from jaxsafe.envs import default_filter, make
-    from jaxsafe.evaluate.adversaries import ADVERSARIES
-    from jaxsafe.evaluate.run_adversaries import SEARCH, attack, longest_episode
-    from jaxsafe.schema.errors import ConfigError, nearest
-    from jaxsafe.storage.files import write_text
-
-    arguments = Arguments.parse(argv)
-    task, out = arguments.pop_text("env"), arguments.pop_text("out")
-    options: dict[str, Any] = {
-        name: arguments.pop_text(name) for name in ("rta", "variant", "actions")
-    }
-    changes = arguments.pop_overrides()
-    steps = arguments.pop_count("steps", MOST_STEPS) if "steps" in arguments.options else None
-    lanes = arguments.pop_count("lanes", 64)
-    known = (*ADVERSARIES, SEARCH)
-    seed, policies = arguments.pop_seed(), arguments.pop("policies", list(known))
-    arguments.refuse_rest([*OPTIONS, "env.…"])
-    if task is None:
-        raise ConfigError("env: missing; for instance env=docking3d")
-    for name in policies if isinstance(policies, list) else [policies]:
-        if name not in known:
-            raise ConfigError(
-                f"policies: unknown policy {name!r}; choose from {nearest(name, known)}"
-            )
-    options["rta"] = options["rta"] or default_filter(task)
-    env = make(task, changes, **options)
+    options = Options.parse(argv)
+    rta = options.filter_or_default()
+    env = options.replace(rta=rta).make(options.env)
     if not env.constraints:
-        raise ConfigError(f"env: {task} has no safety constraint")
+        raise ConfigError(f"env: {options.env} has no safety constraint")
     facts: dict[str, Any] = {
         "command": f"python -m jaxsafe.rta.falsify {shlex.join(argv)}",
         "commit": provenance.commit(),
+        "versions": provenance.versions(),
+        "env": options.env,
+        "rta": rta,
+        "variant": options.variant,
+        "actions": options.actions,
+        "seed": options.seed,
     }
-    facts |= {"versions": provenance.versions(), "env": task, **options, "seed": seed}
     length = (
-        min(longest_episode(env), max(1, MOST_STEPS // lanes))
-        if steps is None
-        else -(-steps // lanes)
+        min(longest_episode(env), max(1, MOST_STEPS // options.num_envs))
+        if options.steps is None
+        else -(-options.steps // options.num_envs)
     )
     rows = []
-    for name in policies if isinstance(policies, list) else [policies]:
-        rows.append(attack(env, name, length, lanes, jax.random.key(seed)))
+    for name in options.policies or POLICIES:
+        rows.append(attack(env, name, length, options.num_envs, jax.random.key(options.seed)))
         print(
             report(rows[-1:]).splitlines()[1]
             if len(rows) > 1
@@ -119,34 +134,18 @@ def main(argv: Sequence[str]) -> int:
             flush=True,
         )
         # The file is written after each adversary, so that nothing is lost if the run is stopped.
-        if out:
+        if options.out:
             write_text(
-                Path(out),
+                Path(options.out),
                 json.dumps({**facts, "policies": rows}, indent=1, ensure_ascii=False) + "\n",
             )
     if report(rows).splitlines()[-1].endswith("confidence"):
         print(report(rows).splitlines()[-1])
-    if out:
-        print(f"written to {out}")
+    if options.out:
+        print(f"written to {options.out}")
     return int(any(map(violated, rows)))
-
-
-def usage() -> str:
-    """Return the help text."""
-    return (
-        "usage: python -m jaxsafe.rta.falsify env=TASK [key=value …]\n\n"
-        "  rta=default            the filter to attack (that of a file: its own); "
-        "none attacks the bare task\n"
-        "  lanes=N                episodes at once (default 64)\n"
-        "  steps=N                steps of each adversary over all of them "
-        "(default: whole episodes, up to a million)\n"
-        "  policies=[a,b]         some adversaries only\n"
-        "  seed=N                 (default 0)\n"
-        "  env.PATH=VALUE         change the environment\n"
-        "  out=FILE.json          write the numbers"
-    )
 
 
 def command() -> None:
     """Run the command on the words of the command line."""
-    cli.run(main, usage)
+    cli.run(main, Options)

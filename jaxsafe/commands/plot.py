@@ -1,50 +1,54 @@
-"""The command `python -m jaxsafe.plot run=runs/x` draws the paper's figures.
+"""Draw the paper's figures of a run from its log files, into RUN/figures.
 
-It draws them from the run's own log files. Several runs are drawn in one figure.
+With several runs of one task, draw their curves in one figure and print a table of their results.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
 from jaxsafe.commands import cli
-from jaxsafe.config.arguments import Arguments
-from jaxsafe.schema.errors import ConfigError, nearest
+from jaxsafe.commands.options import CommandOptions, File, Option
+from jaxsafe.schema.errors import ConfigError
+
+
+class Options(CommandOptions):
+    """The options of `jaxsafe plot`."""
+
+    run: Annotated[
+        tuple[str, ...],
+        Option(
+            examples=("run=runs/docking3d", "run=[runs/a,runs/b]"),
+            takes="a directory, or several in brackets",
+        ),
+    ]
+    """The run directories."""
+    x: Annotated[Literal["steps", "wall"], Option(kind="axis")] = "steps"
+    """The horizontal axis: environment steps of a seed, or wall time."""
+    out: File = "comparison.png"
+    """File of the figure of several runs. The figures of a single run are in its directory."""
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command and return its exit code."""
     from jaxsafe.commands.run_figures import draw_all
-    from jaxsafe.plot.figures import AXES
     from jaxsafe.train.host import run_directory
 
-    arguments = Arguments.parse(argv)
-    several = isinstance(arguments.options.get("run"), list)
-    arguments.refuse_beside(
-        [] if several else ["out"], "but for several runs, which run=[A,B] draws in one figure"
-    )
-    run, x = (
-        arguments.pop("run") if several else arguments.pop_text("run"),
-        arguments.pop_text("x") or "steps",
-    )
-    out = Path(arguments.pop_text("out") or "comparison.png")
-    arguments.refuse_rest(["run", "x", "out"])
-    if run is None:
-        raise ConfigError("run: missing; for instance run=runs/docking3d or run=[runs/a,runs/b]")
-    if x not in AXES:
-        raise ConfigError(f"x: unknown axis {x!r}; choose from {nearest(x, AXES)}")
-    if several:
-        _compare(run, x, out)
+    options = Options.parse(argv)
+    if isinstance(options.given["run"], list):
+        _compare(options.run, options.x, Path(options.out))
         return 0
-    run_directory.read(Path(run), "run")
-    for path in draw_all(Path(run), x):  # type: ignore[arg-type]
+    options.refuse_beside(["out"], "but for several runs, which run=[A,B] draws in one figure")
+    [run] = map(Path, options.run)
+    run_directory.read(run, "run")
+    for path in draw_all(run, options.x):
         print(path)
     return 0
 
 
-def _compare(runs: Sequence[Any], x: str, out: Path) -> None:
+def _compare(runs: Sequence[str], x: str, out: Path) -> None:
     """Draw several runs in one figure and print a table of their results.
 
     Each run appears under the name of its directory.
@@ -63,11 +67,10 @@ def _compare(runs: Sequence[Any], x: str, out: Path) -> None:
     from jaxsafe.train.host import run_directory
     from jaxsafe.train.host.results import summary
 
-    paths = {Path(str(run)).name: Path(str(run)) for run in runs}
+    paths = {Path(run).name: Path(run) for run in runs}
     if len(paths) < len(runs) or len(runs) < 2:
         raise ConfigError(
-            "run: expected several directories of different names, "
-            f"found {', '.join(map(str, runs))}"
+            f"run: expected several directories of different names, found {', '.join(runs)}"
         )
     tasks = {run_directory.read(path, "run")[2] for path in paths.values()}
     if len(tasks) > 1:
@@ -83,16 +86,6 @@ def _compare(runs: Sequence[Any], x: str, out: Path) -> None:
     print(save(figure, out))
 
 
-def usage() -> str:
-    """Return the help text."""
-    return (
-        "usage: python -m jaxsafe.plot run=RUN [x=steps|wall]\n"
-        "       python -m jaxsafe.plot 'run=[RUN,RUN,…]' [x=steps|wall] [out=comparison.png]\n\n"
-        "  draws into RUN/figures from RUN's log files; "
-        "or the curves of several runs of one task, with a table of results"
-    )
-
-
 def command() -> None:
     """Run the command on the words of the command line."""
-    cli.run(main, usage)
+    cli.run(main, Options)

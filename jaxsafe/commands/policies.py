@@ -11,7 +11,7 @@ import numpy as np
 from jaxsafe.agents.agent import Agent, Params
 from jaxsafe.agents.imported_policy import ForeignAgent
 from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
-from jaxsafe.commands.policy_source import Source
+from jaxsafe.commands.policy_options import PolicyOptions
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.schema.errors import ConfigError
@@ -45,35 +45,36 @@ class Subject(NamedTuple):
     """Directory into which evaluations of the policies are written."""
 
 
-def load_foreign(source: Source) -> Subject:
+def load_foreign(options: PolicyOptions) -> Subject:
     """Return a policy that was trained elsewhere, to act in a task.
 
     Which files can be read stands in `jaxsafe.agents.imported_policy`.
 
     Args:
-        source: the policy, as a command names it.
+        options: the options of the command, which name the policy and the task.
 
     Raises:
         ConfigError: there is no such task, or the policy does not fit it.
     """
-    policy, mapper = source.read(), SeedMapper(1)
+    policy, mapper = options.read_foreign(), SeedMapper(1)
     params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], policy.params))
+    path = Path(options.run)
     about = {
-        "env": source.task,
-        "preset": source.path.name,
+        "env": options.task,
+        "preset": path.name,
         "algorithm": "unknown",
         "seeds": 1,
         "seed": 0,
         "steps": 0,
     }
     return Subject(
-        source.task,
-        policy.env,
-        policy.agent,
-        mapper,
-        params,
-        about,
-        Path("evaluations") / source.path.stem,
+        name=options.task,
+        env=policy.env,
+        agent=policy.agent,
+        mapper=mapper,
+        params=params,
+        facts=about,
+        place=Path("evaluations") / path.stem,
     )
 
 

@@ -1,27 +1,48 @@
-"""The command `python -m jaxsafe.train env=docking3d seeds=10` trains policies.
+"""Train all seeds of a task, evaluate them, draw figures and print a table.
 
-It trains all seeds, evaluates them, draws figures and prints a table.
+Everything is kept in a run directory, and a training that was stopped goes on with resume=RUN.
+Steps and episodes are counted for each seed.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any
 
 from jaxsafe.commands import cli
-from jaxsafe.config.arguments import Arguments
+from jaxsafe.commands.environment_options import Overrides
+from jaxsafe.commands.options import CommandOptions, Directory, Option
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores
+from jaxsafe.train.host.options import TrainConfig, resolve_all
 
 if TYPE_CHECKING:
     from jaxsafe.train.host.session import Training
 
 BEGAN = time.monotonic()
 """Time [s] at which the command began. The clock of the first run starts then."""
+
+
+class Options(CommandOptions):
+    """The options of `jaxsafe train`."""
+
+    env: Annotated[str, Option(examples=("env=docking3d",))] | None = None
+    """A task, the file of an environment, or all for the five tasks one after another.
+
+    It is left out only with resume.
+    """
+    overrides: Overrides
+    """Change one field of the environment, for instance env.reward.delta_v.scale=-0.02."""
+    resume: Directory | None = None
+    """The run to go on with. Beside it there is no other option but distributed."""
+    distributed: bool = False
+    """Whether this is one of several processes that srun or mpirun started."""
+    training: Annotated[Mapping[str, Any], Option(prefix="", component=TrainConfig)]
+    """The options of the training."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -34,18 +55,17 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.schema.errors import ConfigError
     from jaxsafe.storage.files import read_json
     from jaxsafe.train.host import run_directory
-    from jaxsafe.train.host.options import resolve_all
     from jaxsafe.train.host.results import summary
 
-    arguments = Arguments.parse(argv)
-    if arguments.pop_flag("distributed"):
+    options = Options.parse(argv)
+    if options.distributed:
         processes.join()
-    resume = arguments.pop_text("resume")
+    resume = options.resume
     if resume is None:
-        resolved = resolve_all(arguments.options)
+        resolved = resolve_all(options.without("resume", "distributed"))
         path = Path(processes.from_leader(lambda: str(run_directory.create_all(resolved))))
     else:
-        arguments.refuse_rest(["resume", "distributed"])
+        options.refuse_others("resume", "distributed")
         path = Path(resume)
     runs = run_directory.runs(path)
     try:
@@ -157,13 +177,6 @@ def _open(run: Path, files: ExitStack, began: float) -> Training:
     return Training(config, env, name, own, Clock(time.monotonic() - began), run)
 
 
-def usage() -> str:
-    """Return the help text."""
-    from jaxsafe.train.host.options import usage
-
-    return usage()
-
-
 def command() -> None:
     """Run the command on the words of the command line."""
-    cli.run(main, usage, cli.at_once)
+    cli.run(main, Options, cli.at_once)

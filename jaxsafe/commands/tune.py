@@ -1,23 +1,62 @@
-"""The command `python -m jaxsafe.tune` trains every setting of a sweep and ranks the settings.
+"""Train many settings of the options of a training as one program, and rank them.
 
-For example: `python -m jaxsafe.tune env=docking2d seeds=4 'sweep.ppo.gamma=[0.95,0.97]'`.
+Several options of a sweep make a grid of all combinations, or samples=N draws some of them. A sweep
+that was stopped goes on with resume=DIR, which stands alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Annotated, Any, Literal
 
 from jaxsafe.commands import cli
+from jaxsafe.commands.options import CommandOptions, Count, Directory, Option, Seed
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores
+from jaxsafe.schema.component import Range
+from jaxsafe.tune.settings import MAX_SETTINGS, PREFIX, alike, pop_sweep, settings
 
-RANKS = ("steps", "success", "deterministic")
-"""Orders of the table of settings. The first is the default."""
+OWN = ("resume", "rank", "samples", "draw", "out")
+"""Options of the sweep, which are not those of its trainings."""
 
-EPISODES = 200
-"""Number of episodes in the evaluation of each seed, unless the user says otherwise."""
+
+class Options(CommandOptions):
+    """The options of `jaxsafe tune`."""
+
+    env: Annotated[str, Option(examples=("env=docking2d",))] | None = None
+    """The task, or the file of an environment. It is left out only with resume."""
+    sweep: Annotated[
+        Mapping[str, Any],
+        Option(
+            examples=("sweep.ppo.gamma=[0.95,0.97]",),
+            prefix=PREFIX,
+            placeholder="OPTION",
+            takes="a list [a,b,…], or in quotes uniform(low,high) or log(low,high)",
+        ),
+    ]
+    """Values of an option of `jaxsafe train`, or of env.PATH.
+
+    From an interval of numbers values are drawn, which needs samples=N.
+    """
+    samples: Annotated[int, Range(1, largest=MAX_SETTINGS)] | None = None
+    """Number of settings to draw. By default all combinations are trained."""
+    draw: Seed = 0
+    """Seed of the draws. Another one chooses other settings."""
+    rank: Annotated[Literal["steps", "success", "deterministic"], Option(kind="order")] = "steps"
+    """Order of the table: by steps to 80 % success in training, or by success at the end.
+
+    The success at the end is that of the stochastic or of the deterministic policies.
+    """
+    episodes: Count = 200
+    """Number of episodes in the evaluation of each seed."""
+    resume: Directory | None = None
+    """The directory of the sweep to go on with."""
+    out: Directory | None = None
+    """Where to write. By default it is a new directory in runs/."""
+    training: Annotated[Mapping[str, Any], Option(prefix="", placeholder="OPTION", takes="a value")]
+    """Any option of `jaxsafe train`, such as seeds=4, the same for all settings."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -26,32 +65,21 @@ def main(argv: Sequence[str]) -> int:
     enable_compilation_cache()
     from tqdm import tqdm
 
-    from jaxsafe.schema.errors import ConfigError, nearest, show
     from jaxsafe.train.host import run_directory
     from jaxsafe.tune import results
     from jaxsafe.tune.lanes import train_all
-    from jaxsafe.tune.settings import MAX_SETTINGS, alike, pop_sweep, settings
 
-    arguments, path = Arguments.parse(argv), None
-    resume = arguments.pop_text("resume")
+    options, path = Options.parse(argv), None
+    resume = options.resume
     if resume is not None:
-        arguments.refuse_rest(["resume"])
-        path, arguments = Path(resume), results.read_request(Path(resume))
-    request, out = dict(arguments.options), arguments.pop_text("out")
-    rank = arguments.pop("rank", RANKS[0])
-    if rank not in RANKS:
-        raise ConfigError(f"rank: unknown order {show(rank)}; choose from {nearest(rank, RANKS)}")
-    samples = (
-        arguments.pop_count("samples", 1, most=MAX_SETTINGS)
-        if "samples" in arguments.options
-        else None
-    )
-    draw = arguments.pop_seed("draw")
-    arguments.options.setdefault("episodes", EPISODES)
+        options.refuse_others("resume")
+        path = Path(resume)
+        options = Options.read(results.read_request(path).options)
+    arguments = Arguments({"episodes": options.episodes, **options.without(*OWN)})
     sweep = pop_sweep(arguments)
-    found = settings(arguments, sweep, samples, draw)
+    found = settings(arguments, sweep, options.samples, options.draw)
     if path is None:
-        path = results.create(out, request, found[0])
+        path = results.create(options.out, options.without(), found[0])
     else:
         results.refuse_other(path, found[0])
     rows = results.read(path, found)
@@ -79,28 +107,10 @@ def main(argv: Sequence[str]) -> int:
             f"go on with: python -m jaxsafe.tune resume={path}"
         )
         return cli.INTERRUPTED
-    print(results.finish(path, rows, list(sweep), rank))
+    print(results.finish(path, rows, list(sweep), options.rank))
     return 0
-
-
-def usage() -> str:
-    """Return the help text."""
-    return (
-        "usage: python -m jaxsafe.tune env=TASK 'sweep.OPTION=[a,b,…]' [key=value …]"
-        "      or      resume=DIR\n\n"
-        "  sweep.OPTION=[a,b]     values of an option of jaxsafe.train, or of env.PATH; "
-        "several make a grid\n"
-        "  sweep.OPTION='log(1e-4,1e-2)' or 'uniform(0.9,1)'   an interval to draw from, "
-        "with samples=N\n"
-        "  samples=N              draw N settings instead of trying all combinations; "
-        "draw=SEED chooses others\n"
-        "  rank=steps|success|deterministic   order of the table "
-        "(default steps to 80 % success in training)\n"
-        "  seeds, steps, episodes, …   any option of jaxsafe.train, the same for all settings\n"
-        "  out=DIR                where to write (default: a new directory in runs/)"
-    )
 
 
 def command() -> None:
     """Run the command on the words of the command line."""
-    cli.run(main, usage, cli.at_once)
+    cli.run(main, Options, cli.at_once)

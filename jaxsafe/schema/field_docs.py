@@ -24,7 +24,7 @@ def field_docs(cls: type[Component]) -> dict[str, str]:
     docs = {name: text for texts in inherited for name, text in texts.items()}
     try:
         tree = ast.parse(textwrap.dedent(inspect.getsource(cls)))
-    except OSError:
+    except (OSError, TypeError):
         return docs
     definition = tree.body[0]
     assert isinstance(definition, ast.ClassDef)

@@ -45,7 +45,7 @@ def fails(
     def run(module: object, *words: str) -> str:
         monkeypatch.setattr(sys, "argv", ["jaxsafe", *words])
         with pytest.raises(SystemExit) as exit_info:
-            cli.run(module.main, module.usage)  # type: ignore[attr-defined]
+            cli.run(module.main, module.Options)  # type: ignore[attr-defined]
         captured = capsys.readouterr()
         assert exit_info.value.code == 2
         assert captured.err.count("\n") == 1
@@ -388,9 +388,9 @@ def test_help_names_the_options(
     command = {"train": train, "evaluate": evaluate, "plot": plot, "config": config}[module]
     monkeypatch.setattr(sys, "argv", ["jaxsafe", "--help"])
     with pytest.raises(SystemExit) as exit_info:
-        cli.run(command.main, command.usage)
+        cli.run(command.main, command.Options)
     assert exit_info.value.code == 0
-    assert f"usage: python -m jaxsafe.{module}" in capsys.readouterr().out
+    assert f"usage: jaxsafe {module}" in capsys.readouterr().out
 
 
 def test_import_draws_in_only_what_the_core_needs() -> None:
@@ -528,7 +528,7 @@ def test_a_warning_is_one_line_and_the_command_goes_on(
     monkeypatch.setattr(sys, "argv", ["jaxsafe", "docking2d", "env.terminal.timeout.limit=50"])
     monkeypatch.setattr(warnings, "filters", [("default", None, Warning, None, 0)])
     with pytest.raises(SystemExit) as exit_info:
-        cli.run(config.main, config.usage)
+        cli.run(config.main, config.Options)
     captured = capsys.readouterr()
     assert exit_info.value.code == 0
     assert captured.err.startswith(

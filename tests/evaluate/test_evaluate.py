@@ -9,10 +9,9 @@ import pytest
 from PIL import Image
 
 import jaxsafe
-from jaxsafe.commands.environment_choice import EnvironmentChoice, differences
 from jaxsafe.commands.evaluate import main
+from jaxsafe.commands.policy_options import PolicyOptions, differences
 from jaxsafe.config import dump
-from jaxsafe.config.arguments import Arguments
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.evaluate import episodes as episodes_module
 from jaxsafe.evaluate import evaluator as seeds_module
@@ -199,8 +198,8 @@ def test_a_change_of_the_observation_is_refused(whole: Path) -> None:
         main([f"run={whole}", "env.observation=[velocity,position,speed,velocity_limit]"])
 
 
-def chosen(*words: str) -> EnvironmentChoice:
-    return EnvironmentChoice.pop(Arguments.parse(words))
+def chosen(*words: str) -> PolicyOptions:
+    return PolicyOptions.parse(["run=x", *words])
 
 
 def test_a_policy_acts_in_another_environment_that_fits_it(tmp_path: Path) -> None:
@@ -210,12 +209,12 @@ def test_a_policy_acts_in_another_environment_that_fits_it(tmp_path: Path) -> No
     file.write_text(
         dump(jaxsafe.make("docking2d", {"deputy.mass": 24.0, "terminal.timeout.limit": 100.0}))
     )
-    other = chosen(f"env={file}", "env.deputy.mass=30").change(own, name, "x")
+    other = chosen(f"env={file}", "env.deputy.mass=30").change(own, name)
     assert float(other.platform("deputy").mass) == 30.0  # type: ignore[attr-defined]
     assert float(other.terminal[-1].limit) == 100.0  # type: ignore[attr-defined]
-    assert dump(chosen("env=docking2d").change(own, name, "x")) == dump(jaxsafe.make("docking2d"))
-    assert dump(chosen().change(own, name, "x")) == dump(own)
-    released = chosen("variant=released").change(own, name, "x")
+    assert dump(chosen("env=docking2d").change(own, name)) == dump(jaxsafe.make("docking2d"))
+    assert dump(chosen().change(own, name)) == dump(own)
+    released = chosen("variant=released").change(own, name)
     assert float(released.platform("deputy").mass) == 14.0  # type: ignore[attr-defined]
     assert released.outcomes == jaxsafe.make("docking2d", variant="released").outcomes
 
@@ -279,14 +278,14 @@ def test_an_environment_that_does_not_fit_is_refused(
     (tmp_path / "mine.yaml").write_text(dump(jaxsafe.make("docking2d", other_order)))
     words = [word.replace("FILE", str(tmp_path / "mine.yaml")) for word in words]
     with pytest.raises(ConfigError, match=message) as raised:
-        chosen(*words).change(jaxsafe.make("docking2d", actions=actions), "docking2d", "x")
+        chosen(*words).change(jaxsafe.make("docking2d", actions=actions), "docking2d")
     assert "\n" not in str(raised.value)
 
 
 def test_a_discrete_policy_is_evaluated_where_actions_are_discrete() -> None:
     own = jaxsafe.make("docking2d", actions="discrete")
     env = chosen("env=docking2d", "actions=discrete", "rta=explicit_simplex").change(
-        own, "docking2d", "x"
+        own, "docking2d"
     )
     assert env.num_action_points == (11, 11)
     assert env.rta is not None
@@ -295,11 +294,10 @@ def test_a_discrete_policy_is_evaluated_where_actions_are_discrete() -> None:
 def test_what_is_defined_otherwise_than_in_training_is_told() -> None:
     own = jaxsafe.make("docking2d")
     assert (
-        differences(own, chosen("env.deputy.mass=24", "rta=default").change(own, "docking2d", "x"))
-        == ""
+        differences(own, chosen("env.deputy.mass=24", "rta=default").change(own, "docking2d")) == ""
     )
     words = ["env.observation.position.scale=10", "env.deputy.controller.actuators.thrust_y.high=2"]
-    told = differences(own, chosen(*words).change(own, "docking2d", "x"))
+    told = differences(own, chosen(*words).change(own, "docking2d"))
     assert told == "defined otherwise than in training: observation position, actuator thrust_y"
 
 

@@ -72,7 +72,7 @@ def test_episodes_are_what_is_counted_and_whole_ones_unless_told_otherwise(
     )
     assert (cut["whole_episodes"], cut["episodes"], cut["violation_bound"]) == (False, 5, 3.0 / 5)
     assert (
-        main(["env=docking2d", "lanes=5", "policies=[uniform]", "env.terminal.timeout.limit=30"])
+        main(["env=docking2d", "num_envs=5", "policies=[uniform]", "env.terminal.timeout.limit=30"])
         == 0
     )
     printed = capsys.readouterr().out

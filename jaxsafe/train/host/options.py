@@ -19,8 +19,8 @@ from jaxsafe.environment import Environment, require_success
 from jaxsafe.envs import TASKS, make, short_name
 from jaxsafe.processors.reward import Intervention
 from jaxsafe.schema import yaml12
-from jaxsafe.schema.component import Component, Range, fields, normalise
-from jaxsafe.schema.convert import expects, to_value
+from jaxsafe.schema.component import Component, Range, normalise
+from jaxsafe.schema.convert import to_value
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.train.host.log import tensorboard_writer
@@ -51,49 +51,57 @@ class TrainConfig(Component):
     """Options of `python -m jaxsafe.train`. Steps and episodes are counted for each seed."""
 
     preset: str = "features"
+    """The recipe of the task: features, plain, lanes or quick.
+
+    Its values take the place of the defaults of other options.
+    """
     algorithm: Literal["ppo", "ppo_lagrangian"] = "ppo"
+    """The algorithm. `ppo_lagrangian` also keeps the violating steps below `cost_limit`."""
     cost_limit: Annotated[Dimensionless, Positive] | None = None
     """Number of violating steps that an episode may have, with `algorithm=ppo_lagrangian`."""
     seeds: Annotated[int, Range(1, largest=MAX_SEEDS)] = 1
+    """Number of seeds, which are trained as one program."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
     """The first seed. With `seeds=10` the seeds are seed … seed + 9."""
     devices_per_seed: Count | None = None
     """Number of devices that share the environments of a seed.
 
-    None stands for as many as there are, while each has work.
+    By default as many as there are share them, while each has work.
     """
     steps: Steps = 500_000
+    """Number of environment steps of each seed."""
     actions: Literal["continuous", "discrete"] | None = None
-    """The kind of actions. None stands for what the environment says."""
+    """The kind of actions. By default it is what the environment says."""
     variant: Literal["paper", "released"] | None = None
-    """The variant of the environment. None stands for `paper`."""
+    """The variant of the environment. By default it is `paper`."""
     rta: str | None = None
     """The run time assurance: `default`, or another preset of the task.
 
-    None stands for what the environment says.
+    By default it is what the environment says.
     """
     rta_training: Literal["punished", "unpunished", "corrected"] | None = None
     """How training treats interventions of run time assurance.
 
-    `punished` adds a reward term for them, and `corrected` learns from the control that acted. None
-    stands for `punished`, where there is a filter.
+    `punished` adds a reward term for them, and `corrected` learns from the control that acted. By
+    default it is `punished`, where there is a filter.
     """
     out: str | None = None
-    """The run directory. None stands for a new directory in runs/."""
+    """The run directory. By default it is a new directory in runs/."""
     eval_every: Steps | None = None
-    """Number of steps between two evaluations. None stands for a tenth of the run."""
+    """Number of steps between two evaluations. By default it is a tenth of the run."""
     eval_episodes: Count = 100
     """Number of episodes of each evaluation during training."""
     episodes: Count = 1000
     """Number of episodes of the evaluation at the end."""
     checkpoint_every: Steps | None = None
-    """Number of steps between two checkpoints. None stands for a tenth of the run."""
+    """Number of steps between two checkpoints. By default it is a tenth of the run."""
     log_every: Steps = 100
     """One of so many evaluation episodes is logged step by step.
 
     Some episodes are logged before the first evaluation too.
     """
     tensorboard: bool = False
+    """Whether to write the progress for TensorBoard too. It needs the extra `tensorboard`."""
     agent: Agent = Agent()
     ppo: PPO = PPO()
 
@@ -326,25 +334,6 @@ def configs() -> Path:
     raise ConfigError(
         f"preset: no recipes in {package / 'configs'}; install the package unpacked, as pip does"
     )
-
-
-def usage() -> str:
-    """Return text that names every option, what it takes, and its default."""
-    lines = ["usage: python -m jaxsafe.train env=TASK [key=value …]      or      resume=RUN", ""]
-    lines += [
-        "  distributed=true, beside either: "
-        "this is one of several processes that srun or mpirun started"
-    ]
-    lines += [
-        "  env=TASK, env=FILE.yaml, or env=all for the five tasks one after another, then evaluated"
-    ]
-    lines += ["  env.PATH=VALUE changes it, for instance env.reward.delta_v.scale=-0.02", ""]
-    for section, cls in (("", TrainConfig), ("agent.", Agent), ("ppo.", PPO)):
-        for name, field in fields(cls).items():
-            if not isinstance(field.default, Component):
-                default = "" if field.default is None else f" (default {field.default})"
-                lines.append(f"  {section}{name}={expects(field)}{default}")
-    return "\n".join(lines)
 
 
 def _flatten(tree: Mapping[str, Any], place: str = "") -> dict[str, Any]:

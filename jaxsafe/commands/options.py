@@ -1,0 +1,218 @@
+"""The options of a command: one class that the parser and the help text are made from.
+
+A new option is one line of such a class, and below it the text that explains it. The annotation
+says what the option takes. For instance:
+
+    episodes: Annotated[int, Range(1, largest=MAX_COUNT)] = 1000
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal, Self
+
+from jaxsafe.config import arguments
+from jaxsafe.schema.component import Component, Field, Range, fields, marks
+from jaxsafe.schema.convert import bare
+from jaxsafe.schema.errors import ConfigError, nearest, show
+
+Count = Annotated[int, Range(1, largest=arguments.MAX_COUNT)]
+"""A number of episodes, steps or environments."""
+
+Seed = Annotated[int, Range(0, largest=arguments.MAX_SEED)]
+"""A seed of random numbers. A larger one would give the same numbers as a smaller one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """Mark of an option that says what its type leaves open."""
+
+    examples: tuple[str, ...] = ()
+    """Words to show if the option is missing. The usage line shows the first one."""
+
+    names: tuple[str, ...] = ()
+    """The names to choose from."""
+
+    kind: str = ""
+    """What the names are names of, for the error about an unknown one."""
+
+    takes: str = ""
+    """What the option takes in words, where its type does not say it."""
+
+    alias: str | None = None
+    """An older name, which is accepted too."""
+
+    prefix: str | None = None
+    """What the names of several options begin with.
+
+    The field gets all of them, by the rest of their names. The empty prefix fits all names, so a
+    field with it stands last and gets the options that no other field takes.
+    """
+
+    placeholder: str = ""
+    """What the help text shows after the prefix."""
+
+    component: type[Component] | None = None
+    """The component whose fields are the options of the empty prefix."""
+
+
+Directory = Annotated[str, Option(takes="a directory")]
+
+File = Annotated[str, Option(takes="a file")]
+
+
+class CommandOptions(Component):
+    """The options of every command, and the base of the options of a single one."""
+
+    program: ClassVar[str | None] = None
+    """How the user calls the command. None stands for `jaxsafe` and the name of the module."""
+
+    given: Mapping[str, Any]
+    """The options that the user gave, as the command line reads them."""
+    imports: bool = True
+    """Whether files may name modules to import. Importing runs the code of whoever wrote them."""
+
+    @classmethod
+    def parse(cls, argv: Sequence[str]) -> Self:
+        """Read the words of a command line.
+
+        Raises:
+            ConfigError: as `read`; or a word is not `key=value`, or a key stands twice.
+        """
+        return cls.read(arguments.Arguments.parse(argv).options)
+
+    @classmethod
+    def read(cls, given: Mapping[str, Any]) -> Self:
+        """Check and convert options.
+
+        Args:
+            given: the values by name, as `Arguments.parse` reads them.
+
+        Raises:
+            ConfigError: an option is unknown or missing, or does not take its value.
+        """
+        table = options_of(cls)
+        rest, values = dict(given), {}
+        for name, field in table.items():
+            mark = option(field)
+            for key in (name, mark.alias) if mark.prefix is None else ():
+                if key in rest:
+                    if name in values:
+                        raise ConfigError(f"{key}: is another name of {name}; leave one out")
+                    values[name] = _convert(rest.pop(key), field, key)
+        for name, field in table.items():
+            if (prefix := option(field).prefix) is not None:
+                keys = [key for key in rest if key.startswith(prefix)]
+                values[name] = {key.removeprefix(prefix): rest.pop(key) for key in keys}
+        _refuse(rest, map(shown_name, table.values()))
+        for name, field in table.items():
+            if field.required and name not in values:
+                examples = " or ".join(option(field).examples)
+                raise ConfigError(f"{name}: missing; for instance {examples}")
+        return cls(given=given, **values)
+
+    def refuse_beside(self, names: Iterable[str], situation: str) -> None:
+        """Refuse options that would change nothing.
+
+        Args:
+            names: the options.
+            situation: why they would change nothing, as the end of the message.
+
+        Raises:
+            ConfigError: one of the options was given.
+        """
+        for name in names:
+            if name in self.given:
+                raise ConfigError(f"{name}: means nothing {situation}; leave it out")
+
+    def refuse_others(self, *names: str) -> None:
+        """Refuse all options but these and those of every command.
+
+        Raises:
+            ConfigError: another option was given.
+        """
+        _refuse(self.without(*names), names)
+
+    def without(self, *names: str) -> dict[str, Any]:
+        """Return the options that were given, without these and those of every command."""
+        left_out = (*names, *fields(CommandOptions))
+        return {name: value for name, value in self.given.items() if name not in left_out}
+
+
+def option(field: Field) -> Option:
+    """Return the mark of an option. One without a mark has an empty one."""
+    return next((mark for mark in marks(field.hint) if isinstance(mark, Option)), Option())
+
+
+def options_of(cls: type[CommandOptions]) -> dict[str, Field]:
+    """Return the fields that are options: those which must be given, the command's own, others."""
+    table = fields(cls)
+    names = [name for base in cls.__mro__ for name in inspect.get_annotations(base)]
+    ordered = [table[name] for name in dict.fromkeys(names) if name in table and name != "given"]
+    ordered.sort(key=lambda field: not field.required or option(field).prefix is not None)
+    return {field.name: field for field in ordered}
+
+
+def shown_name(field: Field) -> str:
+    """Return the name of an option. That of several with a prefix has a placeholder in it."""
+    mark = option(field)
+    return field.name if mark.prefix is None else f"{mark.prefix}{mark.placeholder}"
+
+
+def names_of(field: Field) -> Sequence[str]:
+    """Return the names that an option can choose from, or none if it takes something else."""
+    hint = bare(field.hint)
+    return typing.get_args(hint) if typing.get_origin(hint) is Literal else option(field).names
+
+
+def _convert(value: Any, field: Field, key: str) -> Any:
+    """Return the value of an option as its annotation says.
+
+    Args:
+        value: the value as the command line reads it.
+        field: the field of the option.
+        key: the name by which it was given, for error messages.
+
+    Raises:
+        ConfigError: the option does not take this value.
+    """
+    hint = bare(field.hint)
+    if hint is bool:
+        return arguments.flag(value, key)
+    if hint is int:
+        limits = field.range or Range()
+        return arguments.count(value, key, least=limits.low, most=limits.largest)
+    if hint == tuple[float, float]:
+        return _interval(value, field, key)
+    if hint == tuple[str, ...]:
+        items = value if isinstance(value, list) else [value]
+        if not items:
+            takes = ", ".join(names_of(field)) or option(field).takes
+            raise ConfigError(f"{key}: expected at least one of {takes}, found none")
+        return tuple(_name(item, field, key) for item in items)
+    return _name(value, field, key)
+
+
+def _name(value: Any, field: Field, key: str) -> str:
+    name = arguments.text(value, key)
+    names = names_of(field)
+    if names and name not in names:
+        kind = option(field).kind
+        unknown = f"unknown {kind}" if kind else "found"
+        raise ConfigError(f"{key}: {unknown} {show(name)}; choose from {nearest(name, names)}")
+    return name
+
+
+def _interval(value: Any, field: Field, key: str) -> tuple[float, float]:
+    numbers = isinstance(value, list) and all(isinstance(item, (int, float)) for item in value)
+    if not numbers or len(value) != 2 or not value[0] < value[1]:
+        raise ConfigError(f"{key}: expected {option(field).takes}, found {show(value)}")
+    return float(value[0]), float(value[1])
+
+
+def _refuse(given: Iterable[str], known: Iterable[str]) -> None:
+    for name in given:
+        raise ConfigError(f"{name}: unknown option; choose from {nearest(name, known)}")
