@@ -3,6 +3,7 @@
 One more environment, composed in YAML, keeps them too.
 """
 
+import itertools
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from default_cases import one_of_each_kind, thorough
 from jax.flatten_util import ravel_pytree
 
 import jaxsafe
@@ -25,6 +27,13 @@ CUSTOM = "custom_env"
 VARIANTS = [(task, actions) for task in (*TASKS, CUSTOM) for actions in ("continuous", "discrete")][
     :-1
 ]
+BY_DEFAULT = (
+    ("docking2d", "continuous"),
+    ("docking2d", "discrete"),
+    ("rejoin2d", "continuous"),
+    (CUSTOM, "continuous"),
+)
+"""Variants of which the default suite tests every law."""
 REJOIN = [task for task in TASKS if task.startswith("rejoin")]
 NUM_STEPS = 40
 NUM_ENVS = 5
@@ -103,7 +112,11 @@ def build(task: str, actions: str = "continuous", **options: Any) -> Environment
     return jaxsafe.make(str(path) if task == CUSTOM else task, actions=actions, **options)
 
 
-@pytest.fixture(scope="module", params=VARIANTS, ids="-".join)
+@pytest.fixture(
+    scope="module",
+    params=[variant if variant in BY_DEFAULT else thorough(variant) for variant in VARIANTS],
+    ids="-".join,
+)
 def variant(request: pytest.FixtureRequest) -> tuple[str, str]:
     return request.param
 
@@ -472,8 +485,13 @@ def test_everything_stays_finite_at_the_edges_of_space(env: Environment, task: s
     chex.assert_tree_all_finite(run(env, state, random_actions(env, NUM_ENVS, NUM_STEPS)))
 
 
-@pytest.mark.parametrize("actions", ["continuous", "discrete"])
-@pytest.mark.parametrize("task", [*REJOIN, "docking2d_oriented"])
+@pytest.mark.parametrize(
+    ("task", "actions"),
+    one_of_each_kind(
+        itertools.product([*REJOIN, "docking2d_oriented"], ["continuous", "discrete"]),
+        [("rejoin2d", "continuous"), ("docking2d_oriented", "discrete")],
+    ),
+)
 def test_limits_are_reached_and_never_exceeded(task: str, actions: str) -> None:
     env = build(task, actions)
     lanes = [
@@ -580,7 +598,7 @@ def without(env: Environment, outcome: str, task: str) -> Environment:
     return jaxsafe.override(env, never.get(outcome, {}))
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("task", one_of_each_kind(TASKS))
 def test_success_and_timeout_are_both_paid_in_the_released_variant(task: str) -> None:
     computed = []
     for variant in ("released", "paper"):
@@ -617,8 +635,8 @@ def visits(
     }
 
 
-@pytest.mark.parametrize("variant", ["paper", "released"])
-@pytest.mark.parametrize("task", REJOIN)
+@pytest.mark.parametrize("variant", one_of_each_kind(["paper", "released"], ["released"]))
+@pytest.mark.parametrize("task", one_of_each_kind(REJOIN, ["rejoin2d"]))
 def test_leaving_the_region_refunds_exactly(task: str, variant: str) -> None:
     facts = visits(task, variant, [0.0, 0.0], [0.0] * 7 + [-1.0] * 6 + [1.0] * 20)
     inside = facts["inside"]
@@ -638,7 +656,7 @@ def test_leaving_the_region_refunds_exactly(task: str, variant: str) -> None:
     assert facts["stay"].max() > 0.6
 
 
-@pytest.mark.parametrize("task", REJOIN)
+@pytest.mark.parametrize("task", one_of_each_kind(REJOIN, ["rejoin2d"]))
 @pytest.mark.parametrize("variant", ["paper", "released"])
 def test_the_first_time_is_paid_once_an_episode_and_to_those_who_start_inside_only_as_released(
     task: str, variant: str
@@ -658,6 +676,7 @@ def test_the_first_time_is_paid_once_an_episode_and_to_those_who_start_inside_on
 # Symmetry
 
 
+@pytest.mark.thorough
 def test_planar_docking_is_spatial_docking_with_z_zero() -> None:
     envs = [build(f"docking{dimension}d") for dimension in (2, 3)]
     actions = random_actions(envs[0], 1, 30)
@@ -719,8 +738,8 @@ def _agree(
     np.testing.assert_array_equal(planar[1].cost, spatial[1].cost)
 
 
-@pytest.mark.parametrize(("x64", "tolerance"), [(True, 1e-9), (False, 2e-3)])
-@pytest.mark.parametrize("task", REJOIN)
+@pytest.mark.parametrize(("x64", "tolerance"), [(True, 1e-9), thorough(False, 2e-3)])
+@pytest.mark.parametrize("task", one_of_each_kind(REJOIN, ["rejoin2d"]))
 def test_rejoin_does_not_change_when_the_whole_world_is_moved_and_turned(
     task: str, x64: bool, tolerance: float
 ) -> None:
@@ -788,7 +807,10 @@ def slopes_at(env: Environment, task: str) -> tuple[dict[str, Any], dict[str, fl
 
 @pytest.mark.parametrize(
     ("task", "actions"),
-    [(task, "continuous") for task in (*TASKS, CUSTOM)] + [("docking2d", "discrete")],
+    one_of_each_kind(
+        [*((task, "continuous") for task in (*TASKS, CUSTOM)), ("docking2d", "discrete")],
+        [("docking3d", "continuous"), ("rejoin2d", "continuous")],
+    ),
 )
 @pytest.mark.usefixtures("x64")
 def test_derivatives_of_a_return_are_those_of_finite_differences(task: str, actions: str) -> None:
@@ -820,7 +842,7 @@ def test_derivatives_of_a_return_are_those_of_finite_differences(task: str, acti
     assert (np.abs(computed) > 1e-6).sum() >= computed.size - env.action_size
 
 
-@pytest.mark.parametrize("task", [*TASKS, CUSTOM])
+@pytest.mark.parametrize("task", one_of_each_kind([*TASKS, CUSTOM]))
 def test_derivatives_are_finite_at_the_edges(task: str) -> None:
     env = build(task)
     states, _ = place(env, edges(env, task))
