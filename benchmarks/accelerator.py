@@ -76,7 +76,7 @@ FEWER_STEPS_FROM = 2**17
 """With so many environments a quarter of the steps take long enough to be measured."""
 
 COMPILING = 0.75
-"""The share of a part's time that its programs may take to compile; later ones are skipped."""
+"""The share of a part's time that its programs may take to compile. Later ones are skipped."""
 
 GRACE = 5.0
 """Seconds beyond its time after which a part is ended."""

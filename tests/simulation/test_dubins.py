@@ -376,7 +376,7 @@ def test_a_step_that_reaches_no_limit_before_its_end_may_be_taken_in_one_piece(
         "speed": "acceleration",
     }
     rng = np.random.default_rng(0)
-    for share in (0.0, 0.5, 1.0):  # share of the way to a limit; a share of 1 ends the step on it
+    for share in (0.0, 0.5, 1.0):  # of the way to a limit, where 1 ends the step on it
         state = aircraft.rest()
         controls = {}
         for name, (low, high) in (
