@@ -16,7 +16,8 @@ KEY = jax.random.key(3)
 
 
 def test_the_gaussian_agrees_with_scipy() -> None:
-    mean, log_std = jax.random.normal(KEY, (5, 3)), jnp.array([-0.7, 0.0, 0.4])
+    mean = jax.random.normal(KEY, (5, 3))
+    log_std = jnp.array([-0.7, 0.0, 0.4])
     policy = Gaussian(mean=mean, log_std=log_std)
     action = policy.sample(jax.random.key(1))
     reference = scipy.stats.norm(np.asarray(mean), np.exp(np.asarray(log_std)))
@@ -38,7 +39,8 @@ def test_gaussian_samples_have_the_stated_distribution() -> None:
 def test_the_factored_categorical_agrees_with_the_product_of_its_factors() -> None:
     logits = jax.random.normal(KEY, (6, 5))
     policy = Categorical(logits=logits, points=(2, 3))
-    first, second = jax.nn.softmax(logits[:, :2]), jax.nn.softmax(logits[:, 2:])
+    first = jax.nn.softmax(logits[:, :2])
+    second = jax.nn.softmax(logits[:, 2:])
     action = policy.sample(jax.random.key(1))
     rows = np.arange(6)
     expected = np.log(
@@ -100,7 +102,8 @@ def test_a_smaller_log_std_sharpens_the_choice_of_its_actuator_and_leaves_the_mo
 
 def test_the_critic_sees_the_totals_in_any_order_and_the_actor_does_not() -> None:
     env = jaxsafe.make("docking2d")
-    blind, seeing = Agent(), Agent(critic_sees_totals=True)
+    blind = Agent()
+    seeing = Agent(critic_sees_totals=True)
     inputs = jnp.arange(6.0)
     totals = {term.name: jnp.array(float(i)) for i, term in enumerate(env.reward)}
     np.testing.assert_array_equal(blind.critic_inputs(inputs, totals), inputs)
@@ -117,9 +120,14 @@ def test_the_critic_sees_the_totals_in_any_order_and_the_actor_does_not() -> Non
 
 
 def test_networks_of_many_seeds_are_orthogonalised_one_by_one_with_the_same_numbers() -> None:
-    """Many at once have hung: see `_orthogonal`."""
-    env, agent = jaxsafe.make("docking2d"), normalise(Agent(features="docking"))
-    init, keys = lambda key: agent.init(key, env), jax.random.split(jax.random.key(0), 3)
+    """Orthogonalising many networks at once has hung, see `_orthogonal`."""
+    env = jaxsafe.make("docking2d")
+    agent = normalise(Agent(features="docking"))
+
+    def init(key: jax.Array) -> Any:
+        return agent.init(key, env)
+
+    keys = jax.random.split(jax.random.key(0), 3)
     shapes = [
         list(value.aval.shape)
         for jaxpr in _inner(jax.make_jaxpr(jax.vmap(init))(keys).jaxpr)

@@ -9,11 +9,14 @@ from jaxsafe.schema.errors import ConfigError
 
 KEY = jax.random.key(3)
 COURSE = np.array([-300.0, 250.0])
-"""The lead's velocity seen from the wingman, when one flies along x at 300 ft/s and the other along y at 250."""
+"""The lead's velocity seen from the wingman.
+
+One flies along x at 300 ft/s and the other along y at 250.
+"""
 
 
 def observed(task: str, ahead: np.ndarray) -> tuple[jaxsafe.Environment, jax.Array]:
-    """What the wingman observes with the lead at a place relative to it."""
+    """Return what the wingman observes with the lead at a place relative to it."""
     env = jaxsafe.make(task)
     rest = [0.0] * (env.observation_names.count("lead_position.z"))
     lead = {"position": [*ahead, *rest], "heading": np.pi / 2, "speed": 250.0}
@@ -43,16 +46,15 @@ def test_approach_features_measure_the_velocity_by_its_limit(task: str) -> None:
         env, {"deputy": deputy | ({"attitude": 0.0} if task == "docking2d_oriented" else {})}
     )
     inputs = np.asarray(Agent(features="approach").inputs(env, timestep.observation))
-    sign = (
-        -1.0 if task == "docking2d_oriented" else 1.0
-    )  # whose observation is of the chief, seen from the deputy
+    # The oriented craft observes the chief, seen from the deputy.
+    sign = -1.0 if task == "docking2d_oriented" else 1.0
     velocity = np.array([-0.1, 0.2, *rest]) / (0.2 + 0.002054 * 60.0)
-    d, size = velocity.size, env.observation_size
-    found, along, across, speed = np.split(inputs[size + d + 1 :], np.cumsum([d, 1, d]))
-    np.testing.assert_allclose(found, velocity, rtol=1e-5)
-    np.testing.assert_allclose(
-        along, sign * velocity[0], rtol=3e-3
-    )  # the direction has length ‖p‖/(‖p‖ + 0.001)
+    d = velocity.size
+    size = env.observation_size
+    measured, along, across, speed = np.split(inputs[size + d + 1 :], np.cumsum([d, 1, d]))
+    np.testing.assert_allclose(measured, velocity, rtol=1e-5)
+    # The direction has length ‖p‖/(‖p‖ + 0.001).
+    np.testing.assert_allclose(along, sign * velocity[0], rtol=3e-3)
     np.testing.assert_allclose(across, [0.0, *velocity[1:]], atol=2e-3)
     np.testing.assert_allclose(speed, np.linalg.norm(velocity), rtol=1e-5)
     np.testing.assert_array_equal(
@@ -72,7 +74,8 @@ def test_plain_agents_see_the_observation_and_nothing_else() -> None:
 def test_rejoin_features_tell_a_collision_course(task: str) -> None:
     env, observation = observed(task, -2.0 * COURSE)
     inputs = np.asarray(Agent(features="rejoin").inputs(env, observation))
-    size, d = env.observation_size, 3 if task == "rejoin3d" else 2
+    size = env.observation_size
+    d = 3 if task == "rejoin3d" else 2
     np.testing.assert_array_equal(inputs[:size], observation)
     level = d if task == "rejoin3d" else 0
     _, way, near, relative, change, urgent, closing, across, miss, danger = np.split(
@@ -83,9 +86,8 @@ def test_rejoin_features_tell_a_collision_course(task: str) -> None:
     np.testing.assert_allclose(relative[:2], COURSE / 400.0, atol=1e-6)
     np.testing.assert_allclose(400.0 * change, 400.0 * relative + 1000.0 * way / 10.0, rtol=1e-5)
     np.testing.assert_allclose(urgent, np.clip(5.0 * change, -1.0, 1.0), rtol=1e-6)
-    np.testing.assert_allclose(
-        closing, -1.0, atol=0.02
-    )  # the direction of w has length ‖w‖/(‖w‖ + 0.01)
+    # The direction of w has length ‖w‖/(‖w‖ + 0.01).
+    np.testing.assert_allclose(closing, -1.0, atol=0.02)
     np.testing.assert_allclose([*across, *miss], 0.0, atol=0.1)
     np.testing.assert_allclose(danger, 1.0, atol=0.05)
 
@@ -114,9 +116,8 @@ def test_rejoin_features_are_level_however_the_wingman_rolls() -> None:
     ahead = turn @ [600.0, -300.0, 100.0]
     np.testing.assert_allclose(inputs[0][:3], ahead / np.linalg.norm(ahead), atol=1e-6)
     for other in inputs[1:]:
-        np.testing.assert_allclose(
-            other[:9], inputs[0][:9], atol=1e-5
-        )  # the lead, and the way to the rejoin point
+        # These inputs are the lead, and the way to the rejoin point.
+        np.testing.assert_allclose(other[:9], inputs[0][:9], atol=1e-5)
 
 
 @pytest.mark.parametrize("task", ["rejoin2d", "rejoin3d"])
@@ -125,16 +126,18 @@ def test_rejoin_features_measure_by_how_much_the_lead_is_missed(task: str) -> No
     env, observation = observed(task, -COURSE + left)
     inputs = np.asarray(Agent(features="rejoin").inputs(env, observation))
     d = 3 if task == "rejoin3d" else 2
-    miss, danger = inputs[-2 - d : -2], inputs[-2:]
+    miss = inputs[-2 - d : -2]
+    danger = inputs[-2:]
     np.testing.assert_allclose(1000.0 * miss[:2] / 4.0, left, atol=10.0)
     assert (danger < 0.15).all()
-    env, observation = observed(task, COURSE)  # it flies away
+    env, observation = observed(task, COURSE)  # the lead flies away
     np.testing.assert_array_equal(Agent(features="rejoin").inputs(env, observation)[-2:], 0.0)
 
 
 def test_the_names_of_an_observation_are_worked_out_once(monkeypatch: pytest.MonkeyPatch) -> None:
     env, observation = observed("rejoin3d", COURSE)
-    traced, reset = [], jaxsafe.environment.reset
+    traced = []
+    reset = jaxsafe.environment.reset
     monkeypatch.setattr("jaxsafe.environment.reset", lambda *args: traced.append(1) or reset(*args))
     Agent(features="rejoin").inputs(env.replace(dt=env.dt), observation)
     assert len(traced) == 1

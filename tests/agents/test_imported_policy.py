@@ -33,8 +33,10 @@ def exported(task: str, path: Path) -> Path:
 
 
 def as_torch_writes_it(path: Path, layers: list[tuple[np.ndarray, np.ndarray]]) -> Path:
-    """Gemm with transposed weights, and ReLU."""
-    nodes, constants, name = [], [], "obs"
+    """Write a network as torch does: Gemm with transposed weights, and ReLU."""
+    nodes = []
+    constants = []
+    name = "obs"
     for i, (kernel, bias) in enumerate(layers):
         constants += [
             numpy_helper.from_array(kernel.T.copy(), f"w{i}"),
@@ -69,14 +71,15 @@ def test_what_was_exported_comes_back(task: str, tmp_path: Path) -> None:
     observations = (
         np.random.default_rng(0).uniform(-1, 1, (200, env.observation_size)).astype(np.float32)
     )
-    found = jax.jit(agent.policy(env, weights, True))(jax.random.key(0), observations)
+    action = jax.jit(agent.policy(env, weights, True))(jax.random.key(0), observations)
     np.testing.assert_allclose(
-        found, jaxsafe.load_policy(task)(jax.random.key(0), observations), atol=2e-5
+        action, jaxsafe.load_policy(task)(jax.random.key(0), observations), atol=2e-5
     )
 
 
 def test_networks_of_other_libraries_are_understood(tmp_path: Path) -> None:
-    env, layers = jaxsafe.make("docking2d"), random_layers(6, 16, 8, 2)
+    env = jaxsafe.make("docking2d")
+    layers = random_layers(6, 16, 8, 2)
     observations = np.random.default_rng(1).normal(size=(50, 6)).astype(np.float32)
     expected = observations
     for i, (kernel, bias) in enumerate(layers):
@@ -87,8 +90,8 @@ def test_networks_of_other_libraries_are_understood(tmp_path: Path) -> None:
     np.savez(tmp_path / "net.npz", **arrays)
     for path in (as_torch_writes_it(tmp_path / "net.onnx", layers), tmp_path / "net.npz"):
         _, agent, weights = read_foreign(path, env, "relu")
-        found = agent.policy(env, weights, True)(jax.random.key(0), jnp.asarray(observations))
-        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+        action = agent.policy(env, weights, True)(jax.random.key(0), jnp.asarray(observations))
+        np.testing.assert_allclose(action, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_discrete_networks_give_logits(tmp_path: Path) -> None:
@@ -96,9 +99,9 @@ def test_discrete_networks_give_logits(tmp_path: Path) -> None:
     _, agent, weights = read_foreign(
         as_torch_writes_it(tmp_path / "net.onnx", random_layers(6, 8, 22)), env
     )
-    found = agent.policy(env, weights, True)(jax.random.key(0), jnp.ones((3, 6)))
-    assert found.shape == (3, 2)
-    assert found.dtype == jnp.int32
+    action = agent.policy(env, weights, True)(jax.random.key(0), jnp.ones((3, 6)))
+    assert action.shape == (3, 2)
+    assert action.dtype == jnp.int32
 
 
 def test_an_evaluation_of_it_is_that_of_the_original(
@@ -146,10 +149,8 @@ def test_its_closed_loop_goes_to_a_verifier(
         env := jaxsafe.make("docking2d"),
         {"deputy": {"position": start[0, :2], "velocity": start[0, 2:]}},
     )
-    margins, (_, agent, weights) = (
-        [timestep.info.margins["velocity_limit"]],
-        read_foreign(tmp_path / "net.onnx", env),
-    )
+    margins = [timestep.info.margins["velocity_limit"]]
+    (_, agent, weights) = read_foreign(tmp_path / "net.onnx", env)
     for _ in range(2):
         action = agent.policy(env, weights, True)(jax.random.key(0), timestep.observation[None])[0]
         state, timestep = jaxsafe.step(env, state, action)
@@ -226,11 +227,11 @@ BOUNDS = {"begins": [0], "ends": [2], "axes": [1]}
         [node("ReduceSum", "obs none", "sum"), node("Add", "obs sum", "y")],
         [node("Clip", "obs ! high", "y")],
     ],
-    ids=lambda nodes: "-".join(one.op_type for one in nodes),
+    ids=lambda nodes: "-".join(operator.op_type for operator in nodes),
 )
 def test_operators_mean_what_the_runtime_means(nodes: list[onnx.NodeProto], tmp_path: Path) -> None:
-    for one in nodes:
-        one.input[:] = ["" if name == "!" else name for name in one.input]
+    for operator in nodes:
+        operator.input[:] = ["" if name == "!" else name for name in operator.input]
     extra = {
         "w": np.array([0.3], np.float32),
         "sizes": [2, 4],
@@ -244,10 +245,10 @@ def test_operators_mean_what_the_runtime_means(nodes: list[onnx.NodeProto], tmp_
         [[-1.0, -7.9, 2.5, -0.4, 4.0, 5.0], [7.1, 0.7, -2.5, 1.0, -4.0, 9.0]], np.float32
     )
     session = onnxruntime.InferenceSession(path)
-    expected = [np.asarray(session.run(None, {"obs": one[None]})[0])[0] for one in observations]
+    expected = [np.asarray(session.run(None, {"obs": row[None]})[0])[0] for row in observations]
     _, agent, weights = read_foreign(path, jaxsafe.make("docking2d"))
-    found = [agent.network(weights, jnp.asarray(one)) for one in observations]
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    computed = [agent.network(weights, jnp.asarray(row)) for row in observations]
+    np.testing.assert_allclose(computed, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -352,10 +353,10 @@ def test_constants_casts_and_extremes_are_understood(tmp_path: Path) -> None:
     cut = helper.make_node("Slice", ["z", "begins", "ends", "axes"], ["out"])
     env = jaxsafe.make("docking2d")
     _, agent, weights = read_foreign(graph(low, high, begins, ends, axes, *clipped, cut), env)
-    found = agent.policy(env, weights, True)(
+    action = agent.policy(env, weights, True)(
         jax.random.key(0), jnp.array([[0.1, 0.4, 0.9, 0.0, 0.0, 0.0], [0.9] * 6])
     )
-    np.testing.assert_allclose(found, [[0.25, 0.4], [0.5, 0.5]])
+    np.testing.assert_allclose(action, [[0.25, 0.4], [0.5, 0.5]])
     words = [
         helper.make_node("Constant", [], ["a"], value_string="x"),
         helper.make_node("Identity", ["obs"], ["out"]),

@@ -27,12 +27,13 @@ def test_every_task_has_a_policy_trained_in_it(task: str) -> None:
 
 
 def flown(task: str, episodes: int) -> float:
-    """The share of successes."""
-    env, policy = jaxsafe.make(task), jaxsafe.load_policy(task)
-    found = jax.jit(lambda env, key: run_episodes(env, policy, key, episodes))(
+    """Return the share of successes."""
+    env = jaxsafe.make(task)
+    policy = jaxsafe.load_policy(task)
+    episode_batch = jax.jit(lambda env, key: run_episodes(env, policy, key, episodes))(
         env, jax.random.key(7)
     )
-    return float(np.mean(np.asarray(found.outcome) == env.success))
+    return float(np.mean(np.asarray(episode_batch.outcome) == env.success))
 
 
 def test_the_policy_of_docking_docks() -> None:

@@ -39,7 +39,10 @@ from jaxsafe.tune import lanes
 def fails(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> Callable[..., str]:
-    """Run a command in an empty directory; it must leave with code 2 and one line on standard error, which is returned."""
+    """Return a function that runs a command in an empty directory and returns its error.
+
+    The command must leave with code 2 and one line on standard error.
+    """
     monkeypatch.chdir(tmp_path)
 
     def run(module: object, *words: str) -> str:
@@ -65,8 +68,12 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["env=doking3d"], "env: unknown task 'doking3d' and not a .yaml file; choose from rejoin2d, rejoin3d, docking2d, "
-         "docking3d, docking2d_oriented. Did you mean 'docking3d'?"),
+        (
+            ["env=doking3d"],
+            "env: unknown task 'doking3d' and not a .yaml file; choose from rejoin2d, rejoin3d,"
+            " docking2d, "
+            "docking3d, docking2d_oriented. Did you mean 'docking3d'?",
+        ),
         (["seeds=2"], "env: missing; for instance env=docking3d"),
         (["env="], "env: expected a name or a path, found None"),
         (["env=docking3d", "sedes=2"], "sedes: unknown field 'sedes'; choose from"),
@@ -77,38 +84,71 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
         (["env=docking3d", "seed=-1"], "seed: expected a whole number in [0, 2"),
         (["env=docking3d", "seeds=2", "seeds=3"], "seeds: given twice"),
         (["env=docking3d", "seeds"], "argument 'seeds': expected key=value"),
-        (["env=docking3d", "preset=featurs"], "preset: unknown preset 'featurs'; choose from features, plain, lanes, quick."
-         " Did you mean 'features'?"),
+        (
+            ["env=docking3d", "preset=featurs"],
+            "preset: unknown preset 'featurs'; choose from features, plain, lanes, quick."
+            " Did you mean 'features'?",
+        ),
         (["env=docking3d", "ppo.gama=0.9"], "ppo.gama: unknown field 'gama'"),
         (["env=docking3d", "ppo.gamma=1.5"], "ppo.gamma: expected a number in [0, 1], found 1.5"),
-        (["env=docking3d", "ppo.gamma=high"], "ppo.gamma: expected a number in [0, 1], found 'high'"),
+        (
+            ["env=docking3d", "ppo.gamma=high"],
+            "ppo.gamma: expected a number in [0, 1], found 'high'",
+        ),
         (["env=docking3d", "ppo.gamma=true"], "ppo.gamma: expected a number in [0, 1], found True"),
-        (["env=docking3d", "ppo.learning_rate=.nan"], "ppo.learning_rate: expected a number > 0, found nan"),
-        (["env=docking3d", "ppo.num_envs=16", "ppo.num_minibatches=3"], "ppo.num_minibatches: expected a divisor of"),
-        (["env=docking3d", "ppo.num_envs=16", "devices_per_seed=3"],
-         "devices_per_seed: expected one of 1, 2, 4, 8, 16, which divide"),
-        (["env=docking3d", "ppo.learning_rate_decay=exponential", "ppo.final_learning_rate=0"],
-         "ppo.final_learning_rate: expected a number > 0 for an exponential decay, found 0"),
-        (["env=docking3d", "agent.log_std=[-1,-2]"],
-         "agent.log_std: expected one number or 3, one for each action, found 2"),
-        (["env=docking3d", "agent.features=dock"], "agent.features: found 'dock'; choose from none, docking, approach, "
-         "rejoin. Did you mean 'docking'?"),
+        (
+            ["env=docking3d", "ppo.learning_rate=.nan"],
+            "ppo.learning_rate: expected a number > 0, found nan",
+        ),
+        (
+            ["env=docking3d", "ppo.num_envs=16", "ppo.num_minibatches=3"],
+            "ppo.num_minibatches: expected a divisor of",
+        ),
+        (
+            ["env=docking3d", "ppo.num_envs=16", "devices_per_seed=3"],
+            "devices_per_seed: expected one of 1, 2, 4, 8, 16, which divide",
+        ),
+        (
+            ["env=docking3d", "ppo.learning_rate_decay=exponential", "ppo.final_learning_rate=0"],
+            "ppo.final_learning_rate: expected a number > 0 for an exponential decay, found 0",
+        ),
+        (
+            ["env=docking3d", "agent.log_std=[-1,-2]"],
+            "agent.log_std: expected one number or 3, one for each action, found 2",
+        ),
+        (
+            ["env=docking3d", "agent.features=dock"],
+            "agent.features: found 'dock'; choose from none, docking, approach, "
+            "rejoin. Did you mean 'docking'?",
+        ),
         (["env=docking3d", "actions=discret"], "Did you mean 'discrete'?"),
-        (["env=docking3d", "tensorboard=maybe"], "tensorboard: expected true or false, found 'maybe'"),
-        (["env=docking3d", "distributed=maybe"], "distributed: expected true or false, found 'maybe'"),
-        (["env=docking3d", "env.reward.delta_v.scal=1"], "reward.delta_v.scal: unknown field 'scal'"),
-        (["env=docking3d", "env.deputy.mass=-1"], "deputy.mass: expected a number in kg > 0, found -1"),
+        (
+            ["env=docking3d", "tensorboard=maybe"],
+            "tensorboard: expected true or false, found 'maybe'",
+        ),
+        (
+            ["env=docking3d", "distributed=maybe"],
+            "distributed: expected true or false, found 'maybe'",
+        ),
+        (
+            ["env=docking3d", "env.reward.delta_v.scal=1"],
+            "reward.delta_v.scal: unknown field 'scal'",
+        ),
+        (
+            ["env=docking3d", "env.deputy.mass=-1"],
+            "deputy.mass: expected a number in kg > 0, found -1",
+        ),
         (["env=nowhere.yaml"], "nowhere.yaml: cannot be read: No such file or directory"),
         (["resume=runs/x"], "resume: no run in 'runs/x' (a directory with config.yaml)"),
         (["resume=runs/x", "steps=5"], "steps: unknown option; choose from resume"),
         (["env=docking3d", "out=/proc/nowhere"], "out: cannot write /proc/nowhere"),
     ],
-)  # fmt: skip
+)
 def test_bad_options_of_train_are_told_in_one_line(
     fails: Callable[..., str], words: list[str], message: str
 ) -> None:
     assert message in fails(train, *words)
-    assert list(Path.cwd().rglob("*")) == []  # and nothing was begun
+    assert list(Path.cwd().rglob("*")) == []  # nothing was begun
 
 
 def test_numbers_in_exponent_form_are_numbers(fails: Callable[..., str]) -> None:
@@ -260,7 +300,7 @@ def rewritten(
     change: Callable[[dict], object],
     compression: int = zipfile.ZIP_STORED,
 ) -> Path:
-    """A policy file with another header."""
+    """Write a policy file with another header."""
     with zipfile.ZipFile(source) as old, zipfile.ZipFile(target, "w", compression) as new:
         for name in old.namelist():
             content = old.read(name)
@@ -315,7 +355,9 @@ def test_the_header_of_a_policy_file_is_checked(
 def test_a_damaged_policy_file_is_told_and_what_is_not_asked_for_is_not_read(
     tmp_path: Path, whole: Path
 ) -> None:
-    source, path, draw = whole / "policy" / "seed_0.npz", tmp_path / "x.npz", random.Random(0)
+    source = whole / "policy" / "seed_0.npz"
+    path = tmp_path / "x.npz"
+    draw = random.Random(0)
     expected = read_policy(source)
     rewritten(source, path, lambda header: None, zipfile.ZIP_DEFLATED)
     content = path.read_bytes()
@@ -324,10 +366,10 @@ def test_a_damaged_policy_file_is_told_and_what_is_not_asked_for_is_not_read(
         damaged[draw.randrange(len(content))] ^= 1 << draw.randrange(8)
         path.write_bytes(damaged)
         try:
-            found = read_policy(path)
+            policy = read_policy(path)
         except ConfigError:
             continue
-        jax.tree.map(np.testing.assert_array_equal, found.params, expected.params)
+        jax.tree.map(np.testing.assert_array_equal, policy.params, expected.params)
     np.save(tmp_path / "x.npy", np.ones(3))
     path.write_bytes((tmp_path / "x.npy").read_bytes())
     with pytest.raises(ConfigError, match="not a policy file"):
@@ -366,8 +408,11 @@ def test_a_path_may_begin_with_the_home_directory(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setenv("HOME", "/home/me")
     arguments = Arguments.parse(["out=~/x", "run=[~/a,b/~,./~]", "env=~/mine.yaml", "rta=~x"])
     assert arguments.options == {
-        "out": "/home/me/x", "run": ["/home/me/a", "b/~", "./~"], "env": "/home/me/mine.yaml", "rta": "~x",
-    }  # fmt: skip
+        "out": "/home/me/x",
+        "run": ["/home/me/a", "b/~", "./~"],
+        "env": "/home/me/mine.yaml",
+        "rta": "~x",
+    }
     with pytest.raises(
         ConfigError,
         match=r"^resume: no home directory for '~nobody-of-that-name/x'; write \./~nobody",
@@ -396,19 +441,20 @@ def test_help_names_the_options(
 def test_import_draws_in_only_what_the_core_needs() -> None:
     heavy = ("yaml", "orbax", "optax", "matplotlib", "jaxsafe.adapters.gymnasium", "flax", "tqdm")
     code = f"import sys, jaxsafe; print([name for name in {heavy} if name in sys.modules])"
-    found = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert found.stdout.strip() == "[]"
+    process = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, text=True
+    )
+    assert process.stdout.strip() == "[]"
 
 
 def test_a_platform_of_jax_that_is_not_there_is_told_in_one_line() -> None:
     command = [sys.executable, "-m", "jaxsafe.config", "docking2d"]
-    found = subprocess.run(
+    process = subprocess.run(
         command, env={**os.environ, "JAX_PLATFORMS": "rocm"}, capture_output=True, text=True
     )
-    assert (found.returncode, found.stdout) == (2, "")
-    assert (
-        found.stderr
-        == "error: JAX_PLATFORMS: no device of 'rocm' can be used here; leave it out, or choose cpu\n"
+    assert (process.returncode, process.stdout) == (2, "")
+    assert process.stderr == (
+        "error: JAX_PLATFORMS: no device of 'rocm' can be used here; leave it out, or choose cpu\n"
     )
 
 
@@ -423,12 +469,13 @@ def test_too_little_address_space_is_told_in_one_line(
 ) -> None:
     script = f"ulimit -v {kilobytes}; exec {sys.executable} -m jaxsafe.{command}"
     environment = {**os.environ, "PYTHONPATH": str(Path(cli.__file__).parents[2])}
-    found = subprocess.run(
+    process = subprocess.run(
         ["bash", "-c", script], env=environment, cwd=tmp_path, capture_output=True, text=True
     )
-    assert (found.returncode, found.stdout) == (2, "")
-    assert found.stderr == (
-        f"error: memory is short: ulimit -v leaves {kilobytes / 2**20:.1f} GiB of address space, a command needs 2.0 GiB\n"
+    assert (process.returncode, process.stdout) == (2, "")
+    assert process.stderr == (
+        f"error: memory is short: ulimit -v leaves {kilobytes / 2**20:.1f} GiB of address"
+        f" space, a command needs 2.0 GiB\n"
     )
     assert not list(tmp_path.iterdir())
 
@@ -489,32 +536,129 @@ HUGE = "9" * 4000
 @pytest.mark.parametrize(
     ("module", "words", "message"),
     [
-        (evaluate, ["run=pretrained/docking2d", "seed=1e38"], "seed: expected a whole number from 0 to 4,294,967,295"),
-        (evaluate, ["run=pretrained/docking2d", "seed=4294967296"], "4,294,967,295, found 4294967296"),
-        (evaluate, ["run=pretrained/docking2d", f"episodes={HUGE}"], "episodes: expected a whole number from 1 to"),
-        (falsify, ["env=docking2d", "seed=4294967296"], "seed: expected a whole number from 0 to 4,294,967,295"),
-        (falsify, ["env=docking2d", "steps=1e300"], "steps: expected a whole number from 1 to 2,147,483,647, found 1e+300"),
-        (tune, ["env=docking2d", "sweep.ppo.gamma=uniform(0.9,1)", "samples=1e38"], "samples: expected a whole"),
-        (tune, ["env=docking2d", "sweep.ppo.gamma=[0.9]", "draw=1e38"], "draw: expected a whole number from 0 to"),
-        (tune, ["env=docking2d", *(f"sweep.ppo.{name}=[{', '.join(map(str, range(1, 102)))}]" for name in
-          ("num_envs", "num_steps"))], "sweep: expected at most 10,000 settings, found 10,201; samples=N draws some"),
-        (train, ["env=docking2d", "steps=1e300"], "steps: expected a whole number ≥ 1 of a magnitude up to 1,000,000,000"),
-        (train, ["env=docking2d", "steps=1e15", "ppo.num_envs=1", "ppo.num_steps=2"], "expected less than 2³¹ updates"),
-        (train, ["env=docking2d", f"eval_every={HUGE}"], "eval_every: expected a whole number ≥ 1 of a magnitude up to"),
-        (train, ["env=docking2d", f"checkpoint_every={HUGE}"], "found a number of thousands of digits"),
-        (train, ["env=docking2d", "eval_episodes=1e12"], "eval_episodes: expected a whole number ≥ 1 of a magnitude up to"),
-        (train, ["env=docking2d", "seeds=1e9"], "seeds: expected a whole number ≥ 1 of a magnitude up to 100,000"),
-        (train, ["env=docking2d", "ppo.num_epochs=1e300"], "ppo.num_epochs: expected a whole number ≥ 1 of a magnitude"),
-        (train, ["env=docking2d", f"agent.hidden=[{HUGE}]"], "agent.hidden.[0]: expected a list ≥ 1 of a magnitude up to"),
-        (train, ["env=docking2d", f"agent.hidden=[{', '.join('1' * 65)}]"], "expected at most 64 layers, found 65"),
-        (train, ["env=docking2d", "agent.log_std=.inf"], "agent.log_std: expected a number or a list of numbers of"),
-        (train, ["env=docking2d", "ppo.horizon_growth=1e-30"], "expected at least 1 − ppo.gamma = 0.04"),
-        (train, ["env=docking2d", "agent={}"], "agent: name one of its options, for instance agent.hidden=…"),
-        (train, ["env=docking2d", "ppo={gamma: 0.9}"], "ppo: name one of its options, for instance ppo.gamma=…"),
-        (train, ["env=docking2d", "seeds=!!bool x"], "seeds, line 1: not valid YAML: found 'x' after the tag !!bool"),
-        (train, ["env=docking2d", "env.dt=1e30"], "dt: expected a number in s > 0 of a magnitude from 1e-06 to 100000"),
+        (
+            evaluate,
+            ["run=pretrained/docking2d", "seed=1e38"],
+            "seed: expected a whole number from 0 to 4,294,967,295",
+        ),
+        (
+            evaluate,
+            ["run=pretrained/docking2d", "seed=4294967296"],
+            "4,294,967,295, found 4294967296",
+        ),
+        (
+            evaluate,
+            ["run=pretrained/docking2d", f"episodes={HUGE}"],
+            "episodes: expected a whole number from 1 to",
+        ),
+        (
+            falsify,
+            ["env=docking2d", "seed=4294967296"],
+            "seed: expected a whole number from 0 to 4,294,967,295",
+        ),
+        (
+            falsify,
+            ["env=docking2d", "steps=1e300"],
+            "steps: expected a whole number from 1 to 2,147,483,647, found 1e+300",
+        ),
+        (
+            tune,
+            ["env=docking2d", "sweep.ppo.gamma=uniform(0.9,1)", "samples=1e38"],
+            "samples: expected a whole",
+        ),
+        (
+            tune,
+            ["env=docking2d", "sweep.ppo.gamma=[0.9]", "draw=1e38"],
+            "draw: expected a whole number from 0 to",
+        ),
+        (
+            tune,
+            [
+                "env=docking2d",
+                *(
+                    f"sweep.ppo.{name}=[{', '.join(map(str, range(1, 102)))}]"
+                    for name in ("num_envs", "num_steps")
+                ),
+            ],
+            "sweep: expected at most 10,000 settings, found 10,201; samples=N draws some",
+        ),
+        (
+            train,
+            ["env=docking2d", "steps=1e300"],
+            "steps: expected a whole number ≥ 1 of a magnitude up to 1,000,000,000",
+        ),
+        (
+            train,
+            ["env=docking2d", "steps=1e15", "ppo.num_envs=1", "ppo.num_steps=2"],
+            "expected less than 2³¹ updates",
+        ),
+        (
+            train,
+            ["env=docking2d", f"eval_every={HUGE}"],
+            "eval_every: expected a whole number ≥ 1 of a magnitude up to",
+        ),
+        (
+            train,
+            ["env=docking2d", f"checkpoint_every={HUGE}"],
+            "found a number of thousands of digits",
+        ),
+        (
+            train,
+            ["env=docking2d", "eval_episodes=1e12"],
+            "eval_episodes: expected a whole number ≥ 1 of a magnitude up to",
+        ),
+        (
+            train,
+            ["env=docking2d", "seeds=1e9"],
+            "seeds: expected a whole number ≥ 1 of a magnitude up to 100,000",
+        ),
+        (
+            train,
+            ["env=docking2d", "ppo.num_epochs=1e300"],
+            "ppo.num_epochs: expected a whole number ≥ 1 of a magnitude",
+        ),
+        (
+            train,
+            ["env=docking2d", f"agent.hidden=[{HUGE}]"],
+            "agent.hidden.[0]: expected a list ≥ 1 of a magnitude up to",
+        ),
+        (
+            train,
+            ["env=docking2d", f"agent.hidden=[{', '.join('1' * 65)}]"],
+            "expected at most 64 layers, found 65",
+        ),
+        (
+            train,
+            ["env=docking2d", "agent.log_std=.inf"],
+            "agent.log_std: expected a number or a list of numbers of",
+        ),
+        (
+            train,
+            ["env=docking2d", "ppo.horizon_growth=1e-30"],
+            "expected at least 1 − ppo.gamma = 0.04",
+        ),
+        (
+            train,
+            ["env=docking2d", "agent={}"],
+            "agent: name one of its options, for instance agent.hidden=…",
+        ),
+        (
+            train,
+            ["env=docking2d", "ppo={gamma: 0.9}"],
+            "ppo: name one of its options, for instance ppo.gamma=…",
+        ),
+        (
+            train,
+            ["env=docking2d", "seeds=!!bool x"],
+            "seeds, line 1: not valid YAML: found 'x' after the tag !!bool",
+        ),
+        (
+            train,
+            ["env=docking2d", "env.dt=1e30"],
+            "dt: expected a number in s > 0 of a magnitude from 1e-06 to 100000",
+        ),
     ],
-)  # fmt: skip
+)
 def test_numbers_that_no_program_can_count_to_are_told_at_once(
     fails: Callable[..., str], module: object, words: list[str], message: str
 ) -> None:

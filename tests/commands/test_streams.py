@@ -21,13 +21,16 @@ ROOT = Path(__file__).parents[2]
 
 
 def shell(command: str, place: Path) -> subprocess.CompletedProcess[str]:
-    """Run a line of the shell with `jaxsafe` for Python and our commands."""
-    command = f"jaxsafe() {{ module=$1; shift; '{sys.executable}' -m jaxsafe.$module \"$@\"; }}; {command}"
-    found = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUTF8": "0"}
+    """Run a line of the shell. In it `jaxsafe` runs our commands by this Python."""
+    command = (
+        f"jaxsafe() {{ module=$1; shift; '{sys.executable}' -m jaxsafe.$module \"$@\";"
+        f" }}; {command}"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONUTF8": "0"}
     return subprocess.run(
         ["bash", "-c", command],
         cwd=place,
-        env=found,
+        env=environment,
         capture_output=True,
         check=False,
         encoding="utf-8",

@@ -43,11 +43,11 @@ def test_another_runtime_acts_alike(task: str) -> None:
     _, starts = jax.jit(reset_batch, static_argnums=2)(policy.env, jax.random.key(0), 10_000)
     drawn = np.random.default_rng(0).uniform(-1, 1, (10_000, policy.env.observation_size))
     limits = [name == "velocity_limit" for name in policy.env.observation_names]
-    drawn[:, limits] = np.abs(drawn[:, limits])  # none is negative
+    drawn[:, limits] = np.abs(drawn[:, limits])  # a velocity limit is never negative
     observations = np.concatenate([starts.observation, drawn]).astype(np.float32)
     expected = jaxsafe.load_policy(task)(jax.random.key(0), observations)
-    found = run(to_onnx(functions.action(policy).function, observations.shape), observations)
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    computed = run(to_onnx(functions.action(policy).function, observations.shape), observations)
+    np.testing.assert_allclose(computed, expected, atol=1e-5)
     network = functions.network(policy)
     features = np.asarray(policy.agent.inputs(policy.env, jnp.asarray(observations)))
     model = to_onnx(network.function, features.shape)
@@ -75,13 +75,14 @@ def test_discrete_policies_choose_alike() -> None:
     expected = policy.agent.act(
         env, policy.params, jax.random.key(0), jnp.asarray(observations), True
     )
-    found = run(to_onnx(functions.action(policy).function, observations.shape), observations)
-    assert np.mean(found == expected) > 0.999
-    assert len(np.unique(found)) >= 3
-    network, inputs = functions.network(policy), policy.agent.inputs(env, jnp.asarray(observations))
+    computed = run(to_onnx(functions.action(policy).function, observations.shape), observations)
+    assert np.mean(computed == expected) > 0.999
+    assert len(np.unique(computed)) >= 3
+    network = functions.network(policy)
+    inputs = policy.agent.inputs(env, jnp.asarray(observations))
     distribution = policy.agent.distribution(env, params, inputs)
-    found = run(to_onnx(network.function, inputs.shape), np.asarray(inputs))
-    np.testing.assert_allclose(found, distribution.logits, rtol=1e-4, atol=1e-3)  # type: ignore[union-attr]
+    computed = run(to_onnx(network.function, inputs.shape), np.asarray(inputs))
+    np.testing.assert_allclose(computed, distribution.logits, rtol=1e-4, atol=1e-3)  # type: ignore[union-attr]
 
 
 def test_the_state_goes_in_and_the_control_comes_out() -> None:
@@ -101,8 +102,8 @@ def test_the_state_goes_in_and_the_control_comes_out() -> None:
     _, timestep = env.step(
         state, jaxsafe.load_policy("docking2d")(jax.random.key(0), timestep.observation)
     )
-    found = run(to_onnx(exported.function, start.shape), start)
-    np.testing.assert_allclose(found[0], timestep.info.control_actual, atol=1e-5)
+    computed = run(to_onnx(exported.function, start.shape), start)
+    np.testing.assert_allclose(computed[0], timestep.info.control_actual, atol=1e-5)
 
 
 def test_the_closed_loop_is_the_environments_own() -> None:
@@ -110,10 +111,10 @@ def test_the_closed_loop_is_the_environments_own() -> None:
     start = np.array([[80.0, -60.0, 0.1, -0.05], [70.0, 106.0, -0.28, 0.28]], np.float32)
     looped = functions.closed_loop(policy, 3)
     expected = jax.jit(looped.function)(start)
-    found = run(
+    computed = run(
         to_onnx(functions.closed_loop(policy, 3, unrolled=True).function, start.shape), start
     )
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    np.testing.assert_allclose(computed, expected, atol=1e-5)
     assert looped.outputs == tuple(f"velocity_limit_{t}" for t in range(4))
     speed = np.linalg.norm(start[:, 2:], axis=1)
     limit = 0.2 + 2 * 0.001027 * np.linalg.norm(start[:, :2], axis=1)
@@ -132,8 +133,12 @@ def test_a_property_names_its_box_and_what_must_not_happen(tmp_path: Path) -> No
     exported = functions.Exported(lambda x: x, ("a", "b"), ("h_0", "h_1"))
     text = write_vnnlib(tmp_path / "x.vnnlib", exported, [(0.5, 1.5), (-2.0, 3.0)]).read_text()
     assert [line for line in text.splitlines() if line.startswith("(assert (")] == [
-        "(assert (>= X_0 0.5))", "(assert (<= X_0 1.5))", "(assert (>= X_1 -2.0))", "(assert (<= X_1 3.0))", "(assert (or",
-    ]  # fmt: skip
+        "(assert (>= X_0 0.5))",
+        "(assert (<= X_0 1.5))",
+        "(assert (>= X_1 -2.0))",
+        "(assert (<= X_1 3.0))",
+        "(assert (or",
+    ]
     assert text.count("(and (<= Y_") == 2
     assert text.count("(") == text.count(")")
 
@@ -153,12 +158,13 @@ def test_a_search_finds_the_least_margin() -> None:
 @pytest.mark.parametrize("mode", [*CHECKED_WHILE_TRACING, *CHECKED_WHILE_RUNNING])
 def test_the_modes_of_jax_change_nothing(mode: str, tmp_path: Path) -> None:
     """Graphs are the same, and the search works."""
-    expected, found = tmp_path / "expected.onnx", tmp_path / "found.onnx"
+    expected = tmp_path / "expected.onnx"
+    written = tmp_path / "found.onnx"
     words = ["run=pretrained/docking2d", "inputs=state"]
     assert main([*words, f"out={expected}"]) == 0
     bowl = lambda x: jnp.sum((x - jnp.array([[0.31, -0.7]])) ** 2, axis=-1, keepdims=True) - 0.01  # noqa: E731
     with (CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING)[mode]():
-        assert main([*words, f"out={found}"]) == 0
+        assert main([*words, f"out={written}"]) == 0
         assert (
             main(
                 ["run=pretrained/docking2d", "format=stablehlo", f"out={tmp_path / 'x.stablehlo'}"]
@@ -168,7 +174,7 @@ def test_the_modes_of_jax_change_nothing(mode: str, tmp_path: Path) -> None:
         exported = functions.Exported(bowl, ("a", "b"), ("h",))
         worst = search(exported, [(-1, 1), (-1, 1)], jax.random.key(0), starts=50)
     start = np.array([[80.0, -60.0, 0.1, -0.05]], np.float32)
-    left, right = (run(onnx.load(path), start) for path in (expected, found))
+    left, right = (run(onnx.load(path), start) for path in (expected, written))
     np.testing.assert_allclose(left, right, atol=1e-5)
     assert worst.margin == pytest.approx(-0.01, abs=1e-4)
     np.testing.assert_allclose(worst.start, [0.31, -0.7], atol=0.02)
@@ -248,9 +254,8 @@ def test_a_loop_that_ends_in_no_number_is_violated(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     layers = {"kernel_0": np.full((6, 2), 3e38), "kernel_1": np.array([[1.0, 1.0], [-1.0, -1.0]])}
-    np.savez(
-        tmp_path / "x.npz", **layers, bias_0=np.zeros(2), bias_1=np.zeros(2)
-    )  # infinity less infinity
+    # The last layer subtracts infinity from infinity.
+    np.savez(tmp_path / "x.npz", **layers, bias_0=np.zeros(2), bias_1=np.zeros(2))
     words = [
         f"run={tmp_path / 'x.npz'}",
         "env=docking2d",
@@ -270,10 +275,11 @@ def test_the_page_tells_what_the_search_finds(
     page = (Path(__file__).parents[2] / "docs" / "export.md").read_text(encoding="utf-8")
     assert main(["run=pretrained/docking2d", "format=vnnlib", f"out={tmp_path / 'x.vnnlib'}"]) == 0
     told = re.compile(r"least margin (\S+) from .*(: no counterexample among .*)")
-    (said, rest), (found, end) = (
+    (said, rest), (margin, end) = (
         told.search(text).groups() for text in (page, capsys.readouterr().out)
     )  # type: ignore[union-attr]
-    assert float(found) == pytest.approx(float(said), abs=2e-4)  # on another processor
+    # The page is from another processor.
+    assert float(margin) == pytest.approx(float(said), abs=2e-4)
     assert end == rest
 
 
@@ -300,8 +306,11 @@ def test_the_command_writes_each_format(
         assert main(["run=pretrained/docking2d", *words]) == 0
     assert "docking2d.onnx: feature_0" in capsys.readouterr().out
     assert {path.name for path in tmp_path.iterdir()} == {
-        "docking2d.onnx", "docking2d.stablehlo", "docking2d_closed_loop.onnx", "docking2d_closed_loop.vnnlib",
-    }  # fmt: skip
+        "docking2d.onnx",
+        "docking2d.stablehlo",
+        "docking2d_closed_loop.onnx",
+        "docking2d_closed_loop.vnnlib",
+    }
     onnx.checker.check_model(onnx.load("docking2d_closed_loop.onnx"), full_check=True)
     loaded = jax.export.deserialize(bytearray(Path("docking2d.stablehlo").read_bytes()))
     observations = np.random.default_rng(0).uniform(-1, 1, (7, 6)).astype(np.float32)

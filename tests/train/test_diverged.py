@@ -1,4 +1,7 @@
-"""A training whose networks or returns are not finite stops for that seed and is never reported as a result."""
+"""A seed whose networks or returns are not finite stops training.
+
+It is never reported as a result.
+"""
 
 import json
 from pathlib import Path
@@ -28,20 +31,23 @@ from jaxsafe.train.host.session import Training
 from jaxsafe.train.ppo import DIAGNOSTICS, PPO, diverged, init
 
 AT = 384
-"""The step after which the networks of a seed are not finite: between two evaluations."""
+"""The step after which the networks of a seed are not finite. It lies between two evaluations."""
 
 
 def rows(run: Path, name: str, seed: int) -> list[dict[str, Any]]:
-    found = [json.loads(line) for line in (run / name).read_text().splitlines()]
+    lines = [json.loads(line) for line in (run / name).read_text().splitlines()]
     return [
         {key: value for key, value in row.items() if key != "wall_s"}
-        for row in found
+        for row in lines
         if row["seed"] == seed
     ]
 
 
 def train(run: Path, monkeypatch: pytest.MonkeyPatch, spoilt: list[int]) -> None:
-    """Train as the fixture `whole` does, but for some seeds whose networks get a NaN on the way."""
+    """Train as the fixture `whole` does.
+
+    The networks of the `spoilt` seeds get a NaN on the way.
+    """
     original = Training._write_progress
 
     def spoil_in_time(self: Training, *args: Any) -> None:
@@ -73,20 +79,24 @@ def test_the_other_seeds_go_on_and_keep_their_bits(run: Path, whole: Path) -> No
     for seed in (0, 2):
         for name in ("progress.jsonl", "eval.jsonl", "episodes.jsonl"):
             assert rows(run, name, seed) == rows(whole, name, seed)
-        one, other = (np.load(path / "policy" / f"seed_{seed}.npz") for path in (run, whole))
-        assert all(one[name].tobytes() == other[name].tobytes() for name in one.files)
+        spoilt_run, sound_run = (
+            np.load(path / "policy" / f"seed_{seed}.npz") for path in (run, whole)
+        )
+        assert all(
+            spoilt_run[name].tobytes() == sound_run[name].tobytes() for name in spoilt_run.files
+        )
 
 
 def test_the_seed_stops_and_the_log_says_so(run: Path, whole: Path) -> None:
-    found, before = rows(run, "progress.jsonl", 1), rows(whole, "progress.jsonl", 1)
+    log = rows(run, "progress.jsonl", 1)
+    before = rows(whole, "progress.jsonl", 1)
     going = AT // 64
-    assert found[:going] == before[:going]
-    assert [row["step"] for row in found] == [
-        row["step"] for row in before
-    ]  # a row for every update all the same
-    for row in found[going:]:
+    assert log[:going] == before[:going]
+    # Every update has a row all the same.
+    assert [row["step"] for row in log] == [row["step"] for row in before]
+    for row in log[going:]:
         assert row["diverged"] is True
-        assert row["episodes"] == found[going - 1]["episodes"]
+        assert row["episodes"] == log[going - 1]["episodes"]
         assert {
             row[name] for name in ("success_rate", "return", "violating_share", "episode_cost")
         } == {None}
@@ -98,17 +108,17 @@ def test_the_seed_stops_and_the_log_says_so(run: Path, whole: Path) -> None:
 def test_no_figure_has_it_and_that_is_said(
     run: Path, whole: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found, before = (json.loads((path / "results.json").read_text()) for path in (run, whole))
-    assert found["diverged"] == [{"seed": 1, "step": AT + 64}]
+    results, before = (json.loads((path / "results.json").read_text()) for path in (run, whole))
+    assert results["diverged"] == [{"seed": 1, "step": AT + 64}]
     assert "diverged" not in before
     for kind in ("stochastic", "deterministic"):
-        for name, metric in found["evaluation"][kind].items():
+        for name, metric in results["evaluation"][kind].items():
             values = before["evaluation"][kind][name]["per_seed"]
             assert metric["per_seed"] == [values[0], None, values[2]]
             assert metric["mean"] == (
                 None if values[0] is None else pytest.approx((values[0] + values[2]) / 2)
             )
-    assert found["training_cost"]["per_seed"][1] is None
+    assert results["training_cost"]["per_seed"][1] is None
     assert {path.name for path in (run / "policy").iterdir()} == {"seed_0.npz", "seed_2.npz"}
     assert command.main([f"resume={run}"]) == cli.DIVERGED
     capsys.readouterr()
@@ -129,8 +139,8 @@ def test_an_evaluation_says_the_same(
 ) -> None:
     assert evaluate.main([f"run={run}", "episodes=4", f"out={tmp_path / 'last'}"]) == cli.DIVERGED
     assert "DIVERGED, and left out of the averages: seed 1" in capsys.readouterr().out
-    found = json.loads((tmp_path / "last" / "results.json").read_text())
-    assert found["evaluation"]["stochastic"]["safety_violation_rate"]["per_seed"][1] is None
+    results = json.loads((tmp_path / "last" / "results.json").read_text())
+    assert results["evaluation"]["stochastic"]["safety_violation_rate"]["per_seed"][1] is None
     assert rows(tmp_path / "last", "eval.jsonl", 1) == []
     assert (
         evaluate.main([f"run={run}", "episodes=4", "checkpoint=best", f"out={tmp_path / 'best'}"])
@@ -145,16 +155,17 @@ def test_a_run_of_which_every_seed_diverged_has_no_result(
     told = capsys.readouterr().out
     assert f"seed 2 has diverged by step {AT + 64}" in told
     assert (
-        f"DIVERGED, and left out of the averages: seeds 0 by step {AT + 64}, 1 by step {AT + 64}, 2 by"
-        in told
-    )
+        f"DIVERGED, and left out of the averages: seeds 0 by step {AT + 64}, 1 by step {AT + 64},"
+        " 2 by"
+    ) in told
     assert "violating steps" not in told
     assert not (tmp_path / "run" / "policy").exists()
     assert "DIVERGED" in summary({"run": tmp_path / "run"})
 
 
 def test_infinite_returns_count_too() -> None:
-    agent, ppo = normalise(Agent(hidden=(4,))), normalise(PPO(num_envs=2))
+    agent = normalise(Agent(hidden=(4,)))
+    ppo = normalise(PPO(num_envs=2))
     state = init(probe(Position(name="reward")), agent, ppo, jax.random.key(0))
     assert not diverged(state)
     returns = state.window.episodes.episode_return
@@ -179,18 +190,19 @@ def test_a_sweep_ranks_it_last_and_marks_it(
     first, last = json.loads((path / "results.json").read_text())["settings"]
     assert (first["setting"], last["setting"]) == (1, 0)
     assert "diverged" not in first
-    assert [one["seed"] for one in last["diverged"]] == [0, 1, 2]
+    assert [seed["seed"] for seed in last["diverged"]] == [0, 1, 2]
     assert set(last["evaluation"]["deterministic"]["safety_violation_rate"]) == {None}
     assert last["training_success"] == [0.0, 0.0, 0.0]
     assert (
-        "setting 0: DIVERGED, and left out of the averages: seeds 0 by step 64, 1 by step 64, 2 by step 64"
-        in told
-    )
+        "setting 0: DIVERGED, and left out of the averages: seeds 0 by step 64, 1 by step 64, 2"
+        " by step 64"
+    ) in told
     assert (path / "results.csv").read_text().splitlines()[-1].endswith(",3")
 
 
 def test_curves_leave_out_the_seeds_that_diverged_and_say_so(run: Path, whole: Path) -> None:
-    broken, sound = progress(run), progress(whole)
+    broken = progress(run)
+    sound = progress(whole)
     figure = training_curves(broken, "steps", "title")
     assert "without seed 1, which diverged" in figure.get_suptitle()
     mean = {line.get_label(): line for line in figure.axes[1].lines}["mean"]

@@ -55,8 +55,8 @@ def value(state: TrainState, observation: float) -> float:
 
 
 def test_gae_equals_a_table_worked_out_by_hand() -> None:
-    # One environment, γ = 0.5, λ = 0.5. Step 0 runs on, step 1 is truncated, step 2 runs on, step 3 terminates, step 4 is
-    # cut off by the end of the batch.
+    # There is one environment, γ = 0.5 and λ = 0.5. Step 0 runs on, step 1 is truncated, step 2
+    # runs on, step 3 terminates, and step 4 is cut off by the end of the batch.
     reward = jnp.array([1.0, 2.0, 3.0, 4.0, 5.0])[:, None]
     values = jnp.array([10.0, 20.0, 30.0, 40.0, 50.0])[:, None]
     next_values = jnp.array([20.0, 8.0, 40.0, 99.0, 60.0])[:, None]
@@ -64,8 +64,8 @@ def test_gae_equals_a_table_worked_out_by_hand() -> None:
     done = jnp.array([False, True, False, True, False])[:, None]
     # δ = 1+10−10 = 1, 2+4−20 = −14, 3+20−30 = −7, 4+0−40 = −36, 5+30−50 = −15
     expected = [1.0 - 14.0 / 4, -14.0, -7.0 - 36.0 / 4, -36.0, -15.0]
-    found = gae(reward, values, next_values, terminated, done, jnp.array(0.5), jnp.array(0.5))
-    np.testing.assert_allclose(found[:, 0], expected, rtol=1e-6)
+    computed = gae(reward, values, next_values, terminated, done, jnp.array(0.5), jnp.array(0.5))
+    np.testing.assert_allclose(computed[:, 0], expected, rtol=1e-6)
 
 
 def test_gae_equals_a_loop_over_random_episodes() -> None:
@@ -73,16 +73,17 @@ def test_gae_equals_a_loop_over_random_episodes() -> None:
     reward, values, next_values = (rng.normal(size=(50, 3)) for _ in range(3))
     terminated, truncated = rng.random((2, 50, 3)) < 0.1
     done = terminated | truncated
-    expected, following = np.zeros((50, 3)), np.zeros(3)
+    expected = np.zeros((50, 3))
+    following = np.zeros(3)
     for t in reversed(range(50)):
         delta = reward[t] + 0.97 * next_values[t] * ~terminated[t] - values[t]
         following = delta + 0.97 * 0.8 * ~done[t] * following
         expected[t] = following
     arrays = (jnp.asarray(x, jnp.float32) for x in (reward, values, next_values))
-    found = gae(
+    computed = gae(
         *arrays, jnp.asarray(terminated), jnp.asarray(done), jnp.array(0.97), jnp.array(0.8)
     )
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    np.testing.assert_allclose(computed, expected, atol=1e-5)
 
 
 def test_the_critic_learns_a_constant() -> None:
@@ -99,16 +100,18 @@ def test_the_critic_learns_from_the_observation() -> None:
 def test_what_is_learnt_does_not_depend_on_how_many_samples_go_through_the_networks_at_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    env, agent = probe(Position(name="reward")), AGENT.replace(cost_critic=True)
+    env = probe(Position(name="reward"))
+    agent = AGENT.replace(cost_critic=True)
     whole = train(env, updates=3, agent=agent)
     monkeypatch.setattr(ppo_module, "CHUNK", 16)  # a minibatch has 64 samples, a batch 128
     parts = train(env, updates=3, agent=agent)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), whole.params, parts.params
     )
+    # Chunks sum in another order, so the last bits differ.
     assert not np.array_equal(
         whole.params["actor"][0]["kernel"], parts.params["actor"][0]["kernel"]
-    )  # in another order
+    )
 
 
 def test_a_terminated_episode_counts_nothing_beyond_its_end() -> None:
@@ -151,9 +154,8 @@ def test_the_policy_learns_the_action_that_the_observation_calls_for(discrete: b
     for observation in (-1.0, 1.0):
         mode = AGENT.distribution(env, state.params, jnp.array([observation])).mode()
         if discrete:
-            assert int(mode[0]) == (
-                3 if observation > 0 else 1
-            )  # the points are −1, −0.5, 0, 0.5, 1
+            # The points are −1, −0.5, 0, 0.5, 1.
+            assert int(mode[0]) == (3 if observation > 0 else 1)
         else:
             assert float(mode[0]) == pytest.approx(0.5 * observation, abs=0.1)
 
@@ -162,7 +164,8 @@ def test_the_learning_rate_falls_linearly_to_its_end() -> None:
     env = probe(Match(name="reward"))
     frozen = SMALL.replace(learning_rate=jnp.array(1e-3), final_learning_rate=jnp.array(0.0))
     state = init(env, AGENT, frozen, jax.random.key(0)).replace(num_updates=jnp.array(10))
-    after = update(env, AGENT, frozen, 10, state)[0]  # progress 1: the rate is 0, so nothing moves
+    # At progress 1 the rate is 0, so nothing moves.
+    after = update(env, AGENT, frozen, 10, state)[0]
     jax.tree.map(np.testing.assert_array_equal, after.params, state.params)
     earlier = update(env, AGENT, frozen, 20, state)[0]
     moved = jax.tree.map(lambda a, b: float(jnp.abs(a - b).max()), earlier.params, state.params)
@@ -200,7 +203,7 @@ def test_the_discount_of_an_update_is_that_of_its_progress() -> None:
     env = probe(Position(name="reward"), steps=4)
     growing = SMALL.replace(gamma=jnp.array(0.5), horizon_growth=jnp.array(10.0))
     state = init(env, AGENT, growing, jax.random.key(0)).replace(num_updates=jnp.array(10))
-    found, *others = (
+    computed, *others = (
         jnp.concatenate(
             [leaf.ravel() for leaf in jax.tree.leaves(update(env, AGENT, ppo, 10, state)[0].params)]
         )
@@ -210,7 +213,7 @@ def test_the_discount_of_an_update_is_that_of_its_progress() -> None:
             SMALL.replace(gamma=jnp.array(0.5)),
         )
     )
-    at_the_end, at_the_start = (float(jnp.abs(found - other).max()) for other in others)
+    at_the_end, at_the_start = (float(jnp.abs(computed - other).max()) for other in others)
     assert at_the_end < 1e-5
     assert at_the_start > 1e-4
 
@@ -246,7 +249,7 @@ def test_diagnostics_of_an_update_that_changes_nothing_are_those_of_its_batch(
     frozen = SMALL.replace(learning_rate=jnp.array(0.0), final_learning_rate=jnp.array(0.0))
     frozen = frozen.replace(entropy_coefficient=jnp.array(0.3))
     state = init(env, AGENT, frozen, jax.random.key(0))
-    _, found = update(env, AGENT, frozen, 10, state)
+    _, computed = update(env, AGENT, frozen, 10, state)
     key = jax.random.split(jax.random.fold_in(state.key, 0))[0]
     _, t = collect(env, AGENT, frozen, state, key)
     values = AGENT.value(state.params, t.inputs)  # an episode has one step, so nothing follows
@@ -263,13 +266,14 @@ def test_diagnostics_of_an_update_that_changes_nothing_are_those_of_its_batch(
         "gamma": 0.9,
         "action_std": jnp.exp(state.params["log_std"]).mean(),
     }
-    assert found.keys() == {*expected, "grad_norm"}
+    assert computed.keys() == {*expected, "grad_norm"}
     for name, value in expected.items():
-        assert float(found[name]) == pytest.approx(float(value), rel=1e-4, abs=1e-5), name
+        assert float(computed[name]) == pytest.approx(float(value), rel=1e-4, abs=1e-5), name
 
 
 def test_the_diagnostics_show_how_far_an_update_went() -> None:
-    env, still = probe(Match(name="reward")), SMALL.replace(num_epochs=1, num_minibatches=1)
+    env = probe(Match(name="reward"))
+    still = SMALL.replace(num_epochs=1, num_minibatches=1)
     state = init(env, AGENT, SMALL, jax.random.key(0))
     near, far = (
         update(env, AGENT, SMALL.replace(learning_rate=jnp.array(rate)), 10, state)[1]
@@ -294,7 +298,7 @@ def test_the_explained_variance_is_1_for_a_perfect_critic_and_0_for_a_constant_o
 
 
 class Push(Match):
-    """The harder to the right, the better."""
+    """A reward for pushing to the right: the harder, the better."""
 
     def process(self, memory: object, sim: Sim) -> jax.Array:
         return sim.platforms["point"].push
@@ -304,13 +308,13 @@ class Push(Match):
     ("limit", "low", "high"), [(0.5, 0.0, 0.5), (0.1, 0.0, 0.1), (5.0, 0.95, 1.0)]
 )
 def test_costs_are_kept_within_their_limit(limit: float, low: float, high: float) -> None:
-    env = probe(
-        Push(name="reward"), most=0.2
-    )  # pays to break the rule; an episode of one step costs 0 or 1
-    agent, ppo = AGENT.replace(cost_critic=True), SMALL.replace(cost_limit=limit, multiplier=2.0)
+    # The reward pays to break the rule. An episode has one step, so it costs 0 or 1.
+    env = probe(Push(name="reward"), most=0.2)
+    agent = AGENT.replace(cost_critic=True)
+    ppo = SMALL.replace(cost_limit=limit, multiplier=2.0)
     state = train(env, 200, ppo, agent)
     assert low <= float(jnp.mean(state.window.episodes.violating_steps)) <= high
-    assert float(state.multiplier) < 2.0  # it fell where nothing exceeded the limit
+    assert float(state.multiplier) < 2.0  # the multiplier fell while nothing exceeded the limit
 
 
 def test_the_critic_of_costs_expects_what_a_step_costs() -> None:
@@ -326,25 +330,23 @@ def test_the_multiplier_follows_the_excess() -> None:
     env = probe(Constant(name="reward"), most=-1.0)
     state = init(env, AGENT.replace(cost_critic=True), SMALL, jax.random.key(0))
     costs = state.window.episodes.replace(violating_steps=jnp.full(100, 3))
-    window, some, none = (
-        state.window.replace(episodes=costs, count=jnp.array(100)),
-        jnp.array([True]),
-        jnp.array([False]),
-    )
+    window = state.window.replace(episodes=costs, count=jnp.array(100))
+    some = jnp.array([True])
+    none = jnp.array([False])
     rate = float(SMALL.multiplier_rate)
     for limit, change in ((3.0, 0.0), (6.0, -0.5 * rate), (2.0, 0.5 * rate), (0.1, rate)):
-        found = dual_ascent(
+        computed = dual_ascent(
             SMALL.replace(cost_limit=jnp.array(limit)), jnp.array(2.0), window, some
         )
-        assert float(found) == pytest.approx(2.0 * np.exp(change), rel=1e-5)
-        assert (
-            float(dual_ascent(SMALL, jnp.array(2.0), window, none)) == 2.0
-        )  # nothing new is known
+        assert float(computed) == pytest.approx(2.0 * np.exp(change), rel=1e-5)
+        # Without finished episodes nothing new is known.
+        assert float(dual_ascent(SMALL, jnp.array(2.0), window, none)) == 2.0
 
 
 def test_the_kept_networks_are_those_of_training_or_their_average() -> None:
     env = probe(Match(name="reward"))
-    plain, averaged = train(env), train(env, ppo=SMALL.replace(averaging=0.5))
+    plain = train(env)
+    averaged = train(env, ppo=SMALL.replace(averaging=0.5))
     assert jax.tree.all(
         jax.tree.map(lambda a, b: bool((a == b).all()), plain.average, plain.params)
     )
@@ -359,13 +361,13 @@ def test_the_kept_networks_are_those_of_training_or_their_average() -> None:
     expected = jax.tree.map(
         lambda a, b, c: 0.25 * a + 0.25 * b + 0.5 * c, start, few[1].params, few[2].params
     )
-    for found, wanted in zip(
+    for computed, wanted in zip(
         jax.tree.leaves(few[2].average), jax.tree.leaves(expected), strict=True
     ):
-        np.testing.assert_allclose(found, wanted, atol=1e-5)
+        np.testing.assert_allclose(computed, wanted, atol=1e-5)
 
 
-def test_the_numbers_of_devices_that_may_share_a_seed_are_the_common_divisors_and_found_quickly() -> (
+def test_numbers_of_devices_that_may_share_a_seed_are_the_common_divisors_and_found_quickly() -> (
     None
 ):
     assert PPO(num_envs=24, num_steps=64, num_minibatches=2).shares == [1, 2, 3, 4, 6, 8, 12, 24]

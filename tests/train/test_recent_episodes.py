@@ -26,7 +26,8 @@ def test_the_window_keeps_the_last_hundred_finished_episodes_in_order() -> None:
     window = empty_window(episodes_like(np.zeros(1, np.float32)))
     finished: list[float] = []
     for _ in range(8):
-        values, done = rng.normal(size=(30, 4)).astype(np.float32), rng.random((30, 4)) < 0.2
+        values = rng.normal(size=(30, 4)).astype(np.float32)
+        done = rng.random((30, 4)) < 0.2
         window = jax.jit(push)(window, episodes_like(values), jnp.asarray(done))
         finished += values[done].tolist()
         kept = np.sort(np.asarray(window.episodes.episode_return)[: min(len(finished), SIZE)])
@@ -44,13 +45,12 @@ def test_the_cost_counts_the_violating_steps_of_all_finished_episodes() -> None:
 
 def test_the_cost_of_the_training_counts_every_violating_step_once() -> None:
     rng = np.random.default_rng(2)
-    window, counted, before = (
-        empty_window(episodes_like(np.zeros(1, np.float32))),
-        0,
-        np.zeros(3, int),
-    )
+    window = empty_window(episodes_like(np.zeros(1, np.float32)))
+    counted = 0
+    before = np.zeros(3, int)
     for _ in range(20):
-        violated, done = rng.random((5, 3)) < 0.5, rng.random((5, 3)) < 0.2
+        violated = rng.random((5, 3)) < 0.5
+        done = rng.random((5, 3)) < 0.2
         rows = []
         for step in range(5):
             rows.append(before + violated[step])
@@ -89,7 +89,8 @@ def test_the_latest_cost_is_that_of_the_last_episodes() -> None:
     assert float(latest_cost(window)) == 0.0
     finished: list[int] = []
     for _ in range(60):
-        costs, done = rng.integers(0, 50, (4, 2)), rng.random((4, 2)) < 0.5
+        costs = rng.integers(0, 50, (4, 2))
+        done = rng.random((4, 2)) < 0.5
         episodes = episodes_like(np.zeros((4, 2), np.float32)).replace(
             violating_steps=jnp.asarray(costs, jnp.int32)
         )

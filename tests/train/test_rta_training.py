@@ -1,4 +1,7 @@
-"""Training and evaluating with run time assurance in the loop: what PPO is told of interventions, and what is reported."""
+"""Training and evaluating with run time assurance in the loop.
+
+The tests check what PPO is told of interventions, and what is reported.
+"""
 
 import json
 from pathlib import Path
@@ -30,10 +33,8 @@ def resolved(*words: str) -> tuple[TrainConfig, jaxsafe.Environment]:
 
 def collected(learns_from: str) -> Transition:
     env = jaxsafe.make("docking2d", rta="default")
-    agent, ppo = (
-        normalise(Agent(hidden=(8,))),
-        normalise(PPO(num_envs=16, num_steps=32, learns_from=learns_from)),
-    )
+    agent = normalise(Agent(hidden=(8,)))
+    ppo = normalise(PPO(num_envs=16, num_steps=32, learns_from=learns_from))
     state = init(env, agent, ppo, jax.random.key(0))
     return jax.jit(lambda state, key: collect(env, agent, ppo, state, key)[1])(
         state, jax.random.key(1)
@@ -41,10 +42,8 @@ def collected(learns_from: str) -> Transition:
 
 
 def test_ppo_learns_from_the_desired_or_the_actual_control() -> None:
-    desired, actual = (
-        np.asarray(collected("desired").action),
-        np.asarray(collected("actual").action),
-    )
+    desired = np.asarray(collected("desired").action)
+    actual = np.asarray(collected("actual").action)
     altered = (desired != actual).any(axis=-1)
     assert 0.01 < altered.mean() < 0.9
     assert (np.abs(actual[altered]) <= 1.0).all()  # what acted was within its bounds
@@ -53,14 +52,12 @@ def test_ppo_learns_from_the_desired_or_the_actual_control() -> None:
 
 def test_the_log_probability_is_that_of_the_stored_action() -> None:
     env = jaxsafe.make("docking2d", rta="default")
-    agent, ppo = (
-        normalise(Agent(hidden=(8,))),
-        normalise(PPO(num_envs=16, num_steps=32, learns_from="actual")),
-    )
+    agent = normalise(Agent(hidden=(8,)))
+    ppo = normalise(PPO(num_envs=16, num_steps=32, learns_from="actual"))
     params = init(env, agent, ppo, jax.random.key(0)).params
-    found = collected("actual")
-    expected = agent.distribution(env, params, found.inputs).log_prob(found.action)
-    np.testing.assert_allclose(found.log_prob, expected, rtol=1e-4, atol=1e-4)
+    transition = collected("actual")
+    expected = agent.distribution(env, params, transition.inputs).log_prob(transition.action)
+    np.testing.assert_allclose(transition.log_prob, expected, rtol=1e-4, atol=1e-4)
 
 
 def test_an_intervention_costs_what_its_term_says() -> None:

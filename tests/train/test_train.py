@@ -34,17 +34,27 @@ from jaxsafe.train.ppo import DIAGNOSTICS
 def test_a_run_directory_holds_everything(whole: Path) -> None:
     names = {path.name for path in whole.iterdir()}
     assert names == {
-        "config.yaml", "progress.jsonl", "progress.csv", "eval.jsonl", "episodes.jsonl", "checkpoints", "policy", "figures",
+        "config.yaml",
+        "progress.jsonl",
+        "progress.csv",
+        "eval.jsonl",
+        "episodes.jsonl",
+        "checkpoints",
+        "policy",
+        "figures",
         "results.json",
-    }  # fmt: skip
+    }
     assert {path.name for path in (whole / "policy").iterdir()} == {
         "seed_0.npz",
         "seed_1.npz",
         "seed_2.npz",
     }
     assert {path.name for path in (whole / "figures").iterdir()} == {
-        "training_steps.png", "learning_steps.png", "trajectories.png", "speed_distance.png",
-    }  # fmt: skip
+        "training_steps.png",
+        "learning_steps.png",
+        "trajectories.png",
+        "speed_distance.png",
+    }
 
 
 def test_progress_has_a_row_for_every_update_of_every_seed(whole: Path) -> None:
@@ -103,6 +113,7 @@ def test_results_follow_the_schema(whole: Path) -> None:
 
 def test_logged_episodes_hold_states_controls_statuses_and_rewards(whole: Path) -> None:
     rows = logs(whole)["episodes.jsonl"]
+    # Episodes are logged in early learning and then at each evaluation.
     assert {row["step"] for row in rows} == {
         0,
         64,
@@ -112,7 +123,7 @@ def test_logged_episodes_hold_states_controls_statuses_and_rewards(whole: Path) 
         640,
         960,
         1280,
-    }  # early learning, then each evaluation
+    }
     episode = [row for row in rows if row["step"] == 640]
     assert [row["t"] for row in episode] == list(range(len(episode)))
     assert [row["outcome"] for row in episode[:-1]] == ["running"] * (len(episode) - 1)
@@ -146,7 +157,7 @@ def _crash_at(
 @pytest.mark.parametrize(
     ("name", "call", "after"),
     [
-        ("_record", 1, True),  # of the untrained policy
+        ("_record", 1, True),  # records the untrained policy
         ("_record", 3, True),
         ("_write_progress", 3, True),  # before any checkpoint
         ("_write_progress", 7, True),  # rows that the checkpoint does not know
@@ -224,7 +235,7 @@ def test_a_refused_training_leaves_its_directory_free(
     assert command.main([*TINY, f"out={tmp_path / 'run'}"]) == 0
 
 
-@pytest.mark.parametrize("step", [448, 1280])  # the second with nothing left to train
+@pytest.mark.parametrize("step", [448, 1280])  # at the second step nothing is left to train
 def test_ctrl_c_stops_after_a_chunk_with_a_checkpoint_and_resumes(
     tmp_path: Path,
     whole: Path,
@@ -284,7 +295,8 @@ def test_all_tasks_run_one_after_another_and_resume(
         patch.setattr(Training, "_write_progress", interrupt)
         assert command.main(["env=all", *words, *same, f"out={path}"]) == cli.INTERRUPTED
     assert f"go on with: python -m jaxsafe.train resume={path}" in capsys.readouterr().out
-    assert not list(path.rglob("results.json"))  # all are trained before the first is evaluated
+    # All tasks are trained before the first is evaluated.
+    assert not list(path.rglob("results.json"))
     with monkeypatch.context() as patch:
         _crash_at(patch, Training, "evaluate_finally", call=2, after=False)
         with pytest.raises(_CrashError):
@@ -302,15 +314,16 @@ def test_all_tasks_run_one_after_another_and_resume(
 def test_the_clocks_of_runs_that_take_turns_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     now = iter(range(0, 1000, 10))
     monkeypatch.setattr(time, "monotonic", lambda: next(now))
-    one, other = Clock(spent=3.0), Clock()
-    with one:  # from 0 to 10
+    first = Clock(spent=3.0)
+    other = Clock()
+    with first:  # from 0 to 10
         pass
     with other:  # from 20
-        assert one.seconds == 13.0
-        assert other.seconds == 10.0  # at 30; to 40
-    with one:  # from 50 to 60
+        assert first.seconds == 13.0
+        assert other.seconds == 10.0  # asked at 30, and running to 40
+    with first:  # from 50 to 60
         pass
-    assert (one.seconds, other.seconds) == (23.0, 20.0)
+    assert (first.seconds, other.seconds) == (23.0, 20.0)
 
 
 def test_options_that_do_not_fit_all_tasks_are_told_with_the_task(
@@ -365,22 +378,29 @@ def test_a_policy_file_acts_like_the_trained_network(whole: Path) -> None:
     _, timestep = env.reset(jax.random.key(0))
     action = load_policy(whole / "policy" / "seed_1.npz")(jax.random.key(1), timestep.observation)
     expected = agent.act(env, trained, jax.random.key(1), timestep.observation, True)
-    np.testing.assert_allclose(action, expected, rtol=1e-6)  # not compiled as one program
+    # The two are not compiled as one program.
+    np.testing.assert_allclose(action, expected, rtol=1e-6)
     assert about == {"env": "docking2d", "preset": "features", "seed": 1, "step": 1280}
 
 
 @pytest.mark.slow
 def test_twenty_kills_at_random_moments_change_nothing(tmp_path: Path) -> None:
-    """Kill runs twenty times at random moments, resume each until it ends, and compare with a run left alone."""
+    """Kill runs twenty times at random moments and resume each until it ends.
+
+    Each must equal a run that was left alone.
+    """
     longer = [
         *(word.replace("=320", "=4000") for word in TINY if not word.startswith("steps")),
         "steps=40000",
     ]
-    call, whole, rng = [sys.executable, "-m", "jaxsafe.train"], tmp_path / "whole", random.Random(0)
+    call = [sys.executable, "-m", "jaxsafe.train"]
+    whole = tmp_path / "whole"
+    rng = random.Random(0)
+    # The second run finds its programs compiled, as the runs to be killed will.
     for out in (
         tmp_path / "first",
         whole,
-    ):  # the second finds its programs compiled, as the runs to be killed will
+    ):
         begin = time.monotonic()
         subprocess.run([*call, *longer, f"out={out}"], check=True, capture_output=True)
         usual = time.monotonic() - begin
@@ -480,8 +500,8 @@ def test_a_run_that_an_older_version_began_does_not_go_on(tmp_path: Path, whole:
     write_rows(run / "progress.jsonl", older)
     with pytest.raises(
         ConfigError,
-        match=r"progress\.jsonl: another version of jaxsafe began it; columns differ in action_std, "
-        r"approx_kl, .*; begin a new run$",
+        match=r"progress\.jsonl: another version of jaxsafe began it; columns differ in"
+        r" action_std, approx_kl, .*; begin a new run$",
     ):
         command.main([f"resume={run}"])
 
@@ -493,9 +513,8 @@ def test_a_log_that_lost_its_end_is_gone_back_to_the_checkpoint_that_it_covers(
     shutil.copytree(whole, run)
     (run / "results.json").unlink()
     lines = (run / "progress.jsonl").read_text().splitlines(keepends=True)
-    (run / "progress.jsonl").write_text(
-        "".join(lines[:47]) + lines[47][:9]
-    )  # up to step 960 with 15 whole updates of 3 seeds
+    # The log goes up to step 960, with 15 whole updates of 3 seeds.
+    (run / "progress.jsonl").write_text("".join(lines[:47]) + lines[47][:9])
     assert command.main([f"resume={run}"]) == 0
     assert (
         "progress.jsonl ends before the checkpoint of step 1,280: going on from 960"
@@ -514,7 +533,9 @@ def flip(file: Path, place: float, bit: int) -> None:
 def test_a_flipped_bit_in_a_checkpoint_is_told_or_changes_nothing(
     tmp_path: Path, whole: Path, seed: int
 ) -> None:
-    draw, expected, refused = random.Random(seed), final_state(whole), 0
+    draw = random.Random(seed)
+    expected = final_state(whole)
+    refused = 0
     for number in range(4):
         run = tmp_path / str(number)
         shutil.copytree(whole / "checkpoints" / "1280", run / "checkpoints" / "1280")
@@ -526,11 +547,11 @@ def test_a_flipped_bit_in_a_checkpoint_is_told_or_changes_nothing(
             draw.randrange(8),
         )
         try:
-            found = final_state(run)
+            state = final_state(run)
         except ConfigError:
             refused += 1
         else:
-            jax.tree.map(np.testing.assert_array_equal, found, expected)
+            jax.tree.map(np.testing.assert_array_equal, state, expected)
     assert refused
 
 
@@ -582,7 +603,7 @@ def test_facts_of_a_checkpoint_are_checked_and_those_of_before_are_known(
     shutil.copytree(whole, run)
     file = run / "checkpoints" / "1280" / "facts" / "metadata"
     facts = json.loads(file.read_text())
-    if name is None:  # as they were before checkpoints had digests
+    if name is None:  # checkpoints once had no digests
         file.write_text(json.dumps({key: facts[key] for key in ("updates", "wall_s", "compile_s")}))
         jax.tree.map(np.testing.assert_array_equal, final_state(run), final_state(whole))
         return
@@ -604,10 +625,10 @@ def test_a_corrupt_checkpoint_leaves_one_line_on_standard_error(
     for manifest in (run / "checkpoints" / "1280").rglob("manifest.ocdbt"):
         manifest.write_bytes(b"")
     call = [sys.executable, "-m", "jaxsafe.train", f"resume={run}"]
-    found = subprocess.run(call, capture_output=True, text=True, check=False)
-    assert found.returncode == 2
-    assert found.stderr.count("\n") == 1, found.stderr
-    assert "checkpoint cannot be read" in found.stderr
+    process = subprocess.run(call, capture_output=True, text=True, check=False)
+    assert process.returncode == 2
+    assert process.stderr.count("\n") == 1, process.stderr
+    assert "checkpoint cannot be read" in process.stderr
 
 
 FULL = """
@@ -632,9 +653,9 @@ def test_a_checkpoint_without_room_is_one_line_and_leaves_the_one_before(
     tmp_path: Path, step: int
 ) -> None:
     call = [sys.executable, "-c", FULL, str(tmp_path), str(step)]
-    found = subprocess.run(call, capture_output=True, text=True, check=False)
-    assert found.returncode == 2
-    [line] = found.stderr.splitlines()
+    process = subprocess.run(call, capture_output=True, text=True, check=False)
+    assert process.returncode == 2
+    [line] = process.stderr.splitlines()
     assert line.startswith(
         f"error: {tmp_path}/checkpoints/{step}: checkpoint cannot be written: File too large"
     )
@@ -644,7 +665,8 @@ def test_a_checkpoint_without_room_is_one_line_and_leaves_the_one_before(
 
 def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(tmp_path: Path) -> None:
     words = [*TINY, "algorithm=ppo_lagrangian", "cost_limit=3"]
-    straight, stopped = tmp_path / "straight", tmp_path / "stopped"
+    straight = tmp_path / "straight"
+    stopped = tmp_path / "stopped"
     assert command.main([*words, f"out={straight}"]) == 0
     rows = logs(straight)["progress.jsonl"]
     assert all(row["multiplier"] > 0.0 for row in rows if row["episodes"])

@@ -1,4 +1,4 @@
-"""Training and evaluation as functions: they do what the commands do, and work under jit and vmap."""
+"""Training and evaluation as functions do what the commands do, and work under jit and vmap."""
 
 import inspect
 import subprocess
@@ -30,7 +30,10 @@ def recipe() -> Recipe:
 
 
 def test_it_trains_bit_for_bit_what_the_command_trains(tmp_path: Path) -> None:
-    """With two updates at a time, as all but the shortest trainings: one is compiled without a loop."""
+    """Two updates run at a time, as in all but the shortest trainings.
+
+    A single one is compiled without a loop.
+    """
     longer = {"seeds=3": "seeds=2", "steps=1280": "steps=6400", "eval_every=320": "eval_every=6400"}
     words = [longer.get(word, word) for word in TINY if not word.startswith("checkpoint_every")]
     assert main([*words, f"out={tmp_path / 'run'}"]) == 0
@@ -102,5 +105,8 @@ def test_the_packages_show_the_arguments_of_their_functions() -> None:
 
 
 def test_importing_jaxsafe_does_not_load_the_optimizer() -> None:
-    code = "import sys, jaxsafe; assert callable(jaxsafe.train) and not {'optax', 'flax'} & {*sys.modules}"
+    code = (
+        "import sys, jaxsafe; assert callable(jaxsafe.train) and not {'optax', 'flax'} &"
+        " {*sys.modules}"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
