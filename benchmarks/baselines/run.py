@@ -89,18 +89,22 @@ def answers(options: Sequence[str], results: Mapping[str, Any]) -> bool:
 def options_of(item: Item) -> dict[str, Any]:
     """Return every option of an item's training and environment, as `config.yaml` has them.
 
-    The place of the run is left out.
+    Where the run and its progress go is left out.
     """
     config, env, _ = resolve(Arguments.parse(item.words).options)
-    content = described(config, env)
-    content["training"].pop("out")
-    return content
+    return _without_places(described(config, env))
+
+
+def _without_places(content: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of a `config.yaml` without the options that say where things go."""
+    places = ("out", "wandb", "mlflow")
+    training = {key: value for key, value in content["training"].items() if key not in places}
+    return {**content, "training": training}
 
 
 def _refuse_other(item: Item, run: Path) -> None:
     """Refuse an old run with other options. Its numbers must not pass as those of a new recipe."""
-    content = read_content(run)
-    content["training"].pop("out", None)
+    content = _without_places(read_content(run))
     if any(content[part] != value for part, value in options_of(item).items()):
         raise ConfigError(
             f"runs: {run} was trained with other options; remove it, or give another directory"

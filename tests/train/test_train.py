@@ -437,29 +437,6 @@ def test_the_default_recipe_learns_to_dock(tmp_path: Path, task: str) -> None:
         assert min(results["evaluation"][kind]["success_rate"]["per_seed"]) > 0.9
 
 
-def test_tensorboard_gets_the_progress_of_every_seed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = tmp_path / "run"
-    assert command.main([*TINY, "tensorboard=true", f"out={run}"]) == 0
-    (events,) = (run / "tensorboard").iterdir()
-    content = events.read_bytes()
-    for seed in range(3):
-        known = [
-            row
-            for row in logs(run)["progress.jsonl"]
-            if row["seed"] == seed and row["return"] is not None
-        ]
-        assert content.count(f"return/seed_{seed}".encode()) == len(known) > 10
-    monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    with pytest.raises(
-        ConfigError,
-        match=r"tensorboard: tensorboardX is not installed; in a clone .*'\.\[tensorboard\]'",
-    ):
-        command.main([*TINY, "tensorboard=true", f"out={tmp_path / 'other'}"])
-    assert not (tmp_path / "other").exists()
-
-
 def test_nothing_is_lost_when_checkpoints_are_missing(
     tmp_path: Path, whole: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,14 +1,14 @@
 """What a run tells while it goes on.
 
-It writes progress rows to files, shows a bar or plain lines on the terminal, and writes to
-TensorBoard if asked.
+It writes progress rows to files and to the sinks that the user asks for, and shows a bar or plain
+lines on the terminal.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +16,10 @@ import numpy as np
 
 from jaxsafe.environment import Environment
 from jaxsafe.metrics import measures
-from jaxsafe.schema.errors import ConfigError, install_hint
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import append_csv, append_rows, read_rows, write_csv, write_rows
 from jaxsafe.storage.forms import COUNT, FLAG, NUMBER, NUMBER_OR_NULL, OTHERS
+from jaxsafe.train.host.sinks import Sink, reason
 from jaxsafe.train.ppo import DIAGNOSTICS
 
 NEEDS = {
@@ -97,14 +98,13 @@ def headline(facts: Mapping[str, Any]) -> str:
 class ProgressLog:
     """`progress.jsonl` and `progress.csv`, with a row for every update of every seed."""
 
-    def __init__(self, run: Path, resume_step: int, expected: int, tensorboard: bool) -> None:
+    def __init__(self, run: Path, resume_step: int, expected: int) -> None:
         """Open the logs, and cut them back to the step from which the run goes on.
 
         Args:
             run: the run directory.
             resume_step: environment steps of each seed from which the run goes on.
             expected: number of rows up to that step.
-            tensorboard: whether to write to TensorBoard too.
 
         Raises:
             ConfigError: rows are missing or broken.
@@ -122,14 +122,11 @@ class ProgressLog:
             write_csv(self._csv, self.rows)
         else:
             self._csv.unlink(missing_ok=True)
-        self._board = (
-            tensorboard_writer()(str(run / "tensorboard"), purge_step=resume_step + 1)
-            if tensorboard
-            else None
-        )
+        self.sinks: dict[str, Sink] = {}
+        """Where the rows go besides the files, by name."""
 
     def write(self, rows: list[dict[str, Any]]) -> None:
-        """Add rows to all logs.
+        """Add rows to all logs, and give them to the sinks.
 
         Raises:
             ConfigError: the log was begun with other columns.
@@ -144,24 +141,38 @@ class ProgressLog:
         self.rows += rows
         append_rows(self._jsonl, rows)
         append_csv(self._csv, rows)
-        for row in rows if self._board else ():
-            for name in [
-                key
-                for key, value in row.items()
-                if key not in ("seed", "step", "diverged") and value is not None
-            ]:
-                self._board.add_scalar(f"{name}/seed_{row['seed']}", row[name], row["step"])  # type: ignore[union-attr]
+
+        def send(sink: Sink) -> None:
+            for row in rows:
+                sink.write(row["step"], row["seed"], _numbers(row))
+
+        self._for_each_sink(send)
 
     def close(self) -> None:
-        """Flush what is buffered."""
-        if self._board:
-            self._board.close()
+        """Let the sinks deliver what is left."""
+        self._for_each_sink(lambda sink: sink.close())
+        self.sinks = {}
+
+    def _for_each_sink(self, action: Callable[[Sink], None]) -> None:
+        """Do something with each sink. One that fails is left out, and the training goes on."""
+        for name, sink in [*self.sinks.items()]:
+            try:
+                action(sink)
+            except Exception as error:
+                print(f"{name}: {reason(error)}; the training goes on without it", flush=True)
+                del self.sinks[name]
 
     def curve(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Return steps [updates] and one column [updates, seeds]. Unknown values are NaN."""
         steps = np.unique([row["step"] for row in self.rows])
         values = np.array([np.nan if row[name] is None else row[name] for row in self.rows], float)
         return steps, values.reshape(len(steps), -1)
+
+
+def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
+    """Return the numbers of a row that are known, by column."""
+    others = ("seed", "step", "diverged")
+    return {name: value for name, value in row.items() if name not in others and value is not None}
 
 
 def progress_rows(
@@ -284,23 +295,3 @@ def _mean(values: list[float | None]) -> float | None:
 
 def _text(value: float | None, form: str) -> str:
     return "–" if value is None else format(value, form)
-
-
-def tensorboard_writer() -> Any:
-    """Return the class that writes TensorBoard's files.
-
-    Raises:
-        ConfigError: the extra is not installed, or cannot be imported.
-    """
-    try:
-        from tensorboardX import SummaryWriter
-    except ImportError:
-        raise ConfigError(
-            f"tensorboard: tensorboardX is not installed; {install_hint('tensorboard')}"
-        ) from None
-    except Exception as error:  # for instance with an old tensorboardX beside a new protobuf
-        reason = next(iter(str(error).splitlines()), "")
-        raise ConfigError(
-            f"tensorboard: tensorboardX cannot be imported: {type(error).__name__}: {reason}"
-        ) from None
-    return SummaryWriter

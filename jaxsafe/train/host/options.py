@@ -23,7 +23,7 @@ from jaxsafe.schema.component import Component, Range, normalise
 from jaxsafe.schema.convert import to_value
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError, nearest, show
-from jaxsafe.train.host.log import tensorboard_writer
+from jaxsafe.train.host.sinks import LIBRARIES, library
 from jaxsafe.train.ppo import MAX_COUNT, PPO
 from jaxsafe.types import Dimensionless, Positive
 
@@ -101,7 +101,17 @@ class TrainConfig(Component):
     Some episodes are logged before the first evaluation too.
     """
     tensorboard: bool = False
-    """Whether to write the progress for TensorBoard too. It needs the extra `tensorboard`."""
+    """Whether the progress also goes to files of TensorBoard. It needs the extra `tensorboard`."""
+    wandb: str | None = None
+    """Project of Weights & Biases that the progress also goes to. It needs the extra `wandb`.
+
+    `true` stands for the project `jaxsafe`.
+    """
+    mlflow: str | None = None
+    """Experiment of MLflow that the progress also goes to. It needs the extra `mlflow`.
+
+    `true` stands for the experiment `jaxsafe`.
+    """
     agent: Agent = Agent()
     ppo: PPO = PPO()
 
@@ -169,6 +179,9 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     for name, example in (("agent", "hidden"), ("ppo", "gamma")):
         if name in arguments.options:
             raise ConfigError(f"{name}: name one of its options, for instance {name}.{example}=…")
+    for sink in ("wandb", "mlflow"):
+        if isinstance(arguments.options.get(sink), bool):
+            arguments.options[sink] = "jaxsafe" if arguments.options[sink] else None
     config = TrainConfig()
     # This comes first, so that a misspelt option is told before a slow start.
     for path, value in arguments.options.items():
@@ -228,8 +241,9 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         raise ConfigError(
             f"seeds: seed + seeds must not exceed 2³¹, found {config.seed} + {config.seeds}"
         )
-    if config.tensorboard:
-        tensorboard_writer()
+    for sink in LIBRARIES:
+        if getattr(config, sink):
+            library(sink)
     if jnp.size(config.agent.log_std) not in (1, env.action_size):
         count, found = env.action_size, jnp.size(config.agent.log_std)
         raise ConfigError(
@@ -318,7 +332,7 @@ def recipe(task: str, preset: str | None) -> dict[str, Any]:
         raise ConfigError(
             f"preset: unknown preset {show(name)}; choose from {nearest(name, known)}"
         )
-    return {"preset": name, **_flatten(known[name] or {})}
+    return {"preset": name, **flatten(known[name] or {})}
 
 
 def configs() -> Path:
@@ -336,11 +350,12 @@ def configs() -> Path:
     )
 
 
-def _flatten(tree: Mapping[str, Any], place: str = "") -> dict[str, Any]:
+def flatten(tree: Mapping[str, Any], place: str = "") -> dict[str, Any]:
+    """Return the values of nested mappings by dotted path."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
         flat |= (
-            _flatten(value, f"{place}{key}.")
+            flatten(value, f"{place}{key}.")
             if isinstance(value, Mapping)
             else {f"{place}{key}": value}
         )

@@ -54,10 +54,13 @@ MAY_CHANGE = (
     "checkpoint_every",
     "log_every",
     "tensorboard",
+    "wandb",
+    "mlflow",
 )
 """Options that may differ from those of a checkpoint.
 
-They say how long to train, on which devices, where the run is, and when to look at the training.
+They say how long to train, on which devices, where the run is, when to look at the training, and
+where its progress goes.
 """
 
 

@@ -27,12 +27,14 @@ from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.evaluator import EVALUATION_SEED, KINDS, Evaluator, episode_rows
 from jaxsafe.metrics import Episode
+from jaxsafe.schema.convert import to_data
 from jaxsafe.storage.files import append_rows, keep_rows, sync
 from jaxsafe.storage.forms import COUNT
 from jaxsafe.train.host.checkpoint import Checkpoints
 from jaxsafe.train.host.log import Display, ProgressLog, progress_rows, read_progress
-from jaxsafe.train.host.options import TrainConfig
+from jaxsafe.train.host.options import TrainConfig, flatten
 from jaxsafe.train.host.restore import made_from, restore, structure
+from jaxsafe.train.host.sinks import Sink, open_sinks
 from jaxsafe.train.train import STATE, programs
 
 
@@ -102,17 +104,17 @@ class Training:
         A second call does nothing.
 
         Raises:
-            ConfigError: the training does not fit into memory, or the logs or checkpoints of the
-                run cannot be read.
+            ConfigError: the training does not fit into memory, the logs or checkpoints of the run
+                cannot be read, or a sink cannot be opened.
         """
         if self._prepared:
             return
         with self.clock, without_collection():
             self._begin()
         self._keep_copies()
-        self.log = ProgressLog(
-            self.run, self.step, self.updates * self.config.seeds, self.config.tensorboard
-        )
+        self.log = ProgressLog(self.run, self.step, self.updates * self.config.seeds)
+        if processes.leads():
+            self.log.sinks = self._open_sinks()
         for name in ("eval.jsonl", "episodes.jsonl"):
             keep_rows(self.run / name, self._known, {"step": COUNT})
         self.diverged = {}
@@ -219,6 +221,18 @@ class Training:
         if self.config.every(self.config.eval_every) < self.config.num_updates:
             self.evaluator.prepare(like.average)
         self.compile_s += time.monotonic() - begin
+
+    def _open_sinks(self) -> dict[str, Sink]:
+        """Return what takes the rows of the progress log besides its files, by name."""
+        config = self.config
+        return open_sinks(
+            tensorboard=config.tensorboard,
+            wandb=config.wandb,
+            mlflow=config.mlflow,
+            run=self.run,
+            resume_step=self.step,
+            options={"env": self.name, **flatten(to_data(config))},
+        )
 
     def _restore(self) -> None:
         """Go back to the newest checkpoint that the progress log covers.
