@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from default_cases import one_of_each_kind, thorough
 
 import jaxsafe
 from jaxsafe.autoreset import MIN_RESETS_PER_ROUND, RESETS_PER_ROUND, SPARSE_RESETS_FROM, renew
@@ -20,7 +21,7 @@ SIZES = (24, SPARSE_RESETS_FROM, 1000, 1031)  # few, many, no power of two, a pr
 
 
 @pytest.mark.parametrize("axis", [0, -1])
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("size", one_of_each_kind(SIZES, [24, 1031]))
 def test_environments_are_renewed_alike_however_many_they_are(
     size: int, axis: Literal[0, -1]
 ) -> None:
@@ -55,24 +56,25 @@ def test_environments_are_renewed_alike_however_many_they_are(
         np.testing.assert_array_equal(computed["b"], np.where(where, -indices, indices))
 
 
-@pytest.mark.parametrize("num_envs", [16, SPARSE_RESETS_FROM])
+@pytest.mark.parametrize("num_envs", [thorough(16), SPARSE_RESETS_FROM])
 def test_gradients_reach_the_starts_of_batches_of_any_size(num_envs: int) -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 1.0})
     state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(0), num_envs)
     state = state.replace(num_steps=jnp.arange(num_envs) % 2)
 
-    def total(least: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def total(least: jax.Array) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         wide = jaxsafe.override(
             env, {"deputy.start.position.distance": jnp.stack([least, jnp.float32(150.0)])}
         )
         (after, _), timestep = step_or_reset_batch(
             wide, state, jnp.zeros((num_envs, 2)), jax.random.key(1)
         )
-        fresh = jnp.linalg.norm(after.sim.platforms["deputy"].position, axis=-1)[timestep.done]
-        return jnp.sum(fresh), fresh
+        distances = jnp.linalg.norm(after.sim.platforms["deputy"].position, axis=-1)
+        return jnp.sum(distances, where=timestep.done), (distances, timestep.done)
 
     for derivative in (jax.grad, jax.jacfwd):
-        slope, distances = derivative(total, has_aux=True)(jnp.float32(100.0))
+        slope, (distances, done) = jax.jit(derivative(total, has_aux=True))(jnp.float32(100.0))
+        distances = distances[done]
         assert len(distances) == num_envs // 2
         # The derivative follows from d = low + (high − low) u.
         np.testing.assert_allclose(slope, np.sum((150.0 - distances) / 50.0), rtol=1e-4)

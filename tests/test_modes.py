@@ -3,6 +3,7 @@
 These are modes for debugging, for other random numbers and for double precision.
 """
 
+import itertools
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any
@@ -11,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from default_cases import one_of_each_kind
 
 import jaxsafe
 from jaxsafe.envs import TASKS
@@ -86,8 +88,18 @@ def test_steps_and_rollouts_can_be_traced(mode: str, task: str) -> None:
             jax.eval_shape(lambda env, key, n=num_envs: core(env, key, n), env, jax.random.key(0))
 
 
-@pytest.mark.parametrize("mode", CHECKED_WHILE_TRACING)
-@pytest.mark.parametrize("training", TRAININGS)
+@pytest.mark.parametrize(
+    ("training", "mode"),
+    one_of_each_kind(
+        itertools.product(TRAININGS, CHECKED_WHILE_TRACING),
+        [
+            *(("ppo", mode) for mode in CHECKED_WHILE_TRACING),
+            ("ppo_lagrangian", "rank_promotion"),
+            ("discrete", "x64"),
+            ("corrected", "dtype_promotion"),
+        ],
+    ),
+)
 def test_training_and_evaluation_can_be_traced(mode: str, training: str) -> None:
     with CHECKED_WHILE_TRACING[mode]():
         learn(TRAININGS[training], jax.random.key(0), jax.eval_shape)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from default_cases import one_of_each_kind
 
 import jaxsafe
 from jaxsafe import ConfigError, Environment
@@ -122,7 +123,8 @@ def test_a_randomized_episode_is_the_episode_with_the_numbers_written_in(env: En
 
 
 @pytest.mark.parametrize(
-    "task", ["docking2d", "docking3d", "docking2d_oriented", "rejoin2d", "rejoin3d"]
+    "task",
+    one_of_each_kind(["docking2d", "docking3d", "docking2d_oriented", "rejoin2d", "rejoin3d"]),
 )
 def test_starts_are_bitwise_those_without_random_numbers(task: str) -> None:
     plain = jaxsafe.make(task)

@@ -10,6 +10,7 @@ import gymnasium as gym
 import jax
 import numpy as np
 import pytest
+from default_cases import one_of_each_kind, thorough
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -53,9 +54,9 @@ def same(ours: Any, theirs: Any, where: np.ndarray, name: str) -> None:
         pytest.param(
             name,
             kind,
-            marks=[pytest.mark.slow]
-            if kind == "discrete" and name != "jaxsafe/Docking2D-v0"
-            else [],
+            marks=[]
+            if name == "jaxsafe/Docking2D-v0"
+            else [pytest.mark.slow if kind == "discrete" else pytest.mark.thorough],
         )
         for name in (task.gymnasium_id for task in TASKS.values())
         for kind in ("continuous", "discrete")
@@ -102,7 +103,7 @@ def step_by_step(ours: GymVectorEnv, theirs: SyncVectorEnv, steps: int) -> int:
     return ends
 
 
-@pytest.mark.parametrize("mode", list(AutoresetMode))
+@pytest.mark.parametrize("mode", one_of_each_kind(AutoresetMode, [AutoresetMode.SAME_STEP]))
 def test_a_batch_is_what_single_environments_are_step_by_step(mode: AutoresetMode) -> None:
     options: dict[str, Any] = {"overrides": SOON, "rta": "explicit_simplex", "max_episode_steps": 7}
     ours = GymVectorEnv("docking2d", 6, autoreset_mode=mode, **options)
@@ -110,6 +111,7 @@ def test_a_batch_is_what_single_environments_are_step_by_step(mode: AutoresetMod
     assert step_by_step(ours, theirs, 30) > 20
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("task", [task for task in TASKS if task != "docking2d"])
 def test_a_batch_of_any_task_and_of_discrete_actions_is_too(task: str) -> None:
@@ -204,7 +206,7 @@ def test_a_generator_of_ones_own_waits_for_the_environments_that_go_on() -> None
     assert np.array_equal(only[0], expected[0])
 
 
-@pytest.mark.parametrize("kind", ["rbg", "unsafe_rbg"])
+@pytest.mark.parametrize("kind", ["rbg", thorough("unsafe_rbg")])
 def test_a_batch_starts_as_single_environments_with_other_kinds_of_keys(kind: str) -> None:
     with jax.default_prng_impl(kind):
         env = GymVectorEnv("docking2d", 3)
@@ -270,7 +272,14 @@ MODES = {
 
 
 @pytest.mark.parametrize(
-    "mode", [pytest.param(mode, marks=[pytest.mark.slow] * (mode == "no_jit")) for mode in MODES]
+    "mode",
+    one_of_each_kind(
+        [
+            pytest.param("no_jit", marks=pytest.mark.slow) if mode == "no_jit" else mode
+            for mode in MODES
+        ],
+        ["double_precision", "nans"],
+    ),
 )
 def test_the_modes_of_jax_change_nothing(mode: str) -> None:
     def fly() -> list[np.ndarray]:
@@ -314,7 +323,7 @@ def test_info_says_what_happened() -> None:
     assert sum(info["reward_terms"].values()) == pytest.approx(sum(info["reward_totals"].values()))
 
 
-@pytest.mark.parametrize("task", ["docking2d", "rejoin2d"])
+@pytest.mark.parametrize("task", ["docking2d", thorough("rejoin2d")])
 def test_an_action_that_is_no_number_ends_the_episode_as_a_failure_that_costs(task: str) -> None:
     action = np.array([np.nan, 0.0], np.float32)
     env = GymEnv(task)

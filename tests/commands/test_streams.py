@@ -8,6 +8,7 @@ from pathlib import Path
 
 import jax
 import pytest
+from default_cases import thorough
 from tiny_run import TINY
 
 from jaxsafe import make
@@ -39,7 +40,8 @@ def shell(command: str, place: Path) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize(
-    "environment", ["PYTHONIOENCODING=cp1252", "PYTHONIOENCODING=ascii", "LC_ALL=POSIX"]
+    "environment",
+    ["PYTHONIOENCODING=cp1252", thorough("PYTHONIOENCODING=ascii"), thorough("LC_ALL=POSIX")],
 )
 def test_what_an_encoding_lacks_is_replaced(environment: str, tmp_path: Path) -> None:
     told = shell(
@@ -74,9 +76,9 @@ def test_an_environment_that_is_printed_can_be_read_again_whatever_the_encoding(
             "error: standard output: No space left on device\n",
         ),
         ("jaxsafe config docking2d >&-", 0, ""),
-        ("jaxsafe config docking2d 2>&- > file", 0, ""),
-        ("jaxsafe config nowhere 2>&-", 2, ""),
-        ("jaxsafe config nowhere 2> /dev/full", 2, ""),
+        thorough("jaxsafe config docking2d 2>&- > file", 0, ""),
+        thorough("jaxsafe config nowhere 2>&-", 2, ""),
+        thorough("jaxsafe config nowhere 2> /dev/full", 2, ""),
         ("jaxsafe config nowhere | true; exit ${PIPESTATUS[0]}", 2, "error: env: unknown task"),
     ],
 )

@@ -76,6 +76,7 @@ def test_an_accelerator_draws_the_same_starts(as_accelerated: Callable[[Any], No
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_an_accelerator_learns_the_same(as_accelerated: Callable[[Any], None]) -> None:
     from jaxsafe.agents.agent import Agent
     from jaxsafe.schema.component import normalise

@@ -5,6 +5,7 @@ import sys
 import jax
 import numpy as np
 import pytest
+from default_cases import thorough
 
 import jaxsafe
 from jaxsafe.agents.agent import Agent
@@ -48,7 +49,7 @@ def three() -> TrainState:
     return seeds(0, 3)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("seed", [thorough(0), 1, thorough(2)])
 def test_a_seed_of_many_is_bit_for_bit_the_seed_alone(three: TrainState, seed: int) -> None:
     alone = seeds(seed, 1)
     jax.tree.map(
@@ -73,6 +74,7 @@ jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b[0]), starts(3), 
 """
 
 
+@pytest.mark.thorough
 def test_oriented_docking_starts_bit_for_bit_where_the_seed_alone_starts() -> None:
     """The program is compiled as the command compiles it.
 
@@ -81,7 +83,7 @@ def test_oriented_docking_starts_bit_for_bit_where_the_seed_alone_starts() -> No
     subprocess.run([sys.executable, "-c", STARTS], check=True, env={**os.environ, "XLA_FLAGS": ""})
 
 
-@pytest.mark.parametrize(("updates", "share"), [(0, 2), (UPDATES, 2)])
+@pytest.mark.parametrize(("updates", "share"), [thorough(0, 2), (UPDATES, 2)])
 def test_devices_that_share_a_seed_train_what_one_trains_to_rounding(
     updates: int, share: int
 ) -> None:
@@ -107,6 +109,7 @@ def test_devices_that_share_a_seed_log_the_diagnostics_of_the_whole_batch() -> N
         np.testing.assert_allclose(shared[name], alone[name], rtol=1e-3, atol=1e-5, err_msg=name)
 
 
+@pytest.mark.thorough
 def test_a_seed_is_to_rounding_the_same_run_under_vmap(three: TrainState) -> None:
     keys = jax.vmap(jax.random.key)(np.arange(3))
     together = jax.jit(jax.vmap(train, in_axes=(None, 0)))((ENV, AGENT, HYPER), keys)

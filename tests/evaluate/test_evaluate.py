@@ -6,6 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from default_cases import thorough
 from PIL import Image
 
 import jaxsafe
@@ -117,7 +118,7 @@ class Idle:
         return zero
 
 
-@pytest.mark.parametrize(("timeout", "piece"), [(30.0, 256), (30.0, 7), (1e10, 7)])
+@pytest.mark.parametrize(("timeout", "piece"), [thorough(30.0, 256), (30.0, 7), thorough(1e10, 7)])
 def test_recorded_episodes_are_those_that_were_evaluated(
     timeout: float, piece: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -183,7 +184,10 @@ def test_an_episode_that_does_not_end_is_given_up_and_that_is_told(
             31,
         ),  # 9 / 0.3 is less than 30 in single precision
         ({"terminal.timeout.limit": 9.0, "randomize": {"dt": [0.5, 1.5]}}, 19),
-        ({"terminal.timeout.limit": 9.0, "randomize": {"terminal.timeout.limit": [5.0, 20.0]}}, 21),
+        thorough(
+            {"terminal.timeout.limit": 9.0, "randomize": {"terminal.timeout.limit": [5.0, 20.0]}},
+            21,
+        ),
     ],
 )
 def test_no_episode_is_cut_before_its_timeout(overrides: dict[str, Any], steps: int) -> None:

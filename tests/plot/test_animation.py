@@ -4,6 +4,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from default_cases import thorough
 from PIL import Image
 
 import jaxsafe
@@ -22,7 +23,7 @@ def recorded(env: jaxsafe.Environment, steps: int) -> Any:
     )
 
 
-@pytest.mark.parametrize(("task", "maps"), [("docking2d_oriented", 1), ("rejoin3d", 2)])
+@pytest.mark.parametrize(("task", "maps"), [thorough("docking2d_oriented", 1), ("rejoin3d", 2)])
 def test_a_scene_shows_the_agent_where_it_is(task: str, maps: int) -> None:
     env = jaxsafe.make(task)
     states, timesteps = recorded(env, 12)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from default_cases import thorough
 from matplotlib.contour import ContourSet
 from matplotlib.image import imread
 
@@ -53,11 +54,13 @@ def labels(figure: object) -> list[str]:
     ("task", "expected"),
     [
         ("docking2d", ["thrust x [N]", "thrust y [N]", "h of velocity limit [m/s]"]),
-        (
+        thorough(
             "docking2d_oriented",
             ["thrust [N]", "attitude acceleration [rad/s²]", "h of velocity limit [m/s]"],
         ),
-        ("rejoin2d", ["heading rate [rad/s]", "acceleration [ft/s²]", "h of collision [ft]"]),
+        thorough(
+            "rejoin2d", ["heading rate [rad/s]", "acceleration [ft/s²]", "h of collision [ft]"]
+        ),
     ],
 )
 def test_interventions_have_a_panel_for_each_control_and_constraint(
@@ -150,7 +153,11 @@ def test_only_a_run_with_a_filter_draws_interventions(whole: Path, tmp_path: Pat
 
 @pytest.mark.parametrize(
     ("task", "rta"),
-    [("docking2d", "default"), ("docking3d", "implicit_simplex"), ("rejoin2d", "default")],
+    [
+        ("docking2d", "default"),
+        thorough("docking3d", "implicit_simplex"),
+        thorough("rejoin2d", "default"),
+    ],
 )
 def test_what_is_drawn_as_certified_is_what_the_filter_certifies(task: str, rta: str) -> None:
     env = jaxsafe.make(task, rta=rta)
@@ -201,7 +208,7 @@ def test_head_on_the_filter_keeps_farther_away_than_the_constraint() -> None:
         assert (best >= env.rta.margin) == saved
 
 
-@pytest.mark.parametrize("task", ["docking2d", "rejoin2d"])
+@pytest.mark.parametrize("task", ["docking2d", thorough("rejoin2d")])
 def test_the_safe_set_has_a_panel_for_each_plane(task: str) -> None:
     env = jaxsafe.make(task, {"rta.margin": 0.0} if task == "docking2d" else None, rta="default")
     required = float(env.rta.required_margin(env))

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from default_cases import one_of_each_kind, thorough
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
@@ -135,7 +136,7 @@ def crossings(x: np.ndarray, rates: np.ndarray, dt: float) -> np.ndarray:
 # One step against the exact flow
 
 
-@pytest.mark.parametrize("dt", [0.1, 1.0, 10.0, 30.0])
+@pytest.mark.parametrize("dt", one_of_each_kind([0.1, 1.0, 10.0, 30.0], [1.0, 30.0]))
 @pytest.mark.usefixtures("x64")
 def test_a_planar_step_of_any_length_is_within_a_millionth_of_a_foot(dt: float) -> None:
     x, rates = flat(*random_aircraft(seed=1))
@@ -206,7 +207,7 @@ def test_the_spatial_integrator_has_order_six() -> None:
     np.testing.assert_allclose(slopes[-2:], 6.0, atol=0.4)
 
 
-@pytest.mark.parametrize("model", [2, 3])
+@pytest.mark.parametrize("model", [thorough(2), 3])
 def test_in_float32_a_step_far_out_errs_by_less_than_the_spacing_of_its_position(
     model: int,
 ) -> None:
@@ -229,7 +230,7 @@ def test_in_float32_a_step_far_out_errs_by_less_than_the_spacing_of_its_position
     assert 0.9 * 2.0**-6 < np.max(np.abs(computed - expected)) < 1.1 * 2.0**-6
 
 
-@pytest.mark.parametrize("model", [2, 3])
+@pytest.mark.parametrize("model", [thorough(2), 3])
 def test_in_float32_the_way_flown_has_six_digits(model: int) -> None:
     x, rates = random_aircraft(seed=5)
     x[:3] = 0.0
@@ -341,7 +342,7 @@ def test_a_speed_beyond_its_limits_counts_as_on_the_limit() -> None:
             )
 
 
-@pytest.mark.parametrize("aircraft", [Dubins2D(name="a"), Dubins3D(name="a")])
+@pytest.mark.parametrize("aircraft", [Dubins2D(name="a"), thorough(Dubins3D(name="a"))])
 def test_a_control_left_out_is_one_of_zero(aircraft: Any) -> None:
     start = planar() if isinstance(aircraft, Dubins2D) else spatial(gamma=0.2, roll=0.5)
     aircraft = normalise(aircraft)
@@ -362,7 +363,7 @@ def test_angles_rest_at_their_limits() -> None:
     np.testing.assert_allclose([state.flight_path_angle for state in states], gammas, rtol=1e-6)
 
 
-@pytest.mark.parametrize("aircraft", [Dubins2D(name="a"), Dubins3D(name="a")])
+@pytest.mark.parametrize("aircraft", [thorough(Dubins2D(name="a")), Dubins3D(name="a")])
 @pytest.mark.usefixtures("x64")
 def test_a_step_that_reaches_no_limit_before_its_end_may_be_taken_in_one_piece(
     aircraft: Any,
@@ -513,7 +514,7 @@ def differences(step: Any, x: np.ndarray, controls: np.ndarray) -> tuple[np.ndar
     return np.stack(left, axis=-1), np.stack(right, axis=-1)
 
 
-@pytest.mark.parametrize("model", [2, 3])
+@pytest.mark.parametrize("model", [thorough(2), 3])
 @pytest.mark.usefixtures("x64")
 def test_derivatives_are_finite_differences(model: int) -> None:
     """The derivative lies between the finite differences to both sides.

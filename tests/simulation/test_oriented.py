@@ -133,6 +133,7 @@ def test_in_float32_a_step_has_six_digits() -> None:
     np.testing.assert_allclose(computed[2:4], expected[2:4], rtol=0.0, atol=4e-7)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 def test_without_a_turn_it_is_a_spacecraft_with_the_thrust_rotated() -> None:
     x, controls = random_craft(seed=4, num=500)

@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from default_cases import thorough
 from probe_environments import Constant, Match, Position, probe
 
 from jaxsafe.agents.agent import Agent
@@ -147,7 +148,7 @@ def test_an_episode_of_training_is_truncated_after_its_limit() -> None:
     assert not transitions.episode.outcome.any()
 
 
-@pytest.mark.parametrize("discrete", [False, True], ids=["gaussian", "categorical"])
+@pytest.mark.parametrize("discrete", [False, thorough(True)], ids=["gaussian", "categorical"])
 def test_the_policy_learns_the_action_that_the_observation_calls_for(discrete: bool) -> None:
     env = probe(Match(name="reward"), discrete=discrete)
     state = train(env, updates=100)
@@ -181,7 +182,7 @@ def test_the_learning_rate_falls_as_it_is_told() -> None:
         np.testing.assert_allclose(rates, [1e-2, middle, 1e-4], rtol=1e-5)
 
 
-@pytest.mark.parametrize("discrete", [False, True], ids=["gaussian", "categorical"])
+@pytest.mark.parametrize("discrete", [thorough(False), True], ids=["gaussian", "categorical"])
 def test_the_noise_falls_besides_what_is_learnt(discrete: bool) -> None:
     env = probe(Constant(name="reward"), discrete=discrete)
     state = init(env, AGENT, SMALL, jax.random.key(0))
@@ -241,7 +242,7 @@ def test_no_gradient_is_larger_than_allowed() -> None:
     assert max(jax.tree.leaves(moved)) < 1e-6
 
 
-@pytest.mark.parametrize("discrete", [False, True], ids=["gaussian", "categorical"])
+@pytest.mark.parametrize("discrete", [False, thorough(True)], ids=["gaussian", "categorical"])
 def test_diagnostics_of_an_update_that_changes_nothing_are_those_of_its_batch(
     discrete: bool,
 ) -> None:
@@ -305,7 +306,8 @@ class Push(Match):
 
 
 @pytest.mark.parametrize(
-    ("limit", "low", "high"), [(0.5, 0.0, 0.5), (0.1, 0.0, 0.1), (5.0, 0.95, 1.0)]
+    ("limit", "low", "high"),
+    [(0.5, 0.0, 0.5), thorough(0.1, 0.0, 0.1), thorough(5.0, 0.95, 1.0)],
 )
 def test_costs_are_kept_within_their_limit(limit: float, low: float, high: float) -> None:
     # The reward pays to break the rule. An episode has one step, so it costs 0 or 1.
@@ -343,6 +345,7 @@ def test_the_multiplier_follows_the_excess() -> None:
         assert float(dual_ascent(SMALL, jnp.array(2.0), window, none)) == 2.0
 
 
+@pytest.mark.thorough
 def test_the_kept_networks_are_those_of_training_or_their_average() -> None:
     env = probe(Match(name="reward"))
     plain = train(env)

@@ -49,6 +49,7 @@ def test_it_trains_bit_for_bit_what_the_command_trains(tmp_path: Path) -> None:
             np.testing.assert_allclose(curves[name], [row[name] for row in rows], rtol=1e-4)
 
 
+@pytest.mark.thorough
 def test_seeds_and_hyperparameters_are_mapped(recipe: Recipe) -> None:
     config, env = recipe
     rates = jnp.array([1e-4, 1e-3])
