@@ -111,7 +111,6 @@ def test_a_batch_is_what_single_environments_are_step_by_step(mode: AutoresetMod
     assert step_by_step(ours, theirs, 30) > 20
 
 
-@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("task", [task for task in TASKS if task != "docking2d"])
 def test_a_batch_of_any_task_and_of_discrete_actions_is_too(task: str) -> None:
@@ -123,6 +122,7 @@ def test_a_batch_of_any_task_and_of_discrete_actions_is_too(task: str) -> None:
     assert step_by_step(ours, theirs, 12) >= 6
 
 
+@pytest.mark.thorough
 def test_the_example_docks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend("examples")
     fly = importlib.import_module("gymnasium_docking3d").fly

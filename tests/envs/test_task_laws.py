@@ -676,7 +676,6 @@ def test_the_first_time_is_paid_once_an_episode_and_to_those_who_start_inside_on
 # Symmetry
 
 
-@pytest.mark.thorough
 def test_planar_docking_is_spatial_docking_with_z_zero() -> None:
     envs = [build(f"docking{dimension}d") for dimension in (2, 3)]
     actions = random_actions(envs[0], 1, 30)
@@ -694,6 +693,7 @@ def test_planar_docking_is_spatial_docking_with_z_zero() -> None:
     assert not spatial[1].observation[..., [2, 5]].any()
 
 
+@pytest.mark.thorough
 def test_planar_rejoin_is_spatial_rejoin_in_straight_level_flight() -> None:
     envs = [build("rejoin2d", overrides={"regions.rejoin_region.radius": 100.0}), build("rejoin3d")]
     actions = random_actions(envs[0], 1, 30).at[..., 0].set(0.0)

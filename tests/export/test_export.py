@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from default_cases import one_of_each_kind
 from test_modes import CHECKED_WHILE_RUNNING, CHECKED_WHILE_TRACING
 
 import jaxsafe
@@ -36,7 +37,8 @@ def run(model: Any, inputs: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    "task", ["docking2d", "docking3d", "docking2d_oriented", "rejoin2d", "rejoin3d"]
+    "task",
+    one_of_each_kind(["docking2d", "docking3d", "docking2d_oriented", "rejoin2d", "rejoin3d"]),
 )
 def test_another_runtime_acts_alike(task: str) -> None:
     policy = saved(task)
@@ -155,7 +157,9 @@ def test_a_search_finds_the_least_margin() -> None:
     np.testing.assert_allclose(worst.start, [0.31, -0.7], atol=0.02)
 
 
-@pytest.mark.parametrize("mode", [*CHECKED_WHILE_TRACING, *CHECKED_WHILE_RUNNING])
+@pytest.mark.parametrize(
+    "mode", one_of_each_kind([*CHECKED_WHILE_TRACING, *CHECKED_WHILE_RUNNING], ["x64", "nans"])
+)
 def test_the_modes_of_jax_change_nothing(mode: str, tmp_path: Path) -> None:
     """Graphs are the same, and the search works."""
     expected = tmp_path / "expected.onnx"

@@ -256,7 +256,6 @@ def test_derivatives_are_finite_differences_where_something_is_active() -> None:
         assert good > NUM
 
 
-@pytest.mark.thorough
 def test_a_point_that_meets_everything_passes_unaltered() -> None:
     u = jnp.array([0.3, -0.2])
     low = -jnp.ones(2)
@@ -266,6 +265,7 @@ def test_a_point_that_meets_everything_passes_unaltered() -> None:
     assert (nearest_control(u, low, high, jnp.eye(2), jnp.array([0.3, -1.0]))[0] == u).all()
 
 
+@pytest.mark.thorough
 def test_degenerate_problems_give_numbers() -> None:
     low = -jnp.ones(2)
     high = jnp.ones(2)

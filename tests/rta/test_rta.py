@@ -62,7 +62,6 @@ def test_no_adversary_breaks_the_filter(preset: str, task: str, policies: tuple[
         assert_unbroken(env, attack(env, policy, 150, 32, jax.random.key(1)))
 
 
-@pytest.mark.thorough
 def test_an_oriented_spacecraft_across_its_velocity_turns_rather_than_pushes_it_away() -> None:
     """The start has less than the margin and was met in training.
 
@@ -84,6 +83,7 @@ def test_an_oriented_spacecraft_across_its_velocity_turns_rather_than_pushes_it_
     assert min(margins[5:]) > 0.0
 
 
+@pytest.mark.thorough
 def test_far_from_the_chief_an_oriented_spacecraft_is_not_certified() -> None:
     """At 15 km the thrust of 1 N that is left at 75° cannot hold the limit.
 
@@ -756,7 +756,6 @@ def test_a_start_outside_the_safe_set_is_flagged_and_braked() -> None:
     assert timestep.info.margins["velocity_limit"] >= 0.0
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -787,6 +786,7 @@ def test_a_filter_that_does_not_fit_is_told_in_one_line(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.thorough
 def test_the_filters_of_the_literature_are_there_to_be_broken() -> None:
     """Both filters fail.
 
@@ -804,7 +804,6 @@ def test_the_filters_of_the_literature_are_there_to_be_broken() -> None:
     assert row["violating_steps_inside"] > 0
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("share", [thorough(1), 4, thorough(16)])
 def test_a_blend_takes_the_largest_share_that_is_certified(share: int) -> None:
     env = jaxsafe.make("docking2d", rta=Blend(**DOCKING_FILTER, parts=share))
@@ -821,6 +820,7 @@ def test_a_blend_takes_the_largest_share_that_is_certified(share: int) -> None:
     assert constraint(env, "velocity_limit").margin(more) < env.rta.margin
 
 
+@pytest.mark.thorough
 def test_an_implicit_asif_changes_less_than_simplex() -> None:
     """It changes at most half a percent more than the exact projection.
 

@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 import pytest
+from default_cases import thorough
 from orbax.checkpoint import CheckpointManager
 from tiny_run import TINY, assert_same_end, final_state, logs
 
@@ -157,14 +158,14 @@ def _crash_at(
 @pytest.mark.parametrize(
     ("name", "call", "after"),
     [
-        ("_record", 1, True),  # records the untrained policy
-        ("_record", 3, True),
-        ("_write_progress", 3, True),  # before any checkpoint
+        thorough("_record", 1, True),  # records the untrained policy
+        thorough("_record", 3, True),
+        thorough("_write_progress", 3, True),  # before any checkpoint
         ("_write_progress", 7, True),  # rows that the checkpoint does not know
-        ("_evaluate", 2, True),
+        thorough("_evaluate", 2, True),
         ("_save", 2, False),  # everything written but the checkpoint
-        ("_save", 4, True),  # trained, not yet evaluated
-        ("_run_episodes", 5, True),  # in the middle of the last evaluation
+        thorough("_save", 4, True),  # trained, not yet evaluated
+        thorough("_run_episodes", 5, True),  # in the middle of the last evaluation
     ],
 )
 def test_a_crashed_run_resumes_to_the_same_end(
@@ -179,7 +180,7 @@ def test_a_crashed_run_resumes_to_the_same_end(
     assert_same_end(run, whole)
 
 
-@pytest.mark.parametrize("when", ["before", "after"])
+@pytest.mark.parametrize("when", ["before", thorough("after")])
 def test_a_kill_while_the_last_checkpoint_is_written_anew_loses_nothing(
     tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, when: str
 ) -> None:
@@ -235,7 +236,7 @@ def test_a_refused_training_leaves_its_directory_free(
     assert command.main([*TINY, f"out={tmp_path / 'run'}"]) == 0
 
 
-@pytest.mark.parametrize("step", [448, 1280])  # at the second step nothing is left to train
+@pytest.mark.parametrize("step", [448, thorough(1280)])  # the second with nothing is left to train
 def test_ctrl_c_stops_after_a_chunk_with_a_checkpoint_and_resumes(
     tmp_path: Path,
     whole: Path,
