@@ -61,7 +61,9 @@ def test_a_packed_tree_is_a_vector_on_an_accelerator_alone(
 
 def test_an_accelerator_draws_the_same_starts(as_accelerated: Callable[[Any], None]) -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 3.0})
-    state, _ = reset_batch(env, jax.random.key(0), autoreset.SPARSE_RESETS_FROM)
+    state, _ = jax.jit(reset_batch, static_argnums=2)(
+        env, jax.random.key(0), autoreset.SPARSE_RESETS_FROM
+    )
     action = jnp.zeros((autoreset.SPARSE_RESETS_FROM, env.action_size))
 
     def following(_: None) -> Any:

@@ -84,6 +84,7 @@ def test_two_processes_whose_devices_share_seeds(
                 np.testing.assert_allclose(gathered[name], expected[name], atol=1e-4)
 
 
+@pytest.mark.thorough
 def test_a_lost_process_ends_the_run(tmp_path: Path) -> None:
     lose_one(tmp_path, tmp_path / "run")
 

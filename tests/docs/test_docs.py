@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from default_cases import thorough
 
 import jaxsafe
 from jaxsafe.config import dump, load
@@ -59,6 +60,7 @@ def test_links_lead_to_files(page: Path) -> None:
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
+@pytest.mark.thorough
 def test_the_site_builds_without_a_warning_twice_and_with_its_own_extra_alone(
     tmp_path: Path,
 ) -> None:
@@ -151,11 +153,11 @@ def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax
     "page",
     [
         "compose",
-        "extend",
-        "extend_rta",
-        "rta",
+        thorough("extend"),
+        thorough("extend_rta"),
+        thorough("rta"),
         "deviations",
-        "adapters/gymnasium",
+        thorough("adapters/gymnasium"),
         "adapters/safety_gymnasium",
         pytest.param("adapters/gymnax", marks=pytest.mark.peer),
     ],

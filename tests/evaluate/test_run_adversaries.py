@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import pytest
+from default_cases import thorough
 
 import jaxsafe
 from jaxsafe.commands.falsify import main, report
@@ -124,7 +125,7 @@ def test_what_is_not_a_number_is_a_violation(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize(
-    "policy", ["there_and_back", pytest.param("drain", marks=pytest.mark.slow)]
+    "policy", [thorough("there_and_back"), pytest.param("drain", marks=pytest.mark.slow)]
 )
 def test_adversaries_that_turn_back_and_that_take_the_least_certificate(policy: str) -> None:
     bare = jaxsafe.make(

@@ -319,9 +319,9 @@ def test_a_control_on_its_bound_keeps_its_derivative() -> None:
         (nearest_control, (jnp.eye(2), jnp.array([-5.0, -5.0]))),
     ]
     for project, rest in problems:
-        slope = jax.jacfwd(lambda u, project=project, rest=rest: project(u, low, high, *rest)[0])(
-            corner
-        )
+        slope = jax.jit(
+            jax.jacfwd(lambda u, project=project, rest=rest: project(u, low, high, *rest)[0])
+        )(corner)
         np.testing.assert_array_equal(slope, np.eye(2))
 
 

@@ -4,6 +4,7 @@ The tests check what PPO is told of interventions, and what is reported.
 """
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,7 @@ def resolved(*words: str) -> tuple[TrainConfig, jaxsafe.Environment]:
     return resolve(Arguments.parse(["env=docking2d", *words]).options)[:2]
 
 
+@cache
 def collected(learns_from: str) -> Transition:
     env = jaxsafe.make("docking2d", rta="default")
     agent = normalise(Agent(hidden=(8,)))
@@ -41,6 +43,7 @@ def collected(learns_from: str) -> Transition:
     )
 
 
+@pytest.mark.thorough
 def test_ppo_learns_from_the_desired_or_the_actual_control() -> None:
     desired = np.asarray(collected("desired").action)
     actual = np.asarray(collected("actual").action)

@@ -32,6 +32,12 @@ from jaxsafe.train.host.session import Clock, Training
 from jaxsafe.train.ppo import DIAGNOSTICS
 
 
+@pytest.fixture(autouse=True)
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave out the figures of a run, which take half of its time. `whole` has them."""
+    monkeypatch.setattr("jaxsafe.commands.run_figures.draw_all", lambda run: [])
+
+
 def test_a_run_directory_holds_everything(whole: Path) -> None:
     names = {path.name for path in whole.iterdir()}
     assert names == {
@@ -275,6 +281,7 @@ def _two_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(f"{module}.TASKS", two)
 
 
+@pytest.mark.thorough
 def test_all_tasks_run_one_after_another_and_resume(
     tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
