@@ -278,7 +278,7 @@ MODES = {
             pytest.param("no_jit", marks=pytest.mark.slow) if mode == "no_jit" else mode
             for mode in MODES
         ],
-        ["double_precision", "nans"],
+        ["dtype_promotion", "nans"],
     ),
 )
 def test_the_modes_of_jax_change_nothing(mode: str) -> None:
@@ -387,6 +387,7 @@ def test_the_whole_action_space_and_no_more_reaches_the_actuators() -> None:
     assert np.array_equal(env.step(2.0 * bound)[-1]["control_actual"], bound)
 
 
+@pytest.mark.thorough
 def test_an_episode_can_be_watched() -> None:
     env = gym.make("jaxsafe/Rejoin2D-v0", render_mode="rgb_array")
     env.reset(seed=0)

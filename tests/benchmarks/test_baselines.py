@@ -107,6 +107,7 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
     assert len(calls) == 4
 
 
+@pytest.mark.thorough
 def test_a_report_in_parts_makes_the_page_of_one(
     calls: list[list[str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -135,6 +136,7 @@ def test_a_report_in_parts_makes_the_page_of_one(
     assert "features |" not in Path("parts/baselines.md").read_text()
 
 
+@pytest.mark.thorough
 def test_an_evaluation_with_other_options_than_today_s_is_left_out_and_made_anew(
     calls: list[list[str]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -172,6 +174,7 @@ def test_a_record_is_of_the_commit_that_trained_it(
     assert len(calls) == 1
 
 
+@pytest.mark.thorough
 def test_the_page_of_the_project_is_that_of_its_records_and_of_todays_recipes() -> None:
     records, old = kept(
         plan([*TASKS], [*KINDS], [f"seeds={command.SEEDS}"]), PAGE.parent / DIRECTORY
@@ -180,6 +183,7 @@ def test_the_page_of_the_project_is_that_of_its_records_and_of_todays_recipes() 
     assert Report(records).text(PAGE.parent / DIRECTORY) == PAGE.read_text(encoding="utf-8")
 
 
+@pytest.mark.thorough
 def test_an_interrupted_report_goes_on(calls: list[list[str]], whole: Path) -> None:
     run = Path("runs/report/docking2d-features")
     assert train.main([*TINY, f"out={run}"]) == 0
@@ -191,6 +195,7 @@ def test_an_interrupted_report_goes_on(calls: list[list[str]], whole: Path) -> N
     assert len(calls) == 3
 
 
+@pytest.mark.thorough
 def test_a_report_killed_while_its_figures_were_drawn_draws_them(calls: list[list[str]]) -> None:
     run = Path("runs/report/docking2d-features")
     words = ["tasks=docking2d", "kinds=features", "film=false", *REST]

@@ -37,6 +37,7 @@ def start(place: Path, *words: str, devices: tuple[int, ...] = (1, 1)) -> list[s
     return processes
 
 
+@pytest.mark.thorough
 def test_two_processes_train_what_one_trains(whole: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     processes = start(tmp_path, *TINY, f"out={run}")

@@ -95,6 +95,7 @@ def test_devices_that_share_a_seed_train_what_one_trains_to_rounding(
     assert alone.num_updates == updates
 
 
+@pytest.mark.thorough
 def test_devices_that_share_a_seed_log_the_diagnostics_of_the_whole_batch() -> None:
     agent = AGENT.replace(cost_critic=True)
 
