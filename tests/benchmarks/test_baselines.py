@@ -394,6 +394,7 @@ def test_the_best_policy_succeeds_most_then_violates_least_then_has_the_highest_
     assert best_seed(results([0.0, 0.0], [None, None], [None, None])) == 5
 
 
+@pytest.mark.thorough
 def test_trainings_with_a_filter_start_where_it_promises_safety() -> None:
     begin = jax.jit(reset_batch, static_argnums=2)
     for item in plan(["docking2d_oriented"], ["rta", "unpunished"], ["seeds=2"]):

@@ -49,6 +49,7 @@ def command(directory: Path, *words: str) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.thorough
 def test_a_task_of_ones_own_is_trained_and_evaluated_by_name(directory: Path) -> None:
     words = [word for word in OPTIONS if not word.startswith("agent.hidden")]
     trained = command(
