@@ -136,7 +136,7 @@ def settings(task: str, num_envs: int = NUM_ENVS) -> tuple[Any, Any]:
     options = {
         "env": task,
         "preset": "plain",
-        "agent.hidden": [*HIDDEN],
+        "agent.actor.hidden": [*HIDDEN],
         "steps": 10 * UPDATES * num_envs * NUM_STEPS,
     }
     config, env, _ = resolve({**options, **{f"ppo.{name}": size for name, size in sizes.items()}})

@@ -6,6 +6,8 @@ A part is a subclass of a base with annotated fields and one or two pure methods
 docs/extend_rta.md show each kind.
 """
 
+from jaxsafe.agents.features import Features
+from jaxsafe.agents.networks import Network
 from jaxsafe.environment import Environment
 from jaxsafe.envs.task import Task, register
 from jaxsafe.processors.constraint import Constraint
@@ -74,12 +76,14 @@ __all__ = [
     "Discrete",
     "Environment",
     "Faults",
+    "Features",
     "FlagName",
     "Initializer",
     "Key",
     "Kilograms",
     "Length",
     "MetresPerSecond",
+    "Network",
     "Newtons",
     "Number",
     "Observation",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import jax
@@ -20,8 +21,51 @@ Policy = Callable[[Key, Array], Array]
 """`policy(key, observation)` returns an action. Both are batched if the environments are."""
 
 
+@dataclass(frozen=True, eq=False)
+class RecurrentPolicy:
+    """A policy that remembers.
+
+    It can stand wherever a policy is run step by step. Its memory starts anew with each episode.
+    """
+
+    act: Callable[[Key, Array, Any], tuple[Array, Any]]
+    """`act(key, observation, memory)` returns an action and the memory after it.
+
+    All are batched if the environments are.
+    """
+    memory: Any
+    """What the policy remembers at the start of an episode, without batch axes."""
+
+
+def first_memory(policy: Policy | RecurrentPolicy, num_envs: int | None = None) -> Any:
+    """Return the memory of a policy at the start of episodes. It is `()` if it has none.
+
+    Args:
+        policy: the policy.
+        num_envs: number of environments, which is the leading axis of the memory. None is one
+            environment without a batch axis.
+    """
+    if not isinstance(policy, RecurrentPolicy):
+        return ()
+    batch = () if num_envs is None else (num_envs,)
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, batch + jnp.shape(x)), policy.memory)
+
+
+def act(
+    policy: Policy | RecurrentPolicy, key: Key, observation: Array, memory: Any
+) -> tuple[Array, Any]:
+    """Return the action of a policy, and its memory after it."""
+    if isinstance(policy, RecurrentPolicy):
+        return policy.act(key, observation, memory)
+    return policy(key, observation), memory
+
+
 def rollout(
-    env: Environment, policy: Policy, key: Key, num_steps: int, num_envs: int | None = None
+    env: Environment,
+    policy: Policy | RecurrentPolicy,
+    key: Key,
+    num_steps: int,
+    num_envs: int | None = None,
 ) -> TimeStep:
     """Run a policy for a number of steps. A fresh random start follows every finished episode.
 
@@ -31,7 +75,7 @@ def rollout(
     Args:
         env: the environment.
         policy: `policy(key, observation)` returns an action. With `num_envs` both have a leading
-            axis of that size.
+            axis of that size. It may be a `RecurrentPolicy`.
         key: a typed PRNG key.
         num_steps: number of steps in each environment.
         num_envs: number of environments side by side. None is one environment without a batch axis.
@@ -51,15 +95,21 @@ def rollout(
     else:
         state, timestep = reset_batch(env, key_start, num_envs, axis=-1)
 
-    def one_step(carry: tuple[State, Array], key: Key) -> tuple[tuple[State, Array], TimeStep]:
-        state, observation = carry
+    start_memory = first_memory(policy, num_envs)
+
+    def one_step(carry: tuple[State, Array, Any], key: Key) -> tuple[Any, TimeStep]:
+        state, observation, memory = carry
         key_policy, key_reset = jax.random.split(key)
         if num_envs is None:
-            return step_or_reset(env, state, policy(key_policy, observation), key_reset)
-        action = policy(key_policy, observation.T).T
-        return step_or_reset_batch(env, state, action, key_reset, axis=-1)
+            action, memory = act(policy, key_policy, observation, memory)
+            after, timestep = step_or_reset(env, state, action, key_reset)
+        else:
+            action, memory = act(policy, key_policy, observation.T, memory)
+            after, timestep = step_or_reset_batch(env, state, action.T, key_reset, axis=-1)
+        memory = choose(timestep.done, start_memory, memory)
+        return (*after, memory), timestep
 
-    start = (state, timestep.observation)
+    start = (state, timestep.observation, start_memory)
     _, timesteps = jax.lax.scan(one_step, start, jax.random.split(key_run, num_steps))
     if num_envs is None:
         return timesteps

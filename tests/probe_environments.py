@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from jaxsafe.config import build
 from jaxsafe.environment import Environment
 from jaxsafe.processors.constraint import SpeedLimit
-from jaxsafe.processors.observation import Observe
+from jaxsafe.processors.observation import Observation, Observe
 from jaxsafe.processors.reward import Reward
 from jaxsafe.processors.status import Status
 from jaxsafe.processors.terminal import Timeout
@@ -46,6 +46,13 @@ class Sign(Initializer):
 
     def draw(self, key: Key, drawn: Any, sim: Sim) -> Array:
         return jax.random.rademacher(key, (1,), jnp.float32)
+
+
+class Glimpse(Observation):
+    """The position at the start of an episode, and 0 after it."""
+
+    def measure(self, memory: Any, sim: Sim) -> Array:
+        return jnp.where(sim.time == 0.0, sim.platforms["point"].position, 0.0)
 
 
 class Constant(Reward):
@@ -88,6 +95,7 @@ def probe(
     ends: str = "terminated",
     discrete: bool = False,
     most: float | None = None,
+    observation: Observation | None = None,
 ) -> Environment:
     """Return an environment whose episodes have `steps` steps at a random sign.
 
@@ -109,6 +117,11 @@ def probe(
             if most is None
             else (SpeedLimit(name="push", speed="hard", velocity_limit="allowed"),),
             reward=(reward,),
-            observation=(Observe(name="position", of="point", what="position"),),
+            observation=(observation or Observe(name="position", of="point", what="position"),),
         )
     )
+
+
+def recall(steps: int) -> Environment:
+    """Return an environment that shows its sign at the start and rewards it on every step."""
+    return probe(Match(name="match"), steps=steps, observation=Glimpse(name="glimpse"))

@@ -13,6 +13,8 @@ from default_cases import one_of_each_kind, thorough
 
 import jaxsafe
 from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.features import ApproachFeatures, DockingFeatures, Features
+from jaxsafe.agents.networks import MLP
 from jaxsafe.agents.policy_file import find_policy, read_policy
 from jaxsafe.envs import TASKS
 from jaxsafe.schema.component import normalise
@@ -102,12 +104,12 @@ def test_a_policy_has_a_value_and_a_jacobian_for_every_observation(task: str) ->
         assert_finite(function(observation), task)
 
 
-@pytest.mark.parametrize("features", ["docking", "approach"])
-def test_features_are_those_of_the_plain_norm_bit_for_bit(features: str) -> None:
+@pytest.mark.parametrize("features", [DockingFeatures(), ApproachFeatures()])
+def test_features_are_those_of_the_plain_norm_bit_for_bit(features: Features) -> None:
     env = jaxsafe.make("docking3d")
     position = jax.random.normal(jax.random.key(0), (100, 3))
     rest = jax.random.uniform(jax.random.key(1), (100, env.observation_size - 3), minval=0.1)
-    inputs = Agent(features=features).inputs(env, jnp.concatenate([position, rest], axis=1))  # type: ignore[arg-type]
+    inputs = features(env, jnp.concatenate([position, rest], axis=1))
     distance = jnp.linalg.norm(position, axis=-1, keepdims=True)
     start = env.observation_size
     np.testing.assert_array_equal(inputs[:, start : start + 3], position / (distance + 0.01))
@@ -124,7 +126,7 @@ def test_the_loss_and_its_gradient_are_finite_however_far_the_policies_are_apart
     old: float, advantage: float, discrete: bool
 ) -> None:
     env = jaxsafe.make("docking2d", actions="discrete" if discrete else "continuous")
-    agent = normalise(Agent(hidden=(4,)))
+    agent = normalise(Agent(actor=MLP(hidden=(4,))))
     ppo = normalise(PPO())
     params = agent.init(jax.random.key(0), env)
     action = jnp.zeros((1, 2), int if discrete else float)
@@ -140,7 +142,7 @@ def test_the_loss_and_its_gradient_are_finite_however_far_the_policies_are_apart
 @pytest.mark.parametrize("old", [-90.0, -1e30])
 def test_a_bad_action_that_became_far_likelier_is_still_made_less_likely(old: float) -> None:
     env = jaxsafe.make("docking2d")
-    agent = normalise(Agent(hidden=(4,)))
+    agent = normalise(Agent(actor=MLP(hidden=(4,))))
     ppo = normalise(PPO())
     params = agent.init(jax.random.key(0), env)
     action = jnp.array([[0.5, -0.5]])
@@ -160,7 +162,7 @@ def test_a_bad_action_that_became_far_likelier_is_still_made_less_likely(old: fl
 @pytest.mark.parametrize("old", [thorough(-10.0), -1.0, thorough(0.3)])
 def test_ordinary_ratios_are_what_they_were(old: float) -> None:
     env = jaxsafe.make("docking2d")
-    agent = normalise(Agent(hidden=(4,)))
+    agent = normalise(Agent(actor=MLP(hidden=(4,))))
     ppo = normalise(PPO())
     params = agent.init(jax.random.key(0), env)
     key = jax.random.key(1)

@@ -38,10 +38,10 @@ TRAININGS: dict[str, dict[str, Any]] = {
     "ppo": {},
     "ppo_lagrangian": {"algorithm": "ppo_lagrangian", "cost_limit": 1},
     "discrete": {"actions": "discrete"},
+    "recurrent": {"agent.actor": {"type": "gru", "hidden": [4], "units": 4}},
     "corrected": {"rta": "default", "rta_training": "corrected"},
 }
 SMALL = {
-    "agent.hidden": [4],
     "ppo.num_envs": 2,
     "ppo.num_steps": 2,
     "ppo.num_epochs": 1,
@@ -67,7 +67,8 @@ def core(env: jaxsafe.Environment, key: jax.Array, num_envs: int) -> Any:
 
 def learn(words: dict[str, Any], key: jax.Array, run: Callable[..., Any]) -> Any:
     """Make two updates and evaluate what they learn."""
-    config, env, _ = resolve({"env": "docking2d", **SMALL, **words})
+    small = {} if "agent.actor" in words else {"agent.actor.hidden": [4]}
+    config, env, _ = resolve({"env": "docking2d", **SMALL, **small, **words})
     shared = env, config.agent, config.ppo
     keys = jax.random.split(key)
 

@@ -25,7 +25,7 @@ TINY = [
     "ppo.num_envs=4",
     "ppo.num_steps=16",
     "ppo.num_epochs=2",
-    "agent.hidden=[8]",
+    "agent.actor.hidden=[8]",
     "checkpoint_every=320",
     "eval_every=320",
 ]

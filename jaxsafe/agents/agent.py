@@ -1,6 +1,6 @@
-"""The agent: features of the observation, multilayer perceptrons, and a distribution over actions.
+"""The agent: features of the observation, networks, and a distribution over actions.
 
-One perceptron is the actor and one the critic. Parameters are a plain dict of arrays, so a policy
+One network is the actor and another the critic. Parameters are nested dicts of arrays, so a policy
 file is an .npz of them. The features belong to the agent: the environment's observation is the
 paper's in every preset.
 """
@@ -8,36 +8,55 @@ paper's in every preset.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
-from typing import Annotated, Any, Literal
+from functools import partial
+from typing import Annotated, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.lax import broadcast_to_rank
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxsafe.agents.distributions import Categorical, Gaussian
-from jaxsafe.agents.features import FEATURES
+from jaxsafe.agents.features import Features, PlainFeatures
+from jaxsafe.agents.networks import (
+    MLP,
+    Memory,
+    Network,
+    Normal,
+    Params,
+    from_one_draw,
+    unroll,
+)
 from jaxsafe.environment import Environment
-from jaxsafe.rollout import Policy
+from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.schema.component import ANY, Component, Range, Unit
+from jaxsafe.schema.errors import ConfigError, summarise_error
+from jaxsafe.schema.user_modules import modules
 from jaxsafe.types import Dimensionless, Key, Number
 
-Params = dict[str, Any]
-"""Parameters of the networks by name, and `log_std` [actuators]."""
+
+class Sequences(NamedTuple):
+    """What a recurrent network needs to know of the sequences that it sees."""
+
+    memory: dict[str, Memory]
+    """The memory of each network before the first step, `[n, …]`."""
+    done: Bool[Array, "n t"]
+    """Whether the episode ended with the step."""
 
 
 class Agent(Component):
-    """Actor and critic of the same shape, which share nothing.
+    """Actor and critic, which share nothing.
 
     Their inputs and outputs follow from the spaces of the environment.
     """
 
-    hidden: Annotated[tuple[int, ...], Range(1, largest=2**16)] = (64, 64)
-    """Sizes of the hidden layers."""
-    features: Literal["none", "docking", "approach", "rejoin"] = "none"
-    """Name of the features that are appended to the observation."""
+    actor: Network = MLP()
+    """The network that decides the actions: mlp, gru or one of your own."""
+    critic: Network | None = None
+    """Network of the critics. None stands for one like the actor's."""
+    features: Features = PlainFeatures()
+    """What the networks see of the observation."""
     log_std: Annotated[Number, Unit("1", length=ANY), Range(largest=20.0)] = -0.7
     """Initial logarithm of the standard deviation of continuous actions in [−1, 1].
 
@@ -58,33 +77,60 @@ class Agent(Component):
     cost_critic: bool = False
     """Whether a second critic expects the cost to come. `algorithm=ppo_lagrangian` sets it."""
 
+    @property
+    def networks(self) -> dict[str, Network]:
+        """The networks by name: `actor`, `critic`, and `cost_critic` if there is one."""
+        critic = self.actor if self.critic is None else self.critic
+        networks = {"actor": self.actor, "critic": critic}
+        return {**networks, "cost_critic": critic} if self.cost_critic else networks
+
+    @property
+    def recurrent(self) -> bool:
+        """Whether a network remembers, so that training needs whole sequences of steps."""
+        return any(network.recurrent for network in self.networks.values())
+
+    def memory(self) -> dict[str, Memory]:
+        """Return what the networks remember at the start of an episode, by name."""
+        return {name: network.memory() for name, network in self.networks.items()}
+
     def init(self, key: Key, env: Environment) -> Params:
-        """Return fresh parameters.
+        """Return fresh parameters: those of each network by name, and `log_std` `[actuators]`.
 
         Args:
             key: a PRNG key.
             env: the environment. Its spaces decide the sizes of inputs and outputs.
         """
-        inputs = self.inputs(env, jnp.zeros(env.observation_size)).shape[-1]
-        outputs = sum(env.num_action_points) or env.action_size
-        seen = len(env.reward) if self.critic_sees_totals else 0
-        actor, critic = (inputs, *self.hidden, outputs), (inputs + seen, *self.hidden, 1)
-        networks = {
-            "actor": actor,
-            "critic": critic,
-            **({"cost_critic": critic} if self.cost_critic else {}),
-        }
-        normals = iter(
-            _normals(key, [shape for sizes in networks.values() for shape in pairwise(sizes)])
-        )
-        params: Params = {
-            name: _layers(
-                [next(normals) for _ in pairwise(sizes)], last_gain=0.01 if name == "actor" else 1.0
-            )
-            for name, sizes in networks.items()
-        }
+        arguments = self._first_arguments(env)
+        keys = [jax.random.fold_in(key, index) for index in range(len(arguments))]
+
+        def build(normal: Normal) -> Params:
+            return {
+                name: self.networks[name].init(own_key, normal, self._module(name, env), *given)
+                for own_key, (name, given) in zip(keys, arguments.items(), strict=True)
+            }
+
         log_std = jnp.log(self.prior_std) if env.num_action_points else jnp.asarray(self.log_std)
+        params = from_one_draw(key, build)
         return {**params, "log_std": jnp.broadcast_to(log_std, env.action_size)}
+
+    def first_outputs(self, env: Environment) -> dict[str, Array]:
+        """Return by name what networks with fresh parameters say of an observation of zeros."""
+        params = self.init(jax.random.key(0), env)
+        outputs = {}
+        for name, given in self._first_arguments(env).items():
+            returned = self._apply(name, env, params, *given)
+            outputs[name] = returned[1] if self.networks[name].recurrent else returned
+        return outputs
+
+    def _first_arguments(self, env: Environment) -> dict[str, tuple]:
+        """Return arguments with which each network's module can be called."""
+        inputs = self.inputs(env, jnp.zeros(env.observation_size))
+        totals = {term.name: jnp.zeros(()) for term in env.reward}
+        arguments = {}
+        for name, network in self.networks.items():
+            seen = inputs if name == "actor" else self.critic_inputs(inputs, totals)
+            arguments[name] = (network.memory(), seen) if network.recurrent else (seen,)
+        return arguments
 
     def inputs(
         self, env: Environment, observation: Float[Array, "*batch o"]
@@ -94,19 +140,47 @@ class Agent(Component):
         Raises:
             ConfigError: the environment does not observe what the features need.
         """
-        return FEATURES[self.features](env, observation)
+        return self.features(env, observation)
 
     def distribution(
-        self, env: Environment, params: Params, inputs: Float[Array, "*batch i"]
+        self,
+        env: Environment,
+        params: Params,
+        inputs: Float[Array, "*batch i"],
+        sequences: Sequences | None = None,
     ) -> Gaussian | Categorical:
         """Return the policy, a distribution over actions.
 
         Args:
             env: the environment.
             params: the parameters.
-            inputs: what `inputs` returns, `[*batch, i]`.
+            inputs: what `inputs` returns, `[*batch, i]`. If the actor remembers they are sequences
+                `[n, t, i]`.
+            sequences: what else a recurrent actor needs to know of sequences.
         """
-        out, points = mlp(params["actor"], inputs), env.num_action_points
+        return self._head(env, params, self._outputs("actor", env, params, inputs, sequences))
+
+    def distribution_step(
+        self, env: Environment, params: Params, inputs: Float[Array, "*batch i"], memory: Memory
+    ) -> tuple[Gaussian | Categorical, Memory]:
+        """Return the policy for one step, and what the actor remembers then.
+
+        Args:
+            env: the environment.
+            params: the parameters.
+            inputs: what `inputs` returns, `[*batch, i]`.
+            memory: what the actor remembers, `[*batch, …]`.
+        """
+        if not self.actor.recurrent:
+            return self.distribution(env, params, inputs), memory
+        memory, outputs = self._apply("actor", env, params, memory, inputs)
+        return self._head(env, params, outputs), memory
+
+    def _head(
+        self, env: Environment, params: Params, out: Float[Array, "*batch o"]
+    ) -> Gaussian | Categorical:
+        """Return the distribution over actions that the outputs of the actor stand for."""
+        points = env.num_action_points
         if not points:
             return Gaussian(mean=out, log_std=params["log_std"])
         # There is one sharpness for each actuator. Below it is repeated for each of its logits.
@@ -140,7 +214,7 @@ class Agent(Component):
         self, params: Params, critic_inputs: Float[Array, "*batch c"]
     ) -> Float[Array, "*batch"]:
         """Return the critic's V(s) `[*batch]`, given what `critic_inputs` returns."""
-        return mlp(params["critic"], critic_inputs)[..., 0]
+        return self.critic_output("critic", params, critic_inputs)
 
     def cost_rate(
         self, params: Params, critic_inputs: Float[Array, "*batch c"]
@@ -149,7 +223,32 @@ class Agent(Component):
 
         It is what a step costs on the average from here on, whatever the horizon.
         """
-        return mlp(params["cost_critic"], critic_inputs)[..., 0]
+        return self.critic_output("cost_critic", params, critic_inputs)
+
+    def critic_output(
+        self,
+        name: str,
+        params: Params,
+        critic_inputs: Float[Array, "*batch c"],
+        sequences: Sequences | None = None,
+    ) -> Float[Array, "*batch"]:
+        """Return the output of a critic `[*batch]`.
+
+        Args:
+            name: `critic` or `cost_critic`.
+            params: the parameters.
+            critic_inputs: what `critic_inputs` returns, `[*batch, c]`. If the critic remembers they
+                are sequences `[n, t, c]`.
+            sequences: what else a recurrent critic needs to know of sequences.
+        """
+        return self._outputs(name, None, params, critic_inputs, sequences)[..., 0]
+
+    def critic_step(
+        self, name: str, params: Params, critic_inputs: Float[Array, "*batch c"], memory: Memory
+    ) -> tuple[Float[Array, "*batch"], Memory]:
+        """Return the output of a recurrent critic for one step, and what it remembers then."""
+        memory, outputs = self._apply(name, None, params, memory, critic_inputs)
+        return outputs[..., 0], memory
 
     def act(
         self,
@@ -158,8 +257,9 @@ class Agent(Component):
         key: Key,
         observation: Array,
         deterministic: Array | bool,
-    ) -> Array:
-        """Return an action for each observation.
+        memory: Memory = (),
+    ) -> tuple[Array, Memory]:
+        """Return an action for each observation, and what the actor remembers then.
 
         Args:
             env: the environment.
@@ -168,70 +268,94 @@ class Agent(Component):
             observation: observations `[*batch, o]`.
             deterministic: whether the actions are the mode of the distribution. Otherwise they are
                 a sample.
+            memory: what the actor remembers, `[*batch, …]`.
         """
-        distribution = self.distribution(env, params, self.inputs(env, observation))
-        return jax.tree.map(
+        inputs = self.inputs(env, observation)
+        distribution, memory = self.distribution_step(env, params, inputs, memory)
+        action = jax.tree.map(
             lambda mode, sample: jnp.where(deterministic, mode, sample),
             distribution.mode(),
             distribution.sample(key),
         )
+        return action, memory
 
-    def policy(self, env: Environment, params: Params, deterministic: Array | bool) -> Policy:
-        """Return `act` as a function of key and observation alone."""
-        return lambda key, observation: self.act(env, params, key, observation, deterministic)
+    def policy(
+        self, env: Environment, params: Params, deterministic: Array | bool
+    ) -> Policy | RecurrentPolicy:
+        """Return `act` as a function of key and observation, and of memory if the actor has one."""
+
+        def act(key: Key, observation: Array, memory: Memory = ()) -> tuple[Array, Memory]:
+            return self.act(env, params, key, observation, deterministic, memory)
+
+        if self.actor.recurrent:
+            return RecurrentPolicy(act, self.actor.memory())
+        return lambda key, observation: act(key, observation)[0]
+
+    def _module(self, name: str, env: Environment | None) -> Any:
+        """Return the Flax module of a network. Only the actor depends on the environment."""
+        network = self.networks[name]
+        if name == "actor" and env is not None:
+            return network.module(num_outputs(env), 0.01)
+        return network.module(1, 1.0)
+
+    def _apply(self, name: str, env: Environment | None, params: Params, *arguments: Any) -> Any:
+        """Return what the module of a network returns."""
+        return self._module(name, env).apply({"params": params[name]}, *arguments)
+
+    def _outputs(
+        self,
+        name: str,
+        env: Environment | None,
+        params: Params,
+        inputs: Float[Array, "*batch i"],
+        sequences: Sequences | None,
+    ) -> Float[Array, "*batch o"]:
+        """Return the outputs of a network for samples, or for whole sequences if it remembers."""
+        network = self.networks[name]
+        if not network.recurrent:
+            return self._apply(name, env, params, inputs)
+        if sequences is None:
+            raise ConfigError(f"agent: {name} remembers, and so it needs sequences of steps")
+        step = partial(self._apply, name, env, params)
+        memory, done = sequences.memory[name], sequences.done
+        return unroll(step, memory, network.memory(), inputs, done)[1]
 
 
-def mlp(layers: Sequence[Params], x: Float[Array, "*batch i"]) -> Float[Array, "*batch o"]:
-    """Return the output of a perceptron, with tanh between layers and none after the last.
+def check_agent(agent: Agent, env: Environment, place: str = "agent") -> None:
+    """Check that an agent can be built and fits an environment.
 
-    Args:
-        layers: for each layer its `kernel` [inputs, outputs] and `bias` [outputs].
-        x: the inputs `[*batch, i]`.
+    Raises:
+        ConfigError: it cannot, or does not. The message begins with the place.
     """
-    for layer in layers[:-1]:
-        x = jnp.tanh(_affine(layer, x))
-    return _affine(layers[-1], x)
+    for name in ("actor", "critic"):
+        network = getattr(agent, name)
+        problem = network and network.problem()
+        if problem:
+            raise ConfigError(f"{place}.{name}.{problem}")
+    count, found = env.action_size, jnp.size(agent.log_std)
+    if found not in (1, count):
+        raise ConfigError(
+            f"{place}.log_std: expected one number or {count}, one for each action, found {found}"
+        )
+    wanted = dict.fromkeys(agent.networks, 1) | {"actor": num_outputs(env)}
+    try:
+        shapes = jax.eval_shape(lambda: agent.first_outputs(env))
+    except ConfigError:
+        raise
+    except Exception as error:  # JAX and Flax raise many kinds of errors
+        reason = summarise_error(error, modules(agent))
+        raise ConfigError(f"{place}: does not fit the environment: {reason}") from None
+    for name, outputs in shapes.items():
+        if getattr(outputs, "shape", None) != (wanted[name],):
+            raise ConfigError(
+                f"{place}.{name}: expected {wanted[name]} outputs, "
+                f"found {getattr(outputs, 'shape', type(outputs).__name__)}"
+            )
 
 
-def _affine(layer: Params, x: Float[Array, "*batch i"]) -> Float[Array, "*batch o"]:
-    return x @ layer["kernel"] + broadcast_to_rank(layer["bias"], x.ndim)
-
-
-def _normals(key: Key, shapes: Sequence[tuple[int, int]]) -> list[Array]:
-    """Return standard normal matrices of these shapes.
-
-    All come from one draw, because every draw compiles to a loop of its own.
-    """
-    ends = np.cumsum([rows * columns for rows, columns in shapes])
-    parts = jnp.split(jax.random.normal(key, (ends[-1],)), ends[:-1])
-    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
-
-
-def _layers(normals: Sequence[Array], last_gain: float) -> list[Params]:
-    """Return layers with orthogonal kernels and zero biases.
-
-    The gain of a kernel is √2, that of the last one `last_gain`.
-    """
-    gains = [2.0**0.5] * (len(normals) - 1) + [last_gain]
-    return [
-        {"kernel": gain * _orthogonal(normal), "bias": jnp.zeros(normal.shape[1])}
-        for gain, normal in zip(gains, normals, strict=True)
-    ]
-
-
-@jax.custom_batching.sequential_vmap
-def _orthogonal(normal: Float[Array, "m n"]) -> Float[Array, "m n"]:
-    """Return a matrix with orthonormal rows or columns, whichever are fewer.
-
-    It is uniform over all such matrices: the Q of a QR decomposition, with the signs of diag R.
-
-    Matrices are decomposed one at a time even under `vmap`. On a CPU the QR of many matrices waits
-    in a thread of XLA's pool for other threads of that pool. As many of these at once as there are
-    cores would wait forever (jaxlib 0.10).
-    """
-    q, r = jnp.linalg.qr(normal if normal.shape[0] >= normal.shape[1] else normal.T)
-    q = q * jnp.sign(jnp.diagonal(r))[None]
-    return q if q.shape == normal.shape else q.T
+def num_outputs(env: Environment) -> int:
+    """Return how many outputs the actor has: one for each action or each discrete choice."""
+    return sum(env.num_action_points) or env.action_size
 
 
 def _prior(points: Sequence[int], std: Array | float) -> Float[Array, " points"]:

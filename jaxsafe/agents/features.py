@@ -1,17 +1,19 @@
 """Features: what the agent computes from an observation before its networks see it.
 
-The environment's observation itself stays the paper's.
+The environment's observation itself stays the paper's. Features are parts: a subclass of `Features`
+with a `type` is chosen by `agent.features=TYPE`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from abc import abstractmethod
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.environment import Environment
+from jaxsafe.schema.component import Component
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.geometry import rotation, safe_norm
 from jaxsafe.types import Number
@@ -23,39 +25,49 @@ No environment observes a smaller one. But other code may ask a policy about an 
 zeros, and that would divide by zero.
 """
 
-Features = Callable[[Environment, Float[Array, "*batch o"]], Float[Array, "*batch i"]]
-"""A function from an environment and its observations to the inputs of the networks."""
+
+class Features(Component):
+    """Base of the functions from an environment's observations to the inputs of the networks."""
+
+    @abstractmethod
+    def __call__(
+        self, env: Environment, observation: Float[Array, "*batch o"]
+    ) -> Float[Array, "*batch i"]:
+        """Return what the networks see of observations `[*batch, o]`: inputs `[*batch, i]`.
+
+        Raises:
+            ConfigError: the environment does not observe what the features need.
+        """
 
 
-def none(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch o"]:
-    """Return the observation and nothing else."""
-    return observation
+class PlainFeatures(Features, type="none"):
+    """The observation and nothing else."""
+
+    def __call__(
+        self, env: Environment, observation: Float[Array, "*batch o"]
+    ) -> Float[Array, "*batch o"]:
+        return observation
 
 
-def docking(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
-    """Append the direction p/(‖p‖ + 0.01) and log(‖p‖ + 0.005) of the observed position p.
+class DockingFeatures(Features, type="docking"):
+    """The observation, the direction p/(‖p‖ + 0.01) and log(‖p‖ + 0.005) of its position p.
 
-    The target is 0.005 wide in units of p. A plain perceptron resolves that late or never.
-
-    Args:
-        env: the environment, which must observe a position.
-        observation: observations `[*batch, o]`.
-
-    Returns:
-        The observation and its features, `[*batch, i]`.
-
-    Raises:
-        ConfigError: the environment does not observe a position.
+    The target is 0.005 wide in units of p. A plain perceptron resolves that late or never. The
+    environment must observe a position.
     """
-    position = _vector(env, observation, "position", "docking")
-    distance = _norm(position)
-    return jnp.concatenate(
-        [observation, position / (distance + 0.01), jnp.log(distance + 0.005)], axis=-1
-    )
+
+    def __call__(
+        self, env: Environment, observation: Float[Array, "*batch o"]
+    ) -> Float[Array, "*batch i"]:
+        position = _vector(env, observation, "position", "docking")
+        distance = _norm(position)
+        return jnp.concatenate(
+            [observation, position / (distance + 0.01), jnp.log(distance + 0.005)], axis=-1
+        )
 
 
-def approach(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
-    """Append to `docking` the velocity as a share of the speed limit.
+class ApproachFeatures(Features, type="approach"):
+    """The features of `docking`, and the velocity as a share of the speed limit.
 
     With p the direction of the chief and v the velocity, both in the frame of the observation,
     these are:
@@ -65,34 +77,39 @@ def approach(env: Environment, observation: Float[Array, "*batch o"]) -> Float[A
     - What is left of v/limit across p.
     - ‖v‖/limit. It is 1 at the limit.
 
-    Args:
-        env: the environment, which must observe position, velocity, speed and speed limit.
-        observation: observations `[*batch, o]`.
-
-    Returns:
-        The observation and its features, `[*batch, i]`.
-
-    Raises:
-        ConfigError: the environment does not observe one of them.
+    The environment must observe position, velocity, speed and speed limit.
     """
-    position = _vector(env, observation, "position", "approach")
-    limit = jnp.maximum(_elements(env, observation, "velocity_limit", "approach"), SMALLEST_LIMIT)
-    relative_to_limit = 1.0 / limit
-    velocity = (
-        _scale(env, "velocity")
-        * _vector(env, observation, "velocity", "approach")
-        * relative_to_limit
-    )
-    direction = position / (_norm(position) + 1e-3)
-    along = jnp.sum(direction * velocity, axis=-1, keepdims=True)
-    speed = _elements(env, observation, "speed", "approach") * relative_to_limit
-    return jnp.concatenate(
-        [docking(env, observation), velocity, along, velocity - along * direction, speed], axis=-1
-    )
+
+    def __call__(
+        self, env: Environment, observation: Float[Array, "*batch o"]
+    ) -> Float[Array, "*batch i"]:
+        position = _vector(env, observation, "position", "approach")
+        limit = jnp.maximum(
+            _elements(env, observation, "velocity_limit", "approach"), SMALLEST_LIMIT
+        )
+        relative_to_limit = 1.0 / limit
+        velocity = (
+            _scale(env, "velocity")
+            * _vector(env, observation, "velocity", "approach")
+            * relative_to_limit
+        )
+        direction = position / (_norm(position) + 1e-3)
+        along = jnp.sum(direction * velocity, axis=-1, keepdims=True)
+        speed = _elements(env, observation, "speed", "approach") * relative_to_limit
+        return jnp.concatenate(
+            [
+                DockingFeatures()(env, observation),
+                velocity,
+                along,
+                velocity - along * direction,
+                speed,
+            ],
+            axis=-1,
+        )
 
 
-def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Array, "*batch i"]:
-    """Append the way to the rejoin point, the lead's relative velocity, and the miss distance.
+class RejoinFeatures(Features, type="rejoin"):
+    """The observation, the way to the rejoin point, the relative velocity and the miss distance.
 
     All vectors are turned from the wingman's body frame into its level frame. There left is left
     however the wingman rolls. With p the direction of the lead and w its velocity relative to the
@@ -112,47 +129,36 @@ def rejoin(env: Environment, observation: Float[Array, "*batch o"]) -> Float[Arr
     - Two numbers near 1 on a collision course: how directly w opposes p, times a bell curve of the
       part of p across w or of the miss distance.
 
-    Args:
-        env: the environment, which must observe the magnitudes and directions of the positions of
-            lead and rejoin point and of both velocities, and in space also flight path angle and
-            roll.
-        observation: observations `[*batch, o]`.
-
-    Returns:
-        The observation and its features, `[*batch, i]`.
-
-    Raises:
-        ConfigError: the environment does not observe one of them.
+    The environment must observe the magnitudes and directions of the positions of lead and rejoin
+    point and of both velocities, and in space also flight path angle and roll.
     """
-    distance, bearing = _magnitude_and_direction(env, observation, "lead_position")
-    far, towards = _magnitude_and_direction(env, observation, "rejoin_position")
-    (speed, along), (own_speed, own) = (
-        _magnitude_and_direction(env, observation, f"{name}_velocity")
-        for name in ("lead", "wingman")
-    )
-    way, relative = far * towards, speed * along - own_speed * own
-    course = relative / (_norm(relative) + 0.01)
-    closing = jnp.sum(bearing * course, axis=-1, keepdims=True)
-    across = bearing - closing * course
-    approaching = jnp.maximum(-closing, 0.0)
-    sine2 = jnp.sum(across * across, axis=-1, keepdims=True)
-    danger = [
-        approaching * jnp.exp(-sine2 * scale) for scale in (1.0 / 0.15**2, distance**2 / 0.2**2)
-    ]
-    miss = 4.0 * across * distance
-    per_10_s = _scale(env, "rejoin_position")[0] / (10.0 * _scale(env, "wingman_velocity")[0])
-    change = relative + per_10_s * way
-    near, urgent = (jnp.clip(5.0 * vector, -1.0, 1.0) for vector in (way, change))
-    # In the plane the observation already has the direction of the lead in the level frame.
-    level = () if "roll" not in env.observation_names else (bearing,)
-    aim = (*level, way, near, relative, change, urgent)
-    return jnp.concatenate([observation, *aim, closing, 4.0 * across, miss, *danger], axis=-1)
 
-
-FEATURES: Mapping[str, Features] = {
-    each.__name__: each for each in (none, docking, approach, rejoin)
-}
-"""The features by name, as `agent.features` gives it."""
+    def __call__(
+        self, env: Environment, observation: Float[Array, "*batch o"]
+    ) -> Float[Array, "*batch i"]:
+        distance, bearing = _magnitude_and_direction(env, observation, "lead_position")
+        far, towards = _magnitude_and_direction(env, observation, "rejoin_position")
+        (speed, along), (own_speed, own) = (
+            _magnitude_and_direction(env, observation, f"{name}_velocity")
+            for name in ("lead", "wingman")
+        )
+        way, relative = far * towards, speed * along - own_speed * own
+        course = relative / (_norm(relative) + 0.01)
+        closing = jnp.sum(bearing * course, axis=-1, keepdims=True)
+        across = bearing - closing * course
+        approaching = jnp.maximum(-closing, 0.0)
+        sine2 = jnp.sum(across * across, axis=-1, keepdims=True)
+        danger = [
+            approaching * jnp.exp(-sine2 * scale) for scale in (1.0 / 0.15**2, distance**2 / 0.2**2)
+        ]
+        miss = 4.0 * across * distance
+        per_10_s = _scale(env, "rejoin_position")[0] / (10.0 * _scale(env, "wingman_velocity")[0])
+        change = relative + per_10_s * way
+        near, urgent = (jnp.clip(5.0 * vector, -1.0, 1.0) for vector in (way, change))
+        # In the plane the observation already has the direction of the lead in the level frame.
+        level = () if "roll" not in env.observation_names else (bearing,)
+        aim = (*level, way, near, relative, change, urgent)
+        return jnp.concatenate([observation, *aim, closing, 4.0 * across, miss, *danger], axis=-1)
 
 
 # One program has the same roundings whether its surroundings are compiled or not.

@@ -15,10 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.agents.agent import Params
 from jaxsafe.agents.distributions import Categorical, Gaussian
+from jaxsafe.agents.networks import MAX_LAYERS, Params
 from jaxsafe.agents.onnx_reader import Network, read_graph
-from jaxsafe.agents.policy_file import MAX_LAYERS
 from jaxsafe.environment import Environment
 from jaxsafe.rollout import Policy
 from jaxsafe.schema.errors import ConfigError, nearest

@@ -16,15 +16,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.agents.agent import Agent, Params
+from jaxsafe.agents.agent import Agent, check_agent
+from jaxsafe.agents.networks import OUTPUT, Params
 from jaxsafe.environment import Environment
-from jaxsafe.rollout import Policy
+from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.convert import to_component, to_data
 from jaxsafe.schema.errors import ConfigError, nearest
+from jaxsafe.schema.user_modules import imports_allowed
 from jaxsafe.storage.archive import Archive, open_archive
 from jaxsafe.storage.files import parse_json, write_bytes
 from jaxsafe.storage.forms import COUNT, TEXT, check
+
+FORMAT = "jaxsafe policy 2"
+"""What a header says of the form of the file."""
+
+OLD_FORMAT = "jaxsafe policy 1"
+"""Form of files whose agents have perceptrons, all of the same size, with numbered layers."""
 
 
 def save_policy(
@@ -46,7 +54,7 @@ def save_policy(
         for key, leaf in jax.tree.leaves_with_path(params)
     }
     header = {
-        "format": "jaxsafe policy 1",
+        "format": FORMAT,
         "agent": to_data(agent),
         "environment": to_data(env),
         **about,
@@ -55,9 +63,6 @@ def save_policy(
     np.savez(buffer, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
     write_bytes(path, buffer.getvalue())
 
-
-MAX_LAYERS = 64
-"""Largest number of hidden layers in a policy file. Each layer takes a while to trace."""
 
 _ABOUT = {"env": TEXT, "preset": TEXT, "seed": COUNT, "step": COUNT}
 """The form of what else a header may say."""
@@ -88,34 +93,40 @@ def read_policy(path: str | os.PathLike) -> SavedPolicy:
         path, "not a policy file (.npz without pickles, as in <run>/policy/)"
     ) as archive:
         header = parse_json(str(archive.read("header")), infinite=True)
-    if not isinstance(header, dict) or header.pop("format", None) != "jaxsafe policy 1":
-        raise ConfigError(f"{path}: not a policy file: expected format 'jaxsafe policy 1'")
+    form = header.pop("format", None) if isinstance(header, dict) else None
+    if form not in (FORMAT, OLD_FORMAT):
+        raise ConfigError(f"{path}: not a policy file: expected format {FORMAT!r}")
     from jaxsafe.config import build
 
-    env = build(to_component(header.pop("environment", None), Environment, f"{path}: environment"))
-    agent = normalise(to_component(header.pop("agent", None), Agent, f"{path}: agent"))
+    agent_data = header.pop("agent", None)
+    if form == OLD_FORMAT:
+        agent_data = with_networks(agent_data)
+    with imports_allowed(False):
+        env_data = header.pop("environment", None)
+        env = build(to_component(env_data, Environment, f"{path}: environment"))
+        agent = normalise(to_component(agent_data, Agent, f"{path}: agent"))
     check(
         header, {name: form for name, form in _ABOUT.items() if name in header}, f"{path}: header"
     )
-    if len(agent.hidden) > MAX_LAYERS:
-        raise ConfigError(
-            f"{path}: agent.hidden: expected at most {MAX_LAYERS} layers, "
-            f"found {len(agent.hidden):,}"
-        )
-    try:
-        like = jax.eval_shape(lambda key: agent.init(key, env), jax.random.key(0))
-    except ConfigError:
-        raise
-    except Exception as error:  # JAX raises many kinds of errors
-        raise ConfigError(
-            f"{path}: agent: does not fit the environment: {str(error).partition(chr(10))[0]}"
-        ) from None
+    check_agent(agent, env, f"{path}: agent")
+    like = jax.eval_shape(lambda key: agent.init(key, env), jax.random.key(0))
     with open_archive(path, "not a policy file, or a damaged one") as archive:
-        return SavedPolicy(env, agent, _fill(like, archive, str(path)), header)
+        params = _fill(like, archive, str(path), numbered=form == OLD_FORMAT)
+    return SavedPolicy(env, agent, params, header)
 
 
-def load_policy(policy: str | os.PathLike, deterministic: bool = True) -> Policy:
+def with_networks(agent: Any) -> Any:
+    """Return an agent as data, from what versions wrote in which all agents had perceptrons."""
+    if not isinstance(agent, dict) or "hidden" not in agent:
+        return agent
+    rest = {name: value for name, value in agent.items() if name != "hidden"}
+    return {"actor": {"type": "mlp", "hidden": agent["hidden"]}, **rest}
+
+
+def load_policy(policy: str | os.PathLike, deterministic: bool = True) -> Policy | RecurrentPolicy:
     """Return `policy(key, observation) -> action`. Observations may have leading batch axes.
+
+    A policy that remembers is a `RecurrentPolicy`, which `rollout` and `evaluate` take as well.
 
     Args:
         policy: the name of a task, for the policy that comes with the package, or a policy file
@@ -129,6 +140,8 @@ def load_policy(policy: str | os.PathLike, deterministic: bool = True) -> Policy
     saved = read_policy(find_policy(policy))
     act = saved.agent.policy(saved.env, saved.params, deterministic)
     # It is compiled, or each call would work out the inputs of the networks anew.
+    if isinstance(act, RecurrentPolicy):
+        return RecurrentPolicy(jax.jit(act.act), act.memory)
     return jax.jit(act)
 
 
@@ -165,15 +178,25 @@ def find_policy(policy: str | os.PathLike) -> Path:
     return known[name]
 
 
-def _fill(like: Any, archive: Archive, path: str) -> Any:
+def _fill(like: Any, archive: Archive, path: str, numbered: bool) -> Any:
     """Return the parameters in an archive, in the structure and shapes of `like`.
+
+    Args:
+        like: parameters, or their shapes.
+        archive: the archive.
+        path: the file, for the message.
+        numbered: whether the layers of the networks have numbers instead of names.
 
     Raises:
         ConfigError: an array is missing, or is not one of numbers of the right shape.
     """
 
     def pick(key: Any, leaf: jax.ShapeDtypeStruct) -> jax.Array:
-        name = jax.tree_util.keystr(key, simple=True, separator="/")
+        keys = [entry.key for entry in key]
+        if numbered and len(keys) > 1:
+            last = len(like[keys[0]]) - 1
+            keys[1] = str(last) if keys[1] == OUTPUT else keys[1].removeprefix("hidden_")
+        name = "/".join(keys)
         shape, dtype = archive.describe(name) if name in archive.names else (None, None)
         if dtype is None or shape != leaf.shape or dtype.kind != "f":
             what = "nothing" if dtype is None else f"{dtype} of shape {shape}"

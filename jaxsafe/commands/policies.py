@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxsafe.agents.agent import Agent, Params
+from jaxsafe.agents.agent import Agent
 from jaxsafe.agents.imported_policy import ForeignAgent
+from jaxsafe.agents.networks import Params
 from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
 from jaxsafe.commands.policy_options import PolicyOptions
 from jaxsafe.devices.seed_mapper import SeedMapper

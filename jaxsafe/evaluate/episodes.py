@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jaxtyping import Array, Int
 from jaxsafe.environment import Environment, step
 from jaxsafe.metrics import Episode, accumulate, begin
 from jaxsafe.processors.terminal import Timeout
-from jaxsafe.rollout import Policy, reset_batch
+from jaxsafe.rollout import Policy, RecurrentPolicy, act, first_memory, reset_batch
 from jaxsafe.types import Key, State, TimeStep
 
 MAX_STEPS_WITHOUT_TIMEOUT = 10_000
@@ -27,7 +27,9 @@ A longer episode is given up. A timeout may be so late that it means none.
 """
 
 
-def run_episodes(env: Environment, policy: Policy, key: Key, num_episodes: int) -> Episode:
+def run_episodes(
+    env: Environment, policy: Policy | RecurrentPolicy, key: Key, num_episodes: int
+) -> Episode:
     """Run one episode in each of `num_episodes` environments.
 
     They run until all episodes have ended, or are given up after `max_steps`. Starts depend on the
@@ -41,21 +43,25 @@ def run_episodes(env: Environment, policy: Policy, key: Key, num_episodes: int) 
     episode = begin(timestep)
     limit = max_steps(env)
 
-    def going(carry: tuple[Array, State, Array, Episode]) -> Array:
-        return (carry[0] < limit) & jnp.any(carry[3].outcome == 0)
+    Carry = tuple[Array, State, Array, Any, Episode]
 
-    def advance(carry: tuple[Array, State, Array, Episode]) -> tuple[Array, State, Array, Episode]:
-        t, state, observation, episode = carry
-        action = policy(jax.random.fold_in(key_act, t), observation)
+    def going(carry: Carry) -> Array:
+        num_steps, *_, episode = carry
+        return (num_steps < limit) & jnp.any(episode.outcome == 0)
+
+    def advance(carry: Carry) -> Carry:
+        t, state, observation, memory, episode = carry
+        action, memory = act(policy, jax.random.fold_in(key_act, t), observation, memory)
         state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, state, action)
         running = episode.outcome == 0
         episode = jax.tree.map(
             lambda new, old: jnp.where(running, new, old), accumulate(episode, timestep), episode
         )
-        return t + 1, state, timestep.observation, episode
+        return t + 1, state, timestep.observation, memory, episode
 
-    start = (jnp.zeros((), jnp.int32), state, timestep.observation, episode)
-    return jax.lax.while_loop(going, advance, start)[3]
+    memory = first_memory(policy, num_episodes)
+    start = (jnp.zeros((), jnp.int32), state, timestep.observation, memory, episode)
+    return jax.lax.while_loop(going, advance, start)[-1]
 
 
 class Position(NamedTuple):
@@ -64,10 +70,12 @@ class Position(NamedTuple):
     num_steps: Int[Array, ""]
     state: State
     observation: Array
+    memory: Any
+    """What the policy remembers."""
 
 
 def begin_recording(
-    env: Environment, key: Key, num_episodes: int
+    env: Environment, policy: Policy | RecurrentPolicy, key: Key, num_episodes: int
 ) -> tuple[Position, tuple[State, TimeStep]]:
     """Start the episodes that `run_episodes` runs with the same key.
 
@@ -77,13 +85,20 @@ def begin_recording(
     key_start, _ = jax.random.split(key)
     state, timestep = reset_batch(env, key_start, num_episodes)
     position = Position(
-        num_steps=jnp.zeros((), jnp.int32), state=state, observation=timestep.observation
+        num_steps=jnp.zeros((), jnp.int32),
+        state=state,
+        observation=timestep.observation,
+        memory=first_memory(policy, num_episodes),
     )
     return position, (state, timestep)
 
 
 def record_steps(
-    env: Environment, policy: Policy, key: Key, position: Position, num_steps: int
+    env: Environment,
+    policy: Policy | RecurrentPolicy,
+    key: Key,
+    position: Position,
+    num_steps: int,
 ) -> tuple[Position, tuple[State, TimeStep]]:
     """Go on with the episodes that `begin_recording` began with this key.
 
@@ -100,20 +115,20 @@ def record_steps(
     """
     _, key_act = jax.random.split(key)
 
-    def advance(
-        carry: tuple[State, Array], t: Array
-    ) -> tuple[tuple[State, Array], tuple[State, TimeStep]]:
-        state, observation = carry
-        action = policy(jax.random.fold_in(key_act, t), observation)
+    def advance(carry: tuple[State, Array, Any], t: Array) -> tuple[Any, tuple[State, TimeStep]]:
+        state, observation, memory = carry
+        action, memory = act(policy, jax.random.fold_in(key_act, t), observation, memory)
         state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, state, action)
-        return (state, timestep.observation), (state, timestep)
+        return (state, timestep.observation, memory), (state, timestep)
 
     times = position.num_steps + jnp.arange(num_steps, dtype=jnp.int32)
-    (state, observation), recorded = jax.lax.scan(
-        advance, (position.state, position.observation), times
-    )
+    start = (position.state, position.observation, position.memory)
+    (state, observation, memory), recorded = jax.lax.scan(advance, start, times)
     position = Position(
-        num_steps=position.num_steps + num_steps, state=state, observation=observation
+        num_steps=position.num_steps + num_steps,
+        state=state,
+        observation=observation,
+        memory=memory,
     )
     return position, recorded
 

@@ -8,13 +8,13 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import numpy as np
 
-from jaxsafe.agents.agent import Params
+from jaxsafe.agents.networks import Params
 from jaxsafe.devices.background_compile import CompiledInBackground
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.episodes import begin_recording, max_steps, record_steps, run_episodes
 from jaxsafe.metrics import METRICS, Episode, measures, summarise
-from jaxsafe.rollout import Policy
+from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.types import Key, State, TimeStep
 
 EPISODES_PER_BATCH = 100
@@ -55,14 +55,14 @@ KINDS = ("stochastic", "deterministic")
 class Recorder(NamedTuple):
     """Two compiled functions that record some episodes of one policy."""
 
-    begin: Callable[..., Any]  # (key) -> (position, starts)
+    begin: Callable[..., Any]  # (parameters, key) -> (position, starts)
     go_on: Callable[..., Any]  # (parameters, key, deterministic, position) -> (position, steps)
 
 
 class Acting(Protocol):
     """An agent, as far as an evaluation uses it."""
 
-    def policy(self, env: Environment, params: Any, deterministic: Any) -> Policy:
+    def policy(self, env: Environment, params: Any, deterministic: Any) -> Policy | RecurrentPolicy:
         """Return a policy, as `Agent.policy` does."""
         ...
 
@@ -92,9 +92,9 @@ class Evaluator:
         self._run = CompiledInBackground(self._run, self._arguments(key, deterministic), params)
         params_of_seed = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), params)
         begin, go_on = self._recorder(MIN_RECORDED_EPISODES)
-        position, _ = jax.eval_shape(begin, key)
+        position, _ = jax.eval_shape(begin, params_of_seed, key)
         self._recorders[MIN_RECORDED_EPISODES] = Recorder(
-            begin=CompiledInBackground(begin, key),
+            begin=CompiledInBackground(begin, params_of_seed, key),
             go_on=CompiledInBackground(go_on, params_of_seed, key, deterministic, position),
         )
 
@@ -153,7 +153,7 @@ class Evaluator:
     ) -> Iterator[tuple[State, TimeStep]]:
         """Yield the first `count` episodes of a batch, each up to its end."""
         begin, go_on = self._recorder(max(count, MIN_RECORDED_EPISODES))
-        position, first = begin(key)
+        position, first = begin(params, key)
         pieces = [
             [jax.tree.map(lambda x, i=i: np.asarray(x)[i : i + 1], first)] for i in range(count)
         ]
@@ -185,8 +185,9 @@ class Evaluator:
         """Return the recorder of a number of episodes. It is compiled once."""
         if num_episodes not in self._recorders:
 
-            def begin(key: Key) -> Any:
-                return begin_recording(self.env, key, num_episodes)
+            def begin(params: Params, key: Key) -> Any:
+                policy = self.agent.policy(self.env, params, True)
+                return begin_recording(self.env, policy, key, num_episodes)
 
             def go_on(params: Params, key: Key, deterministic: Any, position: Any) -> Any:
                 policy = self.agent.policy(self.env, params, deterministic)

@@ -12,9 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsafe.agents.agent import Agent, num_outputs
 from jaxsafe.agents.imported_policy import ForeignPolicy
 from jaxsafe.agents.policy_file import SavedPolicy
 from jaxsafe.environment import Environment, reset_to, step
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.types import State, TimeStep
 
 Function = Callable[[Float[Array, "batch i"]], Float[Array, "batch o"]]
@@ -34,12 +36,13 @@ def network(saved: SavedPolicy) -> Exported:
     It is a function from the features that the actor sees to the means of its actions. If actions
     are discrete, it returns their logits.
     """
-    size = saved.params["actor"][0]["kernel"].shape[0]
-    count = saved.params["actor"][-1]["bias"].size
+    _require_no_memory(saved)
+    observation = jax.ShapeDtypeStruct((saved.env.observation_size,), jnp.float32)
+    size = jax.eval_shape(lambda x: saved.agent.inputs(saved.env, x), observation).shape[0]
     names = (
-        saved.env.action_names
-        if count == saved.env.action_size
-        else tuple(f"logit_{i}" for i in range(count))
+        tuple(f"logit_{i}" for i in range(num_outputs(saved.env)))
+        if saved.env.num_action_points
+        else saved.env.action_names
     )
 
     def function(features: Array) -> Array:
@@ -49,12 +52,26 @@ def network(saved: SavedPolicy) -> Exported:
     return Exported(function, tuple(f"feature_{i}" for i in range(size)), names)
 
 
+def _require_no_memory(saved: SavedPolicy | ForeignPolicy) -> None:
+    """Refuse a policy that remembers, because an exported function has nowhere to keep a memory.
+
+    Raises:
+        ConfigError: the policy remembers.
+    """
+    if isinstance(saved.agent, Agent) and saved.agent.actor.recurrent:
+        raise ConfigError(
+            f"run: the actor is {saved.agent.actor.type_name!r}, which remembers; "
+            "an exported function has no memory"
+        )
+
+
 def action(saved: SavedPolicy | ForeignPolicy) -> Exported:
     """Return the function from an observation to the action that the environment takes.
 
     The action is the mode of the policy's distribution. Computing the features is part of the
     function.
     """
+    _require_no_memory(saved)
 
     def function(observation: Array) -> Array:
         inputs = saved.agent.inputs(saved.env, observation)

@@ -5,6 +5,7 @@ Every fault is one line that names its place.
 
 from __future__ import annotations
 
+import sys
 import types
 import typing
 from collections.abc import Mapping
@@ -29,6 +30,7 @@ from jaxsafe.schema.component import (
 from jaxsafe.schema.component import field as field_of
 from jaxsafe.schema.dotted_paths import join
 from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.user_modules import import_modules
 
 _SHAPES = {
     None: "a number",
@@ -45,16 +47,20 @@ _UNITS_WITHOUT_SYMBOL = ("1", "physical", "as observed")
 def to_component(data: Any, base: type[Kind], place: str) -> Kind:
     """Build a component from a mapping, whose `type` chooses among the subclasses of `base`.
 
+    The name of a type alone stands for that type with the defaults of its fields. `MODULE:CLASS`
+    names a class of a user's module, which is imported.
+
     Raises:
         ConfigError: a value is wrong. The message names the place, what was found and what is
             allowed.
     """
     if isinstance(data, base):
         return normalise(data)
+    known = choices(base)
+    if isinstance(data, str) and known and (":" in data or data in known):
+        data = {"type": data}
     if not isinstance(data, Mapping):
-        raise ConfigError(
-            f"{place or 'environment'}: expected a mapping of fields, found {_show(data)}"
-        )
+        raise _no_mapping(data, base, place)
     cls, entries = _choose_class(dict(data), base, place)
     table = fields(cls)
     label = f"{place} ({cls.type_name})" if cls.type_name else place or "environment"
@@ -122,11 +128,46 @@ def _choose_class(entries: dict, base: type[Kind], place: str) -> tuple[type[Kin
             f"{place}: field 'type' is missing; choose from {nearest('', sorted(options))}"
         )
     kind = entries.pop("type")
+    if isinstance(kind, str) and ":" in kind:
+        return _import_class(kind, base, place), entries
     if not isinstance(kind, str) or kind not in options:
         raise ConfigError(
             f"{place}: unknown type {show(kind)}; choose from {nearest(kind, sorted(options))}"
         )
     return options[kind], entries
+
+
+def _no_mapping(data: Any, base: type[Component], place: str) -> ConfigError:
+    """Return the error of a part that is no mapping.
+
+    Where names of types alone are enough, because no type has a field without a default, the error
+    tells these names.
+    """
+    options = choices(base)
+    enough = options and not any(
+        field.required for option in options.values() for field in fields(option).values()
+    )
+    if isinstance(data, str) and enough:
+        return ConfigError(f"{place}: found {show(data)}; choose from {nearest(data, options)}")
+    return ConfigError(
+        f"{place or 'environment'}: expected a mapping of fields, found {_show(data)}"
+    )
+
+
+def _import_class(name: str, base: type[Kind], place: str) -> type[Kind]:
+    """Return the class that `MODULE:CLASS` names.
+
+    Raises:
+        ConfigError: the module cannot be imported, or has no such class.
+    """
+    module, _, class_name = name.partition(":")
+    import_modules([module], place)
+    cls = getattr(sys.modules[module], class_name, None)
+    if not (isinstance(cls, type) and issubclass(cls, base) and cls.type_name):
+        raise ConfigError(
+            f"{place}: {module} has no {base.__name__} with a type called {show(class_name)}"
+        )
+    return cls
 
 
 def _to_structure(value: Any, hint: Any, field: Field, place: str) -> Any:

@@ -23,7 +23,9 @@ import optax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsafe.agents.agent import Agent, Params
+from jaxsafe.agents.agent import Agent, Sequences
+from jaxsafe.agents.networks import Memory, Params, unroll
+from jaxsafe.autoreset import choose
 from jaxsafe.devices.backend import accelerated, packing, scan_packed
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment
@@ -128,13 +130,19 @@ class PPO(Component):
         """Number of environment steps in one update."""
         return self.num_envs * self.num_steps
 
-    @property
-    def shares(self) -> list[int]:
-        """The numbers of devices that can share a seed.
+    def rows(self, agent: Agent) -> int:
+        """Return how many samples are shuffled into minibatches.
+
+        If a network remembers, a sample is all the steps of an environment between two updates.
+        """
+        return self.num_envs if agent.recurrent else self.batch_size
+
+    def shares(self, agent: Agent) -> list[int]:
+        """Return the numbers of devices that can share a seed.
 
         Each device has the same number of environments and of samples of a minibatch.
         """
-        most = math.gcd(self.num_envs, self.batch_size // self.num_minibatches)
+        most = math.gcd(self.num_envs, self.rows(agent) // self.num_minibatches)
         small = [count for count in range(1, math.isqrt(most) + 1) if most % count == 0]
         return sorted({*small, *(most // count for count in small)})
 
@@ -147,6 +155,8 @@ class TrainState(Record):
     env_state: State  # [num_envs]
     observation: Float[Array, "num_envs o"]
     episode: Episode  # sums of the running episodes, [num_envs]
+    memory: Mapping[str, Memory]
+    """What each network remembers of the running episodes, [num_envs, …]. `()` for most."""
     window: Window  # the latest finished episodes
     key: Key
     """Key of the whole run. Update i uses fold_in(key, i)."""
@@ -186,6 +196,8 @@ class Batch(NamedTuple):
     value_target: Array
     cost_target: Any = ()
     """(1 − γ) times the discounted cost to come, if there is a critic of it."""
+    sequences: Sequences | None = None
+    """What recurrent networks need to know of sequences. Samples are sequences then, [n, t, …]."""
 
 
 def over_devices(whole: Any, split: Any) -> TrainState:
@@ -197,7 +209,7 @@ def over_devices(whole: Any, split: Any) -> TrainState:
             of a seed have the entries of their own ones.
     """
     names = {field.name for field in dataclasses.fields(TrainState)}
-    by_environment = {"env_state", "observation", "episode"}
+    by_environment = {"env_state", "observation", "episode", "memory"}
     return TrainState(**{name: split if name in by_environment else whole for name in names})
 
 
@@ -216,10 +228,23 @@ def init(env: Environment, agent: Agent, ppo: PPO, key: Key, shard: Shard = WHOL
     env_state, timestep = reset_batch(env, key_reset, ppo.num_envs, shard)
     episode = begin(timestep)
     return TrainState(
-        params, _optimizer(ppo).init(params), env_state, timestep.observation, episode,
-        empty_window(episode), key_run, jnp.zeros((), jnp.int32), params,
-        jnp.asarray(ppo.multiplier) if agent.cost_critic else (),
-    )  # fmt: skip
+        params=params,
+        optimizer=_optimizer(ppo).init(params),
+        env_state=env_state,
+        observation=timestep.observation,
+        episode=episode,
+        memory=_fresh_memory(agent, timestep.observation.shape[0]),
+        window=empty_window(episode),
+        key=key_run,
+        num_updates=jnp.zeros((), jnp.int32),
+        average=params,
+        multiplier=jnp.asarray(ppo.multiplier) if agent.cost_critic else (),
+    )
+
+
+def _fresh_memory(agent: Agent, num_envs: int) -> dict[str, Memory]:
+    """Return what the networks remember at the start of episodes, [num_envs, …]."""
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (num_envs, *x.shape)), agent.memory())
 
 
 def update(
@@ -247,11 +272,12 @@ def update(
         The state after the update, and the diagnostics of the update.
     """
     key_collect, key_learn = jax.random.split(jax.random.fold_in(state.key, state.num_updates))
+    memory = state.memory
     state, transitions = collect(env, agent, ppo, state, key_collect, shard)
     progress = state.num_updates / total_updates
     gamma = discount(ppo, progress)
     step_size = learning_rate(ppo, progress)
-    batch, explained = _to_batch(agent, ppo, gamma, state, transitions, shard)
+    state, batch, explained = _to_batch(agent, ppo, gamma, state, transitions, memory, shard)
     params, optimizer, losses = learn(env, agent, ppo, step_size, state, batch, key_learn, shard)
     params = {**params, "log_std": params["log_std"] - ppo.noise_decay / total_updates}
     episode, done = shard.join((transitions.episode, transitions.done), axis=1)
@@ -364,15 +390,17 @@ def collect(
     Returns:
         The state with the environments after these steps, and the transitions.
     """
+    start = (state.env_state, state.observation, state.episode, state.memory["actor"])
+    fresh_memory = _fresh_memory(agent, state.observation.shape[0])["actor"]
 
     def one_step(
-        carry: tuple[State, Array, Episode], key: Key
-    ) -> tuple[tuple[State, Array, Episode], Transition]:
-        env_state, observation, episode = carry
+        carry: tuple[State, Array, Episode, Memory], key: Key
+    ) -> tuple[tuple[State, Array, Episode, Memory], Transition]:
+        env_state, observation, episode, memory = carry
         key_act, key_reset = jax.random.split(key)
         inputs = agent.inputs(env, observation)
         totals = env_state.reward_totals if agent.critic_sees_totals else {}
-        policy = agent.distribution(env, state.params, inputs)
+        policy, memory = agent.distribution_step(env, state.params, inputs, memory)
         action = policy.sample(key_act, shard)
         (env_state, observation), timestep = step_or_reset_batch(
             env, env_state, action, key_reset, ppo.max_episode_steps, shard
@@ -396,12 +424,18 @@ def collect(
             env_state,
             observation,
             jax.tree.map(lambda x: jnp.where(done, jnp.zeros_like(x), x), episode),
+            choose(done, fresh_memory, memory),
         ), transition
 
-    start = (state.env_state, state.observation, state.episode)
     scan = scan_packed if accelerated() else jax.lax.scan
     end, transitions = scan(one_step, start, jax.random.split(key, ppo.num_steps))
-    return state.replace(env_state=end[0], observation=end[1], episode=end[2]), transitions
+    state = state.replace(
+        env_state=end[0],
+        observation=end[1],
+        episode=end[2],
+        memory={**state.memory, "actor": end[3]},
+    )
+    return state, transitions
 
 
 def _acted(env: Environment, action: Array, timestep: TimeStep) -> Array:
@@ -484,7 +518,7 @@ def learn(
         return jax.grad(loss, has_aux=True)(params, env, agent, ppo, samples)
 
     def mean_gradient(params: Params, rows: Array) -> tuple[Params, Diagnostics]:
-        parts = _num_chunks(rows.size)
+        parts = 1 if agent.recurrent else _num_chunks(rows.size)
         if parts == 1:
             return gradient(params, rows)
 
@@ -512,7 +546,7 @@ def learn(
     def epoch(
         carry: tuple[Params, optax.OptState], key: Key
     ) -> tuple[tuple[Params, optax.OptState], Diagnostics]:
-        rows = shuffle(key, ppo.batch_size).reshape(ppo.num_minibatches, -1)
+        rows = shuffle(key, ppo.rows(agent)).reshape(ppo.num_minibatches, -1)
         scan = scan_packed if accelerated() else jax.lax.scan
         return scan(minibatch_step, carry, rows)
 
@@ -530,7 +564,7 @@ def loss(
     The second value has the terms of the loss, and how far the policy is from the one that
     collected the batch.
     """
-    policy = agent.distribution(env, params, batch.inputs)
+    policy = agent.distribution(env, params, batch.inputs, batch.sequences)
     log_ratio = policy.log_prob(batch.action) - batch.log_prob
     bounded = jax.lax.stop_gradient(jnp.minimum(log_ratio, MAX_LOG_RATIO))
     # The second term is 0 and has the derivative.
@@ -538,7 +572,7 @@ def loss(
     clipped = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
     seen = agent.critic_inputs(batch.inputs, batch.totals)
-    value = agent.value(params, seen)
+    value = agent.critic_output("critic", params, seen, batch.sequences)
     value_error = 0.5 * (value - batch.value_target) ** 2
     entropy = policy.entropy()
     outside = jnp.abs(ratio - 1.0) > ppo.clip
@@ -553,7 +587,8 @@ def loss(
         "clip_fraction": jnp.mean(outside.astype(ratio.dtype)),
     }
     if agent.cost_critic:
-        cost_error = 0.5 * (agent.cost_rate(params, seen) - batch.cost_target) ** 2
+        rate = agent.critic_output("cost_critic", params, seen, batch.sequences)
+        cost_error = 0.5 * (rate - batch.cost_target) ** 2
         terms["cost_value_loss"] = jnp.mean(cost_error)
         value_error += cost_error
     total = jnp.mean(
@@ -568,34 +603,96 @@ def _to_batch(
     gamma: Array,
     state: TrainState,
     transitions: Transition,
+    memory: Mapping[str, Memory],
     shard: Shard = WHOLE,
-) -> tuple[Batch, Array]:
-    """Return advantages and targets of the critics, with all samples along one axis.
+) -> tuple[TrainState, Batch, Array]:
+    """Return the samples to learn from, with advantages and targets of the critics.
 
-    Advantages are normalised over the whole batch. The second value is the explained variance of
-    the critic on the whole batch.
+    Advantages are normalised over the whole batch.
+
+    Args:
+        agent: the agent.
+        ppo: the hyperparameters.
+        gamma: the discount factor.
+        state: the state after the transitions.
+        transitions: the transitions.
+        memory: what the networks remembered before the transitions.
+        shard: the part of the environments that this device has.
+
+    Returns:
+        The state, in which the critics remember the transitions. The samples of all devices along
+        the first axis: a sample is one step, or all steps of an environment if a network remembers.
+        The explained variance of the critic on the whole batch.
     """
-    t, params = transitions, state.params
-    seen = [
-        agent.critic_inputs(*one)
-        for one in ((t.inputs, t.totals), (t.next_inputs, t.episode.reward_totals))
-    ]
-    value, next_value = (_in_chunks(partial(agent.value, params), one) for one in seen)
+    t = transitions
+    seen = agent.critic_inputs(t.inputs, t.totals)
+    next_seen = agent.critic_inputs(t.next_inputs, t.episode.reward_totals)
+    judge = partial(_judge, agent, state.params, seen=seen, next_seen=next_seen, done=t.done)
+    value, next_value, critic_memory = judge("critic", memory["critic"])
+    after = {**state.memory, "critic": critic_memory}
     advantage = gae(t.reward, value, next_value, t.terminated, t.done, gamma, ppo.gae_lambda)
     target, cost_target = advantage + value, ()
     if agent.cost_critic:
-        rate, next_rate = (_in_chunks(partial(agent.cost_rate, params), one) for one in seen)
+        rate, next_rate, after["cost_critic"] = judge("cost_critic", memory["cost_critic"])
         cost_advantage = gae(
             (1.0 - gamma) * t.cost, rate, next_rate, t.terminated, t.done, gamma, ppo.gae_lambda
         )
         cost_target = cost_advantage + rate
         advantage -= state.multiplier * cost_advantage / (1.0 - gamma)
     part = Batch(t.inputs, t.totals, t.action, t.log_prob, advantage, target, cost_target)
-    batch, value = shard.join((part, value), axis=1)
+    done = t.done if agent.recurrent else ()
+    batch, value, done = shard.join((part, value, done), axis=1)
     explained = explained_variance(batch.value_target, value)
     advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8)
     batch = batch._replace(advantage=advantage)
-    return jax.tree.map(lambda x: x.reshape(ppo.batch_size, *x.shape[2:]), batch), explained
+    state = state.replace(memory=after)
+    if not agent.recurrent:
+        batch = jax.tree.map(lambda x: x.reshape(ppo.batch_size, *x.shape[2:]), batch)
+        return state, batch, explained
+    batch, done = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), (batch, done))
+    sequences = Sequences(memory=shard.join(dict(memory)), done=done)
+    return state, batch._replace(sequences=sequences), explained
+
+
+def _judge(
+    agent: Agent,
+    params: Params,
+    name: str,
+    memory: Memory,
+    seen: Float[Array, "t n c"],
+    next_seen: Float[Array, "t n c"],
+    done: Bool[Array, "t n"],
+) -> tuple[Float[Array, "t n"], Float[Array, "t n"], Memory]:
+    """Return what a critic says of each state, and of the state after it before any reset.
+
+    Args:
+        agent: the agent.
+        params: the parameters.
+        name: the critic, `critic` or `cost_critic`.
+        memory: what the critic remembers before the first step, [num_envs, …].
+        seen: what the critic sees of each state.
+        next_seen: what it sees of the state after it.
+        done: whether the episode ended with the step.
+
+    Returns:
+        Both outputs, and what the critic remembers after the last step.
+    """
+    network = agent.networks[name]
+    if not network.recurrent:
+        critic = partial(agent.critic_output, name, params)
+        return _in_chunks(critic, seen), _in_chunks(critic, next_seen), memory
+
+    def step(memory: Memory, inputs: tuple[Array, Array]) -> tuple[Memory, tuple[Array, Array]]:
+        now, following = inputs
+        value, memory = agent.critic_step(name, params, now, memory)
+        # What the critic sees of the next state before a reset is not what it goes on from.
+        next_value, _ = agent.critic_step(name, params, following, memory)
+        return memory, (value, next_value)
+
+    sequences = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), ((seen, next_seen), done))
+    memory, outputs = unroll(step, memory, network.memory(), *sequences)
+    value, next_value = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), outputs)
+    return value, next_value, memory
 
 
 def _in_chunks(

@@ -10,6 +10,7 @@ import scipy.stats
 import jaxsafe
 from jaxsafe.agents.agent import Agent
 from jaxsafe.agents.distributions import Categorical, Gaussian
+from jaxsafe.agents.features import DockingFeatures
 from jaxsafe.schema.component import normalise
 
 KEY = jax.random.key(3)
@@ -65,12 +66,12 @@ def test_categorical_samples_have_the_stated_frequencies() -> None:
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
 def test_an_untrained_policy_is_centred_and_as_wide_as_configured(actions: str) -> None:
     env = jaxsafe.make("docking2d", actions=actions)  # type: ignore[arg-type]
-    agent = normalise(Agent(features="docking", log_std=-1.2, prior_std=0.3))
+    agent = normalise(Agent(features=DockingFeatures(), log_std=-1.2, prior_std=0.3))
     params = agent.init(KEY, env)
     _, timestep = env.reset(KEY)
-    actions_drawn = jax.vmap(lambda key: agent.act(env, params, key, timestep.observation, False))(
-        jax.random.split(KEY, 2000)
-    )
+    actions_drawn = jax.vmap(
+        lambda key: agent.act(env, params, key, timestep.observation, False)[0]
+    )(jax.random.split(KEY, 2000))
     pushes = (
         np.asarray(actions_drawn) / 5.0 - 1.0
         if actions == "discrete"
@@ -114,15 +115,15 @@ def test_the_critic_sees_the_totals_in_any_order_and_the_actor_does_not() -> Non
     np.testing.assert_array_equal(np.sort(seen[6:]), np.arange(len(env.reward)))
     shapes = jax.tree.map(jnp.shape, [normalise(agent).init(KEY, env) for agent in (blind, seeing)])
     assert shapes[0]["actor"] == shapes[1]["actor"]
-    assert shapes[1]["critic"][0]["kernel"][0] == shapes[0]["critic"][0]["kernel"][0] + len(
-        env.reward
-    )
+    assert shapes[1]["critic"]["hidden_0"]["kernel"][0] == shapes[0]["critic"]["hidden_0"][
+        "kernel"
+    ][0] + len(env.reward)
 
 
 def test_networks_of_many_seeds_are_orthogonalised_one_by_one_with_the_same_numbers() -> None:
     """Orthogonalising many networks at once has hung, see `_orthogonal`."""
     env = jaxsafe.make("docking2d")
-    agent = normalise(Agent(features="docking"))
+    agent = normalise(Agent(features=DockingFeatures()))
 
     def init(key: jax.Array) -> Any:
         return agent.init(key, env)

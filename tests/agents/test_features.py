@@ -5,6 +5,13 @@ import pytest
 
 import jaxsafe
 from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.features import (
+    ApproachFeatures,
+    DockingFeatures,
+    Features,
+    PlainFeatures,
+    RejoinFeatures,
+)
 from jaxsafe.schema.errors import ConfigError
 
 KEY = jax.random.key(3)
@@ -27,14 +34,14 @@ def observed(task: str, ahead: np.ndarray) -> tuple[jaxsafe.Environment, jax.Arr
 
 def test_docking_features_are_direction_and_log_distance() -> None:
     env = jaxsafe.make("docking3d")
-    agent = Agent(features="docking")
+    agent = Agent(features=DockingFeatures())
     _, timestep = jaxsafe.reset_to(
         env, {"deputy": {"position": [30.0, 0.0, 40.0], "velocity": [0.0, 0.0, 0.0]}}
     )
     inputs = agent.inputs(env, timestep.observation)
     np.testing.assert_array_equal(inputs[:8], timestep.observation)
     np.testing.assert_allclose(inputs[8:], [0.3 / 0.51, 0.0, 0.4 / 0.51, np.log(0.505)], rtol=1e-6)
-    assert agent.init(KEY, env)["actor"][0]["kernel"].shape == (12, 64)
+    assert agent.init(KEY, env)["actor"]["hidden_0"]["kernel"].shape == (12, 64)
 
 
 @pytest.mark.parametrize("task", ["docking2d", "docking3d", "docking2d_oriented"])
@@ -45,7 +52,7 @@ def test_approach_features_measure_the_velocity_by_its_limit(task: str) -> None:
     _, timestep = jaxsafe.reset_to(
         env, {"deputy": deputy | ({"attitude": 0.0} if task == "docking2d_oriented" else {})}
     )
-    inputs = np.asarray(Agent(features="approach").inputs(env, timestep.observation))
+    inputs = np.asarray(Agent(features=ApproachFeatures()).inputs(env, timestep.observation))
     # The oriented craft observes the chief, seen from the deputy.
     sign = -1.0 if task == "docking2d_oriented" else 1.0
     velocity = np.array([-0.1, 0.2, *rest]) / (0.2 + 0.002054 * 60.0)
@@ -58,7 +65,7 @@ def test_approach_features_measure_the_velocity_by_its_limit(task: str) -> None:
     np.testing.assert_allclose(across, [0.0, *velocity[1:]], atol=2e-3)
     np.testing.assert_allclose(speed, np.linalg.norm(velocity), rtol=1e-5)
     np.testing.assert_array_equal(
-        inputs[: size + d + 1], Agent(features="docking").inputs(env, timestep.observation)
+        inputs[: size + d + 1], Agent(features=DockingFeatures()).inputs(env, timestep.observation)
     )
 
 
@@ -66,14 +73,14 @@ def test_plain_agents_see_the_observation_and_nothing_else() -> None:
     env = jaxsafe.make("docking2d")
     _, timestep = env.reset(KEY)
     np.testing.assert_array_equal(
-        Agent(features="none").inputs(env, timestep.observation), timestep.observation
+        Agent(features=PlainFeatures()).inputs(env, timestep.observation), timestep.observation
     )
 
 
 @pytest.mark.parametrize("task", ["rejoin2d", "rejoin3d"])
 def test_rejoin_features_tell_a_collision_course(task: str) -> None:
     env, observation = observed(task, -2.0 * COURSE)
-    inputs = np.asarray(Agent(features="rejoin").inputs(env, observation))
+    inputs = np.asarray(Agent(features=RejoinFeatures()).inputs(env, observation))
     size = env.observation_size
     d = 3 if task == "rejoin3d" else 2
     np.testing.assert_array_equal(inputs[:size], observation)
@@ -106,7 +113,7 @@ def test_rejoin_features_are_level_however_the_wingman_rolls() -> None:
         }
         _, timestep = jaxsafe.reset_to(env, {"lead": lead, "wingman": wingman})
         inputs.append(
-            np.asarray(Agent(features="rejoin").inputs(env, timestep.observation))[
+            np.asarray(Agent(features=RejoinFeatures()).inputs(env, timestep.observation))[
                 env.observation_size :
             ]
         )
@@ -124,14 +131,16 @@ def test_rejoin_features_are_level_however_the_wingman_rolls() -> None:
 def test_rejoin_features_measure_by_how_much_the_lead_is_missed(task: str) -> None:
     left = 300.0 * np.array([-COURSE[1], COURSE[0]]) / np.linalg.norm(COURSE)
     env, observation = observed(task, -COURSE + left)
-    inputs = np.asarray(Agent(features="rejoin").inputs(env, observation))
+    inputs = np.asarray(Agent(features=RejoinFeatures()).inputs(env, observation))
     d = 3 if task == "rejoin3d" else 2
     miss = inputs[-2 - d : -2]
     danger = inputs[-2:]
     np.testing.assert_allclose(1000.0 * miss[:2] / 4.0, left, atol=10.0)
     assert (danger < 0.15).all()
     env, observation = observed(task, COURSE)  # the lead flies away
-    np.testing.assert_array_equal(Agent(features="rejoin").inputs(env, observation)[-2:], 0.0)
+    np.testing.assert_array_equal(
+        Agent(features=RejoinFeatures()).inputs(env, observation)[-2:], 0.0
+    )
 
 
 def test_the_names_of_an_observation_are_worked_out_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,20 +148,19 @@ def test_the_names_of_an_observation_are_worked_out_once(monkeypatch: pytest.Mon
     traced = []
     reset = jaxsafe.environment.reset
     monkeypatch.setattr("jaxsafe.environment.reset", lambda *args: traced.append(1) or reset(*args))
-    Agent(features="rejoin").inputs(env.replace(dt=env.dt), observation)
+    Agent(features=RejoinFeatures()).inputs(env.replace(dt=env.dt), observation)
     assert len(traced) == 1
 
 
 @pytest.mark.parametrize(
     ("features", "task", "missing"),
     [
-        ("docking", "rejoin2d", "position.x"),
-        ("rejoin", "docking3d", "lead_position.magnitude"),
+        (DockingFeatures(), "rejoin2d", "position.x"),
+        (RejoinFeatures(), "docking3d", "lead_position.magnitude"),
     ],
 )
-def test_features_of_another_task_are_refused(features: str, task: str, missing: str) -> None:
+def test_features_of_another_task_are_refused(features: Features, task: str, missing: str) -> None:
     env = jaxsafe.make(task)
-    with pytest.raises(
-        ConfigError, match=f"agent.features: '{features}' needs an observation called '{missing}'"
-    ):
-        Agent(features=features).inputs(env, jnp.zeros(env.observation_size))  # type: ignore[arg-type]
+    message = f"agent.features: '{features.type_name}' needs an observation called '{missing}'"
+    with pytest.raises(ConfigError, match=message):
+        features(env, jnp.zeros(env.observation_size))

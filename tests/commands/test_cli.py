@@ -140,7 +140,7 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
         ),
         (["env=nowhere.yaml"], "nowhere.yaml: cannot be read: No such file or directory"),
         (["resume=runs/x"], "resume: no run in 'runs/x' (a directory with config.yaml)"),
-        (["resume=runs/x", "steps=5"], "steps: unknown option; choose from resume"),
+        (["resume=runs/x", "seeds=5"], "seeds: unknown option; choose from resume"),
         (["env=docking3d", "out=/proc/nowhere"], "out: cannot write /proc/nowhere"),
     ],
 )
@@ -327,20 +327,20 @@ def rewritten(
         ),
         (lambda header: header.update(env=[1]), r"header: env: expected text, found \[1\]"),
         (
-            lambda header: header["agent"].update(hidden=[1e30]),
-            r"agent\.hidden\.\[0\]: expected .*, found 1e\+30",
+            lambda header: header["agent"]["actor"].update(hidden=[1e30]),
+            r"agent\.actor\.hidden\.\[0\]: expected .*, found 1e\+30",
         ),
         (
-            lambda header: header["agent"].update(hidden=[8] * 10**4),
-            "agent.hidden: expected at most 64 layers",
+            lambda header: header["agent"]["actor"].update(hidden=[8] * 10**4),
+            "agent.actor.hidden: expected at most 64 layers",
         ),
         (
-            lambda header: header["agent"].update(hidden=[9]),
+            lambda header: header["agent"]["actor"].update(hidden=[9]),
             r"expected numbers of shape \(9,\), found float32 of shape",
         ),
         (lambda header: header["agent"].update(log_std=[0.0] * 7), "agent"),
         (lambda header: "[" * 10**5, "not a policy file"),
-        (lambda header: "null", "expected format 'jaxsafe policy 1'"),
+        (lambda header: "null", "expected format 'jaxsafe policy 2'"),
     ],
 )
 def test_the_header_of_a_policy_file_is_checked(
@@ -619,12 +619,12 @@ HUGE = "9" * 4000
         ),
         (
             train,
-            ["env=docking2d", f"agent.hidden=[{HUGE}]"],
-            "agent.hidden.[0]: expected a list ≥ 1 of a magnitude up to",
+            ["env=docking2d", f"agent.actor.hidden=[{HUGE}]"],
+            "agent.actor.hidden.[0]: expected a list ≥ 1 of a magnitude up to",
         ),
         (
             train,
-            ["env=docking2d", f"agent.hidden=[{', '.join('1' * 65)}]"],
+            ["env=docking2d", f"agent.actor.hidden=[{', '.join('1' * 65)}]"],
             "expected at most 64 layers, found 65",
         ),
         (
@@ -640,7 +640,7 @@ HUGE = "9" * 4000
         (
             train,
             ["env=docking2d", "agent={}"],
-            "agent: name one of its options, for instance agent.hidden=…",
+            "agent: name one of its options, for instance agent.features=…",
         ),
         (
             train,

@@ -81,10 +81,11 @@ def test_an_accelerator_draws_the_same_starts(as_accelerated: Callable[[Any], No
 @pytest.mark.thorough
 def test_an_accelerator_learns_the_same(as_accelerated: Callable[[Any], None]) -> None:
     from jaxsafe.agents.agent import Agent
+    from jaxsafe.agents.networks import MLP
     from jaxsafe.schema.component import normalise
 
     env = jaxsafe.make("docking2d")
-    agent = normalise(Agent(hidden=(8,)))
+    agent = normalise(Agent(actor=MLP(hidden=(8,))))
     hyper = normalise(ppo.PPO(num_envs=4, num_steps=8, num_epochs=2))
     start = ppo.init(env, agent, hyper, jax.random.key(0))
     expected = jax.jit(lambda state: ppo.update(env, agent, hyper, 4, state)[0])(start)

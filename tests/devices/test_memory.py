@@ -49,7 +49,7 @@ def test_the_batch_of_an_update_is_counted(
         "ppo.num_steps=32",
         "ppo.num_minibatches=8",
         "steps=65536",
-        "agent.hidden=[8]",
+        "agent.actor.hidden=[8]",
     ]
     words = ["env=docking2d", "seeds=1", f"out={tmp_path / 'run'}", *sizes]
     if command is tune:

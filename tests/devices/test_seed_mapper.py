@@ -9,6 +9,8 @@ from default_cases import thorough
 
 import jaxsafe
 from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.features import DockingFeatures
+from jaxsafe.agents.networks import GRU
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.schema.component import normalise
@@ -17,7 +19,7 @@ from jaxsafe.train.ppo import DIAGNOSTICS, PPO, TrainState, init, update
 from jaxsafe.train.train import STATE, programs
 
 ENV = jaxsafe.make("docking2d")
-AGENT = normalise(Agent(features="docking"))
+AGENT = normalise(Agent(features=DockingFeatures()))
 HYPER = normalise(PPO(num_envs=4, num_steps=32, num_epochs=2))
 UPDATES = 5
 
@@ -32,14 +34,16 @@ def train(
     )
 
 
-def seeds(first: int, count: int, share: int = 1, updates: int = UPDATES) -> TrainState:
+def seeds(
+    first: int, count: int, share: int = 1, updates: int = UPDATES, agent: Agent = AGENT
+) -> TrainState:
     mapper = SeedMapper(count, (share,))
 
     def train_shared(shared: tuple, key: jax.Array) -> TrainState:
         return train(shared, key, updates, mapper.shard)
 
     state = mapper.map(train_shared, out_specs=STATE)(
-        mapper.replicate((ENV, AGENT, HYPER)), mapper.keys(first)
+        mapper.replicate((ENV, agent, HYPER)), mapper.keys(first)
     )
     return mapper.gather(state)
 
@@ -63,10 +67,11 @@ claim_cores()
 import jax, jaxsafe, numpy as np
 from jaxsafe.schema.component import normalise
 from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.features import ApproachFeatures, DockingFeatures
 from jaxsafe.train.train import programs
 from jaxsafe.train.ppo import PPO
 env = jaxsafe.make("docking2d_oriented")
-shared = env, normalise(Agent(features="approach")), normalise(PPO(num_envs=32))
+shared = env, normalise(Agent(features=ApproachFeatures())), normalise(PPO(num_envs=32))
 def starts(count):
     mapper = SeedMapper(count)
     return mapper.gather(programs(mapper, 1, 1)[0](mapper.replicate(shared), mapper.keys(0)))
@@ -110,6 +115,17 @@ def test_devices_that_share_a_seed_log_the_diagnostics_of_the_whole_batch() -> N
         np.testing.assert_allclose(shared[name], alone[name], rtol=1e-3, atol=1e-5, err_msg=name)
 
 
+def test_devices_share_a_seed_whose_networks_remember() -> None:
+    agent = normalise(Agent(actor=GRU(hidden=(4,), units=4)))
+    alone = seeds(0, 1, 1, updates=2, agent=agent)
+    shared = seeds(0, 1, 2, updates=2, agent=agent)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4),
+        (alone.params, alone.memory),
+        (shared.params, shared.memory),
+    )
+
+
 @pytest.mark.thorough
 def test_a_seed_is_to_rounding_the_same_run_under_vmap(three: TrainState) -> None:
     keys = jax.vmap(jax.random.key)(np.arange(3))
@@ -120,7 +136,7 @@ def test_a_seed_is_to_rounding_the_same_run_under_vmap(three: TrainState) -> Non
 
 
 def test_seeds_differ(three: TrainState) -> None:
-    kernel = three.params["actor"][0]["kernel"]
+    kernel = three.params["actor"]["hidden_0"]["kernel"]
     assert np.abs(kernel[0] - kernel[1]).max() > 0.01
 
 

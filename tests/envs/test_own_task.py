@@ -34,7 +34,7 @@ def directory(tmp_path: Path) -> Path:
     )
     (tmp_path / "my_tasks.py").write_text(f"from pathlib import Path\n{text}", encoding="utf-8")
     (tmp_path / "own.yaml").write_text(
-        "plain: {agent: {hidden: [8]}}\nwide: {agent: {hidden: [12]}}\n"
+        "plain: {agent: {actor: {hidden: [8]}}}\nwide: {agent: {actor: {hidden: [12]}}}\n"
     )
     return tmp_path
 
@@ -51,7 +51,7 @@ def command(directory: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.thorough
 def test_a_task_of_ones_own_is_trained_and_evaluated_by_name(directory: Path) -> None:
-    words = [word for word in OPTIONS if not word.startswith("agent.hidden")]
+    words = [word for word in OPTIONS if not word.startswith("agent.actor.hidden")]
     trained = command(
         directory,
         "jaxsafe.train",

@@ -74,7 +74,7 @@ def test_discrete_policies_choose_alike() -> None:
     }
     policy = policy._replace(env=env, params=params)
     observations = np.random.default_rng(0).uniform(-1, 1, (500, 6)).astype(np.float32)
-    expected = policy.agent.act(
+    expected, _ = policy.agent.act(
         env, policy.params, jax.random.key(0), jnp.asarray(observations), True
     )
     computed = run(to_onnx(functions.action(policy).function, observations.shape), observations)
@@ -238,12 +238,13 @@ def test_a_policy_that_diverged_is_not_exported(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     policy = saved("docking2d")
-    layers = [jax.tree.map(np.array, layer) for layer in policy.params["actor"]]
-    layers[0]["kernel"][0, 0] = value
+    layers = jax.tree.map(np.array, policy.params["actor"])
+    layers["hidden_0"]["kernel"][0, 0] = value
     save_policy(Path("own.npz"), policy.env, policy.agent, {**policy.params, "actor": layers}, {})
     for words in (["format=onnx"], ["format=stablehlo"], ["format=vnnlib"]):
         with pytest.raises(
-            ConfigError, match=r"^own\.npz: actor/0/kernel: not all parameters are finite numbers"
+            ConfigError,
+            match=r"^own\.npz: actor/hidden_0/kernel: not all parameters are finite numbers",
         ):
             main(["run=own.npz", *words])
     np.savez("theirs.npz", kernel_0=np.full((6, 2), np.nan), bias_0=np.zeros(2))

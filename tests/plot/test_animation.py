@@ -16,7 +16,7 @@ def recorded(env: jaxsafe.Environment, steps: int) -> Any:
     """Return the record of an episode of random actions."""
     policy = lambda key, o: jax.random.uniform(key, (*o.shape[:-1], env.action_size), minval=-1.0)  # noqa: E731
     key = jax.random.key(0)
-    position, start = jax.jit(begin_recording, static_argnums=2)(env, key, 1)
+    position, start = jax.jit(begin_recording, static_argnums=(1, 3))(env, policy, key, 1)
     _, later = jax.jit(record_steps, static_argnums=(1, 4))(env, policy, key, position, steps)
     return jax.tree.map(
         lambda x, y: np.concatenate([np.asarray(x), np.asarray(y)[:, 0]]), start, later

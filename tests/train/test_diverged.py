@@ -15,6 +15,7 @@ from probe_environments import Position, probe
 from tiny_run import TINY
 
 from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.networks import MLP
 from jaxsafe.commands import cli
 from jaxsafe.commands import evaluate as evaluate
 from jaxsafe.commands import train as command
@@ -164,7 +165,7 @@ def test_a_run_of_which_every_seed_diverged_has_no_result(
 
 
 def test_infinite_returns_count_too() -> None:
-    agent = normalise(Agent(hidden=(4,)))
+    agent = normalise(Agent(actor=MLP(hidden=(4,))))
     ppo = normalise(PPO(num_envs=2))
     state = init(probe(Position(name="reward")), agent, ppo, jax.random.key(0))
     assert not diverged(state)

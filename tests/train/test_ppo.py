@@ -6,6 +6,7 @@ from default_cases import thorough
 from probe_environments import Constant, Match, Position, probe
 
 from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.networks import MLP
 from jaxsafe.environment import Environment
 from jaxsafe.schema.component import normalise
 from jaxsafe.train import ppo as ppo_module
@@ -23,7 +24,7 @@ from jaxsafe.train.ppo import (
 )
 from jaxsafe.types import Sim
 
-AGENT = normalise(Agent(hidden=(16,)))
+AGENT = normalise(Agent(actor=MLP(hidden=(16,))))
 SMALL = normalise(
     PPO(
         num_envs=8,
@@ -111,7 +112,7 @@ def test_what_is_learnt_does_not_depend_on_how_many_samples_go_through_the_netwo
     )
     # Chunks sum in another order, so the last bits differ.
     assert not np.array_equal(
-        whole.params["actor"][0]["kernel"], parts.params["actor"][0]["kernel"]
+        whole.params["actor"]["hidden_0"]["kernel"], parts.params["actor"]["hidden_0"]["kernel"]
     )
 
 
@@ -226,7 +227,7 @@ def test_hyperparameters_are_leaves_that_vmap() -> None:
 
     def bias(rate: jax.Array) -> jax.Array:
         ppo = SMALL.replace(learning_rate=rate)
-        return update(env, AGENT, ppo, 10, state)[0].params["critic"][0]["bias"]
+        return update(env, AGENT, ppo, 10, state)[0].params["critic"]["hidden_0"]["bias"]
 
     together = jax.vmap(bias)(rates)
     np.testing.assert_allclose(together, jnp.stack([bias(rate) for rate in rates]), atol=1e-6)
@@ -373,6 +374,15 @@ def test_the_kept_networks_are_those_of_training_or_their_average() -> None:
 def test_numbers_of_devices_that_may_share_a_seed_are_the_common_divisors_and_found_quickly() -> (
     None
 ):
-    assert PPO(num_envs=24, num_steps=64, num_minibatches=2).shares == [1, 2, 3, 4, 6, 8, 12, 24]
-    assert PPO(num_envs=9, num_steps=1, num_minibatches=1).shares == [1, 3, 9]
-    assert PPO(num_envs=2**30 - 1, num_steps=1, num_minibatches=1).shares[:4] == [1, 3, 7, 9]
+    assert PPO(num_envs=24, num_steps=64, num_minibatches=2).shares(AGENT) == [
+        1,
+        2,
+        3,
+        4,
+        6,
+        8,
+        12,
+        24,
+    ]
+    assert PPO(num_envs=9, num_steps=1, num_minibatches=1).shares(AGENT) == [1, 3, 9]
+    assert PPO(num_envs=2**30 - 1, num_steps=1, num_minibatches=1).shares(AGENT)[:4] == [1, 3, 7, 9]

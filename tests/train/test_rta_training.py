@@ -16,6 +16,7 @@ from tiny_run import TINY
 
 import jaxsafe
 from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.networks import MLP
 from jaxsafe.commands.evaluate import main as evaluate
 from jaxsafe.commands.train import main as train
 from jaxsafe.config.arguments import Arguments
@@ -35,7 +36,7 @@ def resolved(*words: str) -> tuple[TrainConfig, jaxsafe.Environment]:
 @cache
 def collected(learns_from: str) -> Transition:
     env = jaxsafe.make("docking2d", rta="default")
-    agent = normalise(Agent(hidden=(8,)))
+    agent = normalise(Agent(actor=MLP(hidden=(8,))))
     ppo = normalise(PPO(num_envs=16, num_steps=32, learns_from=learns_from))
     state = init(env, agent, ppo, jax.random.key(0))
     return jax.jit(lambda state, key: collect(env, agent, ppo, state, key)[1])(
@@ -55,7 +56,7 @@ def test_ppo_learns_from_the_desired_or_the_actual_control() -> None:
 
 def test_the_log_probability_is_that_of_the_stored_action() -> None:
     env = jaxsafe.make("docking2d", rta="default")
-    agent = normalise(Agent(hidden=(8,)))
+    agent = normalise(Agent(actor=MLP(hidden=(8,))))
     ppo = normalise(PPO(num_envs=16, num_steps=32, learns_from="actual"))
     params = init(env, agent, ppo, jax.random.key(0)).params
     transition = collected("actual")

@@ -385,7 +385,7 @@ def test_a_policy_file_acts_like_the_trained_network(whole: Path) -> None:
     jax.tree.map(np.testing.assert_array_equal, params, trained)
     _, timestep = env.reset(jax.random.key(0))
     action = load_policy(whole / "policy" / "seed_1.npz")(jax.random.key(1), timestep.observation)
-    expected = agent.act(env, trained, jax.random.key(1), timestep.observation, True)
+    expected, _ = agent.act(env, trained, jax.random.key(1), timestep.observation, True)
     # The two are not compiled as one program.
     np.testing.assert_allclose(action, expected, rtol=1e-6)
     assert about == {"env": "docking2d", "preset": "features", "seed": 1, "step": 1280}
@@ -551,7 +551,11 @@ def test_a_flipped_bit_in_a_checkpoint_is_told_or_changes_nothing(
         ("seed: 0", "seed: 1", r"config\.yaml: training\.seed: found 1, but .* made with 0"),
         ("gamma: 0.", "gamma: 0.1", r"config\.yaml: training\.ppo\.gamma: found 0\.1"),
         ("dt: 1.0", "dt: 2.0", r"config\.yaml: environment\.dt: found 2\.0, but .* made with 1\.0"),
-        ("hidden: [8]", "hidden: [9]", r"config\.yaml: training\.agent\.hidden\.\[0\]: found 9"),
+        (
+            "hidden: [8]",
+            "hidden: [9]",
+            r"config\.yaml: training\.agent\.actor\.hidden\.\[0\]: found 9",
+        ),
     ],
 )
 def test_a_checkpoint_is_tied_to_the_configuration_that_made_it(

@@ -57,7 +57,7 @@ def test_seeds_and_hyperparameters_are_mapped(recipe: Recipe) -> None:
 
     def final(rate: jax.Array, key: jax.Array) -> jax.Array:
         state, _ = train(env, config.agent, config.ppo.replace(learning_rate=rate), key, 2)
-        return state.params["actor"][0]["kernel"]
+        return state.params["actor"]["hidden_0"]["kernel"]
 
     kernels = np.asarray(jax.jit(jax.vmap(final))(rates, keys))
     assert kernels.shape[0] == 2

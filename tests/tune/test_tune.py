@@ -70,7 +70,7 @@ def test_draws_lie_in_their_range_and_can_be_repeated() -> None:
 
 
 def test_settings_that_differ_in_sizes_are_compiled_apart() -> None:
-    arguments = options("sweep.agent.hidden=[[8],[8,8]]", "sweep.ppo.clip=[0.1,0.2]")
+    arguments = options("sweep.agent.actor.hidden=[[8],[8,8]]", "sweep.ppo.clip=[0.1,0.2]")
     chosen = settings(arguments, pop_sweep(arguments), None, 0)
     assert alike(chosen, range(4)) == [[0, 1], [2, 3]]
     assert alike(chosen, [1, 2]) == [[1], [2]]
@@ -101,8 +101,8 @@ def test_settings_that_differ_in_sizes_are_compiled_apart() -> None:
             "sweep.seeds: must be the same in all settings; give seeds=… instead",
         ),
         (
-            ["sweep.agent.hidden=[[8]]"],
-            "sweep.agent.hidden: agent.hidden is given as well; leave one out",
+            ["sweep.agent.actor.hidden=[[8]]"],
+            "sweep.agent.actor.hidden: agent.actor.hidden is given as well; leave one out",
         ),
         (
             ["sweep.ppo.clip=[0.1]", "rank=speed"],
@@ -203,7 +203,7 @@ def test_the_table_leaves_out_violations_that_were_not_counted(swept: Path) -> N
 
 
 def test_a_group_of_one_trains_once() -> None:
-    arguments = options("sweep.agent.hidden=[[8],[8,8]]")
+    arguments = options("sweep.agent.actor.hidden=[[8],[8,8]]")
     chosen = settings(arguments, pop_sweep(arguments), None, 0)
     assert Lanes(chosen[0], 1).at_once == 1
 

@@ -9,10 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import jax
-import jax.numpy as jnp
-
-from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.agent import Agent, check_agent
 from jaxsafe.config import override
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.environment import Environment, require_success
@@ -37,9 +34,6 @@ Double precision counts as far as the largest one.
 """
 
 MAX_SEEDS = 100_000
-MAX_LAYERS = 64
-"""Largest number of hidden layers of a network. Each layer is compiled by itself."""
-
 WORTHWHILE = 128
 """Least number of samples of a minibatch for each device that shares a seed.
 
@@ -126,7 +120,11 @@ class TrainConfig(Component):
         if self.devices_per_seed is not None:
             return [self.devices_per_seed]
         minibatch = self.ppo.batch_size // self.ppo.num_minibatches
-        return [count for count in self.ppo.shares if count == 1 or minibatch >= count * WORTHWHILE]
+        return [
+            count
+            for count in self.ppo.shares(self.agent)
+            if count == 1 or minibatch >= count * WORTHWHILE
+        ]
 
     def every(self, steps: int | None) -> int:
         """Return an interval of environment steps in updates. None is a tenth of the run."""
@@ -176,7 +174,7 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     overrides = arguments.pop_overrides()
     if task is None:
         raise ConfigError("env: missing; for instance env=docking3d")
-    for name, example in (("agent", "hidden"), ("ppo", "gamma")):
+    for name, example in (("agent", "features"), ("ppo", "gamma")):
         if name in arguments.options:
             raise ConfigError(f"{name}: name one of its options, for instance {name}.{example}=…")
     for sink in ("wandb", "mlflow"):
@@ -203,14 +201,18 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         config = set_path(config, "ppo.learns_from", "actual", to_value)
     config = _with_algorithm(config, arguments.options)
     _check_rta(config, env)
-    if config.ppo.batch_size % config.ppo.num_minibatches:
+    rows = config.ppo.rows(config.agent)
+    if rows % config.ppo.num_minibatches:
+        what = "ppo.num_envs" if config.agent.recurrent else "ppo.num_envs × ppo.num_steps"
+        why = ", because a network remembers" if config.agent.recurrent else ""
         raise ConfigError(
-            "ppo.num_minibatches: expected a divisor of ppo.num_envs × ppo.num_steps = "
-            f"{config.ppo.batch_size}, found {config.ppo.num_minibatches}"
+            f"ppo.num_minibatches: expected a divisor of {what} = {rows}{why}, "
+            f"found {config.ppo.num_minibatches}"
         )
-    if config.devices_per_seed is not None and config.devices_per_seed not in config.ppo.shares:
+    shares = config.ppo.shares(config.agent)
+    if config.devices_per_seed is not None and config.devices_per_seed not in shares:
         raise ConfigError(
-            f"devices_per_seed: expected one of {', '.join(map(str, config.ppo.shares))}, "
+            f"devices_per_seed: expected one of {', '.join(map(str, shares))}, "
             "which divide ppo.num_envs and the samples of a minibatch, "
             f"found {config.devices_per_seed}"
         )
@@ -222,10 +224,6 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         raise ConfigError(
             f"steps: expected less than 2³¹ updates of {config.ppo.batch_size:,}, "
             f"found {config.steps:,} steps"
-        )
-    if len(config.agent.hidden) > MAX_LAYERS:
-        raise ConfigError(
-            f"agent.hidden: expected at most {MAX_LAYERS} layers, found {len(config.agent.hidden)}"
         )
     if float(config.ppo.horizon_growth) < 1.0 - float(config.ppo.gamma):
         raise ConfigError(
@@ -244,14 +242,7 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     for sink in LIBRARIES:
         if getattr(config, sink):
             library(sink)
-    if jnp.size(config.agent.log_std) not in (1, env.action_size):
-        count, found = env.action_size, jnp.size(config.agent.log_std)
-        raise ConfigError(
-            f"agent.log_std: expected one number or {count}, one for each action, found {found}"
-        )
-    observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
-    # This refuses features that the task cannot have.
-    jax.eval_shape(lambda o: config.agent.inputs(env, o), observation)
+    check_agent(config.agent, env)
     return config, env, short_name(task)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from jaxsafe.agents.agent import Params
+from jaxsafe.agents.networks import Params
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.schema.errors import ConfigError, nearest, show

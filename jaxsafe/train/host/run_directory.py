@@ -10,12 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import jaxsafe.config
+from jaxsafe.agents.policy_file import with_networks
 from jaxsafe.environment import Environment
 from jaxsafe.envs import TASKS, user_module
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.convert import to_component, to_data
 from jaxsafe.schema.errors import ConfigError, nearest
+from jaxsafe.schema.user_modules import modules
 from jaxsafe.storage.files import write_text
 from jaxsafe.storage.forms import NULL, NUMBER, TEXT, check
 from jaxsafe.storage.provenance import commit, versions
@@ -36,12 +38,12 @@ def create(config: TrainConfig, env: Environment, name: str) -> Path:
     """
     path = make(config.out, Path("runs"), name)
     content = {"env": name, **described(config, env), "commit": commit(), "versions": versions()}
+    environment = content["environment"]
+    # Where the run is read, the module of a task registers it. So its filters are known by name.
     module = user_module(name)
-    # Where the run is read, the module registers the task. So its filters are known by name.
-    if module:
-        environment = content["environment"]
-        content["environment"] = {"imports": [], **environment}
-        content["environment"]["imports"] = sorted({module, *environment.get("imports", [])})
+    imports = {*environment.get("imports", []), *modules(config), *([module] if module else [])}
+    if imports:
+        content["environment"] = {**environment, "imports": sorted(imports)}
     try:
         write_text(path / "config.yaml", yaml12.write(content))
     except OSError as error:
@@ -143,8 +145,12 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
             f"{option}: no run in {str(path)!r} (a directory with config.yaml){choice}"
         )
     content, place = read_content(path), f"{path / 'config.yaml'}: "
-    config = normalise(to_component(content["training"], TrainConfig, f"{place}training"))
+    # The environment comes first, because it names the modules in which the parts of both are.
     env = jaxsafe.config.from_data(content["environment"], f"{place}environment")
+    training = content["training"]
+    if "agent" in training:
+        training = {**training, "agent": with_networks(training["agent"])}
+    config = normalise(to_component(training, TrainConfig, f"{place}training"))
     return config, env, str(content["env"])
 
 
