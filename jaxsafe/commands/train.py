@@ -38,7 +38,7 @@ class Options(CommandOptions):
     overrides: Overrides
     """Change one field of the environment, for instance env.reward.delta_v.scale=-0.02."""
     resume: Directory | None = None
-    """The run to go on with. Beside it there is no other option but distributed."""
+    """The run to go on with. Beside it stand only distributed, and steps to train it for longer."""
     distributed: bool = False
     """Whether this is one of several processes that srun or mpirun started."""
     training: Annotated[Mapping[str, Any], Option(prefix="", component=TrainConfig)]
@@ -65,9 +65,11 @@ def main(argv: Sequence[str]) -> int:
         resolved = resolve_all(options.without("resume", "distributed"))
         path = Path(processes.from_leader(lambda: str(run_directory.create_all(resolved))))
     else:
-        options.refuse_others("resume", "distributed")
+        options.refuse_others("resume", "distributed", "steps")
         path = Path(resume)
     runs = run_directory.runs(path)
+    if resume is not None and "steps" in options.given:
+        processes.from_leader(lambda: run_directory.extend(runs, options.given["steps"]))
     try:
         with processes.reporting_lost_process(
             f"go on with: python -m jaxsafe.train distributed=true resume={path}"

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.networks import Params
 from jaxsafe.devices.seed_mapper import SPLIT_BY_ENV, SPLIT_BY_SEED, SeedMapper, isolated
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment
@@ -49,6 +50,7 @@ def train(
     num_updates: int,
     callback: Callback | None = None,
     every: int | None = None,
+    params: Params | None = None,
 ) -> tuple[TrainState, Curves]:
     """Train one seed.
 
@@ -67,12 +69,16 @@ def train(
         callback: a function that is called on the host after every `every` updates, for logs or a
             stop of one's own.
         every: number of updates between two calls. None stands for a fiftieth of the training.
+        params: parameters to start from, such as `state.average` of another training. None stands
+            for fresh ones.
 
     Returns:
         The state and the curves. `state.average` holds the parameters for `agent.policy`.
     """
     shared = (env, normalise(agent), normalise(hyperparameters))
     state = _begin(shared, key)
+    if params is not None:
+        state = state.replace(params=params, average=params)
     if callback is None:
         return _chunk(shared, state, num_updates, num_updates)
     every = every or max(1, num_updates // CALLS)

@@ -21,6 +21,7 @@ from jaxsafe.schema.convert import to_value
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.train.host.sinks import LIBRARIES, library
+from jaxsafe.train.host.warm_start import agent_options
 from jaxsafe.train.ppo import MAX_COUNT, PPO
 from jaxsafe.types import Dimensionless, Positive
 
@@ -78,6 +79,11 @@ class TrainConfig(Component):
 
     `punished` adds a reward term for them, and `corrected` learns from the control that acted. By
     default it is `punished`, where there is a filter.
+    """
+    start_from: str | None = None
+    """The run directory, policy file or `pretrained/TASK` whose networks are trained on.
+
+    It is also written `from=`, for instance from=runs/docking3d. None stands for fresh networks.
     """
     out: str | None = None
     """The run directory. By default it is a new directory in runs/."""
@@ -171,6 +177,9 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     """
     arguments = Arguments(dict(options))
     task = arguments.pop_text("env")
+    source = arguments.pop_text("from")
+    if source is not None:
+        _inherit_agent(arguments, source)
     overrides = arguments.pop_overrides()
     if task is None:
         raise ConfigError("env: missing; for instance env=docking3d")
@@ -244,6 +253,23 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
             library(sink)
     check_agent(config.agent, env)
     return config, env, short_name(task)
+
+
+def _inherit_agent(arguments: Arguments, source: str) -> None:
+    """Add the options of the agent that a training has from what it starts from.
+
+    Raises:
+        ConfigError: there is no such run or policy, or the user asks for another agent.
+    """
+    for path, value in agent_options(source).items():
+        given = [name for name in arguments.options if f"{name}.".startswith(f"{path}.")]
+        if given:
+            raise ConfigError(f"{given[0]}: the training starts from {source}, which decides it")
+        if path != "agent.cost_critic":
+            arguments.options[path] = value
+        elif value and arguments.options.get("algorithm") != "ppo_lagrangian":
+            raise ConfigError(f"from: {source} was trained with algorithm=ppo_lagrangian; add it")
+    arguments.options["start_from"] = source
 
 
 def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfig:

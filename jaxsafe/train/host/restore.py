@@ -11,8 +11,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxsafe.agents.networks import Params
+from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.schema.errors import ConfigError, nearest, show
@@ -126,6 +128,41 @@ def _difference(before: Any, now: Any, place: str = "") -> tuple[str, Any, Any]:
         if found[0]:
             return found
     return "", None, None
+
+
+def start_params(mapper: SeedMapper, config: TrainConfig, env: Environment) -> Params:
+    """Return the networks of every seed at the start of a training that does not start afresh.
+
+    The i-th seed starts with the i-th policy of the run that it starts from. Where there are fewer
+    policies than seeds, they are taken from the first again.
+
+    Raises:
+        ConfigError: there is no such run or policy, or its networks have other shapes.
+    """
+    source = str(config.start_from)
+    if is_single(source):
+        found = jax.tree.map(lambda x: np.asarray(x)[None], read_policy(find_policy(source)).params)
+    else:
+        before, own_env, _ = run_directory.read(Path(source), "from")
+        seeds = SeedMapper(before.seeds)
+        found = seeds.gather(load_params(seeds, Path(source), before, own_env, "last")[0])
+    like = structure(env, config)["state"].average
+    policies = jax.tree.leaves(found)[0].shape[0]
+
+    def pick(path: Any, leaf: jax.ShapeDtypeStruct) -> np.ndarray:
+        stacked = found
+        for entry in path:
+            stacked = stacked.get(entry.key, {}) if isinstance(stacked, dict) else {}
+        shape = np.shape(stacked)[1:] if not isinstance(stacked, dict) else "nothing"
+        if shape != leaf.shape[1:]:
+            name = jax.tree_util.keystr(path, simple=True, separator="/")
+            raise ConfigError(
+                f"from: {name}: expected numbers of shape {leaf.shape[1:]}, found {shape}; "
+                f"{source} observes or does something else"
+            )
+        return np.asarray(stacked)[np.arange(config.seeds) % policies]
+
+    return mapper.place(jax.tree_util.tree_map_with_path(pick, like))
 
 
 def load_params(

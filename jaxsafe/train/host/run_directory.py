@@ -15,9 +15,10 @@ from jaxsafe.environment import Environment
 from jaxsafe.envs import TASKS, user_module
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import normalise
-from jaxsafe.schema.convert import to_component, to_data
+from jaxsafe.schema.convert import to_component, to_data, to_value
+from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError, nearest
-from jaxsafe.schema.user_modules import modules
+from jaxsafe.schema.user_modules import import_modules, modules
 from jaxsafe.storage.files import write_text
 from jaxsafe.storage.forms import NULL, NUMBER, TEXT, check
 from jaxsafe.storage.provenance import commit, versions
@@ -145,12 +146,13 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
             f"{option}: no run in {str(path)!r} (a directory with config.yaml){choice}"
         )
     content, place = read_content(path), f"{path / 'config.yaml'}: "
-    # The environment comes first, because it names the modules in which the parts of both are.
-    env = jaxsafe.config.from_data(content["environment"], f"{place}environment")
+    # The environment names the modules in which the parts of both are.
+    import_modules(content["environment"].get("imports", []), f"{place}environment")
     training = content["training"]
     if "agent" in training:
         training = {**training, "agent": with_networks(training["agent"])}
     config = normalise(to_component(training, TrainConfig, f"{place}training"))
+    env = jaxsafe.config.from_data(content["environment"], f"{place}environment")
     return config, env, str(content["env"])
 
 
@@ -167,6 +169,31 @@ def read_content(path: Path) -> dict[str, Any]:
     form = {"env": TEXT | NUMBER, "training": {}, "environment": {}}
     check(content, form | ({"commit": TEXT | NULL} if "commit" in content else {}), str(file))
     return content
+
+
+def extend(runs: Sequence[Path], steps: Any) -> None:
+    """Let runs train for more steps, also those that have ended. Schedules run over the new number.
+
+    The results of a run that has ended are kept beside those to come, as `results_STEPS.json`.
+
+    Args:
+        runs: the run directories.
+        steps: the new number of environment steps of each seed.
+
+    Raises:
+        ConfigError: it is not more than a run has now, or a directory holds no run.
+    """
+    configs = {run: read(run, "resume")[0] for run in runs}
+    longer = {run: set_path(config, "steps", steps, to_value) for run, config in configs.items()}
+    for run, config in configs.items():
+        if longer[run].num_updates <= config.num_updates:
+            raise ConfigError(f"steps: expected more than the {config.steps:,} of {run}")
+    for run, config in configs.items():
+        if (run / "results.json").exists():
+            (run / "results.json").rename(run / f"results_{config.steps}.json")
+        content = read_content(run)
+        content["training"]["steps"] = longer[run].steps
+        write_text(run / "config.yaml", yaml12.write(content))
 
 
 def discard_unused(path: Path) -> None:

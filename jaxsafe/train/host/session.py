@@ -33,7 +33,7 @@ from jaxsafe.storage.forms import COUNT
 from jaxsafe.train.host.checkpoint import Checkpoints
 from jaxsafe.train.host.log import Display, ProgressLog, progress_rows, read_progress
 from jaxsafe.train.host.options import TrainConfig, flatten
-from jaxsafe.train.host.restore import made_from, restore, structure
+from jaxsafe.train.host.restore import made_from, restore, start_params, structure
 from jaxsafe.train.host.sinks import Sink, open_sinks
 from jaxsafe.train.train import STATE, programs
 
@@ -215,6 +215,9 @@ class Training:
             self._restore()
         else:
             self.state = fresh(self.shared, keys)
+            if self.config.start_from is not None:
+                params = start_params(self.mapper, self.config, self.env)
+                self.state = self.state.replace(params=params, average=params)
             never = self.mapper.place(np.full(self.config.seeds, -1.0, np.float32))
             self.best = {"params": self.state.average, "success": never}
         # If the only evaluation is at the end, its program can wait until the cores are free.
