@@ -3,3 +3,33 @@
 The package has what they see, their networks, the distributions from which they draw actions, and
 the files of their weights.
 """
+
+from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.distributions import Categorical, Gaussian
+from jaxsafe.agents.features import (
+    ApproachFeatures,
+    DockingFeatures,
+    Features,
+    PlainFeatures,
+    RejoinFeatures,
+)
+from jaxsafe.agents.networks import GRU, MLP, Network
+from jaxsafe.agents.policy_file import SavedPolicy, load_policy, read_policy, save_policy
+
+__all__ = [
+    "GRU",
+    "MLP",
+    "Agent",
+    "ApproachFeatures",
+    "Categorical",
+    "DockingFeatures",
+    "Features",
+    "Gaussian",
+    "Network",
+    "PlainFeatures",
+    "RejoinFeatures",
+    "SavedPolicy",
+    "load_policy",
+    "read_policy",
+    "save_policy",
+]

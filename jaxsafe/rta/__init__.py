@@ -2,3 +2,40 @@
 
 They are described in Section 2 and Fig. 2 of the paper.
 """
+
+from jaxsafe.rta.asif import DiscreteASIF, ExplicitASIF, ImplicitASIF, Polynomial, Strengthening
+from jaxsafe.rta.backups import (
+    AlignAndBrake,
+    AlignedOrSlow,
+    Brake,
+    MatchVelocity,
+    Slow,
+    VelocityMatched,
+)
+from jaxsafe.rta.cascade import Cascade, Stage
+from jaxsafe.rta.filter import RTA, BackupController, CertifiedRTA, RTAMemory, TerminalSet
+from jaxsafe.rta.simplex import Blend, CollisionSimplex, Simplex
+
+__all__ = [
+    "RTA",
+    "AlignAndBrake",
+    "AlignedOrSlow",
+    "BackupController",
+    "Blend",
+    "Brake",
+    "Cascade",
+    "CertifiedRTA",
+    "CollisionSimplex",
+    "DiscreteASIF",
+    "ExplicitASIF",
+    "ImplicitASIF",
+    "MatchVelocity",
+    "Polynomial",
+    "RTAMemory",
+    "Simplex",
+    "Slow",
+    "Stage",
+    "Strengthening",
+    "TerminalSet",
+    "VelocityMatched",
+]
