@@ -23,8 +23,8 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from jaxsafe.adapters import FORKED, checked_count, environment, refuse_fork
-from jaxsafe.adapters.conversion import facts, masked, spaces
-from jaxsafe.adapters.lanes import Episodes, Lanes
+from jaxsafe.adapters.gymnasium_spaces import facts, masked, spaces
+from jaxsafe.adapters.packed_batch import Episodes, PackedBatch
 from jaxsafe.environment import Environment, reset_to
 from jaxsafe.schema.errors import ConfigError, nearest
 
@@ -33,7 +33,7 @@ class _Chains:
     """Chains of PRNG keys from which episodes start, one for each environment of the batch."""
 
     env: Environment
-    _lanes: Lanes
+    _batch: PackedBatch
     _unseeded: np.ndarray
     """Which environments begin a chain at their next start even without a seed, [num_envs].
 
@@ -69,9 +69,9 @@ class _Chains:
         """
         self._begin_chains(mask, seeds)
         if placed is None:
-            self._lanes.restart(mask)
+            self._batch.restart(mask)
         else:
-            self._lanes.place(mask, placed)
+            self._batch.place(mask, placed)
 
     def _begin_chains(self, mask: np.ndarray, seeds: Sequence[int | None]) -> None:
         """Begin a chain in each environment of the mask that has a seed or needs a chain."""
@@ -86,7 +86,7 @@ class _Chains:
                 if known == -1
                 else range(known, known + len(seeds))
             )
-        self._lanes.seed(
+        self._batch.seed(
             begin, [one if seed is None else seed for seed, one in zip(seeds, own, strict=True)]
         )
         self._unseeded &= ~begin
@@ -139,7 +139,7 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
         self.env = environment(task, overrides, options)
         self.render_mode = _checked_render_mode(render_mode)
         self.observation_space, self.action_space = spaces(self.env)
-        self._lanes = Lanes(self.env, 1, _checked_limit(max_episode_steps))
+        self._batch = PackedBatch(self.env, 1, _checked_limit(max_episode_steps))
         self._unseeded = np.ones(1, bool)
         self._frames = Frames(self.env) if render_mode else None
 
@@ -164,7 +164,7 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
         self._start(_ALONE, [_checked_seed(seed)], _placed(self.env, chosen))
         if self._frames is not None:
             self._frames.clear()
-        observation, _, _, _, info = self._receive(self._lanes.now)
+        observation, _, _, _, info = self._receive(self._batch.now)
         return observation, info
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
@@ -175,10 +175,10 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
             ConfigError: the action has another shape, or actions are discrete and it is not whole
                 numbers.
         """
-        if not self._lanes.running:
+        if not self._batch.running:
             raise ResetNeeded("step: call reset first")
-        self._lanes.step(_checked_action(self.env, action)[None])
-        return self._receive(self._lanes.now)
+        self._batch.step(_checked_action(self.env, action)[None])
+        return self._receive(self._batch.now)
 
     def render(self) -> Any:
         """Return a picture of the episode so far, [height, width, 3].
@@ -194,7 +194,7 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
                 " make the environment with render_mode='rgb_array'"
             )
             return None
-        if not self._lanes.running:
+        if not self._batch.running:
             raise ResetNeeded("render: call reset first")
         return self._frames.draw()
 
@@ -258,7 +258,7 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.single_observation_space, self.single_action_space = spaces(self.env)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self._lanes = Lanes(self.env, self.num_envs, _checked_limit(max_episode_steps))
+        self._batch = PackedBatch(self.env, self.num_envs, _checked_limit(max_episode_steps))
         self._unseeded = np.ones(self.num_envs, bool)
         self._over = np.zeros(self.num_envs, bool)
         self._frames = [Frames(self.env) for _ in range(self.num_envs)] if render_mode else []
@@ -282,7 +282,7 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         chosen = dict(_checked_options(options, ("start", "parameters", "reset_mask")))
         mask = _checked_mask(chosen.pop("reset_mask", None), self.num_envs)
-        if not self._lanes.running and not mask.all():
+        if not self._batch.running and not mask.all():
             raise ResetNeeded("reset: the first reset takes no reset_mask")
         placed = _placed(self.env, chosen)
         self._start(mask, self._seeds(seed), placed)
@@ -315,7 +315,7 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     def _begun(self, mask: np.ndarray) -> tuple[np.ndarray, dict]:
         """Return observations and infos after environments of a mask have started episodes."""
-        episodes = self._lanes.now
+        episodes = self._batch.now
         self._over = np.where(mask, False, self._over)
         self._film(mask, episodes)
         return np.array(episodes.timestep.observation), masked(
@@ -340,13 +340,13 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             ConfigError: the actions have another shape, or actions are discrete and they are not
                 whole numbers.
         """
-        if not self._lanes.running:
+        if not self._batch.running:
             raise ResetNeeded("step: call reset first")
         over = self._over
         if self.autoreset_mode is AutoresetMode.DISABLED and over.any():
-            lanes = np.flatnonzero(over).tolist()
+            ended = np.flatnonzero(over).tolist()
             raise ResetNeeded(
-                f"step: the episodes of lanes {lanes} are over;"
+                f"step: the episodes of environments {ended} are over;"
                 " reset them with options={'reset_mask': …}"
             )
         action = _checked_action(self.env, actions)
@@ -354,19 +354,19 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise ConfigError(
                 f"actions: expected shape {self.action_space.shape}, found {action.shape}"
             )
-        self._lanes.step(action)
+        self._batch.step(action)
         restarted, final = np.zeros_like(over), {}
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and over.any():
             # The start replaces the step that these environments have taken above.
             restarted = over
-            self._lanes.restart(over)
-        episodes = self._lanes.now
+            self._batch.restart(over)
+        episodes = self._batch.now
         taken = episodes.timestep
         self._over = taken.terminated | taken.truncated
         if self.autoreset_mode is AutoresetMode.SAME_STEP and self._over.any():
             restarted = self._over
-            self._lanes.restart(restarted)
-            episodes = self._lanes.now
+            self._batch.restart(restarted)
+            episodes = self._batch.now
             final = {"final_obs": np.array(taken.observation), "final_info": facts(self.env, taken)}
         self._film(restarted, episodes)
         infos = masked(facts(self.env, episodes.timestep), np.ones(self.num_envs, bool)) | masked(
@@ -390,7 +390,7 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 " make the environments with render_mode='rgb_array'"
             )
             return None
-        if not self._lanes.running:
+        if not self._batch.running:
             raise ResetNeeded("render: call reset first")
         return tuple(frames.draw() for frames in self._frames)
 
@@ -404,10 +404,11 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             # Gymnasium's own reset sets `np_random`.
             super().reset(seed=seed)
             first = _checked_seed(seed)
-            return [None if first is None else first + lane for lane in range(self.num_envs)]
+            return [None if first is None else first + index for index in range(self.num_envs)]
         if not isinstance(seed, Iterable):
             raise ConfigError(
-                f"reset: seed: expected a whole number ≥ 0, or one for each lane, found {seed!r}"
+                "reset: seed: expected a whole number ≥ 0, or one for each environment, "
+                f"found {seed!r}"
             )
         seeds = [_checked_seed(one) for one in seed]
         if len(seeds) != self.num_envs:
@@ -421,12 +422,12 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             restarted: which environments have started a new episode, [num_envs].
             episodes: the episodes after the step or reset.
         """
-        for lane, frames in enumerate(self._frames):
-            if restarted[lane]:
+        for index, frames in enumerate(self._frames):
+            if restarted[index]:
                 frames.clear()
             frames.add(
                 *jax.tree.map(
-                    lambda x, lane=lane: x[lane],
+                    lambda x, index=index: x[index],
                     (episodes.state.sim, episodes.timestep.info.margins),
                 )
             )

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxsafe.adapters.conversion import of_lane
 from jaxsafe.adapters.gymnasium import GymVectorEnv
+from jaxsafe.adapters.gymnasium_spaces import of_environment
 from jaxsafe.environment import Environment
 from jaxsafe.schema.errors import ConfigError, missing
 
@@ -64,7 +64,7 @@ class SB3VecEnv(VecEnv):
             The observations, [num_envs, observation].
         """
         observation, infos = self.env.start_lanes(self._seeds, self._options)
-        self.reset_infos = [of_lane(infos, lane) for lane in range(self.num_envs)]
+        self.reset_infos = [of_environment(infos, index) for index in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
         return observation
@@ -81,7 +81,8 @@ class SB3VecEnv(VecEnv):
         """
         if not isinstance(options, dict | None) and len(options) != self.num_envs:
             raise ConfigError(
-                f"set_options: expected options for {self.num_envs} lanes, found {len(options)}"
+                f"set_options: expected options for {self.num_envs} environments, "
+                f"found {len(options)}"
             )
         super().set_options(options)
 
@@ -93,16 +94,16 @@ class SB3VecEnv(VecEnv):
         done = terminated | truncated
         infos: list[dict[str, Any]] = [{"cost": cost} for cost in facts["cost"].tolist()]
         begun = {name: value for name, value in facts.items() if name in self.reset_infos[0]}
-        for lane in np.flatnonzero(done):
+        for index in np.flatnonzero(done):
             final = facts["final_info"]
-            infos[lane] = {
-                "cost": final["cost"][lane].item(),
-                "terminal_observation": facts["final_obs"][lane],
-                "TimeLimit.truncated": bool(truncated[lane] and not terminated[lane]),
-                "is_success": bool(final["is_success"][lane]),
-                "outcome": final["outcome"][lane],
+            infos[index] = {
+                "cost": final["cost"][index].item(),
+                "terminal_observation": facts["final_obs"][index],
+                "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
+                "is_success": bool(final["is_success"][index]),
+                "outcome": final["outcome"][index],
             }
-            self.reset_infos[lane] = of_lane(begun, int(lane))
+            self.reset_infos[index] = of_environment(begun, int(index))
         return observation, reward.astype(np.float32), done, infos
 
     def close(self) -> None:
@@ -116,14 +117,14 @@ class SB3VecEnv(VecEnv):
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         raise AttributeError(
-            f"{attr_name}: the lanes are one program; give options when making the environments"
+            f"{attr_name}: the environments are one program; give options when making them"
         )
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
         raise AttributeError(
-            f"{method_name}: the lanes are one program without methods of their own; see self.env"
+            f"{method_name}: the environments are one program without own methods; see self.env"
         )
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:

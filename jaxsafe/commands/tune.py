@@ -67,7 +67,7 @@ def main(argv: Sequence[str]) -> int:
 
     from jaxsafe.train.host import run_directory
     from jaxsafe.tune import results
-    from jaxsafe.tune.lanes import train_all
+    from jaxsafe.tune.batched_training import train_all
 
     options, path = Options.parse(argv), None
     resume = options.resume

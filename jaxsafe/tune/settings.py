@@ -144,13 +144,13 @@ def alike(found: Sequence[Setting], chosen: Sequence[int]) -> list[list[int]]:
     """
     groups: dict[Any, list[int]] = {}
     for index in chosen:
-        leaves, structure = jax.tree.flatten(lane(found[index]))
+        leaves, structure = jax.tree.flatten(parameters(found[index]))
         shapes = tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
         groups.setdefault((structure, shapes, found[index].config.num_updates), []).append(index)
     return list(groups.values())
 
 
-def lane(setting: Setting) -> tuple[Any, Any, Any]:
+def parameters(setting: Setting) -> tuple[Any, Any, Any]:
     """Return environment, agent and hyperparameters of a setting.
 
     They are all that a training is made from, except its seed.

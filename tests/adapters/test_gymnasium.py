@@ -18,7 +18,7 @@ from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 import jaxsafe
 from jaxsafe import ConfigError
-from jaxsafe.adapters import lanes
+from jaxsafe.adapters import packed_batch
 from jaxsafe.adapters.gymnasium import GymEnv, GymVectorEnv
 from jaxsafe.adapters.safety_gymnasium import SafetyEnv
 from jaxsafe.envs import TASKS
@@ -92,7 +92,7 @@ def step_by_step(ours: GymVectorEnv, theirs: SyncVectorEnv, steps: int) -> int:
         done = result[2] | result[3]
         ends += int(done.sum())
         if mode is AutoresetMode.DISABLED and done.any():
-            with pytest.raises(ResetNeeded, match="episodes of lanes"):
+            with pytest.raises(ResetNeeded, match="episodes of environments"):
                 ours.step(action)
             mask = {"reset_mask": done}
             (observation, infos), (expected, their_infos) = (
@@ -249,7 +249,8 @@ def test_a_copy_goes_on_alike_and_compiles_nothing(build: Any, copied: Any) -> N
 
     def programs() -> list[int]:
         return [
-            program._cache_size() for program in (lanes.advance, lanes.restart, lanes._raw_keys)
+            program._cache_size()
+            for program in (packed_batch.advance, packed_batch.restart, packed_batch._raw_keys)
         ]
 
     env = build()
@@ -537,7 +538,7 @@ def test_workers_that_are_spawned_work() -> None:
         ),
         (
             lambda: GymVectorEnv("docking2d", 2).reset(seed=1.5),
-            "seed: expected a whole number ≥ 0, or one for each lane",
+            "seed: expected a whole number ≥ 0, or one for each environment",
         ),
         (
             lambda: GymEnv("docking2d").reset(seed=True),

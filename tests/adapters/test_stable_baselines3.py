@@ -85,7 +85,9 @@ def test_options_place_environments_and_the_infos_of_starts_are_kept(make: Any) 
                     theirs["outcome"],
                     type(theirs["cost"]),
                 )
-    with pytest.raises(ConfigError, match="set_options: expected options for 3 lanes, found 1"):
+    with pytest.raises(
+        ConfigError, match="set_options: expected options for 3 environments, found"
+    ):
         env.set_options([placed(20.0)])
     env.set_options({"stat": {}})
     with pytest.raises(

@@ -32,7 +32,7 @@ from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.text_table import columns
 from jaxsafe.train.host import options as config_module
 from jaxsafe.train.host.session import Training
-from jaxsafe.tune import lanes
+from jaxsafe.tune import batched_training
 
 
 @pytest.fixture
@@ -179,7 +179,7 @@ def test_what_fails_before_anything_comes_of_it_leaves_no_directory(
 
     monkeypatch.setattr(Training, "prepare", fail)
     monkeypatch.setattr(Evaluator, "run", fail)
-    monkeypatch.setattr(lanes, "train_all", fail)
+    monkeypatch.setattr(batched_training, "train_all", fail)
     commands = (train, ["env=docking2d"]), (evaluate, ["run=pretrained/docking2d"])
     for command, words in (*commands, (tune, ["env=docking2d", "sweep.ppo.gamma=[0.9,0.95]"])):
         with pytest.raises(RuntimeError, match="a compiler that fails"):

@@ -493,13 +493,13 @@ def test_everything_stays_finite_at_the_edges_of_space(env: Environment, task: s
 )
 def test_limits_are_reached_and_never_exceeded(task: str, actions: str) -> None:
     env = build(task, actions)
-    lanes = [
+    flown = [
         random_actions(env, 200),
         *(jnp.broadcast_to(action(env, share), (200, env.action_size)) for share in (1, -1)),
     ]
     blocks = jnp.stack([action(env, np.sign(np.sin(t / 7.0))) for t in range(1, 201)])
-    lanes += [blocks, 3 * lanes[1] - lanes[2]]
-    states, _ = run(env, reset_many(env, keys())[0], jnp.stack(lanes))
+    flown += [blocks, 3 * flown[1] - flown[2]]
+    states, _ = run(env, reset_many(env, keys())[0], jnp.stack(flown))
     agent = jax.tree.map(np.asarray, states.sim.platforms[env.agent])
     limits = (
         {"speed": (200.0, 400.0)}

@@ -14,7 +14,7 @@ from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.host.options import recipe
-from jaxsafe.tune.lanes import Lanes
+from jaxsafe.tune.batched_training import BatchedTraining
 from jaxsafe.tune.results import _flat, _key
 from jaxsafe.tune.settings import Span, alike, pop_sweep, settings
 
@@ -205,7 +205,7 @@ def test_the_table_leaves_out_violations_that_were_not_counted(swept: Path) -> N
 def test_a_group_of_one_trains_once() -> None:
     arguments = options("sweep.agent.actor.hidden=[[8],[8,8]]")
     chosen = settings(arguments, pop_sweep(arguments), None, 0)
-    assert Lanes(chosen[0], 1).at_once == 1
+    assert BatchedTraining(chosen[0], 1).at_once == 1
 
 
 def test_a_sweep_does_not_go_on_by_another_recipe(swept: Path, tmp_path: Path) -> None:
@@ -294,7 +294,7 @@ def test_an_interrupted_sweep_says_how_to_go_on(
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("jaxsafe.tune.lanes.train_all", interrupted)
+    monkeypatch.setattr("jaxsafe.tune.batched_training.train_all", interrupted)
     assert command.main([*SWEEP, f"out={tmp_path / 'sweep'}"]) == cli.INTERRUPTED
     said = capsys.readouterr().out.splitlines()[-1]
     assert said == (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxsafe
-from jaxsafe.adapters.lanes import Episodes, Lanes, packing
+from jaxsafe.adapters.packed_batch import Episodes, PackedBatch, packing
 
 
 def test_packing_loses_no_bit() -> None:
@@ -14,7 +14,7 @@ def test_packing_loses_no_bit() -> None:
         "point": jnp.array([[1.1, jnp.nan, -0.0], [jnp.inf, 1e-42, 3.3]]),
         "matrix": jnp.arange(12.0).reshape(2, 3, 2),
     }
-    layout = packing(tree, lanes=1)
+    layout = packing(tree, num_batch_axes=1)
     words = jax.jit(layout.pack)(tree)
     assert words.shape == (1 + 1 + 3 + 6, 2)
     for unpacked in (layout.receive(words), jax.jit(layout.unpack)(words)):
@@ -33,10 +33,10 @@ def test_environments_of_one_structure_share_a_layout() -> None:
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
 def test_a_batch_does_what_the_pure_functions_do(actions: str) -> None:
     env = jaxsafe.make("docking2d", actions=actions)
-    lanes = Lanes(env, 3, np.inf)
+    batch = PackedBatch(env, 3, np.inf)
     seeds = [4, 5, 6]
-    lanes.seed(np.ones(3, bool), seeds)
-    lanes.restart(np.ones(3, bool))
+    batch.seed(np.ones(3, bool), seeds)
+    batch.restart(np.ones(3, bool))
     action = (
         np.array([[0, 10], [3, 3], [7, 1]], np.int32)
         if actions == "discrete"
@@ -45,13 +45,13 @@ def test_a_batch_does_what_the_pure_functions_do(actions: str) -> None:
     keys = [jax.random.split(jax.random.key(seed)) for seed in seeds]
     expected = [Episodes(*env.reset(now)) for _, now in keys]
     for _ in range(3):
-        lanes.step(action)
+        batch.step(action)
         expected = [
             Episodes(*env.step(member.state, a)) for member, a in zip(expected, action, strict=True)
         ]
-    lanes.restart(np.array([False, True, False]))
+    batch.restart(np.array([False, True, False]))
     expected[1] = Episodes(*env.reset(jax.random.split(keys[1][0])[1]))
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *expected)
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), lanes.now, stacked
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6), batch.now, stacked
     )

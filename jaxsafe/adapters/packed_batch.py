@@ -68,13 +68,13 @@ class Packing:
     def __reduce__(self) -> tuple[Any, ...]:
         return _packing, (self._structure, self._shapes)
 
-    def empty(self, lanes: int) -> np.ndarray:
+    def empty(self, num_envs: int) -> np.ndarray:
         """Return words that stand for no tree yet, [words, num_envs].
 
         Args:
-            lanes: number of environments.
+            num_envs: number of environments.
         """
-        return np.zeros((self._size, lanes), _unsigned(jnp.result_type(float)))
+        return np.zeros((self._size, num_envs), _unsigned(jnp.result_type(float)))
 
     def pack(self, tree: Any) -> Array:
         """Return the words of a tree, [words] or [words, num_envs]."""
@@ -128,7 +128,7 @@ class Packing:
         return jax.tree.unflatten(self._structure, leaves)
 
 
-def packing(example: Any, lanes: int = 0) -> Packing:
+def packing(example: Any, num_batch_axes: int = 0) -> Packing:
     """Return the packing of trees shaped like `example`.
 
     Examples of the same structure, shapes and dtypes get the very same object, so that they share
@@ -136,10 +136,12 @@ def packing(example: Any, lanes: int = 0) -> Packing:
 
     Args:
         example: a tree of arrays or of their shapes.
-        lanes: number of leading axes that are batch axes. They are not part of the layout.
+        num_batch_axes: number of leading axes that are batch axes. They are not part of the layout.
     """
     leaves, structure = jax.tree.flatten(example)
-    return _packing(structure, tuple((leaf.shape[lanes:], np.dtype(leaf.dtype)) for leaf in leaves))
+    return _packing(
+        structure, tuple((leaf.shape[num_batch_axes:], np.dtype(leaf.dtype)) for leaf in leaves)
+    )
 
 
 @functools.cache
@@ -161,7 +163,7 @@ class Layout(NamedTuple):
     """The kind of PRNG keys, as `jax.random.key(seed, impl=…)` takes it."""
 
 
-class Lanes:
+class PackedBatch:
     """A batch of environments, with their episodes and the chains of PRNG keys of their starts."""
 
     def __init__(self, env: Environment, num_envs: int, max_episode_steps: float) -> None:
@@ -176,7 +178,7 @@ class Lanes:
         impl: Any = jax.config.jax_default_prng_impl  # pyright: ignore[reportAttributeAccessIssue]
         keys = np.zeros((num_envs, *_key_shape(impl)), np.uint32)
         episodes = jax.eval_shape(functools.partial(_start, impl), env, keys)[1]
-        self._layout = Layout(packing(env), packing(episodes, lanes=1), impl)
+        self._layout = Layout(packing(env), packing(episodes, num_batch_axes=1), impl)
         self._env = np.asarray(self._layout.env.pack(env))
         self._limit = np.float32(max_episode_steps)
         # The next key of each environment's chain as raw words, [num_envs, words of a key].
@@ -253,9 +255,9 @@ def restart(
     """
     running = (keys, layout.episodes.unpack(words))
 
-    def draw(parameters: tuple[Array, Array], lanes: Array) -> tuple[Array, Episodes]:
+    def draw(parameters: tuple[Array, Array], indices: Array) -> tuple[Array, Episodes]:
         env, keys = parameters
-        return _start(layout.key_impl, layout.env.unpack(env), keys[lanes])
+        return _start(layout.key_impl, layout.env.unpack(env), keys[indices])
 
     keys, episodes = renew(mask, draw, (env, keys), running)
     return keys, layout.episodes.pack(episodes)

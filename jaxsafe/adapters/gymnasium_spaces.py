@@ -82,17 +82,17 @@ def masked(found: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
     return batch
 
 
-def of_lane(infos: Mapping[str, Any], lane: int) -> dict[str, Any]:
+def of_environment(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
     """Return the info of one environment of a batch, in the form that a single environment has.
 
     Args:
         infos: the infos of the batch, in Gymnasium's form.
-        lane: the index of the environment in the batch.
+        index: the index of the environment in the batch.
     """
     found = {}
     for name, value in infos.items():
         if name.startswith("_") and name[1:] in infos:
             continue
-        one = of_lane(value, lane) if isinstance(value, Mapping) else value[lane]
+        one = of_environment(value, index) if isinstance(value, Mapping) else value[index]
         found[name] = one.item() if isinstance(one, np.generic) else one
     return found

@@ -1,7 +1,6 @@
 """Training of many settings at once.
 
-In this module a lane is the training of one seed with one setting. All lanes run the same compiled
-program.
+Here a training is that of one seed with one setting. All trainings run the same compiled program.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from jaxsafe.evaluate.evaluator import (
 from jaxsafe.metrics import Episode, interaction_efficiency
 from jaxsafe.train.host.results import diverged_seeds
 from jaxsafe.train.train import begin, chunk
-from jaxsafe.tune.settings import Setting, alike, lane
+from jaxsafe.tune.settings import Setting, alike, parameters
 from jaxsafe.types import Key
 
 CURVES = ("success_rate", "count", "return", "diverged")
@@ -55,13 +54,13 @@ def train_all(
         The results of the settings that were trained together, by index.
     """
     for group in alike(found, chosen):
-        lanes = Lanes(found[group[0]], len(group))
-        for first in range(0, len(group), lanes.at_once):
-            some = group[first : first + lanes.at_once]
-            yield dict(zip(some, lanes.run([found[i] for i in some], tick), strict=True))
+        batch = BatchedTraining(found[group[0]], len(group))
+        for first in range(0, len(group), batch.at_once):
+            some = group[first : first + batch.at_once]
+            yield dict(zip(some, batch.run([found[i] for i in some], tick), strict=True))
 
 
-class Lanes:
+class BatchedTraining:
     """A training that is compiled once for settings that differ in numbers only."""
 
     def __init__(self, like: Setting, count: int) -> None:
@@ -82,7 +81,7 @@ class Lanes:
         self.mapper = SeedMapper(self.at_once * self.seeds)
         self.length = -(-like.config.num_updates // CHUNKS)
         self._init = self.mapper.map(lambda _, one: begin(*one))
-        # Compiled when the first lanes are known.
+        # Compiled when the first trainings are known.
         self._advance: Any = None
         self._evaluate = self.mapper.map(_one_evaluation)
 
@@ -95,22 +94,23 @@ class Lanes:
                 settings.
         """
         places = self.mapper.pad(np.arange(self.at_once * self.seeds))
-        trees = [lane(some[min(place // self.seeds, len(some) - 1)]) for place in places]
-        lanes = self.mapper.place(jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees))
+        trees = [parameters(some[min(place // self.seeds, len(some) - 1)]) for place in places]
+        trainings = self.mapper.place(jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees))
         keys = self.mapper.place(
             jax.vmap(jax.random.key)(jnp.asarray(self.like.config.seed + places % self.seeds))
         )
-        self._advance = self._advance or self._fitting(lanes, keys)
-        state = self._init((), (lanes, keys))
+        self._advance = self._advance or self._fitting(trainings, keys)
+        state = self._init((), (trainings, keys))
         curves = []
         for first in range(0, self.like.config.num_updates, self.length):
             count = min(self.length, self.like.config.num_updates - first)
-            state, rows = self._advance((), (lanes, state))
+            state, rows = self._advance((), (trainings, state))
             curves.append(self.mapper.gather({name: rows[name][:, :count] for name in CURVES}))
             tick(count * len(some))
         curve = {name: np.concatenate([one[name] for one in curves], axis=1) for name in curves[0]}
         sums = {
-            kind: self._episodes(lanes, state.average, kind == "deterministic") for kind in KINDS
+            kind: self._episodes(trainings, state.average, kind == "deterministic")
+            for kind in KINDS
         }
         split = lambda table: table.reshape(self.at_once, self.seeds, *table.shape[1:])[: len(some)]  # noqa: E731
         curve, sums = jax.tree.map(split, (curve, sums))
@@ -119,23 +119,23 @@ class Lanes:
             for i, setting in enumerate(some)
         ]
 
-    def _fitting(self, lanes: Any, keys: jax.Array) -> jax.stages.Compiled:
+    def _fitting(self, trainings: Any, keys: jax.Array) -> jax.stages.Compiled:
         """Compile the program of one piece of the training.
 
         Args:
-            lanes: environment, agent and hyperparameters of each lane.
-            keys: a PRNG key for each lane.
+            trainings: environment, agent and hyperparameters of each training.
+            keys: a PRNG key for each training.
 
         Raises:
             ConfigError: the state or the program needs more memory than there is. This is found
                 out before the state is allocated.
         """
-        like = self.mapper.like(jax.eval_shape(self._init, (), (lanes, keys)))
+        like = self.mapper.like(jax.eval_shape(self._init, (), (trainings, keys)))
         state = memory.size(like) // self.mapper.mesh.size
         memory.require(
             state, self.mapper.num_local_devices, memory.MEMORY_OPTIONS, memory.COMPILE_BYTES
         )
-        compiled = self.mapper.map(self._one_chunk).lower((), (lanes, like)).compile()
+        compiled = self.mapper.map(self._one_chunk).lower((), (trainings, like)).compile()
         memory.require(
             memory.footprint(compiled),
             self.mapper.num_local_devices,
@@ -147,18 +147,18 @@ class Lanes:
     def _one_chunk(self, _: tuple, one: tuple[Any, Any]) -> tuple[Any, dict[str, jax.Array]]:
         return chunk(*one, self.length, self.like.config.num_updates)
 
-    def _episodes(self, lanes: Any, params: Any, deterministic: bool) -> Episode:
-        """Return the evaluation episodes of every lane. Each field is [lanes, episodes].
+    def _episodes(self, trainings: Any, params: Any, deterministic: bool) -> Episode:
+        """Return the evaluation episodes of every training. Each field is [trainings, episodes].
 
         Args:
-            lanes: environment, agent and hyperparameters of each lane.
-            params: the weights of each lane's networks.
+            trainings: environment, agent and hyperparameters of each training.
+            params: the weights of each training's networks.
             deterministic: whether actions are the mode of the policy's distribution.
         """
 
         def batch(key: Key) -> Episode:
             shared = self.mapper.replicate((key, np.asarray(deterministic)))
-            return self.mapper.gather(self._evaluate(shared, (lanes, params)))
+            return self.mapper.gather(self._evaluate(shared, (trainings, params)))
 
         return in_batches(batch, self.like.config.episodes, EVALUATION_SEED)
 
