@@ -101,7 +101,9 @@ class MLP(Network, type="mlp"):
     """A multilayer perceptron. Its kernels start orthogonal, with a gain of √2 in hidden layers."""
 
     hidden: Hidden = (64, 64)
+    """Numbers of units of the hidden layers."""
     activation: Activation = "tanh"
+    """Function between two layers."""
     layer_norm: bool = False
     """Whether each hidden layer is normalised before its activation."""
 
@@ -119,6 +121,7 @@ class GRU(Network, type="gru"):
 
     recurrent: ClassVar[bool] = True
     hidden: Hidden = (64,)
+    """Numbers of units of the layers before the recurrent ones."""
     units: Width = 64
     """Number of recurrent units."""
 

@@ -69,9 +69,8 @@ def test_an_untrained_policy_is_centred_and_as_wide_as_configured(actions: str) 
     agent = normalise(Agent(features=DockingFeatures(), log_std=-1.2, prior_std=0.3))
     params = agent.init(KEY, env)
     _, timestep = env.reset(KEY)
-    actions_drawn = jax.vmap(
-        lambda key: agent.act(env, params, key, timestep.observation, False)[0]
-    )(jax.random.split(KEY, 2000))
+    act = lambda key: agent.act(env, params, key, timestep.observation, False)[0]  # noqa: E731
+    actions_drawn = jax.vmap(act)(jax.random.split(KEY, 2000))
     pushes = (
         np.asarray(actions_drawn) / 5.0 - 1.0
         if actions == "discrete"
@@ -115,9 +114,8 @@ def test_the_critic_sees_the_totals_in_any_order_and_the_actor_does_not() -> Non
     np.testing.assert_array_equal(np.sort(seen[6:]), np.arange(len(env.reward)))
     shapes = jax.tree.map(jnp.shape, [normalise(agent).init(KEY, env) for agent in (blind, seeing)])
     assert shapes[0]["actor"] == shapes[1]["actor"]
-    assert shapes[1]["critic"]["hidden_0"]["kernel"][0] == shapes[0]["critic"]["hidden_0"][
-        "kernel"
-    ][0] + len(env.reward)
+    rows = [shape["critic"]["hidden_0"]["kernel"][0] for shape in shapes]
+    assert rows[1] == rows[0] + len(env.reward)
 
 
 def test_networks_of_many_seeds_are_orthogonalised_one_by_one_with_the_same_numbers() -> None:

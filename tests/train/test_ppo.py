@@ -385,4 +385,5 @@ def test_numbers_of_devices_that_may_share_a_seed_are_the_common_divisors_and_fo
         24,
     ]
     assert PPO(num_envs=9, num_steps=1, num_minibatches=1).shares(AGENT) == [1, 3, 9]
-    assert PPO(num_envs=2**30 - 1, num_steps=1, num_minibatches=1).shares(AGENT)[:4] == [1, 3, 7, 9]
+    many = PPO(num_envs=2**30 - 1, num_steps=1, num_minibatches=1)
+    assert many.shares(AGENT)[:4] == [1, 3, 7, 9]

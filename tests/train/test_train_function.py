@@ -99,6 +99,7 @@ def test_what_was_trained_is_evaluated_as_any_policy(recipe: Recipe) -> None:
 
 def test_the_packages_show_the_arguments_of_their_functions() -> None:
     names = ["env", "agent", "hyperparameters", "key", "num_updates", "callback", "every"]
+    names.append("params")
     assert list(inspect.signature(train).parameters) == names
     assert "num_episodes" in inspect.signature(jaxsafe.evaluate).parameters
     with pytest.raises(AttributeError, match=r"module 'jaxsafe\.train' has no attribute 'trian'"):
