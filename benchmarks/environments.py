@@ -79,7 +79,7 @@ def main() -> None:
         for name in names:
             request = [f"probe={name}", f"envs={num}", f"repeats={repeats}"]
             rate = probe(__file__, request, 1, python[name.partition(":")[0]])
-            results.append({"task": name, "lanes": num, **rate})
+            results.append({"task": name, "num_envs": num, **rate})
             print(f"{name} × {num:,}: {rate['steps_per_s']:,.0f}", file=sys.stderr)
     content = {
         **here,

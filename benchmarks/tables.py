@@ -779,7 +779,7 @@ def _record(task: str, kind: str) -> Results:
 
 
 def _steps(results: Results) -> dict[tuple[str, int], float]:
-    return {(run["task"], run["lanes"]): run["steps_per_s"] for run in results["runs"]}
+    return {(run["task"], run["num_envs"]): run["steps_per_s"] for run in results["runs"]}
 
 
 def _samples(results: Results) -> dict[tuple[str, int], float]:

@@ -160,7 +160,7 @@ class Report:
     def _wall(self) -> Rows:
         rows = []
         for record in self.records:
-            if record.item.kind in ("quick", "lanes"):
+            if record.item.kind in ("quick", "many_envs"):
                 reached = wall_to(0.95, record.curves)
                 pace = samples_per_second(record.curves)
                 results = record.results

@@ -34,8 +34,8 @@ KINDS: Mapping[str, Kind] = {
             " after 300 steps."
         ),
     ),
-    "lanes": Kind(
-        ("preset=lanes",),
+    "many_envs": Kind(
+        ("preset=many_envs",),
         (
             "4,096 environments side by side, for accelerators. All begin together. So in oriented"
             " docking those that have not docked all time out at 12.3 million steps, which is a dip"

@@ -288,7 +288,7 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._start(mask, self._seeds(seed), placed)
         return self._begun(mask)
 
-    def start_lanes(
+    def start_each(
         self, seeds: Sequence[int | None], options: Sequence[Mapping[str, Any] | None]
     ) -> tuple[np.ndarray, dict]:
         """Start an episode in each environment, with a seed and options of its own.

@@ -314,7 +314,7 @@ def _start(impl: str, env: Environment, keys: Array) -> tuple[Array, Episodes]:
 
     # Under vmap, what keys of another kind than threefry draw depends on the key of the first
     # environment of the batch. An environment would start where it started before.
-    over_lanes = (
+    over_batch = (
         jax.vmap(start) if impl == "threefry2x32" else functools.partial(jax.lax.map, start)
     )
-    return over_lanes(keys)
+    return over_batch(keys)

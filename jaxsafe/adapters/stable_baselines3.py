@@ -63,7 +63,7 @@ class SB3VecEnv(VecEnv):
         Returns:
             The observations, [num_envs, observation].
         """
-        observation, infos = self.env.start_lanes(self._seeds, self._options)
+        observation, infos = self.env.start_each(self._seeds, self._options)
         self.reset_infos = [of_environment(infos, index) for index in range(self.num_envs)]
         self._reset_seeds()
         self._reset_options()
@@ -113,7 +113,7 @@ class SB3VecEnv(VecEnv):
         return self.env.render()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [getattr(self.env, attr_name)] * len(self._lanes(indices))
+        return [getattr(self.env, attr_name)] * len(self._chosen(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         raise AttributeError(
@@ -128,8 +128,8 @@ class SB3VecEnv(VecEnv):
         )
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        return [False] * len(self._lanes(indices))
+        return [False] * len(self._chosen(indices))
 
-    def _lanes(self, indices: Any) -> list[int]:
+    def _chosen(self, indices: Any) -> list[int]:
         found: Iterable[int] = self._get_indices(indices)
         return list(found)

@@ -311,7 +311,7 @@ def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:
         (["tasks=docking4d"], "tasks: found 'docking4d'; choose from rejoin2d"),
         (
             ["kinds=[features,plane]"],
-            "kinds: found 'plane'; choose from features, plain, lanes, quick, discrete,"
+            "kinds: found 'plane'; choose from features, plain, many_envs, quick, discrete,"
             " plain_discrete, rta, unpunished. Did you mean 'plain'?",
         ),
         (["tasks=[]"], "tasks: expected at least one of rejoin2d"),

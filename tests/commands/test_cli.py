@@ -31,6 +31,7 @@ from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.text_table import columns
 from jaxsafe.train.host import options as config_module
+from jaxsafe.train.host.options import resolve
 from jaxsafe.train.host.session import Training
 from jaxsafe.tune import batched_training
 
@@ -86,7 +87,7 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
         (["env=docking3d", "seeds"], "argument 'seeds': expected key=value"),
         (
             ["env=docking3d", "preset=featurs"],
-            "preset: unknown preset 'featurs'; choose from features, plain, lanes, quick."
+            "preset: unknown preset 'featurs'; choose from features, plain, many_envs, quick."
             " Did you mean 'features'?",
         ),
         (["env=docking3d", "ppo.gama=0.9"], "ppo.gama: unknown field 'gama'"),
@@ -709,3 +710,9 @@ def test_a_command_is_called_by_its_name(
     assert told.endswith("Did you mean 'train'?\n")
     for name in commands.COMMANDS:
         assert callable(importlib.import_module(f"jaxsafe.commands.{name}").command)
+
+
+def test_a_preset_is_known_by_the_name_that_it_had_before() -> None:
+    config, _, _ = resolve({"env": "docking2d", "preset": "lanes"})
+    assert config.preset == "many_envs"
+    assert config.ppo.num_envs == 4096

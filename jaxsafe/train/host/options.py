@@ -34,6 +34,9 @@ Steps = Annotated[int, Range(1, largest=10**15)]
 Double precision counts as far as the largest one.
 """
 
+OLD_PRESETS = {"lanes": "many_envs"}
+"""Presets that had another name, by that name."""
+
 MAX_SEEDS = 100_000
 WORTHWHILE = 128
 """Least number of samples of a minibatch for each device that shares a seed.
@@ -46,7 +49,7 @@ class TrainConfig(Component):
     """Options of `python -m jaxsafe.train`. Steps and episodes are counted for each seed."""
 
     preset: str = "features"
-    """The recipe of the task: features, plain, lanes or quick.
+    """The recipe of the task: features, plain, many_envs or quick.
 
     Its values take the place of the defaults of other options.
     """
@@ -200,10 +203,8 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     env = override(env, overrides)
     require_success(env)
     config = normalise(TrainConfig())
-    for path, value in {
-        **recipe(task, arguments.options.get("preset")),
-        **arguments.options,
-    }.items():
+    settings = recipe(task, arguments.options.get("preset"))
+    for path, value in {**settings, **arguments.options, "preset": settings["preset"]}.items():
         config = set_path(config, path, value, to_value)
     config = config.replace(rta_training=told)
     if told == "corrected":
@@ -345,6 +346,8 @@ def recipe(task: str, preset: str | None) -> dict[str, Any]:
         else {"plain": {}}
     )
     name = preset if preset is not None else ("features" if "features" in known else "plain")
+    if name not in known:
+        name = OLD_PRESETS.get(name, name)
     if name not in known:
         raise ConfigError(
             f"preset: unknown preset {show(name)}; choose from {nearest(name, known)}"
