@@ -83,7 +83,8 @@ class Network(Component):
             module: what `module` returned.
             *inputs: arguments with which the module can be called.
         """
-        return module.init(key, *inputs)["params"]
+        variables: Any = module.init(key, *inputs)
+        return variables["params"]
 
     def memory(self) -> Memory:
         """Return what a recurrent network remembers at the start of an episode."""
@@ -181,7 +182,7 @@ def from_one_draw(key: Key, build: Callable[[Normal], Params]) -> Params:
 
 
 def unroll(
-    step: Callable[[Memory, Array], tuple[Memory, Tree]],
+    step: Callable[[Memory, Any], tuple[Memory, Tree]],
     memory: Memory,
     first_memory: Memory,
     inputs: Any,

@@ -69,7 +69,7 @@ def main(argv: Sequence[str]) -> int:
         path = Path(resume)
     runs = run_directory.runs(path)
     if resume is not None and "steps" in options.given:
-        processes.from_leader(lambda: run_directory.extend(runs, options.given["steps"]))
+        processes.from_leader(lambda: run_directory.extend(runs, options.given["steps"]) or "")
     try:
         with processes.reporting_lost_process(
             f"go on with: python -m jaxsafe.train distributed=true resume={path}"

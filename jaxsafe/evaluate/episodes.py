@@ -27,6 +27,10 @@ A longer episode is given up. A timeout may be so late that it means none.
 """
 
 
+Carry = tuple[Array, State, Array, Any, Episode]
+"""Steps so far, states, observations, memory of the policy, and sums over the episodes."""
+
+
 def run_episodes(
     env: Environment, policy: Policy | RecurrentPolicy, key: Key, num_episodes: int
 ) -> Episode:
@@ -42,8 +46,6 @@ def run_episodes(
     state, timestep = reset_batch(env, key_start, num_episodes)
     episode = begin(timestep)
     limit = max_steps(env)
-
-    Carry = tuple[Array, State, Array, Any, Episode]
 
     def going(carry: Carry) -> Array:
         num_steps, *_, episode = carry

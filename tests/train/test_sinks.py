@@ -136,7 +136,7 @@ def test_every_number_of_the_progress_log_goes_to_every_sink(
     assert opened["config"]["ppo.num_envs"] == 4
     assert wandb.finished == 1
     assert mlflow.runs == [("id of docking", "run")]
-    assert (mlflow.params["seeds"], mlflow.params["agent.hidden"]) == ("3", "[8]")
+    assert (mlflow.params["seeds"], mlflow.params["agent.actor.hidden"]) == ("3", "[8]")
     assert max(mlflow.requests) < 2 * METRICS_PER_REQUEST
     assert mlflow.status == "FINISHED"
 
