@@ -181,6 +181,7 @@ def test_every_kind_of_end_is_followed_by_a_start(ends: str) -> None:
         assert np.array_equal(observation, timestep.observation) == (expected != 0)
 
 
+@pytest.mark.thorough
 def test_environments_may_be_the_last_axis(env: Environment) -> None:
     begin = jax.jit(reset_batch, static_argnames=("num_envs", "axis"))
     advance = jax.jit(step_or_reset_batch, static_argnames="axis")
