@@ -115,6 +115,7 @@ def test_a_stream_that_failed_leads_nowhere_and_says_why() -> None:
         os.write(writer, b"what a library prints")
 
 
+@pytest.mark.thorough
 def test_a_training_in_any_thread_ends_well_though_nobody_reads_its_output(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import pytest
-from default_cases import thorough
 
 from jaxsafe.commands.train import main
 from jaxsafe.commands.tune import main as tune
@@ -36,7 +35,8 @@ def test_a_training_that_would_not_fit_is_refused_before_it_starts(tmp_path: Pat
         main([*words[:-2], "ppo.num_envs=1000000000", "ppo.num_steps=8"])
 
 
-@pytest.mark.parametrize("command", [main, thorough(tune)])
+@pytest.mark.thorough
+@pytest.mark.parametrize("command", [main, tune])
 def test_the_batch_of_an_update_is_counted(
     command: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

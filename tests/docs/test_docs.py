@@ -196,6 +196,7 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_pa
     assert process.stdout.split(f"{MARK}\n")[:-1] == expected
 
 
+@pytest.mark.thorough
 def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:
     blocks = [
         text

@@ -58,6 +58,7 @@ def test_a_violation_is_the_exit_code_and_bounds_nothing(tmp_path: Path) -> None
     assert "without a violation" not in report([{**row, "violating_steps": 0}])
 
 
+@pytest.mark.thorough
 def test_episodes_are_what_is_counted_and_whole_ones_unless_told_otherwise(
     capsys: pytest.CaptureFixture[str],
 ) -> None:

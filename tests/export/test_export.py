@@ -274,6 +274,7 @@ def test_a_loop_that_ends_in_no_number_is_violated(
     )
 
 
+@pytest.mark.thorough
 def test_the_page_tells_what_the_search_finds(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

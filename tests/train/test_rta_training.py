@@ -145,6 +145,7 @@ def test_a_run_reports_how_often_it_was_corrected(
     assert all(row["certified"] for row in steps)
 
 
+@pytest.mark.thorough
 def test_an_evaluation_switches_the_filter(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
