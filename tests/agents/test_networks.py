@@ -138,7 +138,10 @@ def test_sequences_are_replayed_as_they_were_flown(critic: MLP | None) -> None:
         np.testing.assert_allclose(value + target.T, batch.value_target, atol=1e-5)
 
 
-@pytest.mark.parametrize(("actor", "solves"), [(GRU(hidden=(16,), units=16), True), (MLP(), False)])
+@pytest.mark.parametrize(
+    ("actor", "solves"),
+    [(GRU(hidden=(16,), units=16), True), pytest.param(MLP(), False, marks=pytest.mark.thorough)],
+)
 def test_only_a_memory_learns_what_was_seen_at_the_start(actor: Any, solves: bool) -> None:
     """Episodes of 5 steps cross the 12 steps of a batch, so memory must last between updates."""
     env, agent, updates = recall(steps=5), normalise(Agent(actor=actor)), 120
@@ -162,6 +165,7 @@ def test_only_a_memory_learns_what_was_seen_at_the_start(actor: Any, solves: boo
     assert (float(single.reward.mean()) > 0.96) == solves
 
 
+@pytest.mark.thorough
 def test_a_run_with_a_memory_is_trained_evaluated_kept_and_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -177,6 +181,7 @@ def test_a_run_with_a_memory_is_trained_evaluated_kept_and_read(
             export(["run=run/policy/seed_0.npz", f"format={form}"])
 
 
+@pytest.mark.thorough
 def test_a_network_of_a_users_module_is_trained_and_read_in_another_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -325,6 +325,7 @@ def test_bad_options_of_report_are_told(words: list[str], message: str) -> None:
     assert str(raised.value).startswith(message)
 
 
+@pytest.mark.thorough
 def test_every_command_of_the_plan_is_valid() -> None:
     from jaxsafe.envs import adapt
 

@@ -115,6 +115,7 @@ def test_devices_that_share_a_seed_log_the_diagnostics_of_the_whole_batch() -> N
         np.testing.assert_allclose(shared[name], alone[name], rtol=1e-3, atol=1e-5, err_msg=name)
 
 
+@pytest.mark.thorough
 def test_devices_share_a_seed_whose_networks_remember() -> None:
     agent = normalise(Agent(actor=GRU(hidden=(4,), units=4)))
     alone = seeds(0, 1, 1, updates=2, agent=agent)

@@ -31,6 +31,7 @@ def first_params(run: Path, words: list[str]) -> list[dict]:
     return [read_policy(run / "policy" / f"seed_{seed}.npz").params for seed in range(3)]
 
 
+@pytest.mark.thorough
 def test_every_seed_starts_from_its_own_policy_of_a_run(whole: Path, tmp_path: Path) -> None:
     words = [f"from={whole}", "env.reward.delta_v.scale=-0.02"]
     for seed, params in enumerate(first_params(tmp_path / "run", words)):
