@@ -17,7 +17,7 @@ from jaxsafe.storage.files import finite, read_csv, read_json, write_bytes, writ
 from jaxsafe.storage.forms import NULL, NUMBER_OR_NULL, OTHERS, TEXT, check
 from jaxsafe.train.host.log import NEEDS, check_order, read_progress
 from jaxsafe.train.host.results import check_results, read_results
-from jaxsafe.train.host.run_directory import read_content
+from jaxsafe.train.host.run_config import read_content
 
 CURVES = (
     "wall_s",

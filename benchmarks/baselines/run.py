@@ -23,7 +23,8 @@ from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import read_json, write_bytes
 from jaxsafe.train.host.options import resolve
 from jaxsafe.train.host.results import read_results
-from jaxsafe.train.host.run_directory import described, read_content
+from jaxsafe.train.host.run_config import read_content
+from jaxsafe.train.host.run_directory import described
 
 FILM_FILE = "episode_deterministic.gif"
 

@@ -188,7 +188,12 @@ def test_a_network_of_a_users_module_is_trained_and_read_in_another_process(
     monkeypatch.chdir(tmp_path)
     Path("residual_network.py").write_text(RESIDUAL, encoding="utf-8")
     words = [*TINY, "agent.actor={type: 'residual_network:Residual', width: 6}"]
-    for command in (["train", *words], ["evaluate", "run=run", "episodes=2"]):
+    again = [word for word in TINY if not word.startswith("out=")]
+    for command in (
+        ["train", *words],
+        ["evaluate", "run=run", "episodes=2"],
+        ["train", *again, "from=run", "out=again"],
+    ):
         done = subprocess.run(
             [sys.executable, "-m", f"jaxsafe.{command[0]}", *command[1:]],
             capture_output=True,

@@ -20,9 +20,9 @@ from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError, nearest
 from jaxsafe.schema.user_modules import import_modules, modules
 from jaxsafe.storage.files import write_text
-from jaxsafe.storage.forms import NULL, NUMBER, TEXT, check
 from jaxsafe.storage.provenance import commit, versions
 from jaxsafe.train.host.options import TrainConfig
+from jaxsafe.train.host.run_config import read_content
 
 
 def create(config: TrainConfig, env: Environment, name: str) -> Path:
@@ -154,21 +154,6 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
     config = normalise(to_component(training, TrainConfig, f"{place}training"))
     env = jaxsafe.config.from_data(content["environment"], f"{place}environment")
     return config, env, str(content["env"])
-
-
-def read_content(path: Path) -> dict[str, Any]:
-    """Return what `config.yaml` of a run holds, as data.
-
-    Raises:
-        ConfigError: it cannot be read, or does not belong to a run.
-    """
-    file = path / "config.yaml"
-    content = yaml12.read(file)
-    if not isinstance(content, dict) or not {"env", "training", "environment"} <= set(content):
-        raise ConfigError(f"{file}: expected the keys env, training and environment")
-    form = {"env": TEXT | NUMBER, "training": {}, "environment": {}}
-    check(content, form | ({"commit": TEXT | NULL} if "commit" in content else {}), str(file))
-    return content
 
 
 def extend(runs: Sequence[Path], steps: Any) -> None:

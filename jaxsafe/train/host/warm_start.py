@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe.agents.policy_file import find_policy, is_single, read_policy, with_networks
-from jaxsafe.schema import yaml12
 from jaxsafe.schema.convert import to_data
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.schema.user_modules import import_modules
+from jaxsafe.train.host.run_config import read_content
 
 OPTIONS = ("actor", "critic", "features", "critic_sees_totals", "cost_critic")
 """Options of the agent that decide which parameters it has and what they mean."""
@@ -34,9 +35,10 @@ def agent_options(source: str) -> dict[str, Any]:
             raise ConfigError(
                 f"from: no run in {source!r} (a directory with config.yaml) and no policy file"
             )
-        content = yaml12.read(file)
-        training = content.get("training") if isinstance(content, dict) else None
-        agent = with_networks(training.get("agent")) if isinstance(training, dict) else None
+        content = read_content(Path(source))
+        # The environment names the modules in which the agent's parts are too.
+        import_modules(content["environment"].get("imports", []), f"{file}: environment")
+        agent = with_networks(content["training"].get("agent"))
         if not isinstance(agent, dict):
-            raise ConfigError(f"from: {file} is not that of a run")
+            raise ConfigError(f"from: {file} has no agent")
     return {f"agent.{name}": agent[name] for name in OPTIONS if name in agent}
