@@ -33,7 +33,7 @@ class Options(CommandOptions):
 
 def main(argv: Sequence[str]) -> int:
     """Run the command and return its exit code."""
-    from jaxsafe.commands.run_figures import draw_all
+    from jaxsafe.runs.figures import draw_all
     from jaxsafe.train.host import run_directory
 
     options = Options.parse(argv)
@@ -61,9 +61,9 @@ def _compare(runs: Sequence[str], x: str, out: Path) -> None:
     Raises:
         ConfigError: the runs cannot be compared, or one of them is not finished.
     """
-    from jaxsafe.commands.run_figures import progress
     from jaxsafe.plot.compare import compare_curves
     from jaxsafe.plot.style import save
+    from jaxsafe.runs.figures import progress
     from jaxsafe.train.host import run_directory
     from jaxsafe.train.host.results import summary
 

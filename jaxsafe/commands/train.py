@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
-from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 from jaxsafe.commands import cli
 from jaxsafe.commands.environment_options import Overrides
@@ -19,9 +17,6 @@ from jaxsafe.commands.options import CommandOptions, Directory, Option
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores
 from jaxsafe.train.host.options import TrainConfig, resolve_all
-
-if TYPE_CHECKING:
-    from jaxsafe.train.host.session import Training
 
 BEGAN = time.monotonic()
 """Time [s] at which the command began. The clock of the first run starts then."""
@@ -52,6 +47,7 @@ def main(argv: Sequence[str]) -> int:
     import jax
 
     from jaxsafe.devices import processes
+    from jaxsafe.runs.training import is_complete, train_all
     from jaxsafe.schema.errors import ConfigError
     from jaxsafe.storage.files import read_json
     from jaxsafe.train.host import run_directory
@@ -75,7 +71,8 @@ def main(argv: Sequence[str]) -> int:
             f"go on with: python -m jaxsafe.train distributed=true resume={path}"
         ):
             try:
-                finished = _train([run for run in runs if not _complete(run)], path)
+                unfinished = [run for run in runs if not is_complete(run)]
+                finished = train_all(unfinished, path, BEGAN)
             except Exception as error:
                 # With several processes, the error may be the loss of another one. The run can go
                 # on after that.
@@ -99,84 +96,6 @@ def main(argv: Sequence[str]) -> int:
         if processes.leads() and any("diverged" in read_json(run / "results.json") for run in runs)
         else 0
     )
-
-
-def _complete(run: Path) -> bool:
-    """Return whether a run is complete. If only its figures are missing, draw them."""
-    from jaxsafe.devices import processes
-
-    if not (run / "results.json").exists():
-        return False
-    print(f"{run} is complete; nothing is left to do")
-    # The command may have been killed between the results and the figures.
-    if not (run / "figures").exists() and processes.leads():
-        from jaxsafe.commands.run_figures import draw_all
-
-        draw_all(run)
-    return True
-
-
-def _train(runs: Sequence[Path], path: Path) -> bool:
-    """Train runs one after another, then evaluate all of them.
-
-    The programs of a run are compiled while the run before it trains, because compiling alone
-    leaves cores idle.
-
-    Args:
-        runs: the directories of the runs.
-        path: the directory from which the user can resume all of them.
-
-    Returns:
-        False if the user asked to stop, else True.
-    """
-    from jaxsafe.train.host.results import finish, table
-
-    trained, upcoming = [], None
-    with ExitStack() as files:
-        for run, following in zip_longest(runs, runs[1:]):
-            training = upcoming or _open(run, files, BEGAN)
-            config = training.config
-            print(
-                f"{training.name}: {config.seeds} seeds × {training.num_steps:,} steps, "
-                f"preset {config.preset}, in {run}"
-            )
-            training.prepare()
-            upcoming = following and _open(following, files, time.monotonic())
-            if upcoming:
-                upcoming.prepare()
-            if not training.train():
-                print(
-                    f"stopped at step {training.step:,}; "
-                    f"go on with: python -m jaxsafe.train resume={path}"
-                )
-                return False
-            trained.append((run, training))
-        for _, training in trained:
-            training.prepare_evaluation()
-        # This import takes a while, so it waits until the figures are needed.
-        from jaxsafe.commands.run_figures import draw_all
-
-        for run, training in trained:
-            print(table(finish(training), run / "results.json"))
-            print("figures: " + ", ".join(str(figure) for figure in draw_all(training.run)))
-    return True
-
-
-def _open(run: Path, files: ExitStack, began: float) -> Training:
-    """Return what is left of a run to train.
-
-    Args:
-        run: the run directory.
-        files: the stack that closes the logs of the run.
-        began: the time [s] of `time.monotonic` since which the clock of the run has run.
-    """
-    from jaxsafe.devices import processes
-    from jaxsafe.train.host import run_directory
-    from jaxsafe.train.host.session import Clock, Training
-
-    own = files.enter_context(processes.own_files(run))
-    config, env, name = run_directory.read(run, "resume")
-    return Training(config, env, name, own, Clock(time.monotonic() - began), run)
 
 
 def command() -> None:

@@ -12,13 +12,13 @@ from matplotlib.patches import Circle
 
 import jaxsafe
 from jaxsafe.commands.plot import main
-from jaxsafe.commands.run_figures import _episodes, draw_all
 from jaxsafe.envs import TASKS
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.compare import compare_curves, seed_curves
 from jaxsafe.plot.figures import speed_distance, training_curves, trajectories
 from jaxsafe.plot.learning import learning_curves
 from jaxsafe.plot.style import GREEN, ORANGE, kept_out, save
+from jaxsafe.runs.figures import _episodes, draw_all
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import read_rows, write_rows

@@ -20,9 +20,9 @@ from jaxsafe.commands import cli
 from jaxsafe.commands import evaluate as evaluate
 from jaxsafe.commands import train as command
 from jaxsafe.commands import tune as tune
-from jaxsafe.commands.run_figures import progress
 from jaxsafe.plot.compare import compare_curves
 from jaxsafe.plot.figures import training_curves
+from jaxsafe.runs.figures import progress
 from jaxsafe.schema.component import normalise
 from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.checkpoint import Checkpoints

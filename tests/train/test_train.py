@@ -35,7 +35,7 @@ from jaxsafe.train.ppo import DIAGNOSTICS
 @pytest.fixture(autouse=True)
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave out the figures of a run, which take half of its time. `whole` has them."""
-    monkeypatch.setattr("jaxsafe.commands.run_figures.draw_all", lambda run: [])
+    monkeypatch.setattr("jaxsafe.runs.figures.draw_all", lambda run: [])
 
 
 def test_a_run_directory_holds_everything(whole: Path) -> None:
