@@ -16,7 +16,7 @@ from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError, show
 
 
-def override(env: Environment, changes: Mapping[str, Any]) -> Environment:
+def override(env: Environment, changes: Mapping[str, Any], place: str = "") -> Environment:
     """Return the environment with the values at dotted paths replaced.
 
     Values may be traced. So a sweep is
@@ -28,6 +28,7 @@ def override(env: Environment, changes: Mapping[str, Any]) -> Environment:
         changes: new values by path. A path consists of field names and of the names of parts in a
             list. It may begin with the name of a platform. Where a list of parts stands, a list of
             names keeps those parts in that order: `{"observation": ["position", "velocity"]}`.
+        place: what stands before the paths in messages of errors, such as `env` on a command line.
 
     Raises:
         ConfigError: a path leads nowhere, or a value has the wrong type, shape or range.
@@ -38,7 +39,7 @@ def override(env: Environment, changes: Mapping[str, Any]) -> Environment:
             raise ConfigError(
                 f"override: expected dotted paths such as 'deputy.mass', found {show(path)}"
             )
-        changed = set_path(changed, path, value, to_value)
+        changed = set_path(changed, path, value, to_value, place)
     checked = check(changed, before=env)
     warn_of_ties(env, checked)
     return checked

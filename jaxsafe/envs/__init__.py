@@ -18,6 +18,7 @@ from jaxsafe.envs.task import (
     Task,
     default_filter,
     find_task,
+    is_file,
     register,
     short_name,
     user_module,
@@ -34,9 +35,11 @@ __all__ = [
     "adapt",
     "default_filter",
     "find_task",
+    "is_file",
     "make",
     "register",
     "short_name",
+    "unchanged",
     "user_module",
 ]
 
@@ -96,10 +99,26 @@ def make(
                 f"found {show(value)}"
             )
     name = os.fspath(task)
-    env = load(name) if name.endswith((".yaml", ".yml")) else build(find_task(name).environment())
     return adapt(
-        env, name, overrides, actions=actions, variant=variant, randomize=randomize, rta=rta
+        unchanged(name),
+        name,
+        overrides,
+        actions=actions,
+        variant=variant,
+        randomize=randomize,
+        rta=rta,
     )
+
+
+def unchanged(task: str) -> Environment:
+    """Return the environment of a task as it is declared, or the one that a YAML file has.
+
+    Raises:
+        ConfigError: there is no such task, or the file has no environment.
+    """
+    if is_file(task):
+        return load(task)
+    return build(find_task(task).environment())
 
 
 def adapt(
@@ -111,6 +130,7 @@ def adapt(
     variant: str | None = None,
     randomize: Mapping[str, Sequence[float]] | None = None,
     rta: str | RTA | None = None,
+    place: str = "",
 ) -> Environment:
     """Return an environment changed by the options of `make`.
 
@@ -122,6 +142,7 @@ def adapt(
         variant: the variant of the task, as for `make`, but None changes nothing.
         randomize: the intervals of random numbers by dotted path.
         rta: run time assurance, as for `make`.
+        place: what stands before the paths of the overrides in messages of errors, such as `env`.
 
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.
@@ -133,7 +154,7 @@ def adapt(
     # A filter may fit the environment only together with the overrides, so both are set at once.
     filters = {} if rta is None else {"rta": _filter(task, rta)}
     random = {} if randomize is None else {"randomize": randomize}
-    return override(env, {**filters, **(overrides or {}), **random})
+    return override(env, {**filters, **(overrides or {}), **random}, place)
 
 
 def _variant_values(name: str, variant: str) -> dict[str, Any]:

@@ -93,9 +93,14 @@ def find_task(name: str) -> Task:
 
 def default_filter(name: str) -> str | None:
     """Return `default` if `rta=default` means something for a task; None if not, or for a file."""
-    if name.endswith((".yaml", ".yml")):
+    if is_file(name):
         return None
     return "default" if "default" in find_task(name).filters else None
+
+
+def is_file(name: str) -> bool:
+    """Return whether a name is that of a YAML file, and not of a task."""
+    return name.endswith((".yaml", ".yml"))
 
 
 def short_name(name: str) -> str:

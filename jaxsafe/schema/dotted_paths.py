@@ -7,6 +7,7 @@ A path walks through field names and the names of the parts in a list, for insta
 
 from __future__ import annotations
 
+import difflib
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any
@@ -47,36 +48,58 @@ def get_path(component: Any, path: str) -> Any:
     return [part.name for part in value] if named else value
 
 
-def set_path(component: Any, path: str, value: Any, convert: Convert = as_given) -> Any:
+def set_path(
+    component: Any, path: str, value: Any, convert: Convert = as_given, place: str = ""
+) -> Any:
     """Return the component with the value at one dotted path replaced.
 
-    Where the path leads to a list of named parts, a list of names picks parts in the new order.
+    Where the path leads to a list of named parts, a list of names picks parts in the new order. A
+    text with commas stands for a list where a list is.
+
+    Args:
+        component: the component.
+        path: the path, which begins at the component.
+        value: the new value.
+        convert: the function that checks and converts the value.
+        place: what stands before the path in messages of errors.
 
     Raises:
         ConfigError: the path leads nowhere, or `convert` refuses the value.
     """
-    return _set(component, path.split("."), value, convert, place="")
+    return _set(component, path.split("."), value, convert, place, component.shorthand)
 
 
-def _set(component: Any, path: list[str], value: Any, convert: Convert, place: str) -> Any:
-    """Do what `set_path` does for a component that stands at `place`."""
+def _set(
+    component: Any,
+    path: list[str],
+    value: Any,
+    convert: Convert,
+    place: str,
+    shorthand: str | None = None,
+) -> Any:
+    """Do what `set_path` does for a component that stands at `place`.
+
+    The path may begin with a part of the field `shorthand`.
+    """
     head = path[0]
     rest = path[1:]
     table = fields(type(component))
-    parts = getattr(component, component.shorthand) if component.shorthand and not place else ()
+    parts = getattr(component, shorthand) if shorthand else ()
     names = [part.name for part in parts]
-    if head not in table and head in names:
-        return component.replace(
-            **{component.shorthand: _set_item(parts, path, value, convert, place)}
-        )
+    if shorthand and head not in table and head in names:
+        return component.replace(**{shorthand: _set_item(parts, path, value, convert, place)})
     if head not in table:
+        known = ", ".join([*table, *names])
+        meant = _meant(component, path, [*table, *names], shorthand)
+        # A path to elsewhere is shown whole.
+        hint = f". Did you mean {join(place, meant) if '.' in meant else meant!r}?" if meant else ""
         raise ConfigError(
-            f"{join(place, head)}: unknown field {show(head)}; "
-            f"choose from {nearest(head, [*table, *names])}"
+            f"{join(place, head)}: unknown field {show(head)}; choose from {known}{hint}"
         )
     field_place = join(place, head)
     content = getattr(component, head)
     if not rest:
+        value = _listed(value, content, table[head], field_place)
         if _are_names(content, value):
             return component.replace(**{head: _pick(content, value, field_place)})
         return component.replace(**{head: convert(value, table[head], field_place)})
@@ -106,6 +129,73 @@ def _set_item(items: tuple, path: list[str], value: Any, convert: Convert, place
         )
     changed = _set(items[index], path[1:], value, convert, item_place)
     return (*items[:index], changed, *items[index + 1 :])
+
+
+def _meant(
+    component: Component, path: Sequence[str], known: Sequence[str], shorthand: str | None
+) -> str | None:
+    """Return the path that a user probably meant by one that leads nowhere, if there is one.
+
+    It ends as the given path does, or in a name that is abbreviated by it or spelt alike.
+
+    Args:
+        component: the component at which the path begins.
+        path: the path. Its first name is no field of the component.
+        known: names with which a path may begin.
+        shorthand: the field of the component whose parts may stand at the beginning of a path.
+    """
+    ends = {}  # the shortest path to each name
+    for other in sorted(_paths(component, shorthand), key=lambda other: other.count(".")):
+        if f".{other}".endswith("." + ".".join(path)):
+            return other
+        ends.setdefault(other.rpartition(".")[2], other)
+    if len(path) > 1:
+        return next(iter(difflib.get_close_matches(path[0], known, n=1, cutoff=0.5)), None)
+    ends |= {name: name for name in known}
+    short = [other for name, other in ends.items() if _abbreviates(path[0], name)]
+    alike = [ends[name] for name in difflib.get_close_matches(path[0], ends, n=1, cutoff=0.5)]
+    return next(iter([*short, *alike]), None)
+
+
+def _paths(component: Component, shorthand: str | None = None) -> Iterator[str]:
+    """Yield the path of every field of a component and of what is in it."""
+    for name in fields(type(component)):
+        value = getattr(component, name)
+        yield name
+        if isinstance(value, Component):
+            yield from (join(name, path) for path in _paths(value))
+        if isinstance(value, Mapping):
+            # A name with a dot, as `randomize` has, can be no part of a path.
+            yield from (join(name, str(key)) for key in value if "." not in str(key))
+        for index, part in enumerate(value if isinstance(value, tuple) else ()):
+            if isinstance(part, Component):
+                place = "" if name == shorthand else name
+                start = join(place, getattr(part, "name", str(index)))
+                yield from (join(start, path) for path in _paths(part))
+
+
+def _abbreviates(short: str, name: str) -> bool:
+    """Return whether a text stands for a name, as `lr` and `learn_rate` do for `learning_rate`."""
+    pieces = short.split("_") if "_" in short else [*short]
+    words = name.split("_")
+    return len(pieces) == len(words) > 1 and all(map(str.startswith, words, pieces))
+
+
+def _listed(value: Any, content: Any, field: Field, place: str) -> Any:
+    """Return the list for which a text with commas stands where a list is or may be.
+
+    Args:
+        value: the value for a field.
+        content: what the field holds now.
+        field: the field.
+        place: where the field stands.
+    """
+    holds_list = isinstance(content, tuple) or (field.unit and field.unit.length is not None)
+    if not holds_list or not isinstance(value, str) or "," not in value:
+        return value
+    from jaxsafe.schema import yaml12
+
+    return yaml12.parse(f"[{value}]", place)
 
 
 def _are_names(content: Any, value: Any) -> bool:

@@ -142,6 +142,9 @@ def test_picked_parts_pass_no_conversion_and_other_values_do(car: Car) -> None:
                 r" 'radius'\?$"
             ),
         ),
+        ("power", 1, r"^power: unknown field 'power'; .* Did you mean 'engine\.power'\?$"),
+        ("radius", 1, r"^radius: unknown field 'radius'; .* Did you mean 'left\.radius'\?$"),
+        ("powr", 1, r"^powr: unknown field 'powr'; .* Did you mean 'engine\.power'\?$"),
         ("engine.wheels.left.radus", 1, r"^engine\.wheels\.left\.radus: unknown field 'radus'"),
         ("wheels.left", 1, r"^wheels\.left: name one of its fields: name, radius$"),
         ("left", 1, r"^left: name one of its fields: name, radius$"),
@@ -166,6 +169,21 @@ def test_a_path_that_leads_nowhere_is_told_in_one_line(
     with pytest.raises(ConfigError, match=message) as caught:
         set_path(car, path, value)
     assert "\n" not in str(caught.value)
+
+
+def test_the_place_of_an_error_may_begin_with_more_than_the_path(car: Car) -> None:
+    with pytest.raises(ConfigError, match=r"^the\.power: .* Did you mean 'the\.engine\.power'"):
+        set_path(car, "power", 1, place="the")
+    with pytest.raises(ConfigError, match=r"^the\.rigt: .* Did you mean 'right'"):
+        set_path(car, "rigt.radius", 1, place="the")
+    assert set_path(car, "left.radius", 7.0, place="the").wheels[0].radius == 7.0
+
+
+def test_a_text_with_commas_is_a_list_where_a_list_is(car: Car) -> None:
+    assert set_path(car, "words", "c,d").words == ["c", "d"]
+    wheels = set_path(car, "wheels", "right,left").wheels
+    assert [wheel.name for wheel in wheels] == ["right", "left"]
+    assert set_path(car, "length", "1,2").length == "1,2"
 
 
 def test_names_are_joined_with_dots_and_without_where_one_is_empty() -> None:
