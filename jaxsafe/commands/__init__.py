@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.metadata
 import sys
 
 COMMANDS = {
@@ -25,12 +26,12 @@ def main() -> None:
     """Run `jaxsafe COMMAND [key=value …]`, a shorter form of `python -m jaxsafe.COMMAND`."""
     name, *words = sys.argv[1:] or ["help"]
     if name in HELP and words:
-        name, *words = words[0], HELP[0]
-    if name in HELP:
-        width = max(map(len, COMMANDS))
-        print("usage: jaxsafe COMMAND [key=value …]\n")
-        print("\n".join(f"  {command:{width}}  {about}" for command, about in COMMANDS.items()))
-        print("\njaxsafe COMMAND help explains the options of a command")
+        name, *words = *words, HELP[0]
+    if name in (*HELP, "--version"):
+        from jaxsafe.commands.streams import lasting_streams
+
+        with lasting_streams():
+            print(_list() if name in HELP else f"jaxsafe {importlib.metadata.version('jaxsafe')}")
         return
     if name not in COMMANDS:
         from jaxsafe.schema.errors import nearest, show
@@ -40,3 +41,20 @@ def main() -> None:
         sys.exit(2)
     sys.argv = [f"jaxsafe {name}", *words]
     importlib.import_module(f"jaxsafe.commands.{name}").command()
+
+
+def _list() -> str:
+    """Return the commands and how to call them."""
+    width = max(map(len, COMMANDS))
+    commands = [f"  {command:{width}}  {about}" for command, about in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: jaxsafe COMMAND [option=value …]",
+            "",
+            *commands,
+            "",
+            "jaxsafe train docking3d       trains a task; it is short for env=docking3d",
+            "jaxsafe train docking3d help  explains the options of a command",
+            "jaxsafe --version             says which version this is",
+        ]
+    )

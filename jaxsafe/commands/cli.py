@@ -7,6 +7,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, NoReturn
 
 from jaxsafe.address_space import is_shortage
@@ -46,17 +47,21 @@ def run(
     """
     argv = sys.argv[1:]
     with lasting_streams() as stdout:
-        if not argv or any(word in HELP for word in argv):
-            print(help_text(options), file=sys.stdout if argv else sys.stderr)
-            code, leave = (0 if argv else 2), sys.exit
-        else:
-            code, finished = _run(main, argv)
-            leave = sys.exit if finished else leave
+        asks = not argv or any(word in HELP for word in argv)
+        code, finished = _run(partial(_explain, options) if asks else main, argv)
+        leave = sys.exit if asks or finished else leave
         sys.stdout.flush()
         if stdout.error and not isinstance(stdout.error, BrokenPipeError):
             print(f"error: standard output: {stdout.error.strerror}", file=sys.stderr)
             code = code or 2
         leave(code)
+
+
+def _explain(options: type[CommandOptions], argv: Sequence[str]) -> int:
+    """Print the help text. A command line without a word is an error, which it explains."""
+    given = options.arguments([word for word in argv if word not in HELP])
+    print(help_text(options, given), file=sys.stdout if argv else sys.stderr)
+    return 0 if argv else 2
 
 
 def _run(main: Callable[[Sequence[str]], int | None], argv: Sequence[str]) -> tuple[int, bool]:

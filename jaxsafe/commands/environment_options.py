@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from jaxsafe.commands.options import CommandOptions, Option
 from jaxsafe.environment import Environment
-from jaxsafe.envs import default_filter, make
+from jaxsafe.envs import adapt, default_filter, unchanged
 
 Actions = Annotated[Literal["continuous", "discrete"], Option(kind="kind")]
 """Name of a kind of actions."""
@@ -50,13 +50,13 @@ class EnvironmentOptions(CommandOptions):
         Raises:
             ConfigError: `jaxsafe.make` refuses the task, an option or an override.
         """
-        return make(task, self.overrides, **self.choices)
+        return adapt(unchanged(task), task, self.overrides, place="env", **self.choices)
 
 
 class TaskOptions(EnvironmentOptions):
     """The options of a command that needs an environment and no policy."""
 
-    env: Annotated[str, Option(examples=("env=docking3d",))]
+    env: Annotated[str, Option(first=True, examples=("env=docking3d",))]
     """A task, such as docking3d, or the file of an environment, such as mine.yaml."""
 
     def filter_or_default(self) -> str | None:

@@ -6,7 +6,7 @@ The results are written into a new directory, and a table of them is printed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from jaxsafe.commands import cli
 from jaxsafe.commands.options import Count, Directory, Seed
@@ -25,6 +25,12 @@ KINDS = {
 
 class Options(PolicyOptions):
     """The options of `jaxsafe evaluate`."""
+
+    groups: ClassVar = {
+        "The policies.": ("run", "checkpoint", "deterministic", "activation"),
+        "The environment in which they act.": ("env", "env.PATH", "actions", "variant", "rta"),
+        "The episodes, and what is kept of them.": ("episodes", "seed", "render", "out"),
+    }
 
     episodes: Count = 1000
     """Number of episodes of each seed."""

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeGuard
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeGuard
 
 from jaxsafe.commands import cli
 from jaxsafe.commands.options import Count, File, Option, Seed
@@ -46,6 +46,12 @@ Squares of larger numbers are infinite in single precision, and so is every marg
 class Options(PolicyOptions):
     """The options of `jaxsafe export`."""
 
+    groups: ClassVar = {
+        "The policy.": ("run", "seed", "activation"),
+        "The environment in which it acts.": ("env", "env.PATH", "actions", "variant", "rta"),
+        "The file.": ("format", "inputs", "batch", "steps", "box.FIELD", "out"),
+    }
+
     format: Literal["onnx", "stablehlo", "vnnlib"] = "onnx"
     """The kind of file.
 
@@ -67,7 +73,8 @@ class Options(PolicyOptions):
     steps: Annotated[int, Range(1, largest=MAX_STEPS)] = 40
     """Number of steps of the closed loop, with format=vnnlib."""
     box: Annotated[
-        Mapping[str, Any], Option(prefix="box.", placeholder="FIELD", takes="a list [low, high]")
+        Mapping[str, Any],
+        Option(prefix="box.", placeholder="FIELD", lists=True, takes="two numbers low,high"),
     ]
     """Starts of the property, with format=vnnlib.
 

@@ -11,7 +11,7 @@ import json
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from jaxsafe.commands import cli
 from jaxsafe.commands.environment_options import TaskOptions
@@ -38,7 +38,12 @@ POLICIES = (*ADVERSARIES, SEARCH)
 class Options(TaskOptions):
     """The options of `jaxsafe falsify`."""
 
-    env: Annotated[str, Option(examples=("env=docking3d",))]
+    groups: ClassVar = {
+        "The filter and its environment.": ("env", "env.PATH", "actions", "variant", "rta"),
+        "The attack.": ("policies", "num_envs", "steps", "seed", "out"),
+    }
+
+    env: Annotated[str, Option(first=True, examples=("env=docking3d",))]
     """The task to attack, or the file of an environment."""
     rta: str | None = None
     """The filter to attack. With none the environment is attacked without a filter.
@@ -53,7 +58,7 @@ class Options(TaskOptions):
     By default the episodes are whole, up to a million steps.
     """
     policies: Annotated[tuple[str, ...], Option(kind="policy", names=POLICIES)] | None = None
-    """The adversaries, in brackets if there are several. By default all of them act in turn."""
+    """The adversaries, with commas between them. By default all of them act in turn."""
     seed: Seed = 0
     """Seed of the starts and of the adversaries."""
     out: File | None = None

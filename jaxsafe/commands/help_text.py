@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import inspect
 import json
-import shlex
 import sys
 import textwrap
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from fnmatch import fnmatch
+from typing import Any, NamedTuple
 
 from jaxsafe.commands.options import CommandOptions, names_of, option, options_of, shown_name
 from jaxsafe.config.arguments import TEXT
@@ -19,23 +20,63 @@ from jaxsafe.schema.field_docs import field_docs
 WIDTH = 100
 """Number of letters of a line."""
 
+REST = "Options of every command."
+"""Title of the options that are in no group."""
 
-def help_text(cls: type[CommandOptions]) -> str:
-    """Return the usage, what the command does, and every option with all that is known of it."""
+
+class Entry(NamedTuple):
+    """All that is known of an option."""
+
+    name: str
+    takes: str
+    """What it takes, in words."""
+    default: str
+    """The default, as a user would write it. It is empty if there is none."""
+    text: str
+    """What the option means."""
+
+
+def help_text(cls: type[CommandOptions], given: Mapping[str, Any]) -> str:
+    """Return the usage, what the command does, and every option with all that is known of it.
+
+    Args:
+        cls: the options of the command.
+        given: options that may decide the defaults of others.
+
+    Raises:
+        ConfigError: one of the given options is wrong.
+    """
+    defaults, origin = cls.defaults(given)
     program = cls.program or f"jaxsafe {cls.__module__.rpartition('.')[2]}"
-    words = [word for field in options_of(cls).values() for word in option(field).examples[:1]]
-    usage = " ".join(["usage:", program, *map(shlex.quote, words), "[option=value …]"])
-    rows = [*entries(cls)]
-    width = max(len(name) for name, *_ in rows)
-    lines = [usage, "", *_wrapped(sys.modules[cls.__module__].__doc__ or "", indent=0), ""]
-    for name, takes, text in rows:
-        first, *rest = _wrapped(takes, indent=width + 4)
-        lines += [f"  {name:{width}}  {first.strip()}", *rest, *_wrapped(text, indent=width + 4)]
+    about = [sys.modules[cls.__module__].__doc__ or "", origin]
+    lines = [" ".join(["usage:", program, *_words(cls), "[option=value …]"])]
+    for text in filter(None, about):
+        lines += ["", *_wrapped(text, indent=0)]
+    options = [*entries(cls)]
+    width = max(len(entry.name) for entry in options)
+    for title, members in grouped(cls, options).items():
+        lines += ["", *([title] if title else [])]
+        for name, takes, default, text in members:
+            default = shown(defaults[name]) if name in defaults else default
+            takes = f"{takes} (default {default})" if default else takes
+            first, *rest = _wrapped(takes, indent=width + 4)
+            lines += [f"  {name:{width}}  {first.strip()}", *rest]
+            lines += _wrapped(text, indent=width + 4)
     return "\n".join(lines)
 
 
-def entries(cls: type[Component], start: str = "") -> Iterator[tuple[str, str, str]]:
-    """Yield the name of each option, what it takes, and the text that explains it.
+def grouped(cls: type[CommandOptions], options: Iterable[Entry]) -> dict[str, list[Entry]]:
+    """Return the options of a command by the title of their group. Options of no group are last."""
+    left = {entry.name: entry for entry in options}
+    groups: dict[str, list[Entry]] = {}
+    for title, patterns in cls.groups.items():
+        names = [name for pattern in patterns for name in left if fnmatch(name, pattern)]
+        groups[title] = [left.pop(name) for name in names]
+    return groups | {REST if groups else "": [*left.values()]}
+
+
+def entries(cls: type[Component], start: str = "") -> Iterator[Entry]:
+    """Yield each option.
 
     Args:
         cls: the options of a command, or a component of which every field is an option.
@@ -50,10 +91,13 @@ def entries(cls: type[Component], start: str = "") -> Iterator[tuple[str, str, s
             yield from entries(mark.component)
         elif isinstance(field.default, Component):
             if kinds := choices(bare(field.hint)):
-                yield f"{start}{name}", f"a mapping with a type: {', '.join(kinds)}", text
+                takes = f"one of {', '.join(kinds)}, or a mapping with such a type"
+                default = field.default.type_name or ""
+                yield Entry(f"{start}{name}", takes=takes, default=default, text=text)
             yield from entries(type(field.default), f"{start}{name}.")
         else:
-            yield f"{start}{shown_name(field)}", f"{_takes(field)}{_default(field)}", text
+            default = "" if field.required or field.default is None else shown(field.default)
+            yield Entry(f"{start}{shown_name(field)}", _takes(field), default, text)
 
 
 def _wrapped(text: str, indent: int) -> list[str]:
@@ -69,13 +113,23 @@ def _wrapped(text: str, indent: int) -> list[str]:
     )
 
 
-def _default(field: Field) -> str:
-    if field.required or field.default is None:
-        return ""
-    value = to_data(field.default)
-    number = isinstance(value, float)
-    text = f"{value:g}" if number else value if isinstance(value, str) else json.dumps(value)
-    return f" (default {text})"
+def shown(value: Any) -> str:
+    """Return a value as a user would write it on a command line."""
+    value = to_data(value)
+    if isinstance(value, str):
+        return value
+    if isinstance(value, list):
+        return ",".join(map(shown, value))
+    if isinstance(value, bool) or value is None:
+        return json.dumps(value)
+    return f"{value:_}" if isinstance(value, int) else f"{value:g}"
+
+
+def _words(cls: type[CommandOptions]) -> Iterator[str]:
+    """Yield the words of the usage line, an example of each option that has one."""
+    for field in options_of(cls).values():
+        for word in option(field).examples[:1]:
+            yield word.partition("=")[2] if option(field).first else word
 
 
 def _takes(field: Field) -> str:

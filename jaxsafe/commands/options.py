@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import re
 import typing
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -29,6 +30,9 @@ Seed = Annotated[int, Range(0, largest=arguments.MAX_SEED)]
 @dataclasses.dataclass(frozen=True)
 class Option:
     """Mark of an option that says what its type leaves open."""
+
+    first: bool = False
+    """Whether the first word of a command line may be the value alone, as `docking3d` for `env`."""
 
     examples: tuple[str, ...] = ()
     """Words to show if the option is missing. The usage line shows the first one."""
@@ -55,6 +59,9 @@ class Option:
     placeholder: str = ""
     """What the help text shows after the prefix."""
 
+    lists: bool = False
+    """Whether each option with the prefix takes a list."""
+
     component: type[Component] | None = None
     """The component whose fields are the options of the empty prefix."""
 
@@ -70,6 +77,12 @@ class CommandOptions(Component):
     program: ClassVar[str | None] = None
     """How the user calls the command. None stands for `jaxsafe` and the name of the module."""
 
+    groups: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    """The options in the order of the help text, by a sentence that says what each group is about.
+
+    `agent.*` stands for all options whose names begin with `agent.`.
+    """
+
     given: Mapping[str, Any]
     """The options that the user gave, as the command line reads them."""
     imports: bool = True
@@ -82,7 +95,27 @@ class CommandOptions(Component):
         Raises:
             ConfigError: as `read`; or a word is not `key=value`, or a key stands twice.
         """
-        return cls.read(arguments.Arguments.parse(argv).options)
+        return cls.read(cls.arguments(argv))
+
+    @classmethod
+    def arguments(cls, argv: Sequence[str]) -> dict[str, Any]:
+        """Return the values on a command line by name. Only their form is checked.
+
+        Raises:
+            ConfigError: a word is not `key=value`, or a key stands twice.
+        """
+        words = list(argv)
+        table = options_of(cls).values()
+        named = next((field.name for field in table if option(field).first), None)
+        place = next((i for i, word in enumerate(words) if not word.startswith("imports=")), 0)
+        if named and words and re.fullmatch(r"[^-=][^=]*", words[place]):
+            words[place] = f"{named}={words[place]}"
+        lists = {
+            option(field).prefix or field.name
+            for field in table
+            if option(field).lists or typing.get_origin(bare(field.hint)) is tuple
+        }
+        return arguments.Arguments.parse(words, lists).options
 
     @classmethod
     def read(cls, given: Mapping[str, Any]) -> Self:
@@ -113,6 +146,21 @@ class CommandOptions(Component):
                 examples = " or ".join(option(field).examples)
                 raise ConfigError(f"{name}: missing; for instance {examples}")
         return cls(given=given, **values)
+
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
+        """Return what the help text says of defaults that depend on other options.
+
+        Args:
+            given: the options beside the word that asks for the help text.
+
+        Returns:
+            These defaults by the name of the option, and a sentence about where they come from.
+
+        Raises:
+            ConfigError: one of the other options is wrong.
+        """
+        return {}, ""
 
     def refuse_beside(self, names: Iterable[str], situation: str) -> None:
         """Refuse options that would change nothing.

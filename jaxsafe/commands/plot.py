@@ -20,8 +20,9 @@ class Options(CommandOptions):
     run: Annotated[
         tuple[str, ...],
         Option(
-            examples=("run=runs/docking3d", "run=[runs/a,runs/b]"),
-            takes="a directory, or several in brackets",
+            first=True,
+            examples=("run=runs/docking3d", "run=runs/a,runs/b"),
+            takes="a directory, or several with commas between them",
         ),
     ]
     """The run directories."""
@@ -40,7 +41,7 @@ def main(argv: Sequence[str]) -> int:
     if isinstance(options.given["run"], list):
         _compare(options.run, options.x, Path(options.out))
         return 0
-    options.refuse_beside(["out"], "but for several runs, which run=[A,B] draws in one figure")
+    options.refuse_beside(["out"], "but for several runs, which run=A,B draws in one figure")
     [run] = map(Path, options.run)
     run_directory.read(run, "run")
     for path in draw_all(run, options.x):

@@ -14,7 +14,7 @@ from jaxsafe.agents.imported_policy import ACTIVATIONS, ForeignPolicy, read_fore
 from jaxsafe.commands.environment_options import EnvironmentOptions
 from jaxsafe.commands.options import Option
 from jaxsafe.environment import Environment
-from jaxsafe.envs import adapt, short_name
+from jaxsafe.envs import TASKS, adapt, short_name
 from jaxsafe.schema.convert import to_data
 from jaxsafe.schema.errors import ConfigError
 
@@ -22,7 +22,9 @@ from jaxsafe.schema.errors import ConfigError
 class PolicyOptions(EnvironmentOptions):
     """The options of a command that takes policies."""
 
-    run: Annotated[str, Option(examples=("run=runs/docking3d", "run=pretrained/docking3d"))]
+    run: Annotated[
+        str, Option(first=True, examples=("run=runs/docking3d", "run=pretrained/docking3d"))
+    ]
     """A run directory, a policy file (.npz), or pretrained/TASK for one that comes with jaxsafe.
 
     With env=TASK it may also be a policy from elsewhere: an .onnx file, or an .npz with the layers
@@ -56,6 +58,11 @@ class PolicyOptions(EnvironmentOptions):
         Raises:
             ConfigError: the options do not fit the policy.
         """
+        if self.run in TASKS and not Path(self.run).exists():
+            raise ConfigError(
+                f"run: {self.run} is a task; name a run of it, "
+                f"or pretrained/{self.run} for the policy that comes with jaxsafe"
+            )
         names = _names(self.run) if self.run.endswith(".npz") else set()
         graph = self.run.endswith(".onnx")
         if self.env is None and (graph or "kernel_0.npy" in names):
@@ -89,7 +96,7 @@ class PolicyOptions(EnvironmentOptions):
                 observation or action than the policies.
         """
         env = (
-            adapt(trained, name, self.overrides, **self.choices)
+            adapt(trained, name, self.overrides, place="env", **self.choices)
             if self.env is None
             else self.make(self.env)
         )

@@ -19,13 +19,13 @@ from jaxsafe.plot.safe_set import Ends, draw
 from jaxsafe.plot.style import save
 from jaxsafe.schema.component import Range
 
-Axis = Annotated[Ends, Option(takes="the ends of the axis, for instance [0,150]")]
+Axis = Annotated[Ends, Option(takes="the ends of the axis, for instance 0,150")]
 
 
 class Options(TaskOptions):
     """The options of `jaxsafe safe_set`."""
 
-    env: Annotated[str, Option(examples=("env=rejoin2d",))]
+    env: Annotated[str, Option(first=True, examples=("env=rejoin2d",))]
     """The task, or the file of an environment."""
     rta: str | None = None
     """The filter, which must certify states.

@@ -9,14 +9,15 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from jaxsafe.commands import cli
 from jaxsafe.commands.environment_options import Overrides
 from jaxsafe.commands.options import CommandOptions, Directory, Option
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores
-from jaxsafe.train.host.options import TrainConfig, resolve_all
+from jaxsafe.envs import TASKS
+from jaxsafe.train.host.options import TrainConfig, recipe, recipe_options, resolve_all
 
 BEGAN = time.monotonic()
 """Time [s] at which the command began. The clock of the first run starts then."""
@@ -25,7 +26,42 @@ BEGAN = time.monotonic()
 class Options(CommandOptions):
     """The options of `jaxsafe train`."""
 
-    env: Annotated[str, Option(examples=("env=docking3d",))] | None = None
+    groups: ClassVar = {
+        "The environment in which the policies act.": (
+            "env",
+            "env.PATH",
+            "actions",
+            "variant",
+            "rta",
+        ),
+        "The training. Its steps are those of each seed.": (
+            "preset",
+            "steps",
+            "seeds",
+            "seed",
+            "algorithm",
+            "cost_limit",
+            "rta_training",
+            "start_from",
+            "resume",
+        ),
+        "Evaluations, checkpoints and where everything is kept.": (
+            "eval_every",
+            "eval_episodes",
+            "episodes",
+            "checkpoint_every",
+            "log_every",
+            "out",
+            "tensorboard",
+            "wandb",
+            "mlflow",
+        ),
+        "The agent: what it sees, its networks and its noise.": ("agent.*",),
+        "The numbers of PPO.": ("ppo.*",),
+        "Several devices or processes.": ("devices_per_seed", "distributed"),
+    }
+
+    env: Annotated[str, Option(first=True, examples=("env=docking3d",))] | None = None
     """A task, the file of an environment, or all for the five tasks one after another.
 
     It is left out only with resume.
@@ -38,6 +74,17 @@ class Options(CommandOptions):
     """Whether this is one of several processes that srun or mpirun started."""
     training: Annotated[Mapping[str, Any], Option(prefix="", component=TrainConfig)]
     """The options of the training."""
+
+    @classmethod
+    def defaults(cls, given: Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
+        task = given.get("env")
+        if task in (None, "all"):
+            return dict.fromkeys(recipe_options(), "from the recipe"), (
+                "A default from the recipe is that of the task, and `jaxsafe train TASK help` "
+                "shows it."
+            )
+        settings = recipe(task, given.get("preset"))
+        return settings, f"The defaults are those of {task} with preset={settings['preset']}."
 
 
 def main(argv: Sequence[str]) -> int:
@@ -58,6 +105,9 @@ def main(argv: Sequence[str]) -> int:
         processes.join()
     resume = options.resume
     if resume is None:
+        task = options.env
+        if task and task not in TASKS and (Path(task) / "config.yaml").is_file():
+            raise ConfigError(f"env: {task} is a run; resume={task} goes on with it")
         resolved = resolve_all(options.without("resume", "distributed"))
         path = Path(processes.from_leader(lambda: str(run_directory.create_all(resolved))))
     else:
@@ -66,6 +116,10 @@ def main(argv: Sequence[str]) -> int:
     runs = run_directory.runs(path)
     if resume is not None and "steps" in options.given:
         processes.from_leader(lambda: run_directory.extend(runs, options.given["steps"]) or "")
+    if "steps" in options.given and processes.leads():
+        for config, _, name in (run_directory.read(run, "resume") for run in runs):
+            if config.rounding:
+                print(f"{name}: {config.rounding}" if len(runs) > 1 else config.rounding)
     try:
         with processes.reporting_lost_process(
             f"go on with: python -m jaxsafe.train distributed=true resume={path}"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from jaxsafe.commands import cli
 from jaxsafe.commands.options import CommandOptions, Count, Directory, Option, Seed
@@ -25,15 +25,26 @@ OWN = ("resume", "rank", "samples", "draw", "out")
 class Options(CommandOptions):
     """The options of `jaxsafe tune`."""
 
-    env: Annotated[str, Option(examples=("env=docking2d",))] | None = None
+    groups: ClassVar = {
+        "What is trained.": ("env", "sweep.OPTION", "samples", "draw", "OPTION"),
+        "How the settings are ranked, and where all is kept.": (
+            "rank",
+            "episodes",
+            "out",
+            "resume",
+        ),
+    }
+
+    env: Annotated[str, Option(first=True, examples=("env=docking2d",))] | None = None
     """The task, or the file of an environment. It is left out only with resume."""
     sweep: Annotated[
         Mapping[str, Any],
         Option(
-            examples=("sweep.ppo.gamma=[0.95,0.97]",),
+            examples=("sweep.ppo.gamma=0.95,0.97",),
             prefix=PREFIX,
             placeholder="OPTION",
-            takes="a list [a,b,…], or in quotes uniform(low,high) or log(low,high)",
+            lists=True,
+            takes="values a,b,…, or in quotes 'uniform(low,high)' or 'log(low,high)'",
         ),
     ]
     """Values of an option of `jaxsafe train`, or of env.PATH.

@@ -6,6 +6,7 @@ The tasks themselves are Python and stand in `jaxsafe.envs`.
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from typing import Any
 
 from jaxsafe.config.check import check
@@ -15,10 +16,19 @@ from jaxsafe.environment import Environment
 from jaxsafe.rta.filter import RTA
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.convert import to_component, to_data
-from jaxsafe.schema.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.schema.user_modules import import_modules, modules
 
-__all__ = ["build", "describe", "dump", "from_data", "load", "load_filter", "override"]
+__all__ = [
+    "build",
+    "describe",
+    "dump",
+    "from_data",
+    "load",
+    "load_filter",
+    "load_recipes",
+    "override",
+]
 
 
 def build(env: Environment) -> Environment:
@@ -36,7 +46,7 @@ def load(source: str | os.PathLike) -> Environment:
     """Read an environment from a YAML file, or from the YAML text that `dump` returns.
 
     The modules listed under `imports` are imported first. So the file can name the components that
-    these modules define.
+    these modules define. What stands under `recipes` is left to `load_recipes`.
 
     Args:
         source: the path of a file, or a text of more than one line.
@@ -48,7 +58,7 @@ def load(source: str | os.PathLike) -> Environment:
 
     text = isinstance(source, str) and "\n" in source
     data = yaml12.parse(str(source), "environment") if text else yaml12.read(source)
-    env = from_data(data, "")
+    env = from_data(_without_recipes(data), "")
     warn_of_ties(env.replace(randomize={}), env)
     return env
 
@@ -72,10 +82,39 @@ def load_filter(path: str | os.PathLike) -> RTA:
         import_modules(data.pop("imports"), f"{path}: rta")
     if not isinstance(data, dict) or "platforms" not in data:
         return to_component(data, RTA, f"{path}: rta")
+    data = _without_recipes(data)
     found = build(to_component(data, Environment, f"{path}: environment")).rta
     if found is None:
         raise ConfigError(f"rta: {path} is an environment without a filter; rta=none is for none")
     return found
+
+
+def load_recipes(path: str | os.PathLike) -> dict[str, dict[str, Any]]:
+    """Read the recipes that a YAML file has for the training in its environment.
+
+    Returns:
+        The options of each recipe by its name. There are none in a file without `recipes`.
+
+    Raises:
+        ConfigError: the file cannot be read, or its recipes are no mappings.
+    """
+    from jaxsafe.schema import yaml12
+
+    data = yaml12.read(path)
+    found = data.get("recipes", {}) if isinstance(data, Mapping) else {}
+    if not isinstance(found, Mapping) or not all(
+        options is None or isinstance(options, Mapping) for options in found.values()
+    ):
+        raise ConfigError(
+            f"{path}: recipes: expected names, each with options of a training, found {show(found)}"
+        )
+    return {str(name): dict(options or {}) for name, options in found.items()}
+
+
+def _without_recipes(data: Any) -> Any:
+    if not isinstance(data, Mapping):
+        return data
+    return {name: value for name, value in data.items() if name != "recipes"}
 
 
 def dump(env: Environment) -> str:

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Collection, Sequence
+from itertools import zip_longest
 from typing import Any
 
 from jaxsafe.schema import yaml12
@@ -28,6 +30,15 @@ MAX_COUNT = 2**31 - 1
 MAX_SEED = 2**32 - 1
 """Largest seed. Keys of random numbers are made of its lowest 32 bits."""
 
+_GROUPED = re.compile(r"[-+]?[0-9]{1,3}(?:_[0-9]{3})+")
+"""A whole number whose digits are in groups, such as 100_000."""
+
+_DASHED = re.compile(r"--?([A-Za-z][^=]*)(?:=(.*))?", re.DOTALL)
+"""An option as other programs take it, such as `--seeds=10` or `--seeds`."""
+
+_OPENINGS = ("[", "log(", "uniform(")
+"""What a list begins with that has its brackets, and an interval to draw from."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Arguments:
@@ -37,22 +48,36 @@ class Arguments:
     """Values by key. Paths are as typed, other values are read as YAML scalars."""
 
     @classmethod
-    def parse(cls, argv: Sequence[str]) -> Arguments:
+    def parse(cls, argv: Sequence[str], lists: Collection[str] = ()) -> Arguments:
         """Read the words of a command line.
+
+        Args:
+            argv: the words.
+            lists: the options that take a list, or `PREFIX.` for all whose names begin with it. The
+                brackets of a list may be left out, as in `run=a,b`.
 
         Raises:
             ConfigError: a word is not `key=value`, or a key stands twice.
         """
         options: dict[str, Any] = {}
-        for word in argv:
+        for word, following in zip_longest(argv, argv[1:], fillvalue=""):
             key, equals, typed = word.partition("=")
+            if dashed := _DASHED.fullmatch(word):
+                name = dashed[1].replace("-", "_")
+                value = following if dashed[2] is None and "=" not in following else dashed[2]
+                raise ConfigError(
+                    f"argument {show(word)}: options have no dashes; write {name}={value or '…'}"
+                )
             if not equals or not key:
                 raise ConfigError(
                     f"argument {show(word)}: expected key=value, for instance seeds=10"
                 )
             if key in options:
                 raise ConfigError(f"{key}: given twice")
-            options[key] = _path(typed, key) if key in PATHS else yaml12.parse(typed, key)
+            is_list = key in lists or f"{key.partition('.')[0]}." in lists
+            if is_list and "," in typed and not typed.startswith(_OPENINGS):
+                typed = f"[{typed}]"
+            options[key] = _path(typed, key) if key in PATHS else _value(typed, key)
         return cls(options)
 
     def pop(self, key: str, default: Any = None) -> Any:
@@ -117,6 +142,18 @@ def flag(value: Any, key: str) -> bool:
     if not isinstance(value, bool):
         raise ConfigError(f"{key}: expected true or false, found {show(value)}")
     return value
+
+
+def _value(typed: str, key: str) -> Any:
+    """Return a value that is no path. 100_000, which is text in YAML, is a number in it."""
+    return _ungrouped(yaml12.parse(typed, key), key)
+
+
+def _ungrouped(value: Any, key: str) -> Any:
+    if isinstance(value, list):
+        return [_ungrouped(item, key) for item in value]
+    grouped = isinstance(value, str) and _GROUPED.fullmatch(value)
+    return yaml12.parse(value.replace("_", ""), key) if grouped else value
 
 
 def _path(typed: str, key: str) -> Any:

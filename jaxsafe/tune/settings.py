@@ -80,7 +80,7 @@ def pop_sweep(arguments: Arguments) -> dict[str, list[Any] | Span]:
     """
     names = [key for key in arguments.options if key.startswith(PREFIX)]
     if not names:
-        raise ConfigError("sweep: nothing to sweep; for instance sweep.ppo.gamma=[0.95,0.97,0.99]")
+        raise ConfigError("sweep: nothing to sweep; for instance sweep.ppo.gamma=0.95,0.97,0.99")
     return {key.removeprefix(PREFIX): _choices(key, arguments.options.pop(key)) for key in names}
 
 
@@ -173,8 +173,7 @@ def _choices(key: str, value: Any) -> list[Any] | Span:
     match = _RANGE.fullmatch(value) if isinstance(value, str) else None
     if match is None:
         raise ConfigError(
-            f"{key}: expected a list [a,b,…], uniform(low,high) or log(low,high),"
-            f" found {show(value)}"
+            f"{key}: expected values a,b,…, uniform(low,high) or log(low,high), found {show(value)}"
         )
     try:
         low, high = float(match[2]), float(match[3])

@@ -3,6 +3,7 @@ import io
 import json
 import os
 import random
+import re
 import subprocess
 import sys
 import tracemalloc
@@ -152,6 +153,48 @@ def test_bad_options_of_train_are_told_in_one_line(
     assert list(Path.cwd().rglob("*")) == []  # nothing was begun
 
 
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("gamma=0.9", "gamma: unknown field 'gamma'; .* Did you mean 'ppo.gamma'"),
+        ("lr=1e-3", "lr: unknown field 'lr'; .* Did you mean 'ppo.learning_rate'"),
+        ("ppo.lr=1e-3", "ppo.lr: unknown field 'lr'; .* Did you mean 'learning_rate'"),
+        ("ent_coef=0", "Did you mean 'ppo.entropy_coefficient'"),
+        ("epochs=3", "Did you mean 'ppo.num_epochs'"),
+        ("env.mass=14", "env.mass: unknown field 'mass'; .* Did you mean 'env.deputy.mass'"),
+        ("env.deputy.mas=14", "env.deputy.mas: unknown field 'mas'; .* Did you mean 'mass'"),
+    ],
+)
+def test_near_misses_lead_on(fails: Callable[..., str], word: str, message: str) -> None:
+    assert re.search(message, fails(train, "docking3d", word))
+
+
+def test_lists_of_a_training_need_no_brackets(fails: Callable[..., str]) -> None:
+    config, env, _ = resolve({"env": "docking2d", "agent.actor.hidden": "32,16"})
+    assert config.agent.actor.hidden == (32, 16)  # pyright: ignore[reportAttributeAccessIssue]
+    words = {"env.observation": "velocity,position", "env.deputy.start.position.distance": "9,11"}
+    _, env, _ = resolve({"env": "docking2d", "preset": "plain", **words})
+    assert [part.name for part in env.observation] == ["velocity", "position"]
+    assert "steps: expected a whole number ≥ 1, found '100,000'" in fails(
+        train, "docking2d", "steps=100,000"
+    )
+
+
+def test_steps_that_are_rounded_are_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: object) -> None:
+        raise RuntimeError("far enough")
+
+    monkeypatch.setattr(Training, "prepare", stop)
+    sizes = ["ppo.num_envs=24", "ppo.num_steps=64", f"out={tmp_path / 'run'}"]
+    for words, told in ((["steps=100_000"], True), (["steps=15_360"], False), ([], False)):
+        with pytest.raises(RuntimeError, match="far enough"):
+            train.main(["docking2d", *words, *sizes])
+        line = "steps: 100,000 becomes 101,376, a whole number of updates of 1,536\n"
+        assert (line in capsys.readouterr().out) == told
+
+
 def test_numbers_in_exponent_form_are_numbers(fails: Callable[..., str]) -> None:
     assert "found -1000000" in fails(train, "env=docking3d", "steps=-1e6")
     assert "steps: expected a whole number ≥ 1, found 0.0003" in fails(
@@ -169,6 +212,7 @@ def test_a_directory_that_holds_something_is_never_overwritten(
         "out: run already holds something and is never overwritten; continue it with resume=run"
         in message
     )
+    assert "env: run is a run; resume=run goes on with it" in fails(train, "run")
     assert (tmp_path / "run" / "config.yaml").read_text() == "precious"
 
 
@@ -219,6 +263,10 @@ def test_an_unwritable_output_is_told_in_one_line(
         (["run=x.npz"], "x.npz: cannot be read: No such file or directory"),
         (["run=runs/x", "render=mp4"], "render: found 'mp4'; choose from gif"),
         (["run=runs/x", "episods=5"], "episods: unknown option; choose from"),
+        (
+            ["docking3d"],
+            "run: docking3d is a task; name a run of it, or pretrained/docking3d for the policy",
+        ),
     ],
 )
 def test_bad_options_of_evaluate_are_told_in_one_line(
@@ -691,6 +739,14 @@ def test_alone_the_program_lists_its_commands(
     commands.main()
     told = capsys.readouterr().out
     assert [name for name in commands.COMMANDS if f"  {name} " not in told] == []
+
+
+def test_the_version_is_told(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["jaxsafe", "--version"])
+    commands.main()
+    assert re.fullmatch(r"jaxsafe \d+\.\d+\.\d+\n", capsys.readouterr().out)
 
 
 def test_a_command_is_called_by_its_name(

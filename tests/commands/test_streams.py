@@ -70,6 +70,8 @@ def test_an_environment_that_is_printed_can_be_read_again_whatever_the_encoding(
     ("command", "code", "told"),
     [
         ("jaxsafe config docking2d | head -1; exit ${PIPESTATUS[0]}", 0, ""),
+        (f"'{sys.executable}' -m jaxsafe | true; exit ${{PIPESTATUS[0]}}", 0, ""),
+        thorough("jaxsafe train help | true; exit ${PIPESTATUS[0]}", 0, ""),
         (
             "jaxsafe config docking2d > /dev/full",
             2,

@@ -20,7 +20,7 @@ from default_cases import one_of_each_kind
 
 import jaxsafe
 from jaxsafe import ConfigError, Environment
-from jaxsafe.config import build, dump, load
+from jaxsafe.config import build, dump, load, load_filter, load_recipes
 from jaxsafe.envs import adapt
 from jaxsafe.processors.reward import Failure
 from jaxsafe.processors.status import Status
@@ -146,6 +146,31 @@ def test_an_environment_is_read_from_a_file_and_then_overridden(
     assert load(str(path)) == env
     assert jaxsafe.make(path, actions="discrete") == jaxsafe.make("docking2d", actions="discrete")
     assert float(jaxsafe.make(str(path), {"deputy.mass": 10}).agent_platform.mass) == 10.0
+
+
+def test_recipes_beside_an_environment_are_left_to_trainings(
+    tree: dict[str, Any], env: Environment, tmp_path: Path
+) -> None:
+    tree["recipes"] = {"mine": {"steps": 7}, "empty": None}
+    file = tmp_path / "mine.yaml"
+    file.write_text(write(tree), encoding="utf-8")
+    assert load(file) == jaxsafe.make(file) == env
+    assert load_recipes(file) == {"mine": {"steps": 7}, "empty": {}}
+    file.write_text(dump(env), encoding="utf-8")
+    assert load_recipes(file) == {}
+    for wrong in (3, [], {"mine": 3}):
+        file.write_text(write({**tree, "recipes": wrong}), encoding="utf-8")
+        assert fault(lambda: load_recipes(file)).startswith(
+            f"{file}: recipes: expected names, each with options of a training, found"
+        )
+    assert "unknown field 'recipe'" in fault_in({**tree, "recipe": {}})
+
+
+def test_a_filter_is_read_from_a_file_with_recipes(tmp_path: Path) -> None:
+    env = jaxsafe.make("docking2d", rta="explicit_simplex")
+    file = tmp_path / "mine.yaml"
+    file.write_text(write({**parse(dump(env), ""), "recipes": {"mine": {}}}), encoding="utf-8")
+    assert load_filter(file) == env.rta
 
 
 def test_fields_with_a_default_may_be_left_out(tree: dict[str, Any], env: Environment) -> None:

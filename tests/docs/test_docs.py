@@ -212,14 +212,16 @@ def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_commands_are_those_of_any_shell(page: Path) -> None:
     """In zsh a word with brackets must be quoted, and a comment behind a command is part of it."""
+    text = page.read_text(encoding="utf-8")
     commands = [
         line
-        for line in page.read_text(encoding="utf-8").splitlines()
-        if "python -m jaxsafe" in line
+        for line in text.splitlines()
+        if "python -m jaxsafe" in line or line.startswith("jaxsafe ")
     ]
     words = [word for line in commands for word in line.split()]
     assert [word for word in words if re.match(r"[\w.]+=.*[\[*?]", word)] == []
-    assert [line for line in commands if line.startswith("python") and " # " in line] == []
+    assert [line for line in commands if not line.startswith("#") and " # " in line] == []
+    assert re.findall(r"`[\w.]+=\[", text) == []
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ from orbax.checkpoint import CheckpointManager
 from tiny_run import TINY, assert_same_end, final_state, logs
 
 from jaxsafe.agents.policy_file import load_policy, read_policy
-from jaxsafe.commands import cli
+from jaxsafe.commands import cli, config
 from jaxsafe.commands import evaluate as evaluate
 from jaxsafe.commands import train as command
 from jaxsafe.devices import processes
@@ -27,7 +27,7 @@ from jaxsafe.envs import TASKS
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import write_rows
 from jaxsafe.train.host.checkpoint import Checkpoints
-from jaxsafe.train.host.options import recipe
+from jaxsafe.train.host.options import recipe, resolve
 from jaxsafe.train.host.session import Clock, Training
 from jaxsafe.train.ppo import DIAGNOSTICS
 
@@ -443,6 +443,34 @@ def test_the_default_recipe_learns_to_dock(tmp_path: Path, task: str) -> None:
     results = json.loads((tmp_path / "run" / "results.json").read_text())
     for kind in ("stochastic", "deterministic"):
         assert min(results["evaluation"][kind]["success_rate"]["per_seed"]) > 0.9
+
+
+def test_a_recipe_travels_with_the_file_of_an_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    config.main(["docking2d", "recipes=true"])
+    text = capsys.readouterr().out
+    Path("mine.yaml").write_text(text, encoding="utf-8")
+    for preset in ({}, {"preset": "many_envs"}):
+        of_file = resolve({"env": "mine.yaml", **preset})
+        assert of_file[:2] == resolve({"env": "docking2d", **preset})[:2]
+    assert of_file[2] == "mine"
+    given, _, _ = resolve({"env": "mine.yaml", "ppo.gamma": 0.5, "steps": 99})
+    assert (float(given.ppo.gamma), given.steps) == (0.5, 99)
+    with pytest.raises(ConfigError, match=r"^preset: unknown preset 'x'; choose from features, "):
+        resolve({"env": "mine.yaml", "preset": "x"})
+    environment = text.partition("recipes:")[0]
+    for recipes, place in (
+        ("{mine: {ppo: {gama: 1}}}", r"mine\.ppo\.gama: unknown field 'gama'; .* mean 'gamma'"),
+        ("{a: {steps: 0}, b: {}}", r"a\.steps: expected a whole number ≥ 1, found 0"),
+    ):
+        Path("mine.yaml").write_text(f"{environment}recipes: {recipes}\n", encoding="utf-8")
+        with pytest.raises(ConfigError, match=rf"^mine\.yaml: recipes\.{place}"):
+            resolve({"env": "mine.yaml"})
+    assert resolve({"env": "mine.yaml", "preset": "b"})[0].preset == "b"
+    Path("mine.yaml").write_text(environment, encoding="utf-8")
+    assert resolve({"env": "mine.yaml"})[0].steps == 500_000
 
 
 def test_nothing_is_lost_when_checkpoints_are_missing(

@@ -79,15 +79,15 @@ def test_settings_that_differ_in_sizes_are_compiled_apart() -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "sweep: nothing to sweep; for instance sweep.ppo.gamma=[0.95,0.97,0.99]"),
+        ([], "sweep: nothing to sweep; for instance sweep.ppo.gamma=0.95,0.97,0.99"),
         (
             ["sweep.ppo.gamma=0.9"],
             (
-                "sweep.ppo.gamma: expected a list [a,b,…], uniform(low,high) or log(low,high),"
+                "sweep.ppo.gamma: expected values a,b,…, uniform(low,high) or log(low,high),"
                 " found 0.9"
             ),
         ),
-        (["sweep.ppo.gamma=[]"], "sweep.ppo.gamma: expected a list"),
+        (["sweep.ppo.gamma=[]"], "sweep.ppo.gamma: expected values"),
         (
             ["sweep.ppo.gamma=log(0,1)"],
             "sweep.ppo.gamma: expected low < high, for log above 0, found 'log(0,1)'",

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from jaxsafe.agents.agent import Agent, check_agent
-from jaxsafe.config import override
+from jaxsafe.config import load_recipes, override
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.environment import Environment, require_success
-from jaxsafe.envs import TASKS, make, short_name
+from jaxsafe.envs import TASKS, find_task, is_file, make, short_name
 from jaxsafe.processors.reward import Intervention
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import Component, Range, normalise
@@ -124,6 +124,17 @@ class TrainConfig(Component):
         return -(-self.steps // self.ppo.batch_size)
 
     @property
+    def rounding(self) -> str:
+        """A line about `steps` if it is no whole number of updates, else an empty text."""
+        rounded = self.num_updates * self.ppo.batch_size
+        if rounded == self.steps:
+            return ""
+        return (
+            f"steps: {self.steps:,} becomes {rounded:,}, "
+            f"a whole number of updates of {self.ppo.batch_size:,}"
+        )
+
+    @property
     def shares(self) -> list[int]:
         """The numbers of devices that may share a seed."""
         if self.devices_per_seed is not None:
@@ -200,11 +211,14 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     told = config.rta_training or ("punished" if env.rta is not None else None)
     if told == "punished" and not any(isinstance(term, Intervention) for term in env.reward):
         env = env.replace(reward=(*env.reward, normalise(Intervention(name="intervention"))))
-    env = override(env, overrides)
+    env = override(env, overrides, place="env")
     require_success(env)
     config = normalise(TrainConfig())
     settings = recipe(task, arguments.options.get("preset"))
-    for path, value in {**settings, **arguments.options, "preset": settings["preset"]}.items():
+    place = f"{task}: recipes.{settings['preset']}" if is_file(task) else ""
+    for path, value in settings.items():
+        config = set_path(config, path, value, to_value, place)
+    for path, value in {**arguments.options, "preset": settings["preset"]}.items():
         config = set_path(config, path, value, to_value)
     config = config.replace(rta_training=told)
     if told == "corrected":
@@ -327,25 +341,21 @@ def _check_rta(config: TrainConfig, env: Environment) -> None:
 
 
 def recipe(task: str, preset: str | None) -> dict[str, Any]:
-    """Return settings by dotted path from the recipe of a task.
+    """Return settings by dotted path from the recipe of a task, or from that in its file.
 
     For an environment without a recipe there is only the preset `plain`.
 
     Args:
-        task: the name of the task.
-        preset: a preset of the recipe. None stands for `features`, or for `plain` if the recipe has
-            no `features`.
+        task: the name of the task, or the file of an environment.
+        preset: a preset of the recipe. None stands for `features`, for `plain` if there is no
+            `features`, and for the first one if there is neither.
 
     Raises:
-        ConfigError: the recipe does not have the preset.
+        ConfigError: there is no such task or file, or the recipe does not have the preset.
     """
-    registered = TASKS.get(task.rpartition(":")[2])
-    known = (
-        yaml12.read(configs() / registered.recipe)
-        if registered and registered.recipe
-        else {"plain": {}}
-    )
-    name = preset if preset is not None else ("features" if "features" in known else "plain")
+    known = recipes(task) or {"plain": {}}
+    first = next((name for name in ("features", "plain") if name in known), next(iter(known)))
+    name = first if preset is None else preset
     if name not in known:
         name = OLD_PRESETS.get(name, name)
     if name not in known:
@@ -353,6 +363,24 @@ def recipe(task: str, preset: str | None) -> dict[str, Any]:
             f"preset: unknown preset {show(name)}; choose from {nearest(name, known)}"
         )
     return {"preset": name, **flatten(known[name] or {})}
+
+
+def recipes(task: str) -> dict[str, Any]:
+    """Return the recipes of a task, or those in its file, by preset. There may be none.
+
+    Raises:
+        ConfigError: there is no such task or file.
+    """
+    if is_file(task):
+        return load_recipes(task)
+    file = find_task(task).recipe
+    return yaml12.read(configs() / file) if file else {}
+
+
+def recipe_options() -> set[str]:
+    """Return the options for which a recipe of some task has a value, by dotted path."""
+    presets = [settings for task in TASKS for settings in recipes(task).values()]
+    return {"preset", *(path for settings in presets for path in flatten(settings or {}))}
 
 
 def configs() -> Path:
