@@ -135,7 +135,7 @@ def settings(task: str, num_envs: int = NUM_ENVS) -> tuple[Any, Any]:
     }
     options = {
         "env": task,
-        "preset": "plain",
+        "preset": "observation_only",
         "agent.actor.hidden": [*HIDDEN],
         "steps": 10 * UPDATES * num_envs * NUM_STEPS,
     }

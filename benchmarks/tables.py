@@ -376,9 +376,9 @@ def filtered_training(_: Results) -> str:
     It is of the records of the report.
     """
     labels = {
-        "features": "no filter",
+        "engineered_features": "no filter",
         "rta": "`rta=default`",
-        "unpunished": "and `rta_training=unpunished`",
+        "rta_no_punishment": "and `rta_training=no_punishment`",
     }
     rows = []
     for task in DOCKING_FIRST:
@@ -388,7 +388,7 @@ def filtered_training(_: Results) -> str:
             mode = own["evaluation"]["deterministic"]
             rows.append(
                 [
-                    task if kind == "features" else "",
+                    task if kind == "engineered_features" else "",
                     label,
                     _until(own["interaction_efficiency"]["timesteps"]),
                     f"{own['training_cost']['mean']:,.0f}",
@@ -397,7 +397,7 @@ def filtered_training(_: Results) -> str:
                     f"{mode['episode_length']['mean']:.0f}",
                 ]
             )
-            if kind == "features":
+            if kind == "engineered_features":
                 rows[-1] += ["–"] * 3
                 continue
             alone = record["evaluations"][WITHOUT_RTA]["evaluation"]["deterministic"]
@@ -419,7 +419,7 @@ def readme_results(_: Results) -> str:
     """Return the table of the recipes of the tasks, from the records of the report."""
     rows = []
     for task in TASKS:
-        own = _record(task, "features")["results"]
+        own = _record(task, "engineered_features")["results"]
         rates = [own["evaluation"][way]["success_rate"] for way in ("stochastic", "deterministic")]
         rows.append(
             [

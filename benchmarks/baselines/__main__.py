@@ -66,9 +66,9 @@ def main(argv: Sequence[str]) -> int:
     try:
         for item, count in zip(items, episodes, strict=True):
             run = train(item, runs)
-            evaluate(item, run, count, options.film and item.kind == "features")
+            evaluate(item, run, count, options.film and item.kind == "engineered_features")
             keep(item, run, out / DIRECTORY, command)
-            if options.policies and item.kind == "features":
+            if options.policies and item.kind == "engineered_features":
                 write_bytes(Path(options.policies) / f"{item.task}.npz", (run / BEST).read_bytes())
     except KeyboardInterrupt:
         print(f"stopped; the same command goes on with what is in {runs}")

@@ -160,7 +160,7 @@ class Report:
     def _wall(self) -> Rows:
         rows = []
         for record in self.records:
-            if record.item.kind in ("quick", "many_envs"):
+            if record.item.kind in ("shortest_time", "many_envs"):
                 reached = wall_to(0.95, record.curves)
                 pace = samples_per_second(record.curves)
                 results = record.results
@@ -243,7 +243,7 @@ class Report:
             flown = ("without", "with") if name == WITH_RTA else ("with", "without")
             item = record.item
             own = record.results
-            trained = "with, unpunished" if item.kind == "unpunished" else flown[0]
+            trained = "with, no punishment" if item.kind == "rta_no_punishment" else flown[0]
             narrowed = any(word in item.words for word in CERTIFIED_STARTS.get(item.task, ()))
             starts = "narrowed" if narrowed else "the task's"
             for label, results in zip(flown, (own, further), strict=True):

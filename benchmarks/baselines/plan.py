@@ -19,7 +19,7 @@ class Kind(NamedTuple):
 
 
 KINDS: Mapping[str, Kind] = {
-    "features": Kind(
+    "engineered_features": Kind(
         (),
         (
             "the recipe of the task, with continuous actions. The agent computes features from the"
@@ -27,8 +27,8 @@ KINDS: Mapping[str, Kind] = {
             " and training episodes end after 300 steps."
         ),
     ),
-    "plain": Kind(
-        ("preset=plain",),
+    "observation_only": Kind(
+        ("preset=observation_only",),
         (
             "the paper's observation straight into the networks. In rejoin3d training episodes end"
             " after 300 steps."
@@ -42,27 +42,29 @@ KINDS: Mapping[str, Kind] = {
             " in the curves of every seed."
         ),
     ),
-    "quick": Kind(
-        ("preset=quick",),
+    "shortest_time": Kind(
+        ("preset=shortest_time",),
         "fewer epochs and steps, for a result soon. An evaluation has 100 episodes a seed.",
     ),
     "discrete": Kind(
-        ("actions=discrete",), "the recipe of `features` with the paper's discrete actions."
+        ("actions=discrete",),
+        "the recipe of `engineered_features` with the paper's discrete actions.",
     ),
-    "plain_discrete": Kind(
-        ("preset=plain", "actions=discrete"), "the recipe of `plain` with discrete actions."
+    "observation_only_discrete": Kind(
+        ("preset=observation_only", "actions=discrete"),
+        "the recipe of `observation_only` with discrete actions.",
     ),
     "rta": Kind(
         ("rta=default",),
         (
-            "the recipe of `features` with run time assurance during training. Each"
+            "the recipe of `engineered_features` with run time assurance during training. Each"
             " intervention costs a little. Oriented docking starts at up to 99 % of the speed"
             " limit, because nothing can keep some faster starts safe."
         ),
     ),
-    "unpunished": Kind(
-        ("rta=default", "rta_training=unpunished"),
-        "the recipe of `rta`, but interventions cost nothing (`rta_training=unpunished`).",
+    "rta_no_punishment": Kind(
+        ("rta=default", "rta_training=no_punishment"),
+        "the recipe of `rta`, but interventions cost nothing (`rta_training=no_punishment`).",
     ),
 }
 """The ways to train, by the name that the page uses."""
@@ -89,7 +91,7 @@ WITH_RTA = "filtered"
 WITHOUT_RTA = "unfiltered"
 
 BEST = "best.npz"
-"""The best policy of a run of the `features` kind, see `best_seed`."""
+"""The best policy of a run of the `engineered_features` kind, see `best_seed`."""
 
 SHIPPED = "shipped"
 """The evaluation of the best policy alone.
@@ -117,9 +119,9 @@ class Item(NamedTuple):
     @property
     def evaluations(self) -> dict[str, list[str]]:
         """The words after `python -m jaxsafe.evaluate run=…`, by the name of the evaluation."""
-        if self.kind == "features":
+        if self.kind == "engineered_features":
             return {**STARTS[self.task], WITH_RTA: ["rta=default"], SHIPPED: ["seed=1"]}
-        return {WITHOUT_RTA: ["rta=none"]} if self.kind in ("rta", "unpunished") else {}
+        return {WITHOUT_RTA: ["rta=none"]} if self.kind in ("rta", "rta_no_punishment") else {}
 
     def subject(self, run: Path, name: str) -> Path:
         """Return what an evaluation evaluates: every policy of a run, or the best one."""

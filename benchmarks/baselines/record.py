@@ -47,7 +47,7 @@ class Record(NamedTuple):
 
 def keep(item: Item, run: Path, files: Path, command: str) -> None:
     """Write what the page needs of a run, with its pictures, into the directory beside the page."""
-    for figure in ("trajectories", "speed_distance") if item.kind == "features" else ():
+    for figure in ("trajectories", "speed_distance") if item.kind == "engineered_features" else ():
         if (run / "figures" / f"{figure}.png").exists():
             _copy(run / "figures" / f"{figure}.png", files / f"{item.task}_{figure}.png")
     if (run / "film" / FILM_FILE).exists():

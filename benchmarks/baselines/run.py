@@ -56,7 +56,7 @@ def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
         ConfigError: an evaluation failed.
         KeyboardInterrupt: the user stopped it.
     """
-    if item.kind == "features" and not (run / BEST).exists():
+    if item.kind == "engineered_features" and not (run / BEST).exists():
         best = best_seed(read_results(run / "results.json"))
         write_bytes(run / BEST, (run / "policy" / f"seed_{best}.npz").read_bytes())
     for name, options in item.evaluations.items():

@@ -50,14 +50,16 @@ def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[list[str]]:
     monkeypatch.setattr(running, "_call", call)
     few = {"heavy": ["env.deputy.mass=24"], SHIPPED: ["seed=1"]}
     monkeypatch.setattr(
-        Item, "evaluations", property(lambda item: few if item.kind == "features" else {})
+        Item,
+        "evaluations",
+        property(lambda item: few if item.kind == "engineered_features" else {}),
     )
     monkeypatch.chdir(tmp_path)
     return made
 
 
 def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str]]) -> None:
-    words = ["tasks=docking2d", "kinds=features", "policies=best", *REST]
+    words = ["tasks=docking2d", "kinds=engineered_features", "policies=best", *REST]
     assert command.main(words) == 0
     page = Path("report/baselines.md").read_text()
     assert f"`python benchmarks/baselines {shlex.join(words)}`" in page
@@ -70,11 +72,11 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
         "The best policies",
     ):
         assert f"## {section}" in page
-    results = json.loads(Path("runs/report/docking2d-features/results.json").read_text())
+    results = json.loads(Path("runs/report/docking2d-engineered_features/results.json").read_text())
     rate = results["evaluation"]["deterministic"]["episode_safety_violation_rate"]["mean"]
-    assert f"| docking2d | features | deterministic | {100 * rate:.2f} [" in page
+    assert f"| docking2d | engineered_features | deterministic | {100 * rate:.2f} [" in page
     best = best_seed(results)
-    run = Path("runs/report/docking2d-features")
+    run = Path("runs/report/docking2d-engineered_features")
     assert (
         Path("best/docking2d.npz").read_bytes()
         == (run / "policy" / f"seed_{best}.npz").read_bytes()
@@ -84,7 +86,7 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
     assert f"| docking2d | {best} | {100 * rate['mean']:.2f} % |" in page
     assert len(rate["per_seed"]) == 1
     assert (
-        f"python -m jaxsafe.evaluate run=runs/docking2d-features/policy/seed_{best}.npz"
+        f"python -m jaxsafe.evaluate run=runs/docking2d-engineered_features/policy/seed_{best}.npz"
         f" episodes=6 seed=1\n"
     ) in page
     for file in (
@@ -96,7 +98,7 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
     ):
         assert Path("report/baselines", file).stat().st_size > 1000
         assert f"(baselines/{file})" in page
-    with open("report/baselines/docking2d-features.csv") as file:
+    with open("report/baselines/docking2d-engineered_features.csv") as file:
         rows = list(csv.DictReader(file))
     assert [(int(row["step"]), int(row["seed"])) for row in rows] == [
         (64 * (i + 1), s) for i in range(20) for s in range(3)
@@ -112,9 +114,9 @@ def test_a_report_in_parts_makes_the_page_of_one(
     calls: list[list[str]], capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["tasks=docking2d", "film=false", *REST]
-    assert command.main([*words, "kinds=[features,plain]"]) == 0
+    assert command.main([*words, "kinds=[engineered_features,observation_only]"]) == 0
     whole = Path("report/baselines.md").read_text()
-    for kind in ("plain", "features"):
+    for kind in ("observation_only", "engineered_features"):
         assert command.main([*words, f"kinds={kind}", "out=parts"]) == 0
     parts = Path("parts/baselines.md").read_text()
     assert [line for line in whole.splitlines() if "|" in line] == [
@@ -123,38 +125,42 @@ def test_a_report_in_parts_makes_the_page_of_one(
     assert parts.count("- `python benchmarks/baselines") == 2
     assert sum(module == "jaxsafe.train" for module, *_ in calls) == 2
 
-    record = Path("parts/baselines/docking2d-features.json")
+    record = Path("parts/baselines/docking2d-engineered_features.json")
     content = json.loads(record.read_text())
     content["options"]["training"]["ppo"]["gamma"] = 0.5
     record.write_text(json.dumps(content))
     capsys.readouterr()
-    assert command.main([*words, "kinds=plain", "out=parts"]) == 0
+    assert command.main([*words, "kinds=observation_only", "out=parts"]) == 0
     assert (
         f"{record}: was made with other options and is left out; report it again"
         in capsys.readouterr().out
     )
-    assert "features |" not in Path("parts/baselines.md").read_text()
+    assert "engineered_features |" not in Path("parts/baselines.md").read_text()
 
 
 @pytest.mark.thorough
 def test_an_evaluation_with_other_options_than_today_s_is_left_out_and_made_anew(
     calls: list[list[str]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["tasks=docking2d", "kinds=features", "film=false", *REST]
+    words = ["tasks=docking2d", "kinds=engineered_features", "film=false", *REST]
     assert command.main(words) == 0
     assert "| docking2d | heavy |" in Path("report/baselines.md").read_text()
     heavier = {"heavy": ["env.deputy.mass=30"], SHIPPED: ["seed=1"]}
     monkeypatch.setattr(
-        Item, "evaluations", property(lambda item: heavier if item.kind == "features" else {})
+        Item,
+        "evaluations",
+        property(lambda item: heavier if item.kind == "engineered_features" else {}),
     )
-    records, old = kept(plan(["docking2d"], ["features"], REST), Path("report/baselines"))
+    records, old = kept(
+        plan(["docking2d"], ["engineered_features"], REST), Path("report/baselines")
+    )
     assert list(records[0].evaluations) == [SHIPPED]
     assert old == [
-        "report/baselines/docking2d-features.json: its evaluation 'heavy' was made with other"
-        " options and is left out; report it again"
+        "report/baselines/docking2d-engineered_features.json: its evaluation 'heavy' was made with"
+        " other options and is left out; report it again"
     ]
     assert command.main(words) == 0
-    assert calls[-1][:2] == ["jaxsafe.evaluate", "run=runs/report/docking2d-features"]
+    assert calls[-1][:2] == ["jaxsafe.evaluate", "run=runs/report/docking2d-engineered_features"]
     assert "env.deputy.mass=30" in calls[-1]
     assert len(calls) == 4
     assert "| docking2d | heavy |" in Path("report/baselines.md").read_text()
@@ -163,13 +169,13 @@ def test_an_evaluation_with_other_options_than_today_s_is_left_out_and_made_anew
 def test_a_record_is_of_the_commit_that_trained_it(
     calls: list[list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ["tasks=docking2d", "kinds=plain", *REST]
+    words = ["tasks=docking2d", "kinds=observation_only", *REST]
     for now, trained in (("first", "first"), ("second", "first")):
         monkeypatch.setattr(run_directory, "commit", lambda now=now: now)
         assert command.main(words) == 0
         assert (
             f"`python benchmarks/baselines {shlex.join(words)}` on commit {trained}:"
-            f" docking2d-plain"
+            f" docking2d-observation_only"
         ) in (Path("report/baselines.md").read_text())
     assert len(calls) == 1
 
@@ -185,20 +191,20 @@ def test_the_page_of_the_project_is_that_of_its_records_and_of_todays_recipes() 
 
 @pytest.mark.thorough
 def test_an_interrupted_report_goes_on(calls: list[list[str]], whole: Path) -> None:
-    run = Path("runs/report/docking2d-features")
+    run = Path("runs/report/docking2d-engineered_features")
     assert train.main([*TINY, f"out={run}"]) == 0
     (run / "results.json").unlink()
     (run / "evaluations" / "heavy").mkdir(parents=True)
     (run / "evaluations" / "heavy" / "eval.jsonl").write_text("")  # left by a run that was killed
-    assert command.main(["tasks=docking2d", "kinds=features", "film=false", *REST]) == 0
+    assert command.main(["tasks=docking2d", "kinds=engineered_features", "film=false", *REST]) == 0
     assert calls[0] == ["jaxsafe.train", f"resume={run}"]
     assert len(calls) == 3
 
 
 @pytest.mark.thorough
 def test_a_report_killed_while_its_figures_were_drawn_draws_them(calls: list[list[str]]) -> None:
-    run = Path("runs/report/docking2d-features")
-    words = ["tasks=docking2d", "kinds=features", "film=false", *REST]
+    run = Path("runs/report/docking2d-engineered_features")
+    words = ["tasks=docking2d", "kinds=engineered_features", "film=false", *REST]
     assert train.main([*TINY, f"out={run}"]) == 0
     pictures = {file.name: file.read_bytes() for file in (run / "figures").iterdir()}
     (run / "figures").rename(run / "figures.part")
@@ -237,7 +243,7 @@ def test_a_report_killed_while_its_figures_were_drawn_draws_them(calls: list[lis
 def test_a_broken_record_is_left_out_with_a_line_that_says_so(
     calls: list[list[str]], whole: Path, file: str, old: str, new: str, message: str
 ) -> None:
-    [item] = plan(["docking2d"], ["plain"], REST)
+    [item] = plan(["docking2d"], ["observation_only"], REST)
     shutil.copytree(whole, "run")
     keep(item, Path("run"), Path("report"), "python benchmarks/baselines")
     assert len(kept([item], Path("report"))[0]) == 1
@@ -254,7 +260,7 @@ def test_a_broken_record_is_left_out_with_a_line_that_says_so(
 
 
 def test_a_run_whose_configuration_is_broken_is_told(calls: list[list[str]]) -> None:
-    run = Path("runs/report/docking2d-plain")
+    run = Path("runs/report/docking2d-observation_only")
     run.mkdir(parents=True)
     for text in (
         "{}",
@@ -263,8 +269,8 @@ def test_a_run_whose_configuration_is_broken_is_told(calls: list[list[str]]) -> 
         "env: x\ntraining: {}\nenvironment: []",
     ):
         (run / "config.yaml").write_text(text)
-        with pytest.raises(ConfigError, match=r"docking2d-plain/config\.yaml: "):
-            command.main(["tasks=docking2d", "kinds=plain", *REST])
+        with pytest.raises(ConfigError, match=r"docking2d-observation_only/config\.yaml: "):
+            command.main(["tasks=docking2d", "kinds=observation_only", *REST])
 
 
 def test_what_is_not_known_is_a_dash_on_the_page_and_a_seed_without_success_failed(
@@ -299,9 +305,9 @@ def test_a_termination_of_the_report_is_passed_on() -> None:
 
 
 def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:
-    assert train.main([*TINY, "out=runs/report/docking2d-features"]) == 0
+    assert train.main([*TINY, "out=runs/report/docking2d-engineered_features"]) == 0
     with pytest.raises(ConfigError, match=r"runs: .* was trained with other options; remove it"):
-        command.main(["tasks=docking2d", "kinds=features", *REST, "ppo.gamma=0.9"])
+        command.main(["tasks=docking2d", "kinds=engineered_features", *REST, "ppo.gamma=0.9"])
     assert not calls
 
 
@@ -310,9 +316,10 @@ def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:
     [
         (["tasks=docking4d"], "tasks: found 'docking4d'; choose from rejoin2d"),
         (
-            ["kinds=[features,plane]"],
-            "kinds: found 'plane'; choose from features, plain, many_envs, quick, discrete,"
-            " plain_discrete, rta, unpunished. Did you mean 'plain'?",
+            ["kinds=[engineered_features,plane]"],
+            "kinds: found 'plane'; choose from engineered_features, observation_only,"
+            " many_envs, shortest_time, discrete, observation_only_discrete, rta,"
+            " rta_no_punishment.",
         ),
         (["tasks=[]"], "tasks: expected at least one of rejoin2d"),
         (["film=gif"], "film: expected true or false, found 'gif'"),
@@ -398,7 +405,7 @@ def test_the_best_policy_succeeds_most_then_violates_least_then_has_the_highest_
 @pytest.mark.thorough
 def test_trainings_with_a_filter_start_where_it_promises_safety() -> None:
     begin = jax.jit(reset_batch, static_argnums=2)
-    for item in plan(["docking2d_oriented"], ["rta", "unpunished"], ["seeds=2"]):
+    for item in plan(["docking2d_oriented"], ["rta", "rta_no_punishment"], ["seeds=2"]):
         [(_, env, _)] = resolve_all(Arguments.parse(item.words).options)
         [deputy] = [platform for platform in env.platforms if platform.name == "deputy"]
         [share] = [start.share for start in deputy.start if start.name == "velocity"]

@@ -29,10 +29,10 @@ from jaxsafe.commands import tune as tune
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.evaluate.evaluator import Evaluator
 from jaxsafe.schema import yaml12
-from jaxsafe.schema.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError, ConfigWarning
 from jaxsafe.storage.text_table import columns
 from jaxsafe.train.host import options as config_module
-from jaxsafe.train.host.options import resolve
+from jaxsafe.train.host.options import RENAMED, resolve
 from jaxsafe.train.host.session import Training
 from jaxsafe.tune import batched_training
 
@@ -87,9 +87,9 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
         (["env=docking3d", "seeds=2", "seeds=3"], "seeds: given twice"),
         (["env=docking3d", "seeds"], "argument 'seeds': expected key=value"),
         (
-            ["env=docking3d", "preset=featurs"],
-            "preset: unknown preset 'featurs'; choose from features, plain, many_envs, quick."
-            " Did you mean 'features'?",
+            ["env=docking3d", "preset=engineered_featurs"],
+            "preset: unknown preset 'engineered_featurs'; choose from engineered_features,"
+            " observation_only, many_envs, shortest_time. Did you mean 'engineered_features'?",
         ),
         (["env=docking3d", "ppo.gama=0.9"], "ppo.gama: unknown field 'gama'"),
         (["env=docking3d", "ppo.gamma=1.5"], "ppo.gamma: expected a number in [0, 1], found 1.5"),
@@ -173,7 +173,7 @@ def test_lists_of_a_training_need_no_brackets(fails: Callable[..., str]) -> None
     config, env, _ = resolve({"env": "docking2d", "agent.actor.hidden": "32,16"})
     assert config.agent.actor.hidden == (32, 16)  # pyright: ignore[reportAttributeAccessIssue]
     words = {"env.observation": "velocity,position", "env.deputy.start.position.distance": "9,11"}
-    _, env, _ = resolve({"env": "docking2d", "preset": "plain", **words})
+    _, env, _ = resolve({"env": "docking2d", "preset": "observation_only", **words})
     assert [part.name for part in env.observation] == ["velocity", "position"]
     assert "steps: expected a whole number ≥ 1, found '100,000'" in fails(
         train, "docking2d", "steps=100,000"
@@ -768,7 +768,9 @@ def test_a_command_is_called_by_its_name(
         assert callable(importlib.import_module(f"jaxsafe.commands.{name}").command)
 
 
-def test_a_preset_is_known_by_the_name_that_it_had_before() -> None:
-    config, _, _ = resolve({"env": "docking2d", "preset": "lanes"})
-    assert config.preset == "many_envs"
-    assert config.ppo.num_envs == 4096
+def test_renamed_values_still_work_and_their_new_names_are_told() -> None:
+    for option, names in RENAMED.items():
+        for old, new in names.items():
+            with pytest.warns(ConfigWarning, match=f"^{option}: {old} is now called {new}$"):
+                config, _, _ = resolve({"env": "docking2d", "rta": "default", option: old})
+            assert getattr(config, option) == new

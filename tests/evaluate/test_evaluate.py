@@ -48,7 +48,7 @@ def test_a_policy_file_gives_the_results_of_its_seed_and_a_film(
     assert main([f"run={file}", "episodes=6", "deterministic=true", "render=gif"]) == 0
     place = tmp_path / "evaluations" / "seed_2" / "last-6-seed0"
     told = capsys.readouterr().out
-    assert "docking2d, preset features, ppo, rta none, 1 seed, 1,280 steps each" in told
+    assert "docking2d, preset engineered_features, ppo, rta none, 1 seed, 1,280 steps each" in told
     assert f"films: {(place / 'episode_deterministic.gif').relative_to(tmp_path)}" in told
     results = json.loads((place / "results.json").read_text())
     own = json.loads((whole / "results.json").read_text())["evaluation"]["deterministic"]

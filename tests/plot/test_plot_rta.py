@@ -130,7 +130,11 @@ def test_only_a_run_with_a_filter_draws_interventions(whole: Path, tmp_path: Pat
     run = tmp_path / "run"
     run.mkdir()
     shutil.copy(whole / "progress.jsonl", run)
-    content = {"env": "docking2d", "training": {"preset": "features"}, "environment": describe(env)}
+    content = {
+        "env": "docking2d",
+        "training": {"preset": "engineered_features"},
+        "environment": describe(env),
+    }
     (run / "config.yaml").write_text(yaml12.write(content))
     common = {
         "step": 1280,

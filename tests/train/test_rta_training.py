@@ -76,10 +76,10 @@ def test_an_intervention_costs_what_its_term_says() -> None:
 
 def test_interventions_are_punished_where_there_is_a_filter_and_nothing_else_is_asked() -> None:
     for words, told, punished in [
-        (["rta=default"], "punished", True),
-        (["rta=default", "rta_training=punished"], "punished", True),
-        (["rta=default", "rta_training=unpunished"], "unpunished", False),
-        (["rta=default", "rta_training=corrected"], "corrected", False),
+        (["rta=default"], "punishment", True),
+        (["rta=default", "rta_training=punishment"], "punishment", True),
+        (["rta=default", "rta_training=no_punishment"], "no_punishment", False),
+        (["rta=default", "rta_training=corrected_action"], "corrected_action", False),
         ([], None, False),
     ]:
         config, env = resolved(*words)
@@ -91,16 +91,16 @@ def test_interventions_are_punished_where_there_is_a_filter_and_nothing_else_is_
     ("words", "message"),
     [
         (
-            ["rta_training=unpunished"],
-            r"^rta_training: 'unpunished' needs run time assurance, for instance rta=default",
+            ["rta_training=no_punishment"],
+            r"^rta_training: 'no_punishment' needs run time assurance, for instance rta=default",
         ),
         (
-            ["rta_training=punished"],
-            r"^rta_training: 'punished' needs run time assurance, for instance rta=default",
+            ["rta_training=punishment"],
+            r"^rta_training: 'punishment' needs run time assurance, for instance rta=default",
         ),
-        (["rta=default", "rta_training=punishd"], r"^rta_training: .*Did you mean 'punished'"),
+        (["rta=default", "rta_training=punishd"], r"^rta_training: .*Did you mean 'punishment'"),
         (
-            ["rta=default", "rta_training=corrected", "actions=discrete"],
+            ["rta=default", "rta_training=corrected_action", "actions=discrete"],
             r"^ppo\.learns_from: .*use actions=continuous",
         ),
         (["rta=released"], r"^rta: docking2d has no preset 'released'"),
@@ -112,7 +112,7 @@ def test_what_does_not_go_together_is_told(words: list[str], message: str) -> No
 
 
 def test_corrected_is_a_setting_of_ppo() -> None:
-    config, env = resolved("rta=default", "rta_training=corrected")
+    config, env = resolved("rta=default", "rta_training=corrected_action")
     assert config.ppo.learns_from == "actual"
     assert env.rta is not None
     assert resolved()[0].ppo.learns_from == "desired"

@@ -388,7 +388,7 @@ def test_a_policy_file_acts_like_the_trained_network(whole: Path) -> None:
     expected, _ = agent.act(env, trained, jax.random.key(1), timestep.observation, True)
     # The two are not compiled as one program.
     np.testing.assert_allclose(action, expected, rtol=1e-6)
-    assert about == {"env": "docking2d", "preset": "features", "seed": 1, "step": 1280}
+    assert about == {"env": "docking2d", "preset": "engineered_features", "seed": 1, "step": 1280}
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ The options of the command line are resolved over a recipe from `configs/`, and 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,7 +20,7 @@ from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import Component, Range, normalise
 from jaxsafe.schema.convert import to_value
 from jaxsafe.schema.dotted_paths import set_path
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, ConfigWarning, nearest, show
 from jaxsafe.train.host.sinks import LIBRARIES, library
 from jaxsafe.train.host.warm_start import agent_options
 from jaxsafe.train.ppo import MAX_COUNT, PPO
@@ -34,8 +35,20 @@ Steps = Annotated[int, Range(1, largest=10**15)]
 Double precision counts as far as the largest one.
 """
 
-OLD_PRESETS = {"lanes": "many_envs"}
-"""Presets that had another name, by that name."""
+RENAMED = {
+    "preset": {
+        "features": "engineered_features",
+        "plain": "observation_only",
+        "lanes": "many_envs",
+        "quick": "shortest_time",
+    },
+    "rta_training": {
+        "punished": "punishment",
+        "unpunished": "no_punishment",
+        "corrected": "corrected_action",
+    },
+}
+"""Today's names of values by option and earlier name. Commands and old runs may use both."""
 
 MAX_SEEDS = 100_000
 WORTHWHILE = 128
@@ -48,8 +61,8 @@ Fewer samples take less time than exchanging their gradients.
 class TrainConfig(Component):
     """Options of `python -m jaxsafe.train`. Steps and episodes are counted for each seed."""
 
-    preset: str = "features"
-    """The recipe of the task: features, plain, many_envs or quick.
+    preset: str = "engineered_features"
+    """The recipe of the task: engineered_features, observation_only, many_envs or shortest_time.
 
     Its values take the place of the defaults of other options.
     """
@@ -77,11 +90,11 @@ class TrainConfig(Component):
 
     By default it is what the environment says.
     """
-    rta_training: Literal["punished", "unpunished", "corrected"] | None = None
+    rta_training: Literal["punishment", "no_punishment", "corrected_action"] | None = None
     """How training treats interventions of run time assurance.
 
-    `punished` adds a reward term for them, and `corrected` learns from the control that acted. By
-    default it is `punished`, where there is a filter.
+    `punishment` adds a reward term for them, and `corrected_action` learns from the control that
+    acted. By default it is `punishment`, where there is a filter.
     """
     start_from: str | None = None
     """The run directory, policy file or `pretrained/TASK` whose networks are trained on.
@@ -203,13 +216,16 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     for sink in ("wandb", "mlflow"):
         if isinstance(arguments.options.get(sink), bool):
             arguments.options[sink] = "jaxsafe" if arguments.options[sink] else None
+    if "rta_training" in arguments.options:
+        told = arguments.options["rta_training"]
+        arguments.options["rta_training"] = current_name("rta_training", told)
     config = TrainConfig()
     # This comes first, so that a misspelt option is told before a slow start.
     for path, value in arguments.options.items():
         config = set_path(config, path, value, to_value)
     env = make(task, actions=config.actions, variant=config.variant, rta=config.rta)
-    told = config.rta_training or ("punished" if env.rta is not None else None)
-    if told == "punished" and not any(isinstance(term, Intervention) for term in env.reward):
+    told = config.rta_training or ("punishment" if env.rta is not None else None)
+    if told == "punishment" and not any(isinstance(term, Intervention) for term in env.reward):
         env = env.replace(reward=(*env.reward, normalise(Intervention(name="intervention"))))
     env = override(env, overrides, place="env")
     require_success(env)
@@ -221,7 +237,7 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     for path, value in {**arguments.options, "preset": settings["preset"]}.items():
         config = set_path(config, path, value, to_value)
     config = config.replace(rta_training=told)
-    if told == "corrected":
+    if told == "corrected_action":
         config = set_path(config, "ppo.learns_from", "actual", to_value)
     config = _with_algorithm(config, arguments.options)
     _check_rta(config, env)
@@ -343,21 +359,19 @@ def _check_rta(config: TrainConfig, env: Environment) -> None:
 def recipe(task: str, preset: str | None) -> dict[str, Any]:
     """Return settings by dotted path from the recipe of a task, or from that in its file.
 
-    For an environment without a recipe there is only the preset `plain`.
+    For an environment without a recipe there is only the preset `observation_only`.
 
     Args:
         task: the name of the task, or the file of an environment.
-        preset: a preset of the recipe. None stands for `features`, for `plain` if there is no
-            `features`, and for the first one if there is neither.
+        preset: a preset of the recipe. None stands for the first one.
 
     Raises:
         ConfigError: there is no such task or file, or the recipe does not have the preset.
     """
-    known = recipes(task) or {"plain": {}}
-    first = next((name for name in ("features", "plain") if name in known), next(iter(known)))
-    name = first if preset is None else preset
-    if name not in known:
-        name = OLD_PRESETS.get(name, name)
+    known = recipes(task) or {"observation_only": {}}
+    name = next(iter(known)) if preset is None else preset
+    if name not in known and RENAMED["preset"].get(name) in known:
+        name = current_name("preset", name)
     if name not in known:
         raise ConfigError(
             f"preset: unknown preset {show(name)}; choose from {nearest(name, known)}"
@@ -381,6 +395,14 @@ def recipe_options() -> set[str]:
     """Return the options for which a recipe of some task has a value, by dotted path."""
     presets = [settings for task in TASKS for settings in recipes(task).values()]
     return {"preset", *(path for settings in presets for path in flatten(settings or {}))}
+
+
+def current_name(option: str, value: Any) -> Any:
+    """Return today's name of the value of an option, and warn if it is another one."""
+    name = RENAMED[option].get(value, value) if isinstance(value, str) else value
+    if name != value:
+        warnings.warn(f"{option}: {value} is now called {name}", ConfigWarning, stacklevel=2)
+    return name
 
 
 def configs() -> Path:

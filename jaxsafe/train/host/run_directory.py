@@ -21,7 +21,7 @@ from jaxsafe.schema.errors import ConfigError, nearest
 from jaxsafe.schema.user_modules import import_modules, modules
 from jaxsafe.storage.files import write_text
 from jaxsafe.storage.provenance import commit, versions
-from jaxsafe.train.host.options import TrainConfig
+from jaxsafe.train.host.options import RENAMED, TrainConfig
 from jaxsafe.train.host.run_config import read_content
 
 
@@ -151,6 +151,9 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
     training = content["training"]
     if "agent" in training:
         training = {**training, "agent": with_networks(training["agent"])}
+    old_names = RENAMED["rta_training"]
+    if training.get("rta_training") in old_names:
+        training = {**training, "rta_training": old_names[training["rta_training"]]}
     config = normalise(to_component(training, TrainConfig, f"{place}training"))
     env = jaxsafe.config.from_data(content["environment"], f"{place}environment")
     return config, env, str(content["env"])
