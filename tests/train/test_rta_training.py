@@ -22,6 +22,7 @@ from jaxsafe.commands.train import main as train
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.options import TrainConfig, resolve
 from jaxsafe.train.ppo import PPO, Transition, collect, init
 
@@ -166,3 +167,12 @@ def test_an_evaluation_switches_the_filter(
     assert results(tmp_path / "other") != results(run)
     with pytest.raises(ConfigError, match=r"^rta: docking2d has no preset 'of'"):
         evaluate([f"run={run}", "rta=of"])
+
+
+def test_a_run_of_an_older_version_is_read_by_the_new_names(tmp_path: Path) -> None:
+    config, env = resolved("rta=default", f"out={tmp_path / 'run'}")
+    run = run_directory.create(config, env, "docking2d")
+    file = run / "config.yaml"
+    file.write_text(file.read_text().replace("rta_training: punishment", "rta_training: punished"))
+    assert "punished" in file.read_text()
+    assert run_directory.read(run, "run")[0].rta_training == "punishment"
