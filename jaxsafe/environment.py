@@ -9,10 +9,11 @@ Nothing here knows a task. An `Environment` is the pytree of its own parameters,
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import functools
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -26,9 +27,10 @@ from jaxsafe.processors.status import Status
 from jaxsafe.processors.terminal import Terminal
 from jaxsafe.rta.filter import RTA
 from jaxsafe.schema.component import Component, Range, Unit
+from jaxsafe.schema.describe import Described, Rows, brief, unbroken
 from jaxsafe.schema.dotted_paths import references, set_path
 from jaxsafe.schema.errors import ConfigError, nearest, part, show
-from jaxsafe.simulation.controllers import Actuator
+from jaxsafe.simulation.controllers import Actuator, AgentController
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.initializers import uniform
 from jaxsafe.simulation.platform import Platform, placed
@@ -44,6 +46,7 @@ from jaxsafe.types import (
     Sim,
     State,
     TimeStep,
+    units,
 )
 
 Parameters = Mapping[str, Float[Array, ""]]
@@ -56,7 +59,7 @@ DIVERGED = "diverged"
 """The outcome of an episode whose state is not finite. It comes last in `Environment.outcomes`."""
 
 
-class Environment(Component):
+class Environment(Component, Described):
     """A task: platforms and regions, and the processors that give their state a meaning.
 
     `randomize` names numbers of the environment by dotted path, each with the interval from which
@@ -64,6 +67,8 @@ class Environment(Component):
     """
 
     shorthand: ClassVar[str | None] = "platforms"
+    _task: ClassVar[str] = ""
+    __repr__ = Described.__repr__
 
     agent: PlatformName
     dt: Annotated[Number, Unit("s"), Range(0.0, open_low=True, smallest=1e-6, largest=1e5)] = 1.0
@@ -86,6 +91,11 @@ class Environment(Component):
     def step(self, state: State, action: Array) -> tuple[State, TimeStep]:
         """Advance one time step: `jaxsafe.step(env, state, action)`."""
         return step(self, state, action)
+
+    @property
+    def task(self) -> str:
+        """The name under which it was made, for texts. Transformations of JAX drop it."""
+        return self._task
 
     def platform(self, name: str) -> Platform:
         """Return a platform by name."""
@@ -151,6 +161,40 @@ class Environment(Component):
         """The number of elements of the observation."""
         return len(self.observation_names)
 
+    def named(self, task: str) -> Self:
+        """Return this environment with the name of a task."""
+        env = copy.copy(self)
+        object.__setattr__(env, "_task", task)
+        return env
+
+    def replace(self, **changes: Any) -> Self:
+        env = super().replace(**changes)
+        object.__setattr__(env, "_task", self._task)
+        return env
+
+    def _heading(self) -> str:
+        return f"Environment {self.task}".rstrip()
+
+    def _rows(self) -> Rows:
+        others = [platform.name for platform in self.platforms if platform.name != self.agent]
+        beside = f" beside {', '.join(others)}" if others else ""
+        yield "agent", f"{self.agent}{beside}, {brief(self.dt)} s a step"
+        try:
+            names = self.observation_names
+        except Exception:  # in a transformation of JAX, leaves may be no numbers
+            names = [item.name for item in self.observation]
+        yield "observation", f"{len(names)} numbers: {', '.join(names)}"
+        yield "action", action_text(self)
+        yield "reward", ", ".join(term.name for term in self.reward)
+        cut = [
+            f"{name} ({ends})" if ends == "truncated" else name for name, ends in self._ends.items()
+        ]
+        yield "ends", ", ".join(cut)
+        yield "constraints", ", ".join(constraint.name for constraint in self.constraints)
+        yield "filter", filter_name(self)
+        for path, interval in self.randomize.items():
+            yield "random", f"{path} in {brief(interval)}"
+
     @property
     def _ends(self) -> dict[str, str]:
         """How an episode ends, `terminated` or `truncated`, by outcome."""
@@ -171,6 +215,73 @@ def require_success(env: Environment) -> None:
             f"terminal: no outcome is called {SUCCESS!r}, so nothing would count as one; "
             f"call the goal so, among {found}"
         )
+
+
+def filter_name(env: Environment) -> str:
+    """Return the kind of run time assurance that acts in an environment, or `none`."""
+    return "none" if env.rta is None else env.rta.type_name or type(env.rta).__name__
+
+
+def length_unit(env: Environment) -> str | None:
+    """Return the unit of positions, m or ft, or None if the platform does not say."""
+    return units(type(env.agent_platform.rest())).get("position")
+
+
+def control_unit(name: str, length: str | None) -> str | None:
+    """Return the unit of a control by the words in its name, or None if it is not known.
+
+    Args:
+        name: the name of the control.
+        length: the unit of lengths.
+    """
+    units_by_word = {
+        "thrust": "N",
+        "rate": "rad/s",
+        "attitude_acceleration": "rad/s²",
+        "acceleration": f"{length}/s²",
+    }
+    return next((unit for word, unit in units_by_word.items() if word in name), None)
+
+
+def action_bounds(env: Environment) -> tuple[list[Any], list[Any]]:
+    """Return the lowest and the highest value of each element of a continuous action.
+
+    They are −1 and 1 where the actuator rescales, and else the actuator's own limits in physical
+    units. If episodes draw a limit at random, the widest that can be drawn is returned.
+    """
+    if not acts_in_physical_units(env):
+        return [-1.0] * env.action_size, [1.0] * env.action_size
+    pairs = list(zip(*map(_listed_actuators, extremes(env)), strict=True))
+    low = [-1.0 if a.rescale else jnp.minimum(a.low, b.low) for a, b in pairs]
+    high = [1.0 if a.rescale else jnp.maximum(a.high, b.high) for a, b in pairs]
+    return low, high
+
+
+def acts_in_physical_units(env: Environment) -> bool:
+    """Return whether some actuator does not rescale its element of a continuous action."""
+    return not all(actuator.rescale for actuator in _listed_actuators(env))
+
+
+def _listed_actuators(env: Environment) -> tuple[Actuator, ...]:
+    controller = env.agent_platform.controller
+    return controller.actuators if isinstance(controller, AgentController) else ()
+
+
+def action_text(env: Environment) -> str:
+    """Return what an action is: its kind, and each control that it sets with bounds and unit."""
+    points = env.num_action_points
+    parts = []
+    for index, name in enumerate(env.action_names):
+        text = f"{name}, {points[index]} points" if points else name
+        if env.actuators:
+            actuator = env.actuators[index]
+            text += f" from {brief(actuator.low)} to {brief(actuator.high)}"
+            text += f" {control_unit(name, length_unit(env)) or ''}"
+        parts.append(unbroken(text))
+    kind = (
+        "indices" if points else "numbers" if acts_in_physical_units(env) else "numbers in [-1, 1]"
+    )
+    return f"{env.action_size} {kind}: {'; '.join(parts)}"
 
 
 def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:

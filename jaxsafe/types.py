@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Self, dataclass_transform
 
 import jax
@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.schema.component import Range, Refers, Unit
+from jaxsafe.schema.describe import Described, Rows, brief, unbroken
 
 Key = Array
 """A typed PRNG key, as made by `jax.random.key`."""
@@ -73,20 +74,63 @@ ParameterPath = Annotated[str, Refers("parameters")]
 
 
 @dataclass_transform(frozen_default=True)
-class Record:
+class Record(Described):
     """Base class of what components compute.
 
-    A record is a frozen dataclass in which every field is a leaf or a subtree.
+    A record is a frozen dataclass in which every field is a leaf or a subtree. It prints a line for
+    each field, with the numbers of small arrays and the types and shapes of others.
     """
 
     def __init_subclass__(cls) -> None:
-        dataclasses.dataclass(frozen=True)(cls)
+        dataclasses.dataclass(frozen=True, repr=False)(cls)
         names = list(cls.__dataclass_fields__)  # type: ignore[attr-defined]
         jax.tree_util.register_dataclass(cls, data_fields=names, meta_fields=[])
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed."""
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]
+
+    def _rows(self) -> Rows:
+        return _lines(self, "")
+
+
+def _lines(record: Record, place: str) -> Iterator[tuple[str, str]]:
+    """Yield a path and a text for each field of a record that is not empty.
+
+    The fields of a record of records or mappings follow one by one.
+    """
+    for name, value in vars(record).items():
+        path = f"{place}{name}"
+        if isinstance(value, Record) and any(map(_is_tree, vars(value).values())):
+            yield from _lines(value, f"{path}.")
+            continue
+        parts = {path: value}
+        if isinstance(value, Mapping) and any(map(_is_tree, value.values())):
+            parts = {f"{path}.{key}": item for key, item in value.items()}
+        texts = {where: _in_one_line(part) for where, part in parts.items()}
+        yield from ((where, text) for where, text in texts.items() if text)
+
+
+def _is_tree(value: Any) -> bool:
+    return isinstance(value, Record | Mapping)
+
+
+def _in_one_line(value: Any) -> str:
+    """Return the text of a leaf, or of a tree with names before its leaves. `()` has no text."""
+    if isinstance(value, Record):
+        symbols = units(type(value))
+        return _named({name: (x, symbols.get(name, "")) for name, x in vars(value).items()})
+    if isinstance(value, Mapping):
+        return _named({name: (x, "") for name, x in value.items()})
+    if isinstance(value, tuple):
+        return ", ".join(filter(None, map(_in_one_line, value)))
+    return "none" if value is None else brief(value)
+
+
+def _named(values: Mapping[str, tuple[Any, str]]) -> str:
+    """Return values with their names and units, without those that have no text."""
+    texts = [(name, _in_one_line(value), unit) for name, (value, unit) in values.items()]
+    return ", ".join(unbroken(f"{name} {text} {unit}") for name, text, unit in texts if text)
 
 
 def is_key(x: Any) -> bool:
@@ -100,7 +144,11 @@ def is_key(x: Any) -> bool:
 def units(record: type[Record]) -> dict[str, str]:
     """Return the unit of each field of a platform's state that has one, from its annotation."""
     symbols = {}
-    for name, hint in typing.get_type_hints(record, include_extras=True).items():
+    try:
+        hints = typing.get_type_hints(record, include_extras=True)
+    except NameError:  # a class of a function, whose names Python does not find
+        return symbols
+    for name, hint in hints.items():
         marks = [mark for mark in typing.get_args(hint)[1:] if isinstance(mark, Unit)]
         if marks:
             symbols[name] = marks[0].symbol

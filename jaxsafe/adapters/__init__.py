@@ -11,14 +11,14 @@ import os
 from collections.abc import Mapping
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.config import override
-from jaxsafe.environment import Environment, extremes
+from jaxsafe.environment import Environment
+from jaxsafe.environment import action_bounds as action_bounds
+from jaxsafe.environment import acts_in_physical_units as acts_in_physical_units
 from jaxsafe.envs import make
 from jaxsafe.schema.errors import ConfigError, nearest, show
-from jaxsafe.simulation.controllers import Actuator, AgentController
 
 FORKED = (
     "forked processes would wait for ever for JAX's threads; start workers with context='spawn'"
@@ -117,27 +117,3 @@ def observation_bounds(env: Environment) -> tuple[list[float], list[float]]:
             else (float(item.clip[0]), float(item.clip[1]))
         ]
     return [low for low, _ in bounds], [high for _, high in bounds]
-
-
-def action_bounds(env: Environment) -> tuple[list[Any], list[Any]]:
-    """Return the lowest and the highest value of each element of a continuous action.
-
-    They are −1 and 1 where the actuator rescales, and else the actuator's own limits in physical
-    units. If episodes draw a limit at random, the widest that can be drawn is returned.
-    """
-    if not acts_in_physical_units(env):
-        return [-1.0] * env.action_size, [1.0] * env.action_size
-    pairs = list(zip(*map(_actuators, extremes(env)), strict=True))
-    low = [-1.0 if a.rescale else jnp.minimum(a.low, b.low) for a, b in pairs]
-    high = [1.0 if a.rescale else jnp.maximum(a.high, b.high) for a, b in pairs]
-    return low, high
-
-
-def acts_in_physical_units(env: Environment) -> bool:
-    """Return whether some actuator does not rescale its element of a continuous action."""
-    return not all(actuator.rescale for actuator in _actuators(env))
-
-
-def _actuators(env: Environment) -> tuple[Actuator, ...]:
-    controller = env.agent_platform.controller
-    return controller.actuators if isinstance(controller, AgentController) else ()

@@ -15,6 +15,7 @@ from jaxsafe.agents.features import (
 )
 from jaxsafe.agents.networks import GRU, MLP, Network
 from jaxsafe.agents.policy_file import SavedPolicy, load_policy, read_policy, save_policy
+from jaxsafe.agents.trained_policy import TrainedPolicy, TrainedRecurrentPolicy
 
 __all__ = [
     "GRU",
@@ -29,6 +30,8 @@ __all__ = [
     "PlainFeatures",
     "RejoinFeatures",
     "SavedPolicy",
+    "TrainedPolicy",
+    "TrainedRecurrentPolicy",
     "load_policy",
     "read_policy",
     "save_policy",

@@ -18,8 +18,12 @@ import numpy as np
 
 from jaxsafe.agents.agent import Agent, check_agent
 from jaxsafe.agents.networks import OUTPUT, Params
+from jaxsafe.agents.trained_policy import (
+    TrainedPolicy,
+    TrainedRecurrentPolicy,
+    trained_policy,
+)
 from jaxsafe.environment import Environment
-from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.convert import to_component, to_data
 from jaxsafe.schema.errors import ConfigError, nearest
@@ -112,7 +116,7 @@ def read_policy(path: str | os.PathLike) -> SavedPolicy:
     like = jax.eval_shape(lambda key: agent.init(key, env), jax.random.key(0))
     with open_archive(path, "not a policy file, or a damaged one") as archive:
         params = _fill(like, archive, str(path), numbered=form == OLD_FORMAT)
-    return SavedPolicy(env, agent, params, header)
+    return SavedPolicy(env.named(header.get("env", "")), agent, params, header)
 
 
 def with_networks(agent: Any) -> Any:
@@ -123,7 +127,9 @@ def with_networks(agent: Any) -> Any:
     return {"actor": {"type": "mlp", "hidden": agent["hidden"]}, **rest}
 
 
-def load_policy(policy: str | os.PathLike, deterministic: bool = True) -> Policy | RecurrentPolicy:
+def load_policy(
+    policy: str | os.PathLike, deterministic: bool = True
+) -> TrainedPolicy | TrainedRecurrentPolicy:
     """Return `policy(key, observation) -> action`. Observations may have leading batch axes.
 
     A policy that remembers is a `RecurrentPolicy`, which `rollout` and `evaluate` take as well.
@@ -137,12 +143,7 @@ def load_policy(policy: str | os.PathLike, deterministic: bool = True) -> Policy
     Raises:
         ConfigError: there is no such policy, or the file holds something else.
     """
-    saved = read_policy(find_policy(policy))
-    act = saved.agent.policy(saved.env, saved.params, deterministic)
-    # It is compiled, or each call would work out the inputs of the networks anew.
-    if isinstance(act, RecurrentPolicy):
-        return RecurrentPolicy(jax.jit(act.act), act.memory)
-    return jax.jit(act)
+    return trained_policy(*read_policy(find_policy(policy)), deterministic=deterministic)
 
 
 def is_single(run: str) -> bool:

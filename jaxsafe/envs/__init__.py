@@ -116,9 +116,8 @@ def unchanged(task: str) -> Environment:
     Raises:
         ConfigError: there is no such task, or the file has no environment.
     """
-    if is_file(task):
-        return load(task)
-    return build(find_task(task).environment())
+    env = load(task) if is_file(task) else build(find_task(task).environment())
+    return env.named(short_name(task))
 
 
 def adapt(

@@ -12,11 +12,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from jaxsafe.environment import SUCCESS
+from jaxsafe.environment import control_unit as control_unit
+from jaxsafe.environment import length_unit as length_unit
 from jaxsafe.processors.constraint import Separation, SpeedLimit
 from jaxsafe.schema.dotted_paths import references
 from jaxsafe.schema.errors import ConfigError, printable
 from jaxsafe.storage.files import write_bytes
-from jaxsafe.types import units
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
@@ -28,27 +29,6 @@ BLUE = "#0072B2"
 ORANGE = "#D55E00"
 GREEN = "#009E73"
 GREY = "#8A8A8A"
-
-
-def length_unit(env: Environment) -> str | None:
-    """Return the unit of positions, m or ft, or None if the platform does not say."""
-    return units(type(env.agent_platform.rest())).get("position")
-
-
-def control_unit(name: str, length: str | None) -> str | None:
-    """Return the unit of a control by the words in its name, or None if it is not known.
-
-    Args:
-        name: the name of the control.
-        length: the unit of lengths.
-    """
-    units_by_word = {
-        "thrust": "N",
-        "rate": "rad/s",
-        "attitude_acceleration": "rad/s²",
-        "acceleration": f"{length}/s²",
-    }
-    return next((unit for word, unit in units_by_word.items() if word in name), None)
 
 
 def margin_unit(constraint: Any, length: str | None) -> str | None:

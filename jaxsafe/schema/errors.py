@@ -35,7 +35,7 @@ class ConfigWarning(UserWarning):
 
 
 def show(value: object, most: int = 60) -> str:
-    """Return what `repr` returns, cut to `most` letters.
+    """Return what `repr` returns, in one line and cut to `most` letters.
 
     A value may be very large, so nothing of it is looked at beyond those letters.
     """
@@ -65,7 +65,7 @@ def _pieces(value: object, most: int) -> Iterator[str]:
     elif isinstance(value, int) and value.bit_length() > MAX_PRINTED_BITS:
         yield "a number of thousands of digits"
     else:
-        yield repr(value)
+        yield " ".join(repr(value).split())
 
 
 def printable(text: str) -> str:

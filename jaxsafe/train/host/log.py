@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaxsafe.environment import Environment
+from jaxsafe.environment import filter_name as filter_name
 from jaxsafe.metrics import measures
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import append_csv, append_rows, read_rows, write_csv, write_rows
@@ -77,11 +78,6 @@ def check_order(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
             raise ConfigError(
                 f"{place}: expected a step after {rows[index - 1]['step']}, found {row['step']}"
             )
-
-
-def filter_name(env: Environment) -> str:
-    """Return the kind of run time assurance that acts in an environment, or `none`."""
-    return "none" if env.rta is None else env.rta.type_name or type(env.rta).__name__
 
 
 def headline(facts: Mapping[str, Any]) -> str:

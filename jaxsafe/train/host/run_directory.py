@@ -156,7 +156,8 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
         training = {**training, "rta_training": old_names[training["rta_training"]]}
     config = normalise(to_component(training, TrainConfig, f"{place}training"))
     env = jaxsafe.config.from_data(content["environment"], f"{place}environment")
-    return config, env, str(content["env"])
+    name = str(content["env"])
+    return config, env.named(name), name
 
 
 def extend(runs: Sequence[Path], steps: Any) -> None:
