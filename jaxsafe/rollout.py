@@ -5,20 +5,23 @@ from __future__ import annotations
 import operator
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, overload
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsafe.autoreset import choose, renew
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.schema.errors import ConfigError, show
-from jaxsafe.types import Key, State, TimeStep
+from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.types import Key, Record, State, TimeStep, Transition
 
 Policy = Callable[[Key, Array], Array]
 """`policy(key, observation)` returns an action. Both are batched if the environments are."""
+
+RECORDS = ("timesteps", "transitions", "states")
+"""What `rollout` can record."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,17 +63,57 @@ def act(
     return policy(key, observation), memory
 
 
+class RolloutState(Record):
+    """Where a rollout has got to, which is where the next one goes on.
+
+    With a batch of environments every array has a leading axis of that size.
+    """
+
+    state: State
+    observation: Float[Array, " observation"]
+    memory: Any  # what a `RecurrentPolicy` remembers, else `()`
+
+
+@overload
 def rollout(
     env: Environment,
     policy: Policy | RecurrentPolicy,
     key: Key,
     num_steps: int,
     num_envs: int | None = None,
-) -> TimeStep:
+    *,
+    record: Literal["timesteps"] = "timesteps",
+    start: RolloutState | None = None,
+) -> TimeStep: ...
+
+
+@overload
+def rollout(
+    env: Environment,
+    policy: Policy | RecurrentPolicy,
+    key: Key,
+    num_steps: int,
+    num_envs: int | None = None,
+    *,
+    record: Literal["transitions", "states"],
+    start: RolloutState | None = None,
+) -> tuple[RolloutState, Transition]: ...
+
+
+def rollout(
+    env: Environment,
+    policy: Policy | RecurrentPolicy,
+    key: Key,
+    num_steps: int,
+    num_envs: int | None = None,
+    *,
+    record: str = "timesteps",
+    start: RolloutState | None = None,
+) -> TimeStep | tuple[RolloutState, Transition]:
     """Run a policy for a number of steps. A fresh random start follows every finished episode.
 
     The time step that ends an episode holds the episode's true last observation. The policy acts
-    next on the observation of the new start, which is not part of the result.
+    next on the observation of the new start, which is not part of the time steps.
 
     Args:
         env: the environment.
@@ -79,45 +122,136 @@ def rollout(
         key: a typed PRNG key.
         num_steps: number of steps in each environment.
         num_envs: number of environments side by side. None is one environment without a batch axis.
+            With `start` it may be left out.
+        record: what to return. `timesteps` are what the environment returns. `transitions` are what
+            a learner needs: they also hold the observation that was acted on, and the action.
+            `states` are transitions that hold the state before each step too.
+        start: where to begin, as an earlier call with `record="transitions"` returned it. None
+            stands for fresh random starts.
 
     Returns:
-        The time steps, stacked [num_steps] or [num_steps, num_envs].
+        The time steps, stacked [num_steps] or [num_steps, num_envs]. With another `record` a pair:
+        the `RolloutState` after the last step, and the transitions, stacked alike.
 
     Raises:
-        ConfigError: `num_steps` or `num_envs` is no number of steps or environments.
+        ConfigError: `num_steps` or `num_envs` is no number of steps or environments, `record` is
+            unknown, `start` is something else or of another batch, or the actions have another
+            shape.
     """
-    _require_count("num_steps", num_steps, least=0)
+    require_count("rollout: num_steps", num_steps, least=0)
     if num_envs is not None:
-        _require_count("num_envs", num_envs, least=1)
+        require_count("rollout: num_envs", num_envs, least=1)
+    if record not in RECORDS:
+        choice = nearest(record, RECORDS)
+        raise ConfigError(f"rollout: record: unknown record {show(record)}; choose from {choice}")
+    if start is not None:
+        num_envs = _num_envs(start, num_envs)
     key_start, key_run = jax.random.split(key)
-    if num_envs is None:
+    start_memory = first_memory(policy, num_envs)
+    if start is not None:
+        carry = (start.state, start.observation, start.memory)
+        if num_envs is not None:
+            carry = (*_move_batch((start.state, start.observation), 0, -1), start.memory)
+    elif num_envs is None:
         state, timestep = reset(env, key_start)
+        carry = (state, timestep.observation, start_memory)
     else:
         state, timestep = reset_batch(env, key_start, num_envs, axis=-1)
+        carry = (state, timestep.observation, start_memory)
 
-    start_memory = first_memory(policy, num_envs)
-
-    def one_step(carry: tuple[State, Array, Any], key: Key) -> tuple[Any, TimeStep]:
+    def one_step(carry: tuple[State, Array, Any], key: Key) -> tuple[Any, Any]:
         state, observation, memory = carry
         key_policy, key_reset = jax.random.split(key)
         if num_envs is None:
-            action, memory = act(policy, key_policy, observation, memory)
+            action, next_memory = act(policy, key_policy, observation, memory)
             after, timestep = step_or_reset(env, state, action, key_reset)
         else:
-            action, memory = act(policy, key_policy, observation.T, memory)
+            action, next_memory = act(policy, key_policy, observation.T, memory)
+            require_batch(env, action, num_envs)
             after, timestep = step_or_reset_batch(env, state, action.T, key_reset, axis=-1)
-        memory = choose(timestep.done, start_memory, memory)
-        return (*after, memory), timestep
+        carry = (*after, choose(timestep.done, start_memory, next_memory))
+        if record == "timesteps":
+            return carry, (timestep, ())
+        seen = (observation, state if record == "states" else None)
+        return carry, ((timestep, *seen), (action, memory))
 
-    start = (state, timestep.observation, start_memory)
-    _, timesteps = jax.lax.scan(one_step, start, jax.random.split(key_run, num_steps))
-    if num_envs is None:
-        return timesteps
-    return jax.tree.map(lambda x: jnp.moveaxis(x, -1, 1), timesteps)
+    # The axis of the environments is the last one in `moved` and the first one in `acted`.
+    carry, (moved, acted) = jax.lax.scan(one_step, carry, jax.random.split(key_run, num_steps))
+    if num_envs is not None:
+        moved = _move_batch(moved, -1, 1)
+    if record == "timesteps":
+        return moved
+    state, observation, memory = carry
+    if num_envs is not None:
+        state, observation = _move_batch((state, observation), -1, 0)
+    return RolloutState(state=state, observation=observation, memory=memory), _transition(
+        *moved, *acted
+    )
 
 
-def _require_count(name: str, value: Any, least: int) -> None:
-    """Refuse what is not a whole number or is too small.
+def _transition(
+    timestep: TimeStep, observation: Array, state: State | None, action: Array, memory: Any
+) -> Transition:
+    return Transition(
+        observation=observation,
+        action=action,
+        reward=timestep.reward,
+        cost=timestep.cost,
+        terminated=timestep.terminated,
+        truncated=timestep.truncated,
+        next_observation=timestep.observation,
+        memory=memory,
+        info=timestep.info,
+        state=state,
+    )
+
+
+def _move_batch(tree: Any, source: int, destination: int) -> Any:
+    """Move the axis of the environments in all leaves."""
+    return jax.tree.map(lambda x: jnp.moveaxis(x, source, destination), tree)
+
+
+def _num_envs(start: Any, num_envs: int | None) -> int | None:
+    """Return the number of environments of the start of a rollout, None without a batch axis.
+
+    Raises:
+        ConfigError: it is no such start, or `num_envs` is another number.
+    """
+    if not isinstance(start, RolloutState):
+        raise ConfigError(
+            "rollout: start: expected the RolloutState that an earlier rollout returned, "
+            f"found {show(start)}"
+        )
+    found = start.observation.shape[0] if jnp.ndim(start.observation) > 1 else None
+    if num_envs not in (None, found):
+        raise ConfigError(
+            f"rollout: num_envs: expected {found or 'nothing'} as in start, found {num_envs}"
+        )
+    return found
+
+
+def require_batch(env: Environment, action: Array, num_envs: int) -> None:
+    """Refuse actions that are not one for each observation of a batch.
+
+    Raises:
+        ConfigError: they have another shape.
+    """
+    found, wanted = jnp.shape(action), (num_envs, env.action_size)
+    if found != wanted:
+        names = ", ".join(env.action_names)
+        advice = (
+            "; for a policy of one observation, write jax.vmap around it"
+            if found == wanted[1:]
+            else ""
+        )
+        raise ConfigError(
+            f"policy: expected actions of shape {wanted}, one ({names}) for each of "
+            f"{num_envs} observations, found {found}{advice}"
+        )
+
+
+def require_count(place: str, value: Any, least: int) -> None:
+    """Refuse what is not a whole number or is too small. `place` begins the message.
 
     XLA would say so in many lines, or run no environment at all.
     """
@@ -126,9 +260,7 @@ def _require_count(name: str, value: Any, least: int) -> None:
     except TypeError:
         enough = False
     if not enough:
-        raise ConfigError(
-            f"rollout: {name}: expected a whole number ≥ {least}, found {show(value)}"
-        )
+        raise ConfigError(f"{place}: expected a whole number ≥ {least}, found {show(value)}")
 
 
 def step_or_reset(

@@ -241,3 +241,27 @@ class TimeStep(Record):
     def done(self) -> Bool[Array, ""]:
         """Whether the episode is over, for either reason."""
         return self.terminated | self.truncated
+
+
+class Transition(Record):
+    """One step as a learner needs it: what was acted on, the action, and what came of it.
+
+    `next_observation` is the observation after the step, also where the step ended the episode. The
+    next transition of that environment then begins with the observation of a fresh start.
+    """
+
+    observation: Float[Array, " observation"]  # what the policy acted on
+    action: Array  # what the policy returned
+    reward: Float[Array, ""]
+    cost: Float[Array, ""]  # as in `TimeStep`
+    terminated: Bool[Array, ""]  # the task ended: there is no value beyond `next_observation`
+    truncated: Bool[Array, ""]  # cut short: the value of `next_observation` still counts
+    next_observation: Float[Array, " observation"]
+    memory: Any  # what a `RecurrentPolicy` remembered when it acted, else `()`
+    info: Info
+    state: State | None  # the state before the step, if it was asked for
+
+    @property
+    def done(self) -> Bool[Array, ""]:
+        """Whether the step ended the episode, for either reason."""
+        return self.terminated | self.truncated

@@ -13,7 +13,7 @@ import pytest
 
 import jaxsafe
 from jaxsafe import ConfigError, Environment
-from jaxsafe.rollout import reset_batch, step_or_reset, step_or_reset_batch
+from jaxsafe.rollout import RecurrentPolicy, reset_batch, step_or_reset, step_or_reset_batch
 from jaxsafe.simulation.cwh import cwh_flow
 from jaxsafe.types import State, TimeStep
 
@@ -24,6 +24,9 @@ TRACED: list[tuple[int, ...]] = []
 
 step = jax.jit(jaxsafe.step)
 rollout = jax.jit(jaxsafe.rollout, static_argnames=("policy", "num_steps", "num_envs"))
+recorded: Any = jax.jit(
+    jaxsafe.rollout, static_argnames=("policy", "num_steps", "num_envs", "record")
+)
 
 
 def policy(key: jax.Array | None, observation: jax.Array) -> jax.Array:
@@ -285,3 +288,89 @@ def test_a_rollout_of_no_number_of_steps_or_environments_is_refused(
             jax.random.key(0),
             **counts,
         )
+
+
+def test_transitions_are_the_same_rollout(env: Environment, batch: TimeStep) -> None:
+    arguments = (env, policy, jax.random.key(0), NUM_STEPS, NUM_ENVS)
+    position, steps = recorded(*arguments, record="transitions")
+    for name in ("reward", "cost", "terminated", "truncated", "done"):
+        np.testing.assert_array_equal(getattr(steps, name), getattr(batch, name))
+    np.testing.assert_array_equal(steps.next_observation, batch.observation)
+    jax.tree.map(np.testing.assert_array_equal, steps.info, batch.info)
+    np.testing.assert_allclose(steps.action, policy(None, steps.observation), rtol=1e-5)
+    goes_on = ~np.asarray(steps.done)[:-1]
+    np.testing.assert_array_equal(
+        np.asarray(steps.observation)[1:][goes_on],
+        np.asarray(steps.next_observation)[:-1][goes_on],
+    )
+    assert all(is_start(o) for o in np.asarray(steps.observation)[1:][~goes_on])
+    assert steps.state is None
+    assert position.observation.shape == (NUM_ENVS, env.observation_size)
+    assert position.state.num_steps.shape == (NUM_ENVS,)
+
+
+def test_states_are_those_before_each_step(env: Environment) -> None:
+    _, steps = recorded(env, policy, jax.random.key(0), NUM_STEPS, NUM_ENVS, record="states")
+    for t, i in ((0, 0), (NUM_STEPS - 1, 2)):
+        state = jax.tree.map(lambda x, t=t, i=i: x[t, i], steps.state)
+        after, timestep = step(env, state, steps.action[t, i])
+        np.testing.assert_allclose(timestep.observation, steps.next_observation[t, i], rtol=1e-5)
+        assert int(after.num_steps) == int(state.num_steps) + 1
+
+
+@pytest.mark.parametrize("num_envs", [pytest.param(None, marks=pytest.mark.thorough), 3])
+def test_a_rollout_goes_on_where_another_stopped(env: Environment, num_envs: int | None) -> None:
+    """Episodes of four steps are cut after six, so the second half begins within one."""
+    arguments = (env, policy, jax.random.key(0), 6)
+    position, first = recorded(*arguments, num_envs, record="transitions")
+    end, second = recorded(*arguments, record="transitions", start=position)
+    np.testing.assert_array_equal(second.observation[0], position.observation)
+    np.testing.assert_array_equal(first.next_observation[-1], second.observation[0])
+    ended = np.asarray(second.done).reshape(6, -1).any(axis=1)
+    assert ended.tolist() == [False, True, False, False, False, True]
+    assert end.observation.shape == position.observation.shape
+
+
+def test_transitions_hold_what_a_policy_remembered(env: Environment) -> None:
+    def count(key: jax.Array, observation: jax.Array, memory: Any) -> tuple[jax.Array, Any]:
+        return jnp.zeros((*observation.shape[:-1], 2)), memory + 1
+
+    counter = RecurrentPolicy(count, jnp.zeros((), jnp.int32))
+    _, steps = recorded(env, counter, jax.random.key(0), 9, 3, record="transitions")
+    assert steps.memory.tolist() == [[t % LENGTH] * 3 for t in range(9)]
+
+
+@pytest.mark.parametrize(
+    ("run", "message"),
+    [
+        (
+            lambda env, policy: jaxsafe.rollout(env, policy, jax.random.key(0), 2, num_envs=5),
+            "expected actions of shape (5, 2), one (thrust_x, thrust_y) for each of 5",
+        ),
+        (lambda env, policy: jaxsafe.evaluate(env, policy, episodes=4), "shape (4, 2)"),
+    ],
+)
+def test_a_policy_that_forgets_the_batch_is_told_so(
+    run: Any, message: str, env: Environment
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        run(env, lambda key, observation: jnp.zeros(2))
+    assert message in str(caught.value)
+    advice = "found (2,); for a policy of one observation, write jax.vmap around it"
+    assert str(caught.value).splitlines()[0].endswith(advice)
+    with pytest.raises(ConfigError, match=r"found \(7, 2\)"):
+        run(env, lambda key, observation: jnp.zeros((7, 2)))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"record": "transition"}, "rollout: record: unknown record 'transition'; choose from"),
+        ({"start": 3}, "rollout: start: expected the RolloutState that an earlier rollout"),
+    ],
+)
+def test_a_wrong_record_or_start_is_refused(
+    arguments: dict[str, Any], message: str, env: Environment
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        jaxsafe.rollout(env, policy, jax.random.key(0), 2, **arguments)

@@ -11,7 +11,14 @@ from jaxtyping import Array, Int
 from jaxsafe.environment import Environment, step
 from jaxsafe.metrics import Episode, accumulate, begin
 from jaxsafe.processors.terminal import Timeout
-from jaxsafe.rollout import Policy, RecurrentPolicy, act, first_memory, reset_batch
+from jaxsafe.rollout import (
+    Policy,
+    RecurrentPolicy,
+    act,
+    first_memory,
+    require_batch,
+    reset_batch,
+)
 from jaxsafe.types import Key, State, TimeStep
 
 MAX_STEPS_WITHOUT_TIMEOUT = 10_000
@@ -54,6 +61,7 @@ def run_episodes(
     def advance(carry: Carry) -> Carry:
         t, state, observation, memory, episode = carry
         action, memory = act(policy, jax.random.fold_in(key_act, t), observation, memory)
+        require_batch(env, action, observation.shape[0])
         state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, state, action)
         running = episode.outcome == 0
         episode = jax.tree.map(
@@ -120,6 +128,7 @@ def record_steps(
     def advance(carry: tuple[State, Array, Any], t: Array) -> tuple[Any, tuple[State, TimeStep]]:
         state, observation, memory = carry
         action, memory = act(policy, jax.random.fold_in(key_act, t), observation, memory)
+        require_batch(env, action, observation.shape[0])
         state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, state, action)
         return (state, timestep.observation, memory), (state, timestep)
 

@@ -7,12 +7,17 @@ import jax
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.metrics import measures, summarise
-from jaxsafe.rollout import Policy, RecurrentPolicy
+from jaxsafe.rollout import Policy, RecurrentPolicy, require_count
 from jaxsafe.types import Key
 
 
 def evaluate(
-    env: Environment, policy: Policy | RecurrentPolicy, key: Key, num_episodes: int = 1000
+    env: Environment,
+    policy: Policy | RecurrentPolicy,
+    key: Key | None = None,
+    num_episodes: int = 1000,
+    *,
+    episodes: int | None = None,
 ) -> dict[str, float | None]:
     """Return the metrics of Section 5 over whole episodes of a policy.
 
@@ -20,12 +25,20 @@ def evaluate(
         env: the environment.
         policy: `policy(key, observation)` returns an action for each of a batch of observations,
             as what `jaxsafe.load_policy` returns does. It may be a `RecurrentPolicy`.
-        key: a typed PRNG key. It decides starts and noise.
+        key: a typed PRNG key. It decides starts and noise. None stands for `jax.random.key(0)`.
         num_episodes: how many episodes run side by side.
+        episodes: another name of `num_episodes`, as the command calls it.
 
     Returns:
         By name: rates as fractions in [0, 1], lengths in steps, Δv in the unit of the task. None
         where the environment does not measure a quantity or it is not finite.
+
+    Raises:
+        ConfigError: the number of episodes is not a whole number of at least 1, or the policy
+            returns actions of another shape.
     """
-    episodes = jax.jit(run_episodes, static_argnums=(1, 3))(env, policy, key, num_episodes)
-    return summarise(jax.device_get(episodes), env.success, **measures(env))
+    count = num_episodes if episodes is None else episodes
+    require_count("evaluate: episodes", count, least=1)
+    key = jax.random.key(0) if key is None else key
+    sums = jax.jit(run_episodes, static_argnums=(1, 3))(env, policy, key, count)
+    return summarise(jax.device_get(sums), env.success, **measures(env))
