@@ -1,6 +1,7 @@
 """Aerospace SafeRL benchmarks as pure JAX functions."""
 
-from typing import TYPE_CHECKING
+import importlib
+from typing import TYPE_CHECKING, Any
 
 import jaxsafe.address_space
 import jaxsafe.quiet  # noqa: F401 before anything imports jaxlib
@@ -13,15 +14,22 @@ from jaxsafe.schema.errors import ConfigError
 
 if TYPE_CHECKING:
     from jaxsafe.evaluate.evaluate import evaluate
+    from jaxsafe.flight import fly
     from jaxsafe.train.train import train
+
+    TASKS: tuple[str, ...]
+    __version__: str
 else:
     from jaxsafe import evaluate, train  # packages that can be called
 
 __all__ = [
+    "TASKS",
     "ConfigError",
     "Environment",
+    "__version__",
     "dump",
     "evaluate",
+    "fly",
     "load",
     "load_policy",
     "make",
@@ -32,3 +40,20 @@ __all__ = [
     "step",
     "train",
 ]
+
+_LATER = {"fly": "jaxsafe.flight"}
+"""Functions whose modules are imported when they are first used."""
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LATER:
+        return getattr(importlib.import_module(_LATER[name]), name)
+    if name == "TASKS":
+        from jaxsafe.envs import TASKS
+
+        return tuple(TASKS)  # a task that is registered later is among them too
+    if name == "__version__":
+        from jaxsafe.storage.provenance import version
+
+        return version()
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -95,3 +95,12 @@ def test_an_error_about_an_environment_stays_one_line() -> None:
     with pytest.raises(ConfigError, match="found Environment docking2d agent deputy") as caught:
         jaxsafe.make(env)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
+
+
+def test_the_package_says_its_version_and_tasks() -> None:
+    assert isinstance(jaxsafe.__version__, str)
+    assert tuple(TASKS) == jaxsafe.TASKS
+    assert "docking2d" in jaxsafe.TASKS
+    with pytest.raises(AttributeError, match="module 'jaxsafe' has no attribute 'tasks'"):
+        _ = jaxsafe.tasks  # type: ignore[attr-defined]
+    assert all(hasattr(jaxsafe, name) for name in jaxsafe.__all__)

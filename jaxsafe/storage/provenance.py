@@ -13,6 +13,14 @@ RECORDED_PACKAGES = ("jaxsafe", "jax", "jaxlib", "numpy", "optax", "orbax-checkp
 """Packages whose versions are recorded, because they can change a result."""
 
 
+def version() -> str:
+    """Return the version of jaxsafe. It is `unknown` in a checkout that is not installed."""
+    try:
+        return importlib.metadata.version("jaxsafe")
+    except importlib.metadata.PackageNotFoundError:
+        return "unknown"
+
+
 def versions() -> dict[str, Any]:
     """Return what a result depends on besides its options.
 
