@@ -15,7 +15,8 @@ from jaxsafe.schema.errors import ConfigError
 if TYPE_CHECKING:
     from jaxsafe.evaluate.evaluate import evaluate
     from jaxsafe.flight import fly
-    from jaxsafe.train.train import train
+    from jaxsafe.runs.run import open_run
+    from jaxsafe.runs.training import train
 
     TASKS: tuple[str, ...]
     __version__: str
@@ -33,6 +34,7 @@ __all__ = [
     "load",
     "load_policy",
     "make",
+    "open_run",
     "override",
     "reset",
     "reset_to",
@@ -41,7 +43,7 @@ __all__ = [
     "train",
 ]
 
-_LATER = {"fly": "jaxsafe.flight"}
+_LATER = {"fly": "jaxsafe.flight", "open_run": "jaxsafe.runs.run"}
 """Functions whose modules are imported when they are first used."""
 
 

@@ -117,9 +117,14 @@ def save(figure: Figure, path: Path) -> Path:
     if file_format not in known_formats:
         choices = ", .".join(sorted(known_formats))
         raise ConfigError(f"out: cannot draw {path.name}; choose from .{choices}")
+    write_bytes(path, to_bytes(figure, file_format))
+    return path
+
+
+def to_bytes(figure: Figure, file_format: str = "png") -> bytes:
+    """Return the content of a file of a figure."""
     for panel in figure.axes:
         panel.spines[["top", "right"]].set_visible(False)
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=150, format=file_format)
-    write_bytes(path, buffer.getvalue())
-    return path
+    return buffer.getvalue()

@@ -1,4 +1,9 @@
-"""Runs: training all seeds of a task in a directory, and the figures of what is kept there.
+"""Runs: training all seeds of a task in a directory, and all that is kept there.
 
-The commands call what is here.
+The commands call what is here, and so does `jaxsafe.train` with the name of a task.
 """
+
+from jaxsafe.runs.run import Run, open_run
+from jaxsafe.runs.training import train_run
+
+__all__ = ["Run", "open_run", "train_run"]

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import base64
 import shutil
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
+from matplotlib.figure import Figure
+
 from jaxsafe.environment import Environment
-from jaxsafe.plot.figures import Episodes, Rows, speed_distance, training_curves, trajectories
+from jaxsafe.plot.figures import AXES, Episodes, Rows, speed_distance, training_curves, trajectories
 from jaxsafe.plot.interventions import interventions, most_altered
 from jaxsafe.plot.learning import learning_curves
-from jaxsafe.plot.style import kept_out, length_unit, save
-from jaxsafe.schema.errors import ConfigError
+from jaxsafe.plot.style import kept_out, length_unit, save, to_bytes
+from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.storage.files import read_rows
 from jaxsafe.storage.forms import (
     ANYTHING,
@@ -30,6 +33,17 @@ from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.log import filter_name, headline, read_progress
 
 
+class Figures(dict[str, Figure]):
+    """Figures by name. A notebook shows them one below the other."""
+
+    def __repr__(self) -> str:
+        return f"Figures: {', '.join(self)}"
+
+    def _repr_html_(self) -> str:
+        images = (base64.b64encode(to_bytes(figure)).decode() for figure in self.values())
+        return "<br>".join(f'<img src="data:image/png;base64,{image}">' for image in images)
+
+
 def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
     """Draw every figure for which the run has data into `<run>/figures/`.
 
@@ -43,6 +57,30 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
     Raises:
         ConfigError: the run has no progress log.
     """
+    figures = draw(run, x)
+    place = run / "figures"
+    # If there are no figures yet, all of them appear at once or none does.
+    new = place if place.exists() else place.with_name("figures.part")
+    # A command that was killed may have left this directory.
+    shutil.rmtree(place.with_name("figures.part"), ignore_errors=True)
+    paths = [save(figure, new / f"{name}.png") for name, figure in figures.items()]
+    if new != place:
+        new.rename(place)
+    return [place / path.name for path in paths]
+
+
+def draw(run: Path, x: str = "steps") -> Figures:
+    """Return every figure for which the run has data, by name.
+
+    Args:
+        run: the run directory.
+        x: the horizontal axis of training curves: `steps` or `wall`.
+
+    Raises:
+        ConfigError: `x` is something else, or the run has no progress log.
+    """
+    if x not in AXES:
+        raise ConfigError(f"x: unknown axis {show(x)}; choose from {nearest(x, AXES)}")
     rows = progress(run)
     config, env, name = run_directory.read(run, "run")
     facts = {
@@ -52,7 +90,7 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
         "rta": filter_name(env),
     }
     title = headline({**facts, "seeds": len({row["seed"] for row in rows})})
-    figures = {f"training_{x}": training_curves(rows, x, title)}
+    figures = Figures({f"training_{x}": training_curves(rows, x, title)})
     learning = learning_curves(rows, x, title)
     if learning is not None:
         figures[f"learning_{x}"] = learning
@@ -67,15 +105,7 @@ def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
             figures["speed_distance"] = speed_distance(episodes, title)
         if "rta" in episodes[-1][1][0]:
             figures["interventions"] = interventions(most_altered(episodes), env, title)
-    place = run / "figures"
-    # If there are no figures yet, all of them appear at once or none does.
-    new = place if place.exists() else place.with_name("figures.part")
-    # A command that was killed may have left this directory.
-    shutil.rmtree(place.with_name("figures.part"), ignore_errors=True)
-    paths = [save(figure, new / f"{name}.png") for name, figure in figures.items()]
-    if new != place:
-        new.rename(place)
-    return [place / path.name for path in paths]
+    return figures
 
 
 def progress(run: Path) -> list[dict[str, Any]]:

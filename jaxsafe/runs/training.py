@@ -1,17 +1,159 @@
-"""Training runs one after another: each trains, is evaluated, and gets its figures."""
+"""Training runs one after another: each trains, is evaluated, and gets its figures.
+
+`jaxsafe.train` calls `train`.
+"""
 
 from __future__ import annotations
 
+import functools
+import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from itertools import zip_longest
 from pathlib import Path
+from typing import Any, overload
 
+import jax
+
+from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.networks import Params
 from jaxsafe.devices import processes
+from jaxsafe.devices.compilation_cache import enable_compilation_cache
+from jaxsafe.devices.seed_mapper import claim_cores
+from jaxsafe.environment import Environment
+from jaxsafe.envs import TASKS
+from jaxsafe.runs.run import Run
+from jaxsafe.schema.errors import ConfigError
+from jaxsafe.train import train as function
 from jaxsafe.train.host import run_directory
+from jaxsafe.train.host.options import TrainConfig, resolve
 from jaxsafe.train.host.results import finish, table
 from jaxsafe.train.host.session import Clock, Training
+from jaxsafe.train.ppo import PPO, TrainState
+from jaxsafe.train.train import Callback, Curves
+from jaxsafe.types import Key
+
+
+@overload
+def train(env: str | os.PathLike, *, progress: bool = True, **options: Any) -> Run: ...
+
+
+@overload
+def train(
+    *,
+    resume: str | os.PathLike,
+    steps: float | None = None,
+    progress: bool = True,
+) -> Run: ...
+
+
+@overload
+def train(
+    env: Environment,
+    agent: Agent,
+    hyperparameters: PPO,
+    key: Key,
+    num_updates: int,
+    callback: Callback | None = None,
+    every: int | None = None,
+    params: Params | None = None,
+) -> tuple[TrainState, Curves]: ...
+
+
+@functools.wraps(
+    function.train
+)  # so that `inspect` and `jax.jit` see the arguments of the function
+def train(*arguments: Any, **options: Any) -> Any:
+    """Train a run, given a name, or do what `jaxsafe.train.train.train` does, given an environment.
+
+    See `train_run` for the first, which takes the options of the command.
+    """
+    env = arguments[0] if arguments else options.get("env")
+    if "resume" in options or isinstance(env, str | os.PathLike):
+        return train_run(*arguments, **options)
+    return function.train(*arguments, **options)
+
+
+def train_run(
+    env: str | os.PathLike | None = None,
+    *,
+    resume: str | os.PathLike | None = None,
+    progress: bool = True,
+    **options: Any,
+) -> Run:
+    """Train all seeds of a task as `python -m jaxsafe.train` does, and return the run.
+
+    The seeds share the cores if no other program of JAX has run before in this process. After
+    Ctrl-C `jaxsafe.train(resume=…)` goes on with the run.
+
+    Args:
+        env: a task, the file of an environment, or `MODULE:TASK`.
+        resume: the directory of a run to go on with. Beside it stands only `steps`, to train it for
+            longer.
+        progress: whether to show how far the training is.
+        **options: the options of the command by name, such as `seeds=10`, `steps=200_000` and
+            `out="runs/mine"`. Those with a dot are written `**{"ppo.gamma": 0.98}`.
+
+    Raises:
+        ConfigError: an option is wrong. The message names the option, what was found and what is
+            allowed.
+        KeyboardInterrupt: the user stopped the training, which is kept.
+    """
+    began = time.monotonic()
+    claim_cores()
+    enable_compilation_cache()
+    if resume is None:
+        path = run_directory.create(*_resolved({"env": env, **options}))
+    else:
+        path = Path(resume)
+        _extend(path, {**options, **({} if env is None else {"env": env})})
+    if progress:
+        _tell_idle_cores(path)
+    try:
+        finished = (path / "results.json").exists() or train_all(
+            [path], path, began, told=False, progress=progress
+        )
+    except Exception:
+        if resume is None:
+            run_directory.discard_unused(path)
+        raise
+    if not finished:
+        raise KeyboardInterrupt
+    return Run(path)
+
+
+def _resolved(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
+    if options["env"] == "all":
+        raise ConfigError(f"env: expected one task, found 'all'; choose from {', '.join(TASKS)}")
+    paths = {name: os.fspath(x) for name, x in options.items() if isinstance(x, os.PathLike)}
+    return resolve({**options, **paths})
+
+
+def _extend(path: Path, options: Mapping[str, Any]) -> None:
+    """Let a run that is resumed train for more steps, if the options say so.
+
+    Raises:
+        ConfigError: there is no run, or another option is given.
+    """
+    run_directory.read(path, "resume")
+    for name in options:
+        if name != "steps":
+            raise ConfigError(f"{name}: the run has its options; beside resume stands only steps")
+    if options.get("steps") is not None:
+        run_directory.extend([path], options["steps"])
+
+
+def _tell_idle_cores(path: Path) -> None:
+    """Say so if the seeds of a run cannot share the cores, because JAX was in use before."""
+    cores = os.cpu_count() or 1
+    device = jax.local_devices()[0]
+    seeds = run_directory.read(path, "run")[0].seeds
+    if device.platform == "cpu" and jax.local_device_count() == 1 < min(seeds, cores):
+        print(
+            f"training {seeds} seeds on one of {cores} cores, because JAX was in use before; "
+            "in a new session call jaxsafe.train first"
+        )
 
 
 def is_complete(run: Path) -> bool:
@@ -27,7 +169,9 @@ def is_complete(run: Path) -> bool:
     return True
 
 
-def train_all(runs: Sequence[Path], path: Path, began: float) -> bool:
+def train_all(
+    runs: Sequence[Path], path: Path, began: float, *, told: bool = True, progress: bool = True
+) -> bool:
     """Train runs one after another, then evaluate all of them.
 
     The programs of a run are compiled while the run before it trains, because compiling alone
@@ -37,6 +181,8 @@ def train_all(runs: Sequence[Path], path: Path, began: float) -> bool:
         runs: the directories of the runs.
         path: the directory from which the user can resume all of them.
         began: the time [s] of `time.monotonic` at which the clock of the first run starts.
+        told: whether to print what a run is and what came of it.
+        progress: whether to show how far a training is.
 
     Returns:
         False if the user asked to stop, else True.
@@ -46,19 +192,18 @@ def train_all(runs: Sequence[Path], path: Path, began: float) -> bool:
         for run, following in zip_longest(runs, runs[1:]):
             training = upcoming or _open(run, files, began)
             config = training.config
-            print(
-                f"{training.name}: {config.seeds} seeds × {training.num_steps:,} steps, "
-                f"preset {config.preset}, in {run}"
-            )
+            if told:
+                print(
+                    f"{training.name}: {config.seeds} seeds × {training.num_steps:,} steps, "
+                    f"preset {config.preset}, in {run}"
+                )
             training.prepare()
             upcoming = following and _open(following, files, time.monotonic())
             if upcoming:
                 upcoming.prepare()
-            if not training.train():
-                print(
-                    f"stopped at step {training.step:,}; "
-                    f"go on with: python -m jaxsafe.train resume={path}"
-                )
+            if not training.train(progress):
+                call = f"python -m jaxsafe.train resume={path}" if told else go_on(path)
+                print(f"stopped at step {training.step:,}; go on with: {call}")
                 return False
             trained.append((run, training))
         for _, training in trained:
@@ -67,9 +212,18 @@ def train_all(runs: Sequence[Path], path: Path, began: float) -> bool:
         from jaxsafe.runs.figures import draw_all
 
         for run, training in trained:
-            print(table(finish(training), run / "results.json"))
-            print("figures: " + ", ".join(str(figure) for figure in draw_all(training.run)))
+            results = finish(training)
+            if told:
+                print(table(results, run / "results.json"))
+            figures = draw_all(training.run)
+            if told:
+                print("figures: " + ", ".join(map(str, figures)))
     return True
+
+
+def go_on(path: Path) -> str:
+    """Return the call that goes on with a run."""
+    return f"jaxsafe.train(resume={str(path)!r})"
 
 
 def _open(run: Path, files: ExitStack, began: float) -> Training:

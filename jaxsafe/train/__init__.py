@@ -1,15 +1,17 @@
 """Training.
 
 `jaxsafe.train(env, agent, hyperparameters, key, num_updates)` trains one seed as a pure function,
-see `jaxsafe.train.train.train`. `python -m jaxsafe.train` trains all seeds of a run, evaluates them
-and keeps everything in a directory.
+see `jaxsafe.train.train.train`. `jaxsafe.train("docking2d", seeds=10)` does what
+`python -m jaxsafe.train` does: it trains all seeds of a run, evaluates them and keeps everything in
+a directory.
 """
 
 from jaxsafe.schema.callable_package import make_callable
 
 make_callable(
     __name__,
-    "jaxsafe.train.train",
+    # As for `__main__.py`, what trains a whole run stands on a higher floor.
+    "jaxsafe.runs.training",
     Agent="jaxsafe.agents.agent",
     PPO="jaxsafe.train.ppo",
     TrainState="jaxsafe.train.ppo",

@@ -234,17 +234,31 @@ def columns(env: Environment) -> list[str]:
 
 
 class Display:
-    """A live bar on a terminal. Elsewhere it is a plain line at every tenth of the run."""
+    """A live bar on a terminal and in a notebook. Elsewhere a plain line at every tenth."""
 
-    def __init__(self, steps: int, done: int) -> None:
-        """Show progress towards `steps` environment steps of each seed. `done` of them are done."""
-        self._steps, self._done = steps, done
+    def __init__(self, steps: int, done: int, shown: bool = True) -> None:
+        """Show progress towards `steps` environment steps of each seed.
+
+        Args:
+            steps: number of steps.
+            done: number of steps that are done already.
+            shown: whether to show anything.
+        """
+        self._steps, self._done, self._shown = steps, done, shown
         self._bar = None
-        if sys.stderr.isatty():
+        notebook = "ipykernel" in sys.modules
+        if shown and (notebook or sys.stderr.isatty()):
             from tqdm import tqdm
 
             self._bar = tqdm(
-                total=steps, initial=done, unit=" steps", unit_scale=True, dynamic_ncols=True
+                total=steps,
+                initial=done,
+                unit=" steps",
+                unit_scale=True,
+                # A notebook has no width, and shows standard error as a fault.
+                ncols=100 if notebook else None,
+                dynamic_ncols=not notebook,
+                file=sys.stdout if notebook else None,
             )
             self._bar.set_postfix_str("compiling")
 
@@ -265,7 +279,7 @@ class Display:
         if self._bar is not None:
             self._bar.set_postfix_str(facts, refresh=False)
             self._bar.update(step - self._done)
-        elif step * 10 // self._steps > self._done * 10 // self._steps:
+        elif self._shown and step * 10 // self._steps > self._done * 10 // self._steps:
             first, begin = self._begin
             left = (time.monotonic() - begin) * (self._steps - step) / max(step - first, 1)
             print(f"{step:>10,} of {self._steps:,} steps, {facts}, {left:.0f} s left", flush=True)
@@ -275,7 +289,7 @@ class Display:
         """Print a line, above the bar if there is one."""
         if self._bar is not None:
             self._bar.write(text)
-        else:
+        elif self._shown:
             print(text, flush=True)
 
     def close(self) -> None:

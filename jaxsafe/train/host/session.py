@@ -131,10 +131,13 @@ class Training:
         """Number of environment steps that each seed is to take."""
         return self.config.num_updates * self.config.ppo.batch_size
 
-    def train(self) -> bool:
+    def train(self, progress: bool = True) -> bool:
         """Train to the end, or until the user asks to stop.
 
         The state is in a checkpoint either way.
+
+        Args:
+            progress: whether to show how far it is.
 
         Returns:
             False if the user asked to stop.
@@ -143,7 +146,7 @@ class Training:
             ConfigError: the program does not fit into memory, the progress log was begun with other
                 columns, or a checkpoint cannot be written.
         """
-        display = Display(self.num_steps, self.step)
+        display = Display(self.num_steps, self.step, progress)
         with self.clock:
             self._await_compiled()
             if self.updates == 0 and self._early_due():
