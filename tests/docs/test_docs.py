@@ -155,6 +155,7 @@ def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax
         thorough("extend_rta"),
         thorough("rta"),
         "deviations",
+        thorough("own_training_loop"),
         thorough("adapters/gymnasium"),
         "adapters/safety_gymnasium",
         pytest.param("adapters/gymnax", marks=pytest.mark.peer),
