@@ -71,7 +71,7 @@ ADAPTERS = {
     "EnvPool CartPole": "EnvPool CartPole",
 }
 DOCKING_FIRST = sorted(TASKS, key=lambda task: task.startswith("rejoin"))
-"""The tasks in the order of docs/rta.md."""
+"""The tasks in the order of docs/safety."""
 
 PARTS = (
     "whole",
@@ -95,6 +95,33 @@ def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     lines = [[*heads], *rows]
     text = ["|" + "|".join(f" {cell} " if cell else " " for cell in line) + "|" for line in lines]
     return "\n".join([text[0], "|" + "---|" * len(heads), *text[1:]])
+
+
+def speed(_: Results) -> str:
+    """Return the first table of the page: what each task does a second, and seconds to learn it."""
+    results = {
+        name: json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
+        for name in ("environments", "accelerator")
+    }
+    core = _steps(results["environments"])
+    rows = results["accelerator"]["parts"]["environments"]["rows"]
+    largest = max(row["environments"] for row in rows)
+    gpu = {row["task"]: row["steps_per_s"] for row in rows if row["environments"] == largest}
+    lines = []
+    for task in TASKS:
+        rates = [core[task, 4096], gpu[task]]
+        seconds = [
+            _record(task, kind)["results"]["wall_s"]
+            for kind in ("engineered_features", "shortest_time")
+        ]
+        lines.append(
+            [task, *(_three(rate / 1e6) for rate in rates), *(f"{value:.0f}" for value in seconds)]
+        )
+    heads = (
+        "task | million steps/s, one core | one GPU | ten seeds, default recipe [s]"
+        " | `preset=shortest_time` [s]"
+    )
+    return markdown(heads.split(" | "), lines)
 
 
 def environments(results: Results, names: Iterable[str] = tuple(ENVIRONMENTS)) -> str:
@@ -232,7 +259,7 @@ def scaling(results: Results) -> str:
             for rate in (single, all_)
         ]
         rows.append([_scaled(name), *cells, f"{all_ / single:.2f}"])
-    return markdown([f"{results['task']}, a second", "1 core", f"{cores} cores", "ratio"], rows)
+    return markdown([f"{results['task']}, per second", "1 core", f"{cores} cores", "ratio"], rows)
 
 
 def projection(results: Results) -> str:
@@ -241,7 +268,7 @@ def projection(results: Results) -> str:
         ["1,000 devices", "seeds", "million samples/s", "of a perfect split"],
         (
             [
-                f"{row['shared']} a seed",
+                f"{row['shared']} per seed",
                 f"{row['seeds']:,}",
                 f"{row['samples_per_s'] / 1e6:.3g}",
                 f"{100 * row['efficiency']:.0f} %",
@@ -635,7 +662,7 @@ def accelerator_learning(results: Results) -> str:
         "95 % in training on the accelerator",
         "seeds × environments",
         "s",
-        "steps a seed",
+        "steps per seed",
         "million samples/s",
     ]
     return markdown([*heads, "seeds at 95 % by then", *PROGRAM], lines)
@@ -712,16 +739,17 @@ def _program(row: Results) -> list[str]:
 
 
 TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
+    ("", speed, "docs/performance.md"),
     ("environments", environments, "docs/performance.md"),
     ("environments", readme_environments, "README.md"),
     ("ppo", ppo, "docs/performance.md"),
     ("startup", startup_parts, "docs/performance.md"),
     ("startup", startup_first, "docs/performance.md"),
-    ("startup", startup_profile, "docs/performance.md"),
+    ("startup", startup_profile, "docs/performance_limits.md"),
     ("five_tasks", five_tasks, "docs/performance.md"),
     ("learning", learning, "docs/performance.md"),
-    ("", goals, "docs/performance.md"),
-    ("accelerator", accelerator_goals, "docs/performance.md"),
+    ("", goals, "docs/performance_limits.md"),
+    ("accelerator", accelerator_goals, "docs/performance_limits.md"),
     ("accelerator", accelerator_environments, "docs/performance.md"),
     ("accelerator", accelerator_ppo, "docs/performance.md"),
     ("accelerator", accelerator_learning, "docs/performance.md"),
@@ -731,12 +759,12 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("scaling", projection, "docs/scaling.md"),
     ("memory", memory, "docs/scaling.md"),
     ("adapters", adapters, "docs/adapters/gymnasium.md"),
-    ("rta", filter_calls, "docs/rta.md"),
-    ("rta", filter_changes, "docs/rta.md"),
-    ("rta", programs, "docs/rta.md"),
-    ("rta", filter_cost, "docs/rta.md"),
-    ("", adversaries, "docs/rta.md"),
-    ("", filtered_training, "docs/rta.md"),
+    ("rta", filter_calls, "docs/safety/cost.md"),
+    ("rta", filter_changes, "docs/safety/cost.md"),
+    ("rta", programs, "docs/safety/cost.md"),
+    ("rta", filter_cost, "docs/safety/cost.md"),
+    ("", adversaries, "docs/safety/attacks.md"),
+    ("", filtered_training, "docs/safety/cost.md"),
     ("", readme_results, "README.md"),
 )
 """The file of results, the function that makes a table of it, and the page of the table."""

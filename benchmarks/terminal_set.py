@@ -13,7 +13,7 @@ printed:
 - the distance up to which the weaker thrust holds the limit at that largest angle, against gravity
   and the shrinking limit.
 
-These are steps of the proof in `docs/rta.md`. `jaxsafe/rta/proofs.py` keeps the numbers.
+These are steps of the proof in `docs/safety/proofs.md`. `jaxsafe/rta/proofs.py` keeps the numbers.
 
     python benchmarks/terminal_set.py [angle=75] [dt=1] [cells=1440]
 """
@@ -34,7 +34,7 @@ LOW_SHARE = 0.3
 """Below this share of the speed limit the limit is far, and nothing is asked of the angle."""
 
 FLIPS = 6
-"""How often the nearer end of the axis may change on the way, see docs/rta.md."""
+"""How often the nearer end of the axis may change on the way, see docs/safety/proofs.md."""
 
 MOST_STEPS = 200
 

@@ -1,8 +1,6 @@
 """The site: `python -m sphinx -W docs docs/_site` after `pip install -e '.[docs]'`."""
 
-import functools
-import re
-from collections.abc import Callable
+import inspect
 from typing import Any
 
 project = "jaxsafe"
@@ -11,44 +9,41 @@ copyright = "The jaxsafe authors, MIT licence"
 extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode"]
 exclude_patterns = ["_site", "jupyter_execute"]  # a build makes these
 nb_execution_mode = "off"  # pages show what is committed, and a test runs the notebook
+myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 myst_links_external_new_tab = True
 
 html_theme = "furo"
 html_title = "jaxsafe"
 html_theme_options = {"navigation_with_keys": True}
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
 
 autodoc_default_options = {"members": True, "member-order": "bysource", "no-value": True}
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 autodoc_preserve_defaults = True
 autodoc_mock_imports = ["brax", "gymnax", "onnx", "stable_baselines3"]
-add_module_names = False
+default_role = "py:obj"  # names in docstrings are code
+python_use_unqualified_type_names = True
+smartquotes = False  # code in docstrings stays as it is written
 
 
 def setup(app: Any) -> None:
-    """Make links that hold in the repository hold on the site.
-
-    The README, one folder up, is its first page.
-    """
-    app.connect("include-read", lambda _app, _path, _page, content: _each(content, _in_docs))
-    app.connect(
-        "source-read",
-        lambda _app, page, content: _each(content, functools.partial(_to_first_page, page)),
-    )
+    """Adapt what the extensions read."""
+    app.connect("source-read", _link_to_file)
+    # Before napoleon reads the docstring.
+    app.connect("autodoc-process-docstring", _docstring_of_function, priority=100)
 
 
-def _each(content: list[str], change: Callable[[str], str]) -> None:
-    content[0] = change(content[0])
+def _link_to_file(_app: Any, _page: str, content: list[str]) -> None:
+    """Make a link to a Markdown file that is no page of the site one to the file."""
+    content[0] = content[0].replace("](../tests/golden/R", "](path:../tests/golden/R")
 
 
-def _in_docs(readme: str) -> str:
-    outside = re.sub(r"\]\((?!https?:|docs/)", "](../", readme).replace("](docs/", "](")
-    return outside.replace("](../tests/golden/README.md", "](path:../tests/golden/README.md")
-
-
-def _to_first_page(page: str, text: str) -> str:
-    up = "../" * page.count("/")
-    return text.replace(f"]({up}../README.md", f"]({up}index.md").replace(
-        "](../tests/golden/R", "](path:../tests/golden/R"
-    )
+def _docstring_of_function(
+    _app: Any, what: str, _name: str, item: Any, _options: Any, lines: list[str]
+) -> None:
+    """Give a package that can be called the docstring of its function."""
+    if what == "function" and inspect.ismodule(item):
+        lines[:] = (inspect.getdoc(item.__wrapped__) or "").splitlines()

@@ -73,6 +73,83 @@ CAPTION = {
 }
 """A caption that says what the figure shows, by agent."""
 
+FILM = {
+    "deputy": "A trained policy docks. The margin h to the speed limit stays above 0.",
+    "wingman": "A trained policy flies to the rejoin point and stays there.",
+}
+"""A caption of the film, by agent."""
+
+HILL = (
+    "r = (x, y) is the deputy's position relative to the chief, with x away from the Earth and y"
+    " along the orbit."
+)
+EQUATIONS = {
+    "docking2d": (
+        r"""
+        \ddot x &= 2n\dot y + 3n^2 x + F_x/m \\
+        \ddot y &= -2n\dot x + F_y/m
+        """,
+        f"These are the Clohessy-Wiltshire equations, Eq. (12). {HILL} The thrust is held over a"
+        " step, and the step is the exact solution.",
+    ),
+    "docking3d": (
+        r"""
+        \ddot x &= 2n\dot y + 3n^2 x + F_x/m \\
+        \ddot y &= -2n\dot x + F_y/m \\
+        \ddot z &= -n^2 z + F_z/m
+        """,
+        f"These are the Clohessy-Wiltshire equations, Eq. (16). {HILL} z completes the frame. The"
+        " thrust is held over a step, and the step is the exact solution.",
+    ),
+    "docking2d_oriented": (
+        r"""
+        \ddot x &= 2n\dot y + 3n^2 x + F\cos\theta/m \\
+        \ddot y &= -2n\dot x + F\sin\theta/m \\
+        \ddot\theta &= u
+        """,
+        f"This is Eq. (20). {HILL} θ is the angle from the x axis to the body's x axis, F the"
+        " thrust along it, and u the acceleration that the reaction wheel gives. θ̇ rests at its"
+        " limit where it reaches it.",
+    ),
+    "rejoin2d": (
+        r"""
+        \dot x &= v\cos\psi \\
+        \dot y &= v\sin\psi \\
+        \dot\psi &= \omega \\
+        \dot v &= a
+        """,
+        "This is Eq. (5), for both aircraft. ψ is the heading, ω the commanded heading rate and a"
+        " the commanded acceleration. They are held over a step, the speed v rests at a limit where"
+        " it reaches it, and the step is the exact solution.",
+    ),
+    "rejoin3d": (
+        r"""
+        \dot x &= v\cos\psi\cos\gamma \\
+        \dot y &= v\sin\psi\cos\gamma \\
+        \dot z &= -v\sin\gamma \\
+        \dot\psi &= (g/v)\tan\phi \\
+        \dot\phi &= p, \quad \dot\gamma = q, \quad \dot v = a
+        """,
+        "This is Eq. (9), for both aircraft. ψ is the heading, γ the flight path angle and φ the"
+        " roll. p, q and a are the commanded rates and the commanded acceleration. They are held"
+        " over a step, and γ, φ and v rest at a limit where they reach it. Positions follow by"
+        " Gauss-Legendre quadrature of order 6.",
+    ),
+}
+"""The equations of motion, and what their symbols mean."""
+
+SAFE = {
+    "deputy": (
+        r"h = \nu_0 + \nu_1\lVert r\rVert - \lVert v\rVert \ge 0",
+        "Here ν₀ = 0.2 m/s and ν₁ = 2n, Eqs. (14), (17).",
+    ),
+    "wingman": (
+        r"h = \lVert r_\text{wingman} - r_\text{lead}\rVert - 100\,\text{ft} \ge 0",
+        "This is Eqs. (8), (11).",
+    ),
+}
+"""The safety constraint, and what its symbols mean, by agent."""
+
 SECTIONS = (
     ("Regions", "", "regions"),
     (
@@ -106,13 +183,20 @@ def page(task: str) -> str:
     blocks = [
         f"<!-- Written by docs/make_tasks.py. -->\n# {task}",
         TEXT[task],
+        f"![A film of {task}](../baselines/{task}.gif)",
+        f"*{FILM[env.agent]}*",
+        "## Try it",
+        try_it(task),
+        "## Equations",
+        *equations(task, env),
+        "## Starts and ends",
         f"![Where {task} starts and how it ends]({task}.png)",
         CAPTION[env.agent],
+        "## Numbers",
         (
-            "The tables and equations named here are those of the paper (see"
-            f" [the README](../../README.md#development)). Lengths are in {length}, and the time"
-            f" step is {number(env.dt)} s. {paths} [Deviations](../deviations.md) says where the"
-            " published code differs."
+            "The tables and equations named here are those of the [paper](index.md). Lengths are in"
+            f" {length}, and the time step is {number(env.dt)} s. {paths}"
+            " [Deviations](../deviations.md) says where the published code differs."
             f" [configs/envs/{task}.yaml](../../configs/envs/{task}.yaml) is the same task as one"
             " file."
         ),
@@ -139,9 +223,47 @@ def page(task: str) -> str:
     return "\n\n".join(wrapped(block) for block in blocks if block) + "\n"
 
 
+def try_it(task: str) -> str:
+    """Return commands and a short program."""
+    return textwrap.dedent(f"""\
+        ```
+        jaxsafe evaluate pretrained/{task} episodes=10 render=gif
+        jaxsafe train {task} seeds=10
+        ```
+
+        ```python
+        import jax
+        import jaxsafe
+
+        env = jaxsafe.make("{task}")
+        policy = jaxsafe.load_policy("{task}")
+        flights = jaxsafe.rollout(env, policy, jax.random.key(0), num_steps=600, num_envs=100)
+        successes = flights.info.outcome == env.outcomes.index("success")
+        print(int(successes.sum()), "successes,", int(flights.cost.sum()), "violating steps")
+        ```""")
+
+
+def equations(task: str, env: jaxsafe.Environment) -> Iterator[str]:
+    """Yield the equations of motion and the safety constraint, with their symbols."""
+    lines, about = EQUATIONS[task]
+    yield f"$$\n\\begin{{aligned}}\n{inspect.cleandoc(lines)}\n\\end{{aligned}}\n$$"
+    agent = env.agent_platform
+    symbols = {"mean_motion": "n", "mass": "m", "gravity": "g"}
+    numbers = [
+        f"{symbols[name]} = {number(getattr(agent, name))} {field.unit.symbol}"
+        for name, field in fields(type(agent)).items()
+        if name in symbols and field.unit
+    ]
+    yield about + (f" {' and '.join(numbers)}." if numbers else "")
+    constraint, meaning = SAFE[env.agent]
+    yield "A state is safe where"
+    yield f"$$\n{constraint}.\n$$"
+    yield meaning
+
+
 def wrapped(block: str) -> str:
     """Return a paragraph in lines of the house's width. Other blocks stay as they are."""
-    if block.startswith(("#", "|", "<", "!")):
+    if block.startswith(("#", "|", "<", "!", "$", "```")):
         return block
     return textwrap.fill(block, 124, break_on_hyphens=False, break_long_words=False)
 
@@ -268,9 +390,10 @@ def parts(env: jaxsafe.Environment, section: str, length: str) -> Iterator[tuple
                 )
 
 
-def summary(component: Component) -> str:
-    """Return the docstring of a component in one line."""
-    return " ".join(inspect.cleandoc(type(component).__doc__ or "").split())
+def summary(component: Component | type[Component]) -> str:
+    """Return the docstring of a component, or of its class, in one line."""
+    cls = component if isinstance(component, type) else type(component)
+    return " ".join(inspect.cleandoc(cls.__doc__ or "").split())
 
 
 def settings(

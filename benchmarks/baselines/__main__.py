@@ -1,7 +1,7 @@
-"""Train every task in every way with ten seeds, evaluate the policies, and write OUT/baselines.md.
+"""Train every task by every recipe with ten seeds, evaluate the policies, and write the pages.
 
-That takes hours. It may be done in parts: the page has also what was reported into OUT before, with
-the same options.
+The first page is OUT/baselines.md, the others are in OUT/results. That takes hours. It may be done
+in parts: the pages also have what was reported into OUT before, with the same options.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class Options(CommandOptions):
     tasks: Annotated[tuple[str, ...], Option(names=tuple(TASKS))] | None = None
     """The tasks to train, in brackets if there are several. By default it is all of them."""
     kinds: Annotated[tuple[str, ...], Option(names=tuple(KINDS))] | None = None
-    """The ways to train, in brackets if there are several. By default it is all of them."""
+    """The recipes, in brackets if there are several. By default it is all of them."""
     runs: Directory = "runs/report"
     """Directory of the runs. What is complete there is not done again."""
     out: Directory = "report"
-    """Where to write the page."""
+    """Where to write the pages."""
     policies: Directory | None = None
     """Where to copy the best policy of each task, as TASK.npz."""
     film: bool = True

@@ -1,6 +1,6 @@
-"""The page of the baselines: tables, figures and curves from the result files of the runs.
+"""The pages of the baselines: tables, figures and curves from the result files of the runs.
 
-The text of the page is in `page.md`. A place like `$efficiency` in it stands for the rows of a
+The text of the pages is in `pages/`. A place like `$efficiency` in it stands for the rows of a
 table, or for a word or a list.
 """
 
@@ -25,18 +25,31 @@ from jaxsafe.train.host.results import known, least
 from jaxsafe.train.recent_episodes import SIZE as WINDOW
 
 DIRECTORY = "baselines"
-"""The directory beside the page that holds records, curves, figures and films."""
+"""The directory beside the first page that holds records, curves, figures and films."""
 
-TEMPLATE = Path(__file__).with_name("page.md")
+TEMPLATES = Path(__file__).with_name("pages")
 
-PICTURES = "## Pictures"
-"""The section that has its text once for each task."""
+FIRST = "baselines.md"
+"""The page that leads to all others."""
+
+QUESTIONS = {
+    "results/learning.md": "How many steps does it take to learn?",
+    "results/quality.md": "How well do the policies fly, and how does it look?",
+    "results/safety.md": "How often are constraints violated, with and without a filter?",
+    "results/starts.md": "What happens from farther away than in training?",
+    "results/wall_time.md": "How many seconds does it take?",
+    "results/provenance.md": "Which commands, commits and seeds are behind the numbers?",
+}
+"""What each other page answers."""
+
+NEEDS = {"results/starts.md": "starts", "results/wall_time.md": "wall"}
+"""The table without which there is no page, by page."""
 
 Rows = list[list[str]]
 
 
 class Report:
-    """The records of all items, and the page that they make."""
+    """The records of all items, and the pages that they make."""
 
     def __init__(self, records: Sequence[Record]) -> None:
         """Take at least one record."""
@@ -54,7 +67,10 @@ class Report:
         self.tasks = [task for task in TASKS if any(record.item.task == task for record in records)]
 
     def write(self, out: Path) -> Path:
-        """Write `baselines.md`. Write figures of training into the directory of the records."""
+        """Write the pages, and figures of training into the directory of the records.
+
+        Return the first page.
+        """
         files = out / DIRECTORY
         for task in self.tasks:
             curves = {
@@ -69,28 +85,17 @@ class Report:
             mark = None if steps is None else ("the paper's 80 %", steps)
             save(compare_curves(curves, task, mark=mark), files / f"{task}_training.png")
             save(seed_curves(curves, task, failed), files / f"{task}_seeds.png")
-        page = out / "baselines.md"
-        write_text(page, self.text(files))
-        return page
+        for name, text in self.pages(files).items():
+            write_text(out / name, text)
+        return out / FIRST
 
-    def text(self, files: Path) -> str:
-        """Return the page as Markdown.
+    def pages(self, files: Path) -> dict[str, str]:
+        """Return the pages as Markdown, by their paths beside the directory of the records.
 
         A section without rows is left out, and so are figures that are not in `files`.
         """
-        results = self.records[0].results
-        words = {
-            "origins": "\n".join(self._origins()),
-            "kinds": "\n".join(f"- **{kind}**: {KINDS[kind].about}" for kind in self.kinds),
-            "first_seed": str(results["seed"]),
-            "last_seed": str(results["seed"] + results["seeds"] - 1),
-            "episodes": f"{max(self.episodes.values()):,}",
-            "enough": str(ENOUGH_EPISODES),
-            "window": str(WINDOW),
-            "curves": self._curves(files),
-            "commands": "\n".join(self._commands()),
-        }
         tables = {
+            "summary": self._summary(),
             "efficiency": self._efficiency(),
             "wall": self._wall(),
             "final": self._final(),
@@ -101,17 +106,40 @@ class Report:
             "best": self._best(),
             "together": self._together(),
         }
-        rows = {name: _markdown(table) for name, table in tables.items()}
-        sections = re.split(r"\n\n(?=## )", TEMPLATE.read_text(encoding="utf-8").rstrip())
+        names = [name for name in QUESTIONS if tables.get(NEEDS.get(name, ""), True)]
+        results = self.records[0].results
+        words = {
+            "origins": "\n".join(self._origins()),
+            "kinds": "\n".join(f"- **{kind}**: {KINDS[kind].about}" for kind in self.kinds),
+            "seeds": str(results["seeds"]),
+            "first_seed": str(results["seed"]),
+            "last_seed": str(results["seed"] + results["seeds"] - 1),
+            "episodes": f"{max(self.episodes.values()):,}",
+            "enough": str(ENOUGH_EPISODES),
+            "window": str(WINDOW),
+            "questions": "\n".join(
+                f"| {QUESTIONS[name]} | [{_title(name)}]({name}) |" for name in names
+            ),
+            "toctree": "\n".join(name.removesuffix(".md") for name in names),
+            "commands": "\n".join(self._commands()),
+        }
+        return {name: self._page(name, files, words, tables) for name in (FIRST, *names)}
+
+    def _page(
+        self, name: str, files: Path, words: Mapping[str, str], tables: Mapping[str, Rows]
+    ) -> str:
+        up = "../" * name.count("/")
+        own = {"files": f"{up}{files.name}", "curves": self._curves(f"{up}{files.name}")}
+        rows = {place: _markdown(table) for place, table in tables.items()}
         parts = []
-        for section in sections:
+        for section in re.split(r"\n\n(?=## )", _template(name)):
             places = Template(section).get_identifiers()
             if any(not tables.get(place, True) for place in places):
                 continue
-            if section.startswith(PICTURES):
-                parts.append(self._pictures(section, files, words))
+            if "task" in places:
+                parts.append(self._pictures(section, files, {**words, **own}))
             else:
-                parts.append(Template(section).substitute(words | rows))
+                parts.append(Template(section).substitute({**words, **own, **rows}))
         return "\n\n".join(parts) + "\n"
 
     def _origins(self) -> list[str]:
@@ -129,6 +157,20 @@ class Report:
             f"- {origin}: {', '.join(items)} ({versions})"
             for (origin, versions), items in names.items()
         ]
+
+    def _summary(self) -> Rows:
+        """Return the rows of the first table: a task each, without and with a filter."""
+        rows = []
+        for task in self.tasks:
+            found = {item.kind: results for item, results in self.own if item.task == task}
+            if "engineered_features" not in found:
+                continue
+            pair = [found["engineered_features"], found.get("rta")]
+            paper = TASKS[task].paper_steps
+            columns = [_learnt, _succeeded, _violating_in_training, _violating]
+            cells = [column(results) if results else "–" for column in columns for results in pair]
+            rows.append([task, f"{paper:,}" if paper else "–", *cells])
+        return rows
 
     def _efficiency(self) -> Rows:
         rows = []
@@ -325,23 +367,23 @@ class Report:
         return rows
 
     def _pictures(self, section: str, files: Path, words: Mapping[str, str]) -> str:
-        """Return the section of pictures. A task has those pictures that are in `files`."""
+        """Return a section of pictures. A task has those pictures that are in `files`."""
         title, *paragraphs = section.split("\n\n")
         lines = [title]
         for task in self.tasks:
             shown = True
             for paragraph in paragraphs:
-                text = Template(paragraph).substitute(words, task=task, files=files.name)
-                picture = re.fullmatch(r"!\[.*\]\((.*)\)", text)
+                text = Template(paragraph).substitute(words, task=task)
+                picture = re.fullmatch(r"!\[.*\]\(.*/(.*)\)", text)
                 # A caption follows its picture, and both are there or neither is.
                 if picture:
-                    shown = (files.parent / picture[1]).exists()
-                if shown:
+                    shown = (files / picture[1]).exists()
+                if shown or text.startswith("#"):
                     lines.append(text)
         return "\n\n".join(lines)
 
-    def _curves(self, files: Path) -> str:
-        return ", ".join(f"[{item.name}]({files.name}/{item.name}.csv)" for item, _ in self.own)
+    def _curves(self, files: str) -> str:
+        return ", ".join(f"[{item.name}]({files}/{item.name}.csv)" for item, _ in self.own)
 
     def _commands(self) -> list[str]:
         """Return the commands behind the tables, as a user would type them."""
@@ -357,6 +399,38 @@ class Report:
                 if name == SHIPPED:
                     lines.append(f"{command} {shlex.join(FILM)}")
         return lines
+
+
+def _template(name: str) -> str:
+    return (TEMPLATES / name).read_text(encoding="utf-8").rstrip()
+
+
+def _title(name: str) -> str:
+    return _template(name).partition("\n")[0].removeprefix("# ")
+
+
+def _learnt(results: Mapping[str, Any]) -> str:
+    steps = results["interaction_efficiency"]["timesteps"]
+    return f"{steps:,}" if steps else "never"
+
+
+def _succeeded(results: Mapping[str, Any]) -> str:
+    return _both(results, "success_rate")
+
+
+def _violating_in_training(results: Mapping[str, Any]) -> str:
+    return known(results["training_cost"]["mean"], ",.0f")
+
+
+def _violating(results: Mapping[str, Any]) -> str:
+    return _both(results, "episode_safety_violation_rate")
+
+
+def _both(results: Mapping[str, Any], name: str) -> str:
+    """Return a share in percent, with sampled actions and with the most probable ones."""
+    metrics = results["evaluation"]
+    shares = [metrics[actions][name]["mean"] for actions in ("stochastic", "deterministic")]
+    return " / ".join("–" if share is None else f"{100 * share:.2f}" for share in shares)
 
 
 def _markdown(rows: Rows) -> str:

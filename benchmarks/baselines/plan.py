@@ -12,7 +12,7 @@ from jaxsafe.schema.errors import ConfigError, nearest
 
 
 class Kind(NamedTuple):
-    """A way to train each task."""
+    """A recipe to train each task by."""
 
     options: tuple[str, ...]  # options of `jaxsafe.train`
     about: str  # what the page says about it
@@ -44,7 +44,7 @@ KINDS: Mapping[str, Kind] = {
     ),
     "shortest_time": Kind(
         ("preset=shortest_time",),
-        "fewer epochs and steps, for a result soon. An evaluation has 100 episodes a seed.",
+        "fewer epochs and steps, for a result soon. An evaluation has 100 episodes per seed.",
     ),
     "discrete": Kind(
         ("actions=discrete",),
@@ -67,7 +67,7 @@ KINDS: Mapping[str, Kind] = {
         "the recipe of `rta`, but interventions cost nothing (`rta_training=no_punishment`).",
     ),
 }
-"""The ways to train, by the name that the page uses."""
+"""The recipes, by the name that the page uses."""
 
 CERTIFIED_STARTS = {"docking2d_oriented": ("env.deputy.start.velocity.share=[0,0.99]",)}
 """Options that leave out the starts of a task from which no filter can promise safety."""

@@ -249,7 +249,10 @@ BRAKE: dict[str, Any] = {
     "margin": LIMIT_MARGIN,
     "backups": (Brake(name="brake"),),
 }
-"""Filters without a horizon: braking holds the limit from one step to the next, see docs/rta.md."""
+"""Filters without a horizon: braking holds the limit from one step to the next.
+
+The proof is in docs/safety/proofs.md.
+"""
 
 STOP: dict[str, Any] = {**BRAKE, "horizon": 16, "terminal": Slow(speed=0.19)}
 """Filters that predict braking until there is hardly any speed, as if nothing was known of it."""

@@ -198,7 +198,7 @@ class Success(Reward, type="success"):
 
 
 class Failure(Reward, type="failure"):
-    """A constant for each way in which an episode may fail, by outcome name."""
+    """A constant for each outcome that is a failure, by its name."""
 
     values: Mapping[OutcomeName, Pay]
 

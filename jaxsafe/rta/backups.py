@@ -272,7 +272,7 @@ class VelocityMatched(TerminalSet, type="velocity_matched"):
     def _tolerance(self, env: Environment) -> Number:
         """Return `tolerance`, or less if in space the proof or the actuators allow only less.
 
-        The bounds are those of Proposition 7 in docs/rta.md.
+        The bounds are those of Proposition 7 in docs/safety/proofs.md.
         """
         plant = env.agent_platform
         if type(plant) is not Dubins3D:

@@ -204,8 +204,8 @@ class CertifiedRTA(RTA):
         """Return the h to keep at samples.
 
         It is `margin`, or more where h could otherwise fall below 0 between two samples. For speed
-        limits that depends on the length of a step, see docs/rta.md. Separations are bounded within
-        the step instead.
+        limits that depends on the length of a step, see docs/safety/proofs.md. Separations are
+        bounded within the step instead.
         """
         facts = [speed_limit_facts(env, name) for name in self.constraints]
         least_margins = [limit.least_margin for limit in facts if limit]

@@ -1,8 +1,8 @@
 """Conditions under which the proofs for the packaged backup controllers and terminal sets hold.
 
-The propositions are those of docs/rta.md. Each function returns in words what is missing at a
-state, as `BackupController.faults` does. Some terminal sets are proved for one backup controller
-alone. Its class is the argument `keeper`.
+The propositions are those of docs/safety/proofs.md. Each function returns in words what is missing
+at a state, as `BackupController.faults` does. Some terminal sets are proved for one backup
+controller alone. Its class is the argument `keeper`.
 """
 
 from __future__ import annotations

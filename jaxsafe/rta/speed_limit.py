@@ -1,8 +1,8 @@
 """Formulas that are proved for a speed limit that grows with the distance from a chief.
 
-They hold for whatever numbers the environment has, and docs/rta.md proves them. They say how far h
-can fall within a step, where thrust still holds the limit, and how far a braking spacecraft goes. A
-filter asks them before it certifies anything.
+They hold for whatever numbers the environment has, and docs/safety/proofs.md proves them. They say
+how far h can fall within a step, where thrust still holds the limit, and how far a braking
+spacecraft goes. A filter asks them before it certifies anything.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jaxsafe.environment import Environment
 
 MAX_ORBIT_ANGLE_PER_STEP = 0.05
-"""Largest angle of the chief's orbit in a step [rad] for which the series of docs/rta.md hold."""
+"""Largest angle of the chief's orbit in a step [rad] for which the proofs' series hold."""
 
 
 class SpeedLimitFacts(Record):
@@ -49,7 +49,7 @@ class SpeedLimitFacts(Record):
     def needed_margin(self, distance: Number) -> Any:
         """Return the least h [m/s] at both ends of a step with which h ≥ 0 within the step.
 
-        This is Proposition 4 of docs/rta.md, for a step from a distance [m].
+        This is Proposition 4 of docs/safety/proofs.md, for a step from a distance [m].
         """
         speed = self.limit(distance) * (1.0 + self.slope * self.dt)
         way = speed * self.dt

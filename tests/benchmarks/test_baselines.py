@@ -31,7 +31,7 @@ from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.options import resolve_all
 
-PAGE = Path(__file__).parents[2] / "docs" / "baselines.md"
+DOCS = Path(__file__).parents[2] / "docs"
 REST = [word for word in TINY if not word.startswith("env=")]
 
 
@@ -58,17 +58,23 @@ def calls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[list[str]]:
     return made
 
 
-def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str]]) -> None:
+def pages(out: str) -> str:
+    """Return the text of all pages of a report."""
+    files = [Path(out, "baselines.md"), *sorted(Path(out, "results").iterdir())]
+    return "\n".join(file.read_text() for file in files)
+
+
+def test_a_report_trains_evaluates_and_writes_the_pages_once(calls: list[list[str]]) -> None:
     words = ["tasks=docking2d", "kinds=engineered_features", "policies=best", *REST]
     assert command.main(words) == 0
-    page = Path("report/baselines.md").read_text()
+    page = pages("report")
     assert f"`python benchmarks/baselines {shlex.join(words)}`" in page
     for section in (
         "Interaction efficiency",
         "After training",
         "Quality of docking",
-        "Safety",
-        "Starts outside training",
+        "Violations",
+        "Farther starts",
         "The best policies",
     ):
         assert f"## {section}" in page
@@ -97,7 +103,7 @@ def test_a_report_trains_evaluates_and_writes_the_page_once(calls: list[list[str
         "docking2d.gif",
     ):
         assert Path("report/baselines", file).stat().st_size > 1000
-        assert f"(baselines/{file})" in page
+        assert f"(../baselines/{file})" in page
     with open("report/baselines/docking2d-engineered_features.csv") as file:
         rows = list(csv.DictReader(file))
     assert [(int(row["step"]), int(row["seed"])) for row in rows] == [
@@ -115,10 +121,10 @@ def test_a_report_in_parts_makes_the_page_of_one(
 ) -> None:
     words = ["tasks=docking2d", "film=false", *REST]
     assert command.main([*words, "kinds=[engineered_features,observation_only]"]) == 0
-    whole = Path("report/baselines.md").read_text()
+    whole = pages("report")
     for kind in ("observation_only", "engineered_features"):
         assert command.main([*words, f"kinds={kind}", "out=parts"]) == 0
-    parts = Path("parts/baselines.md").read_text()
+    parts = pages("parts")
     assert [line for line in whole.splitlines() if "|" in line] == [
         line for line in parts.splitlines() if "|" in line
     ]
@@ -135,7 +141,7 @@ def test_a_report_in_parts_makes_the_page_of_one(
         f"{record}: was made with other options and is left out; report it again"
         in capsys.readouterr().out
     )
-    assert "engineered_features |" not in Path("parts/baselines.md").read_text()
+    assert "engineered_features |" not in pages("parts")
 
 
 @pytest.mark.thorough
@@ -144,7 +150,7 @@ def test_an_evaluation_with_other_options_than_today_s_is_left_out_and_made_anew
 ) -> None:
     words = ["tasks=docking2d", "kinds=engineered_features", "film=false", *REST]
     assert command.main(words) == 0
-    assert "| docking2d | heavy |" in Path("report/baselines.md").read_text()
+    assert "| docking2d | heavy |" in pages("report")
     heavier = {"heavy": ["env.deputy.mass=30"], SHIPPED: ["seed=1"]}
     monkeypatch.setattr(
         Item,
@@ -163,7 +169,7 @@ def test_an_evaluation_with_other_options_than_today_s_is_left_out_and_made_anew
     assert calls[-1][:2] == ["jaxsafe.evaluate", "run=runs/report/docking2d-engineered_features"]
     assert "env.deputy.mass=30" in calls[-1]
     assert len(calls) == 4
-    assert "| docking2d | heavy |" in Path("report/baselines.md").read_text()
+    assert "| docking2d | heavy |" in pages("report")
 
 
 def test_a_record_is_of_the_commit_that_trained_it(
@@ -176,17 +182,17 @@ def test_a_record_is_of_the_commit_that_trained_it(
         assert (
             f"`python benchmarks/baselines {shlex.join(words)}` on commit {trained}:"
             f" docking2d-observation_only"
-        ) in (Path("report/baselines.md").read_text())
+        ) in pages("report")
     assert len(calls) == 1
 
 
 @pytest.mark.thorough
-def test_the_page_of_the_project_is_that_of_its_records_and_of_todays_recipes() -> None:
-    records, old = kept(
-        plan([*TASKS], [*KINDS], [f"seeds={command.SEEDS}"]), PAGE.parent / DIRECTORY
-    )
+def test_the_pages_of_the_project_are_those_of_its_records_and_of_todays_recipes() -> None:
+    records, old = kept(plan([*TASKS], [*KINDS], [f"seeds={command.SEEDS}"]), DOCS / DIRECTORY)
     assert len(records) == len(TASKS) * len(KINDS), old
-    assert Report(records).text(PAGE.parent / DIRECTORY) == PAGE.read_text(encoding="utf-8")
+    written = Report(records).pages(DOCS / DIRECTORY)
+    assert [name for name, text in written.items() if (DOCS / name).read_text() != text] == []
+    assert {f"results/{file.name}" for file in (DOCS / "results").iterdir()} < written.keys()
 
 
 @pytest.mark.thorough

@@ -20,6 +20,7 @@ from default_cases import thorough
 import jaxsafe
 from jaxsafe.config import dump, load
 from jaxsafe.envs import TASKS
+from jaxsafe.train.host.options import recipe
 
 ROOT = Path(__file__).parents[2]
 CUSTOM = ROOT / "configs" / "custom_env.yaml"
@@ -37,6 +38,26 @@ def test_the_page_of_a_task_is_current(task: str, monkeypatch: pytest.MonkeyPatc
         "run docs/make_tasks.py"
     )
     assert (ROOT / "docs" / "tasks" / f"{task}.png").is_file()
+
+
+@pytest.mark.parametrize("name", ["options", "parts"])
+def test_a_page_of_the_reference_is_current(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    import make_reference  # pyright: ignore[reportMissingImports]
+
+    page = (ROOT / "docs" / "reference" / f"{name}.md").read_text(encoding="utf-8")
+    assert page == getattr(make_reference, name)(), "run docs/make_reference.py"
+
+
+def test_the_reference_has_every_type_and_every_option_of_the_tasks_and_recipes() -> None:
+    reference = ROOT / "docs" / "reference"
+    parts = (reference / "parts.md").read_text(encoding="utf-8")
+    options = (reference / "options.md").read_text(encoding="utf-8")
+    for task in TASKS:
+        for kind in re.findall(r"\btype: (\w+)", dump(jaxsafe.make(task))):
+            assert f"### `{kind}`" in parts
+        for option in recipe(task, None):
+            assert f"| `{option}` |" in options
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -89,8 +110,7 @@ def test_the_site_builds_without_a_warning_twice_and_with_its_own_extra_alone(
         )
         assert (ran.returncode, ran.stderr) == (0, "")
     first = (copy / "docs" / "_site" / "index.html").read_text(encoding="utf-8")
-    # The README calls this page docs/tasks/docking3d.md.
-    assert 'href="tasks/docking3d.html"' in first
+    assert 'class="card ' in first
     assert "jaxsafe.reset_to" in (copy / "docs" / "_site" / "api.html").read_text(encoding="utf-8")
 
 
@@ -153,7 +173,8 @@ def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax
         "compose",
         thorough("extend"),
         thorough("extend_rta"),
-        thorough("rta"),
+        thorough("safety/presets"),
+        thorough("safety/proofs"),
         "deviations",
         thorough("own_training_loop"),
         thorough("adapters/gymnasium"),
@@ -210,6 +231,17 @@ def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:
     assert process.stdout.count("\n") >= len(blocks)
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize("page", ["quickstart", "concepts", "tasks/docking2d"])
+def test_the_code_of_a_first_page_runs(page: str, tmp_path: Path) -> None:
+    blocks = BLOCK.findall((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8"))
+    program = "\n".join(text for kind, text in blocks if kind == "python")
+    (tmp_path / "program.py").write_text(program, encoding="utf-8")
+    process = run(["program.py"], tmp_path)
+    assert process.returncode == 0, process.stderr
+    assert process.stdout.count("\n") == program.count("print(")
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_commands_are_those_of_any_shell(page: Path) -> None:
     """In zsh a word with brackets must be quoted, and a comment behind a command is part of it."""
@@ -227,7 +259,7 @@ def test_commands_are_those_of_any_shell(page: Path) -> None:
 
 @pytest.mark.slow
 def test_terminal_sets_hold_where_the_page_says_so(tmp_path: Path) -> None:
-    page = (ROOT / "docs" / "rta.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "safety" / "proofs.md").read_text(encoding="utf-8")
     script = next(
         text for _, text in BLOCK.findall(page) if text.startswith("# terminal_sets.py\n")
     )
