@@ -14,7 +14,8 @@ own, pinned to one core. Peers run in Python environments that this script build
   (spring), and CartPole of Gymnasium (NumPy) and EnvPool (one thread). The last two get the same
   actions at every step.
 
-Results are written to `benchmarks/results/environments.json`, and the README's table is printed:
+Results are written to `benchmarks/results/environments.json`, and the table of docs/performance.md
+is printed:
 
     python benchmarks/environments.py [envs=1,1024,4096,16384] [names=docking3d,…]
         [repeats=5]

@@ -13,7 +13,7 @@ import statistics
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from baselines.plan import WITHOUT_RTA
 
@@ -41,7 +41,29 @@ ENVIRONMENTS = {
     "gymnasium:CartPole-v1": "Gymnasium CartPole-v1, NumPy",
     "envpool:CartPole-v1": "EnvPool CartPole-v1, one thread",
 }
-README_ENVIRONMENTS = (*TASKS, "docking3d:usual_way", PENDULUM, "gymnasium:CartPole-v1")
+
+
+class Facts(NamedTuple):
+    """What the README says about a task besides its results."""
+
+    goal: str
+    never: str  # what the safety constraint forbids
+    observation: int  # number of elements
+    actions: int  # number of actuators
+
+
+_REJOIN = "hold the rejoin point behind the lead for 20 s"
+_APART = "come within 100 ft of the lead"
+_DOCK = "reach 0.5 m from the chief"
+_SLOW = "exceed 0.2 m/s + 2n·distance"
+FACTS = {
+    "rejoin2d": Facts(goal=_REJOIN, never=_APART, observation=12, actions=2),
+    "rejoin3d": Facts(goal=_REJOIN, never=_APART, observation=18, actions=3),
+    "docking2d": Facts(goal=_DOCK, never=_SLOW, observation=6, actions=2),
+    "docking3d": Facts(goal=_DOCK, never=_SLOW, observation=8, actions=3),
+    "docking2d_oriented": Facts(goal=_DOCK, never=_SLOW, observation=9, actions=2),
+}
+"""Facts by task."""
 
 PPO = {
     "jaxsafe": "jaxsafe, one seed",
@@ -137,11 +159,6 @@ def environments(results: Results, names: Iterable[str] = tuple(ENVIRONMENTS)) -
             for name in shown
         ),
     )
-
-
-def readme_environments(results: Results) -> str:
-    """Return the table of `environments` with fewer rows."""
-    return environments(results, README_ENVIRONMENTS)
 
 
 def ppo(results: Results) -> str:
@@ -442,27 +459,38 @@ def filtered_training(_: Results) -> str:
     )
 
 
-def readme_results(_: Results) -> str:
-    """Return the table of the recipes of the tasks, from the records of the report."""
+def readme_tasks(_: Results) -> str:
+    """Return the table of the tasks, with their results from the records of the report.
+
+    Success and violations after training are those of deterministic policies. Violating steps of
+    training are counted for each seed.
+    """
     rows = []
-    for task in TASKS:
-        own = _record(task, "engineered_features")["results"]
-        rates = [own["evaluation"][way]["success_rate"] for way in ("stochastic", "deterministic")]
+    for task, facts in FACTS.items():
+        alone, filtered = (
+            _record(task, kind)["results"] for kind in ("engineered_features", "rta")
+        )
+        after = [run["evaluation"]["deterministic"] for run in (alone, filtered)]
         rows.append(
             [
-                task,
-                f"{TASKS[task].paper_steps:,}",
-                _until(own["interaction_efficiency"]["timesteps"]),
-                f"{own['steps']:,}",
-                *(f"{100 * rate['mean']:.2f} %" for rate in rates),
-                f"{100 * min(min(rate['per_seed']) for rate in rates):.1f} %",
+                f'<a href="docs/tasks/{task}.md"><img src="docs/baselines/{task}.gif" width="150"'
+                f' alt="{task}"></a>',
+                f"[{task}](docs/tasks/{task}.md)",
+                facts.goal,
+                facts.never,
+                f"{facts.observation} / {facts.actions}",
+                f"{_until(alone['interaction_efficiency']['timesteps'])}"
+                f" ({TASKS[task].paper_steps:,})",
+                f"{100 * after[0]['success_rate']['mean']:.1f} %",
+                " → ".join(f"{run['training_cost']['mean']:,.0f}" for run in (alone, filtered)),
+                " → ".join(_share(run["episode_safety_violation_rate"]) for run in after),
             ]
         )
     heads = (
-        "task | 80 % in training, paper | here | trained for | success, stochastic |"
-        " deterministic | worst seed"
+        "task | to do | never | observation / actions | 80 % after (paper) | success"
+        " | violating steps while training | afterwards"
     )
-    return markdown(heads.split(" | "), rows)
+    return markdown(["", *heads.split(" | ")], rows)
 
 
 def goals(_: Results) -> str:
@@ -741,7 +769,6 @@ def _program(row: Results) -> list[str]:
 TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("", speed, "docs/performance.md"),
     ("environments", environments, "docs/performance.md"),
-    ("environments", readme_environments, "README.md"),
     ("ppo", ppo, "docs/performance.md"),
     ("startup", startup_parts, "docs/performance.md"),
     ("startup", startup_first, "docs/performance.md"),
@@ -765,7 +792,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("rta", filter_cost, "docs/safety/cost.md"),
     ("", adversaries, "docs/safety/attacks.md"),
     ("", filtered_training, "docs/safety/cost.md"),
-    ("", readme_results, "README.md"),
+    ("", readme_tasks, "README.md"),
 )
 """The file of results, the function that makes a table of it, and the page of the table."""
 

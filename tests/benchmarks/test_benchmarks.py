@@ -9,6 +9,8 @@ from types import ModuleType
 
 import pytest
 
+from jaxsafe.envs import TASKS, make
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -27,6 +29,15 @@ def test_the_tables_of_the_pages_are_current(tables: ModuleType) -> None:
         if text != page.read_text(encoding="utf-8")
     ]
     assert stale == [], "run benchmarks/tables.py"
+
+
+def test_the_sizes_of_the_tasks_in_the_readme_are_those_of_the_environments(
+    tables: ModuleType,
+) -> None:
+    assert list(tables.FACTS) == list(TASKS)
+    for task, facts in tables.FACTS.items():
+        env = make(task)
+        assert (facts.observation, facts.actions) == (env.observation_size, env.action_size), task
 
 
 def test_another_result_makes_another_table(tables: ModuleType) -> None:

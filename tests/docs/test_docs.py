@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import jax
@@ -218,17 +219,23 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_pa
 
 @pytest.mark.thorough
 def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:
-    blocks = [
-        text
-        for kind, text in BLOCK.findall((ROOT / "README.md").read_text(encoding="utf-8"))
-        if kind == "python"
-    ]
-    # This is what the filter is there for.
-    shown = "assert safe.info.intervening.mean() > 0.9 and safe.cost.sum() == 0"
-    (tmp_path / "program.py").write_text("\n".join([*blocks, shown]), encoding="utf-8")
+    blocks = BLOCK.findall((ROOT / "README.md").read_text(encoding="utf-8"))
+    program = "\n".join(text for kind, text in blocks if kind == "python")
+    [shown] = [text for kind, text in blocks if kind == "text"]
+    (tmp_path / "program.py").write_text(program, encoding="utf-8")
     process = run(["program.py"], tmp_path)
     assert process.returncode == 0, process.stderr
-    assert process.stdout.count("\n") >= len(blocks)
+    assert process.stdout.endswith(f"\n{shown}")
+    assert (tmp_path / "flight.png").is_file()
+
+
+def test_the_address_of_the_repository_is_written_in_one_place() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for address in re.findall(r"https://github\.com/\w+/jaxsafe\b", text):
+            assert address == project["urls"]["Source"], page
+    assert project["urls"]["Source"] in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 @pytest.mark.thorough
