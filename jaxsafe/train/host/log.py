@@ -80,15 +80,27 @@ def check_order(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
             )
 
 
-def headline(facts: Mapping[str, Any]) -> str:
+def headline(*runs: Mapping[str, Any]) -> str:
     """Return in short what a run is, for the title of a table or a figure.
 
     Args:
-        facts: the facts about the run that its results hold.
+        *runs: the facts about the run that its results hold. Of several runs, only what they share
+            is told.
     """
-    count = facts["seeds"]
-    what = f"{facts['env']}, preset {facts['preset']}, {facts['algorithm']}, rta {facts['rta']}"
-    return f"{what}, {count} seed{'s' * (count != 1)}"
+    told = [
+        [
+            str(facts["env"]),
+            f"preset {facts['preset']}",
+            # Results of older versions have neither of the next two.
+            str(facts.get("algorithm", "")),
+            f"rta {facts['rta']}" if "rta" in facts else "",
+            f"{facts['seeds']} seed{'s' * (facts['seeds'] != 1)}",
+        ]
+        for facts in runs
+    ]
+    return ", ".join(
+        words[0] for words in zip(*told, strict=True) if words[0] and len({*words}) == 1
+    )
 
 
 class ProgressLog:

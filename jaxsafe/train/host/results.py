@@ -163,7 +163,7 @@ def table(results: dict[str, Any], path: Path) -> str:
             *(percent(least([one["success_rate"]]), 1) for one in found.values()),
         ]
     )
-    lines += [*columns(rows), *told_diverged(results)]
+    lines += [*columns(rows), *told_diverged(results), *told_violations(results)]
     if "given_up" in results:
         counts, limit = results["given_up"], results["given_up"]["after_steps"]
         told = ", ".join(f"{counts[kind]:,} {kind}" for kind in found)
@@ -303,6 +303,34 @@ def told_diverged(results: Mapping[str, Any]) -> list[str]:
         f"{one['seed']}" + (f" by step {one['step']:,}" if one["step"] else "") for one in diverged
     )
     return [f"DIVERGED, and left out of the averages: seed{'s' * (len(diverged) > 1)} {steps}"]
+
+
+def told_violations(results: Mapping[str, Any]) -> list[str]:
+    """Return lines about the violating steps while training and after it.
+
+    Return no line if the environment has no safety constraints.
+    """
+    found = results["evaluation"]
+    rates = {kind: one["episode_safety_violation_rate"]["mean"] for kind, one in found.items()}
+    if any(rate is None for rate in rates.values()):
+        return []
+    shares = []
+    cost = results.get("training_cost", {}).get("mean")
+    if cost is not None:
+        steps = results["steps"]
+        share = 100.0 * cost / max(steps, 1)
+        shares.append(f"{share:.2f} % while training ({cost:,.0f} of each seed's {steps:,})")
+    shares += [f"{100.0 * rate:.2f} % {kind}" for kind, rate in rates.items()]
+    rta = results.get("rta", "none")
+    where = "without a filter" if rta == "none" else f"with the filter {rta}"
+    lines = ["", f"violating steps {where}: {', '.join(shares)}"]
+    if rates.get("stochastic"):
+        lines += [
+            "stochastic episodes sample their actions, as training does. This noise carries a",
+            "policy that flies close to a limit across it for single steps, so many episodes may",
+            "have a violation and few steps. Deterministic episodes take the most probable action.",
+        ]
+    return lines
 
 
 def least(metrics: Sequence[Mapping[str, Any]]) -> float | None:

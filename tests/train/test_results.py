@@ -1,0 +1,73 @@
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from jaxsafe.train.host.comparison import csv_rows, latex
+from jaxsafe.train.host.log import headline
+from jaxsafe.train.host.results import table
+
+
+@pytest.fixture
+def results(whole: Path) -> dict[str, Any]:
+    return json.loads((whole / "results.json").read_text())
+
+
+def set_violations(results: dict[str, Any], stochastic: float | None, training: float) -> None:
+    """Set how many steps violate, and in how many episodes."""
+    for kind, rate in (("stochastic", stochastic), ("deterministic", stochastic and 0.0)):
+        results["evaluation"][kind]["episode_safety_violation_rate"]["mean"] = rate
+        results["evaluation"][kind]["safety_violation_rate"]["mean"] = rate
+    results["training_cost"]["mean"] = training
+
+
+def test_the_table_tells_violating_steps_while_training_and_after(results: dict) -> None:
+    set_violations(results, stochastic=0.02, training=128.0)
+    told = table(results, Path("x"))
+    assert (
+        "violating steps without a filter: 10.00 % while training (128 of each seed's 1,280), "
+        "2.00 % stochastic, 0.00 % deterministic"
+    ) in told
+    assert "stochastic episodes sample their actions, as training does." in told
+    set_violations(results, stochastic=0.0, training=0.0)
+    told = table(results | {"rta": "discrete_asif"}, Path("x"))
+    assert "violating steps with the filter discrete_asif: 0.00 % while training" in told
+    assert "sample their actions" not in told
+
+
+def test_an_evaluation_tells_the_violating_steps_of_its_episodes(results: dict) -> None:
+    del results["training_cost"]
+    set_violations(results | {"training_cost": {}}, stochastic=0.5, training=0.0)
+    assert "filter: 50.00 % stochastic, 0.00 % deterministic" in table(results, Path("x"))
+
+
+def test_a_task_without_constraints_has_no_violations_to_tell(results: dict) -> None:
+    set_violations(results, stochastic=None, training=0.0)
+    assert "violating steps with" not in table(results, Path("x"))
+
+
+def test_a_headline_of_several_runs_tells_what_they_share(results: dict) -> None:
+    assert headline(results).endswith(", ppo, rta none, 3 seeds")
+    assert headline(results, results | {"rta": "x", "seeds": 1}).endswith(", ppo")
+    del results["rta"]
+    assert headline(results).endswith(", ppo, 3 seeds")
+
+
+def test_tables_of_several_runs_have_intervals_where_they_are_known(results: dict) -> None:
+    success = results["evaluation"]["stochastic"]["success_rate"]
+    success |= {"mean": 0.5, "ci95": [0.25, 0.75]}
+    results["training_cost"] |= {"mean": 1200.0, "ci95": None}
+    results["interaction_efficiency"]["timesteps"] = None
+    [row] = csv_rows({"a_b": results})
+    assert [row[f"stochastic/success_rate/{end}"] for end in ("mean", "low", "high")] == [
+        0.5,
+        0.25,
+        0.75,
+    ]
+    assert row["training_cost/low"] is None
+    text = latex({"a_b & 5 %": results})
+    assert r"a\_b \& 5 \% & 50.00 [25.00, 75.00] & " in text
+    assert r" & 1,200 & never \\" in text
+    body = [line for line in text.splitlines() if "&" in line]
+    assert {line.replace(r"\&", "").count("&") for line in body} == {6}
