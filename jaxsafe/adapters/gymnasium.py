@@ -11,6 +11,8 @@ from __future__ import annotations
 import inspect
 import multiprocessing
 import os
+import sys
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -111,7 +113,7 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
     """
 
     # Gymnasium declares it so, without an annotation.
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 30}  # noqa: RUF012
 
     def __init__(
         self,
@@ -127,21 +129,25 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
         Args:
             task: the name of a task, a YAML file, or an environment that `jaxsafe.make` returned.
             overrides: as `jaxsafe.make` takes them.
-            render_mode: `rgb_array`, or None for no pictures.
+            render_mode: `rgb_array` for pictures, `human` for a window that shows every step, or
+                None for neither.
             max_episode_steps: number of steps after which an episode is truncated, if the task has
                 not ended it before. None stands for no such limit.
             options: `actions`, `variant`, `randomize` and `rta` of `jaxsafe.make`.
 
         Raises:
-            ConfigError: as `jaxsafe.make`.
+            ConfigError: as `jaxsafe.make`; or there is no display to open a window on.
         """
         _refuse_forking_workers()
         self.env = environment(task, overrides, options)
-        self.render_mode = _checked_render_mode(render_mode)
+        self.render_mode = _checked_render_mode(render_mode, GymEnv.metadata["render_modes"])
         self.observation_space, self.action_space = spaces(self.env)
         self._batch = PackedBatch(self.env, 1, _checked_limit(max_episode_steps))
         self._unseeded = np.ones(1, bool)
         self._frames = Frames(self.env) if render_mode else None
+        if not _may_have_display():
+            self.metadata = {**self.metadata, "render_modes": ["rgb_array"]}
+        self._window = Window(self.metadata["render_fps"]) if render_mode == "human" else None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -183,7 +189,8 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
     def render(self) -> Any:
         """Return a picture of the episode so far, [height, width, 3].
 
-        Without a render mode it is None, with a warning.
+        It is None where a window shows the picture. Without a render mode it is None, with a
+        warning.
 
         Raises:
             ResetNeeded: there was no reset before.
@@ -196,14 +203,22 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
             return None
         if not self._batch.running:
             raise ResetNeeded("render: call reset first")
+        if self._window is not None:
+            self._window.show(self._frames.draw())
+            return None
         return self._frames.draw()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
 
     def _receive(self, episodes: Episodes) -> tuple[np.ndarray, float, bool, bool, dict]:
         timestep: Any = jax.tree.map(lambda x: x[0], episodes.timestep)
         if self._frames is not None:
-            self._frames.add(
-                jax.tree.map(lambda x: x[0], episodes.state.sim), timestep.info.margins
-            )
+            self._frames.add(jax.tree.map(lambda x: x[0], episodes.state.sim), timestep.info)
+        if self._window is not None:
+            self.render()
         info = jax.tree.map(
             lambda x: x.item() if isinstance(x, np.generic) else x, facts(self.env, timestep)
         )
@@ -243,7 +258,7 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             num_envs: number of environments.
             overrides: as `jaxsafe.make` takes them.
             autoreset_mode: what follows the end of an episode.
-            render_mode: as `GymEnv` takes it.
+            render_mode: `rgb_array` for pictures, or None.
             max_episode_steps: as `GymEnv` takes it.
             options: as `GymEnv` takes them.
 
@@ -252,9 +267,13 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         """
         self.env = environment(task, overrides, options)
         self.num_envs = checked_count("num_envs", num_envs)
-        self.render_mode = _checked_render_mode(render_mode)
+        self.render_mode = _checked_render_mode(render_mode, ["rgb_array"])
         self.autoreset_mode = _checked_mode(autoreset_mode)
-        self.metadata = {**GymEnv.metadata, "autoreset_mode": self.autoreset_mode}
+        self.metadata = {
+            **GymEnv.metadata,
+            "render_modes": ["rgb_array"],
+            "autoreset_mode": self.autoreset_mode,
+        }
         self.single_observation_space, self.single_action_space = spaces(self.env)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -428,7 +447,7 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             frames.add(
                 *jax.tree.map(
                     lambda x, index=index: x[index],
-                    (episodes.state.sim, episodes.timestep.info.margins),
+                    (episodes.state.sim, episodes.timestep.info),
                 )
             )
 
@@ -437,28 +456,97 @@ class Frames:
     """Pictures of an episode that is still going on."""
 
     def __init__(self, env: Environment) -> None:
-        self._env, self._past = env, []
+        self._env = env
+        self._scene: Any = None
+        self._new: list[tuple[Any, Any]] = []
 
     def clear(self) -> None:
         """Forget the episode."""
-        self._past.clear()
+        self._new.clear()
+        if self._scene is not None:
+            self._scene.clear()
 
-    def add(self, sim: Any, margins: Mapping[str, Any]) -> None:
+    def add(self, sim: Any, info: Any) -> None:
         """Remember one step.
 
         Args:
             sim: the simulation after the step, as NumPy arrays.
-            margins: h of each safety constraint.
+            info: the facts about the step.
         """
-        self._past.append((sim, margins))
+        self._new.append((sim, info))
 
     def draw(self) -> np.ndarray:
         """Return a picture of the latest step and the path that led there, [height, width, 3]."""
         # Only drawing needs matplotlib.
         from jaxsafe.plot.animation import Scene
 
-        sim, margins = jax.tree.map(lambda *steps: np.stack(steps), *self._past)
-        return Scene(self._env, sim, margins, self._env.agent).draw(len(self._past) - 1)
+        if self._scene is None:
+            self._scene = Scene(self._env, self._env.agent)
+        for sim, info in self._new:
+            self._scene.add(sim, info.margins, info.control_actual)
+        self._new.clear()
+        return self._scene.draw()
+
+
+class Window:
+    """A window that shows pictures as fast as they come, but no faster than `fps`."""
+
+    def __init__(self, fps: int) -> None:
+        """Find out whether a window can be opened. It opens with the first picture.
+
+        Raises:
+            ConfigError: there is no display, or matplotlib was told to draw into files.
+        """
+        import matplotlib
+        from matplotlib import pyplot
+
+        self._pyplot = pyplot
+        self._seconds = 1.0 / fps
+        self._latest = 0.0
+        self._figure: Any = None
+        backend = pyplot.get_backend()
+        if not _opens_windows(matplotlib, backend):
+            raise ConfigError(
+                f"render_mode: human needs a display, and matplotlib draws with {backend} here, "
+                "which opens no window; choose rgb_array"
+            )
+
+    def show(self, picture: np.ndarray) -> None:
+        """Show a picture. Nothing happens after the user has closed the window."""
+        if self._figure is None:
+            height, width, _ = picture.shape
+            self._figure = self._pyplot.figure(
+                "jaxsafe", figsize=(width / 100, height / 100), dpi=100
+            )
+            self._image = self._figure.figimage(picture)
+            self._pyplot.show(block=False)
+        elif not self._pyplot.fignum_exists(self._figure.number):
+            return
+        self._image.set_data(picture)
+        time.sleep(max(0.0, self._latest + self._seconds - time.monotonic()))
+        self._latest = time.monotonic()
+        self._figure.canvas.draw()
+        self._figure.canvas.flush_events()
+
+    def close(self) -> None:
+        """Close the window."""
+        if self._figure is not None:
+            self._pyplot.close(self._figure)
+
+
+def _may_have_display() -> bool:
+    """Return whether a window could be opened here, as far as that is known without matplotlib."""
+    desktop = sys.platform in ("darwin", "win32")
+    return desktop or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _opens_windows(matplotlib: Any, backend: str) -> bool:
+    """Return whether a backend of matplotlib opens windows."""
+    interactive = matplotlib.backends.backend_registry.list_builtin(
+        matplotlib.backends.BackendFilter.INTERACTIVE
+    )
+    # The backend of notebooks that show widgets is not a builtin one.
+    return backend.lower() in interactive or "ipympl" in backend
 
 
 _ALONE = np.ones(1, bool)
@@ -577,9 +665,11 @@ def _checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
         ) from None
 
 
-def _checked_render_mode(render_mode: str | None) -> str | None:
-    if render_mode not in (None, *GymEnv.metadata["render_modes"]):
-        raise ConfigError(f"render_mode: found {render_mode!r}; choose from rgb_array, None")
+def _checked_render_mode(render_mode: str | None, known: Sequence[str]) -> str | None:
+    if render_mode not in (None, *known):
+        raise ConfigError(
+            f"render_mode: found {render_mode!r}; choose from {', '.join(known)}, None"
+        )
     return render_mode
 
 

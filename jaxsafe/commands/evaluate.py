@@ -29,7 +29,8 @@ class Options(PolicyOptions):
     groups: ClassVar = {
         "The policies.": ("run", "checkpoint", "deterministic", "activation"),
         "The environment in which they act.": ("env", "env.PATH", "actions", "variant", "rta"),
-        "The episodes, and what is kept of them.": ("episodes", "seed", "render", "out"),
+        "The episodes, and what is kept of them.": ("episodes", "seed", "out"),
+        "A film of an episode.": ("render", "film", "film_seed"),
     }
 
     episodes: Count = 1000
@@ -43,8 +44,15 @@ class Options(PolicyOptions):
     """
     deterministic: bool | None = None
     """Whether the policies act by their most probable action. By default both ways are measured."""
-    render: Literal["gif"] | None = None
-    """Draw the first episode of the first seed as an animation."""
+    render: Literal["gif", "mp4"] | None = None
+    """Make a film of an episode. An mp4 needs ffmpeg on the PATH."""
+    film: Literal["first", "failing", "violating", "worst"] = "first"
+    """The episode to film: the first, or the first that fails or violates, or the worst by return.
+
+    If there is no such episode, the first is filmed.
+    """
+    film_seed: Seed | None = None
+    """The training seed whose policy is filmed. By default it is the first one."""
     out: Directory | None = None
     """Where to write. By default it is a new directory in RUN/evaluations, or in evaluations/."""
 
@@ -53,7 +61,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the command and return its exit code."""
     claim_cores()
     enable_compilation_cache()
-    from jaxsafe.commands.evaluation import evaluate, film
+    from jaxsafe.commands.evaluation import Film, evaluate
     from jaxsafe.commands.policies import load, load_foreign
     from jaxsafe.train.host.results import table
 
@@ -67,7 +75,21 @@ def main(argv: Sequence[str]) -> int:
             "a policy from elsewhere acts by its mode"
         )
     kinds = KINDS[True if foreign else options.deterministic]
+    film = None
+    if options.render is None:
+        options.refuse_beside(["film", "film_seed"], "without render=gif or render=mp4")
+    else:
+        film = Film(options.render, options.film, options.film_seed)
+    if options.render == "mp4":
+        from jaxsafe.plot.animation import require_ffmpeg
+
+        require_ffmpeg()
     subject = load_foreign(options) if foreign else load(options.run, options.checkpoint)
+    if options.film_seed is not None:
+        first, last = subject.facts["seed"], subject.facts["seed"] + subject.facts["seeds"] - 1
+        if not first <= options.film_seed <= last:
+            found = f"found {options.film_seed}"
+            raise ConfigError(f"film_seed: expected a seed from {first} to {last}, {found}")
     env = subject.env if foreign else options.change(subject.env, subject.name)
     if told := differences(subject.env, env):
         print(told)
@@ -82,12 +104,8 @@ def main(argv: Sequence[str]) -> int:
             if not (foreign and name == "env")
         },
     }
-    path, results = evaluate(
-        subject, env, kinds, request=request, out=options.out, render=options.render is not None
-    )
+    path, results = evaluate(subject, env, kinds, request=request, out=options.out, film=film)
     print(table(results, path))
-    if options.render:
-        print("films: " + ", ".join(str(film(path.parent, kind)) for kind in kinds))
     return cli.DIVERGED if "diverged" in results else 0
 
 

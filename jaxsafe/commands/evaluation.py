@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -12,11 +12,41 @@ import numpy as np
 from jaxsafe.commands.policies import Subject
 from jaxsafe.environment import Environment, require_success
 from jaxsafe.evaluate.evaluator import Evaluator, episode_rows, given_up
+from jaxsafe.metrics import Episode
 from jaxsafe.storage.files import append_rows, write_json
 from jaxsafe.storage.provenance import versions
 from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.log import filter_name
 from jaxsafe.train.host.results import diverged_seeds, evaluation
+
+
+class Film(NamedTuple):
+    """Which episode to film, and in which format."""
+
+    form: str
+    """The format, `gif` or `mp4`."""
+
+    which: str = "first"
+    """The first episode, the first that is `failing` or `violating`, or the `worst` by return."""
+
+    seed: int | None = None
+    """The training seed of the policy. None stands for the first one."""
+
+    def choose(self, sums: Episode, success: int) -> int | None:
+        """Return the number of the episode, or None if there is no such episode.
+
+        Args:
+            sums: sums over the episodes of the policy, each field [episodes].
+            success: the index of the outcome that counts as success.
+        """
+        if self.which == "worst":
+            return int(np.argmin(sums.episode_return))
+        flags = {
+            "first": np.ones(len(sums.outcome), bool),
+            "failing": sums.outcome != success,
+            "violating": sums.violating_steps > 0,
+        }[self.which]
+        return int(np.argmax(flags)) if flags.any() else None
 
 
 def evaluate(
@@ -25,7 +55,7 @@ def evaluate(
     kinds: Sequence[str],
     request: dict[str, Any],
     out: str | None,
-    render: bool = False,
+    film: Film | None = None,
 ) -> tuple[Path, dict[str, Any]]:
     """Evaluate every policy and write `results.json` and `eval.jsonl`.
 
@@ -36,7 +66,7 @@ def evaluate(
         request: what was asked for: `run`, `episodes`, `evaluation_seed`, `checkpoint` and
             `changes`. It becomes part of the results.
         out: a new directory. None makes one in `subject.place`.
-        render: whether to draw the first episode of the first policy as `episode_<kind>.gif` too.
+        film: the film to make of each kind of evaluation, or None.
 
     Returns:
         The path of `results.json` and its content.
@@ -76,8 +106,9 @@ def evaluate(
     }
     results |= given_up(env, sums) | diverged_seeds({first + place: None for place in left_out})
     write_json(path / "results.json", results)
-    for kind in kinds if render else ():
-        _render(subject, evaluator, seed, kind, path)
+    if film is not None:
+        for kind, one in sums.items():
+            _render(subject, evaluator, one, seed, kind, film, path)
     return path / "results.json", results
 
 
@@ -94,14 +125,38 @@ def _not_finite(subject: Subject) -> list[int]:
     ]
 
 
-def _render(subject: Subject, evaluator: Evaluator, seed: int, kind: str, path: Path) -> None:
+def _render(
+    subject: Subject,
+    evaluator: Evaluator,
+    sums: Episode,
+    seed: int,
+    kind: str,
+    film: Film,
+    path: Path,
+) -> None:
+    """Make a film of an episode of one policy, and print its path.
+
+    Args:
+        subject: the policies.
+        evaluator: the evaluator that has flown the episodes.
+        sums: sums over the episodes, each field [seeds, episodes].
+        seed: the seed of the evaluation.
+        kind: the kind of evaluation.
+        film: what to film.
+        path: the directory of the evaluation.
+    """
     from jaxsafe.plot.animation import animate
 
-    first = jax.tree.map(lambda x: x[0], subject.mapper.gather(subject.params))
-    [episode] = evaluator.episodes(first, 1, seed, kind == "deterministic")
-    animate(evaluator.env, episode, film(path, kind), f"{subject.name}, {kind}")
-
-
-def film(path: Path, kind: str) -> Path:
-    """Return the path of an episode's animation in the directory of an evaluation."""
-    return path / f"episode_{kind}.gif"
+    env = evaluator.env
+    first = subject.facts["seed"]
+    index = 0 if film.seed is None else film.seed - first
+    own = jax.tree.map(lambda x: np.asarray(x)[index], sums)
+    number = film.choose(own, env.success)
+    whose = f"seed {first + index}, {kind}"
+    if number is None:
+        print(f"film: no {film.which} episode of {whose}; this is the first one")
+    params = jax.tree.map(lambda x: x[index], subject.mapper.gather(subject.params))
+    episode = evaluator.episode(params, number or 0, seed, kind == "deterministic")
+    title = f"{subject.name}, {whose}, episode {number or 0}"
+    file = animate(env, episode, path / f"episode_{kind}.{film.form}", title)
+    print(f"film of {whose}, episode {number or 0}: {file}")

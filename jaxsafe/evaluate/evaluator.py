@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -145,19 +145,45 @@ class Evaluator:
         for batch, key in enumerate(batch_keys(seed, num_batches)):
             count = min(EPISODES_PER_BATCH, num_episodes - batch * EPISODES_PER_BATCH)
             yield from self._episodes(
-                params, key, deterministic=np.asarray(deterministic), count=count
+                params,
+                key,
+                deterministic=np.asarray(deterministic),
+                chosen=range(count),
+                size=max(count, MIN_RECORDED_EPISODES),
             )
 
+    def episode(
+        self, params: Params, number: int, seed: int, deterministic: bool
+    ) -> tuple[State, TimeStep]:
+        """Return states and time steps, each [steps + 1], of one of the episodes that `run` runs.
+
+        The whole batch of the episode is flown again, because it shares the noise of the actions.
+
+        Args:
+            params: the parameters of one seed's policy.
+            number: which of the episodes.
+            seed: the seed of the evaluation.
+            deterministic: whether the policy takes the mode of its actions.
+        """
+        batch, index = divmod(number, EPISODES_PER_BATCH)
+        *_, key = batch_keys(seed, batch + 1)
+        [episode] = self._episodes(
+            params,
+            key,
+            deterministic=np.asarray(deterministic),
+            chosen=[index],
+            size=EPISODES_PER_BATCH,
+        )
+        return episode
+
     def _episodes(
-        self, params: Params, key: Key, deterministic: Any, count: int
+        self, params: Params, key: Key, deterministic: Any, chosen: Sequence[int], size: int
     ) -> Iterator[tuple[State, TimeStep]]:
-        """Yield the first `count` episodes of a batch, each up to its end."""
-        begin, go_on = self._recorder(max(count, MIN_RECORDED_EPISODES))
+        """Yield chosen episodes of a batch of some size, each up to its end."""
+        begin, go_on = self._recorder(size)
         position, first = begin(params, key)
-        pieces = [
-            [jax.tree.map(lambda x, i=i: np.asarray(x)[i : i + 1], first)] for i in range(count)
-        ]
-        running = [*range(count)]
+        pieces = {i: [jax.tree.map(lambda x, i=i: np.asarray(x)[i : i + 1], first)] for i in chosen}
+        running = [*chosen]
         limit = min(max_steps(self.env), MAX_RECORDED_STEPS)
         for before in range(0, limit, RECORDED_STEPS_PER_CALL):
             position, recorded = go_on(params, key, deterministic, position)
@@ -170,7 +196,7 @@ class Evaluator:
             running = [i for i in running if not ends[i].size]
             if not running:
                 break
-        for episode in pieces:
+        for episode in pieces.values():
             yield jax.tree.map(lambda *x: np.concatenate(x), *episode)
 
     def _one_seed(self, shared: tuple, params: Params) -> Episode:

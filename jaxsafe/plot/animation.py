@@ -1,40 +1,50 @@
-"""An episode of any environment as an animated GIF.
+"""An episode of any environment as a film, or as pictures while it goes on.
 
-It shows where the agent is, how far from the other platform, and how safe.
+It shows where the agent is, what its thrusters do, how far it is from the other platform, and how
+safe.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+import shutil
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import cycle
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Patch
 from matplotlib.ticker import MaxNLocator, NullFormatter
 from PIL import Image
 
 from jaxsafe.environment import Environment
 from jaxsafe.plot.style import (
+    AMBER,
     BLUE,
+    FORBIDDEN,
+    GOAL,
     GREEN,
     GREY,
     ORANGE,
+    Ball,
     centre_patch,
+    frame_labels,
+    keep_away_distances,
     kept_out,
     labelled,
     length_unit,
     margin_unit,
     plain,
     region_patch,
+    region_surface,
+    styled,
 )
-from jaxsafe.processors.constraint import Separation
-from jaxsafe.processors.status import Distance
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import write_bytes
 from jaxsafe.types import Sim, State, TimeStep
 
@@ -50,21 +60,75 @@ LAST_FRAME_MS = 1500
 MAX_TICK_INTERVALS = 4
 """Largest number of intervals between the numbers at an axis of the map."""
 
+SIZE = (8.6, 4.6)
+"""Width and height of a picture in inches."""
+
+DOTS_PER_INCH = 100
+
+PLACES = {"map": (0.1, 0.2, 0.39, 0.69), "space": (0.01, 0.15, 0.52, 0.78)}
+"""Places of the map and of the view in space: left, bottom, width and height."""
+
+CURVE_PLACES = ((0.64, 0.58, 0.34, 0.31), (0.64, 0.2, 0.34, 0.31))
+"""Places of the two curves."""
+
+NICE = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)
+"""Sizes of the map, up to a power of ten."""
+
+MAX_ROOM = 2.5
+"""How many times larger than needed the map may be before it closes in."""
+
+FIRST_STEPS = 50
+"""Number of steps that the curves of an episode have room for at first."""
+
+MIN_DISTANCE = 1e-3
+"""Smallest distance on the logarithmic axis."""
+
+MIN_ROOM = 0.05
+"""Smallest room beyond the values at an axis, in its unit or as a share of a power of ten."""
+
+ARROW = 0.4
+"""Length of the arrow of full thrust, as a share of half the width of the map."""
+
 
 def animate(env: Environment, episode: tuple[State, TimeStep], path: Path, title: str) -> Path:
-    """Write an episode as a GIF file that repeats.
+    """Write an episode as a film.
 
     Args:
         env: the environment of the episode.
         episode: states and time steps from the start to the end, [steps + 1].
-        path: the path of the file.
+        path: the path of the file. Its ending is `.gif` or `.mp4`.
         title: the title, to which time and outcome are added.
+
+    Raises:
+        ConfigError: the film is an mp4, and ffmpeg is missing or fails.
     """
     states, timesteps = episode
-    scene = Scene(env, sim=states.sim, margins=timesteps.info.margins, title=title)
+    scene = Scene(env, title)
     last = len(states.sim.time) - 1
+    for step in range(last + 1):
+        sim, info = jax.tree.map(lambda x, step=step: x[step], (states.sim, timesteps.info))
+        scene.add(sim, info.margins, info.control_actual)
     steps = np.unique(np.linspace(0, last, min(MAX_FRAMES, last + 1)).round().astype(int))
-    images = [Image.fromarray(scene.draw(step)) for step in steps]
+    frames = (scene.draw(step) for step in steps)
+    write_bytes(path, _mp4(frames) if path.suffix == ".mp4" else _gif(frames))
+    return path
+
+
+def require_ffmpeg() -> str:
+    """Return the path of ffmpeg.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    found = shutil.which("ffmpeg")
+    if found is None:
+        raise ConfigError("render: mp4 needs the program ffmpeg, which is not on the PATH; use gif")
+    return found
+
+
+def _gif(frames: Iterator[np.ndarray]) -> bytes:
+    """Return a GIF file that repeats."""
+    images = [Image.fromarray(frame) for frame in frames]
     palette = images[-1].quantize(128)
     images = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     buffer = io.BytesIO()
@@ -77,174 +141,401 @@ def animate(env: Environment, episode: tuple[State, TimeStep], path: Path, title
         loop=0,
         optimize=True,
     )
-    write_bytes(path, buffer.getvalue())
-    return path
+    return buffer.getvalue()
+
+
+def _mp4(frames: Iterator[np.ndarray]) -> bytes:
+    """Return an mp4 file, made by ffmpeg."""
+    images = list(frames)
+    images += images[-1:] * (LAST_FRAME_MS // FRAME_MS)
+    height, width, _ = images[0].shape
+    source = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {1000 / FRAME_MS:.6g} -i -"
+    # A fragmented file can be written to a pipe, which cannot go back.
+    target = "-pix_fmt yuv420p -movflags frag_keyframe+empty_moov -f mp4 -"
+    words = [require_ffmpeg(), "-v", "error", *source.split(), *target.split()]
+    run = subprocess.run(words, input=b"".join(map(bytes, images)), capture_output=True)
+    if run.returncode:
+        told = run.stderr.decode(errors="replace").strip().splitlines() or ["no message"]
+        raise ConfigError(f"render: ffmpeg failed: {told[-1]}")
+    return run.stdout
+
+
+class Moment(NamedTuple):
+    """What a picture shows of one step. Vectors are relative to the platform looked from."""
+
+    time: float
+    places: Mapping[str, np.ndarray]  # of platforms and regions
+    directions: Mapping[str, np.ndarray]  # in which platforms point, or else move
+    thrust: np.ndarray | None  # as a share of the largest thrust
+    distance: float  # of the agent
+    margins: Mapping[str, float]
+    outcome: str
+
+
+class Ends:
+    """The lowest and the highest value so far, and the ends of an axis that shows them."""
+
+    def __init__(self, low: float = np.inf, high: float = -np.inf) -> None:
+        self._low = low
+        self._high = high
+        self._shown = (np.inf, -np.inf)
+
+    def include(self, value: float) -> None:
+        """Take a value into account. One that is not finite leaves a gap in the curve."""
+        if np.isfinite(value):
+            self._low = min(self._low, value)
+            self._high = max(self._high, value)
+
+    @property
+    def fits(self) -> bool:
+        """Whether the axis shows all values."""
+        return self._shown[0] <= self._low and self._high <= self._shown[1]
+
+    def widen(self, room: float, logarithmic: bool = False) -> tuple[float, float]:
+        """Return the ends of the axis, moved if a value lies beyond them.
+
+        Args:
+            room: the room beyond a value at an end that moves, as a share of the range.
+            logarithmic: whether the axis is logarithmic. All values are positive then.
+        """
+        if not self._low <= self._high:
+            return (0.1, 1.0)  # no value is known
+        low, high = np.log10((self._low, self._high)) if logarithmic else (self._low, self._high)
+        more = max(room * (high - low), MIN_ROOM)
+        ends = (low - more, high + more)
+        ends = (10.0 ** ends[0], 10.0 ** ends[1]) if logarithmic else ends
+        if self._low < self._shown[0]:
+            self._shown = (float(ends[0]), self._shown[1])
+        if self._high > self._shown[1]:
+            self._shown = (self._shown[0], float(ends[1]))
+        return self._shown
 
 
 class Scene:
     """Picture of one step: the paths of all platforms, and two curves over time.
 
-    The paths are seen from the first platform that is not the agent.
+    All is seen from the first platform that is not the agent, along its heading if it has one. What
+    stands still is drawn once, and again when an axis changes.
     """
 
-    def __init__(self, env: Environment, sim: Sim, margins: Mapping[str, Any], title: str) -> None:
-        """Draw everything that does not move.
+    def __init__(self, env: Environment, title: str) -> None:
+        """Draw what does not move.
 
         Args:
             env: the environment of the episode.
-            sim: the simulation at all steps. Every field has the shape [steps].
-            margins: h of each constraint, shape [steps].
             title: the title.
         """
         self.env = env
-        self.sim = sim
-        self.margins = margins
         self.title = plain(title)
+        self.moments: list[Moment] = []
         others = [platform.name for platform in env.platforms if platform.name != env.agent]
-        origin = sim.platforms[others[0] if others else env.agent].position
-        self.origin = origin if others else np.zeros_like(origin)
-        self.paths = {name: state.position - self.origin for name, state in sim.platforms.items()}
-        self.planes = [(0, 1)] if origin.shape[1] == 2 else [(0, 1), (0, 2)]
-        self.figure = Figure(
-            figsize=(4.0 * len(self.planes) + 3.6, 4.2), dpi=80, layout="constrained"
-        )
-        FigureCanvasAgg(self.figure)
-        parts: Any = self.figure.subfigures(1, 2, width_ratios=[4.0 * len(self.planes), 3.6])
-        left, right = parts
-        self.maps = np.atleast_1d(left.subplots(1, len(self.planes)))
-        self.curves = right.subplots(2, 1, sharex=True)
-        self.heading = self.figure.suptitle(self.title, fontsize="medium")
-        self._draw_maps()
-        self._draw_curves(self.paths[env.agent])
-        self.draw(max(range(len(self.sim.time)), key=self._width))
-        # The layout is fixed at the step with the widest numbers. Otherwise the panels would jump.
-        self.figure.set_layout_engine("none")
+        self._origin = next(iter(others), None)
+        rest = {platform.name: platform.rest() for platform in env.platforms}
+        self._turned = self._origin is not None and "heading" in vars(rest[self._origin])
+        self._spatial = len(rest[env.agent].position) == 3
+        self._set_up()
 
-    def draw(self, step: int) -> np.ndarray:
-        """Return the picture of a step in 8-bit red, green and blue, shape (height, width, 3)."""
-        sim = self.sim
-        ended = [name for name, flag in sim.ended.items() if flag[step]]
-        self.heading.set_text(
-            f"{self.title}: {sim.time[step]:.0f} s, {plain(ended[0]) if ended else 'running'}"
+    def clear(self) -> None:
+        """Forget the episode."""
+        self.moments.clear()
+        self._reach = 0.0
+        self._end = 0.0
+        self._distances = Ends()
+        self._margins = Ends(0.0, 0.0)
+        self._background: Any = None
+
+    def add(self, sim: Sim, margins: Mapping[str, Any], control: Any) -> None:
+        """Remember one step.
+
+        Args:
+            sim: the simulation after the step.
+            margins: h of each constraint.
+            control: the control that acted, in the order of `env.action_names`.
+        """
+        origin, turn = self._frame(sim)
+        directions = {name: _direction(state) for name, state in sim.platforms.items()}
+        named = {**sim.regions, **sim.platforms}
+        places = {name: turn @ (np.asarray(one.position) - origin) for name, one in named.items()}
+        distance = float(np.linalg.norm(places[self.env.agent]))
+        ended = [name for name, flag in sim.ended.items() if flag]
+        self.moments.append(
+            Moment(
+                time=float(sim.time),
+                places=places,
+                directions={name: turn @ direction for name, direction in directions.items()},
+                thrust=self._thrust(np.asarray(control), directions[self.env.agent]),
+                distance=distance,
+                margins={name: float(margin) for name, margin in margins.items()},
+                outcome=plain(ended[0]) if ended else "running",
+            )
         )
-        reach = self._reach(step)
-        for panel, plane, artists in zip(self.maps, self.planes, self.moving, strict=True):
-            for name, (trail, dot, axis) in artists["platforms"].items():
-                path = self.paths[name][:, plane]
-                trail.set_data(*path[: step + 1].T)
-                dot.set_data(*path[step : step + 1].T)
-                end = path[step] + 0.12 * reach * self._axes[name][step, plane]
-                axis.set_data(*np.stack([path[step], end], axis=1))
-            for region, patch in artists["regions"].items():
-                centre_patch(patch, (sim.regions[region].position - self.origin)[step][list(plane)])
-            panel.set(xlim=(-reach, reach), ylim=(-reach, reach))
-        for line, (at, values) in self.lines:
-            line.set_data(at[: step + 1], values[: step + 1])
+        self._distances.include(max(distance, MIN_DISTANCE))
+        for margin in margins.values():
+            self._margins.include(float(margin))
+
+    @styled
+    def draw(self, step: int = -1) -> np.ndarray:
+        """Return the picture of a step in 8-bit red, green and blue, shape (height, width, 3)."""
+        step %= len(self.moments)
+        past = self.moments[: step + 1]
+        now = past[-1]
         canvas: Any = self.figure.canvas
-        canvas.draw()
+        if self._fit(now):
+            self._draw_background(now)
+            canvas.draw()
+            self._background = canvas.copy_from_bbox(self.figure.bbox)
+        canvas.restore_region(self._background)
+        self._move(past)
+        for panel, artists in self._moving:
+            for artist in artists:
+                panel.draw_artist(artist)
+        self._heading.set_text(f"{self.title}: {now.time:.0f} s, {now.outcome}")
+        self.figure.draw_artist(self._heading)
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
-    def _reach(self, step: int) -> float:
-        """Return half the width of the map.
+    def _frame(self, sim: Sim) -> tuple[np.ndarray, np.ndarray]:
+        """Return the place that all is seen from, and the rotation into its axes."""
+        dimension = 3 if self._spatial else 2
+        if self._origin is None:
+            return np.zeros(dimension), np.eye(dimension)
+        platform = sim.platforms[self._origin]
+        turn = np.eye(dimension)
+        if self._turned:
+            cosine, sine = np.cos(platform.heading), np.sin(platform.heading)
+            turn[:2, :2] = [[cosine, sine], [-sine, cosine]]
+        return np.asarray(platform.position), turn
 
-        All platforms and regions are on it, and it closes in with the agent.
-        """
-        regions = self.sim.regions.values()
-        centres = [np.abs(region.position - self.origin)[step].max() for region in regions]
-        radii = [float(getattr(region, "radius", 0.0)) for region in self.env.regions]
-        reaches = [1.5 * (centre + radius) for centre, radius in zip(centres, radii, strict=True)]
-        farthest_platform = max(np.abs(path[step]).max() for path in self.paths.values())
-        return max(max(reaches, default=0.0), 1.2 * farthest_platform, 1e-6)
+    def _thrust(self, control: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
+        """Return the thrust as a share of the largest one, or None if the agent has no thruster."""
+        thrust = np.zeros(len(direction))
+        known = False
+        for actuator, value in zip(self.env.actuators, control, strict=True):
+            axis = {"thrust_x": 0, "thrust_y": 1, "thrust_z": 2}.get(actuator.name)
+            largest = max(abs(float(actuator.low)), abs(float(actuator.high))) or 1.0
+            if actuator.name == "thrust":
+                thrust = thrust + direction * value / largest
+            elif axis is not None and axis < len(thrust):
+                thrust[axis] += value / largest
+            known |= actuator.name == "thrust" or axis is not None
+        return thrust if known else None
 
-    def _width(self, step: int) -> int:
-        """Return the number of characters of the longest number at the axes of the map."""
-        reach = self._reach(step)
-        ticks = MaxNLocator(MAX_TICK_INTERVALS).tick_values(-reach, reach)
-        return max(len(f"{tick:.10g}") for tick in ticks)
-
-    def _draw_maps(self) -> None:
-        unit = length_unit(self.env)
-        forbidden = kept_out(self.env)
-        platforms = [platform.name for platform in self.env.platforms]
-        others = [name for name in platforms if name != self.env.agent]
-        self._axes = {name: _axis(state) for name, state in self.sim.platforms.items()}
-        self.moving: list[dict[str, dict[str, Any]]] = []
-        for panel, (i, j) in zip(self.maps, self.planes, strict=True):
-            panel.set(
-                xlabel=labelled("xyz"[i], unit), ylabel=labelled("xyz"[j], unit), aspect="equal"
-            )
-            panel.xaxis.set_major_locator(MaxNLocator(MAX_TICK_INTERVALS))
-            panel.yaxis.set_major_locator(MaxNLocator(MAX_TICK_INTERVALS))
-            artists: dict[str, dict[str, Any]] = {"platforms": {}, "regions": {}}
-            for region in self.env.regions:
-                patch = region_patch(region, j == 2, region.name in forbidden)
-                artists["regions"][region.name] = panel.add_patch(patch)
-                artists["regions"][region.name].set_label(plain(region.name))
-            for radius in self._kept_away():
-                look = {"color": ORANGE, "alpha": 0.35, "linewidth": 0}
-                panel.add_patch(Circle((0.0, 0.0), radius, label="too near", **look))
-            for name in self.paths:
-                colour = BLUE if name == self.env.agent else GREY
-                trail = panel.plot([], [], color=colour, linewidth=1.2)[0]
-                axis = panel.plot([], [], color=colour, linewidth=2.4)[0]
-                dot = panel.plot([], [], "o", color=colour, markersize=6, label=plain(name))[0]
-                artists["platforms"][name] = (trail, dot, axis)
-            self.moving.append(artists)
-        self.maps[0].legend(loc="upper left", fontsize="x-small", frameon=False)
-        if others:
-            self.maps[0].set_title(plain(f"seen from the {others[0]}"), fontsize="small")
-
-    def _kept_away(self) -> list[float]:
-        """Return the distances to the other platforms that the agent must not go below."""
-        own_distances = {
-            status.name
-            for status in self.env.status
-            if isinstance(status, Distance) and self.env.agent in (status.of, status.to)
-        }
-        return [
-            float(constraint.minimum)
-            for constraint in self.env.constraints
-            if isinstance(constraint, Separation) and constraint.distance in own_distances
-        ]
-
-    def _draw_curves(self, path: np.ndarray) -> None:
-        unit = length_unit(self.env)
-        time = self.sim.time
-        distance = np.linalg.norm(path, axis=1)
-        above, below = self.curves
-        above.set(yscale="log", ylabel=labelled("distance", unit))
-        above.set(
-            xlim=(0, time[-1] or 1.0),
-            ylim=(0.7 * max(distance.min(), 1e-3), 1.4 * distance.max() + 1e-3),
+    @styled
+    def _set_up(self) -> None:
+        """Make the panels and everything in them."""
+        self.figure = Figure(figsize=SIZE, dpi=DOTS_PER_INCH)
+        FigureCanvasAgg(self.figure)
+        kind = "space" if self._spatial else "map"
+        self.map: Any = self.figure.add_axes(
+            PLACES[kind], projection="3d" if self._spatial else None
         )
-        if np.ptp(np.log10(above.get_ylim())) > 1.0:
-            # A power of ten is in the range and is labelled. More numbers would be too close to
-            # each other.
-            above.yaxis.set_minor_formatter(NullFormatter())
+        self.curves: Any = [self.figure.add_axes(place) for place in CURVE_PLACES]
+        self._heading = self.figure.suptitle(self.title, animated=True)
+        self._moving: list[tuple[Any, list[Any]]] = []
+        self._surfaces: list[Any] = []
+        self._set_up_map()
+        self._set_up_curves()
+        self.clear()
+
+    def _set_up_map(self) -> None:
+        labels = frame_labels(self._origin if self._turned else None, length_unit(self.env))
+        for letter, label in zip("xyz" if self._spatial else "xy", labels, strict=False):
+            axis = getattr(self.map, f"{letter}axis")
+            axis.set_label_text(label)
+            # Numbers at the ends of axes in space would meet at the corners.
+            prune = "both" if self._spatial else None
+            axis.set_major_locator(MaxNLocator(MAX_TICK_INTERVALS, prune=prune))
+        self.map.set_aspect("equal")
+        self._regions = {}
+        self._trails = {}
+        self._shadow = None
+        entries: list[Any] = []
+        forbidden = kept_out(self.env)
+        for region in self.env.regions:
+            look = FORBIDDEN if region.name in forbidden else GOAL
+            entries.append(Patch(label=plain(region.name), **look))
+            if not self._spatial:
+                patch = region_patch(region, False, region.name in forbidden)
+                patch.set_animated(True)
+                self._regions[region.name] = self.map.add_patch(patch)
+        radii = keep_away_distances(self.env)
+        for radius in radii:
+            if self._spatial:
+                region_surface(self.map, Ball(radius), np.zeros(3), forbidden=True)
+            else:
+                self.map.add_patch(Circle((0.0, 0.0), radius, **FORBIDDEN))
+        if radii:
+            entries.append(Patch(label="too near", **FORBIDDEN))
+        if self._spatial:
+            self._shadow = self._line("-", color=GREY, linewidth=1.0, alpha=0.5)
+        for platform in self.env.platforms:
+            name = platform.name
+            colour = BLUE if name == self.env.agent else "black"
+            trail = self._line("-", color=colour, linewidth=1.4)
+            nose = self._line("-", color=colour, linewidth=2.6)
+            dot = self._line("o", color=colour, markersize=6, label=plain(name))
+            self._trails[name] = (trail, nose, dot)
+            entries.append(dot)
+        self._arrow = self._line("-", color=AMBER, linewidth=2.2, label="thrust (length √thrust)")
+        if self._thrust(np.zeros(len(self.env.actuators)), np.zeros(2)) is not None:
+            entries.append(self._arrow)
+        self.figure.legend(handles=entries, loc="lower left", ncols=len(entries))
+        lines = [line for trail in self._trails.values() for line in trail]
+        shadow = [] if self._shadow is None else [self._shadow]
+        self._moving.append((self.map, [*self._regions.values(), *shadow, *lines, self._arrow]))
+
+    def _line(self, form: str, **look: Any) -> Any:
+        """Return a line or a dot of the map that moves."""
+        nothing = np.zeros((3 if self._spatial else 2, 0))
+        return self.map.plot(*nothing, form, animated=True, **look)[0]
+
+    def _set_up_curves(self) -> None:
+        unit = length_unit(self.env)
+        above, below = self.curves
+        origin = plain(self._origin)
+        what = "distance" if self._origin is None else f"distance to\nthe {origin}"
+        above.set(yscale="log", ylabel=labelled(what, unit))
+        above.tick_params(labelbottom=False)
+        below.set(xlabel="time [s]")
         below.axhline(0.0, color="black", linewidth=0.8)
-        below.set(xlabel="time [s]", xlim=(0, time[-1] or 1.0))
-        self.lines = [(above.plot([], [], color=BLUE, linewidth=1.4)[0], (time, distance))]
+        self._distance_line = above.plot([], [], color=BLUE, linewidth=1.6, animated=True)[0]
+        self._margin_lines = {}
         colours = cycle((GREEN, ORANGE, GREY, BLUE))
-        for colour, (name, margin) in zip(colours, self.margins.items(), strict=False):
-            line = below.plot([], [], color=colour, linewidth=1.4, label=plain(name))[0]
-            self.lines.append((line, (time, margin)))
-        if self.margins:
-            units = {margin_unit(constraint, unit) for constraint in self.env.constraints}
-            below.set_ylabel(labelled("margin h", units.pop() if len(units) == 1 else None))
-            values = np.concatenate([*self.margins.values()])
-            low = np.nanmin(values, initial=0.0)
-            high = np.nanmax(values, initial=0.0)
-            below.set_ylim(low - 0.08 * (high - low) - 1e-3, high + 0.08 * (high - low) + 1e-3)
-            below.axhspan(below.get_ylim()[0], 0.0, color=ORANGE, alpha=0.15, linewidth=0)
-            below.legend(loc="best", fontsize="x-small", frameon=False)
+        names = [constraint.name for constraint in self.env.constraints]
+        for colour, name in zip(colours, names, strict=False):
+            line = below.plot([], [], color=colour, linewidth=1.6, animated=True, label=plain(name))
+            self._margin_lines[name] = line[0]
+        units = {margin_unit(constraint, unit) for constraint in self.env.constraints}
+        shared = units.pop() if len(units) == 1 else None
+        if len(names) == 1:
+            below.set_ylabel(labelled(f"h of\n{plain(names[0])}", shared))
+        elif names:
+            below.set_ylabel(labelled("margin h", shared))
+            below.legend(loc="upper right")
+        self._unsafe: Any = below.axhspan(-1.0, 0.0, color=ORANGE, alpha=0.15, linewidth=0)
+        self._moving += [(above, [self._distance_line]), (below, [*self._margin_lines.values()])]
+
+    def _fit(self, now: Moment) -> bool:
+        """Change the axes if what they show does not fit. Return whether to draw them again."""
+        first = self._background is None
+        needed = self._needed_reach(now)
+        reach = self._reach
+        if not needed <= reach <= MAX_ROOM * needed:
+            reach = _nice(needed)
+        end = self.moments[-1].time
+        if end > self._end or first:
+            room = FIRST_STEPS * float(self.env.dt)
+            # The end of a film is known from the start.
+            end = end if first and end > room else max(room, 2.0 * end)
+        else:
+            end = self._end
+        changed = first or (reach, end) != (self._reach, self._end)
+        self._reach = reach
+        self._end = end
+        return changed or not (self._distances.fits and self._margins.fits)
+
+    def _needed_reach(self, now: Moment) -> float:
+        """Return half the width of a map that shows all platforms and regions."""
+        platforms = [platform.name for platform in self.env.platforms]
+        reaches = [1.2 * float(np.abs(now.places[name]).max()) for name in platforms]
+        for region in self.env.regions:
+            radius = float(getattr(region, "radius", 0.0))
+            reaches.append(1.5 * (float(np.abs(now.places[region.name]).max()) + radius))
+        finite = [reach for reach in reaches if np.isfinite(reach)]
+        return max([*finite, 1e-6])
+
+    def _draw_background(self, now: Moment) -> None:
+        """Set the axes and everything that depends on them only."""
+        ends = (-self._reach, self._reach)
+        self.map.set(xlim=ends, ylim=ends)
+        if self._spatial:
+            self.map.set_zlim(ends)
+            for surface in self._surfaces:
+                surface.remove()
+            forbidden = kept_out(self.env)
+            self._surfaces = [
+                region_surface(self.map, region, now.places[region.name], region.name in forbidden)
+                for region in self.env.regions
+            ]
+        above, below = self.curves
+        first = self._background is None
+        low, high = self._distances.widen(0.1 if first else 0.5, logarithmic=True)
+        above.set(xlim=(0.0, self._end), ylim=(low, high))
+        # With a power of ten in the range, more numbers would be too close to each other.
+        if np.log10(high / low) > 1.0:
+            above.yaxis.set_minor_formatter(NullFormatter())
+        low, high = self._margins.widen(0.1 if first else 0.5)
+        below.set(xlim=(0.0, self._end), ylim=(low, high))
+        self._unsafe.set(y=low, height=-low)
+
+    def _move(self, past: Sequence[Moment]) -> None:
+        """Put everything that moves to where it is after a step."""
+        now = past[-1]
+        for name, (trail, nose, dot) in self._trails.items():
+            path = np.stack([moment.places[name] for moment in past])
+            here = path[-1]
+            if self._spatial:  # axes in space do not clip
+                inside = (np.abs(path) <= self._reach).all(axis=1, keepdims=True)
+                path = np.where(inside, path, np.nan)
+            _put(trail, path)
+            _put(dot, here[None])
+            tip = here + 0.12 * self._reach * now.directions[name]
+            _put(nose, np.stack([here, tip]))
+            if name == self.env.agent and self._shadow is not None:
+                floor = path.copy()
+                floor[:, 2] = -self._reach
+                _put(self._shadow, floor)
+        if now.thrust is not None:
+            tail = now.places[self.env.agent]
+            # Without the root, the small thrusts of a long flight would not be seen.
+            share = np.sqrt(np.linalg.norm(now.thrust)) or 1.0
+            _put(self._arrow, _arrow(tail, ARROW * self._reach * now.thrust / share))
+        for name, patch in self._regions.items():
+            centre_patch(patch, now.places[name])
+        time = [moment.time for moment in past]
+        self._distance_line.set_data(time, [moment.distance for moment in past])
+        for name, line in self._margin_lines.items():
+            line.set_data(time, [moment.margins[name] for moment in past])
 
 
-def _axis(platform: Any) -> np.ndarray:
-    """Return the direction in which a platform points, or else moves, shape (steps, d).
+def _put(line: Any, points: np.ndarray) -> None:
+    """Set the points of a line, shape (points, 2 or 3)."""
+    if points.shape[1] == 3:
+        line.set_data_3d(*points.T)
+    else:
+        line.set_data(*points.T)
+
+
+def _arrow(tail: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Return the points of an arrow as one line, shape (5, d)."""
+    tip = tail + vector
+    upright = np.array([0.0, 0.0, 1.0]) if len(vector) == 3 and vector[:2].any() else None
+    if len(vector) == 2:
+        across = np.array([-vector[1], vector[0]])
+    else:
+        across = np.cross(vector, np.array([1.0, 0.0, 0.0]) if upright is None else upright)
+        across *= np.linalg.norm(vector) / max(float(np.linalg.norm(across)), 1e-12)
+    barbs = [tip - 0.3 * vector + side * 0.18 * across for side in (1.0, -1.0)]
+    return np.stack([tail, tip, barbs[0], tip, barbs[1]])
+
+
+def _nice(reach: float) -> float:
+    """Return the smallest nice size that is at least `reach`."""
+    power = 10.0 ** np.floor(np.log10(reach))
+    return next(float(size * power) for size in NICE if size * power >= reach * (1 - 1e-9))
+
+
+def _direction(platform: Any) -> np.ndarray:
+    """Return the direction in which a platform points, or else moves, shape (d,).
 
     It is 0 for a platform that rests.
     """
     if {"attitude", "heading"} & vars(platform).keys():
-        return np.asarray(jax.vmap(lambda state: state.orientation[:, 0])(platform))
+        return np.asarray(_forward(platform))
     velocity = np.asarray(platform.velocity)
-    return velocity / np.maximum(np.linalg.norm(velocity, axis=1, keepdims=True), 1e-9)
+    return velocity / max(float(np.linalg.norm(velocity)), 1e-9)
+
+
+@jax.jit
+def _forward(platform: Any) -> Any:
+    """Return the first axis of a platform's body."""
+    return platform.orientation[:, 0]

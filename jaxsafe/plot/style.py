@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
@@ -15,6 +17,7 @@ from jaxsafe.environment import SUCCESS
 from jaxsafe.environment import control_unit as control_unit
 from jaxsafe.environment import length_unit as length_unit
 from jaxsafe.processors.constraint import Separation, SpeedLimit
+from jaxsafe.processors.status import Distance
 from jaxsafe.schema.dotted_paths import references
 from jaxsafe.schema.errors import ConfigError, printable
 from jaxsafe.storage.files import write_bytes
@@ -28,7 +31,44 @@ ZERO_WIDTH_SPACE = "\u200b"
 BLUE = "#0072B2"
 ORANGE = "#D55E00"
 GREEN = "#009E73"
+PURPLE = "#CC79A7"
+AMBER = "#E69F00"
+SKY = "#56B4E9"
 GREY = "#8A8A8A"
+
+styled = rc_context(
+    {
+        "font.size": 9.0,
+        "axes.titlesize": 9.0,
+        "axes.labelsize": 9.0,
+        "xtick.labelsize": 8.0,
+        "ytick.labelsize": 8.0,
+        "legend.fontsize": 8.0,
+        "figure.titlesize": 10.0,
+        "axes.linewidth": 0.8,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "legend.frameon": False,
+        "hatch.linewidth": 0.8,
+        # Letters stay letters, which journals ask for.
+        "pdf.fonttype": 42,
+    }
+)
+"""Decorator of the functions that draw a figure. It gives all figures the same look."""
+
+GOAL: dict[str, Any] = {"facecolor": f"{GREEN}59", "edgecolor": GREEN, "linewidth": 0.8}
+"""Look of a region to reach."""
+
+FORBIDDEN: dict[str, Any] = {
+    "facecolor": f"{ORANGE}33",
+    "edgecolor": ORANGE,
+    "linewidth": 0.8,
+    "hatch": "////",
+}
+"""Look of a region to stay out of. The hatch tells it from a goal without its colour."""
+
+CHARACTERS_PER_INCH = 13
+"""Number of characters of a title that fit into an inch."""
 
 
 def margin_unit(constraint: Any, length: str | None) -> str | None:
@@ -58,6 +98,12 @@ def labelled(quantity: str, unit: str | None) -> str:
     return f"{quantity} [{unit}]" if unit else quantity
 
 
+def fitted(title: str, figure: Figure) -> str:
+    """Return a title in lines that are no longer than the figure is wide."""
+    room = int(CHARACTERS_PER_INCH * figure.get_figwidth())
+    return "\n".join(part for line in title.split("\n") for part in textwrap.wrap(line, room))
+
+
 def kept_out(env: Environment) -> set[str]:
     """Return the names of the regions that the agent must stay out of.
 
@@ -84,14 +130,74 @@ def kept_out(env: Environment) -> set[str]:
 def region_patch(region: Any, from_the_side: bool, forbidden: bool = False) -> Any:
     """Return a patch of a region around the origin, seen from above or from the side.
 
-    Seen from the side, a region with a height is a rectangle.
+    Seen from the side, a region with a height is a rectangle. A region to stay out of is hatched.
     """
-    style = {"color": ORANGE if forbidden else GREEN, "alpha": 0.35, "linewidth": 0}
+    style = FORBIDDEN if forbidden else GOAL
     if from_the_side and hasattr(region, "height"):
         width = 2.0 * float(region.radius)
         height = float(region.height)
         return Rectangle((-width / 2.0, -height / 2.0), width, height, **style)
     return Circle((0.0, 0.0), float(getattr(region, "radius", 0.0)), **style)
+
+
+class Ball(NamedTuple):
+    """A region that `region_surface` draws as a ball."""
+
+    radius: float
+
+
+def region_surface(panel: Any, region: Any, centre: np.ndarray, forbidden: bool = False) -> Any:
+    """Draw and return the surface of a region in space, a ball or an upright cylinder.
+
+    Args:
+        panel: axes in space.
+        region: the region.
+        centre: its centre, shape (3,).
+        forbidden: whether it is a region to stay out of.
+    """
+    radius = float(getattr(region, "radius", 0.0))
+    turn, rise = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 25), np.linspace(-0.5, 0.5, 13))
+    if hasattr(region, "height"):
+        across = radius
+        up = float(region.height) * rise
+    else:
+        across = radius * np.cos(np.pi * rise)
+        up = radius * np.sin(np.pi * rise)
+    surface = [across * np.cos(turn), across * np.sin(turn), up * np.ones_like(turn)]
+    look = FORBIDDEN if forbidden else GOAL
+    return panel.plot_surface(
+        *(part + offset for part, offset in zip(surface, centre, strict=True)),
+        color=look["facecolor"],
+        edgecolor=look["edgecolor"] if forbidden else "none",  # a net in place of the hatch
+        linewidth=0.4,
+    )
+
+
+def keep_away_distances(env: Environment) -> list[float]:
+    """Return the distances to the other platforms that the agent must not go below."""
+    own_distances = {
+        status.name
+        for status in env.status
+        if isinstance(status, Distance) and env.agent in (status.of, status.to)
+    }
+    return [
+        float(constraint.minimum)
+        for constraint in env.constraints
+        if isinstance(constraint, Separation) and constraint.distance in own_distances
+    ]
+
+
+def frame_labels(heads: str | None, unit: str | None) -> list[str]:
+    """Return the labels of the axes x, y and z.
+
+    Args:
+        heads: the platform along whose heading x is, or None.
+        unit: the unit of lengths.
+    """
+    if heads is None:
+        return [labelled(name, unit) for name in "xyz"]
+    sides = ("ahead of", "left of", "above")
+    return [labelled(plain(f"{side} the {heads}"), unit) for side in sides]
 
 
 def centre_patch(patch: Any, centre: np.ndarray) -> None:
@@ -121,10 +227,9 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
+@styled
 def to_bytes(figure: Figure, file_format: str = "png") -> bytes:
     """Return the content of a file of a figure."""
-    for panel in figure.axes:
-        panel.spines[["top", "right"]].set_visible(False)
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=150, format=file_format)
     return buffer.getvalue()

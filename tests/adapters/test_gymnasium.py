@@ -388,6 +388,32 @@ def test_the_whole_action_space_and_no_more_reaches_the_actuators() -> None:
     assert np.array_equal(env.step(2.0 * bound)[-1]["control_actual"], bound)
 
 
+def test_a_window_shows_every_step_and_the_picture_that_an_array_has(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with pytest.raises(
+        ConfigError, match="render_mode: human needs a display, and matplotlib draws"
+    ):
+        GymEnv("docking2d", render_mode="human")
+    # The window is drawn offscreen.
+    monkeypatch.setattr("jaxsafe.adapters.gymnasium._opens_windows", lambda *_: True)
+    env = GymEnv("docking2d", render_mode="human")
+    other = GymEnv("docking2d", render_mode="rgb_array")
+    action = np.zeros(2, np.float32)
+    for one in (env, other):
+        one.reset(seed=0)
+        one.render()
+        one.step(action)
+    assert env.render() is None
+    window: Any = env._window
+    shown = np.asarray(window._figure.canvas.buffer_rgba())[..., :3]
+    np.testing.assert_array_equal(shown, other.render())
+    assert len(env._frames._scene.moments) == 2
+    window._pyplot.close(window._figure)  # as the user may do
+    env.step(action)
+    env.close()
+
+
 @pytest.mark.thorough
 def test_an_episode_can_be_watched() -> None:
     env = gym.make("jaxsafe/Rejoin2D-v0", render_mode="rgb_array")
@@ -400,7 +426,8 @@ def test_an_episode_can_be_watched() -> None:
     assert first.dtype == np.uint8
     assert (first != second).any()
     env.reset()
-    assert len(env.unwrapped._frames._past) == 1
+    env.render()
+    assert len(env.unwrapped._frames._scene.moments) == 1
     batch = gym.make_vec(
         "jaxsafe/Rejoin2D-v0", num_envs=2, render_mode="rgb_array", max_episode_steps=2
     )
@@ -408,14 +435,15 @@ def test_an_episode_can_be_watched() -> None:
     for _ in range(3):
         batch.step(np.zeros((2, 2), np.float32))
     assert np.array_equal(batch.render()[0].shape, first.shape)
-    assert len(batch.unwrapped._frames[0]._past) == 1
+    assert len(batch.unwrapped._frames[0]._scene.moments) == 1
     batch = GymVectorEnv(
         "docking2d", 1, autoreset_mode="SameStep", render_mode="rgb_array", max_episode_steps=3
     )
     batch.reset(seed=0)
     for _ in range(4):  # the third step ends the episode and shows the start of the next
         batch.step(np.zeros((1, 2), np.float32))
-    assert len(batch._frames[0]._past) == 2
+    batch.render()
+    assert len(batch._frames[0]._scene.moments) == 2
 
 
 START = {**FAST, "parameters": {"deputy.mass": 13.0}}
@@ -504,8 +532,12 @@ def test_workers_that_are_spawned_work() -> None:
             "action: unknown option; choose from .*'actions'",
         ),
         (
-            lambda: GymEnv("docking2d", render_mode="human"),
-            "render_mode: found 'human'; choose from rgb_array",
+            lambda: GymEnv("docking2d", render_mode="rgb"),
+            "render_mode: found 'rgb'; choose from rgb_array, human, None",
+        ),
+        (
+            lambda: GymVectorEnv("docking2d", 1, render_mode="human"),
+            "render_mode: found 'human'; choose from rgb_array, None",
         ),
         (
             lambda: GymEnv("docking2d", max_episode_steps=0),

@@ -261,7 +261,7 @@ def test_an_unwritable_output_is_told_in_one_line(
         ),
         (["run=pretrained/x"], "policy: 'pretrained/x' is no .npz file and not pretrained"),
         (["run=x.npz"], "x.npz: cannot be read: No such file or directory"),
-        (["run=runs/x", "render=mp4"], "render: found 'mp4'; choose from gif"),
+        (["run=runs/x", "render=avi"], "render: found 'avi'; choose from gif, mp4"),
         (["run=runs/x", "episods=5"], "episods: unknown option; choose from"),
         (
             ["docking3d"],

@@ -1,6 +1,7 @@
 import json
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -11,6 +12,7 @@ from PIL import Image
 
 import jaxsafe
 from jaxsafe.commands.evaluate import main
+from jaxsafe.commands.evaluation import Film
 from jaxsafe.commands.policy_options import PolicyOptions, differences
 from jaxsafe.config import dump
 from jaxsafe.devices.seed_mapper import SeedMapper
@@ -19,6 +21,7 @@ from jaxsafe.evaluate import evaluator as seeds_module
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.evaluate.evaluator import Evaluator, batch_keys
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.storage.files import read_rows
 
 
 def zero(key: jax.Array, observation: jax.Array) -> jax.Array:
@@ -49,7 +52,8 @@ def test_a_policy_file_gives_the_results_of_its_seed_and_a_film(
     place = tmp_path / "evaluations" / "seed_2" / "last-6-seed0"
     told = capsys.readouterr().out
     assert "docking2d, preset engineered_features, ppo, rta none, 1 seed, 1,280 steps each" in told
-    assert f"films: {(place / 'episode_deterministic.gif').relative_to(tmp_path)}" in told
+    film = (place / "episode_deterministic.gif").relative_to(tmp_path)
+    assert f"film of seed 2, deterministic, episode 0: {film}" in told
     results = json.loads((place / "results.json").read_text())
     own = json.loads((whole / "results.json").read_text())["evaluation"]["deterministic"]
     assert results["seed"] == 2
@@ -62,6 +66,46 @@ def test_a_policy_file_gives_the_results_of_its_seed_and_a_film(
         ConfigError, match=r"checkpoint: .* is a single policy; leave checkpoint=best out"
     ):
         main([f"run={file}", "checkpoint=best"])
+
+
+def test_a_film_shows_the_episode_that_is_asked_for(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    filmed = []
+
+    def animate(env: Any, episode: Any, path: Path, title: str) -> Path:
+        filmed.append(episode)
+        return path
+
+    monkeypatch.setattr("jaxsafe.plot.animation.animate", animate)
+    words = [f"run={whole}", "episodes=6", "deterministic=false", "render=gif", "film_seed=1"]
+    for which in ("worst", "failing"):
+        assert main([*words, f"film={which}", f"out={tmp_path / which}"]) == 0
+    rows = read_rows(tmp_path / "worst" / "eval.jsonl")
+    own = [row for row in rows if row["seed"] == 1]
+    worst = min(own, key=lambda row: row["return"])
+    failing = next(row for row in own if not row["success"])
+    told = capsys.readouterr().out
+    for (_, timesteps), row in zip(filmed, (worst, failing), strict=True):
+        # The sampled actions are those of the evaluation.
+        assert float(timesteps.reward[1:].sum()) == pytest.approx(row["return"], rel=1e-4)
+        assert len(timesteps.reward) == row["length"] + 1
+        assert f"film of seed 1, stochastic, episode {row['episode']}: " in told
+    for more, message in (
+        (["film_seed=3"], "film_seed: expected a seed from 0 to 2, found 3"),
+        (["film=last"], "film: found 'last'; choose from first, failing, violating, worst"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            main([*words[:-1], *more])
+    with pytest.raises(ConfigError, match="film: means nothing without render=gif"):
+        main([f"run={whole}", "film=worst"])
+
+
+def test_a_film_of_what_did_not_happen_is_that_of_the_first_episode() -> None:
+    flags = np.array([1, 1])
+    sums: Any = SimpleNamespace(outcome=flags, violating_steps=np.zeros(2), episode_return=flags)
+    assert [Film("gif", which).choose(sums, 1) for which in ("failing", "violating")] == [None] * 2
+    assert Film("gif").choose(sums, 1) == 0
 
 
 def test_evaluations_get_directories_of_their_own(whole: Path, tmp_path: Path) -> None:
