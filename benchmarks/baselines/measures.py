@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaxsafe.metrics import ENOUGH_EPISODES, interaction_efficiency
-from jaxsafe.plot.figures import curve_table
+from jaxsafe.plot.curves import curve_table
 
 
 def failed_seeds(results: Mapping[str, Any]) -> list[int]:

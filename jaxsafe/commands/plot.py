@@ -1,17 +1,35 @@
 """Draw the paper's figures of a run from its log files, into RUN/figures.
 
-With several runs of one task, draw their curves in one figure and print a table of their results.
+With several runs of one task, draw their curves in one figure and their performance profiles in
+another, and print a table of their results. Beside the figures the table is written as CSV and
+LaTeX, with 95 % intervals.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import glob
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from jaxsafe.commands import cli
 from jaxsafe.commands.options import CommandOptions, File, Option
 from jaxsafe.schema.errors import ConfigError
+
+PANELS = (
+    "success_rate",
+    "return",
+    "length",
+    "delta_v",
+    "violating_share",
+    "episode_cost",
+    "intervention_share",
+)
+"""The columns of the progress log that have a panel. `jaxsafe.plot.curves` has their labels."""
+
+MIN_WIDTH = 2.0
+MAX_WIDTH = 40.0
+"""Smallest and largest width of a figure in inches. A page is about 7 inches wide."""
 
 
 class Options(CommandOptions):
@@ -22,14 +40,25 @@ class Options(CommandOptions):
         Option(
             first=True,
             examples=("run=runs/docking3d", "run=runs/a,runs/b"),
-            takes="a directory, or several with commas between them",
+            takes="a directory, several with commas between them, or a pattern such as 'runs/*'",
         ),
     ]
-    """The run directories."""
+    """The run directories. A pattern such as 'runs/*' stands for all runs that fit it."""
     x: Annotated[Literal["steps", "wall"], Option(kind="axis")] = "steps"
     """The horizontal axis: environment steps of a seed, or wall time."""
-    out: File = "comparison.png"
-    """File of the figure of several runs. The figures of a single run are in its directory."""
+    panels: Annotated[tuple[str, ...], Option(names=PANELS, kind="panel")] = ()
+    """The panels of the training curves. By default they are all that the runs have values for."""
+    labels: Annotated[tuple[str, ...], Option(takes="a name for each run")] = ()
+    """Names of several runs in legends and tables. By default they are those of the directories."""
+    width: Annotated[str, Option(takes="a number of inches")] | None = None
+    """The width of each figure in inches. A column of a paper is about 3.5 wide, a page 7."""
+    format: Annotated[Literal["png", "pdf", "svg"], Option(kind="format")] = "png"
+    """The format of the figures."""
+    out: File | None = None
+    """File of the figure of several runs, by default comparison.png. Its ending says its format.
+
+    The figures of a single run are in its directory.
+    """
 
 
 def main(argv: Sequence[str]) -> int:
@@ -38,41 +67,86 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.train.host import run_directory
 
     options = Options.parse(argv)
-    if isinstance(options.given["run"], list):
-        _compare(options.run, options.x, Path(options.out))
+    width = _width(options.width)
+    runs, several = _expand(options)
+    if several:
+        for path in _compare(runs, options, width):
+            print(path)
         return 0
-    options.refuse_beside(["out"], "but for several runs, which run=A,B draws in one figure")
-    [run] = map(Path, options.run)
+    options.refuse_beside(
+        ["out", "labels"], "but for several runs, which run=A,B draws in one figure"
+    )
+    [run] = runs
     run_directory.read(run, "run")
-    for path in draw_all(run, options.x):
+    for path in draw_all(run, options.x, form=options.format, panels=options.panels, width=width):
         print(path)
     return 0
 
 
-def _compare(runs: Sequence[str], x: str, out: Path) -> None:
-    """Draw several runs in one figure and print a table of their results.
+def _expand(options: Options) -> tuple[list[Path], bool]:
+    """Return the run directories, and whether the user asks for a figure of several runs.
 
-    Each run appears under the name of its directory.
+    Raises:
+        ConfigError: no run fits a pattern.
+    """
+    several = isinstance(options.given["run"], list)
+    paths: list[Path] = []
+    for typed in options.run:
+        if Path(typed).exists() or not glob.has_magic(typed):
+            paths.append(Path(typed))
+            continue
+        several = True
+        found = [Path(name) for name in sorted(glob.glob(typed))]
+        found = [path for path in found if (path / "config.yaml").exists()]
+        if not found:
+            raise ConfigError(f"run: no run fits {typed!r}")
+        paths += found
+    return paths, several
+
+
+def _width(typed: str | None) -> float | None:
+    """Return the width of the figures in inches, or None if it is left open.
+
+    Raises:
+        ConfigError: it is no number, or too small or too large.
+    """
+    if typed is None:
+        return None
+    try:
+        width = float(typed)
+    except ValueError:
+        width = float("nan")
+    if not MIN_WIDTH <= width <= MAX_WIDTH:
+        limits = f"{MIN_WIDTH:g} to {MAX_WIDTH:g}"
+        raise ConfigError(f"width: expected a number of inches from {limits}, found {typed}")
+    return width
+
+
+def _compare(runs: Sequence[Path], options: Options, width: float | None) -> list[Path]:
+    """Draw several runs in one figure, print a table of their results and write it to files.
 
     Args:
         runs: the run directories.
-        x: the horizontal axis, one of `jaxsafe.plot.figures.AXES`.
-        out: the path of the figure.
+        options: the options of the command.
+        width: the width of the figures in inches.
+
+    Returns:
+        The paths of the files.
 
     Raises:
         ConfigError: the runs cannot be compared, or one of them is not finished.
     """
     from jaxsafe.plot.compare import compare_curves
+    from jaxsafe.plot.profiles import performance_profiles
     from jaxsafe.plot.style import save
-    from jaxsafe.runs.figures import progress
+    from jaxsafe.runs.figures import evaluations, progress
+    from jaxsafe.storage.files import write_csv, write_text
     from jaxsafe.train.host import run_directory
-    from jaxsafe.train.host.results import summary
+    from jaxsafe.train.host.comparison import csv_rows, latex
+    from jaxsafe.train.host.log import headline
+    from jaxsafe.train.host.results import read_results, summary
 
-    paths = {Path(run).name: Path(run) for run in runs}
-    if len(paths) < len(runs) or len(runs) < 2:
-        raise ConfigError(
-            f"run: expected several directories of different names, found {', '.join(runs)}"
-        )
+    paths = _labelled(runs, options.labels)
     tasks = {run_directory.read(path, "run")[2] for path in paths.values()}
     if len(tasks) > 1:
         raise ConfigError(f"run: expected runs of one task, found {', '.join(sorted(tasks))}")
@@ -82,9 +156,82 @@ def _compare(runs: Sequence[str], x: str, out: Path) -> None:
                 f"run: {path} has no results.json; "
                 f"finish it with python -m jaxsafe.train resume={path}"
             )
-    figure = compare_curves({name: progress(path) for name, path in paths.items()}, tasks.pop(), x)
+    out = _out(options)
+    results = {name: read_results(path / "results.json") for name, path in paths.items()}
+    rows = {name: progress(path) for name, path in paths.items()}
+    title = headline(*results.values())
+    figure = compare_curves(
+        rows,
+        title,
+        options.x,
+        evaluations={name: evaluations(path, rows[name]) for name, path in paths.items()},
+        panels=options.panels,
+        width=width,
+    )
+    scores = {
+        "success rate τ [%]": _scores(results, "success_rate", 100.0),
+        "return τ": _scores(results, "average_return", 1.0),
+    }
+    written = [save(figure, out)]
+    known = {quantity: values for quantity, values in scores.items() if values}
+    if known:
+        profiles = performance_profiles(known, title, width)
+        written.append(save(profiles, out.with_name(f"{out.stem}_profiles{out.suffix}")))
+    write_csv(out.with_suffix(".csv"), csv_rows(results))
+    write_text(out.with_suffix(".tex"), latex(results))
     print(summary(paths))
-    print(save(figure, out))
+    return [*written, out.with_suffix(".csv"), out.with_suffix(".tex")]
+
+
+def _labelled(runs: Sequence[Path], labels: Sequence[str]) -> dict[str, Path]:
+    """Return the run directories by their labels, which are their names unless others are given.
+
+    Raises:
+        ConfigError: there are not several runs of different labels.
+    """
+    shown = ", ".join(map(str, runs))
+    if labels and len(labels) != len(runs):
+        raise ConfigError(
+            f"labels: expected one for each of {len(runs)} runs ({shown}), found {len(labels)}"
+        )
+    paths = dict(zip(labels or [run.resolve().name for run in runs], runs, strict=True))
+    if labels and len(paths) < len(labels):
+        raise ConfigError(f"labels: expected different ones, found {', '.join(labels)}")
+    if len(paths) < len(runs) or len(runs) < 2:
+        raise ConfigError(f"run: expected several directories of different names, found {shown}")
+    return paths
+
+
+def _out(options: Options) -> Path:
+    """Return the path of the figure of several runs.
+
+    Raises:
+        ConfigError: its ending and `format` contradict each other.
+    """
+    out = Path(options.out or f"comparison.{options.format}")
+    if "format" in options.given and out.suffix not in ("", f".{options.format}"):
+        raise ConfigError(
+            f"format: found {options.format}, but out={options.out} says {out.suffix[1:]}; "
+            "leave one out"
+        )
+    return out if out.suffix else out.with_suffix(f".{options.format}")
+
+
+def _scores(
+    results: Mapping[str, Mapping[str, Any]], metric: str, factor: float
+) -> dict[str, list[float]]:
+    """Return a metric of the stochastic evaluation of every seed, by the label of the run."""
+    return {
+        name: known
+        for name, one in results.items()
+        if (
+            known := [
+                factor * value
+                for value in one["evaluation"]["stochastic"][metric]["per_seed"]
+                if value is not None
+            ]
+        )
+    }
 
 
 def command() -> None:

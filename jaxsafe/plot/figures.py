@@ -1,24 +1,34 @@
-"""Figures of a run from its own log files.
+"""Figures of logged episodes of a run.
 
-They are training curves (Figs. 12-16), trajectories (Fig. 18), and speed and distance (Fig. 19).
-What run time assurance altered is drawn by `jaxsafe.plot.interventions`.
+They are trajectories (Fig. 18), and speed and distance (Fig. 19). What run time assurance altered
+is drawn by `jaxsafe.plot.interventions`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, PowerNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.patches import Circle
+from matplotlib.ticker import MaxNLocator
 
-from jaxsafe.metrics import ENOUGH_SEEDS, bootstrap_interval
-from jaxsafe.plot.style import BLUE, GREY, ORANGE, centre_patch, labelled, plain, region_patch
+from jaxsafe.plot.curves import MILLIONS_FROM
+from jaxsafe.plot.style import (
+    FORBIDDEN,
+    Ball,
+    centre_patch,
+    fitted,
+    frame_labels,
+    plain,
+    region_patch,
+    region_surface,
+    styled,
+)
 
 LAST_COLOUR = 0.85
 """Part of the colour map that is used. Its end is too light on white."""
@@ -26,21 +36,14 @@ LAST_COLOUR = 0.85
 CLOSE_UP = 3.0
 """Half the width of a close-up of the smallest region, in distances to the region's far end."""
 
-CURVES = (
-    ("success_rate", "success rate [%]", 100.0),
-    ("return", "return", 1.0),
-    ("length", "episode length [steps]", 1.0),
-    ("delta_v", "Δv per episode [m/s]", 1.0),
-    ("violating_share", "violating share\nof an episode's steps [%]", 100.0),
-    ("episode_cost", "violating steps per episode", 1.0),
-)
-"""Column of the progress log, label, and factor of each curve."""
+PANEL_WIDTH = 3.2
+"""Width of a panel of trajectories in inches, if the width of the figure is left open."""
 
-ALWAYS_SHOWN = ("success_rate", "return", "length")
-"""Curves that are shown even where all values are 0."""
+ZOOM = 0.85
+"""Size of a view in space. Larger ones have no room for their labels."""
 
-AXES = {"steps": ("step", "environment steps per seed"), "wall": ("wall_s", "wall time [s]")}
-"""Column of the progress log and label of each horizontal axis."""
+COLOUR_BAR_WIDTH = 0.9
+"""Width of the colour bar with its label in inches."""
 
 Rows = list[dict[str, Any]]
 """Rows of an episode in a log, one per step."""
@@ -49,103 +52,22 @@ Episodes = list[tuple[int, Rows]]
 """Logged episodes, each with the step of the training at which it was logged."""
 
 
-def training_curves(rows: Sequence[Mapping[str, Any]], x: str, title: str) -> Figure:
-    """Return a figure with a panel for each quantity.
-
-    A panel shows a thin curve for every seed, their mean, and the mean's 95 % interval if there are
-    enough seeds.
-
-    Args:
-        rows: rows of the progress log.
-        x: what the horizontal axis shows, `steps` or `wall`.
-        title: the title of the figure.
-    """
-    column, label = AXES[x]
-    rows, left_out = without_diverged(rows)
-    curves = shown_curves(rows)
-    figure, panels = panel_grid(len(curves), 4.2)
-    for panel, (name, quantity, factor) in zip(panels, curves, strict=False):
-        at, values = curve_table(rows, column, name)
-        _curve(panel, at, factor * values)
-        set_axes(panel, label=label, quantity=quantity, name=name)
-    if panels[0].get_legend_handles_labels()[0]:
-        panels[0].legend(loc="best", fontsize="small", frameon=False)
-    figure.suptitle(f"{plain(title)}\nthe last 100 training episodes{left_out}", fontsize="medium")
-    return figure
-
-
-def shown_curves(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, float]]:
-    """Return the curves that rows of the progress log have values for."""
-    return [
-        curve
-        for curve in CURVES
-        if curve[0] in ALWAYS_SHOWN or any(row.get(curve[0]) for row in rows)
-    ]
-
-
-def without_diverged(rows: Sequence[Mapping[str, Any]]) -> tuple[Sequence[Mapping[str, Any]], str]:
-    """Return the rows of the seeds that have not diverged and words that say which are left out.
-
-    If every seed has diverged, all rows are returned. Their curves end where the seeds diverged.
-    """
-    diverged = {row["seed"] for row in rows if row.get("diverged")}
-    sound = [row for row in rows if row["seed"] not in diverged]
-    if not diverged or not sound:
-        return rows, ""
-    seeds = f"seed{'s' * (len(diverged) > 1)} {', '.join(map(str, sorted(diverged)))}"
-    return sound, f", without {seeds}, which diverged"
-
-
-def set_axes(panel: Axes, label: str, quantity: str, name: str) -> None:
-    """Set the axes of a panel.
-
-    A success rate is shown in its whole range, with the level of Table 2.
-
-    Args:
-        panel: the panel.
-        label: the label of the horizontal axis.
-        quantity: the label of the vertical axis.
-        name: the column of the progress log.
-    """
-    panel.set(xlabel=label, ylabel=quantity)
-    panel.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
-    if name == "success_rate":
-        panel.set_ylim(-3, 103)
-        panel.axhline(80.0, color="black", linestyle=":", linewidth=1.0)
-
-
-def panel_grid(
-    count: int, width: float, height: float = 3.1, in_row: int = 3
-) -> tuple[Figure, np.ndarray]:
-    """Return a figure and its panels.
-
-    Args:
-        count: number of panels.
-        width: width of a panel in inches.
-        height: height of a panel in inches.
-        in_row: number of panels in a row.
-    """
-    rows = -(-count // in_row)
-    columns = min(count, in_row)
-    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(rows, columns)).ravel()
-    for panel in panels[count:]:
-        panel.remove()
-    return figure, panels
-
-
+@styled
 def trajectories(
     episodes: Episodes,
     title: str,
     unit: str | None,
     regions: Sequence[Any] = (),
     forbidden: Collection[str] = (),
+    keep_away: Sequence[float] = (),
+    width: float | None = None,
 ) -> Figure:
     """Return a figure of the agent's paths relative to the other platform.
 
     The first column shows the paths from one start in the course of training, the second column the
     last paths. A third column shows the last paths near the smallest region, if that is small
-    beside the paths. There is a row for each plane.
+    beside the paths. Paths in space are drawn in space, from above and from the side. Paths in the
+    plane have a single row.
 
     If the other platform has a heading, x is along it. Then the motion and the turn of that
     platform do not show, and a region that it carries is at rest.
@@ -156,6 +78,8 @@ def trajectories(
         unit: the unit of lengths.
         regions: the regions of the environment.
         forbidden: the names of the regions to stay out of.
+        keep_away: distances to the other platform that the agent must not go below.
+        width: the width of the figure in inches.
     """
     paths = [(step, _relative_path(rows, _agent(rows))) for step, rows in episodes]
     last = episodes[-1][1]
@@ -185,36 +109,64 @@ def trajectories(
     if sizes and CLOSE_UP * min(sizes) < 0.5 * reach[1]:
         columns.append(("their ends", columns[1][1]))
         reach.append(CLOSE_UP * min(sizes))
-    planes = [(0, 1)] if len(start) == 2 else [(0, 1), (0, 2)]
-    size = (3.7 * len(columns) + 1.2, 3.5 * len(planes) + 0.6)
+    views: list[tuple[int, ...]] = [(0, 1)] if len(start) == 2 else [(0, 1, 2), (0, 1), (0, 2)]
+    side = PANEL_WIDTH if width is None else (width - COLOUR_BAR_WIDTH) / len(columns)
+    size = (side * len(columns) + COLOUR_BAR_WIDTH, side * len(views) + 0.5)
     figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(len(planes), len(columns), squeeze=False)
+    grid = figure.add_gridspec(len(views), len(columns))
     alone = len(last[0]["platforms"]) == 1
     turned = not alone and "heading" in last[0]["platforms"][first]
-    along = f" along the heading of the {first}" if turned else ""
-    for (i, j), row in zip(planes, panels, strict=True):
-        for panel, (name, column), half in zip(row, columns, reach, strict=True):
+    labels = frame_labels(first if turned else None, unit)
+    panels: list[Any] = []
+    for number, ((name, column), half) in enumerate(zip(columns, reach, strict=True)):
+        for row, view in enumerate(views):
+            spatial = len(view) == 3
+            panel: Any = figure.add_subplot(grid[row, number], projection="3d" if spatial else None)
+            panels.append(panel)
+            axes = list(view)
             for region, place in zip(regions, places, strict=True):
-                patch = panel.add_patch(region_patch(region, j == 2, region.name in forbidden))
-                centre_patch(patch, place[[i, j]])
+                kept_out = region.name in forbidden
+                if spatial:
+                    region_surface(panel, region, place, kept_out)
+                    continue
+                patch = panel.add_patch(region_patch(region, view == (0, 2), kept_out))
+                centre_patch(patch, place[axes])
                 patch.set_label(plain(region.name))
+            for radius in keep_away:
+                if spatial:
+                    region_surface(panel, Ball(radius), np.zeros(3), forbidden=True)
+                else:
+                    panel.add_patch(Circle((0.0, 0.0), radius, label="too near", **FORBIDDEN))
             if not alone:
-                panel.plot(0, 0, "*", color=ORANGE, markersize=7, label=plain(first), zorder=1)
+                look = {"color": "black", "markersize": 7, "label": plain(first), "zorder": 1}
+                panel.plot(*np.zeros((len(view), 1)), ">" if turned else "*", **look)
             for step, path in column:
-                panel.plot(path[:, i], path[:, j], color=colour(step), linewidth=1.2)
-                panel.plot(path[0, i], path[0, j], "o", color=colour(step), markersize=3)
-            x_label = labelled(plain(f"x{along}"), unit)
-            panel.set(xlabel=x_label, ylabel=labelled("xyz"[j], unit), aspect="equal")
-            panel.set(xlim=(-half, half), ylim=(-half, half))
-            panel.xaxis.set_major_locator(MaxNLocator(4))
-            panel.yaxis.set_major_locator(MaxNLocator(4))
-            if j == 1:
-                panel.set_title(name, fontsize="medium")
-    if panels[0, -1].get_legend_handles_labels()[0]:
-        panels[0, -1].legend(loc="best", fontsize="small", frameon=False)
-    _colour_bar(figure, colours, list(panels.ravel()))
-    figure.suptitle(f"{plain(title)}\ndeterministic episodes of the first seed", fontsize="medium")
+                shown = _within(path, half) if spatial else path
+                panel.plot(*shown[:, axes].T, color=colour(step), linewidth=1.2)
+                panel.plot(*shown[:1, axes].T, "o", color=colour(step), markersize=3)
+            for place, letter in zip(view, "xyz", strict=False):
+                axis = getattr(panel, f"{letter}axis")
+                axis.set_label_text(labels[place])
+                axis.set_major_locator(MaxNLocator(4 if not spatial else 3))
+                getattr(panel, f"set_{letter}lim")(-half, half)
+            if spatial:
+                panel.set_box_aspect((1.0, 1.0, 1.0), zoom=ZOOM)
+            else:
+                panel.set_aspect("equal")
+            if row == 0:
+                panel.set_title(name)
+    handles, names = panels[-1].get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
+    _colour_bar(figure, colours, panels)
+    what = "deterministic episodes of the first seed"
+    figure.suptitle(fitted(f"{plain(title)}\n{what}", figure))
     return figure
+
+
+def _within(path: np.ndarray, half: float) -> np.ndarray:
+    """Return a path with a gap where it is outside of the box. Axes in space do not clip."""
+    return np.where((np.abs(path) <= half).all(axis=1, keepdims=True), path, np.nan)
 
 
 def _farthest(paths: Sequence[np.ndarray]) -> float:
@@ -222,7 +174,8 @@ def _farthest(paths: Sequence[np.ndarray]) -> float:
     return 1.1 * max(np.nanmax(np.abs(path)) for path in paths)
 
 
-def speed_distance(episodes: Episodes, title: str) -> Figure:
+@styled
+def speed_distance(episodes: Episodes, title: str, width: float | None = None) -> Figure:
     """Return a figure of speed against distance, with the speed limit at each distance.
 
     A speed below the dotted line is safe.
@@ -230,8 +183,10 @@ def speed_distance(episodes: Episodes, title: str) -> Figure:
     Args:
         episodes: logged episodes, in the order of training.
         title: the title of the figure.
+        width: the width of the figure in inches.
     """
-    figure = Figure(figsize=(6.4, 4.4), layout="constrained")
+    width = width or 6.4
+    figure = Figure(figsize=(width, 0.66 * width), layout="constrained")
     panel = figure.subplots()
     colours, colour = _colours(episodes)
     limits = []
@@ -255,64 +210,11 @@ def speed_distance(episodes: Episodes, title: str) -> Figure:
     panel.set(xlabel="distance to the chief [m]", ylabel="speed [m/s]")
     top = max(1.5 * np.nanmax(line[1], initial=0.2), 1.05 * fastest)
     panel.set(xlim=(0, reach), ylim=(0, top))
-    panel.legend(loc="best", frameon=False)
+    panel.legend(loc="best")
     _colour_bar(figure, colours, panel)
-    figure.suptitle(f"{plain(title)}\ndeterministic episodes of the first seed", fontsize="medium")
+    what = "deterministic episodes of the first seed"
+    figure.suptitle(fitted(f"{plain(title)}\n{what}", figure))
     return figure
-
-
-def _curve(panel: Axes, at: np.ndarray, values: np.ndarray) -> None:
-    known = ~np.isnan(values).any(axis=1)  # a mean over fewer seeds would be another curve
-    at = at[known]
-    values = values[known]
-    if not len(at):
-        panel.text(
-            0.5,
-            0.5,
-            "no episode has ended yet",
-            ha="center",
-            va="center",
-            transform=panel.transAxes,
-        )
-        return
-    panel.plot(at, values, color=GREY, linewidth=0.6, alpha=0.6)
-    panel.plot([], [], color=GREY, linewidth=0.6, label="each seed")
-    panel.plot(at, values.mean(axis=1), color=BLUE, linewidth=1.8, label="mean")
-    if values.shape[1] >= ENOUGH_SEEDS:
-        low, high = bootstrap_interval(values)
-        look = {"color": BLUE, "alpha": 0.25, "linewidth": 0}
-        panel.fill_between(at, low, high, label="95 % interval", **look)
-    panel.margins(x=0.0)
-
-
-def curve_table(
-    rows: Sequence[Mapping[str, Any]], column: str, name: str, most: int = 300
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return a column of the progress log as a table over steps and seeds.
-
-    Args:
-        rows: rows of the progress log.
-        column: the column of the horizontal axis.
-        name: the column of the values.
-        most: the largest number of points. More are thinned out.
-
-    Returns:
-        The values of `column`, shape (points,), and those of `name`, shape (points, seeds). A value
-        that is missing is NaN.
-    """
-    steps = sorted({row["step"] for row in rows})
-    kept = np.linspace(0, len(steps) - 1, min(most, len(steps))).astype(int)
-    steps = sorted({steps[i] for i in kept})
-    seeds = sorted({row["seed"] for row in rows})
-    index = {step: i for i, step in enumerate(steps)}
-    at = np.zeros(len(steps))
-    values = np.full((len(steps), len(seeds)), np.nan)
-    for row in rows:
-        if row["step"] in index:
-            point = index[row["step"]]
-            at[point] = row[column]
-            values[point, seeds.index(row["seed"])] = np.nan if row[name] is None else row[name]
-    return at, values
 
 
 def _agent(rows: list[dict[str, Any]]) -> str:
@@ -356,5 +258,8 @@ def _colours(episodes: Sequence[tuple[int, Any]]) -> tuple[ScalarMappable, Any]:
 
 
 def _colour_bar(figure: Figure, colours: ScalarMappable, panels: Any) -> None:
-    bar = figure.colorbar(colours, ax=panels, label="environment steps of training")
-    bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda step, _: f"{step:,.0f}"))
+    last: Any = colours.norm.vmax
+    unit, name = (1e6, "M") if last >= MILLIONS_FROM else (1e3, "k")
+    label = f"environment steps of training [{name}]"
+    bar = figure.colorbar(colours, ax=panels, label=label, aspect=40, pad=0.02)
+    bar.ax.yaxis.set_major_formatter(lambda step, _: f"{step / unit:g}")

@@ -20,10 +20,12 @@ from jaxsafe.plot.style import (
     GREY,
     ORANGE,
     control_unit,
+    fitted,
     labelled,
     length_unit,
     margin_unit,
     plain,
+    styled,
 )
 
 if TYPE_CHECKING:
@@ -47,7 +49,8 @@ def most_altered(episodes: Sequence[tuple[int, Rows]]) -> Rows:
     return max(latest, key=lambda rows: int(_intervening(rows).sum()))
 
 
-def interventions(rows: Rows, env: Environment, title: str) -> Figure:
+@styled
+def interventions(rows: Rows, env: Environment, title: str, width: float | None = None) -> Figure:
     """Return a figure of one episode over time in s.
 
     It has a panel for each control, desired and actual, and a panel for h of each constraint. Steps
@@ -59,13 +62,14 @@ def interventions(rows: Rows, env: Environment, title: str) -> Figure:
             that led to it.
         env: the environment, for bounds and units.
         title: the title of the figure.
+        width: the width of the figure in inches.
     """
     actuators = env.actuators
     length = length_unit(env)
     filtered = getattr(env.rta, "constraints", ())
     apart = len(filtered) != 1
     count = len(actuators) + len(env.constraints) + apart
-    figure = Figure(figsize=(7.0, 1.0 + 1.35 * count), layout="constrained")
+    figure = Figure(figsize=(width or 7.0, 1.0 + 1.35 * count), layout="constrained")
     panels = np.atleast_1d(figure.subplots(count, 1, sharex=True))
     times = _column(rows, "t")
     altered = _intervening(rows)
@@ -106,14 +110,12 @@ def interventions(rows: Rows, env: Environment, title: str) -> Figure:
         labels,
         loc="outside lower center",
         ncols=len(entries),
-        fontsize="small",
-        frameon=False,
     )
     figure.align_ylabels(list(panels))
     share = altered.mean() if len(altered) else 0.0
     outcome = plain(rows[-1]["outcome"])
     what = f"altered on {100.0 * share:.0f} % of the steps, ended with {outcome}"
-    figure.suptitle(f"{plain(title)}\n{what}", fontsize="medium")
+    figure.suptitle(fitted(f"{plain(title)}\n{what}", figure))
     return figure
 
 
@@ -137,7 +139,7 @@ def _control(panel: Axes, times: np.ndarray, rows: Rows, actuator: Any) -> None:
 def _name(panel: Axes, quantity: str, unit: str | None) -> None:
     """Label the y axis in short lines, because the panels are low."""
     lines = textwrap.wrap(labelled(quantity, unit).replace("_", " "), 14)
-    panel.set_ylabel("\n".join(map(plain, lines)), fontsize="small")
+    panel.set_ylabel("\n".join(map(plain, lines)))
 
 
 def _shade(panel: Axes, times: np.ndarray, altered: np.ndarray, label: str | None) -> None:

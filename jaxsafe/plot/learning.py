@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter
 
-from jaxsafe.plot.figures import AXES, curve_table, panel_grid, without_diverged
-from jaxsafe.plot.style import BLUE, plain
+from jaxsafe.plot.curves import Axis, Rows, curve_table, panel_grid, without_diverged
+from jaxsafe.plot.style import BLUE, fitted, plain, styled
 
 PANELS = (
     ("policy_loss", "policy loss", 1.0),
@@ -34,11 +30,15 @@ LOGARITHMIC = ("value_loss", "cost_value_loss")
 IN_ROW = 5
 """Number of panels in a row."""
 
+PANEL_WIDTH = 2.2
+"""Width of a panel in inches, if the width of the figure is left open."""
+
 WORST_SHOWN = -0.5
 """Lowest explained variance that is shown. The first updates may have far lower ones."""
 
 
-def learning_curves(rows: Sequence[Mapping[str, Any]], x: str, title: str) -> Figure | None:
+@styled
+def learning_curves(rows: Rows, x: str, title: str, width: float | None = None) -> Figure | None:
     """Return a figure with a small panel for each diagnostic, or None if the log has none.
 
     A panel shows the median of the seeds, and their range. Logs of older versions have no
@@ -48,27 +48,30 @@ def learning_curves(rows: Sequence[Mapping[str, Any]], x: str, title: str) -> Fi
         rows: rows of the progress log.
         x: what the horizontal axis shows, `steps` or `wall`.
         title: the title of the figure.
+        width: the width of the figure in inches.
     """
-    shown = [panel for panel in PANELS if panel[0] in rows[0]]
+    rows, left_out = without_diverged(rows)
+    shown = [panel for panel in PANELS if any(row.get(panel[0]) is not None for row in rows)]
     if not shown:
         return None
-    column, label = AXES[x]
-    rows, left_out = without_diverged(rows)
-    figure, panels = panel_grid(len(shown), 2.7, height=2.2, in_row=IN_ROW)
-    for panel, (name, quantity, factor) in zip(panels, shown, strict=False):
-        at, values = curve_table(rows, column, name)
-        _band(panel, at, factor * values)
-        panel.set_title(quantity, fontsize="medium")
-        panel.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axis = Axis.of(x, rows)
+    figure, panels, _ = panel_grid(
+        len(shown), width, panel_width=PANEL_WIDTH, ratio=0.85, in_row=IN_ROW
+    )
+    for panel, (name, quantity, factor) in zip(panels, shown, strict=True):
+        at, values = curve_table(rows, axis.column, name)
+        _band(panel, at / axis.unit, factor * values)
+        panel.set_title(quantity)
+        panel.margins(x=0.0)
+        panel.set_xlim(left=0.0)
         if name in LOGARITHMIC and np.nanmax(values, initial=0.0) > 0.0:
             panel.set_yscale("log")
         if name == "explained_variance":
             panel.set_ylim(max(WORST_SHOWN, panel.get_ylim()[0]), 1.05)
-    for panel in panels[max(0, len(shown) - IN_ROW) : len(shown)]:
-        panel.set_xlabel(label)
+    figure.supxlabel(axis.label, fontsize="medium")
     several = len({row["seed"] for row in rows}) > 1
     what = "median and range of the seeds" if several else "one seed"
-    figure.suptitle(f"{plain(title)}\neach update, {what}{left_out}", fontsize="medium")
+    figure.suptitle(fitted(f"{plain(title)}\neach update, {what}{left_out}", figure))
     return figure
 
 
@@ -89,4 +92,3 @@ def _band(panel: Axes, at: np.ndarray, values: np.ndarray) -> None:
         at, values.min(axis=1), values.max(axis=1), color=BLUE, alpha=0.25, linewidth=0
     )
     panel.plot(at, np.median(values, axis=1), color=BLUE, linewidth=1.2)
-    panel.margins(x=0.0)

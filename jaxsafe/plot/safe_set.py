@@ -24,7 +24,17 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxsafe.environment import Environment, reset_to
-from jaxsafe.plot.style import GREY, ORANGE, labelled, length_unit, margin_unit, plain
+from jaxsafe.plot.style import (
+    GREY,
+    ORANGE,
+    SKY,
+    fitted,
+    labelled,
+    length_unit,
+    margin_unit,
+    plain,
+    styled,
+)
 from jaxsafe.rta.filter import CertifiedRTA
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.cwh import Spacecraft
@@ -33,7 +43,6 @@ from jaxsafe.simulation.oriented import OrientedSpacecraft
 from jaxsafe.transition import constraint
 from jaxsafe.types import Sim
 
-SKY = "#56B4E9"
 LOST = "#C9C9C9"
 """Colour of states from which no backup controller ends in the terminal set."""
 
@@ -138,6 +147,7 @@ def place(env: Environment, start: Mapping[str, Mapping[str, Any]]) -> Sim:
     return reset_to(env.replace(rta=None, randomize={}), states)[0].sim
 
 
+@styled
 def draw(
     env: Environment, title: str, x: Ends | None = None, y: Ends | None = None, points: int = 161
 ) -> Figure:
@@ -191,9 +201,9 @@ def draw(
     panels[0].set_ylabel(plain(plane.y_label))
     colours = ScalarMappable(scale, SHADES)
     figure.colorbar(colours, ax=list(panels), label=labelled("H", _unit(env)), extend="max")
-    figure.legend(handles=_entries(surveys), loc="outside lower center", ncols=3, frameon=False)
+    figure.legend(handles=_entries(surveys), loc="outside lower center", ncols=3)
     notes = [plane.note, "" if env.rta.enforce else "certificates not enforced"]
-    figure.suptitle(plain("; ".join([title, *(note for note in notes if note)])))
+    figure.suptitle(fitted(plain("; ".join([title, *(note for note in notes if note)])), figure))
     return figure
 
 

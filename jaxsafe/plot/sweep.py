@@ -10,12 +10,14 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.figure import Figure
 
-from jaxsafe.plot.style import GREY, plain, save
+from jaxsafe.plot.curves import CURVES, TRAINING, Axis, set_axes
+from jaxsafe.plot.style import GREY, plain, save, styled
 
 MAX_NAMED_SETTINGS = 8
 """Number of the best settings that get a colour and a name."""
 
 
+@styled
 def sweep_curves(path: Path, curves: Sequence[tuple[str, dict[str, Any]]]) -> Path:
     """Draw the success rate of each setting, averaged over seeds, and return the path of the file.
 
@@ -25,6 +27,7 @@ def sweep_curves(path: Path, curves: Sequence[tuple[str, dict[str, Any]]]) -> Pa
     """
     figure = Figure(figsize=(7.6, 4.4), layout="constrained")
     panel = figure.subplots()
+    axis = Axis.of("steps", [{"step": max(curve["steps"])} for _, curve in curves])
     num_named = min(len(curves), MAX_NAMED_SETTINGS)
     for place, (label, curve) in reversed(list(enumerate(curves))):
         steps = np.array(curve["steps"])
@@ -32,23 +35,16 @@ def sweep_curves(path: Path, curves: Sequence[tuple[str, dict[str, Any]]]) -> Pa
         named = place < MAX_NAMED_SETTINGS
         colour = colormaps["viridis"](0.85 * place / max(num_named - 1, 1)) if named else GREY
         panel.plot(
-            steps,
+            steps / axis.unit,
             success,
             color=colour,
             linewidth=1.6 if named else 0.6,
             label=plain(label) if named else None,
             zorder=-place,
         )
-    panel.axhline(80.0, color="black", linestyle=":", linewidth=1.0)
-    panel.set(
-        xlabel="environment steps per seed",
-        ylabel="success rate [%], last 100 episodes",
-        ylim=(-3, 103),
-    )
-    panel.ticklabel_format(axis="x", style="sci", scilimits=(-3, 4))
-    panel.margins(x=0.0)
+    name, quantity, _ = CURVES[0]
+    set_axes(panel, axis, quantity=quantity, name=name)
+    figure.suptitle(f"{TRAINING}, averaged over seeds")
     handles, labels = panel.get_legend_handles_labels()
-    figure.legend(
-        handles[::-1], labels[::-1], loc="outside right upper", fontsize="small", frameon=False
-    )
+    figure.legend(handles[::-1], labels[::-1], loc="outside right upper")
     return save(figure, path / "curves.png")

@@ -12,10 +12,11 @@ from typing import Any, Literal
 from matplotlib.figure import Figure
 
 from jaxsafe.environment import Environment
-from jaxsafe.plot.figures import AXES, Episodes, Rows, speed_distance, training_curves, trajectories
+from jaxsafe.plot.curves import AXES, evaluation_rows, training_curves
+from jaxsafe.plot.figures import Episodes, Rows, speed_distance, trajectories
 from jaxsafe.plot.interventions import interventions, most_altered
 from jaxsafe.plot.learning import learning_curves
-from jaxsafe.plot.style import kept_out, length_unit, save, to_bytes
+from jaxsafe.plot.style import keep_away_distances, kept_out, length_unit, save, to_bytes
 from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.storage.files import read_rows
 from jaxsafe.storage.forms import (
@@ -44,40 +45,56 @@ class Figures(dict[str, Figure]):
         return "<br>".join(f'<img src="data:image/png;base64,{image}">' for image in images)
 
 
-def draw_all(run: Path, x: Literal["steps", "wall"] = "steps") -> list[Path]:
+def draw_all(
+    run: Path,
+    x: Literal["steps", "wall"] = "steps",
+    form: str = "png",
+    panels: Sequence[str] = (),
+    width: float | None = None,
+) -> list[Path]:
     """Draw every figure for which the run has data into `<run>/figures/`.
 
     Args:
         run: the run directory.
         x: the horizontal axis of training curves: steps, or wall time.
+        form: the format of the figures: png, pdf or svg.
+        panels: the columns of the progress log that the training curves show. Without any, they
+            show all.
+        width: the width of each figure in inches.
 
     Returns:
         The paths of the figures.
 
     Raises:
-        ConfigError: the run has no progress log.
+        ConfigError: the run has no progress log, or no values of a column of `panels`.
     """
-    figures = draw(run, x)
+    figures = draw(run, x, panels, width)
     place = run / "figures"
     # If there are no figures yet, all of them appear at once or none does.
     new = place if place.exists() else place.with_name("figures.part")
     # A command that was killed may have left this directory.
     shutil.rmtree(place.with_name("figures.part"), ignore_errors=True)
-    paths = [save(figure, new / f"{name}.png") for name, figure in figures.items()]
+    paths = [save(figure, new / f"{name}.{form}") for name, figure in figures.items()]
     if new != place:
         new.rename(place)
     return [place / path.name for path in paths]
 
 
-def draw(run: Path, x: str = "steps") -> Figures:
+def draw(
+    run: Path, x: str = "steps", panels: Sequence[str] = (), width: float | None = None
+) -> Figures:
     """Return every figure for which the run has data, by name.
 
     Args:
         run: the run directory.
         x: the horizontal axis of training curves: `steps` or `wall`.
+        panels: the columns of the progress log that the training curves show. Without any, they
+            show all.
+        width: the width of each figure in inches.
 
     Raises:
-        ConfigError: `x` is something else, or the run has no progress log.
+        ConfigError: `x` is something else, or the run has no progress log, or no values of a column
+            of `panels`.
     """
     if x not in AXES:
         raise ConfigError(f"x: unknown axis {show(x)}; choose from {nearest(x, AXES)}")
@@ -90,8 +107,11 @@ def draw(run: Path, x: str = "steps") -> Figures:
         "rta": filter_name(env),
     }
     title = headline({**facts, "seeds": len({row["seed"] for row in rows})})
-    figures = Figures({f"training_{x}": training_curves(rows, x, title)})
-    learning = learning_curves(rows, x, title)
+    curves = training_curves(
+        rows, x, title, evaluations=evaluations(run, rows), panels=panels, width=width
+    )
+    figures = Figures({f"training_{x}": curves})
+    learning = learning_curves(rows, x, title, width)
     if learning is not None:
         figures[f"learning_{x}"] = learning
     others = [platform.name for platform in env.platforms if platform.name != env.agent]
@@ -99,12 +119,18 @@ def draw(run: Path, x: str = "steps") -> Figures:
     episodes = _episodes(run / "episodes.jsonl", names, partial(_row_form, env, names))
     if episodes:
         figures["trajectories"] = trajectories(
-            episodes, title, length_unit(env), env.regions, kept_out(env)
+            episodes,
+            title,
+            unit=length_unit(env),
+            regions=env.regions,
+            forbidden=kept_out(env),
+            keep_away=keep_away_distances(env),
+            width=width,
         )
         if {"docking_distance", "speed", "velocity_limit"} <= episodes[0][1][0]["status"].keys():
-            figures["speed_distance"] = speed_distance(episodes, title)
+            figures["speed_distance"] = speed_distance(episodes, title, width)
         if "rta" in episodes[-1][1][0]:
-            figures["interventions"] = interventions(most_altered(episodes), env, title)
+            figures["interventions"] = interventions(most_altered(episodes), env, title, width)
     return figures
 
 
@@ -118,6 +144,29 @@ def progress(run: Path) -> list[dict[str, Any]]:
     if not rows:
         raise ConfigError(f"run: {run} has no rows in progress.jsonl yet; nothing to draw")
     return rows
+
+
+def evaluations(run: Path, progress: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the means of the evaluations during the training of a run.
+
+    Args:
+        run: the run directory.
+        progress: the rows of its progress log.
+
+    Raises:
+        ConfigError: a row of the log of evaluations is broken.
+    """
+    form = {
+        **dict.fromkeys(("step", "seed", "length"), COUNT),
+        **dict.fromkeys(("final", "success"), FLAG),
+        "return": NUMBER_OR_NULL,
+    }
+    log = read_rows(run / "eval.jsonl", form)
+    optional = ("delta_v", "violating_steps", "interventions")
+    known = {name: NUMBER_OR_NULL for name in optional if any(name in row for row in log)}
+    for number, row in enumerate(log, start=1):
+        check(row, known, f"{run / 'eval.jsonl'}, row {number}")
+    return evaluation_rows(log, progress)
 
 
 def _episodes(

@@ -15,17 +15,20 @@ from jaxsafe.commands.plot import main
 from jaxsafe.envs import TASKS
 from jaxsafe.metrics import bootstrap_interval
 from jaxsafe.plot.compare import compare_curves, seed_curves
-from jaxsafe.plot.figures import speed_distance, training_curves, trajectories
+from jaxsafe.plot.curves import EVALUATIONS, FEW, TRAINING, evaluation_rows, training_curves
+from jaxsafe.plot.figures import speed_distance, trajectories
 from jaxsafe.plot.learning import learning_curves
-from jaxsafe.plot.style import GREEN, ORANGE, kept_out, save
+from jaxsafe.plot.profiles import performance_profiles
+from jaxsafe.plot.style import GREEN, GREY, ORANGE, kept_out, save
 from jaxsafe.runs.figures import _episodes, draw_all
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.storage.files import read_rows, write_rows
+from jaxsafe.storage.files import read_csv, read_rows, write_rows
 from jaxsafe.train.ppo import DIAGNOSTICS
 
 
-def rows(num_updates: int = 50, num_seeds: int = 4) -> list[dict]:
+def rows(num_updates: int = 50, num_seeds: int = 5) -> list[dict]:
+    """Return rows of a progress log. Ten episodes end in each update, the first in the fourth."""
     rng = np.random.default_rng(0)
     curves = np.cumsum(rng.random((num_updates, num_seeds)), axis=0) / num_updates
     names = ("success_rate", "return", "length", "delta_v", "violating_steps")
@@ -34,7 +37,7 @@ def rows(num_updates: int = 50, num_seeds: int = 4) -> list[dict]:
             "seed": 7 + i,
             "step": 100 * (j + 1),
             "wall_s": 0.5 * j,
-            "episodes": 10 * j,
+            "episodes": max(0, 10 * (j - 2)),
             **dict.fromkeys(names, None if j < 3 else float(curves[j, i])),
         }
         for j in range(num_updates)
@@ -42,30 +45,141 @@ def rows(num_updates: int = 50, num_seeds: int = 4) -> list[dict]:
     ]
 
 
+def evaluated(num_seeds: int = 5, steps: tuple[int, ...] = (0, 1000, 3000, 5000)) -> list[dict]:
+    """Return rows of a log of evaluations, with two episodes of each seed at each step."""
+    return [
+        {
+            "step": step,
+            "seed": 7 + seed,
+            "final": False,
+            "success": episode == 0,
+            "return": step + seed + episode,
+            "length": 10,
+            "violating_steps": 4 * episode,
+        }
+        for step in steps
+        for seed in range(num_seeds)
+        for episode in range(2)
+    ]
+
+
+def entries(figure: Any) -> list[str]:
+    """Return the texts of the legend, which is below the panels or in a spare one."""
+    legends = [*figure.legends, *(panel.get_legend() for panel in figure.axes)]
+    return [text.get_text() for legend in legends if legend for text in legend.get_texts()]
+
+
+def long(panel: Any, line: str = "-") -> list[Any]:
+    """Return the lines of a panel with several points and this line style."""
+    return [
+        drawn
+        for drawn in panel.lines
+        if len(drawn.get_xdata()) > 1
+        and drawn.get_linestyle() == line
+        and drawn.get_color() != GREY
+    ]
+
+
 def test_curves_show_each_seed_their_mean_and_its_interval() -> None:
     figure = training_curves(rows(), "steps", "title")
     panel = figure.axes[0]
-    assert panel.get_xlabel() == "environment steps per seed"
+    assert panel.get_xlabel() == "environment steps per seed [k]"
     assert panel.get_ylabel() == "success rate [%]"
-    mean = next(line for line in panel.lines if line.get_label() == "mean")
     # No episode has finished in the first three updates.
-    values = np.array([row["success_rate"] or np.nan for row in rows()]).reshape(50, 4)[3:]
-    np.testing.assert_allclose(mean.get_ydata(), 100 * values.mean(axis=1))
-    np.testing.assert_allclose(mean.get_xdata(), 100 * np.arange(4, 51))
+    values = np.array([row["success_rate"] or np.nan for row in rows()]).reshape(50, 5)[3:]
+    *seeds, mean = long(panel)
+    assert len(seeds) == 5
+    # The mean is dotted until 20 episodes have ended.
+    [few] = long(panel, ":")
+    np.testing.assert_allclose(few.get_xdata(), [0.4, 0.5])
+    np.testing.assert_allclose(mean.get_xdata(), np.arange(5, 51) / 10)
+    np.testing.assert_allclose(mean.get_ydata(), 100 * values.mean(axis=1)[1:])
     shaded = panel.collections[0].get_paths()[0].vertices
     assert shaded[:, 1].max() == pytest.approx(100 * bootstrap_interval(values)[1].max())
-    assert len(panel.lines) == 4 + 1 + 1 + 1  # seeds, the label, the mean and the 80 % line
+    assert entries(figure) == [TRAINING, FEW, "each seed", "95 % interval of the mean"]
+    assert {panel.get_xlim()[0] for panel in figure.axes if panel.axison} == {0.0}
 
 
-def test_a_run_in_which_no_episode_ended_has_curves_that_say_so() -> None:
-    panels = training_curves(rows(num_updates=3), "steps", "title").axes
-    assert [panel.texts[0].get_text() for panel in panels] == ["no episode has ended yet"] * 3
+def test_evaluations_are_the_main_curve_and_begin_at_step_0() -> None:
+    log = evaluation_rows(evaluated(), rows())
+    figure = training_curves(rows(), "steps", "title", log)
+    panel = figure.axes[1]
+    assert panel.get_ylabel() == "return"
+    [main] = [line for line in long(panel) if line.get_marker() == "o"]
+    np.testing.assert_allclose(main.get_xdata(), [0.0, 1.0, 3.0, 5.0])
+    np.testing.assert_allclose(main.get_ydata(), np.array([0, 1000, 3000, 5000]) + 2.5)
+    assert len(panel.collections) == 1  # the interval of the main curve
+    assert entries(figure)[:3] == [EVALUATIONS, TRAINING, FEW]
+    # Too few evaluations make no curve. They are points.
+    two = evaluation_rows(evaluated(steps=(0, 5000)), rows())
+    panel = training_curves(rows(), "steps", "title", two).axes[1]
+    [points] = [line for line in panel.lines if line.get_marker() == "o"]
+    assert points.get_linestyle() == "None"
+
+
+def test_an_evaluation_is_the_mean_of_its_episodes() -> None:
+    log = [*evaluated(), {**evaluated()[0], "final": True}]
+    first, *_ = evaluation_rows(log, rows())
+    assert first == {
+        "seed": 7,
+        "step": 0,
+        "wall_s": 0.0,
+        "episodes": 2,
+        "success_rate": 0.5,
+        "return": 0.5,
+        "length": 10.0,
+        "delta_v": None,
+        "episode_cost": 2.0,
+        "violating_share": 0.2,
+        "intervention_share": None,
+    }
+
+
+@pytest.mark.parametrize("num_seeds", [1, 4])
+def test_fewer_than_five_seeds_are_drawn_alone(num_seeds: int) -> None:
+    log = evaluation_rows(evaluated(num_seeds), rows(num_seeds=num_seeds))
+    figure = training_curves(rows(num_seeds=num_seeds), "steps", "title", log)
+    panel = figure.axes[1]
+    main = [line for line in long(panel) if line.get_marker() == "o"]
+    assert len({line.get_color() for line in main}) == len(main) == num_seeds
+    assert not panel.collections  # no interval
+    seeds = [f"seed {7 + seed}" for seed in range(num_seeds)] if num_seeds > 1 else []
+    assert entries(figure) == [*seeds, EVALUATIONS, TRAINING, FEW]
+
+
+def test_long_trainings_count_millions_of_steps() -> None:
+    log = [{**row, "step": 100 * row["step"]} for row in rows()]
+    panel = training_curves(log, "steps", "title").axes[0]
+    assert panel.get_xlabel() == "environment steps per seed [M]"
+    assert panel.get_xlim()[1] == pytest.approx(0.5, rel=0.03)
+
+
+def test_panels_are_those_that_are_asked_for_or_have_values() -> None:
+    figure = training_curves(rows(), "steps", "title", panels=["delta_v", "return"])
+    assert [panel.get_ylabel() for panel in figure.axes] == ["Δv per episode [m/s]", "return"]
+    with pytest.raises(
+        ConfigError, match=r"panels: no values of episode_cost here; choose from su"
+    ):
+        training_curves(rows(), "steps", "title", panels=["episode_cost"])
+
+
+@pytest.mark.parametrize(("width", "columns"), [(3.5, 1), (7.0, 2)])
+def test_a_figure_is_as_wide_as_asked(width: float, columns: int) -> None:
+    figure = training_curves(rows(), "steps", "title", width=width)
+    assert figure.get_figwidth() == width
+    figure.draw_without_rendering()
+    assert len({round(panel.get_position().x0, 2) for panel in figure.axes}) == columns
+
+
+def test_a_run_in_which_no_episode_ended_has_a_figure_that_says_so() -> None:
+    [panel] = training_curves(rows(num_updates=3), "steps", "title").axes
+    assert panel.texts[0].get_text() == "no episode has ended yet"
 
 
 def test_curves_over_wall_time_use_the_clock() -> None:
     panel = training_curves(rows(), "wall", "title").axes[1]
     assert panel.get_xlabel() == "wall time [s]"
-    assert panel.get_xlim()[1] == pytest.approx(24.5)
+    assert panel.get_xlim()[1] == pytest.approx(24.5, rel=0.03)
 
 
 def episode(step: int, dimension: int) -> tuple[int, list[dict]]:
@@ -84,9 +198,9 @@ def episode(step: int, dimension: int) -> tuple[int, list[dict]]:
     return step, [{"status": s, "platforms": p} for s, p in zip(status, platforms, strict=True)]
 
 
-@pytest.mark.parametrize(("dimension", "planes"), [(2, 1), (3, 2)])
-def test_trajectories_show_one_start_during_training_and_all_after_it_in_each_plane(
-    dimension: int, planes: int
+@pytest.mark.parametrize(("dimension", "views"), [(2, 1), (3, 3)])
+def test_trajectories_show_one_start_during_training_and_all_after_it_in_each_view(
+    dimension: int, views: int
 ) -> None:
     other = episode(200, dimension)
     for row in other[1]:
@@ -97,18 +211,21 @@ def test_trajectories_show_one_start_during_training_and_all_after_it_in_each_pl
         "m",
     )
     axes = [panel for panel in figure.axes if panel.get_xlabel() == "x [m]"]
-    assert [panel.get_title() for panel in axes[:2]] == [
+    assert len(axes) == 2 * views
+    titled = [panel for panel in axes if panel.get_title()]
+    assert [panel.get_title() for panel in titled] == [
         "one start, during training",
         "after training",
     ]
-    assert len(axes) == 2 * planes
-    during, after = (
-        [line for line in panel.lines if len(line.get_xdata()) > 1] for panel in axes[:2]
-    )
+    spatial = [panel for panel in axes if hasattr(panel, "get_zlabel")]
+    assert [panel.get_zlabel() for panel in spatial] == ["z [m]"] * 2 * (dimension == 3)
+    flat = [panel for panel in axes if panel.get_ylabel() == "y [m]" and panel not in spatial]
+    during, after = ([line for line in panel.lines if len(line.get_xdata()) > 1] for panel in flat)
     assert (len(during), len(after)) == (3, 2)
     np.testing.assert_allclose(during[0].get_xdata(), np.linspace(80.0, 0.0, 20))
     np.testing.assert_allclose(after[1].get_xdata(), np.linspace(-80.0, 0.0, 20))
     assert len({line.get_color() for line in during}) == 3
+    figure.draw_without_rendering()
 
 
 def test_the_ends_of_the_paths_have_a_panel_where_a_region_is_small_beside_them() -> None:
@@ -182,7 +299,8 @@ def test_paths_are_seen_from_the_lead_along_its_heading_with_the_region_that_it_
     assert isinstance(region, Circle)
     np.testing.assert_allclose(region.center, [-250.0, 433.0], atol=1e-6)
     assert region.radius == float(env.regions[0].radius)
-    assert panel.get_xlabel() == "x along the heading of the lead [ft]"
+    assert panel.get_xlabel() == "ahead of the lead [ft]"
+    assert panel.get_ylabel() == "left of the lead [ft]"
 
 
 def test_the_speed_limit_is_drawn_from_the_log() -> None:
@@ -221,7 +339,7 @@ def test_what_is_learnt_is_drawn_as_the_median_and_the_range_of_the_seeds() -> N
     log = diagnostics()
     figure = learning_curves(log, "steps", "title")
     assert figure is not None
-    assert len(figure.axes) == len(DIAGNOSTICS)
+    assert len([panel for panel in figure.axes if panel.axison]) == len(DIAGNOSTICS)
     panels = {panel.get_title(): panel for panel in figure.axes}
     for title, name, factor in (
         ("value loss", "value_loss", 1),
@@ -230,12 +348,12 @@ def test_what_is_learnt_is_drawn_as_the_median_and_the_range_of_the_seeds() -> N
         values = factor * np.array([row[name] for row in log]).reshape(50, 4)
         (line,) = panels[title].lines
         np.testing.assert_allclose(line.get_ydata(), np.median(values, axis=1))
-        np.testing.assert_array_equal(line.get_xdata(), 100 * np.arange(1, 51))
+        np.testing.assert_allclose(line.get_xdata(), np.arange(1, 51) / 10)
         shaded = panels[title].collections[0].get_paths()[0].vertices
         assert {shaded[:, 1].min(), shaded[:, 1].max()} == {values.min(), values.max()}
     assert panels["value loss"].get_yscale() == "log"
-    assert panels["explained variance"].lines[0].get_xdata()[0] == 200
-    assert [panel.get_xlabel() for panel in figure.axes[-5:]] == ["environment steps per seed"] * 5
+    assert panels["explained variance"].lines[0].get_xdata()[0] == 0.2
+    assert figure.get_supxlabel() == "environment steps per seed [k]"
     assert figure.get_suptitle() == "title\neach update, median and range of the seeds"
 
 
@@ -246,13 +364,11 @@ def test_the_figure_of_what_is_learnt_has_what_the_log_has() -> None:
     ]
     figure = learning_curves(without_cost, "wall", "title")
     assert figure is not None
-    assert len(figure.axes) == len(DIAGNOSTICS) - 1
-    assert figure.axes[-1].get_xlabel() == "wall time [s]"
+    assert len([panel for panel in figure.axes if panel.axison]) == len(DIAGNOSTICS) - 1
+    assert figure.get_supxlabel() == "wall time [s]"
     assert figure.get_suptitle() == "title\neach update, one seed"
     nothing = [row | dict.fromkeys(DIAGNOSTICS) for row in without_cost]
-    figure = learning_curves(nothing, "steps", "title")
-    assert figure is not None
-    figure.draw_without_rendering()
+    assert learning_curves(nothing, "steps", "title") is None
     broken = [row | {"diverged": row["seed"] == 8} for row in diagnostics()]
     figure = learning_curves(broken, "steps", "title")
     assert figure is not None
@@ -303,8 +419,8 @@ NASTY = [FORMULA, "_old", "$x$", r"\$a$", "a\x1b]0;b\x07c", "\udcff"]
 def test_names_are_drawn_letter_by_letter(name: str) -> None:
     figure = compare_curves({name: rows(), f"{name}2": rows()}, name, mark=(name, 1000.0))
     figure.draw_without_rendering()
-    shown = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert len(shown) == 3
+    shown = entries(figure)
+    assert len(shown) == 5  # two runs, the mark, and two of the training
     drawn = figure.axes[0].text(0.0, 0.0, shown[0])
     assert drawn._preprocess_math(shown[0])[1] is False  # pyright: ignore[reportAttributeAccessIssue]
     seen = drawn._preprocess_math(shown[0])[0]  # pyright: ignore[reportAttributeAccessIssue]
@@ -314,20 +430,26 @@ def test_names_are_drawn_letter_by_letter(name: str) -> None:
 
 
 def test_an_interval_is_drawn_and_named_only_where_there_are_seeds_enough() -> None:
-    for count, interval in ((2, False), (3, True)):
-        panel = training_curves(rows(num_seeds=count), "steps", "title").axes[0]
-        assert (
-            ("95 % interval" in panel.get_legend_handles_labels()[1])
-            == bool(panel.collections)
-            == interval
-        )
+    for count, interval in ((4, False), (5, True)):
+        figure = training_curves(rows(num_seeds=count), "steps", "title")
+        named = "95 % interval of the mean" in entries(figure)
+        assert named == bool(figure.axes[0].collections) == interval
         figure = compare_curves({"one": rows(num_seeds=count)}, "docking2d")
-        title = figure.get_suptitle()
-        assert title == (
-            "docking2d: the last 100 training episodes,"
-            f" mean{' and 95 % interval' * interval} over seeds"
-        )
+        what = ": mean and 95 % interval over seeds" * interval
+        assert figure.get_suptitle() == f"docking2d{what}"
         assert bool(figure.axes[0].collections) == interval
+        assert len(long(figure.axes[0])) == (1 if interval else count)
+
+
+def test_evaluations_are_the_main_curves_of_a_comparison() -> None:
+    log = {"one": evaluation_rows(evaluated(), rows())}
+    figure = compare_curves({"one": rows(), "other": rows()}, "title", evaluations=log)
+    panel = figure.axes[1]
+    training, main, other = long(panel)
+    assert main.get_marker() == "o"
+    assert main.get_color() == training.get_color() != other.get_color()
+    assert main.get_linewidth() == other.get_linewidth() > training.get_linewidth()
+    assert entries(figure) == ["one", "other", EVALUATIONS, TRAINING, FEW]
 
 
 def test_what_to_stay_out_of_is_not_drawn_like_the_goal() -> None:
@@ -340,9 +462,10 @@ def test_what_to_stay_out_of_is_not_drawn_like_the_goal() -> None:
     for row in rows:
         row["regions"] = {"docking_region": {"position": [0.0, 0.0]}}
     env = jaxsafe.make("docking2d")
-    for forbidden, colour in (((), GREEN), (("docking_region",), ORANGE)):
+    for forbidden, colour, hatch in (((), GREEN, None), (("docking_region",), ORANGE, "////")):
         panel = trajectories([(step, rows)], "title", "m", env.regions, forbidden).axes[0]
         assert to_hex(panel.patches[0].get_facecolor()).upper() == colour
+        assert panel.patches[0].get_hatch() == hatch
 
 
 @pytest.mark.parametrize("nasty", [FORMULA, "_$x"])
@@ -475,25 +598,84 @@ def test_several_runs_in_one_figure_with_a_table(
     for name in ("ppo", "limited"):
         shutil.copytree(whole, name)
     assert main(["run=[ppo,limited]", "x=wall", "out=both.png"]) == 0
-    heads, first, second, written = capsys.readouterr().out.splitlines()
+    heads, first, second, *written = capsys.readouterr().out.splitlines()
     assert "cost/episode" in heads
     assert [(line.split()[0], *line.split()[-2:]) for line in (first, second)] == [
         ("ppo", "ppo", "none"),
         ("limited", "ppo", "none"),
     ]
-    assert written == "both.png"
-    assert imread("both.png").shape[2] == 4
+    assert written == ["both.png", "both_profiles.png", "both.csv", "both.tex"]
+    for name in written[:2]:
+        assert imread(name).shape[2] == 4
+    results = json.loads((whole / "results.json").read_text())
+    success = results["evaluation"]["stochastic"]["success_rate"]
+    row, _ = read_csv(Path("both.csv"))
+    assert (row["run"], row["algorithm"], row["seeds"]) == ("ppo", "ppo", 3)
+    low, high = success["ci95"]
+    assert row["stochastic/success_rate/mean"] == pytest.approx(success["mean"])
+    assert row["stochastic/success_rate/low"] == pytest.approx(low)
+    assert row["stochastic/success_rate/high"] == pytest.approx(high)
     (tmp_path / "limited" / "results.json").unlink()
     for runs, message in (
         ("[ppo]", "expected several directories of different names, found ppo"),
         ("[ppo,x/ppo]", "expected several directories of different names"),
         ("[ppo,limited]", "limited has no results.json; finish it with"),
         ("[ppo,none]", "no run in 'none'"),
+        ("none*", r"run: no run fits 'none\*'"),
     ):
         with pytest.raises(ConfigError, match=message):
             main([f"run={runs}"])
-    with pytest.raises(ConfigError, match="out: means nothing but for several runs"):
-        main(["run=ppo", "out=x.png"])
+    for words, message in (
+        (["run=ppo", "out=x.png"], "out: means nothing but for several runs"),
+        (["run=ppo", "labels=[x]"], "labels: means nothing but for several runs"),
+        (["run=[ppo,limited]", "labels=[x]"], "labels: expected one for each of 2 runs"),
+        (["run=[ppo,limited]", "labels=[x,x]"], "labels: expected different ones, found x, x"),
+        (["run=ppo", "width=1"], "width: expected a number of inches from 2 to 40, found 1"),
+        (["run=ppo", "width=wide"], "width: expected a number of inches"),
+        (["run=ppo", "panels=[reward]"], "panels: unknown panel 'reward'; choose from .*return"),
+        (["run=ppo", "panels=[intervention_share]"], "panels: no values of intervention_share"),
+        (["run=ppo", "format=bmp"], "format: unknown format 'bmp'; choose from png, pdf, svg"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            main(words)
+
+
+def test_a_pattern_stands_for_runs_and_labels_name_them(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b"):
+        shutil.copytree(whole, Path("runs") / name)
+    Path("runs/notes.txt").write_text("no run")
+    words = [
+        "run=runs/*",
+        "labels=[50 % _off_,other]",
+        "panels=[return]",
+        "format=pdf",
+        "width=3.5",
+    ]
+    assert main(words) == 0
+    written = ["comparison.pdf", "comparison_profiles.pdf", "comparison.csv", "comparison.tex"]
+    *_, first, _ = capsys.readouterr().out.split("comparison.pdf")[0].splitlines()
+    assert first.startswith("50 % _off_")
+    assert sorted(path.name for path in tmp_path.glob("comparison*")) == sorted(written)
+    assert r"50 \% \_off\_ & " in Path("comparison.tex").read_text()
+    with pytest.raises(ConfigError, match=r"format: found svg, but out=x\.pdf says pdf"):
+        main(["run=runs/*", "out=x.pdf", "format=svg"])
+    assert main(["run=runs/a", "format=svg", "panels=[return]"]) == 0
+    assert {path.suffix for path in Path("runs/a/figures").glob("t*.svg")} == {".svg"}
+
+
+def test_a_profile_is_the_share_of_seeds_above_each_score() -> None:
+    panels = {"success rate τ [%]": {"one": [50.0, 60.0, 90.0, 100.0, 100.0], "few": [70.0]}}
+    figure = performance_profiles(panels, "title", None)
+    panel = figure.axes[0]
+    one, few = panel.lines
+    share = np.interp([55.0, 80.0, 95.0], one.get_xdata(), one.get_ydata())
+    np.testing.assert_allclose(share, [80.0, 60.0, 40.0])
+    assert set(few.get_ydata()) == {0.0, 100.0}
+    assert len(panel.collections) == 1  # one seed has no interval
+    assert entries(figure) == ["one", "few"]
 
 
 def test_comparison_is_logarithmic_only_where_runs_differ_much_in_length():
@@ -513,22 +695,19 @@ def test_comparison_is_logarithmic_only_where_runs_differ_much_in_length():
         assert {panel.get_xscale() for panel in figure.axes} == {scale}
 
 
-def test_curves_of_a_comparison_begin_when_every_seed_has_finished_enough_episodes() -> None:
+def test_curves_of_a_comparison_are_dotted_until_every_seed_has_finished_enough_episodes() -> None:
     # each update finishes 10 more episodes
-    known = [{**row, "success_rate": 0.5} for row in rows()]
-    panel = compare_curves({"one": known}, "docking2d", mark=("the paper's 80 %", 3000.0)).axes[0]
-    curve = next(line for line in panel.lines if line.get_label() == "one")
-    assert curve.get_xdata()[0] == 300
-    few = [{**row, "episodes": row["episodes"] // 50} for row in known]
-    curve = next(
-        line
-        for line in compare_curves({"one": few}, "docking2d").axes[0].lines
-        if line.get_label() == "one"
-    )
-    # only rows in which the run has finished all its 9 episodes
-    assert 0 < len(curve.get_xdata()) < 10
-    (mark,) = [line for line in panel.lines if line.get_label() == "the paper's 80 %"]
-    assert mark.get_xydata().tolist() == [[3000.0, 80.0]]
+    log = rows()
+    panel = compare_curves({"one": log}, "docking2d", mark=("the paper's 80 %", 3000.0)).axes[0]
+    [curve] = long(panel)
+    [few] = long(panel, ":")
+    assert (few.get_xdata()[0], curve.get_xdata()[0]) == (0.4, 0.5)
+    never = [{**row, "episodes": row["episodes"] // 50} for row in log]
+    panel = compare_curves({"one": never}, "docking2d", mark=("the paper's 80 %", 3000.0)).axes[0]
+    assert not long(panel)
+    assert len(long(panel, ":")) == 1
+    (mark,) = [line for line in panel.lines if line.get_marker() == "*"]
+    assert mark.get_xydata().tolist() == [[3.0, 80.0]]
 
 
 def test_every_seed_has_its_line_and_those_that_failed_are_named() -> None:

@@ -171,7 +171,7 @@ def _crash_at(
         thorough("_evaluate", 2, True),
         ("_save", 2, False),  # everything written but the checkpoint
         thorough("_save", 4, True),  # trained, not yet evaluated
-        thorough("_run_episodes", 5, True),  # in the middle of the last evaluation
+        thorough("_run_episodes", 6, True),  # in the middle of the last evaluation
     ],
 )
 def test_a_crashed_run_resumes_to_the_same_end(
@@ -184,6 +184,31 @@ def test_a_crashed_run_resumes_to_the_same_end(
             command.main([*TINY, f"out={run}"])
     assert command.main([f"resume={run}"]) == 0
     assert_same_end(run, whole)
+
+
+def test_the_first_evaluation_measures_the_policies_before_training_too(whole: Path) -> None:
+    rows = [row for row in logs(whole)["eval.jsonl"] if not row["final"]]
+    assert list(dict.fromkeys(row["step"] for row in rows)) == [0, 320, 640, 960, 1280]
+    # The episode of step 0 that is logged step by step is one of them.
+    [first] = [row for row in rows if (row["step"], row["seed"], row["episode"]) == (0, 0, 0)]
+    logged = [row for row in logs(whole)["episodes.jsonl"] if row["step"] == 0]
+    assert len(logged) == first["length"] + 1
+    assert sum(row["reward"] for row in logged[1:]) == pytest.approx(first["return"], abs=1e-3)
+
+
+@pytest.mark.thorough
+def test_a_crash_after_the_first_evaluation_does_not_repeat_its_rows(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    often = [word for word in TINY if "checkpoint_every" not in word]
+    with monkeypatch.context() as patch:
+        _crash_at(patch, Training, "_evaluate", 1, True)
+        with pytest.raises(_CrashError):
+            command.main([*often, "checkpoint_every=128", f"out={run}"])
+    assert command.main([f"resume={run}"]) == 0
+    rows = logs(run)["eval.jsonl"]
+    assert len([row for row in rows if row["step"] == 0]) == 3 * 4
 
 
 @pytest.mark.parametrize("when", ["before", thorough("after")])

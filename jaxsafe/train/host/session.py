@@ -117,6 +117,8 @@ class Training:
             self.log.sinks = self._open_sinks()
         for name in ("eval.jsonl", "episodes.jsonl"):
             keep_rows(self.run / name, self._known, {"step": COUNT})
+        if not self._has_evaluated():
+            keep_rows(self.run / "eval.jsonl", lambda row: False)
         self.diverged = {}
         self._find_diverged(self.log.rows)
         self._prepared = True
@@ -196,7 +198,9 @@ class Training:
         self._save()
         found = {}
         for kind in KINDS:
-            found[kind] = self._run_episodes(kind, self.config.episodes, final=True)
+            found[kind] = self._run_episodes(
+                kind, self.config.episodes, self.state.average, self.step, final=True
+            )
         self._record(self.config.episodes, final=True)
         return found
 
@@ -353,23 +357,35 @@ class Training:
         """Run a periodic evaluation.
 
         It writes rows, logs some episodes step by step, and keeps the best parameters of each seed
-        so far.
+        so far. The first one also measures the policies as they were before training, unless it is
+        the only one.
         """
-        episodes = self._run_episodes("deterministic", self.config.eval_episodes, final=False)
+        params = self.state.average
+        if self.updates < self.config.num_updates and not self._has_evaluated():
+            self._keep_best(self.best["params"], step=0)
+        self._keep_best(params, self.step)
         self._record(self.config.eval_episodes, final=False)
+
+    def _has_evaluated(self) -> bool:
+        """Return whether there has been a periodic evaluation."""
+        return bool((self.mapper.gather(self.best["success"]) >= 0.0).any())
+
+    def _keep_best(self, params: Any, step: int) -> None:
+        """Evaluate parameters of a step, and keep those of each seed that succeed most."""
+        count = self.config.eval_episodes
+        episodes = self._run_episodes("deterministic", count, params=params, step=step)
         rate = np.mean(np.asarray(episodes.outcome) == self.env.success, axis=1)
         success = self.mapper.place(rate.astype(np.float32))
-        self.best = _keep_best(self.best, {"params": self.state.average, "success": success})
+        self.best = _keep_best(self.best, {"params": params, "success": success})
 
-    def _run_episodes(self, kind: str, num_episodes: int, final: bool) -> Episode:
-        self.evaluator.prepare(self.state.average)
+    def _run_episodes(
+        self, kind: str, num_episodes: int, params: Any, step: int, final: bool = False
+    ) -> Episode:
+        """Run episodes of every seed, and log a row for each of them."""
+        self.evaluator.prepare(params)
         deterministic = kind == "deterministic"
-        episodes = self.evaluator.run(
-            self.state.average, num_episodes, EVALUATION_SEED, deterministic
-        )
-        rows = episode_rows(
-            self.env, episodes, self.config.seed, step=self.step, kind=kind, final=final
-        )
+        episodes = self.evaluator.run(params, num_episodes, EVALUATION_SEED, deterministic)
+        rows = episode_rows(self.env, episodes, self.config.seed, step=step, kind=kind, final=final)
         append_rows(
             self.run / "eval.jsonl", (row for row in rows if row["seed"] not in self.diverged)
         )
