@@ -263,7 +263,7 @@ def test_the_command_writes_a_figure(
         ),
         (
             ["env=docking2d", "x=[5,1]"],
-            r"x: expected the ends of the axis, for instance \[0,150\], found \[5, 1\]",
+            r"x: expected the ends of the axis, for instance 0,150, found \[5, 1\]",
         ),
         (["env=docking2d", "y=3"], "y: expected the ends of the axis"),
         (["env=docking2d", "points=1"], "points: expected a whole number ≥ 2, found 1"),
