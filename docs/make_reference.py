@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import inspect
 import itertools
 import typing
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from make_tasks import number, summary, table, wrapped
+from make_tasks import number, table, wrapped
 
 from jaxsafe.agents.agent import Agent
 from jaxsafe.agents.features import Features
@@ -147,7 +148,7 @@ def name(cls: type[Component]) -> str:
 def part(cls: type[Component]) -> Iterator[str]:
     """Yield the name of a part, what it is, and its fields."""
     yield f"### `{name(cls)}`"
-    yield summary(cls)
+    yield from inspect.cleandoc(cls.__doc__ or "").split("\n\n")
     docs = field_docs(cls)
     rows = [
         (f"`{key}`", _takes(field), _default(field), _line(docs.get(key, "")))

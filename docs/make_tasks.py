@@ -263,7 +263,7 @@ def equations(task: str, env: jaxsafe.Environment) -> Iterator[str]:
 
 def wrapped(block: str) -> str:
     """Return a paragraph in lines of the house's width. Other blocks stay as they are."""
-    if block.startswith(("#", "|", "<", "!", "$", "```")):
+    if block.startswith(("#", "|", "<", "!", "$", "```", "- ")):
         return block
     return textwrap.fill(block, 124, break_on_hyphens=False, break_long_words=False)
 
@@ -390,10 +390,9 @@ def parts(env: jaxsafe.Environment, section: str, length: str) -> Iterator[tuple
                 )
 
 
-def summary(component: Component | type[Component]) -> str:
-    """Return the docstring of a component, or of its class, in one line."""
-    cls = component if isinstance(component, type) else type(component)
-    return " ".join(inspect.cleandoc(cls.__doc__ or "").split())
+def summary(component: Component) -> str:
+    """Return the docstring of a component in one line."""
+    return " ".join(inspect.cleandoc(type(component).__doc__ or "").split())
 
 
 def settings(

@@ -3,7 +3,7 @@
 They follow the order of Figs. 8, 9 and 11 of the paper.
 
 Nothing here knows a task. An `Environment` is the pytree of its own parameters, so
-`jax.jit(jaxsafe.step)` traces every number of it. Changing a number compiles nothing anew, and
+`jax.jit(jaxsafe.step)` traces every number of it. Changing a number compiles nothing again, and
 `vmap` over environments sweeps numbers.
 """
 

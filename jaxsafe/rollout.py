@@ -28,7 +28,7 @@ RECORDS = ("timesteps", "transitions", "states")
 class RecurrentPolicy:
     """A policy that remembers.
 
-    It can stand wherever a policy is run step by step. Its memory starts anew with each episode.
+    It can stand wherever a policy is run step by step. Its memory starts afresh with each episode.
     """
 
     act: Callable[[Key, Array, Any], tuple[Array, Any]]

@@ -191,7 +191,7 @@ class Report:
                     f"{paper / steps:.1f}" if steps else "–",
                     f"{finished(record.curves, steps):,.0f}" if steps else "–",
                     f"{strict:,}" if strict else "never",
-                    f"{sum(reached is not None for reached in per_seed)} of {len(per_seed)}",
+                    f"{sum(reached is not None for reached in per_seed)}/{len(per_seed)}",
                     f"{results['steps']:,}",
                     f"{results['wall_s']:.0f}",
                     f"{results['compile_s']:.0f}",

@@ -221,7 +221,7 @@ class Agent(Component):
     ) -> Float[Array, "*batch"]:
         """Return the cost critic's (1 − γ)·V_C(s) `[*batch]`, given what `critic_inputs` returns.
 
-        It is what a step costs on the average from here on, whatever the horizon.
+        It is what a step costs on average from here on, whatever the horizon.
         """
         return self.critic_output("cost_critic", params, critic_inputs)
 

@@ -43,7 +43,7 @@ class Options(PolicyOptions):
     With best, each seed has the one with the most success in the evaluations during training.
     """
     deterministic: bool | None = None
-    """Whether the policies act by their most probable action. By default both ways are measured."""
+    """Whether the policies act by their most probable action. By default both are measured."""
     render: Literal["gif", "mp4"] | None = None
     """Make a film of an episode. An mp4 needs ffmpeg on the PATH."""
     film: Literal["first", "failing", "violating", "worst"] = "first"

@@ -65,7 +65,7 @@ def lasting_streams() -> Iterator[LastingStream]:
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(number)
-    # A progress bar is drawn anew with a carriage return.
+    # A progress bar is drawn again with a carriage return.
     sys.stdout, sys.stderr = _lasting(before[0]), _lasting(before[1], allowed="\r")
     try:
         yield sys.stdout

@@ -76,7 +76,7 @@ def make(
             each actuator. None leaves what the task has. The tasks by name are continuous.
         variant: `paper`, or `released` for the semantics of the published SafeRL code. None stands
             for `paper`.
-        randomize: intervals, by dotted path, of numbers that are drawn anew for each episode, for
+        randomize: intervals, by dotted path, of numbers that are drawn again for each episode, for
             instance `{"deputy.mass": [10, 14]}`.
         rta: run time assurance. It is the name of a preset of the task, `default` for the
             recommended preset, a filter, or a YAML file with a filter that

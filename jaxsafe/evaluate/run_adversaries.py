@@ -132,7 +132,7 @@ def longest_episode(env: Environment) -> int:
 
 @functools.partial(jax.jit, static_argnums=(1, 2, 3))
 def _follow(env: Environment, name: str, num_steps: int, num_envs: int, key: Key) -> Counts:
-    """Run an adversary from the task's own starts. An episode begins anew where one ends."""
+    """Run an adversary from the task's own starts. A new episode begins where one ends."""
     adversary = ADVERSARIES[name]
 
     def act(state: State, key: Key) -> Float[Array, " m"]:

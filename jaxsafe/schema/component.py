@@ -1,8 +1,8 @@
 """Component: a frozen keyword-only dataclass that is a pytree.
 
 Numbers are leaves, names and counts are structure. The annotation of a field decides: `str`, `int`,
-`bool`, `Literal` and tuples of them are structure, and changing one compiles anew. Everything else
-is a leaf or a subtree, and changing a number never compiles anew. The annotation also carries the
+`bool`, `Literal` and tuples of them are structure, and changing one compiles again. Everything else
+is a leaf or a subtree, and changing a number never compiles again. The annotation also carries the
 unit, the allowed range and what a name refers to, so configuration files are checked from the same
 line.
 """

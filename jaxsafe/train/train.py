@@ -166,6 +166,6 @@ def chunk(
     return jax.lax.scan(one, state, None, length=length)
 
 
-# Made once: every call of `isolated` is a new function, which JAX would compile anew.
+# Made once: every call of `isolated` is a new function, which JAX would compile again.
 _begin = jax.jit(isolated(begin))
 _chunk = jax.jit(isolated(chunk), static_argnums=(2, 3))

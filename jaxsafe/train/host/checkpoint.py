@@ -83,7 +83,7 @@ class Checkpoints:
         return sorted(self._manager.all_steps()) if hasattr(self, "_manager") else []
 
     def save(self, step: int, state: Any, facts: dict[str, Any]) -> None:
-        """Write one checkpoint, or write it anew.
+        """Write one checkpoint, or write it again.
 
         A digest of the state and the facts is written with them, and `restore` compares it.
 
