@@ -33,7 +33,7 @@ def setup(app: Any) -> None:
     """Adapt what the extensions read."""
     app.connect("source-read", _link_to_file)
     # Before napoleon reads the docstring.
-    app.connect("autodoc-process-docstring", _docstring_of_function, priority=100)
+    app.connect("autodoc-process-docstring", _adapt_docstring, priority=100)
 
 
 def _link_to_file(_app: Any, _page: str, content: list[str]) -> None:
@@ -41,9 +41,14 @@ def _link_to_file(_app: Any, _page: str, content: list[str]) -> None:
     content[0] = content[0].replace("](../tests/golden/R", "](path:../tests/golden/R")
 
 
-def _docstring_of_function(
+def _adapt_docstring(
     _app: Any, what: str, _name: str, item: Any, _options: Any, lines: list[str]
 ) -> None:
-    """Give a package that can be called the docstring of its function."""
+    """Give a package that can be called the docstring of its function.
+
+    An attribute keeps its first line, of which napoleon would take what is before a colon as type.
+    """
     if what == "function" and inspect.ismodule(item):
         lines[:] = (inspect.getdoc(item.__wrapped__) or "").splitlines()
+    if what in ("attribute", "property"):
+        lines.insert(0, "")
