@@ -17,7 +17,14 @@ import numpy as np
 from jaxsafe.environment import Environment, reset, reset_to, step
 from jaxsafe.evaluate.episodes import max_steps
 from jaxsafe.evaluate.evaluator import MAX_RECORDED_STEPS, RECORDED_STEPS_PER_CALL
-from jaxsafe.rollout import Policy, RecurrentPolicy, RolloutState, act, first_memory
+from jaxsafe.rollout import (
+    Policy,
+    RecurrentPolicy,
+    RolloutState,
+    act,
+    first_memory,
+    require_hashable,
+)
 from jaxsafe.schema.describe import Described, Rows, brief
 from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.storage.columns import flat
@@ -111,7 +118,10 @@ class Flight(Described):
         return self.env.outcomes[int(self.timesteps.info.outcome[-1])]
 
     def plot(self) -> Figure:
-        """Return a figure of the path, and of distance, controls and margins over time."""
+        """Return a figure of the path, and of distance, controls and margins over time.
+
+        It is a matplotlib `Figure`, which a notebook shows.
+        """
         from jaxsafe.plot.flight import flight_figure
 
         return flight_figure(self.env, (self.states, self.timesteps), self._title())
@@ -230,6 +240,7 @@ def fly(
     Raises:
         ConfigError: the start or the policy does not fit the environment.
     """
+    require_hashable(policy)
     key_start, key_act = jax.random.split(jax.random.key(0) if key is None else key)
     state, timestep = _reset(env, key_start) if start is None else _started(env, start)
     # A weakly typed number would compile the program again.

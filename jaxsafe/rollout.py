@@ -250,6 +250,22 @@ def require_batch(env: Environment, action: Array, num_envs: int) -> None:
         )
 
 
+def require_hashable(policy: Policy | RecurrentPolicy) -> None:
+    """Refuse a policy for which no program can be compiled once and kept.
+
+    Raises:
+        ConfigError: it has no hash, as modules of arrays such as those of Equinox have none.
+    """
+    try:
+        hash(policy)
+    except TypeError:
+        kind = type(policy).__name__
+        raise ConfigError(
+            f"policy: expected a function, found {kind}, which has no hash; "
+            "write lambda key, observation: … around it"
+        ) from None
+
+
 def require_count(place: str, value: Any, least: int) -> None:
     """Refuse what is not a whole number or is too small. `place` begins the message.
 

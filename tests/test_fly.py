@@ -24,6 +24,15 @@ def policy(key: jax.Array, observation: jax.Array) -> jax.Array:
     return 0.02 * jnp.sin(7.0 * observation[:2])
 
 
+class Unhashable:
+    """A policy like a module of arrays."""
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __call__(self, key: jax.Array, observation: jax.Array) -> jax.Array:
+        return observation[:2]
+
+
 @pytest.fixture(scope="module")
 def env() -> Environment:
     """Return an environment whose episodes last longer than one compiled piece."""
@@ -105,6 +114,7 @@ def test_a_flight_is_drawn(task: str, tmp_path: Path) -> None:
     figure = flight.plot()
     assert len(figure.axes) == (5 if task == "docking3d" else 4)
     assert figure.get_suptitle().startswith(f"{task}: ")
+    assert figure._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]
     film = flight.animate(tmp_path / "episode.gif")
     assert (tmp_path / "episode.gif").read_bytes() == film.data
     assert film.data.startswith(b"GIF8")
@@ -124,6 +134,7 @@ def test_a_filter_shows_in_a_flight() -> None:
     ("arguments", "message"),
     [
         ({"policy": lambda key, o: jnp.zeros((16, 2))}, r"action: expected shape \(2,\)"),
+        ({"policy": Unhashable()}, "policy: expected a function, found Unhashable, which has no"),
         ({"start": "here"}, "fly: start: expected what reset or reset_to returns"),
         ({"start": {"chief": {}}}, "reset_to: "),
     ],

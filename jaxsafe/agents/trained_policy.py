@@ -101,6 +101,7 @@ class TrainedPolicy(_Trained):
 
     Observations may have leading batch axes, and the actions then have them too. Actions are within
     the bounds of the actuators, which are −1 and 1 unless an actuator takes physical units.
+    `policy.task`, `policy.observation_names` and `policy.action_names` say what it is for.
     """
 
     def __call__(self, key: Key, observation: Float[Array, "*batch o"]) -> Array:

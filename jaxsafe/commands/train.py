@@ -16,7 +16,6 @@ from jaxsafe.commands.environment_options import Overrides
 from jaxsafe.commands.options import CommandOptions, Directory, Option
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores
-from jaxsafe.envs import TASKS
 from jaxsafe.train.host.options import TrainConfig, recipe, recipe_options, resolve_all
 
 BEGAN = time.monotonic()
@@ -94,7 +93,7 @@ def main(argv: Sequence[str]) -> int:
     import jax
 
     from jaxsafe.devices import processes
-    from jaxsafe.runs.training import is_complete, train_all
+    from jaxsafe.runs.training import is_complete, refuse_run, train_all
     from jaxsafe.schema.errors import ConfigError
     from jaxsafe.storage.files import read_json
     from jaxsafe.train.host import run_directory
@@ -105,9 +104,7 @@ def main(argv: Sequence[str]) -> int:
         processes.join()
     resume = options.resume
     if resume is None:
-        task = options.env
-        if task and task not in TASKS and (Path(task) / "config.yaml").is_file():
-            raise ConfigError(f"env: {task} is a run; resume={task} goes on with it")
+        refuse_run(options.env)
         resolved = resolve_all(options.without("resume", "distributed"))
         path = Path(processes.from_leader(lambda: str(run_directory.create_all(resolved))))
     else:

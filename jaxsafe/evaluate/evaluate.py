@@ -7,7 +7,7 @@ import jax
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.metrics import measures, summarise
-from jaxsafe.rollout import Policy, RecurrentPolicy, require_count
+from jaxsafe.rollout import Policy, RecurrentPolicy, require_count, require_hashable
 from jaxsafe.types import Key
 
 
@@ -39,6 +39,7 @@ def evaluate(
     """
     count = num_episodes if episodes is None else episodes
     require_count("evaluate: episodes", count, least=1)
+    require_hashable(policy)
     key = jax.random.key(0) if key is None else key
     sums = jax.jit(run_episodes, static_argnums=(1, 3))(env, policy, key, count)
     return summarise(jax.device_get(sums), env.success, **measures(env))

@@ -16,6 +16,7 @@ from jaxsafe.plot.style import (
     GREEN,
     GREY,
     ORANGE,
+    NotebookFigure,
     centre_patch,
     kept_out,
     labelled,
@@ -42,7 +43,7 @@ def flight_figure(env: Environment, episode: tuple[State, TimeStep], title: str)
     """
     states, timesteps = episode
     planes = [(0, 1)] if env.agent_platform.dimension == 2 else [(0, 1), (0, 2)]
-    figure = Figure(figsize=(4.4 * len(planes) + 5.4, 4.8), layout="constrained")
+    figure = NotebookFigure(figsize=(4.4 * len(planes) + 5.4, 4.8), layout="constrained")
     parts: Any = figure.subfigures(1, 2, width_ratios=[4.4 * len(planes), 5.4])
     left, right = parts
     maps = np.atleast_1d(left.subplots(1, len(planes)))
@@ -62,8 +63,6 @@ def flight_figure(env: Environment, episode: tuple[State, TimeStep], title: str)
     _draw_margins(margins, env, timesteps, times)
     margins.set(xlabel="time [s]", xlim=(0.0, times[-1] or 1.0))
     right.align_ylabels([distance, controls, margins])
-    for panel in figure.axes:
-        panel.spines[["top", "right"]].set_visible(False)
     outcome = env.outcomes[int(timesteps.info.outcome[-1])]
     figure.suptitle(
         f"{plain(title)}: {plain(outcome)} after {len(times) - 1:,} steps", fontsize="medium"

@@ -227,6 +227,13 @@ def save(figure: Figure, path: Path) -> Path:
     return path
 
 
+class NotebookFigure(Figure):
+    """A figure that a notebook shows, also where pyplot is not in use."""
+
+    def _repr_png_(self) -> bytes:
+        return to_bytes(self)
+
+
 @styled
 def to_bytes(figure: Figure, file_format: str = "png") -> bytes:
     """Return the content of a file of a figure."""

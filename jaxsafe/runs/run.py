@@ -54,7 +54,7 @@ class Run(Described):
 
     @cached_property
     def results(self) -> dict[str, Any]:
-        """The content of `results.json`: metrics of each kind of evaluation, steps, versions."""
+        """The content of `results.json`, with the metrics of each kind of evaluation."""
         from jaxsafe.train.host.results import read_results
 
         return read_results(self.path / "results.json")

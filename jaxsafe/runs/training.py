@@ -123,11 +123,23 @@ def train_run(
     return Run(path)
 
 
+def refuse_run(env: str | None) -> None:
+    """Refuse a run where a task is expected.
+
+    Raises:
+        ConfigError: it is the directory of a run.
+    """
+    if env and env not in TASKS and (Path(env) / "config.yaml").is_file():
+        raise ConfigError(f"env: {env} is a run; resume={env} goes on with it")
+
+
 def _resolved(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     if options["env"] == "all":
         raise ConfigError(f"env: expected one task, found 'all'; choose from {', '.join(TASKS)}")
     paths = {name: os.fspath(x) for name, x in options.items() if isinstance(x, os.PathLike)}
-    return resolve({**options, **paths})
+    given = {**options, **paths}
+    refuse_run(given["env"])
+    return resolve(given)
 
 
 def _extend(path: Path, options: Mapping[str, Any]) -> None:

@@ -1,6 +1,8 @@
 """Training by name from Python does what the command does, and a run is an object."""
 
+import os
 import re
+import signal
 import sys
 from pathlib import Path
 from typing import Any
@@ -13,9 +15,9 @@ from tiny_run import TINY, assert_same_end
 import jaxsafe
 from jaxsafe import ConfigError
 from jaxsafe.config.arguments import Arguments
-from jaxsafe.devices import processes
 from jaxsafe.storage.columns import table
 from jaxsafe.storage.files import read_json
+from jaxsafe.train.host.session import Training
 
 
 def options(words: list[str]) -> dict[str, Any]:
@@ -50,8 +52,14 @@ def test_a_run_is_stopped_and_resumed_and_trained_for_longer(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     path = tmp_path / "run"
+    original = Training._write_progress
+
+    def interrupt(self: Training, *arguments: Any) -> None:
+        original(self, *arguments)
+        os.kill(os.getpid(), signal.SIGINT)
+
     with monkeypatch.context() as patch:
-        patch.setattr(processes, "any_process", lambda flag: True)
+        patch.setattr(Training, "_write_progress", interrupt)
         with pytest.raises(KeyboardInterrupt):
             jaxsafe.train("docking2d", **options(TINY), out=path)
     said = capsys.readouterr().out
@@ -149,6 +157,8 @@ def test_a_run_that_is_resumed_keeps_its_options(whole: Path) -> None:
     with pytest.raises(ConfigError, match="seeds: the run has its options; beside resume stands"):
         jaxsafe.train(resume=whole, seeds=4)  # type: ignore[call-overload]
     assert jaxsafe.train(resume=whole).path == whole
+    with pytest.raises(ConfigError, match=r"env: .*whole is a run; resume=.* goes on with it"):
+        jaxsafe.train(whole)
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
