@@ -130,16 +130,21 @@ class Flight(Described):
         """Return a film of the episode, which a notebook shows.
 
         Args:
-            path: a file to write it to, such as `episode.gif`. None writes none.
+            path: a file to write it to. It ends in `.gif`, or in `.mp4` where ffmpeg is installed.
+                None writes none.
+
+        Raises:
+            ConfigError: the path has another ending, or ffmpeg is missing.
         """
         from jaxsafe.plot.animation import animate
 
-        episode = (self.states, self.timesteps)
-        if path is not None:
-            return Film(animate(self.env, episode, Path(path), self._title()).read_bytes())
+        kind = "gif" if path is None else Path(path).suffix[1:]
+        if kind not in FILMS:
+            raise ConfigError(f"animate: expected a path that ends in .gif or .mp4, found {path}")
         with tempfile.TemporaryDirectory() as place:
-            file = animate(self.env, episode, Path(place) / "episode.gif", self._title())
-            return Film(file.read_bytes())
+            file = Path(place) / f"episode.{kind}" if path is None else Path(path)
+            animate(self.env, (self.states, self.timesteps), file, self._title())
+            return Film(file.read_bytes(), kind)
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return all numbers of the episode as columns [n + 1] by dotted name.
@@ -195,11 +200,19 @@ class Flight(Described):
         yield "", "actions, control_desired, control_actual, intervening, rewards, costs [n]"
 
 
-class Film:
-    """An animated GIF, which a notebook shows."""
+FILMS = {
+    "gif": '<img src="data:image/gif;base64,{}">',
+    "mp4": '<video controls src="data:video/mp4;base64,{}"></video>',
+}
+"""How HTML shows each kind of film."""
 
-    def __init__(self, data: bytes) -> None:
+
+class Film:
+    """An animated GIF or an mp4, which a notebook shows."""
+
+    def __init__(self, data: bytes, kind: str) -> None:
         self.data = data
+        self.kind = kind
 
     def save(self, path: str | os.PathLike) -> Path:
         """Write the film to a file and return its path."""
@@ -207,10 +220,11 @@ class Film:
         return Path(path)
 
     def __repr__(self) -> str:
-        return f"Film: a GIF of {len(self.data):,} bytes; film.save('episode.gif') writes it"
+        size = f"{self.kind} of {len(self.data):,} bytes"
+        return f"Film: {size}; film.save('episode.{self.kind}') writes it"
 
     def _repr_html_(self) -> str:
-        return f'<img src="data:image/gif;base64,{base64.b64encode(self.data).decode()}">'
+        return FILMS[self.kind].format(base64.b64encode(self.data).decode())
 
 
 def fly(

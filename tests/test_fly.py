@@ -119,7 +119,10 @@ def test_a_flight_is_drawn(task: str, tmp_path: Path) -> None:
     assert (tmp_path / "episode.gif").read_bytes() == film.data
     assert film.data.startswith(b"GIF8")
     assert "data:image/gif;base64," in film._repr_html_()
+    assert film.save(tmp_path / "copy.gif").read_bytes() == film.data
     assert repr(flight).startswith(f"Flight of {task}: ")
+    with pytest.raises(ConfigError, match=r"animate: expected a path that ends in .gif or .mp4"):
+        flight.animate("episode.mov")
 
 
 def test_a_filter_shows_in_a_flight() -> None:

@@ -7,34 +7,49 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
 
 from jaxsafe.environment import Environment, control_unit, length_unit
+from jaxsafe.plot.figures import ZOOM
 from jaxsafe.plot.style import (
     BLUE,
+    FORBIDDEN,
     GREEN,
-    GREY,
     ORANGE,
+    PURPLE,
+    Ball,
     NotebookFigure,
     centre_patch,
+    fitted,
+    frame_labels,
+    keep_away_distances,
     kept_out,
     labelled,
     margin_unit,
     plain,
     region_patch,
+    region_surface,
+    styled,
 )
 from jaxsafe.types import State, TimeStep
 
-COLOURS = (BLUE, ORANGE, GREEN, GREY)
+COLOURS = (BLUE, ORANGE, GREEN, PURPLE)
 """Colours of several curves in a panel."""
 
+MAP_WIDTH = 3.8
+"""Width of a panel of the path in inches."""
 
-def flight_figure(env: Environment, episode: tuple[State, TimeStep], title: str) -> Figure:
+CURVES_WIDTH = 4.6
+"""Width of the panels over time in inches."""
+
+
+@styled
+def flight_figure(env: Environment, episode: tuple[State, TimeStep], title: str) -> NotebookFigure:
     """Return a figure of one episode.
 
     The path is relative to the first platform that is not the agent. If that platform has a
-    heading, x is along it. In space there is a second panel for the other plane.
+    heading, x is along it. A path in space is drawn in space and from above.
 
     Args:
         env: the environment of the episode.
@@ -42,36 +57,42 @@ def flight_figure(env: Environment, episode: tuple[State, TimeStep], title: str)
         title: the title, to which the outcome is added.
     """
     states, timesteps = episode
-    planes = [(0, 1)] if env.agent_platform.dimension == 2 else [(0, 1), (0, 2)]
-    figure = NotebookFigure(figsize=(4.4 * len(planes) + 5.4, 4.8), layout="constrained")
-    parts: Any = figure.subfigures(1, 2, width_ratios=[4.4 * len(planes), 5.4])
+    views = [(0, 1)] if env.agent_platform.dimension == 2 else [(0, 1, 2), (0, 1)]
+    widths = [MAP_WIDTH * len(views), CURVES_WIDTH]
+    figure = NotebookFigure(figsize=(sum(widths), 4.2), layout="constrained")
+    parts: Any = figure.subfigures(1, 2, width_ratios=widths)
     left, right = parts
-    maps = np.atleast_1d(left.subplots(1, len(planes)))
-    for panel, plane in zip(maps, planes, strict=True):
-        _draw_path(panel, plane, env, states)
-    if maps[0].get_legend_handles_labels()[0]:
-        maps[0].legend(loc="best", fontsize="x-small", frameon=False)
+    for number, view in enumerate(views, start=1):
+        spatial = len(view) == 3
+        panel = left.add_subplot(1, len(views), number, projection="3d" if spatial else None)
+        _draw_path(panel, view, env, states)
+    handles, names = left.axes[-1].get_legend_handles_labels()
+    left.legend(handles, names, loc="outside lower center", ncols=len(names))
     distance, controls, margins = right.subplots(3, 1, sharex=True)
     times = np.asarray(states.sim.time)
-    unit = length_unit(env)
     path = _relative_path(env, states, env.agent)
     distance.plot(times, np.linalg.norm(path, axis=1), color=BLUE, linewidth=1.4)
-    others = _others(env)
-    name = f"distance to\nthe {plain(others[0])}" if others else "distance to\nthe origin"
-    distance.set(ylabel=labelled(name, unit), ylim=(0.0, None))
+    name = f"distance to\nthe {plain(_origin(env) or 'origin')}"
+    distance.set(ylabel=labelled(name, length_unit(env)), ylim=(0.0, None))
     _draw_controls(controls, env, timesteps, times)
     _draw_margins(margins, env, timesteps, times)
     margins.set(xlabel="time [s]", xlim=(0.0, times[-1] or 1.0))
     right.align_ylabels([distance, controls, margins])
-    outcome = env.outcomes[int(timesteps.info.outcome[-1])]
-    figure.suptitle(
-        f"{plain(title)}: {plain(outcome)} after {len(times) - 1:,} steps", fontsize="medium"
-    )
+    outcome = plain(env.outcomes[int(timesteps.info.outcome[-1])])
+    figure.suptitle(fitted(f"{plain(title)}: {outcome} after {len(times) - 1:,} steps", figure))
     return figure
 
 
-def _others(env: Environment) -> list[str]:
-    return [platform.name for platform in env.platforms if platform.name != env.agent]
+def _origin(env: Environment) -> str | None:
+    """Return the name of the first platform that is not the agent."""
+    others = [platform.name for platform in env.platforms if platform.name != env.agent]
+    return others[0] if others else None
+
+
+def _heads(env: Environment, states: State) -> str | None:
+    """Return the platform along whose heading x is, or None."""
+    origin = _origin(env)
+    return origin if origin and "heading" in vars(states.sim.platforms[origin]) else None
 
 
 def _relative_path(env: Environment, states: State, of: str) -> np.ndarray:
@@ -79,45 +100,54 @@ def _relative_path(env: Environment, states: State, of: str) -> np.ndarray:
     sim = states.sim
     place = sim.platforms[of] if of in sim.platforms else sim.regions[of]
     path = np.array(place.position, float)
-    if not _others(env):
+    origin = _origin(env)
+    if origin is None:
         return path
-    origin = sim.platforms[_others(env)[0]]
-    path -= origin.position
-    if "heading" in vars(origin):
-        cosine = np.cos(origin.heading)
-        sine = np.sin(origin.heading)
-        x = cosine * path[:, 0] + sine * path[:, 1]
-        path[:, 1] = cosine * path[:, 1] - sine * path[:, 0]
+    path -= sim.platforms[origin].position
+    if _heads(env, states):
+        heading = sim.platforms[origin].heading
+        x = np.cos(heading) * path[:, 0] + np.sin(heading) * path[:, 1]
+        path[:, 1] = np.cos(heading) * path[:, 1] - np.sin(heading) * path[:, 0]
         path[:, 0] = x
     return path
 
 
-def _draw_path(panel: Axes, plane: tuple[int, int], env: Environment, states: State) -> None:
-    i, j = plane
-    unit = length_unit(env)
-    others = _others(env)
+def _draw_path(panel: Any, view: tuple[int, ...], env: Environment, states: State) -> None:
+    """Draw the path in space, or in the plane of two axes."""
+    axes = list(view)
+    spatial = len(view) == 3
     forbidden = kept_out(env)
     for region in env.regions:
-        patch = panel.add_patch(region_patch(region, j == 2, region.name in forbidden))
-        centre_patch(patch, _relative_path(env, states, region.name)[-1, [i, j]])
+        place = np.nan_to_num(_relative_path(env, states, region.name)[-1])
+        if spatial:
+            region_surface(panel, region, place, region.name in forbidden)
+            continue
+        patch = panel.add_patch(region_patch(region, False, region.name in forbidden))
+        centre_patch(patch, place[axes])
         patch.set_label(plain(region.name))
-    if others:
-        panel.plot(0.0, 0.0, "*", color=ORANGE, markersize=8, label=plain(others[0]), zorder=1)
+    for radius in keep_away_distances(env):
+        if spatial:
+            region_surface(panel, Ball(radius), np.zeros(3), forbidden=True)
+        else:
+            panel.add_patch(Circle((0.0, 0.0), radius, label="too near", **FORBIDDEN))
+    heads = _heads(env, states)
+    if origin := _origin(env):
+        look = {"color": "black", "markersize": 7, "label": plain(origin), "zorder": 1}
+        panel.plot(*np.zeros((len(view), 1)), ">" if heads else "*", **look)
     path = _relative_path(env, states, env.agent)
-    panel.plot(path[:, i], path[:, j], color=BLUE, linewidth=1.4, label=plain(env.agent))
-    panel.plot(path[0, i], path[0, j], "o", color=BLUE, markersize=4)
-    turned = bool(others) and "heading" in vars(states.sim.platforms[others[0]])
-    along = f" along the heading of the {others[0]}" if turned else ""
+    panel.plot(*path[:, axes].T, color=BLUE, linewidth=1.4, label=plain(env.agent))
+    panel.plot(*path[:1, axes].T, "o", color=BLUE, markersize=4)
     half = 1.1 * np.nanmax(np.abs(path)) or 1.0
-    panel.set(
-        xlabel=labelled(plain(f"x{along}"), unit),
-        ylabel=labelled("xyz"[j], unit),
-        xlim=(-half, half),
-        ylim=(-half, half),
-        aspect="equal",
-    )
-    panel.xaxis.set_major_locator(MaxNLocator(4))
-    panel.yaxis.set_major_locator(MaxNLocator(4))
+    labels = frame_labels(heads, length_unit(env))
+    for place, letter in zip(view, "xyz", strict=False):
+        axis = getattr(panel, f"{letter}axis")
+        axis.set_label_text(labels[place])
+        axis.set_major_locator(MaxNLocator(3 if spatial else 4))
+        getattr(panel, f"set_{letter}lim")(-half, half)
+    if spatial:
+        panel.set_box_aspect((1.0, 1.0, 1.0), zoom=ZOOM)
+    else:
+        panel.set_aspect("equal")
 
 
 def _draw_controls(panel: Axes, env: Environment, timesteps: TimeStep, times: np.ndarray) -> None:
@@ -139,7 +169,7 @@ def _draw_controls(panel: Axes, env: Environment, timesteps: TimeStep, times: np
             desired = info.control_desired[1:, index] / scales[index]
             panel.stairs(desired, times, baseline=None, color=colour, linewidth=0.5, alpha=0.6)
     panel.set_ylabel(labelled("controls", shared) if shared else "controls,\nshare of bound")
-    panel.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="x-small", frameon=False)
+    panel.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
 
 
 def _draw_margins(panel: Axes, env: Environment, timesteps: TimeStep, times: np.ndarray) -> None:
@@ -153,4 +183,4 @@ def _draw_margins(panel: Axes, env: Environment, timesteps: TimeStep, times: np.
     units = {margin_unit(constraint, unit) for constraint in env.constraints}
     panel.set_ylabel(labelled("margin h", units.pop() if len(units) == 1 else None))
     if env.constraints:
-        panel.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize="x-small", frameon=False)
+        panel.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
