@@ -32,8 +32,9 @@ smartquotes = False  # code in docstrings stays as it is written
 def setup(app: Any) -> None:
     """Adapt what the extensions read."""
     app.connect("source-read", _link_to_file)
-    # Before napoleon reads the docstring.
-    app.connect("autodoc-process-docstring", _adapt_docstring, priority=100)
+    # Before and after napoleon, which reads docstrings with priority 500.
+    app.connect("autodoc-process-docstring", _before_napoleon, priority=100)
+    app.connect("autodoc-process-docstring", _after_napoleon, priority=900)
 
 
 def _link_to_file(_app: Any, _page: str, content: list[str]) -> None:
@@ -41,14 +42,22 @@ def _link_to_file(_app: Any, _page: str, content: list[str]) -> None:
     content[0] = content[0].replace("](../tests/golden/R", "](path:../tests/golden/R")
 
 
-def _adapt_docstring(
-    _app: Any, what: str, _name: str, item: Any, _options: Any, lines: list[str]
-) -> None:
-    """Give a package that can be called the docstring of its function.
+_attributes: dict[str, list[str]] = {}
+"""Docstrings of attributes, from before napoleon to after it."""
 
-    An attribute keeps its first line, of which napoleon would take what is before a colon as type.
-    """
+
+def _before_napoleon(
+    _app: Any, what: str, name: str, item: Any, _options: Any, lines: list[str]
+) -> None:
+    """Give a package that can be called the docstring of its function."""
     if what == "function" and inspect.ismodule(item):
         lines[:] = (inspect.getdoc(item.__wrapped__) or "").splitlines()
-    if what in ("attribute", "property"):
-        lines.insert(0, "")
+    if what in ("attribute", "data", "property"):
+        _attributes[name] = lines.copy()
+
+
+def _after_napoleon(
+    _app: Any, _what: str, name: str, _item: Any, _options: Any, lines: list[str]
+) -> None:
+    """Keep the docstring of an attribute, of which napoleon takes a part for its type."""
+    lines[:] = _attributes.pop(name, lines)
