@@ -205,8 +205,9 @@ def train_all(
             training = upcoming or _open(run, files, began)
             config = training.config
             if told:
+                seeds = f"{config.seeds} {'seed' if config.seeds == 1 else 'seeds'}"
                 print(
-                    f"{training.name}: {config.seeds} seeds × {training.num_steps:,} steps, "
+                    f"{training.name}: {seeds} × {training.num_steps:,} steps, "
                     f"preset {config.preset}, in {run}"
                 )
             training.prepare()

@@ -175,7 +175,9 @@ def _paths(component: Component, shorthand: str | None = None) -> Iterator[str]:
 
 
 def _abbreviates(short: str, name: str) -> bool:
-    """Return whether a text stands for a name, as `lr` and `learn_rate` do for `learning_rate`."""
+    """Return whether a text stands for a name, as `lr` and `learn` do for `learning_rate`."""
+    if len(short) > 2 and name.startswith(short):
+        return True
     pieces = short.split("_") if "_" in short else [*short]
     words = name.split("_")
     return len(pieces) == len(words) > 1 and all(map(str.startswith, words, pieces))

@@ -161,6 +161,7 @@ def test_bad_options_of_train_are_told_in_one_line(
         ("ppo.lr=1e-3", "ppo.lr: unknown field 'lr'; .* Did you mean 'learning_rate'"),
         ("ent_coef=0", "Did you mean 'ppo.entropy_coefficient'"),
         ("epochs=3", "Did you mean 'ppo.num_epochs'"),
+        ("env.obs=position", "Did you mean 'observation'"),
         ("env.mass=14", "env.mass: unknown field 'mass'; .* Did you mean 'env.deputy.mass'"),
         ("env.deputy.mas=14", "env.deputy.mas: unknown field 'mas'; .* Did you mean 'mass'"),
     ],
