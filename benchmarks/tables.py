@@ -388,6 +388,26 @@ def filter_cost(results: Results) -> str:
     )
 
 
+def attacks(_: Results) -> str:
+    """Return the table of what all adversaries together achieved against each task's filter."""
+    rows = []
+    for task in DOCKING_FIRST:
+        results = json.loads((RESULTS / "falsify" / f"{task}.json").read_text(encoding="utf-8"))
+        policies = results["policies"]
+        violating = [row["violating_steps"] + row["violating_steps_inside"] for row in policies]
+        rows.append(
+            [
+                task,
+                str(len(policies)),
+                f"{sum(row['steps'] for row in policies):,}",
+                f"{sum(violating):,}",
+                f"{min(row['worst_margin_inside'] for row in policies):.2g}",
+            ]
+        )
+    heads = "task | adversaries | steps | violating, at samples or inside steps | least h"
+    return markdown(heads.split(" | "), rows)
+
+
 def adversaries(_: Results) -> str:
     """Return the table of what each adversary achieved against each task's filter."""
     rows = []
@@ -790,6 +810,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("rta", filter_changes, "docs/safety/cost.md"),
     ("rta", programs, "docs/safety/cost.md"),
     ("rta", filter_cost, "docs/safety/cost.md"),
+    ("", attacks, "docs/safety/attacks.md"),
     ("", adversaries, "docs/safety/attacks.md"),
     ("", filtered_training, "docs/safety/cost.md"),
     ("", readme_tasks, "README.md"),
