@@ -7,6 +7,7 @@ or 3.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import typing
 from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, Self, dataclass_transform
@@ -128,9 +129,21 @@ def _in_one_line(value: Any) -> str:
 
 
 def _named(values: Mapping[str, tuple[Any, str]]) -> str:
-    """Return values with their names and units, without those that have no text."""
-    texts = [(name, _in_one_line(value), unit) for name, (value, unit) in values.items()]
-    return ", ".join(unbroken(f"{name} {text} {unit}") for name, text, unit in texts if text)
+    """Return values with their names and units, without those that have no text.
+
+    Neighbours that are shown by the same type and shape share it.
+    """
+    texts = {
+        name: f"{_in_one_line(value)} {unit}".strip() for name, (value, unit) in values.items()
+    }
+    parts = []
+    for text, group in itertools.groupby(filter(texts.get, texts), key=texts.get):
+        names = list(group)
+        if str(text).endswith("]"):
+            parts.append(f"{', '.join(names)} {text}")
+        else:
+            parts += [unbroken(f"{name} {text}") for name in names]
+    return ", ".join(parts)
 
 
 def is_key(x: Any) -> bool:

@@ -64,13 +64,14 @@ def test_what_is_traced_or_has_no_numbers_prints() -> None:
 
     jax.eval_shape(look, env, jax.random.key(0))
     shapes = jax.eval_shape(jaxsafe.reset, env, jax.random.key(0))
-    batch = reset_batch(env, jax.random.key(0), 7)
+    batch = reset_batch(env, jax.random.key(0), 9)
     nothing = [jax.tree.map(lambda _, x=x: x, (env, *shapes)) for x in (None, object(), "text")]
     for tree in (*shapes, *batch, *(part for parts in nothing for part in parts)):
         texts.append(repr(tree))
         assert tree._repr_html_().startswith("<b>")
     assert "thrust_x from float32[] to float32[] N" in texts[0]
-    assert "float32[7,2]" in "".join(texts)
+    assert "float32[9,2]" in "".join(texts)
+    assert "speed, velocity_limit float32[9]" in "".join(texts)
 
 
 def test_a_state_and_a_time_step_print_their_numbers() -> None:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, overload
 
 import jax
+import numpy as np
 
 from jaxsafe.agents.agent import Agent
 from jaxsafe.agents.networks import Params
@@ -72,6 +73,11 @@ def train(*arguments: Any, **options: Any) -> Any:
     env = arguments[0] if arguments else options.get("env")
     if "resume" in options or isinstance(env, str | os.PathLike):
         return train_run(*arguments, **options)
+    if isinstance(env, Environment) and len(arguments) < 2 and "agent" not in options:
+        raise ConfigError(
+            "train: an environment needs agent, hyperparameters, key and num_updates; a run needs "
+            f"the name of a task or a file, for instance jaxsafe.train({env.task or 'docking2d'!r})"
+        )
     return function.train(*arguments, **options)
 
 
@@ -136,10 +142,16 @@ def refuse_run(env: str | None) -> None:
 def _resolved(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     if options["env"] == "all":
         raise ConfigError(f"env: expected one task, found 'all'; choose from {', '.join(TASKS)}")
-    paths = {name: os.fspath(x) for name, x in options.items() if isinstance(x, os.PathLike)}
-    given = {**options, **paths}
+    given = {name: _plain(value) for name, value in options.items()}
     refuse_run(given["env"])
     return resolve(given)
+
+
+def _plain(value: Any) -> Any:
+    """Return a path as text and a number of NumPy as one of Python."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _extend(path: Path, options: Mapping[str, Any]) -> None:

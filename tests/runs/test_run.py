@@ -40,7 +40,8 @@ def run(whole: Path) -> Any:
 def test_a_call_trains_bit_for_bit_what_the_command_trains(
     whole: Path, tmp_path: Path, capfd: pytest.CaptureFixture
 ) -> None:
-    trained = jaxsafe.train("docking2d", **options(TINY), out=tmp_path / "run", progress=False)
+    given = {**options(TINY), "seeds": np.int64(3), "out": tmp_path / "run"}
+    trained = jaxsafe.train("docking2d", **given, progress=False)
     assert capfd.readouterr().out == ""
     assert trained.path == tmp_path / "run"
     assert_same_end(trained.path, whole)
@@ -140,6 +141,10 @@ def test_a_run_prints_what_it_is_and_what_came_of_it(run: Any, whole: Path) -> N
         ({"env": "all"}, "env: expected one task, found 'all'"),
         ({"env": "docking2d", "sedes": 2}, "sedes: unknown field 'sedes'"),
         ({"env": "docking2d", "ppo.gama": 0.9}, "ppo.gama: unknown field 'gama'"),
+        (
+            {"env": jaxsafe.make("docking2d"), "seeds": 2},
+            "train: an environment needs agent, hyper",
+        ),
         ({"resume": "nowhere"}, "resume: no run in 'nowhere'"),
     ],
 )
