@@ -104,8 +104,10 @@ def main(argv: Sequence[str]) -> int:
             if not (foreign and name == "env")
         },
     }
-    path, results = evaluate(subject, env, kinds, request=request, out=options.out, film=film)
-    print(table(results, path))
+    path, results, films = evaluate(
+        subject, env, kinds, request=request, out=options.out, film=film
+    )
+    print("\n".join([table(results, path), *films]))
     return cli.DIVERGED if "diverged" in results else 0
 
 

@@ -56,7 +56,7 @@ def evaluate(
     request: dict[str, Any],
     out: str | None,
     film: Film | None = None,
-) -> tuple[Path, dict[str, Any]]:
+) -> tuple[Path, dict[str, Any], list[str]]:
     """Evaluate every policy and write `results.json` and `eval.jsonl`.
 
     Args:
@@ -69,7 +69,7 @@ def evaluate(
         film: the film to make of each kind of evaluation, or None.
 
     Returns:
-        The path of `results.json` and its content.
+        The path of `results.json`, its content, and lines that tell of the films.
 
     Raises:
         ConfigError: `out` holds something, or no outcome of the environment is a success.
@@ -106,10 +106,11 @@ def evaluate(
     }
     results |= given_up(env, sums) | diverged_seeds({first + place: None for place in left_out})
     write_json(path / "results.json", results)
+    told = []
     if film is not None:
         for kind, one in sums.items():
-            _render(subject, evaluator, one, seed, kind, film, path)
-    return path / "results.json", results
+            told += _render(subject, evaluator, one, seed, kind, film, path)
+    return path / "results.json", results, told
 
 
 def _not_finite(subject: Subject) -> list[int]:
@@ -133,8 +134,8 @@ def _render(
     kind: str,
     film: Film,
     path: Path,
-) -> None:
-    """Make a film of an episode of one policy, and print its path.
+) -> list[str]:
+    """Make a film of an episode of one policy, and return lines that tell its path.
 
     Args:
         subject: the policies.
@@ -153,10 +154,11 @@ def _render(
     own = jax.tree.map(lambda x: np.asarray(x)[index], sums)
     number = film.choose(own, env.success)
     whose = f"seed {first + index}, {kind}"
+    told = []
     if number is None:
-        print(f"film: no {film.which} episode of {whose}; this is the first one")
+        told.append(f"film: no {film.which} episode of {whose}; the first one is shown")
     params = jax.tree.map(lambda x: x[index], subject.mapper.gather(subject.params))
     episode = evaluator.episode(params, number or 0, seed, kind == "deterministic")
     title = f"{subject.name}, {whose}, episode {number or 0}"
     file = animate(env, episode, path / f"episode_{kind}.{film.form}", title)
-    print(f"film of {whose}, episode {number or 0}: {file}")
+    return [*told, f"film of {whose}, episode {number or 0}: {file}"]

@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Patch
-from matplotlib.ticker import MaxNLocator, NullFormatter
+from matplotlib.ticker import NullFormatter
 from PIL import Image
 
 from jaxsafe.environment import Environment
@@ -39,9 +39,11 @@ from jaxsafe.plot.style import (
     labelled,
     length_unit,
     margin_unit,
+    nice,
     plain,
     region_patch,
     region_surface,
+    set_frame,
     styled,
 )
 from jaxsafe.schema.errors import ConfigError
@@ -57,22 +59,16 @@ FRAME_MS = 75
 LAST_FRAME_MS = 1500
 """Duration of the last frame, before the animation repeats."""
 
-MAX_TICK_INTERVALS = 4
-"""Largest number of intervals between the numbers at an axis of the map."""
-
 SIZE = (8.6, 4.6)
 """Width and height of a picture in inches."""
 
 DOTS_PER_INCH = 100
 
-PLACES = {"map": (0.1, 0.2, 0.39, 0.69), "space": (0.01, 0.15, 0.52, 0.78)}
+PLACES = {"map": (0.1, 0.2, 0.39, 0.69), "space": (0.0, 0.13, 0.54, 0.81)}
 """Places of the map and of the view in space: left, bottom, width and height."""
 
 CURVE_PLACES = ((0.64, 0.58, 0.34, 0.31), (0.64, 0.2, 0.34, 0.31))
 """Places of the two curves."""
-
-NICE = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)
-"""Sizes of the map, up to a power of ten."""
 
 MAX_ROOM = 2.5
 """How many times larger than needed the map may be before it closes in."""
@@ -337,14 +333,6 @@ class Scene:
         self.clear()
 
     def _set_up_map(self) -> None:
-        labels = frame_labels(self._origin if self._turned else None, length_unit(self.env))
-        for letter, label in zip("xyz" if self._spatial else "xy", labels, strict=False):
-            axis = getattr(self.map, f"{letter}axis")
-            axis.set_label_text(label)
-            # Numbers at the ends of axes in space would meet at the corners.
-            prune = "both" if self._spatial else None
-            axis.set_major_locator(MaxNLocator(MAX_TICK_INTERVALS, prune=prune))
-        self.map.set_aspect("equal")
         self._regions = {}
         self._trails = {}
         self._shadow = None
@@ -420,7 +408,7 @@ class Scene:
         needed = self._needed_reach(now)
         reach = self._reach
         if not needed <= reach <= MAX_ROOM * needed:
-            reach = _nice(needed)
+            reach = nice(needed)
         end = self.moments[-1].time
         if end > self._end or first:
             room = FIRST_STEPS * float(self.env.dt)
@@ -445,10 +433,9 @@ class Scene:
 
     def _draw_background(self, now: Moment) -> None:
         """Set the axes and everything that depends on them only."""
-        ends = (-self._reach, self._reach)
-        self.map.set(xlim=ends, ylim=ends)
+        labels = frame_labels(self._origin if self._turned else None, length_unit(self.env))
+        set_frame(self.map, range(3 if self._spatial else 2), labels, self._reach)
         if self._spatial:
-            self.map.set_zlim(ends)
             for surface in self._surfaces:
                 surface.remove()
             forbidden = kept_out(self.env)
@@ -516,12 +503,6 @@ def _arrow(tail: np.ndarray, vector: np.ndarray) -> np.ndarray:
         across *= np.linalg.norm(vector) / max(float(np.linalg.norm(across)), 1e-12)
     barbs = [tip - 0.3 * vector + side * 0.18 * across for side in (1.0, -1.0)]
     return np.stack([tail, tip, barbs[0], tip, barbs[1]])
-
-
-def _nice(reach: float) -> float:
-    """Return the smallest nice size that is at least `reach`."""
-    power = 10.0 ** np.floor(np.log10(reach))
-    return next(float(size * power) for size in NICE if size * power >= reach * (1 - 1e-9))
 
 
 def _direction(platform: Any) -> np.ndarray:

@@ -15,7 +15,6 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, PowerNorm
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
-from matplotlib.ticker import MaxNLocator
 
 from jaxsafe.plot.curves import MILLIONS_FROM
 from jaxsafe.plot.style import (
@@ -27,6 +26,7 @@ from jaxsafe.plot.style import (
     plain,
     region_patch,
     region_surface,
+    set_frame,
     styled,
 )
 
@@ -38,9 +38,6 @@ CLOSE_UP = 3.0
 
 PANEL_WIDTH = 3.2
 """Width of a panel of trajectories in inches, if the width of the figure is left open."""
-
-ZOOM = 0.85
-"""Size of a view in space. Larger ones have no room for their labels."""
 
 COLOUR_BAR_WIDTH = 0.9
 """Width of the colour bar with its label in inches."""
@@ -144,15 +141,7 @@ def trajectories(
                 shown = _within(path, half) if spatial else path
                 panel.plot(*shown[:, axes].T, color=colour(step), linewidth=1.2)
                 panel.plot(*shown[:1, axes].T, "o", color=colour(step), markersize=3)
-            for place, letter in zip(view, "xyz", strict=False):
-                axis = getattr(panel, f"{letter}axis")
-                axis.set_label_text(labels[place])
-                axis.set_major_locator(MaxNLocator(4 if not spatial else 3))
-                getattr(panel, f"set_{letter}lim")(-half, half)
-            if spatial:
-                panel.set_box_aspect((1.0, 1.0, 1.0), zoom=ZOOM)
-            else:
-                panel.set_aspect("equal")
+            set_frame(panel, view, labels, half)
             if row == 0:
                 panel.set_title(name)
     handles, names = panels[-1].get_legend_handles_labels()

@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
-from matplotlib.ticker import MaxNLocator
 
 from jaxsafe.environment import Environment, control_unit, length_unit
-from jaxsafe.plot.figures import ZOOM
 from jaxsafe.plot.style import (
     BLUE,
     FORBIDDEN,
@@ -30,6 +28,7 @@ from jaxsafe.plot.style import (
     plain,
     region_patch,
     region_surface,
+    set_frame,
     styled,
 )
 from jaxsafe.types import State, TimeStep
@@ -138,16 +137,7 @@ def _draw_path(panel: Any, view: tuple[int, ...], env: Environment, states: Stat
     panel.plot(*path[:, axes].T, color=BLUE, linewidth=1.4, label=plain(env.agent))
     panel.plot(*path[:1, axes].T, "o", color=BLUE, markersize=4)
     half = 1.1 * np.nanmax(np.abs(path)) or 1.0
-    labels = frame_labels(heads, length_unit(env))
-    for place, letter in zip(view, "xyz", strict=False):
-        axis = getattr(panel, f"{letter}axis")
-        axis.set_label_text(labels[place])
-        axis.set_major_locator(MaxNLocator(3 if spatial else 4))
-        getattr(panel, f"set_{letter}lim")(-half, half)
-    if spatial:
-        panel.set_box_aspect((1.0, 1.0, 1.0), zoom=ZOOM)
-    else:
-        panel.set_aspect("equal")
+    set_frame(panel, view, frame_labels(heads, length_unit(env)), half)
 
 
 def _draw_controls(panel: Axes, env: Environment, timesteps: TimeStep, times: np.ndarray) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
+from matplotlib.ticker import FixedLocator, MaxNLocator
 
 from jaxsafe.environment import SUCCESS
 from jaxsafe.environment import control_unit as control_unit
@@ -66,6 +67,15 @@ FORBIDDEN: dict[str, Any] = {
     "hatch": "////",
 }
 """Look of a region to stay out of. The hatch tells it from a goal without its colour."""
+
+NICE = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)
+"""Round numbers, up to a power of ten."""
+
+ZOOM = 0.82
+"""Size of a view in space. Larger ones have no room for their labels."""
+
+SPACE_LABEL_PAD = 10.0
+"""Distance of a label from its axis in space, in points. Numbers of five digits fit between."""
 
 CHARACTERS_PER_INCH = 13
 """Number of characters of a title that fit into an inch."""
@@ -198,6 +208,40 @@ def frame_labels(heads: str | None, unit: str | None) -> list[str]:
         return [labelled(name, unit) for name in "xyz"]
     sides = ("ahead of", "left of", "above")
     return [labelled(plain(f"{side} the {heads}"), unit) for side in sides]
+
+
+def set_frame(panel: Any, view: Sequence[int], labels: Sequence[str], half: float) -> None:
+    """Set labels, limits, numbers and proportions of axes that show positions.
+
+    Args:
+        panel: axes in the plane or in space.
+        view: the coordinates that are shown.
+        labels: the labels of `frame_labels`.
+        half: half the width of what is shown, whose middle is the origin.
+    """
+    spatial = len(view) == 3
+    for coordinate, letter in zip(view, "xyz", strict=False):
+        axis = getattr(panel, f"{letter}axis")
+        axis.set_label_text(labels[coordinate])
+        getattr(panel, f"set_{letter}lim")(-half, half)
+        axis.set_major_locator(MaxNLocator(4))
+        if spatial:
+            # Numbers near the ends of axes in space would meet at the corners.
+            last = nice(0.8 * half, up=False)
+            axis.set_major_locator(FixedLocator([-last, 0.0, last]))
+            axis.labelpad = SPACE_LABEL_PAD
+    if spatial:
+        panel.set_box_aspect((1.0, 1.0, 1.0), zoom=ZOOM)
+    else:
+        panel.set_aspect("equal")
+
+
+def nice(value: float, up: bool = True) -> float:
+    """Return the nearest round number that is at least `value`, or at most `value`."""
+    power = 10.0 ** np.floor(np.log10(value))
+    if up:
+        return next(float(size * power) for size in NICE if size * power >= value * (1 - 1e-9))
+    return max(float(size * power) for size in NICE if size * power <= value * (1 + 1e-9))
 
 
 def centre_patch(patch: Any, centre: np.ndarray) -> None:

@@ -26,14 +26,14 @@ def test_the_table_tells_violating_steps_while_training_and_after(results: dict)
     set_violations(results, stochastic=0.02, training=128.0)
     told = table(results, Path("x"))
     assert (
-        "violating steps without a filter: 10.00 % while training (128 of each seed's 1,280), "
-        "2.00 % stochastic, 0.00 % deterministic"
+        "violating steps without a filter: 10.00 % while training (128 per seed); "
+        "after it 2.00 % stochastic, 0.00 % deterministic"
     ) in told
-    assert "stochastic episodes sample their actions, as training does." in told
+    assert "stochastic actions are sampled, as in training." in told
     set_violations(results, stochastic=0.0, training=0.0)
     told = table(results | {"rta": "discrete_asif"}, Path("x"))
     assert "violating steps with the filter discrete_asif: 0.00 % while training" in told
-    assert "sample their actions" not in told
+    assert "are sampled" not in told
 
 
 def test_an_evaluation_tells_the_violating_steps_of_its_episodes(results: dict) -> None:

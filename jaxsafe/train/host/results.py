@@ -314,21 +314,20 @@ def told_violations(results: Mapping[str, Any]) -> list[str]:
     rates = {kind: one["episode_safety_violation_rate"]["mean"] for kind, one in found.items()}
     if any(rate is None for rate in rates.values()):
         return []
-    shares = []
+    rta = results.get("rta", "none")
+    line = f"violating steps {'without a filter' if rta == 'none' else f'with the filter {rta}'}: "
     cost = results.get("training_cost", {}).get("mean")
     if cost is not None:
-        steps = results["steps"]
-        share = 100.0 * cost / max(steps, 1)
-        shares.append(f"{share:.2f} % while training ({cost:,.0f} of each seed's {steps:,})")
-    shares += [f"{100.0 * rate:.2f} % {kind}" for kind, rate in rates.items()]
-    rta = results.get("rta", "none")
-    where = "without a filter" if rta == "none" else f"with the filter {rta}"
-    lines = ["", f"violating steps {where}: {', '.join(shares)}"]
-    if rates.get("stochastic"):
+        share = 100.0 * cost / max(results["steps"], 1)
+        line += f"{share:.2f} % while training ({cost:,.0f} per seed); after it "
+    line += ", ".join(f"{100.0 * rate:.2f} % {kind}" for kind, rate in rates.items())
+    lines = ["", line]
+    episodes = {kind: one["safety_violation_rate"]["mean"] for kind, one in found.items()}
+    if episodes.get("stochastic", 0.0) > episodes.get("deterministic", 0.0):
         lines += [
-            "stochastic episodes sample their actions, as training does. This noise carries a",
-            "policy that flies close to a limit across it for single steps, so many episodes may",
-            "have a violation and few steps. Deterministic episodes take the most probable action.",
+            "stochastic actions are sampled, as in training. Their noise now and then carries a",
+            "policy that flies along a limit across it. So many episodes have a violation, of few",
+            "steps. deterministic actions are the most probable ones.",
         ]
     return lines
 
