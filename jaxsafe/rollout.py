@@ -115,6 +115,8 @@ def rollout(
     The time step that ends an episode holds the episode's true last observation. The policy acts
     next on the observation of the new start, which is not part of the time steps.
 
+    For `jax.jit`, `policy`, `num_steps`, `num_envs` and `record` are static arguments.
+
     Args:
         env: the environment.
         policy: `policy(key, observation)` returns an action. With `num_envs` both have a leading

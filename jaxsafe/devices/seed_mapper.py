@@ -42,10 +42,8 @@ def claim_cores() -> None:
     longer on a GPU.
     """
     flags = os.environ.get("XLA_FLAGS", "")
-    has_affinity = hasattr(os, "sched_getaffinity")
-    cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
     defaults = {
-        "--xla_force_host_platform_device_count": str(cores),
+        "--xla_force_host_platform_device_count": str(usable_cores()),
         "--xla_cpu_multi_thread_eigen": "false",
     }
     if not accelerator_installed():
@@ -54,6 +52,12 @@ def claim_cores() -> None:
         if name not in flags:
             flags += f" {name}={value}"
     os.environ["XLA_FLAGS"] = flags.strip()
+
+
+def usable_cores() -> int:
+    """Return the number of cores that this process may use."""
+    has_affinity = hasattr(os, "sched_getaffinity")
+    return len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
 
 
 def accelerator_installed() -> bool:

@@ -21,7 +21,7 @@ from jaxsafe.agents.agent import Agent
 from jaxsafe.agents.networks import Params
 from jaxsafe.devices import processes
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
-from jaxsafe.devices.seed_mapper import claim_cores
+from jaxsafe.devices.seed_mapper import claim_cores, usable_cores
 from jaxsafe.environment import Environment
 from jaxsafe.envs import TASKS
 from jaxsafe.runs.run import Run
@@ -114,12 +114,12 @@ def train_run(
     else:
         path = Path(resume)
         _extend(path, {**options, **({} if env is None else {"env": env})})
+    if (path / "results.json").exists():
+        return Run(path)
     if progress:
         _tell_idle_cores(path)
     try:
-        finished = (path / "results.json").exists() or train_all(
-            [path], path, began, told=False, progress=progress
-        )
+        finished = train_all([path], path, began, told=False, progress=progress)
     except Exception:
         if resume is None:
             run_directory.discard_unused(path)
@@ -170,10 +170,10 @@ def _extend(path: Path, options: Mapping[str, Any]) -> None:
 
 def _tell_idle_cores(path: Path) -> None:
     """Say so if the seeds of a run cannot share the cores, because JAX was in use before."""
-    cores = os.cpu_count() or 1
-    device = jax.local_devices()[0]
+    cores = usable_cores()
     seeds = run_directory.read(path, "run")[0].seeds
-    if device.platform == "cpu" and jax.local_device_count() == 1 < min(seeds, cores):
+    alone = jax.default_backend() == "cpu" and jax.local_device_count() == 1
+    if alone and min(seeds, cores) > 1:
         print(
             f"training {seeds} seeds on one of {cores} cores, because JAX was in use before; "
             "in a new session call jaxsafe.train first"

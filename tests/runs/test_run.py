@@ -15,6 +15,7 @@ from tiny_run import TINY, assert_same_end
 import jaxsafe
 from jaxsafe import ConfigError
 from jaxsafe.config.arguments import Arguments
+from jaxsafe.runs.training import _tell_idle_cores
 from jaxsafe.storage.columns import table
 from jaxsafe.storage.files import read_json
 from jaxsafe.train.host.session import Training
@@ -164,6 +165,21 @@ def test_a_run_that_is_resumed_keeps_its_options(whole: Path) -> None:
     assert jaxsafe.train(resume=whole).path == whole
     with pytest.raises(ConfigError, match=r"env: .*whole is a run; resume=.* goes on with it"):
         jaxsafe.train(whole)
+
+
+def test_seeds_that_cannot_share_the_cores_are_told(
+    whole: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setattr("jaxsafe.runs.training.usable_cores", lambda: 8)
+    _tell_idle_cores(whole)
+    assert capsys.readouterr().out == ""
+    monkeypatch.setattr(jax, "local_device_count", lambda: 1)
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    _tell_idle_cores(whole)
+    assert capsys.readouterr().out == (
+        "training 3 seeds on one of 8 cores, because JAX was in use before; "
+        "in a new session call jaxsafe.train first\n"
+    )
 
 
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
