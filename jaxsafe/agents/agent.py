@@ -216,15 +216,6 @@ class Agent(Component):
         """Return the critic's V(s) `[*batch]`, given what `critic_inputs` returns."""
         return self.critic_output("critic", params, critic_inputs)
 
-    def cost_rate(
-        self, params: Params, critic_inputs: Float[Array, "*batch c"]
-    ) -> Float[Array, "*batch"]:
-        """Return the cost critic's (1 − γ)·V_C(s) `[*batch]`, given what `critic_inputs` returns.
-
-        It is what a step costs on average from here on, whatever the horizon.
-        """
-        return self.critic_output("cost_critic", params, critic_inputs)
-
     def critic_output(
         self,
         name: str,
@@ -233,6 +224,8 @@ class Agent(Component):
         sequences: Sequences | None = None,
     ) -> Float[Array, "*batch"]:
         """Return the output of a critic `[*batch]`.
+
+        That of `cost_critic` is (1 − γ)·V_C(s), what a step costs on average from here on.
 
         Args:
             name: `critic` or `cost_critic`.

@@ -324,7 +324,7 @@ def test_the_critic_of_costs_expects_what_a_step_costs() -> None:
     env = probe(Constant(name="reward"), steps=3, most=-1.0)  # every push is too hard
     agent = AGENT.replace(cost_critic=True)
     state = train(env, 60, agent=agent)
-    assert float(agent.cost_rate(state.params, jnp.ones(1))) == pytest.approx(
+    assert float(agent.critic_output("cost_critic", state.params, jnp.ones(1))) == pytest.approx(
         0.1 * (2.71 + 1.9 + 1.0) / 3, abs=0.05
     )
 
