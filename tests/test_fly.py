@@ -112,6 +112,7 @@ def test_a_flight_is_drawn(task: str, tmp_path: Path) -> None:
     env = jaxsafe.make(task, {"terminal.timeout.limit": 20})
     flight = jaxsafe.fly(env, jaxsafe.load_policy(task))
     figure = flight.plot()
+    assert figure._repr_png_().startswith(b"\x89PNG")
     assert len(figure.axes) == (5 if task == "docking3d" else 4)
     assert figure.get_suptitle().startswith(f"{task}: ")
     assert figure._repr_png_().startswith(b"\x89PNG")  # type: ignore[attr-defined]

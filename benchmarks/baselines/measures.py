@@ -24,7 +24,7 @@ def failed_seeds(results: Mapping[str, Any]) -> list[int]:
 
 
 def finished(curves: Sequence[Mapping[str, Any]], step: int) -> float:
-    """Return how many training episodes a seed had finished by a step, on the average."""
+    """Return how many training episodes a seed had finished by a step, on average."""
     latest = max(row["step"] for row in curves if row["step"] <= step)
     counts = [row["episodes"] for row in curves if row["step"] == latest]
     return sum(counts) / len(counts)
@@ -38,7 +38,7 @@ def steps_to(
     This is the definition of Table 2.
 
     Args:
-        level: the success rate, on the average over seeds.
+        level: the success rate, on average over seeds.
         curves: rows of the progress log.
         at_least: episodes that every seed must have finished.
     """

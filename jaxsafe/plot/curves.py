@@ -17,7 +17,18 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from jaxsafe.metrics import ENOUGH_EPISODES, bootstrap_interval
-from jaxsafe.plot.style import AMBER, BLUE, GREEN, GREY, ORANGE, PURPLE, fitted, plain, styled
+from jaxsafe.plot.style import (
+    AMBER,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    NotebookFigure,
+    fitted,
+    plain,
+    styled,
+)
 from jaxsafe.schema.errors import ConfigError
 
 CURVES = (
@@ -372,7 +383,7 @@ def panel_grid(
     columns = -(-count // rows)
     panel_width = panel_width if width is None else width / columns
     height = ratio * panel_width * rows + 0.6  # for title and legend
-    figure = Figure(figsize=(panel_width * columns, height), layout="constrained")
+    figure = NotebookFigure(figsize=(panel_width * columns, height), layout="constrained")
     panels = list(np.atleast_1d(figure.subplots(rows, columns)).ravel())
     for panel in panels[count:]:
         panel.set_axis_off()

@@ -20,6 +20,7 @@ from jaxsafe.plot.curves import MILLIONS_FROM
 from jaxsafe.plot.style import (
     FORBIDDEN,
     Ball,
+    NotebookFigure,
     centre_patch,
     fitted,
     frame_labels,
@@ -109,7 +110,7 @@ def trajectories(
     views: list[tuple[int, ...]] = [(0, 1)] if len(start) == 2 else [(0, 1, 2), (0, 1), (0, 2)]
     side = PANEL_WIDTH if width is None else (width - COLOUR_BAR_WIDTH) / len(columns)
     size = (side * len(columns) + COLOUR_BAR_WIDTH, side * len(views) + 0.5)
-    figure = Figure(figsize=size, layout="constrained")
+    figure = NotebookFigure(figsize=size, layout="constrained")
     grid = figure.add_gridspec(len(views), len(columns))
     alone = len(last[0]["platforms"]) == 1
     turned = not alone and "heading" in last[0]["platforms"][first]
@@ -175,7 +176,7 @@ def speed_distance(episodes: Episodes, title: str, width: float | None = None) -
         width: the width of the figure in inches.
     """
     width = width or 6.4
-    figure = Figure(figsize=(width, 0.66 * width), layout="constrained")
+    figure = NotebookFigure(figsize=(width, 0.66 * width), layout="constrained")
     panel = figure.subplots()
     colours, colour = _colours(episodes)
     limits = []

@@ -19,6 +19,7 @@ from jaxsafe.plot.style import (
     GREEN,
     GREY,
     ORANGE,
+    NotebookFigure,
     control_unit,
     fitted,
     labelled,
@@ -69,7 +70,7 @@ def interventions(rows: Rows, env: Environment, title: str, width: float | None 
     filtered = getattr(env.rta, "constraints", ())
     apart = len(filtered) != 1
     count = len(actuators) + len(env.constraints) + apart
-    figure = Figure(figsize=(width or 7.0, 1.0 + 1.35 * count), layout="constrained")
+    figure = NotebookFigure(figsize=(width or 7.0, 1.0 + 1.35 * count), layout="constrained")
     panels = np.atleast_1d(figure.subplots(count, 1, sharex=True))
     times = _column(rows, "t")
     altered = _intervening(rows)

@@ -5,11 +5,12 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-NOTEBOOK = Path(__file__).parents[2] / "docs" / "episodes.ipynb"
+DOCS = Path(__file__).parents[2] / "docs"
+TUTORIALS = sorted((DOCS / "tutorials").glob("*.ipynb"))
 
 
-def execute(folder: Path) -> Any:
-    notebook = nbformat.read(NOTEBOOK, as_version=4)
+def execute(path: Path, folder: Path) -> Any:
+    notebook = nbformat.read(path, as_version=4)
     NotebookClient(
         notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
     ).execute()
@@ -23,7 +24,7 @@ def test_the_notebook_reads_the_log_of_a_run(
     monkeypatch.setenv("JAXSAFE_RUN", str(whole))
     outputs = [
         output
-        for cell in execute(tmp_path).cells
+        for cell in execute(DOCS / "episodes.ipynb", tmp_path).cells
         if cell.cell_type == "code"
         for output in cell.outputs
     ]
@@ -35,3 +36,23 @@ def test_the_notebook_reads_the_log_of_a_run(
     assert "10 episodes, " in text
     assert text.endswith("rows: consistent\n")
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
+
+
+def test_tutorials_show_what_their_code_returns() -> None:
+    for path in TUTORIALS:
+        cells = nbformat.read(path, as_version=4).cells
+        code = [cell for cell in cells if cell.cell_type == "code"]
+        assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), path
+        assert cells[0].source.startswith("# "), path
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")  # warnings of Jupyter's packages
+@pytest.mark.parametrize("path", TUTORIALS, ids=lambda path: path.stem)
+def test_a_tutorial_runs(path: Path, tmp_path: Path) -> None:
+    for cell in execute(path, tmp_path).cells:
+        for output in cell.get("outputs", []):
+            assert output.output_type != "error"
+            # Without a figure's image, its text would say only what it is.
+            shown = output.get("data", {})
+            assert "image/png" in shown or "<Figure" not in shown.get("text/plain", "")
