@@ -43,6 +43,8 @@ class Options(CommandOptions):
     """Where to copy the best policy of each task, as TASK.npz."""
     film: bool = True
     """Whether to draw animations."""
+    train: bool = True
+    """Whether to train what is not done yet. With false the pages are written from the records."""
     training: Annotated[Mapping[str, Any], Option(prefix="", placeholder="OPTION", takes="a value")]
     """Any option of `jaxsafe train`, the same for all trainings."""
 
@@ -64,7 +66,7 @@ def main(argv: Sequence[str]) -> int:
     episodes = [resolve(Arguments.parse(item.words).options)[0].episodes for item in items]
     command = f"python benchmarks/baselines {shlex.join(argv)}".rstrip()
     try:
-        for item, count in zip(items, episodes, strict=True):
+        for item, count in zip(items, episodes, strict=True) if options.train else ():
             run = train(item, runs)
             evaluate(item, run, count, options.film and item.kind == "engineered_features")
             keep(item, run, out / DIRECTORY, command)

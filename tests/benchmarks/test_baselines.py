@@ -112,6 +112,9 @@ def test_a_report_trains_evaluates_and_writes_the_pages_once(calls: list[list[st
     assert {"success_rate", "return", "cost"} <= rows[0].keys()
     assert [module for module, *_ in calls] == ["jaxsafe.train", *3 * ["jaxsafe.evaluate"]]
     assert command.main(words) == 0  # all records are there
+    shutil.rmtree("runs")
+    assert command.main([*words, "train=false"]) == 0
+    assert pages("report") == page
     assert len(calls) == 4
 
 
@@ -325,7 +328,7 @@ def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:
             ["kinds=[engineered_features,plane]"],
             "kinds: found 'plane'; choose from engineered_features, observation_only,"
             " many_envs, shortest_time, discrete, observation_only_discrete, rta,"
-            " rta_no_punishment.",
+            " rta_no_punishment",
         ),
         (["tasks=[]"], "tasks: expected at least one of rejoin2d"),
         (["film=gif"], "film: expected true or false, found 'gif'"),
