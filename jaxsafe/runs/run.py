@@ -155,7 +155,13 @@ class Run(Described):
         return f"Run {self.path}"
 
     def _rows(self) -> Rows:
-        from jaxsafe.train.host.results import known, least, percent, told_diverged
+        from jaxsafe.train.host.results import (
+            known,
+            least,
+            percent,
+            told_diverged,
+            told_violations,
+        )
 
         results = self.results
         kinds = results["evaluation"]
@@ -172,11 +178,8 @@ class Run(Described):
         yield "success", f"{each('success_rate', '.1%')}, worst seed {percent(least(rates), 1)}"
         yield "80 % success", f"after {reached:,} steps" if reached else "not reached in training"
         yield "return", each("average_return", ".2f")
-        if kinds["stochastic"]["episode_safety_violation_rate"]["mean"] is not None:
-            training = known(results["training_cost"]["mean"], ",.0f")
-            after = each("episode_safety_violation_rate", ".2%")
-            of = f"{training} of {results['steps']:,} in training"
-            yield "violating steps", f"{of}; afterwards {after}"
+        for line in told_violations(results)[1:2]:
+            yield "violating steps", line.partition(": ")[2]
         yield "time", f"{results['wall_s']:.1f} s, {results['compile_s']:.1f} s of it compiling"
         for line in told_diverged(results):
             yield "diverged", line
