@@ -32,9 +32,9 @@ class Options(CommandOptions):
     program = "python benchmarks/baselines"
 
     tasks: Annotated[tuple[str, ...], Option(names=tuple(TASKS))] | None = None
-    """The tasks to train, in brackets if there are several. By default it is all of them."""
+    """The tasks to train, with commas between them. By default it is all of them."""
     kinds: Annotated[tuple[str, ...], Option(names=tuple(KINDS))] | None = None
-    """The recipes, in brackets if there are several. By default it is all of them."""
+    """The recipes, with commas between them. By default it is all of them."""
     runs: Directory = "runs/report"
     """Directory of the runs. What is complete there is not done again."""
     out: Directory = "report"
