@@ -109,6 +109,7 @@ def compare_curves(
             first = min(row[axis.column] for row in every_row if row[axis.column] > 0)
             panel.set_xscale("log")
             panel.set_xlim(left=first / axis.unit)
+            panel.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
         if mark and name == "success_rate":
             panel.plot(mark[1] / axis.unit, 80.0, "k*", markersize=9, clip_on=False, zorder=4)
     entries: list[Any] = [
