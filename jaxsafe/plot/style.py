@@ -71,10 +71,10 @@ FORBIDDEN: dict[str, Any] = {
 NICE = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)
 """Round numbers, up to a power of ten."""
 
-ZOOM = 0.82
+ZOOM = 0.78
 """Size of a view in space. Larger ones have no room for their labels."""
 
-SPACE_LABEL_PAD = 10.0
+SPACE_LABEL_PAD = 8.0
 """Distance of a label from its axis in space, in points. Numbers of five digits fit between."""
 
 CHARACTERS_PER_INCH = 13
