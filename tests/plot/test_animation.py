@@ -82,7 +82,8 @@ def test_a_scene_shows_the_agent_where_it_is_and_what_its_thrusters_do(
     thrust = timesteps.info.control_actual[12][:dimension]
     if task == "docking2d_oriented":
         angle = agent.attitude[12]
-        thrust = thrust[0] * np.array([np.cos(angle), np.sin(angle)])
+        largest = float(env.actuators[0].high)
+        thrust = thrust[0] / largest * np.array([np.cos(angle), np.sin(angle)])
     tail, tip = arrow[:2]
     np.testing.assert_allclose(tail, shown)
     root = np.sqrt(np.linalg.norm(thrust))
