@@ -39,7 +39,7 @@ TRAININGS: dict[str, dict[str, Any]] = {
     "ppo_lagrangian": {"algorithm": "ppo_lagrangian", "cost_limit": 1},
     "discrete": {"actions": "discrete"},
     "recurrent": {"agent.actor": {"type": "gru", "hidden": [4], "units": 4}},
-    "corrected": {"rta": "default", "rta_training": "corrected"},
+    "corrected": {"rta": "default", "rta_training": "corrected_action"},
 }
 SMALL = {
     "ppo.num_envs": 2,
