@@ -56,6 +56,7 @@ def test_environments_are_renewed_alike_however_many_they_are(
         np.testing.assert_array_equal(computed["b"], np.where(where, -indices, indices))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("num_envs", [thorough(16), SPARSE_RESETS_FROM])
 def test_gradients_reach_the_starts_of_batches_of_any_size(num_envs: int) -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 1.0})

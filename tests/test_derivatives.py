@@ -119,6 +119,7 @@ def test_features_are_those_of_the_plain_norm_bit_for_bit(features: Features) ->
 OLD_LOG_PROB = [-90.0, -1e30, 0.0, 90.0, 1e30, -25.0, -0.5]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("discrete", [False, True])
 @pytest.mark.parametrize("advantage", [1.0, -1.0])
 @pytest.mark.parametrize("old", one_of_each_kind(OLD_LOG_PROB, [-1e30, 0.0, 90.0]))
@@ -159,6 +160,7 @@ def test_a_bad_action_that_became_far_likelier_is_still_made_less_likely(old: fl
     assert float(jax.tree.reduce(jnp.add, product)) > 0.0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("old", [thorough(-10.0), -1.0, thorough(0.3)])
 def test_ordinary_ratios_are_what_they_were(old: float) -> None:
     env = jaxsafe.make("docking2d")

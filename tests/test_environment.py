@@ -330,6 +330,7 @@ def test_the_first_condition_that_holds_hides_those_after_it() -> None:
     assert ends(swapped, [0.3, 0.0])[:2] == (["timeout"], "timeout")
 
 
+@pytest.mark.thorough
 def test_a_condition_that_stands_apart_neither_hides_nor_is_hidden() -> None:
     numbers = {"terminal.timeout.limit": 0.5, "terminal.distance.limit": 0.1}
     for names, outcome in (

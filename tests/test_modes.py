@@ -89,6 +89,7 @@ def test_steps_and_rollouts_can_be_traced(mode: str, task: str) -> None:
             jax.eval_shape(lambda env, key, n=num_envs: core(env, key, n), env, jax.random.key(0))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("training", "mode"),
     one_of_each_kind(
@@ -157,6 +158,7 @@ def test_training_runs_without_compilation() -> None:
     assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(state.params))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rta", [None, "default"])
 def test_a_state_may_be_donated_after_an_eager_start(rta: str | None) -> None:
     env = jaxsafe.make("docking2d", rta=rta, randomize={"deputy.mass": [10, 14]})

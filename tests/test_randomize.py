@@ -286,6 +286,7 @@ def test_a_path_of_a_vector_is_refused(path: str, named: str) -> None:
         jaxsafe.make("rejoin2d", script, randomize={path: [0.5, 1.0]})
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("num_envs", [None, 3])
 def test_a_rollout_draws_anew_at_every_automatic_reset(num_envs: int | None) -> None:
     env = jaxsafe.make(
@@ -306,6 +307,7 @@ def test_a_rollout_draws_anew_at_every_automatic_reset(num_envs: int | None) -> 
     assert len(np.unique(episodes[:, 0].round(3))) == 4 * (num_envs or 1)
 
 
+@pytest.mark.thorough
 def test_only_the_environments_that_end_draw_anew() -> None:
     env = jaxsafe.make(
         "docking2d", {"terminal.distance.limit": 125.0}, randomize={"deputy.mass": [5, 50]}
@@ -349,6 +351,7 @@ def test_numbers_may_be_overridden_by_traced_values(env: Environment) -> None:
     np.testing.assert_allclose(computed[1], 2.0 * computed[0], rtol=1e-4)
 
 
+@pytest.mark.thorough
 def test_leads_turn_differently() -> None:
     path = "lead.controller.commands.heading_rate.at"
     env = jaxsafe.make("rejoin2d", randomize={path: [-0.02, 0.02]})
@@ -377,6 +380,7 @@ def test_equal_environments_start_alike_whatever_order_their_numbers_were_writte
         chex.assert_trees_all_equal(reset(env, keys()[0])[0].parameters, expected)
 
 
+@pytest.mark.thorough
 def test_a_number_of_the_filter_may_be_random() -> None:
     env = jaxsafe.make(
         "docking2d", rta="default", randomize={"rta.margin": [2e-4, 1e-3], "deputy.mass": [10, 14]}

@@ -53,6 +53,7 @@ def test_the_name_survives_changes_and_not_transformations() -> None:
     assert env == jax.tree.map(lambda x: x, env)
 
 
+@pytest.mark.thorough
 def test_what_is_traced_or_has_no_numbers_prints() -> None:
     env = jaxsafe.make("docking2d")
     texts = []

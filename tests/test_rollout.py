@@ -203,6 +203,7 @@ def test_environments_may_be_the_last_axis(env: Environment) -> None:
     )
 
 
+@pytest.mark.thorough
 def test_the_starts_of_a_large_batch_are_those_of_its_environments() -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": LENGTH - 1})
     state, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(1), 256)
@@ -254,6 +255,7 @@ def test_the_key_decides_everything(env: Environment, single: TimeStep) -> None:
     assert not np.isin(other.observation[:, 0], single.observation[:, 0]).any()
 
 
+@pytest.mark.thorough
 def test_discrete_actions_roll_out_with_a_new_key_at_every_step() -> None:
     env = jaxsafe.make("docking3d", {"terminal.timeout.limit": LENGTH - 1}, actions="discrete")
 
@@ -309,6 +311,7 @@ def test_transitions_are_the_same_rollout(env: Environment, batch: TimeStep) -> 
     assert position.state.num_steps.shape == (NUM_ENVS,)
 
 
+@pytest.mark.thorough
 def test_states_are_those_before_each_step(env: Environment) -> None:
     _, steps = recorded(env, policy, jax.random.key(0), NUM_STEPS, NUM_ENVS, record="states")
     for t, i in ((0, 0), (NUM_STEPS - 1, 2)):
@@ -331,6 +334,7 @@ def test_a_rollout_goes_on_where_another_stopped(env: Environment, num_envs: int
     assert end.observation.shape == position.observation.shape
 
 
+@pytest.mark.thorough
 def test_transitions_hold_what_a_policy_remembered(env: Environment) -> None:
     def count(key: jax.Array, observation: jax.Array, memory: Any) -> tuple[jax.Array, Any]:
         return jnp.zeros((*observation.shape[:-1], 2)), memory + 1

@@ -103,6 +103,7 @@ def step_by_step(ours: GymVectorEnv, theirs: SyncVectorEnv, steps: int) -> int:
     return ends
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("mode", one_of_each_kind(AutoresetMode, [AutoresetMode.SAME_STEP]))
 def test_a_batch_is_what_single_environments_are_step_by_step(mode: AutoresetMode) -> None:
     options: dict[str, Any] = {"overrides": SOON, "rta": "explicit_simplex", "max_episode_steps": 7}
@@ -130,6 +131,7 @@ def test_the_example_docks(monkeypatch: pytest.MonkeyPatch) -> None:
     assert fly("default", num_envs=16) == {"success": 1.0, "with a violation": 0.0}
 
 
+@pytest.mark.thorough
 def test_final_observations_may_be_written_to_and_wrappers_count_episodes() -> None:
     env = RecordEpisodeStatistics(
         GymVectorEnv("docking2d", 4, autoreset_mode="SameStep", max_episode_steps=3)
@@ -143,6 +145,7 @@ def test_final_observations_may_be_written_to_and_wrappers_count_episodes() -> N
     assert infos["episode"]["l"].tolist() == [3] * 4
 
 
+@pytest.mark.thorough
 def test_seeds_are_chains_of_keys() -> None:
     env = gym.make("jaxsafe:jaxsafe/Docking2D-v0")
     first, _ = env.reset(seed=7)
@@ -161,6 +164,7 @@ def test_seeds_are_chains_of_keys() -> None:
 BIG = [0, 1, 2**32 - 1, 2**32, 2**32 + 1, 2**40, 2**64, 2**64 + 2**32, 2**70, 2**96, 2**128 - 1]
 
 
+@pytest.mark.thorough
 def test_every_seed_has_a_start_of_its_own_however_big_it_is() -> None:
     env = GymEnv("docking2d")
     starts = [env.reset(seed=seed)[0] for seed in BIG]
@@ -206,6 +210,7 @@ def test_a_generator_of_ones_own_waits_for_the_environments_that_go_on() -> None
     assert np.array_equal(only[0], expected[0])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["rbg", thorough("unsafe_rbg")])
 def test_a_batch_starts_as_single_environments_with_other_kinds_of_keys(kind: str) -> None:
     with jax.default_prng_impl(kind):
@@ -350,6 +355,7 @@ def test_an_action_that_is_no_number_ends_the_episode_as_a_failure_that_costs(ta
     assert np.isfinite(batch.step(zero)[0]).all()
 
 
+@pytest.mark.thorough
 def test_every_option_of_make_is_understood() -> None:
     options: dict[str, Any] = {
         "actions": "discrete",

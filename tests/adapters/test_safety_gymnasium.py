@@ -19,6 +19,7 @@ def test_the_cost_stands_between_reward_and_end() -> None:
     assert isinstance(reward, float)
 
 
+@pytest.mark.thorough
 def test_the_cost_in_a_batch_is_that_of_the_step_even_where_an_environment_starts_anew() -> None:
     ends = {"terminal.timeout.limit": 1.0, "reward.velocity_constraint.scale": -0.01}
     # Every start is too fast.

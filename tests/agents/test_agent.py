@@ -63,6 +63,7 @@ def test_categorical_samples_have_the_stated_frequencies() -> None:
     assert scipy.stats.chisquare(counts, 6000 * np.array([0.2, 0.3, 0.5])).pvalue > 0.001
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("actions", ["continuous", "discrete"])
 def test_an_untrained_policy_is_centred_and_as_wide_as_configured(actions: str) -> None:
     env = jaxsafe.make("docking2d", actions=actions)  # type: ignore[arg-type]
@@ -80,6 +81,7 @@ def test_an_untrained_policy_is_centred_and_as_wide_as_configured(actions: str) 
     assert pushes.std() == pytest.approx(0.3, abs=0.02)
 
 
+@pytest.mark.thorough
 def test_a_smaller_log_std_sharpens_the_choice_of_its_actuator_and_leaves_the_mode() -> None:
     env = jaxsafe.make(
         "docking2d", {"deputy.controller.actuators.thrust_x.points": 5}, actions="discrete"

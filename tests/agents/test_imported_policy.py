@@ -104,6 +104,7 @@ def test_discrete_networks_give_logits(tmp_path: Path) -> None:
     assert action.dtype == jnp.int32
 
 
+@pytest.mark.thorough
 def test_an_evaluation_of_it_is_that_of_the_original(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -137,6 +138,7 @@ def test_a_discrete_network_is_evaluated_once_by_its_modes(
     assert list(read_json(tmp_path / "x" / "results.json")["evaluation"]) == ["deterministic"]
 
 
+@pytest.mark.thorough
 def test_its_closed_loop_goes_to_a_verifier(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,6 +164,7 @@ def test_its_closed_loop_goes_to_a_verifier(
         export(["run=net.onnx", "env=docking2d", "inputs=network"])
 
 
+@pytest.mark.thorough
 def test_changes_of_the_environment_come_before_what_a_network_must_fit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -105,6 +105,7 @@ def test_unrolling_is_a_loop_that_begins_anew_with_each_episode() -> None:
         np.testing.assert_allclose(memory[n], expected, rtol=1e-5)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("critic", [None, MLP(hidden=(8,))])
 def test_sequences_are_replayed_as_they_were_flown(critic: MLP | None) -> None:
     """Before anything is learnt, every probability is the one that the action was drawn with."""

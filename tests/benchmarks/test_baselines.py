@@ -175,6 +175,7 @@ def test_an_evaluation_with_other_options_than_today_s_is_left_out_and_made_anew
     assert "| docking2d | heavy |" in pages("report")
 
 
+@pytest.mark.thorough
 def test_a_record_is_of_the_commit_that_trained_it(
     calls: list[list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -313,6 +314,7 @@ def test_a_termination_of_the_report_is_passed_on() -> None:
     assert signal.getsignal(signal.SIGTERM) is not process.terminate
 
 
+@pytest.mark.thorough
 def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:
     assert train.main([*TINY, "out=runs/report/docking2d-engineered_features"]) == 0
     with pytest.raises(ConfigError, match=r"runs: .* was trained with other options; remove it"):

@@ -98,6 +98,7 @@ def accelerator(tables: ModuleType) -> ModuleType:
     return importlib.import_module("accelerator")
 
 
+@pytest.mark.thorough
 def test_the_accelerator_script_measures_and_says_what_it_skips(
     accelerator: ModuleType, tables: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -402,6 +402,7 @@ def test_the_header_of_a_policy_file_is_checked(
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.thorough
 def test_a_damaged_policy_file_is_told_and_what_is_not_asked_for_is_not_read(
     tmp_path: Path, whole: Path
 ) -> None:

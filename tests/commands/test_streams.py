@@ -39,6 +39,7 @@ def shell(command: str, place: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "environment",
     ["PYTHONIOENCODING=cp1252", thorough("PYTHONIOENCODING=ascii"), thorough("LC_ALL=POSIX")],
@@ -52,6 +53,7 @@ def test_what_an_encoding_lacks_is_replaced(environment: str, tmp_path: Path) ->
     assert told.stderr == ""
 
 
+@pytest.mark.thorough
 def test_an_environment_that_is_printed_can_be_read_again_whatever_the_encoding(
     tmp_path: Path,
 ) -> None:
@@ -66,6 +68,7 @@ def test_an_environment_that_is_printed_can_be_read_again_whatever_the_encoding(
     assert load(tmp_path / "copy.yaml") == make(tmp_path / "mine.yaml")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("command", "code", "told"),
     [

@@ -1753,6 +1753,7 @@ def test_a_variant_puts_in_all_in_which_variants_differ(task: str) -> None:
     assert dump(adapt(released, task, variant="paper")) == dump(paper)
 
 
+@pytest.mark.thorough
 def test_a_filter_comes_from_a_file(tmp_path: Path) -> None:
     default = jaxsafe.make("docking2d", rta="default")
     (tmp_path / "filter.yaml").write_text(write(to_data(default.rta)))

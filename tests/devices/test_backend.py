@@ -59,6 +59,7 @@ def test_a_packed_tree_is_a_vector_on_an_accelerator_alone(
     assert same(unpack(pack(tree)), tree)
 
 
+@pytest.mark.thorough
 def test_an_accelerator_draws_the_same_starts(as_accelerated: Callable[[Any], None]) -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 3.0})
     state, _ = jax.jit(reset_batch, static_argnums=2)(

@@ -53,6 +53,7 @@ def three() -> TrainState:
     return seeds(0, 3)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [thorough(0), 1, thorough(2)])
 def test_a_seed_of_many_is_bit_for_bit_the_seed_alone(three: TrainState, seed: int) -> None:
     alone = seeds(seed, 1)
@@ -88,6 +89,7 @@ def test_oriented_docking_starts_bit_for_bit_where_the_seed_alone_starts() -> No
     subprocess.run([sys.executable, "-c", STARTS], check=True, env={**os.environ, "XLA_FLAGS": ""})
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("updates", "share"), [thorough(0, 2), (UPDATES, 2)])
 def test_devices_that_share_a_seed_train_what_one_trains_to_rounding(
     updates: int, share: int

@@ -188,6 +188,7 @@ def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax
     return outcome, cost.sum(), margin.min()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "page",
     [

@@ -17,6 +17,7 @@ def execute(path: Path, folder: Path) -> Any:
     return notebook
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("default")  # warnings of Jupyter's packages
 def test_the_notebook_reads_the_log_of_a_run(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -497,6 +497,7 @@ def free_run(env: Environment, fields: Fields, actions: jax.Array) -> tuple[Any,
     return jax.vmap(lambda start, taken: jax.lax.scan(advance, start, taken)[1])(first, actions)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("task", "tolerance"),
     [

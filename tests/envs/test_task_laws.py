@@ -484,6 +484,7 @@ def test_everything_stays_finite_at_the_edges_of_space(env: Environment, task: s
     chex.assert_tree_all_finite(run(env, state, random_actions(env, NUM_ENVS, NUM_STEPS)))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("task", "actions"),
     one_of_each_kind(
@@ -634,6 +635,7 @@ def visits(
     }
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("variant", one_of_each_kind(["paper", "released"], ["released"]))
 @pytest.mark.parametrize("task", one_of_each_kind(REJOIN, ["rejoin2d"]))
 def test_leaving_the_region_refunds_exactly(task: str, variant: str) -> None:
@@ -655,6 +657,7 @@ def test_leaving_the_region_refunds_exactly(task: str, variant: str) -> None:
     assert facts["stay"].max() > 0.6
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("task", one_of_each_kind(REJOIN, ["rejoin2d"]))
 @pytest.mark.parametrize("variant", ["paper", "released"])
 def test_the_first_time_is_paid_once_an_episode_and_to_those_who_start_inside_only_as_released(
@@ -738,6 +741,7 @@ def _agree(
     np.testing.assert_array_equal(planar[1].cost, spatial[1].cost)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("x64", "tolerance"), [(True, 1e-9), thorough(False, 2e-3)])
 @pytest.mark.parametrize("task", one_of_each_kind(REJOIN, ["rejoin2d"]))
 def test_rejoin_does_not_change_when_the_whole_world_is_moved_and_turned(
@@ -805,6 +809,7 @@ def slopes_at(env: Environment, task: str) -> tuple[dict[str, Any], dict[str, fl
     return docking_start(env, [100.0, 30.0], [0.2, 2.0], attitude_rate=0.01), shared | parameters
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("task", "actions"),
     one_of_each_kind(

@@ -108,6 +108,7 @@ def test_a_film_of_what_did_not_happen_is_that_of_the_first_episode() -> None:
     assert Film("gif").choose(sums, 1) == 0
 
 
+@pytest.mark.thorough
 def test_evaluations_get_directories_of_their_own(whole: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(whole, run)
@@ -138,6 +139,7 @@ def test_a_checkpoint_that_is_not_there_is_told_with_those_that_are(whole: Path)
         main([f"run={whole}", "checkpoint=lst"])
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("damage", ["cut", "garbage", "gone"])
 def test_a_corrupt_checkpoint_is_told_in_one_line(whole: Path, tmp_path: Path, damage: str) -> None:
     run = tmp_path / "run"
@@ -162,6 +164,7 @@ class Idle:
         return zero
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("timeout", "piece"), [thorough(30.0, 256), (30.0, 7), thorough(1e10, 7)])
 def test_recorded_episodes_are_those_that_were_evaluated(
     timeout: float, piece: int, monkeypatch: pytest.MonkeyPatch
@@ -197,6 +200,7 @@ def test_a_timeout_that_means_none_leaves_episodes_as_they_are() -> None:
         np.testing.assert_array_equal(late.outcome, usual.outcome)
 
 
+@pytest.mark.thorough
 def test_an_episode_that_does_not_end_is_given_up_and_that_is_told(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -220,6 +224,7 @@ def test_an_episode_that_does_not_end_is_given_up_and_that_is_told(
     )
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("overrides", "steps"),
     [
@@ -349,6 +354,7 @@ def test_what_is_defined_otherwise_than_in_training_is_told() -> None:
     assert told == "defined otherwise than in training: observation position, actuator thrust_y"
 
 
+@pytest.mark.thorough
 def test_another_environment_is_the_change_that_makes_it(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

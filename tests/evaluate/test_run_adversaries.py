@@ -18,6 +18,7 @@ from jaxsafe.evaluate.run_adversaries import attack, longest_episode
 from jaxsafe.processors.terminal import Timeout, time_limit
 
 
+@pytest.mark.thorough
 def test_the_numbers_name_the_command_and_the_versions_that_made_them(tmp_path: Path) -> None:
     argv = [
         "env=docking2d",
@@ -82,6 +83,7 @@ def test_episodes_are_what_is_counted_and_whole_ones_unless_told_otherwise(
     assert "less than a share of 0.6 of the episodes has one" in printed
 
 
+@pytest.mark.thorough
 def test_a_random_time_limit_is_read_as_each_episode_has_it() -> None:
     env = jaxsafe.make(
         "docking2d",
@@ -147,6 +149,7 @@ def test_adversaries_that_turn_back_and_that_take_the_least_certificate(policy: 
     assert kept["worst_margin"] < (0.001 if policy == "drain" else 0.1)
 
 
+@pytest.mark.thorough
 def test_what_an_episode_draws_is_the_plant_that_is_counted_on() -> None:
     """The nominal limit is exceeded all the time.
 

@@ -70,6 +70,7 @@ def test_another_runtime_acts_alike(task: str) -> None:
     }
 
 
+@pytest.mark.thorough
 def test_discrete_policies_choose_alike() -> None:
     policy = saved("docking2d")
     env = jaxsafe.make("docking2d", actions="discrete")
@@ -163,6 +164,7 @@ def test_a_search_finds_the_least_margin() -> None:
     np.testing.assert_allclose(worst.start, [0.31, -0.7], atol=0.02)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "mode", one_of_each_kind([*CHECKED_WHILE_TRACING, *CHECKED_WHILE_RUNNING], ["x64", "nans"])
 )
@@ -261,6 +263,7 @@ def test_a_policy_that_diverged_is_not_exported(
     assert not [path for path in tmp_path.iterdir() if path.suffix != ".npz"]
 
 
+@pytest.mark.thorough
 def test_a_loop_that_ends_in_no_number_is_violated(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

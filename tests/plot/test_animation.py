@@ -40,6 +40,7 @@ def points(line: Any) -> np.ndarray:
     return np.stack(line.get_data_3d() if hasattr(line, "get_data_3d") else line.get_data(), axis=1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("task", "dimension"),
     [
@@ -90,6 +91,7 @@ def test_a_scene_shows_the_agent_where_it_is_and_what_its_thrusters_do(
     np.testing.assert_allclose((tip - tail) / scene._reach, 0.4 * thrust / root, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_a_picture_while_the_episode_goes_on_shows_what_that_of_the_whole_episode_shows() -> None:
     env = jaxsafe.make("docking2d")
     states, timesteps = recorded(env, 70)
@@ -123,6 +125,7 @@ def test_what_stands_still_is_drawn_once(monkeypatch: pytest.MonkeyPatch) -> Non
     assert len(drawn) == 1
 
 
+@pytest.mark.thorough
 def test_names_and_titles_are_drawn_letter_by_letter() -> None:
     env = jaxsafe.make("docking2d")
     regions = tuple(region.replace(name="$\\frac{$") for region in env.regions)
@@ -136,6 +139,7 @@ def test_names_and_titles_are_drawn_letter_by_letter() -> None:
     assert scene.curves[1].get_ylabel() == "h of\n\u200b_\\$\\frac{\\$ [m/s]"
 
 
+@pytest.mark.thorough
 def test_an_animation_repeats_and_rests_at_the_end(tmp_path: Path) -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 10.0})
     with Image.open(animate(env, recorded(env, 11), tmp_path / "x.gif", "docking2d")) as image:
@@ -145,6 +149,7 @@ def test_an_animation_repeats_and_rests_at_the_end(tmp_path: Path) -> None:
         assert image.info["duration"] == 1500
 
 
+@pytest.mark.thorough
 def test_ffmpeg_makes_an_mp4(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     env = jaxsafe.make("docking2d")
     episode = recorded(env, 3)

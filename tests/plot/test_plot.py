@@ -386,6 +386,7 @@ def test_a_run_of_an_older_version_is_drawn_without_what_is_learnt(
     assert [path.name for path in draw_all(tmp_path)] == ["training_steps.png"]
 
 
+@pytest.mark.thorough
 def test_the_agent_is_drawn_whatever_it_and_the_others_are_called(
     whole: Path, tmp_path: Path
 ) -> None:
@@ -468,6 +469,7 @@ def test_what_to_stay_out_of_is_not_drawn_like_the_goal() -> None:
         assert panel.patches[0].get_hatch() == hatch
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("nasty", [FORMULA, "_$x"])
 def test_a_run_whose_every_name_is_a_formula_is_drawn(
     whole: Path,
@@ -640,6 +642,7 @@ def test_several_runs_in_one_figure_with_a_table(
             main(words)
 
 
+@pytest.mark.thorough
 def test_a_pattern_stands_for_runs_and_labels_name_them(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

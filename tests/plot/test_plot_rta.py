@@ -50,6 +50,7 @@ def labels(figure: object) -> list[str]:
     return [panel.get_ylabel().replace("\n", " ") for panel in figure.axes]  # type: ignore[attr-defined]
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("task", "expected"),
     [
@@ -125,6 +126,7 @@ def test_units_of_controls_come_from_their_names() -> None:
     assert control_unit("flaps", "ft") is None
 
 
+@pytest.mark.thorough
 def test_only_a_run_with_a_filter_draws_interventions(whole: Path, tmp_path: Path) -> None:
     env = jaxsafe.make("docking2d", rta="default")
     run = tmp_path / "run"
@@ -155,6 +157,7 @@ def test_only_a_run_with_a_filter_draws_interventions(whole: Path, tmp_path: Pat
     )  # the picture is not blank
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("task", "rta"),
     [
@@ -203,6 +206,7 @@ def test_without_a_horizon_the_safe_set_is_that_of_h() -> None:
         np.testing.assert_allclose(h, 0.2 + 2.0 * 0.001027 * distance - speed[:, None], atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_head_on_the_filter_keeps_farther_away_than_the_constraint() -> None:
     env = jaxsafe.make("rejoin2d", rta="default")
     head_on, _, overtaking = safe_set.planes(env).panels.values()
@@ -232,6 +236,7 @@ def test_the_safe_set_has_a_panel_for_each_plane(task: str) -> None:
     assert [line.levels[0] for line in lines] == pytest.approx([0.0, required])
 
 
+@pytest.mark.thorough
 def test_the_command_writes_a_figure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:

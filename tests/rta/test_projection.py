@@ -256,6 +256,7 @@ def test_derivatives_are_finite_differences_where_something_is_active() -> None:
         assert good > NUM
 
 
+@pytest.mark.thorough
 def test_a_point_that_meets_everything_passes_unaltered() -> None:
     u = jnp.array([0.3, -0.2])
     low = -jnp.ones(2)
@@ -292,6 +293,7 @@ def test_degenerate_problems_give_numbers() -> None:
         assert np.isfinite(slopes).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("slack", [None, thorough(1.0)])
 def test_a_row_of_zeros_has_derivatives(slack: float | None) -> None:
     low = -jnp.ones(2)
@@ -325,6 +327,7 @@ def test_a_control_on_its_bound_keeps_its_derivative() -> None:
         np.testing.assert_array_equal(slope, np.eye(2))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "rta", [thorough("default"), "explicit_simplex", thorough("explicit_asif")]
 )

@@ -113,6 +113,7 @@ def test_far_from_the_chief_an_oriented_spacecraft_is_not_certified() -> None:
     assert min(margins) < -0.07
 
 
+@pytest.mark.thorough
 def test_in_its_terminal_set_an_oriented_spacecraft_holds_the_limit_for_long() -> None:
     """The set itself is tested up to where it ends, also at the limit.
 
@@ -259,6 +260,7 @@ def test_a_certificate_checks_the_numbers_that_its_proof_assumes(
     assert not timestep.info.rta.certified
 
 
+@pytest.mark.thorough
 def test_a_lead_that_cannot_be_copied_is_not_certified_whatever_an_episode_draws() -> None:
     env = jaxsafe.make(
         "rejoin2d",
@@ -273,6 +275,7 @@ def test_a_lead_that_cannot_be_copied_is_not_certified_whatever_an_episode_draws
     assert not first.info.rta.certified[turn > 0.166].any()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("dt", [0.25, 2.0, 5.0, 10.0])
 def test_the_margin_of_a_speed_limit_follows_the_step(dt: float) -> None:
     env = jaxsafe.make("docking2d", {"dt": dt}, rta="default")
@@ -281,6 +284,7 @@ def test_the_margin_of_a_speed_limit_follows_the_step(dt: float) -> None:
     assert float(env.rta.required_margin(env)) == pytest.approx(max(2.5e-4, 2.07e-4 * dt), rel=0.15)
 
 
+@pytest.mark.thorough
 def test_an_uncertified_start_becomes_certified_under_an_agent_that_asks_for_nothing_sensible() -> (
     None
 ):
@@ -300,6 +304,7 @@ def test_an_uncertified_start_becomes_certified_under_an_agent_that_asks_for_not
     assert not timestep.info.intervening
 
 
+@pytest.mark.thorough
 def test_a_certificate_that_is_not_renewed_ends_before_anything_is_violated() -> None:
     """A lead turns faster than it was certified for.
 
@@ -354,6 +359,7 @@ def assert_unbroken(env: Environment, row: dict[str, Any]) -> None:
         assert row["worst_margin_inside"] >= float(env.rta.margin) - 0.5
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("task", "policy"),
     [("docking2d", "greedy"), thorough("rejoin2d", "intercept"), ("docking2d", "search")],
@@ -364,6 +370,7 @@ def test_the_same_adversaries_break_the_bare_task(task: str, policy: str) -> Non
     assert row["intervention_rate"] == 0.0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("task", one_of_each_kind(TASKS))
 def test_an_environment_with_a_filter_is_written_and_read(task: str) -> None:
     bare = jaxsafe.make(task)
@@ -501,6 +508,7 @@ def test_the_sampled_data_filter_changes_no_more_than_it_must(task: str) -> None
     assert 5 < altered < 25
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "task",
     [
@@ -622,6 +630,7 @@ def test_barrier_rows_are_the_change_of_h_along_the_plant(task: str, degree: int
     np.testing.assert_allclose(float(rows[0] @ u - offsets[0]), expected, rtol=2e-3, atol=1e-4)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("task", one_of_each_kind(DOCKING, ["docking2d"]))
 def test_derivatives_through_the_filter_are_numbers_at_every_kink(task: str) -> None:
     env = jaxsafe.make(task, rta="default")
@@ -650,6 +659,7 @@ def test_derivatives_through_the_filter_are_numbers_at_every_kink(task: str) -> 
                 assert leaf.dtype == jax.dtypes.float0 or np.isfinite(leaf).all()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("task", "dt"),
     [("rejoin2d", 1.0), ("rejoin2d", 5.0), thorough("rejoin3d", 1.0), thorough("rejoin3d", 2.0)],
@@ -806,6 +816,7 @@ def test_the_filters_of_the_literature_are_there_to_be_broken() -> None:
     assert row["violating_steps_inside"] > 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("share", [thorough(1), 4, thorough(16)])
 def test_a_blend_takes_the_largest_share_that_is_certified(share: int) -> None:
     env = jaxsafe.make("docking2d", rta=Blend(**DOCKING_FILTER, parts=share))
@@ -840,6 +851,7 @@ def test_an_implicit_asif_changes_less_than_simplex() -> None:
     assert corrections["implicit_asif"] < 0.51 * corrections["implicit_simplex"]
 
 
+@pytest.mark.thorough
 def test_stages_follow_each_other() -> None:
     """The last stage decides. Where it intervenes the certificate of the first is void."""
     loose = Stage(name="loose", rta=Simplex(**DOCKING_FILTER))
@@ -877,6 +889,7 @@ def test_rejoin_needs_barriers_of_a_higher_degree() -> None:
         jaxsafe.make("rejoin2d", {"rta.degree": 1}, rta="explicit_asif")
 
 
+@pytest.mark.thorough
 def test_slack_lets_a_barrier_be_missed_at_a_price() -> None:
     desired = jnp.array([0.0, 1.0])
     corrections = []
@@ -929,6 +942,7 @@ class Shy(Command, type="of_tests_shy"):
 SHY = {"type": "of_tests_shy", "name": "heading_rate", "other": "wingman"}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("task", "changes", "reacts"),
     [

@@ -110,6 +110,7 @@ def test_a_run_has_the_policies_that_it_saved(run: Any, whole: Path) -> None:
         run.policy(checkpoint="lest")
 
 
+@pytest.mark.thorough
 def test_a_run_draws_its_figures_for_a_notebook(run: Any, whole: Path) -> None:
     figures = run.plot()
     assert {f"{name}.png" for name in figures} == {

@@ -514,6 +514,7 @@ def differences(step: Any, x: np.ndarray, controls: np.ndarray) -> tuple[np.ndar
     return np.stack(left, axis=-1), np.stack(right, axis=-1)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("model", [thorough(2), 3])
 @pytest.mark.usefixtures("x64")
 def test_derivatives_are_finite_differences(model: int) -> None:
@@ -551,6 +552,7 @@ def test_derivatives_are_finite_differences(model: int) -> None:
     assert (np.abs(computed) > 10.0 * slack)[smooth].mean() > 0.2  # the slack hides little
 
 
+@pytest.mark.thorough
 def test_in_float32_derivatives_are_finite_on_limits_and_at_zero_rates() -> None:
     for step, start in ((step2d, (0.0, 0.0, 0.0)), (step3d, (0.0, 0.0, 0.0, 0.0))):
         for speed in SPEEDS:

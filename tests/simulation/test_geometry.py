@@ -46,6 +46,7 @@ def test_the_safe_norm_is_taken_along_the_last_axis() -> None:
     assert safe_norm(vectors).tolist() == [5.0, 0.0, 13.0]
 
 
+@pytest.mark.thorough
 def test_the_gradient_of_the_safe_norm_is_the_direction_and_zero_at_zero() -> None:
     gradient = jax.grad(safe_norm)
     np.testing.assert_allclose(gradient(jnp.asarray([3.0, 4.0])), [0.6, 0.8], rtol=1e-6)

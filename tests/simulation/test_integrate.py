@@ -68,6 +68,7 @@ def test_the_ratios_of_sines_are_their_series(tau: float) -> None:
             np.testing.assert_allclose(computed, series(tau, first), rtol=1e-14, atol=1e-16)
 
 
+@pytest.mark.thorough
 @pytest.mark.usefixtures("x64")
 def test_the_derivatives_of_the_ratios_satisfy_their_recurrence() -> None:
     """Each ratio c_k obeys τ c_k′ = c_(k−1) − k c_k, with c₀ = cos τ."""

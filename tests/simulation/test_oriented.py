@@ -266,6 +266,7 @@ def test_derivatives_are_finite_differences() -> None:
         assert (computed[..., k] <= np.maximum(*sides) + slack).all(), k
 
 
+@pytest.mark.thorough
 def test_in_float32_derivatives_are_finite_on_the_limit_and_at_zero_controls() -> None:
     for rate in (-RATE_LIMIT, 0.0, RATE_LIMIT):
         for turn in (-1e-38, 0.0, 1e-38, TURN):

@@ -83,6 +83,7 @@ def test_the_tangent_is_sine_over_cosine() -> None:
     np.testing.assert_allclose(sine / cosine, np.tan(x.astype(float)), rtol=3e-7)
 
 
+@pytest.mark.thorough
 def test_the_arctangent_is_within_two_bits_everywhere() -> None:
     spread = [
         np.linspace(-3.0, 3.0, 100_001),

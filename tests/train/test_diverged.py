@@ -149,6 +149,7 @@ def test_an_evaluation_says_the_same(
     )
 
 
+@pytest.mark.thorough
 def test_a_run_of_which_every_seed_diverged_has_no_result(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -164,6 +165,7 @@ def test_a_run_of_which_every_seed_diverged_has_no_result(
     assert "DIVERGED" in summary({"run": tmp_path / "run"})
 
 
+@pytest.mark.thorough
 def test_infinite_returns_count_too() -> None:
     agent = normalise(Agent(actor=MLP(hidden=(4,))))
     ppo = normalise(PPO(num_envs=2))
@@ -175,6 +177,7 @@ def test_infinite_returns_count_too() -> None:
         assert diverged(state.replace(window=state.window.replace(episodes=episodes)))
 
 
+@pytest.mark.thorough
 def test_a_sweep_ranks_it_last_and_marks_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -88,6 +88,7 @@ def test_gae_equals_a_loop_over_random_episodes() -> None:
     np.testing.assert_allclose(computed, expected, atol=1e-5)
 
 
+@pytest.mark.thorough
 def test_the_critic_learns_a_constant() -> None:
     state = train(probe(Constant(name="reward")))
     assert value(state, 1.0) == pytest.approx(1.0, abs=0.05)
@@ -99,6 +100,7 @@ def test_the_critic_learns_from_the_observation() -> None:
     assert value(state, -1.0) == pytest.approx(-1.0, abs=0.1)
 
 
+@pytest.mark.thorough
 def test_what_is_learnt_does_not_depend_on_how_many_samples_go_through_the_networks_at_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -122,6 +124,7 @@ def test_a_terminated_episode_counts_nothing_beyond_its_end() -> None:
     assert value(state, 1.0) == pytest.approx((1.0 + 1.9) / 2, abs=0.1)
 
 
+@pytest.mark.thorough
 def test_a_critic_that_sees_the_totals_tells_first_steps_from_second_ones() -> None:
     agent = AGENT.replace(critic_sees_totals=True)
     state = train(probe(Constant(name="reward"), steps=2), updates=80, agent=agent)
@@ -135,6 +138,7 @@ def test_a_truncated_episode_counts_what_would_follow() -> None:
     assert value(state, 1.0) == pytest.approx(1.0 / (1.0 - 0.9), rel=0.1)
 
 
+@pytest.mark.thorough
 def test_an_episode_of_training_is_truncated_after_its_limit() -> None:
     limited = SMALL.replace(max_episode_steps=jnp.array(3.0))
     state = init(probe(Constant(name="reward"), steps=1000), AGENT, limited, jax.random.key(0))
@@ -162,6 +166,7 @@ def test_the_policy_learns_the_action_that_the_observation_calls_for(discrete: b
             assert float(mode[0]) == pytest.approx(0.5 * observation, abs=0.1)
 
 
+@pytest.mark.thorough
 def test_the_learning_rate_falls_linearly_to_its_end() -> None:
     env = probe(Match(name="reward"))
     frozen = SMALL.replace(learning_rate=jnp.array(1e-3), final_learning_rate=jnp.array(0.0))
@@ -183,6 +188,7 @@ def test_the_learning_rate_falls_as_it_is_told() -> None:
         np.testing.assert_allclose(rates, [1e-2, middle, 1e-4], rtol=1e-5)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("discrete", [thorough(False), True], ids=["gaussian", "categorical"])
 def test_the_noise_falls_besides_what_is_learnt(discrete: bool) -> None:
     env = probe(Constant(name="reward"), discrete=discrete)
@@ -201,6 +207,7 @@ def test_the_horizon_grows_exponentially_to_its_end() -> None:
     assert float(discount(normalise(PPO(gamma=0.97)), 0.7)) == pytest.approx(0.97)
 
 
+@pytest.mark.thorough
 def test_the_discount_of_an_update_is_that_of_its_progress() -> None:
     env = probe(Position(name="reward"), steps=4)
     growing = SMALL.replace(gamma=jnp.array(0.5), horizon_growth=jnp.array(10.0))
@@ -233,6 +240,7 @@ def test_hyperparameters_are_leaves_that_vmap() -> None:
     np.testing.assert_allclose(together, jnp.stack([bias(rate) for rate in rates]), atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_no_gradient_is_larger_than_allowed() -> None:
     env = probe(Position(name="reward"))
     tiny = SMALL.replace(max_grad_norm=jnp.array(1e-30))
@@ -243,6 +251,7 @@ def test_no_gradient_is_larger_than_allowed() -> None:
     assert max(jax.tree.leaves(moved)) < 1e-6
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("discrete", [False, thorough(True)], ids=["gaussian", "categorical"])
 def test_diagnostics_of_an_update_that_changes_nothing_are_those_of_its_batch(
     discrete: bool,
@@ -273,6 +282,7 @@ def test_diagnostics_of_an_update_that_changes_nothing_are_those_of_its_batch(
         assert float(computed[name]) == pytest.approx(float(value), rel=1e-4, abs=1e-5), name
 
 
+@pytest.mark.thorough
 def test_the_diagnostics_show_how_far_an_update_went() -> None:
     env = probe(Match(name="reward"))
     still = SMALL.replace(num_epochs=1, num_minibatches=1)
@@ -320,6 +330,7 @@ def test_costs_are_kept_within_their_limit(limit: float, low: float, high: float
     assert float(state.multiplier) < 2.0  # the multiplier fell while nothing exceeded the limit
 
 
+@pytest.mark.thorough
 def test_the_critic_of_costs_expects_what_a_step_costs() -> None:
     env = probe(Constant(name="reward"), steps=3, most=-1.0)  # every push is too hard
     agent = AGENT.replace(cost_critic=True)

@@ -21,6 +21,7 @@ def episodes_like(values: np.ndarray) -> Episode:
     )
 
 
+@pytest.mark.thorough
 def test_the_window_keeps_the_last_hundred_finished_episodes_in_order() -> None:
     rng = np.random.default_rng(0)
     window = empty_window(episodes_like(np.zeros(1, np.float32)))
@@ -83,6 +84,7 @@ def test_averages_are_over_the_filled_part_only() -> None:
     assert float(row["outcome/crash"]) == 0.0
 
 
+@pytest.mark.thorough
 def test_the_latest_cost_is_that_of_the_last_episodes() -> None:
     rng = np.random.default_rng(1)
     window = empty_window(episodes_like(np.zeros(1, np.float32)))

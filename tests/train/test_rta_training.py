@@ -55,6 +55,7 @@ def test_ppo_learns_from_the_desired_or_the_actual_control() -> None:
     assert (np.abs(desired[~altered]) == np.abs(actual[~altered])).all()
 
 
+@pytest.mark.thorough
 def test_the_log_probability_is_that_of_the_stored_action() -> None:
     env = jaxsafe.make("docking2d", rta="default")
     agent = normalise(Agent(actor=MLP(hidden=(8,))))
@@ -130,6 +131,7 @@ def results(path: Path) -> Any:
     return json.loads((path / "results.json").read_text())["evaluation"]["stochastic"]
 
 
+@pytest.mark.thorough
 def test_a_run_reports_how_often_it_was_corrected(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -116,6 +116,7 @@ def without_clock(points: list[Point]) -> list[Point]:
     return [point for point in points if not point[0].startswith("wall_s/")]
 
 
+@pytest.mark.thorough
 def test_every_number_of_the_progress_log_goes_to_every_sink(
     tmp_path: Path, wandb: FakeWandB, mlflow: FakeMLflow
 ) -> None:
@@ -141,6 +142,7 @@ def test_every_number_of_the_progress_log_goes_to_every_sink(
     assert mlflow.status == "FINISHED"
 
 
+@pytest.mark.thorough
 def test_a_resumed_run_goes_on_in_the_same_run_of_a_service(
     tmp_path: Path, whole: Path, wandb: FakeWandB, mlflow: FakeMLflow
 ) -> None:

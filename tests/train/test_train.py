@@ -211,6 +211,7 @@ def test_a_crash_after_the_first_evaluation_does_not_repeat_its_rows(
     assert len([row for row in rows if row["step"] == 0]) == 3 * 4
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("when", ["before", thorough("after")])
 def test_a_kill_while_the_last_checkpoint_is_written_anew_loses_nothing(
     tmp_path: Path, whole: Path, monkeypatch: pytest.MonkeyPatch, when: str
@@ -226,7 +227,7 @@ def test_a_kill_while_the_last_checkpoint_is_written_anew_loses_nothing(
         patch.setattr(
             Training,
             "train",
-            lambda self: self.step == 1280 or pytest.fail(f"went back to {self.step}"),
+            lambda self, progress: self.step == 1280 or pytest.fail(f"went back to {self.step}"),
         )
         assert command.main([f"resume={run}"]) == 0
     assert sorted(path.name for path in (run / "checkpoints").iterdir()) == [
@@ -238,6 +239,7 @@ def test_a_kill_while_the_last_checkpoint_is_written_anew_loses_nothing(
     assert_same_end(run, whole)
 
 
+@pytest.mark.thorough
 def test_a_run_has_one_command_at_work_on_it(tmp_path: Path, whole: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(whole, run)
@@ -253,6 +255,7 @@ def test_a_run_has_one_command_at_work_on_it(tmp_path: Path, whole: Path) -> Non
     assert command.main([f"resume={run}"]) == 0
 
 
+@pytest.mark.thorough
 def test_a_refused_training_leaves_its_directory_free(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -267,6 +270,7 @@ def test_a_refused_training_leaves_its_directory_free(
     assert command.main([*TINY, f"out={tmp_path / 'run'}"]) == 0
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("step", [448, thorough(1280)])  # the second with nothing is left to train
 def test_ctrl_c_stops_after_a_chunk_with_a_checkpoint_and_resumes(
     tmp_path: Path,
@@ -363,7 +367,9 @@ def test_options_that_do_not_fit_all_tasks_are_told_with_the_task(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match=r"^env=all: rejoin2d: deputy: unknown field 'deputy'"):
+    with pytest.raises(
+        ConfigError, match=r"^env=all: rejoin2d: env.deputy: unknown field 'deputy'"
+    ):
         command.main(["env=all", "env.deputy.mass=14"])
     assert not list(tmp_path.iterdir())
 
@@ -386,6 +392,7 @@ def test_runs_without_a_name_take_the_next_free_one(
     assert (tmp_path / "runs" / "docking2d-2" / "results.json").exists()
 
 
+@pytest.mark.thorough
 def test_evaluation_only_at_the_end_finds_what_evaluation_on_the_way_does(
     tmp_path: Path, whole: Path
 ) -> None:
@@ -483,7 +490,9 @@ def test_a_recipe_travels_with_the_file_of_an_environment(
     assert of_file[2] == "mine"
     given, _, _ = resolve({"env": "mine.yaml", "ppo.gamma": 0.5, "steps": 99})
     assert (float(given.ppo.gamma), given.steps) == (0.5, 99)
-    with pytest.raises(ConfigError, match=r"^preset: unknown preset 'x'; choose from features, "):
+    with pytest.raises(
+        ConfigError, match=r"^preset: unknown preset 'x'; choose from engineered_features, "
+    ):
         resolve({"env": "mine.yaml", "preset": "x"})
     environment = text.partition("recipes:")[0]
     for recipes, place in (
@@ -515,6 +524,7 @@ def test_nothing_is_lost_when_checkpoints_are_missing(
     assert_same_end(run, whole)
 
 
+@pytest.mark.thorough
 def test_a_damaged_progress_log_is_told_before_anything_is_done(
     tmp_path: Path, whole: Path
 ) -> None:
@@ -528,6 +538,7 @@ def test_a_damaged_progress_log_is_told_before_anything_is_done(
         command.main([f"resume={run}"])
 
 
+@pytest.mark.thorough
 def test_a_run_that_an_older_version_began_does_not_go_on(tmp_path: Path, whole: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(whole, run)
@@ -544,6 +555,7 @@ def test_a_run_that_an_older_version_began_does_not_go_on(tmp_path: Path, whole:
         command.main([f"resume={run}"])
 
 
+@pytest.mark.thorough
 def test_a_log_that_lost_its_end_is_gone_back_to_the_checkpoint_that_it_covers(
     tmp_path: Path, whole: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -567,6 +579,7 @@ def flip(file: Path, place: float, bit: int) -> None:
     file.write_bytes(content)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("seed", range(3))
 def test_a_flipped_bit_in_a_checkpoint_is_told_or_changes_nothing(
     tmp_path: Path, whole: Path, seed: int
@@ -593,6 +606,7 @@ def test_a_flipped_bit_in_a_checkpoint_is_told_or_changes_nothing(
     assert refused
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -637,6 +651,7 @@ def test_a_run_may_go_on_for_longer_and_look_at_itself_more_often(
     jax.tree.map(np.testing.assert_array_equal, final_state(run), final_state(whole))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("name", ["sha256", "made_from", "updates", "wall_s", None])
 def test_facts_of_a_checkpoint_are_checked_and_those_of_before_are_known(
     tmp_path: Path, whole: Path, name: str | None
@@ -658,6 +673,7 @@ def test_facts_of_a_checkpoint_are_checked_and_those_of_before_are_known(
         final_state(run)
 
 
+@pytest.mark.thorough
 def test_a_corrupt_checkpoint_leaves_one_line_on_standard_error(
     tmp_path: Path, whole: Path
 ) -> None:
@@ -690,6 +706,7 @@ cli.run(main, str, cli.at_once)
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("step", [1, 2])
 def test_a_checkpoint_without_room_is_one_line_and_leaves_the_one_before(
     tmp_path: Path, step: int
@@ -705,6 +722,7 @@ def test_a_checkpoint_without_room_is_one_line_and_leaves_the_one_before(
     assert [path.name for path in (tmp_path / "checkpoints").iterdir()] == ["1"]
 
 
+@pytest.mark.thorough
 def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(tmp_path: Path) -> None:
     words = [*TINY, "algorithm=ppo_lagrangian", "cost_limit=3"]
     straight = tmp_path / "straight"

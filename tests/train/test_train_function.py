@@ -29,6 +29,7 @@ def recipe() -> Recipe:
     return resolve(Arguments.parse(TINY).options)[:2]
 
 
+@pytest.mark.thorough
 def test_it_trains_bit_for_bit_what_the_command_trains(tmp_path: Path) -> None:
     """Two updates run at a time, as in all but the shortest trainings.
 
@@ -67,6 +68,7 @@ def test_seeds_and_hyperparameters_are_mapped(recipe: Recipe) -> None:
         )
 
 
+@pytest.mark.thorough
 def test_a_callback_sees_every_piece_and_can_stop(recipe: Recipe) -> None:
     config, env = recipe
     arguments = (env, config.agent, config.ppo, jax.random.key(1), 5)
@@ -87,6 +89,7 @@ def test_a_callback_sees_every_piece_and_can_stop(recipe: Recipe) -> None:
     assert int(state.num_updates) == 2
 
 
+@pytest.mark.thorough
 def test_what_was_trained_is_evaluated_as_any_policy(recipe: Recipe) -> None:
     config, env = recipe
     state, _ = train(env, config.agent, config.ppo, jax.random.key(0), 1)

@@ -39,6 +39,7 @@ def test_every_seed_starts_from_its_own_policy_of_a_run(whole: Path, tmp_path: P
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), params, before)
 
 
+@pytest.mark.thorough
 def test_all_seeds_start_from_one_policy(whole: Path, tmp_path: Path) -> None:
     policy = whole / "policy" / "seed_1.npz"
     for params in first_params(tmp_path / "run", [f"from={policy}"]):
@@ -55,6 +56,7 @@ def test_python_starts_from_parameters() -> None:
     jax.tree.map(np.testing.assert_array_equal, again.params, state.params)
 
 
+@pytest.mark.thorough
 def test_a_run_that_has_ended_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
@@ -84,6 +86,7 @@ def test_what_no_training_can_start_from_is_told(words: list[str], message: str)
         main([*TINY, *words])
 
 
+@pytest.mark.thorough
 def test_networks_of_another_shape_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

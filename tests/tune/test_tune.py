@@ -55,6 +55,7 @@ def test_a_grid_has_every_combination() -> None:
     assert alike(chosen, range(6)) == [list(range(6))]
 
 
+@pytest.mark.thorough
 def test_draws_lie_in_their_range_and_can_be_repeated() -> None:
     arguments = options("sweep.ppo.learning_rate=log(1e-4,1e-2)", "sweep.ppo.gamma=[0.9,0.99]")
     sweep = pop_sweep(arguments)
@@ -220,6 +221,7 @@ def test_a_sweep_does_not_go_on_by_another_recipe(swept: Path, tmp_path: Path) -
         command.main([f"resume={path}"])
 
 
+@pytest.mark.thorough
 def test_a_killed_sweep_goes_on_and_ends_the_same(swept: Path, tmp_path: Path) -> None:
     path = tmp_path / "killed"
     path.mkdir()
