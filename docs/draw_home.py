@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 import jaxsafe
 from jaxsafe.simulation.geometry import safe_norm
@@ -38,7 +39,7 @@ NUM_STEPS = 900
 def approaches() -> list[np.ndarray]:
     """Return the paths of docked approaches, each of shape (steps, 3) in m."""
     env = jaxsafe.make("docking3d")
-    policy = jaxsafe.load_policy("docking3d", deterministic=True)
+    policy: Any = jaxsafe.load_policy("docking3d", deterministic=True)
     states, timesteps = jax.vmap(jaxsafe.reset, in_axes=(None, 0))(
         env, jax.random.split(jax.random.key(5), NUM_APPROACHES)
     )
@@ -87,9 +88,8 @@ def dash(rta: str) -> tuple[np.ndarray, np.ndarray]:
 
 def draw() -> Figure:
     """Return the picture."""
-    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
-    figure.get_layout_engine().set(wspace=0.08)
-    space = figure.add_subplot(1, 2, 1, projection="3d")
+    figure = Figure(figsize=(10.0, 4.2), layout=ConstrainedLayoutEngine(wspace=0.08))
+    space: Any = figure.add_subplot(1, 2, 1, projection="3d")
     for path in approaches():
         space.plot(*path.T, color=BLUE, linewidth=1.2)
         space.plot(*path[0], "o", color=BLUE, markersize=3)
