@@ -139,10 +139,8 @@ def test_sequences_are_replayed_as_they_were_flown(critic: MLP | None) -> None:
         np.testing.assert_allclose(value + target.T, batch.value_target, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("actor", "solves"),
-    [(GRU(hidden=(16,), units=16), True), pytest.param(MLP(), False, marks=pytest.mark.thorough)],
-)
+@pytest.mark.thorough
+@pytest.mark.parametrize(("actor", "solves"), [(GRU(hidden=(16,), units=16), True), (MLP(), False)])
 def test_only_a_memory_learns_what_was_seen_at_the_start(actor: Any, solves: bool) -> None:
     """Episodes of 5 steps cross the 12 steps of a batch, so memory must last between updates."""
     env, agent, updates = recall(steps=5), normalise(Agent(actor=actor)), 120

@@ -20,7 +20,7 @@ Policy of docking2d, most probable action
   action       2 numbers in [-1, 1]: thrust_x from -1 to 1 N; thrust_y from -1 to 1 N
   network      mlp, hidden (64, 64), activation tanh, layer_norm False
   features     approach
-  trained      preset features, seed 2, 500,736 steps"""
+  trained      preset engineered_features, seed 2, 500,736 steps"""
 
 
 def test_a_policy_prints_what_it_is_for() -> None:

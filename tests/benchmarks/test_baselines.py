@@ -64,6 +64,7 @@ def pages(out: str) -> str:
     return "\n".join(file.read_text() for file in files)
 
 
+@pytest.mark.thorough
 def test_a_report_trains_evaluates_and_writes_the_pages_once(calls: list[list[str]]) -> None:
     words = ["tasks=docking2d", "kinds=engineered_features", "policies=best", *REST]
     assert command.main(words) == 0

@@ -36,7 +36,7 @@ SHORT = [
     ("explicit_simplex", "docking3d", ("greedy",)),
     thorough("implicit_simplex", "docking2d", ("greedy",)),
     thorough("implicit_asif", "docking2d", ("greedy",)),
-    ("implicit_simplex", "rejoin2d", ("intercept",)),
+    thorough("implicit_simplex", "rejoin2d", ("intercept",)),
     slow("implicit_simplex", "docking2d_oriented", ("greedy",)),
     slow("implicit_simplex", "rejoin2d", ("search",)),
 ]

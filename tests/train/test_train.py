@@ -169,7 +169,7 @@ def _crash_at(
         thorough("_write_progress", 3, True),  # before any checkpoint
         ("_write_progress", 7, True),  # rows that the checkpoint does not know
         thorough("_evaluate", 2, True),
-        ("_save", 2, False),  # everything written but the checkpoint
+        thorough("_save", 2, False),  # everything written but the checkpoint
         thorough("_save", 4, True),  # trained, not yet evaluated
         thorough("_run_episodes", 6, True),  # in the middle of the last evaluation
     ],
