@@ -18,11 +18,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 import jaxsafe
-from jaxsafe.simulation.geometry import safe_norm
-
-BLUE = "#0072B2"  # colours of the Okabe-Ito palette
-ORANGE = "#D55E00"
-GREEN = "#009E73"
+from jaxsafe.plot.style import BLUE, GREEN, ORANGE
 
 NUM_APPROACHES = 12
 
@@ -32,58 +28,37 @@ FARTHEST = 120.0
 FASTEST = 1.0
 """Largest speed that is shown [m/s]. Without a filter the deputy passes the chief at 5 m/s."""
 
-NUM_STEPS = 900
-"""Number of steps that are flown. The approaches take fewer."""
-
 
 def approaches() -> list[np.ndarray]:
-    """Return the paths of docked approaches, each of shape (steps, 3) in m."""
+    """Return the paths of docked approaches, each of shape (steps + 1, 3) in m."""
     env = jaxsafe.make("docking3d")
-    policy: Any = jaxsafe.load_policy("docking3d", deterministic=True)
-    states, timesteps = jax.vmap(jaxsafe.reset, in_axes=(None, 0))(
-        env, jax.random.split(jax.random.key(5), NUM_APPROACHES)
-    )
+    policy = jaxsafe.load_policy("docking3d", deterministic=True)
+    keys = jax.random.split(jax.random.key(5), NUM_APPROACHES)
+    flights = [jaxsafe.fly(env, policy, start=env.reset(key)) for key in keys]
+    return [flight.platforms["deputy"].position for flight in flights]
 
-    def advance(carry: Any, _: None) -> Any:
-        states, observations = carry
-        actions = policy(jax.random.key(0), observations)
-        states, timesteps = jax.vmap(jaxsafe.step, in_axes=(None, 0, 0))(env, states, actions)
-        position = states.sim.platforms["deputy"].position
-        return (states, timesteps.observation), (position, timesteps.done)
 
-    start = (states, timesteps.observation)
-    _, (positions, done) = jax.jit(lambda: jax.lax.scan(advance, start, length=NUM_STEPS))()
-    first = np.asarray(states.sim.platforms["deputy"].position)
-    paths = []
-    for place in range(NUM_APPROACHES):
-        end = int(np.argmax(np.asarray(done)[:, place])) + 1
-        paths.append(np.vstack([first[place], np.asarray(positions)[:end, place]]))
-    return paths
+def towards(key: jax.Array, observation: jax.Array) -> jax.Array:
+    """Return full thrust towards the chief, which is where the observed position is 0."""
+    return -observation[:3] / jnp.max(jnp.abs(observation[:3]))
 
 
 def dash(rta: str) -> tuple[np.ndarray, np.ndarray]:
     """Return distance [m] and speed [m/s] of a deputy that always thrusts towards the chief.
 
-    They are cut where the episode ends, or where it passes the chief.
+    They are cut where it passes the chief.
 
     Args:
         rta: the filter, as `jaxsafe.make` takes it.
     """
     env = jaxsafe.make("docking3d", rta=rta)
-    state, _ = env.reset(jax.random.key(3))
-
-    def advance(state: Any, _: None) -> Any:
-        position = state.sim.platforms["deputy"].position
-        action = -position / jnp.max(jnp.abs(position))
-        state, timestep = jaxsafe.step(env, state, action)
-        deputy = state.sim.platforms["deputy"]
-        return state, (safe_norm(deputy.position), safe_norm(deputy.velocity), timestep.done)
-
-    _, (distance, speed, done) = jax.jit(lambda: jax.lax.scan(advance, state, length=NUM_STEPS))()
-    distance = np.asarray(distance)
-    passes = np.append(np.diff(distance) > 0.0, True)
-    end = int(np.argmax(np.asarray(done) | passes)) + 1
-    return distance[:end], np.asarray(speed)[:end]
+    flight = jaxsafe.fly(env, towards, start=env.reset(jax.random.key(3)))
+    deputy = flight.platforms["deputy"]
+    # Without the start, from which it first has to be turned round.
+    distance = np.linalg.norm(deputy.position[1:], axis=1)
+    speed = np.linalg.norm(deputy.velocity[1:], axis=1)
+    end = int(np.argmax(np.append(np.diff(distance) > 0.0, True))) + 1
+    return distance[:end], speed[:end]
 
 
 def draw() -> Figure:
