@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import sys
 
 COMMANDS = {
@@ -29,9 +28,10 @@ def main() -> None:
         name, *words = *words, HELP[0]
     if name in (*HELP, "--version"):
         from jaxsafe.commands.streams import lasting_streams
+        from jaxsafe.storage.provenance import version
 
         with lasting_streams():
-            print(_list() if name in HELP else f"jaxsafe {importlib.metadata.version('jaxsafe')}")
+            print(_list() if name in HELP else f"jaxsafe {version()}")
         return
     if name not in COMMANDS:
         from jaxsafe.schema.errors import nearest, show

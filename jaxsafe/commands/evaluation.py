@@ -10,13 +10,12 @@ import jax
 import numpy as np
 
 from jaxsafe.commands.policies import Subject
-from jaxsafe.environment import Environment, require_success
+from jaxsafe.environment import Environment, filter_name, require_success
 from jaxsafe.evaluate.evaluator import Evaluator, episode_rows, given_up
 from jaxsafe.metrics import Episode
 from jaxsafe.storage.files import append_rows, write_json
 from jaxsafe.storage.provenance import versions
 from jaxsafe.train.host import run_directory
-from jaxsafe.train.host.log import filter_name
 from jaxsafe.train.host.results import diverged_seeds, evaluation
 
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from matplotlib.figure import Figure
 
-from jaxsafe.environment import Environment
+from jaxsafe.environment import Environment, filter_name
 from jaxsafe.plot.curves import AXES, evaluation_rows, training_curves
 from jaxsafe.plot.figures import Episodes, Rows, speed_distance, trajectories
 from jaxsafe.plot.interventions import interventions, most_altered
@@ -31,7 +31,7 @@ from jaxsafe.storage.forms import (
     numbers,
 )
 from jaxsafe.train.host import run_directory
-from jaxsafe.train.host.log import filter_name, headline, read_progress
+from jaxsafe.train.host.log import headline, read_progress
 
 
 class Figures(dict[str, Figure]):

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from jaxsafe.environment import Environment
-from jaxsafe.environment import filter_name as filter_name
 from jaxsafe.metrics import measures
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import append_csv, append_rows, read_rows, write_csv, write_rows

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxsafe.agents.policy_file import save_policy
-from jaxsafe.environment import Environment
+from jaxsafe.environment import Environment, filter_name
 from jaxsafe.evaluate.evaluator import KINDS, given_up, metrics_per_seed
 from jaxsafe.metrics import ENOUGH_SEEDS, Episode, interaction_efficiency, over_seeds, with_interval
 from jaxsafe.storage.files import read_json, write_json
@@ -25,7 +25,7 @@ from jaxsafe.storage.forms import (
 )
 from jaxsafe.storage.provenance import versions
 from jaxsafe.storage.text_table import columns
-from jaxsafe.train.host.log import filter_name, headline
+from jaxsafe.train.host.log import headline
 from jaxsafe.train.host.options import TrainConfig
 from jaxsafe.train.host.session import Training
 
