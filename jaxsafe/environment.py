@@ -373,22 +373,14 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
     num_steps = state.num_steps + 1
     sim = _empty_sim(env).replace(time=num_steps.astype(env.dt.dtype) * env.dt, platforms=platforms)
     intervening = jnp.zeros((), bool) if rta_info is None else rta_memory.intervening
-    sim = sim.replace(intervening=intervening)
+    sim = sim.replace(intervening=intervening, control_desired=desired, control_actual=actual)
 
     sim, status_memory = update_statuses(env, sim, state.memory.status)
     sim = _update_ended(env, sim)
     sim, reward_memory, terms, totals = _rewards(env, sim, state)
     observation, observation_memory = _observations(env, sim, state.memory.observation)
 
-    info = _info(
-        env,
-        sim,
-        terms=terms,
-        totals=totals,
-        desired=desired,
-        actual=actual,
-        rta_info=rta_info,
-    )
+    info = _info(env, sim, terms=terms, totals=totals, rta_info=rta_info)
     timestep = _time_step(
         env, sim, observation=observation, reward=jnp.asarray(sum(terms.values())), info=info
     )
@@ -472,7 +464,8 @@ def extremes(env: Environment) -> tuple[Environment, Environment]:
 
 
 def _empty_sim(env: Environment) -> Sim:
-    """Return a simulation at time 0 without platforms, in which nothing has ended."""
+    """Return a simulation at time 0 without platforms and controls, in which nothing has ended."""
+    no_control = jnp.zeros(env.action_size, env.dt.dtype)
     return Sim(
         time=jnp.zeros_like(env.dt),
         platforms={},
@@ -480,6 +473,8 @@ def _empty_sim(env: Environment) -> Sim:
         status={},
         ended={name: jnp.zeros((), bool) for name in env.outcomes[1:]},
         intervening=jnp.zeros((), bool),
+        control_desired=no_control,
+        control_actual=no_control,
     )
 
 
@@ -499,16 +494,7 @@ def _begin(env: Environment, sim: Sim, parameters: Parameters) -> tuple[State, T
     if env.rta is not None:
         with part("rta"):
             rta_memory, rta_info = env.rta.begin(env, sim)
-    no_control = jnp.zeros(env.action_size, observation.dtype)
-    info = _info(
-        env,
-        ended,
-        terms=terms,
-        totals=terms,
-        desired=no_control,
-        actual=no_control,
-        rta_info=rta_info,
-    )
+    info = _info(env, ended, terms=terms, totals=terms, rta_info=rta_info)
     memory = Memory(
         status=status_memory,
         reward=reward_memory,
@@ -663,8 +649,6 @@ def _info(
     *,
     terms: dict,
     totals: dict,
-    desired: Array,
-    actual: Array,
     rta_info: RTAInfo | None,
 ) -> Info:
     outcome = jnp.zeros((), jnp.int32)
@@ -685,8 +669,8 @@ def _info(
         status=sim.status,
         reward_terms=terms,
         reward_totals=totals,
-        control_desired=desired,
-        control_actual=actual,
+        control_desired=sim.control_desired,
+        control_actual=sim.control_actual,
         intervening=sim.intervening,
         margins=margins,
         severity=severity,

@@ -30,7 +30,8 @@ def advance(
 ) -> Sim:
     """Return the simulation one step later. All platforms move at once.
 
-    Regions and statuses are left out.
+    Regions and statuses are left out. The control is that of the step, both as desired and as
+    actual.
 
     Args:
         env: the environment.
@@ -44,13 +45,15 @@ def advance(
         platforms[env.agent] = plant.step(
             sim.platforms[env.agent], commanded(env, plant, sim, control), env.dt
         )
-    return later_sim(env, sim, platforms)
+    later_world = later_sim(env, sim, platforms)
+    return later_world.replace(control_desired=control, control_actual=control)
 
 
 def later_sim(env: Environment, sim: Sim, platforms: Others) -> Sim:
     """Return the simulation one step later, given its platforms then.
 
-    A time close to a whole number of steps is rounded to it. Regions and statuses are left out.
+    A time close to a whole number of steps is rounded to it. Regions and statuses are left out, and
+    the controls are those of `sim`.
     """
     time = sim.time + env.dt
     whole = jnp.round(time / env.dt) * env.dt

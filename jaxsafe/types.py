@@ -175,6 +175,11 @@ class RegionState(Record):
     inside: Mapping[str, Bool[Array, ""]]  # by platform name
 
 
+def _no_control() -> Float[Array, " 0"]:
+    """Return the controls of a simulation without actuators, such as one made by hand."""
+    return jnp.zeros(0, jnp.result_type(float))
+
+
 class Sim(Record):
     """The simulated world at one instant, as processors and controllers see it."""
 
@@ -186,6 +191,11 @@ class Sim(Record):
     ended: Mapping[str, Bool[Array, ""]]
     # Whether run time assurance changed the control of the step that led here.
     intervening: Bool[Array, ""]
+    # The controls of the step that led here, in physical units and the order of `env.action_names`,
+    # 0 at reset: what the agent asked for, and what the plant received after run time assurance. In
+    # the predictions of a filter both are the control of the predicted step.
+    control_desired: Float[Array, " actuators"] = dataclasses.field(default_factory=_no_control)
+    control_actual: Float[Array, " actuators"] = dataclasses.field(default_factory=_no_control)
 
 
 class Memory(Record):

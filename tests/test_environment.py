@@ -13,8 +13,10 @@ from jaxtyping import Array, Float
 import jaxsafe
 from jaxsafe import ConfigError, Environment
 from jaxsafe.environment import require_success
+from jaxsafe.processors.reward import Reward
 from jaxsafe.processors.status import Status
 from jaxsafe.processors.terminal import TooFar
+from jaxsafe.transition import advance
 from jaxsafe.types import Sim, State, StatusName, TimeStep
 
 START = {"deputy": {"position": [100.0, 50.0], "velocity": [0.1, -0.2]}}
@@ -59,6 +61,8 @@ def test_a_start_has_no_reward_no_cost_and_no_end(env: Environment) -> None:
         assert state.sim.time == 0.0
         assert all(value == 0.0 for value in timestep.info.reward_terms.values())
         assert all(value == 0.0 for value in timestep.info.reward_totals.values())
+        assert state.sim.control_desired.tolist() == [0.0, 0.0]
+        assert state.sim.control_actual.tolist() == [0.0, 0.0]
         assert not timestep.info.control_actual.any()
     assert timestep.info.margins["velocity_limit"] < 0.0
 
@@ -194,10 +198,35 @@ def test_control_is_reported_in_physical_units_and_no_assurance_intervenes(
     env: Environment,
 ) -> None:
     state, _ = reset(env, jax.random.key(0))
-    _, timestep = step(env, state, jnp.asarray([0.25, -7.0]))
+    state, timestep = step(env, state, jnp.asarray([0.25, -7.0]))
     np.testing.assert_array_equal(timestep.info.control_desired, [0.25, -1.0])
     np.testing.assert_array_equal(timestep.info.control_actual, timestep.info.control_desired)
     assert not timestep.info.intervening
+    for name in ("control_desired", "control_actual"):
+        np.testing.assert_array_equal(getattr(state.sim, name), getattr(timestep.info, name))
+
+
+class LastControl(Reward):
+    """The first element of the control that acted minus that of the desired one."""
+
+    def process(self, memory: Any, sim: Sim) -> Array:
+        return sim.control_actual[0] - sim.control_desired[0]
+
+
+def test_rewards_see_the_desired_and_the_actual_control_of_their_step() -> None:
+    env = jaxsafe.make("docking2d", rta="default")
+    env = jaxsafe.override(env, {"reward": [*env.reward, LastControl(name="correction")]})
+    fast = {"deputy": {"position": [100.0, 0.0], "velocity": [-0.405, 0.0]}}
+    _, timestep = step(env, jaxsafe.reset_to(env, fast)[0], jnp.asarray([-1.0, 0.0]))
+    corrected = timestep.info.control_actual[0] - timestep.info.control_desired[0]
+    assert corrected > 0.1
+    assert timestep.info.reward_terms["correction"] == corrected
+
+
+def test_a_predicted_step_carries_its_control(env: Environment) -> None:
+    sim = jaxsafe.reset_to(env, START)[0].sim
+    later = advance(env, sim, jnp.asarray([0.5, -1.0]))
+    assert later.control_actual.tolist() == later.control_desired.tolist() == [0.5, -1.0]
 
 
 def test_time_counts_steps(env: Environment) -> None:

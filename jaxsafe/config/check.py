@@ -278,9 +278,18 @@ def _check_kinds(env: Environment) -> None:
 
     def statuses(env: Environment) -> Mapping[str, Any]:
         platforms = {platform.name: platform.rest() for platform in env.platforms}
-        return judge(
-            env, Sim(jnp.zeros_like(env.dt), platforms, {}, {}, {}, jnp.zeros((), bool))
-        ).status
+        no_control = jnp.zeros(env.action_size, env.dt.dtype)
+        sim = Sim(
+            time=jnp.zeros_like(env.dt),
+            platforms=platforms,
+            regions={},
+            status={},
+            ended={},
+            intervening=jnp.zeros((), bool),
+            control_desired=no_control,
+            control_actual=no_control,
+        )
+        return judge(env, sim).status
 
     try:
         found = jax.eval_shape(statuses, env)

@@ -380,7 +380,9 @@ class CertifiedRTA(RTA):
                 agent_states[i] = move(
                     agent_states[i], commanded(env, plant, before, control), env.dt
                 )
-                lowest = self.lowest(env, before, with_agent(after, agent_states[i]))
+                moved = with_agent(after, agent_states[i])
+                moved = moved.replace(control_desired=control, control_actual=control)
+                lowest = self.lowest(env, before, moved)
                 least[i] = jnp.minimum(least[i], lowest)
             return with_agent(after, agent_states[0]), agent_states, least
 
