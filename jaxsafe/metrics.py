@@ -26,6 +26,7 @@ METRICS = (
     "success_rate",
     "control_usage",
     "control_usage_l1",
+    "control_effort",
     "safety_violation_rate",
     "episode_safety_violation_rate",
     "episode_cost",
@@ -80,10 +81,18 @@ class Episode(Record):
     severity_max: Float[Array, ""]
     interventions: Int[Array, ""]  # steps on which run time assurance changed the control
     reward_totals: Mapping[str, Float[Array, ""]]  # Σ of each reward term
+    # Σ |u| of each control that acted, in the order of the action; () where it is not summed.
+    controls: tuple[Float[Array, ""], ...] = ()
 
 
-def begin(timestep: TimeStep) -> Episode:
-    """Return the sums at the start of an episode: all zero, in the shapes of `timestep`."""
+def begin(timestep: TimeStep, sum_controls: bool = False) -> Episode:
+    """Return the sums at the start of an episode: all zero, in the shapes of `timestep`.
+
+    Args:
+        timestep: the first time step.
+        sum_controls: whether to sum up the controls too, from which `control_effort` comes.
+    """
+    num_controls = timestep.info.control_actual.shape[-1] if sum_controls else 0
     zero = jnp.zeros_like(timestep.reward)
     count = jnp.zeros(timestep.reward.shape, jnp.int32)
     return Episode(
@@ -97,6 +106,7 @@ def begin(timestep: TimeStep) -> Episode:
         severity_max=zero,
         interventions=count,
         reward_totals=jax.tree.map(jnp.zeros_like, timestep.info.reward_totals),
+        controls=(zero,) * num_controls,
     )
 
 
@@ -116,6 +126,9 @@ def accumulate(episode: Episode, timestep: TimeStep) -> Episode:
         severity_max=jnp.maximum(episode.severity_max, severity),
         interventions=episode.interventions + info.intervening.astype(jnp.int32),
         reward_totals=info.reward_totals,
+        controls=tuple(
+            total + jnp.abs(info.control_actual[..., i]) for i, total in enumerate(episode.controls)
+        ),
     )
 
 
@@ -130,6 +143,14 @@ def measures(env: Environment) -> dict[str, bool]:
     }
 
 
+def full_controls(env: Environment) -> tuple[float, ...]:
+    """Return the largest magnitude of each control, in the order of the action.
+
+    It is `()` if the agent's controller lists no actuators.
+    """
+    return tuple(max(abs(float(one.low)), abs(float(one.high))) for one in env.actuators)
+
+
 def summarise(
     episodes: Episode,
     success: int,
@@ -137,6 +158,7 @@ def summarise(
     has_rta: bool = False,
     has_delta_v_l1: bool | None = None,
     has_constraints: bool = True,
+    full_controls: Sequence[float] = (),
 ) -> dict[str, float | None]:
     """Return the metrics over a set of finished episodes.
 
@@ -153,17 +175,23 @@ def summarise(
             it if it has `delta_v`.
         has_constraints: whether the environment has safety constraints, whose violations are
             counted.
+        full_controls: the largest magnitude of each control. Empty means that it is not known.
 
     Returns:
         A value for every name of `METRICS`. Rates are fractions in [0, 1], Δv is in m/s, length in
-        steps. Severity is a share of the limit; its mean is over violating steps, and 0 if there
-        are none. A value that is not finite is None too.
+        steps. `control_effort` is the mean |u| of the controls that acted, each as a share of its
+        full magnitude, over controls and steps. Severity is a share of the limit; its mean is over
+        violating steps, and 0 if there are none. A value that is not finite is None too.
     """
     mean = {
         name: float(np.mean(value))
         for name, value in vars(episodes).items()
-        if name != "reward_totals"
+        if name not in ("reward_totals", "controls")
     }
+    effort = [
+        float(np.mean(total)) / (full or 1.0)
+        for total, full in zip(episodes.controls, full_controls, strict=False)
+    ]
     violating = mean["violating_steps"]
     steps = mean["length"]
     values = {
@@ -172,6 +200,7 @@ def summarise(
         "success_rate": float(np.mean(np.asarray(episodes.outcome) == success)),
         "control_usage": mean["delta_v"],
         "control_usage_l1": mean["delta_v_l1"],
+        "control_effort": sum(effort) / max(len(effort), 1) / max(steps, MIN_STEPS),
         "safety_violation_rate": float(np.mean(np.asarray(episodes.violating_steps) > 0)),
         "episode_safety_violation_rate": violating / max(steps, MIN_STEPS),
         "episode_cost": violating,
@@ -184,6 +213,7 @@ def summarise(
         "success_rate": success >= 0,
         "control_usage": has_delta_v,
         "control_usage_l1": has_delta_v if has_delta_v_l1 is None else has_delta_v_l1,
+        "control_effort": bool(effort),
         "intervention_rate": has_rta,
         **dict.fromkeys(SAFETY_METRICS, has_constraints),
     }

@@ -19,6 +19,7 @@ from jaxsafe.metrics import (
     accumulate,
     begin,
     bootstrap_interval,
+    full_controls,
     interaction_efficiency,
     measures,
     over_seeds,
@@ -99,7 +100,7 @@ def test_steps_add_up(episodes: Episode) -> None:
         "severity_max": [0.0, 2.0, 0.1],
         "interventions": [0, 1, 1],
     }
-    assert set(vars(episodes)) == {*expected, "reward_totals"}
+    assert set(vars(episodes)) == {*expected, "reward_totals", "controls"}
     for name, values in expected.items():
         np.testing.assert_allclose(getattr(episodes, name), values, rtol=1e-6, err_msg=name)
     np.testing.assert_allclose(episodes.reward_totals["term"], [30.0, 20.0, -20.0])
@@ -130,6 +131,7 @@ def test_sums_work_on_batches_and_without_delta_v() -> None:
 def test_the_metrics_of_three_episodes_are_those_worked_out_by_hand(episodes: Episode) -> None:
     computed = summarise(episodes, SUCCESS, has_rta=True)
     assert tuple(computed) == METRICS
+    assert computed.pop("control_effort") is None  # of controls that were not summed
     assert computed == pytest.approx(
         {
             "average_return": 3.0 / 3,
@@ -196,6 +198,29 @@ def test_an_environment_says_what_it_measures() -> None:
         "has_rta": False,
     }
     assert not measures(jaxsafe.make("rejoin2d"))["has_delta_v"]
+
+
+def test_control_effort_is_the_mean_share_of_full_control_over_controls_and_steps() -> None:
+    controls = [[0.5, -40.0], [-1.0, 0.0], [0.0, 20.0]]
+    timesteps = [time_step(0.0) for _ in controls]
+    timesteps = [
+        timestep.replace(info=timestep.info.replace(control_actual=jnp.asarray(control)))
+        for timestep, control in zip(timesteps, controls, strict=True)
+    ]
+    episode = begin(timesteps[0], sum_controls=True)
+    for timestep in timesteps:
+        episode = accumulate(episode, timestep)
+    np.testing.assert_allclose(episode.controls, [1.5, 60.0])
+    episodes = jax.tree.map(lambda leaf: leaf[None], episode)
+    computed = summarise(episodes, SUCCESS, full_controls=(1.0, 80.0))["control_effort"]
+    assert computed == pytest.approx((1.5 / 1.0 + 60.0 / 80.0) / 2 / 3)
+    assert summarise(episodes, SUCCESS)["control_effort"] is None
+
+
+def test_full_controls_are_the_larger_limits_in_either_direction() -> None:
+    limits = {"wingman.controller.actuators.acceleration.low": -200.0}
+    env = jaxsafe.make("rejoin2d", limits)
+    assert full_controls(env) == pytest.approx((0.17, 200.0))
 
 
 def test_a_figure_that_is_not_finite_is_none(episodes: Episode) -> None:

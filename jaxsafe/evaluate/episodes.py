@@ -51,7 +51,7 @@ def run_episodes(
     """
     key_start, key_act = jax.random.split(key)
     state, timestep = reset_batch(env, key_start, num_episodes)
-    episode = begin(timestep)
+    episode = begin(timestep, sum_controls=True)
     limit = max_steps(env)
 
     def going(carry: Carry) -> Array:

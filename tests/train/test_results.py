@@ -6,7 +6,7 @@ import pytest
 
 from jaxsafe.train.host.comparison import csv_rows, latex
 from jaxsafe.train.host.log import headline
-from jaxsafe.train.host.results import table
+from jaxsafe.train.host.results import check_results, table
 
 
 @pytest.fixture
@@ -45,6 +45,14 @@ def test_an_evaluation_tells_the_violating_steps_of_its_episodes(results: dict) 
 def test_a_task_without_constraints_has_no_violations_to_tell(results: dict) -> None:
     set_violations(results, stochastic=None, training=0.0)
     assert "violating steps with" not in table(results, Path("x"))
+
+
+def test_control_effort_is_told_and_results_of_earlier_versions_lack_it(results: dict) -> None:
+    assert "control, share of full control" in table(results, Path("x"))
+    for metrics in results["evaluation"].values():
+        assert 0.0 < metrics.pop("control_effort")["mean"] < 1.0
+    check_results(results, "results.json", training=True)
+    assert "control, share of full control" not in table(results, Path("x"))
 
 
 def test_a_headline_of_several_runs_tells_what_they_share(results: dict) -> None:

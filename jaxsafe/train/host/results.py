@@ -35,6 +35,7 @@ _ROWS = (
     ("episode_length", "episode length [steps]", ""),
     ("control_usage", "control usage Δv [m/s]", ""),
     ("control_usage_l1", "control usage Δv, L1 [m/s]", ""),
+    ("control_effort", "control, share of full control", "%"),
     ("safety_violation_rate", "episodes with a violation", "%"),
     ("episode_safety_violation_rate", "violating steps", "%"),
     ("episode_cost", "violating steps per episode", ""),
@@ -58,6 +59,9 @@ _METRICS = {
     ),
 }
 """The form of the values of each metric. Every evaluation has these metrics."""
+
+_NEW = ("control_effort",)
+"""Metrics that the results of earlier versions lack."""
 
 
 def finish(training: Training) -> dict[str, Any]:
@@ -155,7 +159,7 @@ def table(results: dict[str, Any], path: Path) -> str:
     sound = results["seeds"] - len(results.get("diverged", ()))
     rows = [["mean [95 % interval] over seeds" if sound >= ENOUGH_SEEDS else "", *found]]
     for name, label, unit in _ROWS:
-        if all(one[name]["mean"] is not None for one in found.values()):
+        if all(one.get(name, {}).get("mean") is not None for one in found.values()):
             rows.append([label, *(_cell(one[name], unit) for one in found.values())])
     rows.append(
         [
@@ -216,6 +220,8 @@ def check_results(results: Any, place: str, training: bool) -> None:
     seeds = results["seeds"]
     for kind, metrics in results["evaluation"].items():
         for name, values in _METRICS.items():
+            if name in _NEW and name not in metrics:
+                continue
             check(metrics.get(name), _metric(seeds, values), f"{place}: evaluation.{kind}.{name}")
     if training:
         form = {
