@@ -11,8 +11,22 @@ from jaxsafe.simulation.controllers import (
     Discrete,
     Uncontrolled,
 )
-from jaxsafe.simulation.cwh import Anchor, Spacecraft, SpacecraftState, cwh_acceleration, cwh_flow
+from jaxsafe.simulation.cwh import (
+    Anchor,
+    Spacecraft,
+    SpacecraftState,
+    ThrustedSpacecraft,
+    cwh_acceleration,
+    cwh_flow,
+)
+from jaxsafe.simulation.double_integrator import DoubleIntegrator
 from jaxsafe.simulation.dubins import Dubins2D, Dubins2DState, Dubins3D, Dubins3DState
+from jaxsafe.simulation.dubins_lag import (
+    LaggedDubins2D,
+    LaggedDubins2DState,
+    LaggedDubins3D,
+    LaggedDubins3DState,
+)
 from jaxsafe.simulation.geometry import (
     Aspect,
     Circle,
@@ -37,7 +51,11 @@ from jaxsafe.simulation.initializers import (
 )
 from jaxsafe.simulation.oriented import OrientedSpacecraft, OrientedState
 from jaxsafe.simulation.platform import Platform
+from jaxsafe.simulation.point_mass import PointMassAircraft
+from jaxsafe.simulation.reaction_wheel import ReactionWheelSpacecraft, ReactionWheelState
 from jaxsafe.simulation.scripted import Command, Constant, Schedule, Scripted, Sinusoid
+from jaxsafe.simulation.two_body import TwoBody, TwoBodyState
+from jaxsafe.simulation.two_body_j2 import TwoBodyJ2, TwoBodyJ2State
 
 __all__ = [
     "Actuator",
@@ -56,16 +74,24 @@ __all__ = [
     "Direction",
     "Discrete",
     "Displacement",
+    "DoubleIntegrator",
     "Dubins2D",
     "Dubins2DState",
     "Dubins3D",
     "Dubins3DState",
     "Fixed",
     "Initializer",
+    "LaggedDubins2D",
+    "LaggedDubins2DState",
+    "LaggedDubins3D",
+    "LaggedDubins3DState",
     "Offset",
     "OrientedSpacecraft",
     "OrientedState",
     "Platform",
+    "PointMassAircraft",
+    "ReactionWheelSpacecraft",
+    "ReactionWheelState",
     "Region",
     "Schedule",
     "Scripted",
@@ -73,6 +99,11 @@ __all__ = [
     "Spacecraft",
     "SpacecraftState",
     "Sphere",
+    "ThrustedSpacecraft",
+    "TwoBody",
+    "TwoBodyJ2",
+    "TwoBodyJ2State",
+    "TwoBodyState",
     "Uncontrolled",
     "Uniform",
     "cwh_acceleration",

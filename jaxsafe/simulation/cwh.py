@@ -66,18 +66,30 @@ class Anchor(Platform, type="anchor"):
         return SpacecraftState(position=zeros, velocity=zeros, delta_v=zeros)
 
 
-class Spacecraft(Anchor, type="spacecraft"):
-    """A point mass with one thruster pair per axis.
+class ThrustedSpacecraft(Anchor):
+    """Base of point masses with one thruster pair per axis.
 
-    Its controls are `thrust_x`, `thrust_y` and, in space, `thrust_z` [N].
+    Their controls are `thrust_x`, `thrust_y` and `thrust_z` [N], one for each axis of space.
     """
 
     mass: Kilograms = MASS
-    mean_motion: MeanMotion = MEAN_MOTION
 
     @property
     def inputs(self) -> tuple[str, ...]:
         return tuple(f"thrust_{axis}" for axis in "xyz"[: self.dimension])
+
+    def _thrust_acceleration(self, controls: Controls) -> Float[Array, " d"]:
+        return jnp.stack([controls.get(name, 0.0) for name in self.inputs]) / self.mass
+
+
+class Spacecraft(ThrustedSpacecraft, type="spacecraft"):
+    """A point mass with one thruster pair per axis, near a chief on a circular orbit.
+
+    Its controls are `thrust_x`, `thrust_y` and, in space, `thrust_z` [N].
+    """
+
+    dimension: Annotated[int, Range(2, 3)]
+    mean_motion: MeanMotion = MEAN_MOTION
 
     def step(self, state: SpacecraftState, controls: Controls, dt: Seconds) -> SpacecraftState:
         """Return the state after `dt` seconds: the exact solution for constant thrust."""
@@ -97,9 +109,6 @@ class Spacecraft(Anchor, type="spacecraft"):
             velocity=acceleration,
             delta_v=jnp.zeros_like(acceleration),
         )
-
-    def _thrust_acceleration(self, controls: Controls) -> Float[Array, " d"]:
-        return jnp.stack([controls.get(name, 0.0) for name in self.inputs]) / self.mass
 
 
 def cwh_acceleration(

@@ -1,14 +1,15 @@
 """Building blocks of exact integration.
 
-They are ratios of sines without cancellation, ramps that stop at a limit, and Gauss-Legendre nodes.
+They are ratios of sines without cancellation, ramps that stop at a limit, first-order lags, and
+Gauss-Legendre nodes. Where no exact solution is known, there are Runge-Kutta steps.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,8 @@ from jaxtyping import Array, Float
 
 from jaxsafe.simulation.trig import sin_cos
 from jaxsafe.types import Number
+
+T = TypeVar("T")
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 NODES = ((_NODES + 1.0) / 2.0).tolist()
@@ -62,6 +65,119 @@ def time_to_limit(x: Number, rate: Number, limits: Float[Array, " 2"], dt: Numbe
     crossing = jnp.abs(rate) * dt > jnp.abs(to_go)
     time = jnp.where(crossing, to_go / jnp.where(crossing, rate, 1.0), dt)
     return jax.lax.stop_gradient(jnp.clip(time, 0.0, dt))
+
+
+def lagged(x: Number, target: Number, time_constant: Number, t: Number) -> Any:
+    """Return what follows a target with a first-order lag, τẋ = target − x, after a time t.
+
+    Args:
+        x: its value at time 0.
+        target: the constant target.
+        time_constant: τ [s].
+        t: time [s].
+    """
+    return target + (x - target) * jnp.exp(-t / time_constant)
+
+
+def lagged_integral(x: Number, target: Number, time_constant: Number, t: Number) -> Any:
+    """Return the integral of `lagged` from 0 to t."""
+    return target * t - (x - target) * time_constant * jnp.expm1(-t / time_constant)
+
+
+def lag_within_rate(
+    x: Number, target: Number, time_constant: Number | None, rate_limit: Number | None, dt: Number
+) -> tuple[Any, Any]:
+    """Return mean and end of a step in which a value follows a target, ẋ = clip((u − x)/τ, ±R).
+
+    The solution is exact: a ramp as long as the rate R limits it, and an exponential afterwards.
+    Without a time constant τ the ramp leads to the target, where the value then rests.
+
+    Args:
+        x: the value at the beginning.
+        target: the constant target u.
+        time_constant: τ [s], or None.
+        rate_limit: R per second, or None.
+        dt: length of the step [s].
+    """
+    total = jnp.zeros_like(dt)
+    left = dt
+    if rate_limit is not None:
+        gap = target - x
+        followed = 0.0 if time_constant is None else rate_limit * time_constant
+        ramped = jnp.clip(jnp.abs(gap) - followed, 0.0, rate_limit * dt)
+        time = ramped / rate_limit
+        total = time * (x + 0.5 * jnp.sign(gap) * ramped)
+        x = jnp.where(ramped >= jnp.abs(gap), target, x + jnp.sign(gap) * ramped)
+        left = dt - time
+    if time_constant is None:
+        return (total + left * x) / dt, x
+    total = total + lagged_integral(x, target, time_constant, left)
+    return total / dt, lagged(x, target, time_constant, left)
+
+
+def lagged_ramp(
+    x: Number,
+    rate: Number,
+    target: Number,
+    time_constant: Number,
+    limits: Float[Array, " 2"],
+    t: Number,
+) -> Any:
+    """Return a state whose rate follows a target with a first-order lag, and which has limits.
+
+    At a limit the state rests until its rate turns inwards. The rate changes its sign once at
+    most. So what the state would exceed a limit by is known, and the solution is exact.
+
+    Args:
+        x: the state at time 0, within the limits.
+        rate: its rate of change at time 0.
+        target: the constant rate that the rate follows.
+        time_constant: time constant of the lag [s].
+        limits: lowest and highest state.
+        t: time [s].
+    """
+    turns = rate * target < 0.0
+    quotient = jnp.where(turns, -rate / jnp.where(turns, target, 1.0), 0.0)
+    turning_time = jax.lax.stop_gradient(time_constant * jnp.log1p(quotient))
+    extreme_time = jnp.where(turns, jnp.minimum(t, turning_time), t)
+    extreme = x + lagged_integral(rate, target, time_constant, extreme_time)
+    excess = extreme - jnp.clip(extreme, limits[0], limits[1])
+    free = x + lagged_integral(rate, target, time_constant, t)
+    return jnp.clip(free - excess, limits[0], limits[1])
+
+
+def runge_kutta(
+    derivative: Callable[[T], T],
+    state: T,
+    dt: Number,
+    substeps: int,
+    limit: Callable[[T], T] = lambda state: state,
+) -> T:
+    """Return the state after `dt` seconds by Runge-Kutta steps of order 4, all of one length.
+
+    Args:
+        derivative: returns the time derivative of a state, as a tree of the same structure.
+        state: the state at time 0, a tree of numbers.
+        dt: length of the step [s].
+        substeps: the number of Runge-Kutta steps.
+        limit: brings a state back into its limits. It is applied after each of these steps.
+    """
+    h = dt / substeps
+
+    def moved(state: T, rates: T, time: Number) -> T:
+        return jax.tree.map(lambda x, rate: x + time * rate, state, rates)
+
+    def one_step(state: T) -> T:
+        k1 = derivative(state)
+        k2 = derivative(moved(state, k1, 0.5 * h))
+        k3 = derivative(moved(state, k2, 0.5 * h))
+        k4 = derivative(moved(state, k3, h))
+        mean = jax.tree.map(lambda a, b, c, d: (a + 2.0 * (b + c) + d) / 6.0, k1, k2, k3, k4)
+        return limit(moved(state, mean, h))
+
+    if substeps == 1:
+        return one_step(state)
+    return jax.lax.scan(lambda state, _: (one_step(state), None), state, length=substeps)[0]
 
 
 def pieces(stops: Sequence[Any], dt: Number) -> tuple[Float[Array, " s"], Float[Array, " s"]]:

@@ -26,7 +26,7 @@ class Platform(Component):
     """A vehicle: initializers for its start, a controller, and the map over one time step."""
 
     name: str
-    dimension: Annotated[int, Range(2, 3)]
+    dimension: Annotated[int, Range(1, 3)]
     start: tuple[Initializer, ...] = ()
     controller: Controller = Uncontrolled()
 
@@ -47,7 +47,12 @@ class Platform(Component):
     def quantities(self) -> tuple[str, ...]:
         """Return the names of what can be observed: fields of the state and its properties."""
         state = self.rest()
-        derived = [name for name, value in vars(type(state)).items() if isinstance(value, property)]
+        derived = [
+            name
+            for kind in reversed(type(state).__mro__)
+            for name, value in vars(kind).items()
+            if isinstance(value, property)
+        ]
         return tuple(name for name in (*vars(state), *derived) if name not in ("orientation",))
 
     def settle(self, state: Any) -> Any:

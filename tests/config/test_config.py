@@ -726,7 +726,7 @@ def test_every_number_replaced_by_a_word_a_truth_value_or_nan_is_refused(
         (
             "platforms.0.type",
             3,
-            r"platforms\.chief: unknown type 3; choose from anchor, .*, spacecraft$",
+            r"platforms\.chief: unknown type 3; choose from anchor, .*, two_body_j2$",
         ),
         ("platforms.0.type", ["anchor"], r"platforms\.chief: unknown type \['anchor'\]"),
         ("platforms.0.name", 3, r"platforms\.\[0\]\.name: expected a name, found 3"),
