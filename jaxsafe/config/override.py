@@ -11,9 +11,8 @@ from typing import Any
 from jaxsafe.config.check import check
 from jaxsafe.config.tied import warn_of_ties
 from jaxsafe.environment import Environment
-from jaxsafe.schema.convert import to_value
-from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError, show
+from jaxsafe.schema.retype import set_paths
 
 
 def override(env: Environment, changes: Mapping[str, Any], place: str = "") -> Environment:
@@ -27,19 +26,20 @@ def override(env: Environment, changes: Mapping[str, Any], place: str = "") -> E
         env: the environment.
         changes: new values by path. A path consists of field names and of the names of parts in a
             list. It may begin with the name of a platform. Where a list of parts stands, a list of
-            names keeps those parts in that order: `{"observation": ["position", "velocity"]}`.
+            names keeps those parts in that order: `{"observation": ["position", "velocity"]}`. A
+            path that ends in `type` replaces a part by one of another type, which keeps the fields
+            that both have: `{"deputy.type": "two_body", "deputy.eccentricity": 0.1}`.
         place: what stands before the paths in messages of errors, such as `env` on a command line.
 
     Raises:
         ConfigError: a path leads nowhere, or a value has the wrong type, shape or range.
     """
-    changed = env
-    for path, value in changes.items():
+    for path in changes:
         if not isinstance(path, str):
             raise ConfigError(
                 f"override: expected dotted paths such as 'deputy.mass', found {show(path)}"
             )
-        changed = set_path(changed, path, value, to_value, place)
+    changed = set_paths(env, changes, place)
     checked = check(changed, before=env)
     warn_of_ties(env, checked)
     return checked

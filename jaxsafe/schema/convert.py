@@ -61,7 +61,7 @@ def to_component(data: Any, base: type[Kind], place: str) -> Kind:
         data = {"type": data}
     if not isinstance(data, Mapping):
         raise _no_mapping(data, base, place)
-    cls, entries = _choose_class(dict(data), base, place)
+    cls, entries = choose_class(dict(data), base, place)
     table = fields(cls)
     label = f"{place} ({cls.type_name})" if cls.type_name else place or "environment"
     for name in entries:
@@ -118,7 +118,7 @@ def expects(field: Field) -> str:
     return f"{expected} {field.range}" if field.range else expected
 
 
-def _choose_class(entries: dict, base: type[Kind], place: str) -> tuple[type[Kind], dict]:
+def choose_class(entries: dict, base: type[Kind], place: str) -> tuple[type[Kind], dict]:
     """Return the class that `type` names and the other entries, or `base` if it has no types."""
     options = choices(base)
     if not options:

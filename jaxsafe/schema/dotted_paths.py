@@ -43,7 +43,7 @@ def get_path(component: Any, path: str) -> Any:
         if value is component and name not in fields(type(component)):
             value = getattr(component, component.shorthand)
         is_list = isinstance(value, tuple)
-        value = value[_index(value, name, path)] if is_list else getattr(value, name)
+        value = value[index_of(value, name, path)] if is_list else getattr(value, name)
     named = isinstance(value, tuple) and all(hasattr(part, "name") for part in value)
     return [part.name for part in value] if named else value
 
@@ -99,8 +99,8 @@ def _set(
     field_place = join(place, head)
     content = getattr(component, head)
     if not rest:
-        value = _listed(value, content, table[head], field_place)
-        if _are_names(content, value):
+        value = as_list(value, content, table[head], field_place)
+        if are_names(content, value):
             return component.replace(**{head: _pick(content, value, field_place)})
         return component.replace(**{head: convert(value, table[head], field_place)})
     if isinstance(content, Component):
@@ -121,7 +121,7 @@ def _set(
 
 def _set_item(items: tuple, path: list[str], value: Any, convert: Convert, place: str) -> tuple:
     """Return the items with one value replaced. Its path begins with the name of an item."""
-    index = _index(items, path[0], place)
+    index = index_of(items, path[0], place)
     item_place = join(place, path[0])
     if len(path) == 1:
         raise ConfigError(
@@ -183,7 +183,7 @@ def _abbreviates(short: str, name: str) -> bool:
     return len(pieces) == len(words) > 1 and all(map(str.startswith, words, pieces))
 
 
-def _listed(value: Any, content: Any, field: Field, place: str) -> Any:
+def as_list(value: Any, content: Any, field: Field, place: str) -> Any:
     """Return the list for which a text with commas stands where a list is or may be.
 
     Args:
@@ -200,7 +200,7 @@ def _listed(value: Any, content: Any, field: Field, place: str) -> Any:
     return yaml12.parse(f"[{value}]", place)
 
 
-def _are_names(content: Any, value: Any) -> bool:
+def are_names(content: Any, value: Any) -> bool:
     """Return whether a field holds named parts and the value for it is a list of names."""
     named = (
         isinstance(content, tuple) and content and all(hasattr(part, "name") for part in content)
@@ -210,10 +210,15 @@ def _are_names(content: Any, value: Any) -> bool:
 
 
 def _pick(items: tuple, names: Sequence[str], place: str) -> tuple:
-    return tuple(items[_index(items, name, place)] for name in names)
+    return tuple(items[index_of(items, name, place)] for name in names)
 
 
-def _index(items: tuple, name: str, place: str) -> int:
+def index_of(items: tuple, name: str, place: str) -> int:
+    """Return the index of the item with a name, or of the item that the name counts.
+
+    Raises:
+        ConfigError: there is no such item.
+    """
     names = [getattr(item, "name", str(index)) for index, item in enumerate(items)]
     if name not in names:
         raise ConfigError(

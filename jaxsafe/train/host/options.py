@@ -21,6 +21,7 @@ from jaxsafe.schema.component import Component, Range, normalise
 from jaxsafe.schema.convert import to_value
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError, ConfigWarning, nearest, show
+from jaxsafe.schema.retype import set_paths
 from jaxsafe.train.host.sinks import LIBRARIES, library
 from jaxsafe.train.host.warm_start import agent_options
 from jaxsafe.train.ppo import MAX_COUNT, PPO
@@ -221,8 +222,7 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         arguments.options["rta_training"] = current_name("rta_training", told)
     config = TrainConfig()
     # This comes first, so that a misspelt option is told before a slow start.
-    for path, value in arguments.options.items():
-        config = set_path(config, path, value, to_value)
+    config = set_paths(config, arguments.options)
     env = make(task, actions=config.actions, variant=config.variant, rta=config.rta)
     told = config.rta_training or ("punishment" if env.rta is not None else None)
     if told == "punishment" and not any(isinstance(term, Intervention) for term in env.reward):
@@ -232,10 +232,8 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     config = normalise(TrainConfig())
     settings = recipe(task, arguments.options.get("preset"))
     place = f"{task}: recipes.{settings['preset']}" if is_file(task) else ""
-    for path, value in settings.items():
-        config = set_path(config, path, value, to_value, place)
-    for path, value in {**arguments.options, "preset": settings["preset"]}.items():
-        config = set_path(config, path, value, to_value)
+    config = set_paths(config, settings, place)
+    config = set_paths(config, {**arguments.options, "preset": settings["preset"]})
     config = config.replace(rta_training=told)
     if told == "corrected_action":
         config = set_path(config, "ppo.learns_from", "actual", to_value)

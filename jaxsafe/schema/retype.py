@@ -1,0 +1,124 @@
+"""Several changes by dotted path, also of the type of a part, such as `deputy.type`."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from jaxsafe.schema.component import Component, Kind, choices, fields, normalise
+from jaxsafe.schema.convert import bare, choose_class, to_component, to_value
+from jaxsafe.schema.dotted_paths import are_names, as_list, index_of, join, set_path
+
+TYPE = "type"
+"""What a path ends in that leads to the type of a part."""
+
+
+def set_paths(component: Kind, changes: Mapping[str, Any], place: str = "") -> Kind:
+    """Return the component with the values at some dotted paths replaced.
+
+    A path that ends in `.type` changes the type of a part. A whole part that is given comes before
+    its type, and the type before the part's other fields, whatever their order is.
+
+    Args:
+        component: the component.
+        changes: new values by dotted path, which are checked and converted.
+        place: what stands before the paths in messages of errors.
+
+    Raises:
+        ConfigError: a path leads nowhere, a value is wrong, or a part cannot have a type.
+    """
+    parents = [path.removesuffix(TYPE) for path in changes if path.endswith(f".{TYPE}")]
+    whole = [path for path in changes if any(parent.startswith(f"{path}.") for parent in parents)]
+    for path in whole:
+        component = set_path(component, path, changes[path], to_value, place)
+    left = {path: value for path, value in changes.items() if path not in whole}
+    component, left = _change_types(component, left, place)
+    for path, value in left.items():
+        component = set_path(component, path, value, to_value, place)
+    return component
+
+
+def _change_types(
+    component: Kind, changes: Mapping[str, Any], place: str
+) -> tuple[Kind, dict[str, Any]]:
+    """Return a component whose parts have the types of some changes, and the changes that are left.
+
+    A part of another type keeps the fields that both types have. The changes must give it the
+    fields that it needs besides. Their order does not matter.
+
+    Args:
+        component: the component.
+        changes: new values by dotted path. Paths to types end in `.type`.
+        place: what stands before the paths in messages of errors.
+
+    """
+    left = dict(changes)
+    typed = [path for path in changes if path.endswith(f".{TYPE}")]
+    for path in sorted(typed, key=lambda path: path.count(".")):
+        names = _names(component, path)[:-1]
+        standing = _standing(component, names)
+        if standing is None:
+            continue
+        part, base = standing
+        kind = left.pop(path)
+        here = join(place, path.removesuffix(f".{TYPE}"))
+        new_fields = fields(choose_class({TYPE: kind}, base, here)[0])
+        old_fields = {} if part is None else fields(type(part))
+        entries = {name: getattr(part, name) for name in old_fields if name in new_fields}
+        for other in [other for other in left if _names(component, other)[:-1] == names]:
+            name = other.rpartition(".")[2]
+            field = new_fields.get(name)
+            if field is None or are_names(entries.get(name), left[other]):
+                continue
+            if field.required or name in entries:
+                value = as_list(left.pop(other), entries.get(name), field, join(place, other))
+                entries[name] = value
+        changed = normalise(to_component({TYPE: kind, **entries}, base, here))
+        component = _put(component, names, changed)
+    return component, left
+
+
+def _names(component: Component, path: Any) -> list[str]:
+    """Return the names of a path, which begins with a field of the component."""
+    names = str(path).split(".")
+    shorthand = component.shorthand
+    if shorthand and names[0] not in fields(type(component)):
+        return [shorthand, *names]
+    return names
+
+
+def _standing(
+    component: Component, names: Sequence[str]
+) -> tuple[Component | None, type[Component]] | None:
+    """Return the part at a path and the base of what may stand there.
+
+    None is returned where the path leads nowhere, or where parts have no types.
+    """
+    value: Any = component
+    base: Any = None
+    for name in names:
+        if isinstance(value, tuple):
+            if name not in [getattr(item, "name", str(i)) for i, item in enumerate(value)]:
+                return None
+            value = value[index_of(value, name, name)]
+            continue
+        if not isinstance(value, Component) or name not in fields(type(value)):
+            return None
+        base = bare(fields(type(value))[name].hint)
+        if typing.get_origin(base) is tuple:
+            base = bare(typing.get_args(base)[0])
+        value = getattr(value, name)
+    typed = isinstance(base, type) and issubclass(base, Component) and choices(base)
+    return (value, base) if typed and (value is None or isinstance(value, Component)) else None
+
+
+def _put(component: Any, names: Sequence[str], part: Component) -> Any:
+    """Return the component, or the list of parts, with another part at a path that leads to one."""
+    if not names:
+        return part
+    name, *rest = names
+    if isinstance(component, tuple):
+        index = index_of(component, name, name)
+        return (*component[:index], _put(component[index], rest, part), *component[index + 1 :])
+    return component.replace(**{name: _put(getattr(component, name), rest, part)})
