@@ -197,6 +197,8 @@ def _scale(env: Environment, name: str) -> Number:
 def _vector(
     env: Environment, observation: Float[Array, "*batch o"], name: str, features: str
 ) -> Float[Array, "*batch d"]:
+    if name in env.observation_names:  # a vector on a line
+        return _elements(env, observation, name, features)
     axes = [f"{name}.{axis}" for axis in "xyz" if f"{name}.{axis}" in env.observation_names]
     return jnp.concatenate(
         [_elements(env, observation, axis, features) for axis in axes or [f"{name}.x"]], axis=-1

@@ -150,7 +150,7 @@ def _check_space(env: Environment) -> None:
                 )
     for region in env.regions:
         space = env.agent_platform.dimension
-        if space in (2, 3) and space not in region.dimensions:
+        if space not in region.dimensions:
             fitting = [name for name, kind in choices(Region).items() if space in kind.dimensions]
             raise ConfigError(
                 f"regions.{region.name}: a {region.type_name} is no part "
@@ -195,12 +195,12 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
                 f"{here}: no such state field; choose from {nearest(initializer.name, rest)}"
             )
         if getattr(initializer, "direction", None) is not None:
-            drawn = 1 + len(initializer.direction.intervals)  # type: ignore[attr-defined]
+            drawn = initializer.direction.dimension  # type: ignore[attr-defined]
             if (drawn,) != rest[initializer.name].shape:
                 raise ConfigError(
                     f"{here}.direction: draws {drawn} numbers, "
                     f"the platform has {platform.dimension} dimensions; "
-                    "give a polar range in space, none in the plane"
+                    "give a polar range in space, none in the plane, no azimuth on a line"
                 )
 
 

@@ -14,12 +14,14 @@ from jaxsafe.config import build, load, load_filter, override
 from jaxsafe.environment import Environment
 from jaxsafe.envs import docking, rejoin
 from jaxsafe.envs.task import (
+    STARTERS,
     TASKS,
     Task,
     default_filter,
     find_task,
     is_file,
     register,
+    registered,
     short_name,
     user_module,
 )
@@ -29,6 +31,7 @@ from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.simulation.controllers import Continuous, Discrete
 
 __all__ = [
+    "STARTERS",
     "TASKS",
     "VARIANTS",
     "Task",
@@ -38,13 +41,14 @@ __all__ = [
     "is_file",
     "make",
     "register",
+    "registered",
     "short_name",
     "unchanged",
     "user_module",
 ]
 
 # The tasks are registered in the order of the paper.
-for _task in (*rejoin.TASKS, *docking.TASKS):
+for _task in (*rejoin.TASKS, *docking.TASKS, *docking.STARTERS):
     register(_task)
 
 VARIANTS = ("paper", "released")
@@ -186,7 +190,7 @@ def _filter(name: str, rta: str | RTA) -> RTA | None:
         return rta
     if isinstance(rta, str) and rta.endswith((".yaml", ".yml")):
         return load_filter(rta)
-    task = TASKS.get(name.rpartition(":")[2])
+    task = registered(name)
     presets = {"none": lambda: None, **(task.filters if task else {})}
     if not isinstance(rta, str) or rta not in presets:
         known = [*presets, "FILE.yaml"]

@@ -31,6 +31,7 @@ from jaxsafe.rta.backups import AlignAndBrake, AlignedOrSlow, Brake, Slow
 from jaxsafe.rta.simplex import Simplex
 from jaxsafe.simulation.controllers import Actuator, Continuous
 from jaxsafe.simulation.cwh import MEAN_MOTION, Anchor, Spacecraft
+from jaxsafe.simulation.double_integrator import DoubleIntegrator
 from jaxsafe.simulation.geometry import Circle, Region, Sphere
 from jaxsafe.simulation.initializers import (
     AtDistance,
@@ -52,12 +53,16 @@ DOCKING_RADIUS = 0.5
 
 ONE_DEGREE = jnp.pi / 180.0
 
+LINEAR = Direction(azimuth=None)
 PLANAR = Direction()
 SPATIAL = Direction(polar=(0.0, jnp.pi))
 
 
-def docking(dimension: Literal[2, 3]) -> Environment:
-    """Return docking in the plane or in space: three thrusters at most, no orientation."""
+def docking(dimension: Literal[1, 2, 3]) -> Environment:
+    """Return docking on a line, in the plane or in space, without orientation.
+
+    On a line there is no orbit, so the deputy is a double integrator there.
+    """
     timeout = 2000.0
     return Environment(
         agent="deputy",
@@ -110,13 +115,14 @@ def docking_oriented() -> Environment:
     )
 
 
-def deputy(dimension: Literal[2, 3]) -> Spacecraft:
+def deputy(dimension: Literal[1, 2, 3]) -> Spacecraft | DoubleIntegrator:
     """Return the active spacecraft, Table 4."""
     thrusters = [f"thrust_{axis}" for axis in "xyz"[:dimension]]
-    return Spacecraft(
+    platform = DoubleIntegrator if dimension == 1 else Spacecraft
+    return platform(
         name="deputy",
         dimension=dimension,
-        start=deputy_start(PLANAR if dimension == 2 else SPATIAL),
+        start=deputy_start({1: LINEAR, 2: PLANAR, 3: SPATIAL}[dimension]),
         controller=Continuous(
             actuators=tuple(
                 Actuator(name=name, low=-1.0, high=1.0, points=11) for name in thrusters
@@ -139,7 +145,7 @@ def deputy_start(direction: Direction) -> tuple[Initializer, ...]:
     )
 
 
-def docking_region(dimension: Literal[2, 3]) -> Region:
+def docking_region(dimension: Literal[1, 2, 3]) -> Region:
     """Return the docking region around the chief, Section 3."""
     shape = Circle if dimension == 2 else Sphere
     return shape(name="docking_region", on="chief", radius=DOCKING_RADIUS)
@@ -326,3 +332,15 @@ TASKS = (
     ),
 )
 """The tasks of this domain."""
+
+STARTERS = (
+    Task(
+        name="docking1d",
+        environment=lambda: docking(1),
+        filters=FILTERS,
+        gymnasium_id="jaxsafe/Docking1D-v0",
+        recipe="docking1d.yaml",
+        starter=True,
+    ),
+)
+"""A small task to begin with. The paper does not have it, but its published code does."""

@@ -27,7 +27,10 @@ Filters = Mapping[str, Callable[[], RTA]]
 """Filters by the name of their preset. `default` is the recommended one."""
 
 TASKS: dict[str, Task] = {}
-"""Every registered task by its name."""
+"""Every registered task by its name, but for the starters."""
+
+STARTERS: dict[str, Task] = {}
+"""Small tasks to begin with, by name. They are not part of the benchmark, nor of `env=all`."""
 
 _NAME = re.compile(r"[A-Za-z]\w*")
 
@@ -50,6 +53,8 @@ class Task:
     Without a file there is only the preset `observation_only`, the options' defaults."""
     paper_steps: int | None = None
     """Table 2 of the paper: environment steps to 80 % success in training."""
+    starter: bool = False
+    """Whether it is a small task to begin with, which no comparison of tasks includes."""
 
 
 def register(task: Task) -> None:
@@ -64,14 +69,20 @@ def register(task: Task) -> None:
         raise ConfigError(
             f"task {show(task.name)}: expected a name of letters, digits and _, other than all"
         )
-    known = TASKS.get(task.name)
+    known = registered(task.name)
     if known and known.environment.__module__ != task.environment.__module__:
         raise ConfigError(
             f"task {task.name!r}: taken by {known.environment.__module__}; choose another name"
         )
     if task.gymnasium_id:
         _register_id(task.gymnasium_id, task.name)
-    TASKS[task.name] = task
+    (STARTERS if task.starter else TASKS)[task.name] = task
+
+
+def registered(name: str) -> Task | None:
+    """Return the task of a name, or None if there is none. The name may begin with its module."""
+    task = name.rpartition(":")[2]
+    return TASKS.get(task) or STARTERS.get(task)
 
 
 def find_task(name: str) -> Task:
@@ -83,12 +94,13 @@ def find_task(name: str) -> Task:
     module, _, task = name.rpartition(":")
     if module:
         import_modules([module], "env")
-    if task not in TASKS:
+    known = registered(task)
+    if known is None:
         raise ConfigError(
             f"env: unknown task {show(task)} and not a .yaml file; "
-            f"choose from {nearest(task, TASKS)}"
+            f"choose from {nearest(task, [*TASKS, *STARTERS])}"
         )
-    return TASKS[task]
+    return known
 
 
 def default_filter(name: str) -> str | None:
@@ -110,7 +122,7 @@ def short_name(name: str) -> str:
 
 def user_module(name: str) -> str | None:
     """Return the module of a user's task; None for a task of this package or a file."""
-    task = TASKS.get(name)
+    task = registered(name)
     if task is None or task.environment.__module__.partition(".")[0] == "jaxsafe":
         return None
     return task.environment.__module__

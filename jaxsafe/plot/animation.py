@@ -34,6 +34,7 @@ from jaxsafe.plot.style import (
     Ball,
     centre_patch,
     frame_labels,
+    in_plane,
     keep_away_distances,
     kept_out,
     labelled,
@@ -249,9 +250,9 @@ class Scene:
             control: the control that acted, in the order of `env.action_names`.
         """
         origin, turn = self._frame(sim)
-        directions = {name: _direction(state) for name, state in sim.platforms.items()}
+        directions = {name: in_plane(_direction(state)) for name, state in sim.platforms.items()}
         named = {**sim.regions, **sim.platforms}
-        places = {name: turn @ (np.asarray(one.position) - origin) for name, one in named.items()}
+        places = {name: turn @ (_place(one) - origin) for name, one in named.items()}
         distance = float(np.linalg.norm(places[self.env.agent]))
         ended = [name for name, flag in sim.ended.items() if flag]
         self.moments.append(
@@ -299,7 +300,7 @@ class Scene:
         if self._turned:
             cosine, sine = np.cos(platform.heading), np.sin(platform.heading)
             turn[:2, :2] = [[cosine, sine], [-sine, cosine]]
-        return np.asarray(platform.position), turn
+        return _place(platform), turn
 
     def _thrust(self, control: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
         """Return the thrust as a share of the largest one, or None if the agent has no thruster."""
@@ -503,6 +504,11 @@ def _arrow(tail: np.ndarray, vector: np.ndarray) -> np.ndarray:
         across *= np.linalg.norm(vector) / max(float(np.linalg.norm(across)), 1e-12)
     barbs = [tip - 0.3 * vector + side * 0.18 * across for side in (1.0, -1.0)]
     return np.stack([tail, tip, barbs[0], tip, barbs[1]])
+
+
+def _place(platform: Any) -> np.ndarray:
+    """Return the position of a platform or region. On a line it gets y = 0."""
+    return in_plane(np.asarray(platform.position))
 
 
 def _direction(platform: Any) -> np.ndarray:

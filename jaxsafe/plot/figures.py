@@ -24,6 +24,7 @@ from jaxsafe.plot.style import (
     centre_patch,
     fitted,
     frame_labels,
+    in_plane,
     plain,
     region_patch,
     region_surface,
@@ -220,10 +221,10 @@ def _relative_path(rows: list[dict[str, Any]], of: str) -> np.ndarray:
     """
     first = next(iter(rows[0]["platforms"]))
     places = [{**row.get("regions", {}), **row["platforms"]} for row in rows]
-    path = np.array([place[of]["position"] for place in places], float)
+    path = in_plane(np.array([place[of]["position"] for place in places], float))
     if len(rows[0]["platforms"]) == 1:
         return path
-    origin = np.array([place[first]["position"] for place in places], float)
+    origin = in_plane(np.array([place[first]["position"] for place in places], float))
     path = path - origin  # a null, from a training that diverged, is NaN here and leaves a gap
     if "heading" in rows[0]["platforms"][first]:
         heading = np.array([row["platforms"][first]["heading"] for row in rows], float)

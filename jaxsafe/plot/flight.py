@@ -21,6 +21,7 @@ from jaxsafe.plot.style import (
     centre_patch,
     fitted,
     frame_labels,
+    in_plane,
     keep_away_distances,
     kept_out,
     labelled,
@@ -56,7 +57,7 @@ def flight_figure(env: Environment, episode: tuple[State, TimeStep], title: str)
         title: the title, to which the outcome is added.
     """
     states, timesteps = episode
-    views = [(0, 1)] if env.agent_platform.dimension == 2 else [(0, 1, 2), (0, 1)]
+    views = [(0, 1)] if env.agent_platform.dimension < 3 else [(0, 1, 2), (0, 1)]
     widths = [MAP_WIDTH * len(views), CURVES_WIDTH]
     figure = NotebookFigure(figsize=(sum(widths), 4.2), layout="constrained")
     parts: Any = figure.subfigures(1, 2, width_ratios=widths)
@@ -98,11 +99,11 @@ def _relative_path(env: Environment, states: State, of: str) -> np.ndarray:
     """Return the positions of a platform or region as seen from the first other platform."""
     sim = states.sim
     place = sim.platforms[of] if of in sim.platforms else sim.regions[of]
-    path = np.array(place.position, float)
+    path = in_plane(np.array(place.position, float))
     origin = _origin(env)
     if origin is None:
         return path
-    path -= sim.platforms[origin].position
+    path -= in_plane(np.array(sim.platforms[origin].position, float))
     if _heads(env, states):
         heading = sim.platforms[origin].heading
         x = np.cos(heading) * path[:, 0] + np.sin(heading) * path[:, 1]

@@ -197,6 +197,12 @@ def keep_away_distances(env: Environment) -> list[float]:
     ]
 
 
+def in_plane(vectors: np.ndarray) -> np.ndarray:
+    """Return vectors on a line as vectors in the plane with y = 0, and all others as they are."""
+    missing = max(0, 2 - vectors.shape[-1])
+    return np.pad(vectors, [(0, 0)] * (vectors.ndim - 1) + [(0, missing)])
+
+
 def frame_labels(heads: str | None, unit: str | None) -> list[str]:
     """Return the labels of the axes x, y and z.
 

@@ -27,6 +27,7 @@ from jaxsafe.rta.speed_limit import (
 )
 from jaxsafe.simulation.controllers import Uncontrolled
 from jaxsafe.simulation.cwh import MEAN_MOTION, Spacecraft
+from jaxsafe.simulation.double_integrator import DoubleIntegrator
 from jaxsafe.simulation.dubins import Dubins2D, Dubins3D
 from jaxsafe.simulation.oriented import OrientedSpacecraft
 from jaxsafe.simulation.scripted import Command, Constant, Scripted
@@ -87,8 +88,9 @@ CLOSE = 1.001
 
 def brake_faults(env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
     """Return what is missing for Propositions 3 and 4: `brake` keeps a speed limit."""
-    if type(env.agent_platform) is not Spacecraft:
-        return {"brake is proved to keep a speed limit for a spacecraft alone": _true()}
+    if type(env.agent_platform) not in (Spacecraft, DoubleIntegrator):
+        fault = "brake is proved to keep a speed limit for a spacecraft or double_integrator alone"
+        return {fault: _true()}
     speed_limits = _speed_limits(env, rta)
     if isinstance(speed_limits, str):
         return {speed_limits: _true()}

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from jaxsafe.processors.constraint import SpeedLimit
 from jaxsafe.processors.status import Distance, Speed, VelocityLimit
 from jaxsafe.simulation.cwh import Anchor, Spacecraft
+from jaxsafe.simulation.double_integrator import DoubleIntegrator
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.simulation.oriented import OrientedSpacecraft
 from jaxsafe.transition import constraint
@@ -27,13 +28,17 @@ MAX_ORBIT_ANGLE_PER_STEP = 0.05
 """Largest angle of the chief's orbit in a step [rad] for which the proofs' series hold."""
 
 
+_POINT_MASSES = (Spacecraft, DoubleIntegrator)
+"""Platforms with a thruster pair per axis. A double integrator moves as at a mean motion of 0."""
+
+
 class SpeedLimitFacts(Record):
     """Numbers of a speed limit ν₀ + ν₁ max(r − r₀, 0) and of the spacecraft that keeps it."""
 
     floor: Float[Array, ""]  # ν₀ [m/s]
     slope: Float[Array, ""]  # ν₁ [1/s]
     constant_to: Float[Array, ""]  # r₀ [m]
-    mean_motion: Float[Array, ""]  # n [rad/s], positive
+    mean_motion: Float[Array, ""]  # n [rad/s], not negative; 0 without gravity
     weakest: Float[
         Array, ""
     ]  # least acceleration by thrust [m/s²], over both directions of all axes
@@ -138,7 +143,7 @@ def speed_limit_facts(env: Environment, name: str) -> SpeedLimitFacts | None:
     limited = constraint(env, name)
     plant: Any = env.agent_platform
     plant_class = type(plant)
-    if type(limited) is not SpeedLimit or plant_class not in (Spacecraft, OrientedSpacecraft):
+    if type(limited) is not SpeedLimit or plant_class not in (*_POINT_MASSES, OrientedSpacecraft):
         return None
     statuses = {status.name: status for status in env.status}
     speed = statuses[limited.speed]
@@ -151,7 +156,7 @@ def speed_limit_facts(env: Environment, name: str) -> SpeedLimitFacts | None:
     actuators = {actuator.name: actuator for actuator in env.actuators}
     if not set(plant.inputs) <= set(actuators):
         return None
-    pushes = plant.inputs if plant_class is Spacecraft else plant.inputs[:1]
+    pushes = plant.inputs if plant_class in _POINT_MASSES else plant.inputs[:1]
     thrusters = [actuators[push] for push in pushes]
     weakest = jnp.min(
         jnp.stack([jnp.minimum(-thruster.low, thruster.high) for thruster in thrusters])
@@ -160,12 +165,12 @@ def speed_limit_facts(env: Environment, name: str) -> SpeedLimitFacts | None:
         jnp.stack([jnp.maximum(-thruster.low, thruster.high) for thruster in thrusters])
     )
     zero = jnp.zeros_like(env.dt)
-    spin = zero if plant_class is Spacecraft else jnp.max(jnp.abs(plant.attitude_rate_limits))
+    spin = zero if plant_class in _POINT_MASSES else jnp.max(jnp.abs(plant.attitude_rate_limits))
     return SpeedLimitFacts(
         floor=limit.floor,
         slope=limit.slope,
         constant_to=limit.constant_to,
-        mean_motion=jnp.abs(plant.mean_motion),
+        mean_motion=zero if plant_class is DoubleIntegrator else jnp.abs(plant.mean_motion),
         weakest=jnp.maximum(weakest, 0.0) / plant.mass,
         strongest=strongest * len(pushes) ** 0.5 / plant.mass,
         spin=spin,

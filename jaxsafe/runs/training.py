@@ -23,7 +23,7 @@ from jaxsafe.devices import processes
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores, usable_cores
 from jaxsafe.environment import Environment
-from jaxsafe.envs import TASKS
+from jaxsafe.envs import TASKS, registered
 from jaxsafe.runs.run import Run
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import train as function
@@ -135,7 +135,7 @@ def refuse_run(env: str | None) -> None:
     Raises:
         ConfigError: it is the directory of a run.
     """
-    if env and env not in TASKS and (Path(env) / "config.yaml").is_file():
+    if env and registered(env) is None and (Path(env) / "config.yaml").is_file():
         raise ConfigError(f"env: {env} is a run; resume={env} goes on with it")
 
 

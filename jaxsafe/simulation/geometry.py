@@ -128,7 +128,7 @@ class Aspect(Offset, type="aspect"):
 
     def vector(self, platform: Any) -> Float[Array, " d"]:
         planar = self.distance * direction(platform.heading + jnp.pi + self.angle)
-        return planar if platform.position.shape == (2,) else jnp.append(planar, 0.0)
+        return planar if platform.position.size < 3 else jnp.append(planar, 0.0)
 
 
 class Displacement(Offset, type="displacement"):
@@ -146,7 +146,7 @@ class Region(Component):
     It is a pure function of the platforms and is recomputed at every step.
     """
 
-    dimensions: ClassVar[tuple[int, ...]] = (2, 3)
+    dimensions: ClassVar[tuple[int, ...]] = (1, 2, 3)
     """Dimensions of space in which the region is what its name says."""
     name: str
     on: PlatformName
@@ -179,7 +179,10 @@ class Region(Component):
 
 
 class Sphere(Region, type="sphere"):
-    """All points within `radius` of the centre: ‖r − c‖ ≤ ρ, Eqs. (7), (13)."""
+    """All points within `radius` of the centre: ‖r − c‖ ≤ ρ, Eqs. (7), (13).
+
+    In the plane it is a disc, and on a line an interval.
+    """
 
     radius: Annotated[Length, Reach]
 

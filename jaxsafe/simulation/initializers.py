@@ -56,16 +56,35 @@ class Initializer(Component):
 class Direction(Component):
     """A random direction whose azimuth and, in space, polar angle are each uniform.
 
-    In space it is therefore not uniform on the sphere.
+    In space it is therefore not uniform on the sphere. On a line there is no azimuth, and each of
+    the two directions is as likely as the other.
     """
 
-    azimuth: Angles = (0.0, TWO_PI)
+    azimuth: Angles | None = (0.0, TWO_PI)
     polar: Angles | None = None
+
+    def problem(self) -> str | None:
+        if self.azimuth is None and self.polar is not None:
+            return "a polar range needs an azimuth; a direction on a line has neither"
+        return None
+
+    @property
+    def dimension(self) -> int:
+        """Number of elements of the direction: 1 on a line, 2 in the plane, 3 in space."""
+        return 1 + (self.azimuth is not None) + (self.polar is not None)
 
     @property
     def intervals(self) -> tuple[Float[Array, " 2"], ...]:
-        """Intervals of the angles: one in the plane, two in space."""
+        """Intervals of the numbers to draw: one on a line or in the plane, two in space."""
+        if self.azimuth is None:
+            return (jnp.array([-1.0, 1.0]),)
         return (self.azimuth,) if self.polar is None else (self.azimuth, self.polar)
+
+    def vector(self, *drawn: Float[Array, ""]) -> Float[Array, " d"]:
+        """Return the unit vector that the drawn numbers stand for, one number per interval."""
+        if self.azimuth is None:
+            return jnp.where(drawn[0] < 0.0, -1.0, 1.0)[None]
+        return direction(*drawn)
 
 
 class Fixed(Initializer, type="fixed"):
@@ -108,7 +127,7 @@ class AtDistance(Initializer, type="at_distance"):
 
     def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Float[Array, " d"]:
         distance, *angles = uniform(key, self.distance, *self.direction.intervals)
-        return sim.platforms[self.about].position + distance * direction(*angles)
+        return sim.platforms[self.about].position + distance * self.direction.vector(*angles)
 
 
 class AroundAtAltitude(Initializer, type="around_at_altitude"):
@@ -146,7 +165,7 @@ class BelowSpeedLimit(Initializer, type="below_speed_limit"):
         limit = self.floor + self.slope * safe_norm(
             drawn["position"] - sim.platforms[self.about].position
         )
-        return limit * share * direction(*angles)
+        return limit * share * self.direction.vector(*angles)
 
 
 def uniform(key: Key, *intervals: Float[Array, " 2"]) -> Float[Array, " n"]:

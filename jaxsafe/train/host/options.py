@@ -14,7 +14,7 @@ from jaxsafe.agents.agent import Agent, check_agent
 from jaxsafe.config import load_recipes, override
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.environment import Environment, require_success
-from jaxsafe.envs import TASKS, find_task, is_file, make, short_name
+from jaxsafe.envs import STARTERS, TASKS, find_task, is_file, make, short_name
 from jaxsafe.processors.reward import Intervention
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import Component, Range, normalise
@@ -391,7 +391,7 @@ def recipes(task: str) -> dict[str, Any]:
 
 def recipe_options() -> set[str]:
     """Return the options for which a recipe of some task has a value, by dotted path."""
-    presets = [settings for task in TASKS for settings in recipes(task).values()]
+    presets = [settings for task in (*TASKS, *STARTERS) for settings in recipes(task).values()]
     return {"preset", *(path for settings in presets for path in flatten(settings or {}))}
 
 
