@@ -235,8 +235,10 @@ def control_unit(name: str, length: str | None) -> str | None:
         length: the unit of lengths.
     """
     units_by_word = {
-        "thrust": "N",
+        "thrust": "lbf" if length == "ft" else "N",
+        "load_factor": "g",
         "rate": "rad/s",
+        "wheel_acceleration": "rad/s²",
         "attitude_acceleration": "rad/s²",
         "acceleration": f"{length}/s²",
     }
@@ -369,9 +371,13 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
     controls = env.agent_platform.controller.control(action, state.sim)
     desired = jnp.stack([controls[name] for name in env.action_names])
     actual, rta_memory, rta_info = _filtered(env, state, desired)
-    platforms = advance(env, state.sim, actual).platforms
+    later = advance(env, state.sim, actual)
     num_steps = state.num_steps + 1
-    sim = _empty_sim(env).replace(time=num_steps.astype(env.dt.dtype) * env.dt, platforms=platforms)
+    sim = _empty_sim(env).replace(
+        time=num_steps.astype(env.dt.dtype) * env.dt,
+        platforms=later.platforms,
+        actuators=later.actuators,
+    )
     intervening = jnp.zeros((), bool) if rta_info is None else rta_memory.intervening
     sim = sim.replace(intervening=intervening, control_desired=desired, control_actual=actual)
 
@@ -464,7 +470,10 @@ def extremes(env: Environment) -> tuple[Environment, Environment]:
 
 
 def _empty_sim(env: Environment) -> Sim:
-    """Return a simulation at time 0 without platforms and controls, in which nothing has ended."""
+    """Return a simulation at time 0 without platforms and controls, in which nothing has ended.
+
+    Actuators with a lag or a rate limit give 0, or the limit nearest to it.
+    """
     no_control = jnp.zeros(env.action_size, env.dt.dtype)
     return Sim(
         time=jnp.zeros_like(env.dt),
@@ -475,6 +484,11 @@ def _empty_sim(env: Environment) -> Sim:
         intervening=jnp.zeros((), bool),
         control_desired=no_control,
         control_actual=no_control,
+        actuators={
+            actuator.name: jnp.clip(jnp.zeros_like(env.dt), actuator.low, actuator.high)
+            for actuator in env.actuators
+            if not actuator.at_once
+        },
     )
 
 

@@ -42,11 +42,10 @@ def advance(
     platforms = {**(others_later(env, sim) if later is None else later)}
     plant = env.agent_platform
     with part("platforms", plant.name):
-        platforms[env.agent] = plant.step(
-            sim.platforms[env.agent], commanded(env, plant, sim, control), env.dt
-        )
+        controls, actuators = driven(env, sim, control)
+        platforms[env.agent] = plant.step(sim.platforms[env.agent], controls, env.dt)
     later_world = later_sim(env, sim, platforms)
-    return later_world.replace(control_desired=control, control_actual=control)
+    return later_world.replace(actuators=actuators, control_desired=control, control_actual=control)
 
 
 def later_sim(env: Environment, sim: Sim, platforms: Others) -> Sim:
@@ -91,6 +90,29 @@ def commanded(
     if platform.name == env.agent:
         return dict(zip(env.action_names, control, strict=True))
     return undirected(platform, sim)
+
+
+def driven(
+    env: Environment, sim: Sim, control: Float[Array, " m"]
+) -> tuple[Controls, Mapping[str, Float[Array, ""]]]:
+    """Return what the agent's plant receives over a step, and what its actuators give after it.
+
+    Both are in physical units, by name. The second has the actuators with a lag or a rate limit.
+
+    Args:
+        env: the environment.
+        sim: the simulation before the step.
+        control: the agent's control in physical units, in action order.
+    """
+    controls = dict(commanded(env, env.agent_platform, sim, control))
+    after = {}
+    for actuator in env.actuators:
+        if not actuator.at_once:
+            name = actuator.name
+            controls[name], after[name] = actuator.follow(
+                sim.actuators[name], controls[name], env.dt
+            )
+    return controls, after
 
 
 def undirected(platform: Platform, sim: Sim) -> Controls:

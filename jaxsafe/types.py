@@ -1,7 +1,7 @@
 """The map of the house: the records that flow through one step, and the units of parameters.
 
-Shapes are those of one environment. `jax.vmap` adds leading axes. `d` is the dimension of space, 2
-or 3.
+Shapes are those of one environment. `jax.vmap` adds leading axes. `d` is the dimension of space, 1
+to 3.
 """
 
 from __future__ import annotations
@@ -192,10 +192,13 @@ class Sim(Record):
     # Whether run time assurance changed the control of the step that led here.
     intervening: Bool[Array, ""]
     # The controls of the step that led here, in physical units and the order of `env.action_names`,
-    # 0 at reset: what the agent asked for, and what the plant received after run time assurance. In
-    # the predictions of a filter both are the control of the predicted step.
+    # 0 at reset: what the agent asked for, and what its actuators were given after run time
+    # assurance. In the predictions of a filter both are the control of the predicted step.
     control_desired: Float[Array, " actuators"] = dataclasses.field(default_factory=_no_control)
     control_actual: Float[Array, " actuators"] = dataclasses.field(default_factory=_no_control)
+    # What each of the agent's actuators with a lag or a rate limit gives now, in physical units, by
+    # name. Empty if all act at once.
+    actuators: Mapping[str, Float[Array, ""]] = dataclasses.field(default_factory=dict)
 
 
 class Memory(Record):
@@ -241,7 +244,9 @@ class Info(Record):
     reward_totals: Mapping[str, Float[Array, ""]]  # each term summed over the episode so far
     # What the agent asked for, in physical units and the order of `env.action_names`.
     control_desired: Float[Array, " actuators"]
-    control_actual: Float[Array, " actuators"]  # what the plant received, after run time assurance
+    # What its actuators were given, after run time assurance. The plant receives it at once, unless
+    # an actuator has a lag or a rate limit.
+    control_actual: Float[Array, " actuators"]
     intervening: Bool[Array, ""]  # whether run time assurance changed the control
     margins: Mapping[str, Float[Array, ""]]  # signed h(x) of each constraint, safe where ≥ 0
     # max(0, −h) as a share of the constraint's limit; 1 where h is not a number.

@@ -23,7 +23,7 @@ from jaxsafe.rollout import reset_batch
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.controllers import Continuous
-from jaxsafe.transition import bounds, commanded, smallest_margin
+from jaxsafe.transition import bounds, driven, smallest_margin, undirected
 from jaxsafe.types import Key, Number, Sim, State, TimeStep
 
 INSTANTS_PER_STEP = 8
@@ -284,7 +284,9 @@ def within_step(env: Environment, before: Sim, control: Float[Array, " m"], shar
     platforms = {}
     for platform in env.platforms:
         state = before.platforms[platform.name]
-        controls = platform.held(state, commanded(env, platform, before, control), env.dt)
+        is_agent = platform.name == env.agent
+        given = driven(env, before, control)[0] if is_agent else undirected(platform, before)
+        controls = platform.held(state, given, env.dt)
         platforms[platform.name] = platform.step(state, controls, env.dt * share)
     time = before.time + env.dt * share
     return before.replace(time=time, platforms=platforms, regions={}, status={})

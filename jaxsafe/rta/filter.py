@@ -5,6 +5,7 @@ One rule carries every guarantee: propose, certify, else back up.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -22,7 +23,7 @@ from jaxsafe.transition import (
     Others,
     advance,
     bounds,
-    commanded,
+    driven,
     later_sim,
     others_later,
     smallest_margin,
@@ -81,6 +82,8 @@ class RTAMemory(Record):
     backup_index: Int[Array, ""]  # the backup controller that the last certificate is about
     certified: Bool[Array, ""]  # whether following that backup controller is known to be safe
     ahead: Mapping[str, Any]  # platforms at the end of the certificate's horizon; empty without one
+    # `Sim.actuators` at that end.
+    actuators_ahead: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
 class BackupController(Component):
@@ -145,6 +148,8 @@ class Paths(Record):
     least: Float[Array, " backups"]  # smallest h on the way
     certified: Bool[Array, " backups"]  # whether all but the margin holds: terminal set and proof
     ahead: Mapping[str, Any]  # platforms at the end, [backups, ...]; empty without a horizon
+    # `Sim.actuators` at the end, [backups]
+    actuators_ahead: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def values(self) -> Float[Array, " backups"]:
@@ -237,6 +242,7 @@ class CertifiedRTA(RTA):
             backup_index=best,
             certified=paths.values[best] >= self.required_margin(env),
             ahead=_selected(paths.ahead, best),
+            actuators_ahead=_selected(paths.actuators_ahead, best),
         )
         info = RTAInfo(
             correction=jnp.zeros_like(sim.time),
@@ -271,16 +277,20 @@ class CertifiedRTA(RTA):
         backup_margin = self.lowest(env, sim, after_backup)
         new_certificate = passes | ~certified_before
         if self.horizon:
-            backup_certified, ahead = self._renew(
+            backup_certified, ahead, actuators_ahead = self._renew(
                 env, sim, memory=memory, after_backup=after_backup, backup_margin=backup_margin
             )
             backup_certified = jnp.where(
                 certified_before, backup_certified, paths.values[best] >= required
             )
             ahead = _where(new_certificate, _selected(paths.ahead, best), ahead)
+            actuators_ahead = _where(
+                new_certificate, _selected(paths.actuators_ahead, best), actuators_ahead
+            )
         else:
             backup_certified = self.follow(env, sim, after_backup).values[0] >= required
             ahead = {}
+            actuators_ahead = {}
         actual = jnp.where(passes, proposal, backup)
         correction = jnp.where(jnp.isfinite(desired), actual - wanted, actual)
         certified = jnp.where(passes, safe, backup_certified)
@@ -289,6 +299,7 @@ class CertifiedRTA(RTA):
             backup_index=jnp.where(new_certificate, best, memory.backup_index),
             certified=certified,
             ahead=ahead,
+            actuators_ahead=actuators_ahead,
         )
         info = RTAInfo(
             correction=safe_norm(correction),
@@ -341,9 +352,13 @@ class CertifiedRTA(RTA):
         least, group_ends = zip(*predicted, strict=True)
         ends = [end for ends in group_ends for end in ends]
         reached = jnp.stack([self._may_end(env, end) for end in ends])
-        platforms = [end.platforms for end in ends]
-        ahead = jax.tree.map(lambda *leaves: jnp.stack(leaves), *platforms)
-        return Paths(least=jnp.concatenate(least), certified=reached & proved, ahead=ahead)
+        stacked = lambda trees: jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)  # noqa: E731
+        return Paths(
+            least=jnp.concatenate(least),
+            certified=reached & proved,
+            ahead=stacked([end.platforms for end in ends]),
+            actuators_ahead=stacked([end.actuators for end in ends]),
+        )
 
     def _follow(
         self,
@@ -364,32 +379,34 @@ class CertifiedRTA(RTA):
         low, high = bounds(env)
         plant = env.agent_platform
 
-        def with_agent(sim: Sim, agent_state: Any) -> Sim:
-            return sim.replace(platforms={**sim.platforms, env.agent: agent_state})
+        def with_agent(sim: Sim, agent: tuple[Any, Any]) -> Sim:
+            state, actuators = agent
+            platforms = {**sim.platforms, env.agent: state}
+            return sim.replace(platforms=platforms, actuators=actuators)
 
         def one_step(
             carry: tuple[Sim, list[Any], list[Array]],
         ) -> tuple[Sim, list[Any], list[Array]]:
-            sim, agent_states, least = carry
+            sim, agents, least = carry
             later = others_later(env, sim)
-            after = later_sim(env, sim, {**later, env.agent: agent_states[0]})
+            after = later_sim(env, sim, {**later, env.agent: agents[0][0]})
             for i, backup in enumerate(backups):
-                before = with_agent(sim, agent_states[i])
+                before = with_agent(sim, agents[i])
                 control = jnp.clip(backup.control(env, before, later), low, high)
                 move = plant.step_within_limits if backup.within_limits else plant.step
-                agent_states[i] = move(
-                    agent_states[i], commanded(env, plant, before, control), env.dt
-                )
-                moved = with_agent(after, agent_states[i])
+                controls, actuators = driven(env, before, control)
+                agents[i] = (move(agents[i][0], controls, env.dt), actuators)
+                moved = with_agent(after, agents[i])
                 moved = moved.replace(control_desired=control, control_actual=control)
                 lowest = self.lowest(env, before, moved)
                 least[i] = jnp.minimum(least[i], lowest)
-            return with_agent(after, agent_states[0]), agent_states, least
+            return with_agent(after, agents[0]), agents, least
 
         sim = sim.replace(regions={}, status={})
-        start = (sim, [sim.platforms[env.agent]] * len(backups), [first] * len(backups))
-        last, agent_states, least = repeat(one_step, start, self.horizon)
-        return jnp.stack(least), [with_agent(last, agent_state) for agent_state in agent_states]
+        agent = (sim.platforms[env.agent], sim.actuators)
+        start = (sim, [agent] * len(backups), [first] * len(backups))
+        last, agents, least = repeat(one_step, start, self.horizon)
+        return jnp.stack(least), [with_agent(last, agent) for agent in agents]
 
     def _may_end(self, env: Environment, end: Sim) -> Bool[Array, ""]:
         """Return whether a certificate may end in a state."""
@@ -404,8 +421,10 @@ class CertifiedRTA(RTA):
         memory: RTAMemory,
         after_backup: Sim,
         backup_margin: Float[Array, ""],
-    ) -> tuple[Bool[Array, ""], Mapping[str, Any]]:
+    ) -> tuple[Bool[Array, ""], Mapping[str, Any], Mapping[str, Any]]:
         """Return whether the state after a step of the backup is certified, and its horizon's end.
+
+        The end is that of all platforms, and that of the agent's actuators.
 
         All steps of the new certificate but the last are steps of the one before it. So only the
         last step is predicted.
@@ -418,7 +437,13 @@ class CertifiedRTA(RTA):
             backup_margin: the smallest h on that step.
         """
         end_time = sim.time + self.horizon * env.dt
-        end = sim.replace(time=end_time, platforms=memory.ahead, regions={}, status={})
+        end = sim.replace(
+            time=end_time,
+            platforms=memory.ahead,
+            actuators=memory.actuators_ahead,
+            regions={},
+            status={},
+        )
         later = others_later(env, end)
         control = self._backup(env, end, memory=memory, later=later)
         new_end = advance(env, end, control, later=later)
@@ -428,7 +453,8 @@ class CertifiedRTA(RTA):
         keeps = last_step_keeps & (backup_margin >= 0.0)
         renewed = memory.certified & keeps & self._may_end(env, new_end)
         renewed = renewed & proved & _finite(after_backup)
-        return renewed, jax.lax.stop_gradient(new_end.platforms)
+        ends = (new_end.platforms, new_end.actuators)
+        return renewed, *jax.lax.stop_gradient(ends)
 
     def _best(self, env: Environment, paths: Paths) -> Int[Array, ""]:
         """Return the index of the backup controller with the largest h on its way.

@@ -91,6 +91,8 @@ def brake_faults(env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
     if type(env.agent_platform) not in (Spacecraft, DoubleIntegrator):
         fault = "brake is proved to keep a speed limit for a spacecraft or double_integrator alone"
         return {fault: _true()}
+    if slow := _slow_actuators(env, "brake"):
+        return slow
     speed_limits = _speed_limits(env, rta)
     if isinstance(speed_limits, str):
         return {speed_limits: _true()}
@@ -121,6 +123,8 @@ def align_and_brake_faults(
     if type(plant) is not OrientedSpacecraft:
         fault = "align_and_brake is proved to keep a speed limit for an oriented spacecraft alone"
         return {fault: _true()}
+    if slow := _slow_actuators(env, "align_and_brake"):
+        return slow
     if rta.terminal is None:
         fault = "align_and_brake keeps no speed limit by itself: give a horizon and a terminal set"
         return {fault: _true()}
@@ -183,6 +187,8 @@ def slow_faults(
     """Return what is missing for the proof that `slow` is safe and that `brake` keeps it."""
     if _packaged_but(keeper, rta):
         return {"slow is proved to be kept by brake alone": _true()}
+    if late := _slow_actuators(env, "slow"):
+        return late
     limits = [facts for name in rta.constraints if (facts := speed_limit_facts(env, name))]
     above = [terminal.speed + rta.required_margin(env) > facts.floor for facts in limits]
     if not above:
@@ -201,6 +207,8 @@ def aligned_or_slow_faults(
     """Return what is missing for Proposition 8: `align_and_brake` keeps the set."""
     if _packaged_but(keeper, rta):
         return {"aligned_or_slow is proved to be kept by align_and_brake alone": _true()}
+    if late := _slow_actuators(env, "aligned_or_slow"):
+        return late
     speed_limits = _speed_limits(env, rta)
     if isinstance(speed_limits, str):
         return {speed_limits: _true()}
@@ -254,6 +262,8 @@ def velocity_matched_faults(
         }
     (name,) = others
     lead = cast(Aircraft, env.platform(name))
+    if late := _slow_actuators(env, "velocity_matched"):
+        return late
     if type(lead) is not type(plant):
         return {"velocity_matched is proved for two aircraft of one kind": _true()}
     leads = [backup.lead for backup in rta.backups if type(backup) is keeper]
@@ -382,6 +392,23 @@ def _faults_in_space(
             (terminal.drift * CLOSE >= 9.0) & (terminal.lag * CLOSE >= 1.0)
         ),
     }
+
+
+def _slow_actuators(env: Environment, proved: str) -> Faults:
+    """Return what is missing where an actuator has a lag or a rate limit.
+
+    Args:
+        env: the environment.
+        proved: the type of the part whose proof takes it that controls act at once.
+    """
+    slow = [actuator.name for actuator in env.actuators if not actuator.at_once]
+    if not slow:
+        return {}
+    fault = (
+        f"{proved} is proved for actuators that act at once,"
+        f" and {slow[0]} has a time_constant or a rate_limit"
+    )
+    return {fault: _true()}
 
 
 def _true() -> Bool[Array, ""]:

@@ -14,10 +14,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.schema.component import Component, Range, Unit
-from jaxsafe.types import Control, Number, Sim
+from jaxsafe.simulation.integrate import lag_within_rate
+from jaxsafe.types import Control, Number, Seconds, Sim
 
 Bound = Annotated[Number, Unit("physical"), Control]
 """A limit of a control, in the unit of that control."""
+
+TimeConstant = Annotated[Number, Unit("s"), Range(0.0, open_low=True, smallest=1e-6, largest=1e6)]
+"""Time constant of a first-order lag [s]."""
+
+RateLimit = Annotated[
+    Number, Unit("physical"), Range(0.0, open_low=True, smallest=1e-9, largest=1e9)
+]
+"""Largest change of a control per second, in the unit of that control."""
 
 Controls = Mapping[str, Float[Array, ""]]
 """Controls in physical units, by name."""
@@ -30,6 +39,11 @@ class Actuator(Component):
     `zero_centred` the map is piecewise linear, so that 0 stays 0. Without `rescale` actions are
     physical already and are only clipped. Discrete actions choose one of `points` values, spaced
     equally from low to high, both included.
+
+    An actuator acts at once, unless it has a `time_constant` τ of a first-order lag or a
+    `rate_limit` R. Then its value x follows the control u by ẋ = (u − x)/τ, no faster than R, and
+    is 0 (or the limit nearest to 0) at the start of an episode. Over a step the plant receives the
+    mean of x, and `sim.actuators` has x itself.
     """
 
     name: str
@@ -38,6 +52,25 @@ class Actuator(Component):
     points: Annotated[int, Range(2, largest=2**16)] = 11
     rescale: bool = True
     zero_centred: bool = False
+    time_constant: TimeConstant | None = None
+    rate_limit: RateLimit | None = None
+
+    @property
+    def at_once(self) -> bool:
+        """Whether the plant receives the control itself: neither a lag nor a rate limit."""
+        return self.time_constant is None and self.rate_limit is None
+
+    def follow(
+        self, value: Float[Array, ""], control: Float[Array, ""], dt: Seconds
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Return the mean of the actuator's value over a step, and its value at the end.
+
+        Args:
+            value: the value at the beginning of the step, in physical units.
+            control: the control that is held over the step, in physical units.
+            dt: length of the step [s].
+        """
+        return lag_within_rate(value, control, self.time_constant, self.rate_limit, dt)
 
     def problem(self) -> str | None:
         return (
