@@ -238,7 +238,7 @@ def try_it(task: str) -> str:
         env = jaxsafe.make("{task}")
         policy = jaxsafe.load_policy("{task}")
         flights = jaxsafe.rollout(env, policy, jax.random.key(0), num_steps=600, num_envs=100)
-        successes = flights.info.outcome == env.outcomes.index("success")
+        successes = env.succeeded(flights.info.outcome)
         print(int(successes.sum()), "successes,", int(flights.cost.sum()), "violating steps")
         ```""")
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import functools
+import operator
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, ClassVar, Self
 
@@ -53,7 +54,7 @@ Parameters = Mapping[str, Float[Array, ""]]
 """Numbers of an environment that are drawn for an episode, by dotted path."""
 
 SUCCESS = "success"
-"""The outcome that success rates count."""
+"""The outcome that counts as success where it is not marked."""
 
 DIVERGED = "diverged"
 """The outcome of an episode whose state is not finite. It comes last in `Environment.outcomes`."""
@@ -117,9 +118,31 @@ class Environment(Component, Described):
         return ("running", *(condition.name for condition in self.terminal), *bounds, DIVERGED)
 
     @property
-    def success(self) -> int:
-        """The index of the outcome `success`, or −1 if the task has none. Nothing ends with −1."""
-        return self.outcomes.index(SUCCESS) if SUCCESS in self.outcomes else -1
+    def successes(self) -> tuple[str, ...]:
+        """The names of the outcomes that count as success, in the order of `outcomes`.
+
+        They are those marked by `success: true`. The outcome called `success` needs no mark, and
+        `success: false` takes it out.
+        """
+        bounds = {term.bound.outcome: term.bound.success for term in self.reward if term.bound}
+        marks = {condition.name: condition.success for condition in self.terminal} | bounds
+        return tuple(
+            name for name, mark in marks.items() if (name == SUCCESS if mark is None else mark)
+        )
+
+    @property
+    def success_indices(self) -> tuple[int, ...]:
+        """The indices in `outcomes` of those that count as success."""
+        return tuple(map(self.outcomes.index, self.successes))
+
+    def succeeded(self, outcome: Any) -> Any:
+        """Return which episodes succeeded.
+
+        Args:
+            outcome: how they ended, as `info.outcome`. It may be an array of any shape.
+        """
+        flags = [outcome == index for index in self.success_indices]
+        return functools.reduce(operator.or_, flags) if flags else outcome < 0
 
     @property
     def actuators(self) -> tuple[Actuator, ...]:
@@ -207,13 +230,12 @@ def require_success(env: Environment) -> None:
     """Refuse an environment in which nothing would count as a success.
 
     Raises:
-        ConfigError: no outcome is called `success`.
+        ConfigError: no outcome is called `success` or marked as one.
     """
-    if env.success < 0:
+    if not env.successes:
         found = ", ".join(env.outcomes[1:-1])
         raise ConfigError(
-            f"terminal: no outcome is called {SUCCESS!r}, so nothing would count as one; "
-            f"call the goal so, among {found}"
+            f"terminal: no outcome counts as a success; mark one with success: true, among {found}"
         )
 
 

@@ -153,7 +153,7 @@ def full_controls(env: Environment) -> tuple[float, ...]:
 
 def summarise(
     episodes: Episode,
-    success: int,
+    success: int | Sequence[int],
     has_delta_v: bool = True,
     has_rta: bool = False,
     has_delta_v_l1: bool | None = None,
@@ -166,8 +166,8 @@ def summarise(
 
     Args:
         episodes: sums of the episodes, each field of shape (episodes,).
-        success: index of the outcome that counts as success. A negative index means that there is
-            none.
+        success: index of the outcome that counts as success, or of several, as
+            `env.success_indices`. A negative index and an empty list mean that there is none.
         has_delta_v: whether the environment has the status `delta_v`, from which control usage
             comes.
         has_rta: whether there was run time assurance, whose interventions are counted.
@@ -192,12 +192,13 @@ def summarise(
         float(np.mean(total)) / (full or 1.0)
         for total, full in zip(episodes.controls, full_controls, strict=False)
     ]
+    successes = np.atleast_1d(np.asarray(success, int))
     violating = mean["violating_steps"]
     steps = mean["length"]
     values = {
         "average_return": mean["episode_return"],
         "episode_length": steps,
-        "success_rate": float(np.mean(np.asarray(episodes.outcome) == success)),
+        "success_rate": float(np.mean(np.isin(episodes.outcome, successes))),
         "control_usage": mean["delta_v"],
         "control_usage_l1": mean["delta_v_l1"],
         "control_effort": sum(effort) / max(len(effort), 1) / max(steps, MIN_STEPS),
@@ -210,7 +211,7 @@ def summarise(
         "intervention_rate": mean["interventions"] / max(steps, MIN_STEPS),
     }
     measured = {
-        "success_rate": success >= 0,
+        "success_rate": bool((successes >= 0).any()),
         "control_usage": has_delta_v,
         "control_usage_l1": has_delta_v if has_delta_v_l1 is None else has_delta_v_l1,
         "control_effort": bool(effort),

@@ -471,9 +471,27 @@ def test_success_is_an_outcome_that_training_and_evaluation_ask_for() -> None:
     env = jaxsafe.override(plain, {"terminal": (goal, *plain.terminal[1:]), "reward": terms})
     with pytest.raises(
         ConfigError,
-        match=r"no outcome is called 'success'.*docked, crash, distance, timeout, velocity",
+        match=r"no outcome counts as a success; mark .*docked, crash, distance, timeout, velocity",
     ):
         require_success(env)
+    marked = jaxsafe.override(env, {"terminal.docked.success": True})
+    require_success(marked)
+    assert marked.successes == ("docked",)
+
+
+def test_marked_outcomes_of_any_name_count_as_success(env: Environment) -> None:
+    assert (env.successes, env.success_indices) == (("success",), (1,))
+    marks = {"terminal.timeout.success": True, "reward.velocity_constraint.bound.success": True}
+    several = jaxsafe.override(env, marks)
+    assert several.successes == ("success", "timeout", "velocity")
+    assert several.succeeded(np.arange(7)).tolist() == [0, 1, 0, 0, 1, 1, 0]
+    assert jaxsafe.config.load(jaxsafe.dump(several)) == several
+
+    others = jaxsafe.override(several, {"terminal.success.success": False})
+    assert others.successes == ("timeout", "velocity")
+    none = jaxsafe.override(env, {"terminal.success.success": False})
+    assert none.successes == none.success_indices == ()
+    assert not none.succeeded(np.arange(7)).any()
 
 
 @pytest.mark.parametrize(

@@ -151,6 +151,13 @@ def test_the_metrics_of_three_episodes_are_those_worked_out_by_hand(episodes: Ep
     )
 
 
+def test_several_outcomes_may_count_as_success(episodes: Episode) -> None:
+    for success, rate in (([SUCCESS, 3], 1.0), ([3], 1.0 / 3), ((), None)):
+        outcomes = episodes.replace(outcome=jnp.array([SUCCESS, 3, SUCCESS]))
+        found = summarise(outcomes, success)["success_rate"]
+        assert found == (rate if rate is None else pytest.approx(rate))
+
+
 def test_without_violations_severity_is_zero() -> None:
     episode = follow(time_step(1.0, outcome=SUCCESS))
     computed = summarise(jax.tree.map(lambda leaf: leaf[None], episode), SUCCESS)

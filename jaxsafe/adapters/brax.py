@@ -108,7 +108,7 @@ class BraxEnv(Env):
         terms = {f"reward_{name}": value for name, value in timestep.info.reward_terms.items()}
         return {
             "cost": timestep.cost,
-            "success": _number(timestep.info.outcome == self.env.success),
+            "success": _number(self.env.succeeded(timestep.info.outcome)),
             **terms,
         }
 

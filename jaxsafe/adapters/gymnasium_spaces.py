@@ -56,7 +56,7 @@ def facts(env: Environment, timestep: TimeStep) -> dict[str, Any]:
     found = {
         "cost": timestep.cost,
         "outcome": outcomes[info.outcome],
-        "is_success": info.outcome == env.success,
+        "is_success": env.succeeded(info.outcome),
         **{name: getattr(info, name) for name in _FACTS},
     }
     return found if info.rta is None else {**found, "rta": vars(info.rta)}

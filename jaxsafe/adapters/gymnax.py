@@ -170,7 +170,7 @@ def _step(
     following, observation = restarted(params.env, state, timestep, key)
     info = {
         "cost": timestep.cost,
-        "is_success": timestep.info.outcome == params.env.success,
+        "is_success": params.env.succeeded(timestep.info.outcome),
         "terminated": timestep.terminated,
         "truncated": timestep.truncated,
         "final_observation": timestep.observation,

@@ -31,18 +31,18 @@ class Film(NamedTuple):
     seed: int | None = None
     """The training seed of the policy. None stands for the first one."""
 
-    def choose(self, sums: Episode, success: int) -> int | None:
+    def choose(self, sums: Episode, env: Environment) -> int | None:
         """Return the number of the episode, or None if there is no such episode.
 
         Args:
             sums: sums over the episodes of the policy, each field [episodes].
-            success: the index of the outcome that counts as success.
+            env: the environment, which says what counts as success.
         """
         if self.which == "worst":
             return int(np.argmin(sums.episode_return))
         flags = {
             "first": np.ones(len(sums.outcome), bool),
-            "failing": sums.outcome != success,
+            "failing": ~env.succeeded(np.asarray(sums.outcome)),
             "violating": sums.violating_steps > 0,
         }[self.which]
         return int(np.argmax(flags)) if flags.any() else None
@@ -71,7 +71,7 @@ def evaluate(
         The path of `results.json`, its content, and lines that tell of the films.
 
     Raises:
-        ConfigError: `out` holds something, or no outcome of the environment is a success.
+        ConfigError: `out` holds something, or no outcome of the environment counts as a success.
     """
     require_success(env)
     episodes, seed = request["episodes"], request["evaluation_seed"]
@@ -151,7 +151,7 @@ def _render(
     first = subject.facts["seed"]
     index = 0 if film.seed is None else film.seed - first
     own = jax.tree.map(lambda x: np.asarray(x)[index], sums)
-    number = film.choose(own, env.success)
+    number = film.choose(own, env)
     whose = f"seed {first + index}, {kind}"
     told = []
     if number is None:

@@ -44,7 +44,7 @@ def evaluate(
     sums = jax.jit(run_episodes, static_argnums=(1, 3))(env, policy, key, count)
     return summarise(
         jax.device_get(sums),
-        env.success,
+        env.success_indices,
         **measures(env),
         full_controls=full_controls(env),
     )

@@ -265,7 +265,6 @@ def episode_rows(
         first_seed: the training seed of the first policy.
         **common: entries that all rows have.
     """
-    success = env.success
     measured = measures(env)
     needs = {
         "delta_v": "has_delta_v",
@@ -278,13 +277,14 @@ def episode_rows(
     columns = {name: np.asarray(getattr(episodes, name)).tolist() for name in names}
     unmeasured = {name for name, what in needs.items() if not measured[what]}
     outcomes = np.asarray(episodes.outcome)
+    succeeded = env.succeeded(outcomes)
     return [
         {
             **common,
             "seed": first_seed + seed,
             "episode": index,
             "outcome": env.outcomes[outcomes[seed, index]],
-            "success": bool(outcomes[seed, index] == success),
+            "success": bool(succeeded[seed, index]),
             **{
                 name.removeprefix("episode_"): None
                 if name in unmeasured
@@ -313,7 +313,7 @@ def metrics_per_seed(env: Environment, episodes: Episode) -> dict[str, list[floa
     measured: dict[str, Any] = {**measures(env), "full_controls": full_controls(env)}
     num_seeds = np.asarray(episodes.outcome).shape[0]
     of_seeds = [jax.tree.map(lambda x, i=i: x[i], episodes) for i in range(num_seeds)]
-    metrics = [summarise(of_seed, env.success, **measured) for of_seed in of_seeds]
+    metrics = [summarise(of_seed, env.success_indices, **measured) for of_seed in of_seeds]
     return {name: [of_seed[name] for of_seed in metrics] for name in METRICS}
 
 

@@ -14,7 +14,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.ticker import FixedLocator, MaxNLocator
 
-from jaxsafe.environment import SUCCESS
 from jaxsafe.environment import control_unit as control_unit
 from jaxsafe.environment import length_unit as length_unit
 from jaxsafe.processors.constraint import Separation, SpeedLimit
@@ -132,8 +131,8 @@ def kept_out(env: Environment) -> set[str]:
                     regions |= watched([status[name]])
         return regions
 
-    goals = [part for part in env.terminal if part.name == SUCCESS]
-    failures = [part for part in env.terminal if part.name != SUCCESS]
+    goals = [part for part in env.terminal if part.name in env.successes]
+    failures = [part for part in env.terminal if part.name not in env.successes]
     return watched([*env.constraints, *failures]) - watched(goals)
 
 

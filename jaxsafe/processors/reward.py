@@ -38,6 +38,8 @@ class Bound(Component):
     below: Pay
     outcome: str
     ends: Ends = "terminated"
+    success: bool | None = None
+    """Whether it counts as a success. By default it does if the outcome is called `success`."""
 
 
 class Reward(Processor):

@@ -32,6 +32,8 @@ class Terminal(Component):
     name: str
     ends: Ends = "terminated"
     apart: bool = False
+    success: bool | None = None
+    """Whether it counts as a success. By default it does if it is called `success`."""
 
     def reached(self, sim: Sim) -> Bool[Array, ""]:
         """Return whether the condition holds."""

@@ -5,6 +5,9 @@ The training curve of Table 2 and the cost of the training come from them.
 
 from __future__ import annotations
 
+import functools
+import operator
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Int
@@ -87,7 +90,9 @@ def latest_cost(window: Window, number: int = 25) -> Array:
     )
 
 
-def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:
+def means(
+    window: Window, outcomes: tuple[str, ...], successes: tuple[str, ...]
+) -> dict[str, Array]:
     """Return averages over the episodes in the window, by column of the progress log.
 
     They are 0 while the window is empty. A share is an average of shares: every episode counts
@@ -98,6 +103,7 @@ def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:
         window: the window.
         outcomes: names of the outcomes, as `env.outcomes`. The first one means that the episode
             still runs.
+        successes: names of those that count as success.
     """
     filled = (jnp.arange(SIZE, dtype=window.count.dtype) < window.count).astype(
         jnp.result_type(float)
@@ -113,8 +119,9 @@ def means(window: Window, outcomes: tuple[str, ...]) -> dict[str, Array]:
         return jnp.sum(weight * steps.astype(weight.dtype) / lengths)
 
     share = {name: mean(episodes.outcome == index) for index, name in enumerate(outcomes) if index}
+    reached = [share[name] for name in successes]
     return {
-        "success_rate": share.get("success", jnp.zeros(())),
+        "success_rate": functools.reduce(operator.add, reached) if reached else jnp.zeros(()),
         "return": mean(episodes.episode_return),
         "length": mean(episodes.length),
         "delta_v": mean(episodes.delta_v),

@@ -160,7 +160,7 @@ def chunk(
         }
         if agent.cost_critic:
             counts["multiplier"] = state.multiplier
-        means = recent_episodes.means(state.window, env.outcomes)
+        means = recent_episodes.means(state.window, env.outcomes, env.successes)
         return state, {**counts, **means, **diagnostics}
 
     return jax.lax.scan(one, state, None, length=length)

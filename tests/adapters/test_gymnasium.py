@@ -329,6 +329,17 @@ def test_info_says_what_happened() -> None:
     assert sum(info["reward_terms"].values()) == pytest.approx(sum(info["reward_totals"].values()))
 
 
+SHORT = {"terminal.timeout.success": True, "terminal.timeout.limit": 1.0}
+
+
+def test_an_end_that_is_marked_is_a_success() -> None:
+    env = GymEnv("docking2d", overrides=SHORT)
+    env.reset(options=FAST)
+    env.step(np.zeros(2, np.float32))
+    *_, info = env.step(np.zeros(2, np.float32))
+    assert (info["outcome"], info["is_success"]) == ("timeout", True)
+
+
 @pytest.mark.parametrize("task", ["docking2d", thorough("rejoin2d")])
 def test_an_action_that_is_no_number_ends_the_episode_as_a_failure_that_costs(task: str) -> None:
     action = np.array([np.nan, 0.0], np.float32)

@@ -905,9 +905,11 @@ def test_an_episode_whose_state_is_not_finite_ends_as_a_violation_and_a_failure(
         assert timestep.terminated
         assert timestep.cost == 1.0
         assert all(0.0 <= float(severity) <= 1.0 for severity in timestep.info.severity.values())
-        assert timestep.info.outcome != env.success
+        assert not env.succeeded(timestep.info.outcome)
         sums = metrics.accumulate(metrics.begin(first), timestep)
-        computed = metrics.summarise(jax.tree.map(lambda leaf: leaf[None], sums), env.success)
+        computed = metrics.summarise(
+            jax.tree.map(lambda leaf: leaf[None], sums), env.success_indices
+        )
         assert computed["success_rate"] == 0.0
         assert computed["safety_violation_rate"] == computed["episode_safety_violation_rate"] == 1.0
 

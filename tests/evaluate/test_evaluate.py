@@ -102,10 +102,12 @@ def test_a_film_shows_the_episode_that_is_asked_for(
 
 
 def test_a_film_of_what_did_not_happen_is_that_of_the_first_episode() -> None:
+    env = jaxsafe.make("docking2d")
     flags = np.array([1, 1])
     sums: Any = SimpleNamespace(outcome=flags, violating_steps=np.zeros(2), episode_return=flags)
-    assert [Film("gif", which).choose(sums, 1) for which in ("failing", "violating")] == [None] * 2
-    assert Film("gif").choose(sums, 1) == 0
+    for which in ("failing", "violating"):
+        assert Film("gif", which).choose(sums, env) is None
+    assert Film("gif").choose(sums, env) == 0
 
 
 @pytest.mark.thorough

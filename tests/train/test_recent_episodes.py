@@ -77,11 +77,13 @@ def test_averages_are_over_the_filled_part_only() -> None:
     window = push(
         empty_window(episodes_like(values)), episodes_like(values), jnp.array([[True, True, False]])
     )
-    row = means(window, ENV.outcomes)
+    row = means(window, ENV.outcomes, ENV.successes)
     assert float(row["return"]) == 2.0
     assert float(row["length"]) == 7.0
     assert float(row["success_rate"]) == float(row["outcome/success"]) == 1.0
     assert float(row["outcome/crash"]) == 0.0
+    for successes, rate in (((), 0.0), (("crash",), 0.0), (("crash", "success"), 1.0)):
+        assert float(means(window, ENV.outcomes, successes)["success_rate"]) == rate
 
 
 @pytest.mark.thorough

@@ -1,3 +1,4 @@
+import copy
 import json
 import os
 import random
@@ -26,6 +27,7 @@ from jaxsafe.devices import processes
 from jaxsafe.envs import TASKS
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import write_rows
+from jaxsafe.train.host import restore, run_directory
 from jaxsafe.train.host.checkpoint import Checkpoints
 from jaxsafe.train.host.options import recipe, resolve
 from jaxsafe.train.host.session import Clock, Training
@@ -649,6 +651,17 @@ def test_a_run_may_go_on_for_longer_and_look_at_itself_more_often(
         text.replace("steps: 1280", "steps: 1500").replace("eval_every: 320", "eval_every: 64")
     )
     jax.tree.map(np.testing.assert_array_equal, final_state(run), final_state(whole))
+
+
+def test_a_field_that_is_newer_than_a_checkpoint_has_its_default_in_it(whole: Path) -> None:
+    config, env, _ = run_directory.read(whole, "run")
+    now = restore.made_from(env, config)
+    before = copy.deepcopy(now)
+    del before["environment"]["terminal"][0]["success"], before["training"]["ppo"]["gae_lambda"]
+    assert restore._as_of_today(before)["environment"] == now["environment"]
+    before["environment"]["dt"] = 2.0
+    assert restore._as_of_today(before)["environment"]["dt"] == 2.0
+    assert restore._as_of_today("x") == "x"
 
 
 @pytest.mark.thorough

@@ -97,7 +97,10 @@ def restore(
     facts, place = checkpoints.facts(step), f"{checkpoints.directory / str(step)}: facts"
     check(facts, {"updates": COUNT, "wall_s": AMOUNT, "compile_s": AMOUNT}, place)
     if "made_from" in facts:
-        path, before, now = _difference(facts["made_from"], made_from(env, config))
+        own = made_from(env, config)
+        path, before, now = _difference(facts["made_from"], own)
+        if path:
+            path, before, now = _difference(_as_of_today(facts["made_from"]), own)
         if path:
             raise ConfigError(
                 f"{checkpoints.directory.parent / 'config.yaml'}: {path}: "
@@ -109,6 +112,18 @@ def restore(
             f"{place}: updates: expected those of {step} steps, found {facts['updates']}"
         )
     return checkpoints.restore(step, structure(env, config)), facts
+
+
+def _as_of_today(before: Any) -> Any:
+    """Return what a checkpoint was made from as this version describes it.
+
+    So a field that is newer than the checkpoint has its default in it.
+    """
+    try:
+        config, env = run_directory.from_described(before, "")
+    except (AttributeError, ConfigError, KeyError, TypeError):
+        return before
+    return made_from(env, config)
 
 
 def _difference(before: Any, now: Any, place: str = "") -> tuple[str, Any, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -146,6 +146,24 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
             f"{option}: no run in {str(path)!r} (a directory with config.yaml){choice}"
         )
     content, place = read_content(path), f"{path / 'config.yaml'}: "
+    config, env = from_described(content, place)
+    name = str(content["env"])
+    return config, env.named(name), name
+
+
+def from_described(content: Mapping[str, Any], place: str) -> tuple[TrainConfig, Environment]:
+    """Return the configuration and the environment of the data that `described` returns.
+
+    The data may be older. Options that had other names then are understood, and what is new since
+    then has its default.
+
+    Args:
+        content: the data.
+        place: what stands before places in messages of errors.
+
+    Raises:
+        ConfigError: the data cannot be read.
+    """
     # The environment names the modules in which the parts of both are.
     import_modules(content["environment"].get("imports", []), f"{place}environment")
     training = content["training"]
@@ -155,9 +173,7 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
     if training.get("rta_training") in old_names:
         training = {**training, "rta_training": old_names[training["rta_training"]]}
     config = normalise(to_component(training, TrainConfig, f"{place}training"))
-    env = jaxsafe.config.from_data(content["environment"], f"{place}environment")
-    name = str(content["env"])
-    return config, env.named(name), name
+    return config, jaxsafe.config.from_data(content["environment"], f"{place}environment")
 
 
 def extend(runs: Sequence[Path], steps: Any) -> None:

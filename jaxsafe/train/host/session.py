@@ -374,7 +374,7 @@ class Training:
         """Evaluate parameters of a step, and keep those of each seed that succeed most."""
         count = self.config.eval_episodes
         episodes = self._run_episodes("deterministic", count, params=params, step=step)
-        rate = np.mean(np.asarray(episodes.outcome) == self.env.success, axis=1)
+        rate = np.mean(self.env.succeeded(np.asarray(episodes.outcome)), axis=1)
         success = self.mapper.place(rate.astype(np.float32))
         self.best = _keep_best(self.best, {"params": params, "success": success})
 
