@@ -31,6 +31,7 @@ from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.schema.describe import Described, Rows, brief, unbroken
 from jaxsafe.schema.dotted_paths import references, set_path
 from jaxsafe.schema.errors import ConfigError, nearest, part, show
+from jaxsafe.schema.ties import Tie, follow
 from jaxsafe.simulation.controllers import Actuator, AgentController
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.initializers import uniform
@@ -64,7 +65,8 @@ class Environment(Component, Described):
     """A task: platforms and regions, and the processors that give their state a meaning.
 
     `randomize` names numbers of the environment by dotted path, each with the interval from which
-    every episode draws it.
+    every episode draws it. `tied` names numbers that follow other numbers when these are changed or
+    drawn, such as a slope that is twice the mean motion.
     """
 
     shorthand: ClassVar[str | None] = "platforms"
@@ -83,6 +85,7 @@ class Environment(Component, Described):
     randomize: Mapping[ParameterPath, Annotated[Number, Unit("physical", length=2)]] = (
         dataclasses.field(default_factory=dict)
     )
+    tied: Mapping[str, Tie] = dataclasses.field(default_factory=dict)
     rta: RTA | None = None
 
     def reset(self, key: Key) -> tuple[State, TimeStep]:
@@ -478,10 +481,13 @@ def _chosen_parameters(env: Environment, parameters: Mapping[str, Any]) -> Param
 
 
 def drawn(env: Environment, parameters: Parameters) -> Environment:
-    """Return the environment with the numbers that an episode has drawn, `state.parameters`."""
+    """Return the environment with the numbers that an episode has drawn, `state.parameters`.
+
+    Numbers that follow them have moved after them.
+    """
     for path, value in parameters.items():
         env = set_path(env, path, value)
-    return env
+    return follow(env, env.tied, parameters)
 
 
 def extremes(env: Environment) -> tuple[Environment, Environment]:

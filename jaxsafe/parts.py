@@ -18,6 +18,7 @@ from jaxsafe.processors.terminal import Terminal
 from jaxsafe.rta.filter import RTA, BackupController, CertifiedRTA, Faults, RTAMemory, TerminalSet
 from jaxsafe.schema.component import ANY, Component, Range, Refers, Unit
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.schema.ties import Tie
 from jaxsafe.simulation.controllers import (
     Actuator,
     AgentController,
@@ -112,6 +113,7 @@ __all__ = [
     "Task",
     "Terminal",
     "TerminalSet",
+    "Tie",
     "Unit",
     "direction",
     "register",

@@ -11,7 +11,7 @@ from typing import Any
 
 from jaxsafe.config.check import check
 from jaxsafe.config.override import override
-from jaxsafe.config.tied import warn_of_ties
+from jaxsafe.config.tied import settle
 from jaxsafe.environment import Environment
 from jaxsafe.rta.filter import RTA
 from jaxsafe.schema.component import normalise
@@ -34,12 +34,12 @@ __all__ = [
 def build(env: Environment) -> Environment:
     """Return a declared environment ready for use.
 
-    Its numbers become arrays, and its parts are checked.
+    Its numbers become arrays, and its parts are checked. A tied number becomes what it follows.
 
     Raises:
         ConfigError: one line that names the part that does not fit and what is allowed.
     """
-    return check(normalise(env))
+    return check(settle(normalise(env)))
 
 
 def load(source: str | os.PathLike) -> Environment:
@@ -58,9 +58,7 @@ def load(source: str | os.PathLike) -> Environment:
 
     text = isinstance(source, str) and "\n" in source
     data = yaml12.parse(str(source), "environment") if text else yaml12.read(source)
-    env = from_data(_without_recipes(data), "")
-    warn_of_ties(env.replace(randomize={}), env)
-    return env
+    return from_data(_without_recipes(data), "")
 
 
 def load_filter(path: str | os.PathLike) -> RTA:

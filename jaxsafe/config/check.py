@@ -16,12 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from jaxsafe.config.tied import check_ties
 from jaxsafe.environment import Environment, reset, step
 from jaxsafe.processors.observation import Observe, ObserveAngle
 from jaxsafe.schema.component import ANY, Component, choices, fields
 from jaxsafe.schema.convert import expects, to_value
 from jaxsafe.schema.dotted_paths import join, references, set_path
 from jaxsafe.schema.errors import ConfigError, nearest, show, summarise_error
+from jaxsafe.schema.ties import follow
 from jaxsafe.schema.user_modules import modules
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.platform import Platform
@@ -68,10 +70,11 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
     for platform in env.platforms:
         _check_platform(platform, is_agent=platform.name == env.agent)
     _check_space(env)
-    _check_randomized(env)
     for required in ("terminal", "reward", "observation"):
         if not names[required]:
             raise ConfigError(f"{required}: an environment needs at least one")
+    check_ties(env)
+    _check_randomized(env)
     if before is None or _shapes(env) != _shapes(before):
         _check_computable(*_shapes(env), jnp.result_type(float))
     # What a filter proves depends on the numbers, so the filter is asked in either case.
@@ -233,6 +236,7 @@ def _check_randomized(env: Environment) -> None:
         for value in (low, high, *([0.0] if low < 0.0 < high else [])):
             try:
                 changed = set_path(env, path, value, convert)
+                changed = follow(changed, env.tied, [path], to_value)
                 if _shapes(changed) != _shapes(env):
                     raise ConfigError(
                         f"{path}: expected the path of one number, found that of a list"
@@ -252,7 +256,11 @@ def _check_randomized(env: Environment) -> None:
 
 
 def _shapes(env: Environment) -> tuple[Any, tuple]:
-    leaves, structure = jax.tree.flatten(env)
+    """Return all that decides whether an environment can be traced.
+
+    Ties matter only where a number is random.
+    """
+    leaves, structure = jax.tree.flatten(env if env.randomize else env.replace(tied={}))
     return structure, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
 
 

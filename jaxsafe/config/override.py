@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from jaxsafe.config.check import check
-from jaxsafe.config.tied import warn_of_ties
+from jaxsafe.config.tied import carry
 from jaxsafe.environment import Environment
 from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.schema.retype import set_paths
@@ -21,6 +21,9 @@ def override(env: Environment, changes: Mapping[str, Any], place: str = "") -> E
     Values may be traced. So a sweep is
     `jax.vmap(lambda w: f(override(env, {"reward.delta_v.scale": w})))(weights)`, and `jax.grad` of
     the same function is a gradient with respect to a parameter.
+
+    Numbers that `env.tied` lists follow the changes. One that is itself changed follows no longer,
+    and a warning says so.
 
     Args:
         env: the environment.
@@ -39,7 +42,5 @@ def override(env: Environment, changes: Mapping[str, Any], place: str = "") -> E
             raise ConfigError(
                 f"override: expected dotted paths such as 'deputy.mass', found {show(path)}"
             )
-    changed = set_paths(env, changes, place)
-    checked = check(changed, before=env)
-    warn_of_ties(env, checked)
-    return checked
+    changed = carry(env, set_paths(env, changes, place), changes)
+    return check(changed, before=env)

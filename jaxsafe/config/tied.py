@@ -1,118 +1,149 @@
-"""Warnings about a number that is changed without another one that belongs to it.
+"""Numbers of an environment that follow other numbers of it: `Environment.tied`.
 
-The tasks derive such numbers from one another, but an environment has them as two numbers.
+What is changed or drawn at random moves the numbers that follow it. A number that is itself changed
+or drawn follows no longer.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
 from jaxsafe.environment import Environment
-from jaxsafe.processors.constraint import Separation
-from jaxsafe.processors.reward import Success
-from jaxsafe.processors.status import VelocityLimit
-from jaxsafe.processors.terminal import Timeout, TooClose
-from jaxsafe.schema.errors import ConfigWarning
-from jaxsafe.simulation.initializers import BelowSpeedLimit
-
-_OFTEN = {1.0: "equal to", 2.0: "twice"}
-"""Words for factors that are common."""
+from jaxsafe.schema.component import ANY, Field
+from jaxsafe.schema.convert import expects, to_value
+from jaxsafe.schema.describe import brief
+from jaxsafe.schema.dotted_paths import get_path, set_path
+from jaxsafe.schema.errors import ConfigError, ConfigWarning
+from jaxsafe.schema.ties import follow_one, in_order, plain_paths, target
 
 
-class Tie(NamedTuple):
-    """Two numbers that may belong together."""
+def settle(env: Environment) -> Environment:
+    """Return an environment in which every tied number is what it follows.
 
-    paths: tuple[str, str]
-    """Dotted paths of the two numbers."""
+    A file may have another number. That it becomes what it follows is told in one line.
 
-    numbers: tuple[Any, Any]
-    """The two numbers."""
-
-    factor: float = 1.0
-    """Quotient of the second number and the first where they belong together."""
-
-    @property
-    def traced(self) -> bool:
-        """Whether a number is traced, so that nothing can be said about the two."""
-        return any(isinstance(number, Tracer) for number in self.numbers)
-
-    @property
-    def holds(self) -> bool:
-        """Whether the numbers belong together with their present values."""
-        first, second = map(np.asarray, self.numbers)
-        return bool(abs(self.factor * first - second) <= 1e-6 * abs(second))
-
-
-def warn_of_ties(before: Environment, after: Environment) -> None:
-    """Warn of each number that was tied to others and was changed or made random without them.
-
-    Each warning is one line.
-
-    Args:
-        before: the environment as it was.
-        after: the environment with the changes of a user. Numbers that are traced are not judged.
+    Raises:
+        ConfigError: numbers follow one another in a circle, or one would be out of its range.
     """
-    held = {tie.paths: tie for tie in _ties(before) if not tie.traced and tie.holds}
-    newly_random = {
-        path.removeprefix("platforms.") for path in after.randomize if path not in before.randomize
-    }
-    alone: dict[tuple[str, str, float], list[str]] = {}
-    for tie in _ties(after):
-        if tie.paths not in held or tie.traced:
+    for path in in_order(env.tied):
+        tie = env.tied[path]
+        number = _number(env, path)
+        source = _number(env, tie.to)
+        # A path that leads nowhere is told by `check_ties`.
+        if number is None or source is None or _equal(number, target(env, tie)):
             continue
-        random = [path in newly_random for path in tie.paths]
-        changed = [
-            not np.array_equal(*pair)
-            for pair in zip(tie.numbers, held[tie.paths].numbers, strict=True)
-        ]
-        if not any(random) and (tie.holds or all(changed)):
-            continue
-        index = random.index(True) if any(random) else changed.index(True)
-        factor = tie.factor if index == 0 else 1.0 / tie.factor
-        verb = "is random" if any(random) else "changes"
-        alone.setdefault((tie.paths[index], verb, factor), []).append(tie.paths[1 - index])
-    for (path, verb, factor), others in alone.items():
-        was = (
-            f"{'was' if len(others) == 1 else 'were'} {_OFTEN.get(factor, f'{factor:g} times')} it"
-        )
-        kept = "keeps its value" if len(others) == 1 else "keep their values"
+        env = follow_one(env, path, tie, to_value)
         warnings.warn(
-            f"{path} {verb} alone: {' and '.join(others)}, which {was}, {kept}",
+            f"{path}: {brief(number)} becomes {brief(get_path(env, path))}, because it follows "
+            f"{tie.rule}; take it out of `tied` to set it apart",
             ConfigWarning,
             stacklevel=3,
         )
+    return env
 
 
-def _ties(env: Environment) -> Iterator[Tie]:
-    """Yield the pairs of numbers of an environment that the tasks derive from one another."""
-    limits = [one for one in env.status if isinstance(one, VelocityLimit)]
-    for timeout in (one for one in env.terminal if isinstance(one, Timeout)):
-        for reward in (one for one in env.reward if isinstance(one, Success)):
-            paths = f"terminal.{timeout.name}.limit", f"reward.{reward.name}.time_scale"
-            yield Tie(paths, (timeout.limit, reward.time_scale))
-    for crash in (one for one in env.terminal if isinstance(one, TooClose)):
-        for constraint in (one for one in env.constraints if isinstance(one, Separation)):
-            if constraint.distance == crash.distance:
-                paths = f"terminal.{crash.name}.limit", f"constraints.{constraint.name}.minimum"
-                yield Tie(paths, (crash.limit, constraint.minimum))
-    for platform in env.platforms:
-        starts = [one for one in platform.start if isinstance(one, BelowSpeedLimit)]
-        sloped = {f"status.{one.name}": one for one in limits} | {
-            f"{platform.name}.start.{one.name}": one for one in starts
-        }
-        motion = getattr(platform, "mean_motion", None)
-        for place, one in sloped.items() if motion is not None else ():
-            yield Tie((f"{platform.name}.mean_motion", f"{place}.slope"), (motion, one.slope), 2.0)
-        for limit in limits:
-            for start in starts:
-                for name in ("floor", "slope"):
-                    paths = (
-                        f"status.{limit.name}.{name}",
-                        f"{platform.name}.start.{start.name}.{name}",
-                    )
-                    yield Tie(paths, (getattr(limit, name), getattr(start, name)))
+def carry(before: Environment, after: Environment, changed: Iterable[str]) -> Environment:
+    """Return a changed environment in which tied numbers have followed the changes.
+
+    A number that was changed itself, or is random now, is tied no longer. One line tells so. A tie
+    whose number or whose source is no longer there goes without a word.
+
+    Args:
+        before: the environment before the changes.
+        after: the environment with the changes.
+        changed: the paths of the changes.
+
+    Raises:
+        ConfigError: numbers follow one another in a circle, or one would be out of its range.
+    """
+    given = set(plain_paths(after, changed))
+    random = set(plain_paths(after, after.randomize))
+    ties = dict(after.tied)
+    for path in in_order(after.tied):
+        tie = after.tied[path]
+        number = _number(after, path)
+        source = _number(after, tie.to)
+        if before.tied.get(path) == tie and (number is None or source is None):
+            del ties[path]
+        elif path in random or path in given or _differs(before, after, path):
+            del ties[path]
+            what = "is random" if path in random else "changes"
+            warnings.warn(
+                f"{path} {what} alone: it followed {tie.rule}, and does so no longer",
+                ConfigWarning,
+                stacklevel=3,
+            )
+        elif number is None or source is None:
+            continue  # `check_ties` tells that the path leads nowhere
+        elif before.tied.get(path) != tie or _differs(before, after, tie.to):
+            after = follow_one(after, path, tie, to_value)
+    return after if len(ties) == len(after.tied) else after.replace(tied=ties)
+
+
+def check_ties(env: Environment) -> None:
+    """Check that every tie is between two numbers of the environment, the first one not random.
+
+    Raises:
+        ConfigError: one is not. The message names it.
+    """
+    random = plain_paths(env, env.randomize)
+    for path, tie in env.tied.items():
+        for end in (path, tie.to):
+            if end.split(".")[0] in ("platforms", "randomize", "tied"):
+                raise ConfigError(
+                    f"tied.{path}: expected paths of numbers that begin with a section or the name "
+                    f"of a platform, such as deputy.mass, found {end}"
+                )
+            try:
+                set_path(env, end, jnp.zeros(()), _one_number)
+            except ConfigError as error:
+                raise ConfigError(f"tied: {error}") from None
+            if _number(env, end) is None:
+                raise ConfigError(f"tied: {end}: expected the path of one number that is set")
+        if path in random:
+            raise ConfigError(
+                f"randomize: {path}: it follows {tie.rule}; draw that, or take {path} out of `tied`"
+            )
+
+
+def _one_number(value: Any, field: Field, place: str) -> Any:
+    """Return a value of a field that holds one number or a mapping of such. Refuse other fields."""
+    one = field.unit.length in (None, ANY) if field.unit else isinstance(value, dict)
+    if not one:
+        raise ConfigError(
+            f"{place}: expected the path of one number, found that of {expects(field)}"
+        )
+    return value
+
+
+def _number(env: Environment, path: str) -> Any:
+    """Return the number at a path, or None if there is none."""
+    try:
+        value = get_path(env, path)
+    except (AttributeError, ConfigError, KeyError, TypeError):
+        return None
+    numeric = hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jnp.floating)
+    return value if numeric and jnp.ndim(value) == 0 else None
+
+
+def _differs(before: Environment, after: Environment, path: str) -> bool:
+    """Return whether the number at a path is another one than before."""
+    old = _number(before, path)
+    new = _number(after, path)
+    if old is new:
+        return False
+    return old is None or new is None or not _equal(old, new)
+
+
+def _equal(number: Any, other: Any) -> bool:
+    """Return whether two numbers are equal but for rounding. Traced numbers are not."""
+    if isinstance(number, Tracer) or isinstance(other, Tracer):
+        return False
+    first, second = float(np.asarray(number)), float(np.asarray(other))
+    return first == second or abs(first - second) <= 1e-6 * abs(second)

@@ -29,6 +29,7 @@ from jaxsafe.processors.terminal import Crashed, Docked, Terminal, Timeout, TooF
 from jaxsafe.rta.asif import DiscreteASIF, ExplicitASIF, ImplicitASIF, Polynomial
 from jaxsafe.rta.backups import AlignAndBrake, AlignedOrSlow, Brake, Slow
 from jaxsafe.rta.simplex import Simplex
+from jaxsafe.schema.ties import Tie, Ties
 from jaxsafe.simulation.controllers import Actuator, Continuous
 from jaxsafe.simulation.cwh import MEAN_MOTION, Anchor, Spacecraft
 from jaxsafe.simulation.double_integrator import DoubleIntegrator
@@ -50,6 +51,14 @@ LIMIT_SLOPE = 2.0 * MEAN_MOTION
 
 DOCKING_RADIUS = 0.5
 """Radius of the docking region around the chief [m], Section 3."""
+
+DOCKING_TIES: Ties = {
+    "status.velocity_limit.slope": Tie(to="deputy.mean_motion", times=2.0),  # ν₁ = 2n, Eq. (14)
+    "deputy.start.velocity.floor": Tie(to="status.velocity_limit.floor"),
+    "deputy.start.velocity.slope": Tie(to="status.velocity_limit.slope"),
+    "reward.success.time_scale": Tie(to="terminal.timeout.limit"),  # t_max of Table 8
+}
+"""Numbers that follow others. A start is within the speed limit."""
 
 ONE_DEGREE = jnp.pi / 180.0
 
@@ -78,6 +87,7 @@ def docking(dimension: Literal[1, 2, 3]) -> Environment:
             Observe(name="velocity", of="deputy", what="velocity", scale=0.5),
             *speed_observation(),
         ),
+        tied=DOCKING_TIES,
     )
 
 
@@ -112,6 +122,7 @@ def docking_oriented() -> Environment:
             Observe(name="attitude_rate", of="deputy", what="attitude_rate", scale=RATE_LIMIT),
             *speed_observation(),
         ),
+        tied=DOCKING_TIES,
     )
 
 

@@ -27,6 +27,7 @@ from jaxsafe.processors.terminal import Held, Terminal, Timeout, TooClose, TooFa
 from jaxsafe.rta.asif import ExplicitASIF, ImplicitASIF, Polynomial
 from jaxsafe.rta.backups import MatchVelocity, VelocityMatched
 from jaxsafe.rta.simplex import CollisionSimplex, Simplex
+from jaxsafe.schema.ties import Tie, Ties
 from jaxsafe.simulation.controllers import Actuator, Continuous
 from jaxsafe.simulation.dubins import Dubins2D, Dubins3D
 from jaxsafe.simulation.geometry import Aspect, Circle, Cylinder
@@ -38,6 +39,12 @@ HOLD = 20.0
 
 SAFE_DISTANCE = 100.0
 """ρ_c of Eqs. (8), (11): the smallest distance to the lead [ft]."""
+
+REJOIN_TIES: Ties = {
+    "terminal.crash.limit": Tie(to="constraints.collision.minimum"),  # ρ_c of Table 9
+    "reward.success.time_scale": Tie(to="terminal.timeout.limit"),  # t_max of Table 7
+}
+"""Numbers that follow others."""
 
 REJOIN_POINT = Aspect(distance=500.0, angle=jnp.pi / 3)
 """Eq. (6): behind the lead, 60° from its tail [ft]."""
@@ -83,6 +90,7 @@ def rejoin2d() -> Environment:
         terminal=rejoin_terminal(farthest=40_000.0, timeout=timeout),
         reward=rejoin_reward(timeout),
         observation=rejoin_observation(2),
+        tied=REJOIN_TIES,
     )
 
 
@@ -137,6 +145,7 @@ def rejoin3d() -> Environment:
             _observe_angle("roll", jnp.pi / 3),
             _observe_angle("flight_path_angle", jnp.pi / 9),
         ),
+        tied=REJOIN_TIES,
     )
 
 

@@ -1,10 +1,10 @@
 """Component: a frozen keyword-only dataclass that is a pytree.
 
 Numbers are leaves, names and counts are structure. The annotation of a field decides: `str`, `int`,
-`bool`, `Literal` and tuples of them are structure, and changing one compiles again. Everything else
-is a leaf or a subtree, and changing a number never compiles again. The annotation also carries the
-unit, the allowed range and what a name refers to, so configuration files are checked from the same
-line.
+`bool`, `float`, `Literal` and tuples of them are structure, and changing one compiles again.
+Everything else is a leaf or a subtree, and changing a number with a unit never compiles again. The
+annotation also carries the unit, the allowed range and what a name refers to, so configuration
+files are checked from the same line.
 """
 
 from __future__ import annotations
@@ -203,8 +203,12 @@ def normalise(value: Any) -> Any:
     if isinstance(value, tuple):
         return tuple(map(normalise, value))
     if isinstance(value, dict):
-        return {key: _as_array(value[key]) for key in sorted(value)}
+        return {key: _normalised_item(value[key]) for key in sorted(value)}
     return value
+
+
+def _normalised_item(item: Any) -> Any:
+    return normalise(item) if isinstance(item, Component) else _as_array(item)
 
 
 def _as_array(value: Any) -> Any:
@@ -301,7 +305,7 @@ def _is_static(hint: Any) -> bool:
     if origin in (typing.Union, types.UnionType, tuple):
         members = [argument for argument in arguments if argument not in (type(None), Ellipsis)]
         return all(map(_is_static, members))
-    return hint in (str, int, bool)
+    return hint in (str, int, bool, float)
 
 
 def _default(item: dataclasses.Field) -> Any:

@@ -5,6 +5,8 @@ Every fault is one line that names its place.
 
 from __future__ import annotations
 
+import contextlib
+import math
 import sys
 import types
 import typing
@@ -72,9 +74,10 @@ def to_component(data: Any, base: type[Kind], place: str) -> Kind:
     for name, field in table.items():
         if field.required and name not in entries:
             raise ConfigError(f"{label}: field {name!r} is missing; it takes {expects(field)}")
-    return cls(
-        **{name: to_value(value, table[name], join(place, name)) for name, value in entries.items()}
-    )
+    values = {
+        name: to_value(value, table[name], join(place, name)) for name, value in entries.items()
+    }
+    return normalise(cls(**values))  # defaults are numbers of Python
 
 
 def to_value(value: Any, field: Field, place: str) -> Any:
@@ -84,7 +87,7 @@ def to_value(value: Any, field: Field, place: str) -> Any:
         ConfigError: the field does not take this value.
     """
     if field.unit:
-        if value is None and _is_optional(field.hint):
+        if value is None and is_optional(field.hint):
             return None
         return _to_array(value, field, place)
     return _to_structure(value, field.hint, field, place)
@@ -113,8 +116,9 @@ def expects(field: Field) -> str:
     core = bare(field.hint)
     if typing.get_origin(core) is Literal:
         return "one of " + ", ".join(map(str, typing.get_args(core)))
-    words = {str: "a name", int: "a whole number", bool: "true or false"}
-    expected = words.get(core, "a mapping" if _is_component(core) else "a list")
+    words = {str: "a name", int: "a whole number", bool: "true or false", float: "a number"}
+    mapping = is_component(core) or is_mapping(core)
+    expected = words.get(core, "a mapping" if mapping else "a list")
     return f"{expected} {field.range}" if field.range else expected
 
 
@@ -180,17 +184,17 @@ def _to_structure(value: Any, hint: Any, field: Field, place: str) -> Any:
         field: the field, for error messages.
         place: where the value stands.
     """
-    optional = _is_optional(hint)
+    optional = is_optional(hint)
     hint = bare(hint)
     origin = typing.get_origin(hint)
     arguments = typing.get_args(hint)
     if value is None and optional:
         return None
-    if _is_component(hint):
+    if is_component(hint):
         return to_component(value, hint, place)
     if origin is tuple:
         return _to_tuple(value, arguments[0], field, place)
-    if origin is not None and isinstance(origin, type) and issubclass(origin, Mapping):
+    if is_mapping(hint):
         return _to_mapping(value, arguments[1], place)
     if origin is Literal:
         if value not in arguments:
@@ -201,14 +205,19 @@ def _to_structure(value: Any, hint: Any, field: Field, place: str) -> Any:
     given = value
     if hint is int and isinstance(value, float) and value.is_integer():
         value = int(value)
-    if not isinstance(value, hint) or (hint is int and isinstance(value, bool)):
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        with contextlib.suppress(OverflowError):  # what no float holds is refused below
+            value = float(value)
+    if not isinstance(value, hint) or (hint in (int, float) and isinstance(value, bool)):
         raise ConfigError(f"{place}: expected {expects(field)}, found {_show(value)}")
-    if field.range and isinstance(value, int) and value not in field.range:
-        raise ConfigError(f"{place}: expected {expects(field)}, found {show(value)}")
-    if field.range and isinstance(value, int) and not field.range.carries(value):
-        raise ConfigError(
-            f"{place}: expected {expects(field)} {field.range.magnitudes}, found {show(given)}"
-        )
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        limits = field.range or Range()
+        if value not in limits or (hint is float and not math.isfinite(value)):
+            raise ConfigError(f"{place}: expected {expects(field)}, found {show(value)}")
+        if not limits.carries(value):
+            raise ConfigError(
+                f"{place}: expected {expects(field)} {limits.magnitudes}, found {show(given)}"
+            )
     return value
 
 
@@ -283,13 +292,21 @@ def bare(hint: Any) -> Any:
     return bare(inner) if optional else hint
 
 
-def _is_optional(hint: Any) -> bool:
+def is_optional(hint: Any) -> bool:
+    """Return whether an annotation allows None."""
     is_union = typing.get_origin(hint) in (typing.Union, types.UnionType)
     return is_union and type(None) in typing.get_args(hint)
 
 
-def _is_component(hint: Any) -> bool:
+def is_component(hint: Any) -> bool:
+    """Return whether an annotation is a class of components."""
     return isinstance(hint, type) and issubclass(hint, Component)
+
+
+def is_mapping(hint: Any) -> bool:
+    """Return whether an annotation is `Mapping[…]` or alike."""
+    origin = typing.get_origin(hint)
+    return isinstance(origin, type) and issubclass(origin, Mapping)
 
 
 def _shortest(array: np.ndarray) -> Any:
@@ -302,4 +319,5 @@ def _shortest(array: np.ndarray) -> Any:
 def _show(value: Any) -> str:
     if isinstance(value, Tracer):
         return f"an array of shape {value.shape}"
-    return show(to_data(value) if isinstance(value, (np.ndarray, jax.Array)) else value)
+    is_number = isinstance(value, (np.ndarray, np.generic, jax.Array))
+    return show(to_data(value) if is_number else value)

@@ -42,8 +42,10 @@ def get_path(component: Any, path: str) -> Any:
     for name in path.split("."):
         if value is component and name not in fields(type(component)):
             value = getattr(component, component.shorthand)
-        is_list = isinstance(value, tuple)
-        value = value[index_of(value, name, path)] if is_list else getattr(value, name)
+        if isinstance(value, tuple):
+            value = value[index_of(value, name, path)]
+        else:
+            value = value[name] if isinstance(value, Mapping) else getattr(value, name)
     named = isinstance(value, tuple) and all(hasattr(part, "name") for part in value)
     return [part.name for part in value] if named else value
 

@@ -720,17 +720,17 @@ def test_numbers_that_no_program_can_count_to_are_told_at_once(
 def test_a_warning_is_one_line_and_the_command_goes_on(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["jaxsafe", "docking2d", "env.terminal.timeout.limit=50"])
+    monkeypatch.setattr(sys, "argv", ["jaxsafe", "docking2d", "env.reward.success.time_scale=50"])
     monkeypatch.setattr(warnings, "filters", [("default", None, Warning, None, 0)])
     with pytest.raises(SystemExit) as exit_info:
         cli.run(config.main, config.Options)
     captured = capsys.readouterr()
     assert exit_info.value.code == 0
     assert captured.err.startswith(
-        "warning: terminal.timeout.limit changes alone: reward.success.time_scale, which was"
+        "warning: reward.success.time_scale changes alone: it followed terminal.timeout.limit, and"
     )
     assert captured.err.count("\n") == 1
-    assert "limit: 50.0" in captured.out
+    assert "time_scale: 50.0" in captured.out
 
 
 @pytest.mark.parametrize("words", [["jaxsafe"], ["jaxsafe", "help"], ["jaxsafe", "--help"]])

@@ -602,7 +602,7 @@ def without(env: Environment, outcome: str, task: str) -> Environment:
 def test_success_and_timeout_are_both_paid_in_the_released_variant(task: str) -> None:
     computed = []
     for variant in ("released", "paper"):
-        env = build(task, variant=variant)
+        env = build(task, variant=variant).replace(tied={})
         together = jaxsafe.override(coinciding(env, task), {"terminal.distance.limit": 1e4})
         state, _ = jaxsafe.reset_to(together, inside(env, task))
         _, timestep = step(together, state, action(env, 0.0))

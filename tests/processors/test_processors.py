@@ -797,7 +797,7 @@ def test_the_first_end_in_the_list_is_the_outcome() -> None:
 
 
 def test_success_with_a_timeout_pays_success_only() -> None:
-    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 0.5})
+    env = jaxsafe.make("docking2d", {"tied": {}, "terminal.timeout.limit": 0.5})
     (timestep,) = run(env, start(env, (0.4, 0.0), (0.0, 0.0)), (0.0, 0.0), 1)
     assert timestep.info.reward_terms["failure"] == 0.0
     assert float(timestep.info.reward_terms["success"]) == pytest.approx(2.0 - 1.0 / 2000.0)
@@ -813,7 +813,7 @@ def test_success_with_a_timeout_pays_success_only() -> None:
 def test_there_is_at_most_one_outcome_and_it_is_the_flag_that_is_set(
     x: float, speed: float, limit: float, offset: float
 ) -> None:
-    env = bounded(offset, **{"terminal.timeout.limit": limit})
+    env = bounded(offset, **{"tied": {}, "terminal.timeout.limit": limit})
     state, timestep = step(env, start(env, (x, 0.0), (-speed, 0.0)), jnp.zeros(2))
     flags = {name: bool(flag) for name, flag in state.sim.ended.items()}
     assert sum(flags.values()) <= 1
