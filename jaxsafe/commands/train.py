@@ -34,7 +34,9 @@ class Options(CommandOptions):
             "rta",
         ),
         "The training. Its steps are those of each seed.": (
+            "recipe",
             "preset",
+            "like",
             "steps",
             "seeds",
             "seed",
@@ -63,7 +65,7 @@ class Options(CommandOptions):
     env: Annotated[str, Option(first=True, examples=("env=docking3d",))] | None = None
     """A task, the file of an environment, or all for the five tasks one after another.
 
-    It is left out only with resume.
+    It is left out only with resume, or with like for the environment of that run.
     """
     overrides: Overrides
     """Change one field of the environment, for instance env.reward.delta_v.scale=-0.02."""
@@ -82,7 +84,7 @@ class Options(CommandOptions):
                 "A default from the recipe is that of the task, and `jaxsafe train TASK help` "
                 "shows it."
             )
-        settings = recipe(task, given.get("preset"))
+        settings = recipe(task, given.get("preset"), given.get("recipe"))
         return settings, f"The defaults are those of {task} with preset={settings['preset']}."
 
 

@@ -26,6 +26,7 @@ __all__ = [
     "from_data",
     "load",
     "load_filter",
+    "load_recipe_name",
     "load_recipes",
     "override",
 ]
@@ -46,7 +47,8 @@ def load(source: str | os.PathLike) -> Environment:
     """Read an environment from a YAML file, or from the YAML text that `dump` returns.
 
     The modules listed under `imports` are imported first. So the file can name the components that
-    these modules define. What stands under `recipes` is left to `load_recipes`.
+    these modules define. What stands under `recipe` and `recipes` is left to `load_recipe_name` and
+    `load_recipes`.
 
     Args:
         source: the path of a file, or a text of more than one line.
@@ -90,8 +92,12 @@ def load_filter(path: str | os.PathLike) -> RTA:
 def load_recipes(path: str | os.PathLike) -> dict[str, dict[str, Any]]:
     """Read the recipes that a YAML file has for the training in its environment.
 
+    Args:
+        path: a file with an environment, whose recipes stand under `recipes`, or with recipes
+            alone.
+
     Returns:
-        The options of each recipe by its name. There are none in a file without `recipes`.
+        The options of each recipe by its name. There are none in an environment without `recipes`.
 
     Raises:
         ConfigError: the file cannot be read, or its recipes are no mappings.
@@ -99,7 +105,8 @@ def load_recipes(path: str | os.PathLike) -> dict[str, dict[str, Any]]:
     from jaxsafe.schema import yaml12
 
     data = yaml12.read(path)
-    found = data.get("recipes", {}) if isinstance(data, Mapping) else {}
+    alone = isinstance(data, Mapping) and not {"platforms", "recipe", "recipes"} & set(data)
+    found = data if alone else data.get("recipes", {}) if isinstance(data, Mapping) else data
     if not isinstance(found, Mapping) or not all(
         options is None or isinstance(options, Mapping) for options in found.values()
     ):
@@ -109,10 +116,35 @@ def load_recipes(path: str | os.PathLike) -> dict[str, dict[str, Any]]:
     return {str(name): dict(options or {}) for name, options in found.items()}
 
 
+def load_recipe_name(path: str | os.PathLike) -> str | None:
+    """Read the task or file whose recipes are those of a YAML file with an environment.
+
+    Returns:
+        What stands under `recipe`. A file is given as seen from the current directory. None if the
+        file names nothing.
+
+    Raises:
+        ConfigError: the file cannot be read, it names no text, or it has recipes of its own too.
+    """
+    from jaxsafe.schema import yaml12
+
+    data = yaml12.read(path)
+    name = data.get("recipe") if isinstance(data, Mapping) else None
+    if name is None:
+        return None
+    if not isinstance(name, str):
+        raise ConfigError(f"{path}: recipe: expected a task or a file, found {show(name)}")
+    if "recipes" in data:
+        raise ConfigError(f"{path}: recipe: the file has recipes of its own; leave one out")
+    if not name.endswith((".yaml", ".yml")):
+        return name
+    return os.path.normpath(os.path.join(os.path.dirname(path), name))
+
+
 def _without_recipes(data: Any) -> Any:
     if not isinstance(data, Mapping):
         return data
-    return {name: value for name, value in data.items() if name != "recipes"}
+    return {name: value for name, value in data.items() if name not in ("recipe", "recipes")}
 
 
 def dump(env: Environment) -> str:

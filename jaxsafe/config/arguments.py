@@ -15,7 +15,7 @@ from typing import Any
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError, show
 
-PATHS = ("env", "out", "run", "runs", "resume", "policies")
+PATHS = ("env", "out", "run", "runs", "resume", "policies", "recipe", "like")
 """Options that are paths.
 
 They are taken as typed, so `out=2024.10` is no number and `out="my run #3"` has no comment.

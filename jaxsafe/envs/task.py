@@ -85,19 +85,23 @@ def registered(name: str) -> Task | None:
     return TASKS.get(task) or STARTERS.get(task)
 
 
-def find_task(name: str) -> Task:
+def find_task(name: str, place: str = "env") -> Task:
     """Return the task of a name. `MODULE:NAME` imports the user's module first, which registers it.
+
+    Args:
+        name: the name.
+        place: where the name stands. Messages of errors begin with it.
 
     Raises:
         ConfigError: the module cannot be imported, or there is no such task.
     """
     module, _, task = name.rpartition(":")
     if module:
-        import_modules([module], "env")
+        import_modules([module], place)
     known = registered(task)
     if known is None:
         raise ConfigError(
-            f"env: unknown task {show(task)} and not a .yaml file; "
+            f"{place}: unknown task {show(task)} and not a .yaml file; "
             f"choose from {nearest(task, [*TASKS, *STARTERS])}"
         )
     return known

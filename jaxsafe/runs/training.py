@@ -28,7 +28,7 @@ from jaxsafe.runs.run import Run
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import train as function
 from jaxsafe.train.host import run_directory
-from jaxsafe.train.host.options import TrainConfig, resolve
+from jaxsafe.train.host.options import NO_RECIPE, TrainConfig, resolve
 from jaxsafe.train.host.results import finish, table
 from jaxsafe.train.host.session import Clock, Training
 from jaxsafe.train.ppo import PPO, TrainState
@@ -38,6 +38,10 @@ from jaxsafe.types import Key
 
 @overload
 def train(env: str | os.PathLike, *, progress: bool = True, **options: Any) -> Run: ...
+
+
+@overload
+def train(*, like: str | os.PathLike, progress: bool = True, **options: Any) -> Run: ...
 
 
 @overload
@@ -71,7 +75,7 @@ def train(*arguments: Any, **options: Any) -> Any:
     See `train_run` for the first, which takes the options of the command.
     """
     env = arguments[0] if arguments else options.get("env")
-    if "resume" in options or isinstance(env, str | os.PathLike):
+    if {"resume", "like"} & set(options) or isinstance(env, str | os.PathLike):
         return train_run(*arguments, **options)
     if isinstance(env, Environment) and len(arguments) < 2 and "agent" not in options:
         raise ConfigError(
@@ -94,7 +98,8 @@ def train_run(
     Ctrl-C `jaxsafe.train(resume=…)` goes on with the run.
 
     Args:
-        env: a task, the file of an environment, or `MODULE:TASK`.
+        env: a task, the file of an environment, or `MODULE:TASK`. It may be left out with the
+            option `like`.
         resume: the directory of a run to go on with. Beside it stands only `steps`, to train it for
             longer.
         progress: whether to show how far the training is.
@@ -110,7 +115,8 @@ def train_run(
     claim_cores()
     enable_compilation_cache()
     if resume is None:
-        path = run_directory.create(*_resolved({"env": env, **options}))
+        task = {} if env is None else {"env": env}
+        path = run_directory.create(*_resolved({**task, **options}))
     else:
         path = Path(resume)
         _extend(path, {**options, **({} if env is None else {"env": env})})
@@ -140,10 +146,10 @@ def refuse_run(env: str | None) -> None:
 
 
 def _resolved(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
-    if options["env"] == "all":
+    if options.get("env") == "all":
         raise ConfigError(f"env: expected one task, found 'all'; choose from {', '.join(TASKS)}")
     given = {name: _plain(value) for name, value in options.items()}
-    refuse_run(given["env"])
+    refuse_run(given.get("env"))
     return resolve(given)
 
 
@@ -220,7 +226,7 @@ def train_all(
                 seeds = f"{config.seeds} {'seed' if config.seeds == 1 else 'seeds'}"
                 print(
                     f"{training.name}: {seeds} × {training.num_steps:,} steps, "
-                    f"preset {config.preset}, in {run}"
+                    f"{recipe_text(config)}, in {run}"
                 )
             training.prepare()
             upcoming = following and _open(following, files, time.monotonic())
@@ -244,6 +250,14 @@ def train_all(
             if told:
                 print("figures: " + ", ".join(map(str, figures)))
     return True
+
+
+def recipe_text(config: TrainConfig) -> str:
+    """Say which options a training began with: those of a run, or a preset of a recipe."""
+    if config.like is not None:
+        return f"like {config.like}"
+    known = config.recipe not in (None, NO_RECIPE)
+    return f"recipe {config.recipe}, preset {config.preset}" if known else f"preset {config.preset}"
 
 
 def go_on(path: Path) -> str:

@@ -23,7 +23,7 @@ from jaxsafe.train.host.options import TrainConfig, resolve
 PREFIX = "sweep."
 """What stands on the command line before the name of an option that is swept."""
 
-COMMON = ("env", "seeds", "seed", "episodes", "out", "preset")
+COMMON = ("env", "seeds", "seed", "episodes", "out", "preset", "recipe", "like")
 """Options that all settings of a sweep share."""
 
 MAX_SETTINGS = 10_000

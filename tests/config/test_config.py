@@ -19,7 +19,7 @@ from default_cases import one_of_each_kind
 
 import jaxsafe
 from jaxsafe import ConfigError, Environment
-from jaxsafe.config import build, dump, load, load_filter, load_recipes
+from jaxsafe.config import build, dump, load, load_filter, load_recipe_name, load_recipes
 from jaxsafe.envs import adapt
 from jaxsafe.processors.reward import Failure
 from jaxsafe.processors.status import Status
@@ -162,7 +162,30 @@ def test_recipes_beside_an_environment_are_left_to_trainings(
         assert fault(lambda: load_recipes(file)).startswith(
             f"{file}: recipes: expected names, each with options of a training, found"
         )
-    assert "unknown field 'recipe'" in fault_in({**tree, "recipe": {}})
+    assert "unknown field 'recips'" in fault_in({**tree, "recips": {}})
+
+
+def test_a_file_may_name_its_recipe(tree: dict[str, Any], env: Environment, tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    for name, found in (
+        ("docking2d", "docking2d"),
+        ("mine:hover", "mine:hover"),
+        ("../other.yaml", str(tmp_path.parent / "other.yaml")),
+    ):
+        file.write_text(write({"recipe": name, **tree}), encoding="utf-8")
+        assert load_recipe_name(file) == found
+        assert load(file) == env
+        assert load_recipes(file) == {}
+    file.write_text(write(tree), encoding="utf-8")
+    assert load_recipe_name(file) is None
+    file.write_text(write({**tree, "recipe": 3}), encoding="utf-8")
+    assert fault(lambda: load_recipe_name(file)) == (
+        f"{file}: recipe: expected a task or a file, found 3"
+    )
+    file.write_text(write({**tree, "recipe": "docking2d", "recipes": {}}), encoding="utf-8")
+    assert fault(lambda: load_recipe_name(file)) == (
+        f"{file}: recipe: the file has recipes of its own; leave one out"
+    )
 
 
 def test_a_filter_is_read_from_a_file_with_recipes(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_the_reference_has_every_type_and_every_option_of_the_tasks_and_recipes(
 @pytest.mark.parametrize("task", TASKS)
 def test_the_file_of_a_task_is_current_and_is_the_task(task: str) -> None:
     file = ROOT / "configs" / "envs" / f"{task}.yaml"
-    assert file.read_text(encoding="utf-8") == dump(jaxsafe.make(task)), (
+    assert file.read_text(encoding="utf-8") == f"recipe: {task}\n{dump(jaxsafe.make(task))}", (
         f"python -m jaxsafe.config {task} > {file}"
     )
     assert load(file) == jaxsafe.make(task)

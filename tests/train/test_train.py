@@ -20,7 +20,8 @@ from orbax.checkpoint import CheckpointManager
 from tiny_run import TINY, assert_same_end, final_state, logs
 
 from jaxsafe.agents.policy_file import load_policy, read_policy
-from jaxsafe.commands import cli, config
+from jaxsafe.commands import cli
+from jaxsafe.commands import config as config_command
 from jaxsafe.commands import evaluate as evaluate
 from jaxsafe.commands import train as command
 from jaxsafe.devices import processes
@@ -483,12 +484,13 @@ def test_a_recipe_travels_with_the_file_of_an_environment(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    config.main(["docking2d", "recipes=true"])
+    config_command.main(["docking2d", "recipes=true"])
     text = capsys.readouterr().out
     Path("mine.yaml").write_text(text, encoding="utf-8")
     for preset in ({}, {"preset": "many_envs"}):
         of_file = resolve({"env": "mine.yaml", **preset})
-        assert of_file[:2] == resolve({"env": "docking2d", **preset})[:2]
+        config, env, _ = resolve({"env": "docking2d", **preset})
+        assert of_file[:2] == (config.replace(recipe="mine.yaml"), env)
     assert of_file[2] == "mine"
     given, _, _ = resolve({"env": "mine.yaml", "ppo.gamma": 0.5, "steps": 99})
     assert (float(given.ppo.gamma), given.steps) == (0.5, 99)

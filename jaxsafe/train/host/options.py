@@ -8,13 +8,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from jaxsafe.agents.agent import Agent, check_agent
-from jaxsafe.config import load_recipes, override
-from jaxsafe.config.arguments import Arguments
+from jaxsafe.config import load_recipe_name, load_recipes, override
+from jaxsafe.config.arguments import Arguments, text
 from jaxsafe.environment import Environment, require_success
-from jaxsafe.envs import STARTERS, TASKS, find_task, is_file, make, short_name
+from jaxsafe.envs import STARTERS, TASKS, adapt, find_task, is_file, make, short_name
 from jaxsafe.processors.reward import Intervention
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import Component, Range, normalise
@@ -51,6 +51,9 @@ RENAMED = {
 }
 """Today's names of values by option and earlier name. Commands and old runs may use both."""
 
+NO_RECIPE = "none"
+"""What a recipe is called that leaves all options at their defaults."""
+
 MAX_SEEDS = 100_000
 WORTHWHILE = 128
 """Least number of samples of a minibatch for each device that shares a seed.
@@ -66,6 +69,16 @@ class TrainConfig(Component):
     """The recipe of the task: engineered_features, observation_only, many_envs or shortest_time.
 
     Its values take the place of the defaults of other options.
+    """
+    recipe: str | None = None
+    """The task or the file whose recipe is taken, or none for the options' own defaults.
+
+    By default it is that of the task, or what the file of an environment names or has.
+    """
+    like: str | None = None
+    """The run whose environment and options are taken, but for those that are given here.
+
+    For instance like=runs/docking3d ppo.gamma=0.98 trains it once more with another number.
     """
     algorithm: Literal["ppo", "ppo_lagrangian"] = "ppo"
     """The algorithm. `ppo_lagrangian` also keeps the violating steps below `cost_limit`."""
@@ -193,7 +206,8 @@ def resolve_all(options: Mapping[str, Any]) -> list[tuple[TrainConfig, Environme
 def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     """Return the complete configuration of a training, its environment, and the environment's name.
 
-    The options win over the task's recipe for the preset, and that wins over the defaults.
+    The options win over the recipe for the preset, and that wins over the defaults. With `like` the
+    options win over those of a run, and no recipe is read.
 
     Args:
         options: the options of `python -m jaxsafe.train` by name, for instance `{"env":
@@ -209,7 +223,8 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     if source is not None:
         _inherit_agent(arguments, source)
     overrides = arguments.pop_overrides()
-    if task is None:
+    like = arguments.options.get("like")
+    if task is None and like is None:
         raise ConfigError("env: missing; for instance env=docking3d")
     for name, example in (("agent", "features"), ("ppo", "gamma")):
         if name in arguments.options:
@@ -220,20 +235,19 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     if "rta_training" in arguments.options:
         told = arguments.options["rta_training"]
         arguments.options["rta_training"] = current_name("rta_training", told)
-    config = TrainConfig()
+    base = None if like is None else _base(text(like, "like"), arguments.options)
+    config = base.config if base else TrainConfig()
     # This comes first, so that a misspelt option is told before a slow start.
     config = set_paths(config, arguments.options)
-    env = make(task, actions=config.actions, variant=config.variant, rta=config.rta)
-    told = config.rta_training or ("punishment" if env.rta is not None else None)
-    if told == "punishment" and not any(isinstance(term, Intervention) for term in env.reward):
-        env = env.replace(reward=(*env.reward, normalise(Intervention(name="intervention"))))
+    env, told = _environment(task, config, base, arguments.options)
     env = override(env, overrides, place="env")
     require_success(env)
-    config = normalise(TrainConfig())
-    settings = recipe(task, arguments.options.get("preset"))
-    place = f"{task}: recipes.{settings['preset']}" if is_file(task) else ""
-    config = set_paths(config, settings, place)
-    config = set_paths(config, {**arguments.options, "preset": settings["preset"]})
+    name = base.name if base and task is None else str(task)
+    if base:
+        config, chosen = normalise(base.config), {}
+    else:
+        config, chosen = _with_recipe(name, arguments.options)
+    config = set_paths(config, {**arguments.options, **chosen})
     config = config.replace(rta_training=told)
     if told == "corrected_action":
         config = set_path(config, "ppo.learns_from", "actual", to_value)
@@ -281,7 +295,93 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         if getattr(config, sink):
             library(sink)
     check_agent(config.agent, env)
-    return config, env, short_name(task)
+    return config, env, short_name(name)
+
+
+def _environment(
+    task: str | None, config: TrainConfig, base: Base | None, given: Mapping[str, Any]
+) -> tuple[Environment, str | None]:
+    """Return the environment of a training without overrides, and how interventions are treated.
+
+    Args:
+        task: a task or a file. None stands for the environment of another run.
+        config: the configuration so far.
+        base: what the training takes from another run.
+        given: the options that the user gave.
+    """
+    if task is None:
+        assert base is not None
+        kinds = {name: given.get(name) for name in ("actions", "variant", "rta")}
+        env = adapt(base.env, base.name, place="", **kinds)
+    else:
+        env = make(task, actions=config.actions, variant=config.variant, rta=config.rta)
+    told = config.rta_training
+    if base and env.rta is None:
+        told = given.get("rta_training")
+    elif told is None and env.rta is not None:
+        told = "punishment"
+    punished = any(isinstance(term, Intervention) for term in env.reward)
+    if base and base.config.rta_training == "punishment" and told != "punishment":
+        others = [term for term in env.reward if not isinstance(term, Intervention)]
+        env = env.replace(reward=tuple(others))
+    elif told == "punishment" and not punished:
+        env = env.replace(reward=(*env.reward, normalise(Intervention(name="intervention"))))
+    return env, told
+
+
+def _with_recipe(task: str, given: Mapping[str, Any]) -> tuple[TrainConfig, dict[str, Any]]:
+    """Return the defaults with the values of a recipe in their place, and which recipe it is.
+
+    Args:
+        task: a task or a file.
+        given: the options that the user gave.
+    """
+    settings = recipe(task, given.get("preset"), given.get("recipe"))
+    source, preset = settings["recipe"], settings["preset"]
+    place = f"{source}: recipes.{preset}" if is_file(source) else ""
+    config = set_paths(normalise(TrainConfig()), settings, place)
+    return config, {"recipe": source, "preset": preset}
+
+
+class Base(NamedTuple):
+    """What a training takes from another run."""
+
+    config: TrainConfig
+    env: Environment
+    name: str
+    """The name of the environment."""
+
+
+def _base(run: str, given: Mapping[str, Any]) -> Base:
+    """Return what a training takes from another run.
+
+    What followed from options of that run is at its default, because these options may change.
+
+    Args:
+        run: the run directory.
+        given: the options that the user gave.
+
+    Raises:
+        ConfigError: there is no such run, its configuration cannot be read, or there is an option
+            that the run decides.
+    """
+    from jaxsafe.train.host import run_directory  # it imports this module
+
+    for name in ("preset", "recipe"):
+        if name in given:
+            raise ConfigError(f"{name}: the options are those of {run}; leave out {name} or like")
+    config, env, name = run_directory.read(Path(run), "like")
+    plain = TrainConfig()
+    kept = config.algorithm == given.get("algorithm", config.algorithm)
+    config = config.replace(
+        out=None,
+        cost_limit=config.cost_limit if kept else None,
+        agent=config.agent.replace(cost_critic=plain.agent.cost_critic),
+        ppo=config.ppo.replace(cost_limit=plain.ppo.cost_limit),
+    )
+    if config.rta_training == "corrected_action":
+        config = config.replace(ppo=config.ppo.replace(learns_from=plain.ppo.learns_from))
+    return Base(config, env, name)
 
 
 def _inherit_agent(arguments: Arguments, source: str) -> None:
@@ -354,19 +454,21 @@ def _check_rta(config: TrainConfig, env: Environment) -> None:
         )
 
 
-def recipe(task: str, preset: str | None) -> dict[str, Any]:
-    """Return settings by dotted path from the recipe of a task, or from that in its file.
+def recipe(task: str, preset: str | None, source: str | None = None) -> dict[str, Any]:
+    """Return settings by dotted path from a recipe, with the recipe's source and its preset.
 
-    For an environment without a recipe there is only the preset `observation_only`.
+    Where there is no recipe, there is only the preset `observation_only`.
 
     Args:
         task: the name of the task, or the file of an environment.
         preset: a preset of the recipe. None stands for the first one.
+        source: whose recipe it is, as for `find_recipes`.
 
     Raises:
         ConfigError: there is no such task or file, or the recipe does not have the preset.
     """
-    known = recipes(task) or {"observation_only": {}}
+    found = find_recipes(task, source)
+    known = found.presets or {"observation_only": {}}
     name = next(iter(known)) if preset is None else preset
     if name not in known and RENAMED["preset"].get(name) in known:
         name = current_name("preset", name)
@@ -374,19 +476,57 @@ def recipe(task: str, preset: str | None) -> dict[str, Any]:
         raise ConfigError(
             f"preset: unknown preset {show(name)}; choose from {nearest(name, known)}"
         )
-    return {"preset": name, **flatten(known[name] or {})}
+    return {"recipe": found.source, "preset": name, **flatten(known[name] or {})}
+
+
+class Recipes(NamedTuple):
+    """The recipes for a training."""
+
+    source: str
+    """The task or the file that has them. It is `none` if there are none."""
+
+    presets: dict[str, Any]
+    """The options of each preset."""
+
+
+def find_recipes(task: str, source: str | None = None) -> Recipes:
+    """Return the recipes for a training.
+
+    Args:
+        task: the name of the task, or the file of an environment.
+        source: the task or the file whose recipes are taken, or `none`. None stands for the task
+            itself, and where that is a file, for what the file has or names.
+
+    Raises:
+        ConfigError: there is no such task or file, or files name one another.
+    """
+    name = task if source is None else source
+    place = "env" if source is None else "recipe"
+    seen: list[str] = []
+    while name != NO_RECIPE:
+        if not is_file(name):
+            file = find_task(name, place).recipe
+            presets = yaml12.read(configs() / file) if file else {}
+            return Recipes(name if presets else NO_RECIPE, presets)
+        following = load_recipe_name(name)
+        if following is None:
+            presets = load_recipes(name)
+            return Recipes(name if presets else NO_RECIPE, presets)
+        seen.append(name)
+        if following in seen:
+            raise ConfigError(f"{name}: recipe: {following} leads back here; name another one")
+        place = f"{name}: recipe"
+        name = following
+    return Recipes(NO_RECIPE, {})
 
 
 def recipes(task: str) -> dict[str, Any]:
-    """Return the recipes of a task, or those in its file, by preset. There may be none.
+    """Return the recipes of a task, or those that its file has or names, by preset.
 
     Raises:
         ConfigError: there is no such task or file.
     """
-    if is_file(task):
-        return load_recipes(task)
-    file = find_task(task).recipe
-    return yaml12.read(configs() / file) if file else {}
+    return find_recipes(task).presets
 
 
 def recipe_options() -> set[str]:

@@ -1,0 +1,189 @@
+"""Which recipe a training takes, and trainings that take the options of another run."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tiny_run import assert_same_end
+
+import jaxsafe
+from jaxsafe.commands import config as config_command
+from jaxsafe.commands import train as command
+from jaxsafe.processors.reward import Intervention
+from jaxsafe.runs.training import recipe_text
+from jaxsafe.schema.component import normalise
+from jaxsafe.schema.errors import ConfigError
+from jaxsafe.train.host import run_directory
+from jaxsafe.train.host.options import TrainConfig, find_recipes, recipe, resolve
+
+
+@pytest.fixture
+def mine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Path:
+    """Print docking2d into `mine.yaml` in an empty directory, and go there."""
+    monkeypatch.chdir(tmp_path)
+    config_command.main(["docking2d"])
+    Path("mine.yaml").write_text(capsys.readouterr().out, encoding="utf-8")
+    return Path("mine.yaml")
+
+
+def refused(**options: Any) -> str:
+    with pytest.raises(ConfigError) as caught:
+        resolve(options)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+# Recipes
+
+
+def test_an_edited_task_keeps_its_recipe(mine: Path) -> None:
+    text = mine.read_text(encoding="utf-8")
+    assert text.startswith("recipe: docking2d\n")
+    mine.write_text(text.replace("mass: 12.0", "mass: 14.0"), encoding="utf-8")
+    for preset in ({}, {"preset": "many_envs"}):
+        config, env, name = resolve({"env": "mine.yaml", **preset})
+        assert config == resolve({"env": "docking2d", **preset})[0]
+        assert (config.recipe, name) == ("docking2d", "mine")
+        assert float(env.agent_platform.mass) == 14.0
+    assert recipe_text(config) == "recipe docking2d, preset many_envs"
+
+
+def test_the_recipe_of_the_command_line_wins(mine: Path) -> None:
+    given = {"env": "mine.yaml", "recipe": "rejoin2d"}
+    assert (
+        recipe("mine.yaml", None, "rejoin2d")["ppo.gamma"] == recipe("rejoin2d", None)["ppo.gamma"]
+    )
+    config, _, _ = resolve({**given, "agent.features": "none", "ppo.gamma": 0.5})
+    assert (config.recipe, float(config.ppo.gamma)) == ("rejoin2d", 0.5)
+    plain, _, _ = resolve({"env": "docking2d", "recipe": "none"})
+    assert (plain.ppo, plain.steps) == (normalise(TrainConfig()).ppo, TrainConfig().steps)
+    assert (plain.recipe, plain.preset) == ("none", "observation_only")
+    assert recipe_text(plain) == "preset observation_only"
+
+
+def test_a_recipe_comes_from_a_file(mine: Path) -> None:
+    Path("own.yaml").write_text("quick: {steps: 7}\nlong: {steps: 70}\n", encoding="utf-8")
+    found, _, _ = resolve({"env": "docking2d", "recipe": "own.yaml", "preset": "long"})
+    assert (found.steps, found.recipe, found.preset) == (70, "own.yaml", "long")
+    Path("below").mkdir()
+    other = mine.read_text(encoding="utf-8").replace("recipe: docking2d", "recipe: ../own.yaml")
+    Path("below/other.yaml").write_text(other, encoding="utf-8")
+    assert resolve({"env": "below/other.yaml"})[0].steps == 7
+    # A file may name one that names another one.
+    assert find_recipes("mine.yaml", "below/other.yaml").source == "own.yaml"
+    Path("own.yaml").write_text("quick: {stps: 7}\n", encoding="utf-8")
+    message = refused(env="below/other.yaml")
+    assert message.startswith("own.yaml: recipes.quick.stps: unknown field 'stps'; choose from ")
+
+
+def test_a_recipe_that_is_not_there_is_told(mine: Path) -> None:
+    message = refused(env="docking2d", recipe="dockin2d")
+    assert message.startswith("recipe: unknown task 'dockin2d' and not a .yaml file; choose from ")
+    assert "Did you mean 'docking2d'?" in message
+    assert refused(env="docking2d", recipe="no.yaml").startswith("no.yaml: cannot be read")
+    text = mine.read_text(encoding="utf-8")
+    for name, told in (
+        ("dockin2d", "mine.yaml: recipe: unknown task 'dockin2d'"),
+        ("mine.yaml", "mine.yaml: recipe: mine.yaml leads back here"),
+        ("[1]", "mine.yaml: recipe: expected a task or a file, found [1]"),
+    ):
+        mine.write_text(text.replace("recipe: docking2d", f"recipe: {name}"), encoding="utf-8")
+        assert refused(env="mine.yaml").startswith(told)
+
+
+def test_a_printed_file_keeps_what_its_source_had(
+    mine: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def printed(*words: str) -> str:
+        config_command.main(words)
+        return capsys.readouterr().out
+
+    text = mine.read_text(encoding="utf-8")
+    assert printed("mine.yaml") == text
+    assert "recipe:" not in printed("mine.yaml", "recipes=true")
+    assert "recipes:\n  engineered_features:\n" in printed("mine.yaml", "recipes=true")
+    own = text.replace("recipe: docking2d\n", "") + "recipes:\n  quick: {steps: 7}\n"
+    mine.write_text(own, encoding="utf-8")
+    assert printed("mine.yaml") == own
+
+
+# Options of another run
+
+
+def test_a_training_takes_everything_from_another_run(whole: Path) -> None:
+    before, env, name = run_directory.read(whole, "run")
+    config, same, as_before = resolve({"like": str(whole)})
+    assert config == before.replace(like=str(whole), out=None)
+    assert (same, as_before) == (env, name)
+    assert recipe_text(config) == f"like {whole}"
+
+
+def test_what_is_given_wins_over_the_other_run(whole: Path) -> None:
+    given = {"like": str(whole), "ppo.gamma": 0.5, "seeds": 7, "env.deputy.mass": 14, "out": "x"}
+    config, env, _ = resolve(given)
+    assert (float(config.ppo.gamma), config.seeds, config.steps) == (0.5, 7, 1280)
+    assert (float(env.agent_platform.mass), float(env.terminal[-1].limit)) == (14.0, 40.0)
+    assert config.out == "x"
+
+    config, env, name = resolve({"like": str(whole), "env": "docking3d"})
+    assert (name, env.agent_platform.dimension, config.steps) == ("docking3d", 3, 1280)
+    assert float(env.terminal[-1].limit) == 2000.0
+
+
+def test_what_follows_from_an_option_of_the_other_run_follows_from_a_new_one(
+    whole: Path, tmp_path: Path
+) -> None:
+    def run_with(name: str, **options: Any) -> str:
+        resolved = resolve({"like": str(whole), "out": str(tmp_path / name), **options})
+        return str(run_directory.create(*resolved))
+
+    filtered = run_with("filtered", rta="explicit_simplex")
+    config, env, _ = resolve({"like": filtered})
+    assert config.rta_training == "punishment"
+    assert isinstance(env.reward[-1], Intervention)
+    for changes, told in (({"rta": "none"}, None), ({"rta_training": "no_punishment"},) * 2):
+        config, env, _ = resolve({"like": filtered, **changes})
+        assert config.rta_training == (told and "no_punishment")
+        assert not isinstance(env.reward[-1], Intervention)
+
+    corrected = run_with("corrected", rta="explicit_simplex", rta_training="corrected_action")
+    assert resolve({"like": corrected})[0].ppo.learns_from == "actual"
+    assert resolve({"like": corrected, "rta": "none"})[0].ppo.learns_from == "desired"
+
+    limited = run_with("limited", algorithm="ppo_lagrangian", cost_limit=5)
+    config, _, _ = resolve({"like": limited})
+    assert (float(config.ppo.cost_limit), config.agent.cost_critic) == (5.0, True)
+    config, _, _ = resolve({"like": limited, "algorithm": "ppo"})
+    assert (config.cost_limit, config.agent.cost_critic) == (None, False)
+
+
+def test_a_run_that_cannot_be_followed_is_told(whole: Path, tmp_path: Path) -> None:
+    like = str(whole)
+    assert re.match(r"like: no run in '.*/nothing'", refused(like=str(tmp_path / "nothing")))
+    assert refused(like=like, preset="many_envs").startswith("preset: the options are those of ")
+    assert refused(like=like, recipe="docking2d").startswith("recipe: the options are those of ")
+    assert refused(like=None) == "env: missing; for instance env=docking3d"
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken" / "config.yaml").write_text("env: [", encoding="utf-8")
+    assert "config.yaml, line 1: not valid YAML" in refused(like=str(tmp_path / "broken"))
+    (tmp_path / "broken" / "config.yaml").write_text("env: x", encoding="utf-8")
+    assert "expected the keys env, training and environment" in refused(
+        like=str(tmp_path / "broken")
+    )
+    with pytest.raises(ConfigError, match="unknown field 'gama'"):
+        resolve({"like": like, "ppo.gama": 1})
+
+
+@pytest.mark.thorough
+def test_a_run_like_another_one_is_that_run(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "again"
+    assert command.main([f"like={whole}", f"out={run}"]) == 0
+    assert f"docking2d: 3 seeds × 1,280 steps, like {whole}, in {run}" in capsys.readouterr().out
+    assert_same_end(run, whole)
+    longer = jaxsafe.train(like=run, steps=64, seeds=1, out=tmp_path / "python", progress=False)
+    assert longer.config.like == str(run)
