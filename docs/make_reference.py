@@ -6,62 +6,20 @@ Run `python docs/make_reference.py` after a change of an option or a component.
 
 from __future__ import annotations
 
-import dataclasses
 import importlib
-import inspect
-import itertools
-import typing
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from make_tasks import number, table, wrapped
+from make_tasks import table, wrapped
 
-from jaxsafe.agents.agent import Agent
-from jaxsafe.agents.features import Features
-from jaxsafe.agents.networks import Network
-from jaxsafe.commands import COMMANDS
+from jaxsafe.commands import COMMANDS, SUBCOMMANDS
+from jaxsafe.commands.catalogue import SECTIONS, Entry, describe, types_of
 from jaxsafe.commands.help_text import entries, grouped, shown
 from jaxsafe.envs import TASKS
-from jaxsafe.processors.constraint import Constraint
-from jaxsafe.processors.observation import Observation
-from jaxsafe.processors.reward import Bound, Reward
-from jaxsafe.processors.status import Status
-from jaxsafe.processors.terminal import Terminal
-from jaxsafe.rta.asif import Strengthening
-from jaxsafe.rta.cascade import Stage
-from jaxsafe.rta.filter import RTA, BackupController, TerminalSet
-from jaxsafe.schema.component import Component, Field, choices, fields
-from jaxsafe.schema.convert import bare, expects, to_data
-from jaxsafe.schema.field_docs import field_docs
-from jaxsafe.simulation.controllers import Actuator, Controller
-from jaxsafe.simulation.geometry import Offset, Region
-from jaxsafe.simulation.initializers import Direction, Initializer
-from jaxsafe.simulation.platform import Platform
-from jaxsafe.simulation.scripted import Command
 from jaxsafe.train.host.options import flatten
 from jaxsafe.train.host.options import recipes as task_recipes
-from jaxsafe.train.ppo import PPO
 
 TARGET = Path(__file__).parent / "reference"
-
-KINDS: dict[str, tuple[type[Component], ...]] = {
-    "Platforms": (Platform,),
-    "Controllers": (Controller, Actuator),
-    "Commands of a script": (Command,),
-    "Starts": (Initializer, Direction),
-    "Regions": (Region, Offset),
-    "Statuses": (Status,),
-    "Constraints": (Constraint,),
-    "Ends": (Terminal,),
-    "Rewards": (Reward, Bound),
-    "Observations": (Observation,),
-    "Filters": (RTA, Stage, Strengthening),
-    "Backup controllers": (BackupController,),
-    "Terminal sets": (TerminalSet,),
-    "Agents": (Agent, Features, Network),
-    "PPO": (PPO,),
-}
-"""Headings of the catalogue, and the bases of the parts below each."""
 
 
 def options() -> str:
@@ -79,8 +37,8 @@ def options() -> str:
         "The exit code is 0, or 2 after a mistake in an option or a file, 3 if a seed diverged, and"
         " 130 after Ctrl-C. `falsify` exits with 1 if there was a violation.",
     ]
-    for command in COMMANDS:
-        module = importlib.import_module(f"jaxsafe.commands.{command}")
+    for command in (*COMMANDS, *SUBCOMMANDS):
+        module = importlib.import_module(f"jaxsafe.commands.{command.replace(' ', '_')}")
         blocks += [f"## jaxsafe {command}", _line(module.__doc__ or "")]
         for title, group in grouped(module.Options, entries(module.Options)).items():
             rows = ((f"`{row.name}`", row.takes, row.default, _line(row.text)) for row in group)
@@ -128,67 +86,22 @@ def parts() -> str:
             " must be given. A length is in metres for spacecraft and in feet for aircraft."
         ),
     ]
-    for heading, bases in KINDS.items():
-        blocks.append(f"## {heading}")
-        for base in bases:
-            blocks += itertools.chain.from_iterable(map(part, _classes(base)))
+    for section in SECTIONS.values():
+        blocks.append(f"## {section.heading}")
+        for cls in types_of(section):
+            blocks += part(describe(cls))
     return _page(blocks)
 
 
-def _classes(base: type[Component]) -> list[type[Component]]:
-    found = [cls for cls in choices(base).values() if cls.__module__.startswith("jaxsafe.")]
-    return found or [base]
-
-
-def name(cls: type[Component]) -> str:
-    """Return what YAML calls a part, or what the catalogue calls one that has no type."""
-    return cls.type_name or cls.__name__.lower()
-
-
-def part(cls: type[Component]) -> Iterator[str]:
+def part(entry: Entry) -> Iterator[str]:
     """Yield the name of a part, what it is, and its fields."""
-    yield f"### `{name(cls)}`"
-    yield from inspect.cleandoc(cls.__doc__ or "").split("\n\n")
-    docs = field_docs(cls)
-    rows = [
-        (f"`{key}`", _takes(field), _default(field), _line(docs.get(key, "")))
-        for key, field in fields(cls).items()
-        if key != "name"
-    ]
+    yield f"### `{entry.name}`"
+    yield from entry.paragraphs
     heads = ("field", "takes", "default", "meaning")
+    rows = [(f"`{row.name}`", *row[1:]) for row in entry.rows]
     if rows:
         columns = len(heads) if any(row[-1] for row in rows) else len(heads) - 1
         yield table(heads[:columns], (row[:columns] for row in rows))
-
-
-def _takes(field: Field) -> str:
-    """Return what a field takes: which parts, a name of which section, or as errors say it."""
-    core = bare(field.hint)
-    inner = typing.get_args(core)
-    base = inner[0] if typing.get_origin(core) is tuple and inner else core
-    if isinstance(base, type) and issubclass(base, Component):
-        types = ", ".join(f"`{name(cls)}`" for cls in _classes(base))
-        return ("a list of " if inner else "one of " if "," in types else "") + types
-    if field.refers and core is str:
-        return f"a name of `{field.refers.section}`"
-    return expects(field)
-
-
-def _default(field: Field) -> str:
-    value = field.default
-    if value is dataclasses.MISSING:
-        return ""
-    if value is None:
-        return "none"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, Component) and not fields(type(value)):
-        return f"`{value.type_name}`"
-    if isinstance(value, str):
-        return f"`{value}`"
-    if field.unit:
-        return number(value)
-    return f"`{to_data(value)}`"
 
 
 def _page(blocks: Iterable[str]) -> str:

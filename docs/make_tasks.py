@@ -11,14 +11,13 @@ import inspect
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator
-from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
 import jaxsafe
+from jaxsafe.commands.catalogue import number
 from jaxsafe.envs import TASKS
 from jaxsafe.plot.style import control_unit, length_unit
 from jaxsafe.processors.observation import Observation, Observe, ObserveAngle, ObserveRegion
@@ -426,27 +425,6 @@ def settings(
                 f"{name} {str(value).lower() if isinstance(value, bool) else f'`{value}`'}"
             )
     return ", ".join(words)
-
-
-def number(value: Any) -> str:
-    """Return a number, or a list of them, as one reads it.
-
-    Fractions of π are written as such where they are exact in float32.
-    """
-    if np.ndim(value):
-        return "[" + ", ".join(map(number, value)) + "]"
-    scalar = np.float32(value)
-    share = Fraction(float(scalar) / np.pi).limit_denominator(180)
-    if (
-        share
-        and abs(float(share) * np.pi / float(scalar) - 1.0) < 1e-6
-        and share.denominator * abs(share.numerator) < 400
-    ):
-        top = {1: "π", -1: "-π"}.get(share.numerator, f"{share.numerator}π")
-        text = top if share.denominator == 1 else f"{top}/{share.denominator}"
-    else:
-        text = np.format_float_positional(scalar, trim="-")
-    return text.replace("-", "−")
 
 
 if __name__ == "__main__":

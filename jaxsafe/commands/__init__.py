@@ -17,6 +17,12 @@ COMMANDS = {
 }
 """What each command does, in the order of the list that `jaxsafe` prints."""
 
+SUBCOMMANDS = {
+    "config types": "list the types of parts, or explain some",
+    "config schema": "write a JSON schema, from which editors complete files",
+}
+"""What the commands of two words do. The module of `config types` is `config_types`."""
+
 HELP = ("help", "-h", "--help")
 """Words that ask for the help text."""
 
@@ -45,8 +51,9 @@ def main() -> None:
 
 def _list() -> str:
     """Return the commands and how to call them."""
-    width = max(map(len, COMMANDS))
-    commands = [f"  {command:{width}}  {about}" for command, about in COMMANDS.items()]
+    listed = COMMANDS | SUBCOMMANDS
+    width = max(map(len, listed))
+    commands = [f"  {command:{width}}  {about}" for command, about in listed.items()]
     return "\n".join(
         [
             "usage: jaxsafe COMMAND [option=value …]",

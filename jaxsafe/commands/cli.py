@@ -32,6 +32,7 @@ def run(
     main: Callable[[Sequence[str]], int | None],
     options: type[CommandOptions],
     leave: Callable[[int], NoReturn] = sys.exit,
+    alone: bool = False,
 ) -> None:
     """Run a command and leave with its exit code.
 
@@ -44,10 +45,11 @@ def run(
         options: the options of the command, for the help text.
         leave: a function that ends the process after an error or Ctrl-C. In all other cases
             `sys.exit` ends it.
+        alone: whether the command does something without a word.
     """
     argv = sys.argv[1:]
     with lasting_streams() as stdout:
-        asks = not argv or any(word in HELP for word in argv)
+        asks = not (argv or alone) or any(word in HELP for word in argv)
         code, finished = _run(partial(_explain, options) if asks else main, argv)
         leave = sys.exit if asks or finished else leave
         sys.stdout.flush()

@@ -7,12 +7,16 @@ of the task, so `jaxsafe train FILE.yaml` trains as the task is trained.
 from __future__ import annotations
 
 import codecs
+import importlib
 import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaxsafe.commands import cli
 from jaxsafe.commands.environment_options import TaskOptions
+
+OTHERS = ("types", "schema")
+"""First words that stand for commands of their own, each in a file of its name."""
 
 
 class Options(TaskOptions):
@@ -29,34 +33,42 @@ def main(argv: Sequence[str]) -> int:
 
     options = Options.parse(argv)
     data = describe(options.make(options.env))
-    name, presets = _recipes(options)
-    data = {
-        **({"recipe": name} if name else {}),
-        **data,
-        **({"recipes": presets} if presets else {}),
-    }
+    name, own = _recipes(options.env, options.recipes)
+    if name:
+        data = {"recipe": name, **data}
+    if own:
+        data["recipes"] = own
     # Whoever reads the file takes it to be UTF-8, so output in another encoding is only ASCII.
     utf8 = codecs.lookup(sys.stdout.encoding).name == "utf-8"
     print(yaml12.write(data, ascii_only=not utf8), end="")
     return 0
 
 
-def _recipes(options: Options) -> tuple[str | None, Mapping[str, Any]]:
-    """Return the task or file that a printed environment names for its recipes, and its own ones."""
+def _recipes(env: str, in_full: bool) -> tuple[str | None, Mapping[str, Any]]:
+    """Return the task or file that decides how a printed environment is trained, and recipes.
+
+    Args:
+        env: a task or a file.
+        in_full: whether to return recipes in place of the name of a task or a file.
+    """
     from jaxsafe.config import load_recipe_name, load_recipes
     from jaxsafe.envs import find_task, is_file
 
-    task = options.env
-    if options.recipes:
+    if in_full:
         from jaxsafe.train.host.options import recipes
 
-        return None, recipes(task)
-    if not is_file(task):
-        return task if find_task(task).recipe else None, {}
-    name = load_recipe_name(task)
-    return name, {} if name else load_recipes(task)
+        return None, recipes(env)
+    if not is_file(env):
+        return env if find_task(env).recipe else None, {}
+    name = load_recipe_name(env)
+    return name, {} if name else load_recipes(env)
 
 
 def command() -> None:
     """Run the command on the words of the command line."""
-    cli.run(main, Options)
+    name = next(iter(sys.argv[1:]), "")
+    if name in OTHERS:
+        sys.argv = [f"{sys.argv[0]} {name}", *sys.argv[2:]]
+        importlib.import_module(f"jaxsafe.commands.config_{name}").command()
+    else:
+        cli.run(main, Options)

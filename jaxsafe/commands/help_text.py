@@ -51,7 +51,7 @@ def help_text(cls: type[CommandOptions], given: Mapping[str, Any]) -> str:
     about = [sys.modules[cls.__module__].__doc__ or "", origin]
     lines = [" ".join(["usage:", program, *_words(cls), "[option=value …]"])]
     for text in filter(None, about):
-        lines += ["", *_wrapped(text, indent=0)]
+        lines += ["", *wrapped(text, indent=0)]
     options = [*entries(cls)]
     width = max(len(entry.name) for entry in options)
     for title, members in grouped(cls, options).items():
@@ -59,9 +59,9 @@ def help_text(cls: type[CommandOptions], given: Mapping[str, Any]) -> str:
         for name, takes, default, text in members:
             default = shown(defaults[name]) if name in defaults else default
             takes = f"{takes} (default {default})" if default else takes
-            first, *rest = _wrapped(takes, indent=width + 4)
+            first, *rest = wrapped(takes, indent=width + 4)
             lines += [f"  {name:{width}}  {first.strip()}", *rest]
-            lines += _wrapped(text, indent=width + 4)
+            lines += wrapped(text, indent=width + 4)
     return "\n".join(lines)
 
 
@@ -100,7 +100,7 @@ def entries(cls: type[Component], start: str = "") -> Iterator[Entry]:
             yield Entry(f"{start}{shown_name(field)}", _takes(field), default, text)
 
 
-def _wrapped(text: str, indent: int) -> list[str]:
+def wrapped(text: str, indent: int) -> list[str]:
     """Return a text in lines. Its paragraphs become one, as they are short."""
     space = " " * indent
     words = " ".join(inspect.cleandoc(text).split())

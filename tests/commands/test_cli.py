@@ -740,7 +740,9 @@ def test_alone_the_program_lists_its_commands(
     monkeypatch.setattr(sys, "argv", words)
     commands.main()
     told = capsys.readouterr().out
-    assert [name for name in commands.COMMANDS if f"  {name} " not in told] == []
+    assert [
+        name for name in commands.COMMANDS | commands.SUBCOMMANDS if f"  {name} " not in told
+    ] == []
 
 
 def test_the_version_is_told(

@@ -1,0 +1,201 @@
+"""All types of which an environment, a filter and an agent are made.
+
+`jaxsafe config types` prints them, and the page of the site has the same.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import inspect
+import typing
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.features import Features
+from jaxsafe.agents.networks import Network
+from jaxsafe.environment import Environment
+from jaxsafe.processors.constraint import Constraint
+from jaxsafe.processors.observation import Observation
+from jaxsafe.processors.reward import Bound, Reward
+from jaxsafe.processors.status import Status
+from jaxsafe.processors.terminal import Terminal
+from jaxsafe.rta.asif import Strengthening
+from jaxsafe.rta.cascade import Stage
+from jaxsafe.rta.filter import RTA, BackupController, TerminalSet
+from jaxsafe.schema.component import Component, Field, choices, fields
+from jaxsafe.schema.convert import bare, expects, to_data
+from jaxsafe.schema.errors import ConfigError, show
+from jaxsafe.schema.field_docs import field_docs
+from jaxsafe.schema.ties import Tie
+from jaxsafe.simulation.controllers import Actuator, Controller
+from jaxsafe.simulation.geometry import Offset, Region
+from jaxsafe.simulation.initializers import Direction, Initializer
+from jaxsafe.simulation.platform import Platform
+from jaxsafe.simulation.scripted import Command
+from jaxsafe.train.ppo import PPO
+
+
+class Section(NamedTuple):
+    """Types that stand in the same place."""
+
+    heading: str
+    bases: tuple[type[Component], ...]
+
+
+SECTIONS = {
+    "environment": Section("Environment", (Environment, Tie)),
+    "platforms": Section("Platforms", (Platform,)),
+    "controller": Section("Controllers", (Controller, Actuator)),
+    "commands": Section("Commands of a script", (Command,)),
+    "start": Section("Starts", (Initializer, Direction)),
+    "regions": Section("Regions", (Region, Offset)),
+    "status": Section("Statuses", (Status,)),
+    "constraints": Section("Constraints", (Constraint,)),
+    "terminal": Section("Ends", (Terminal,)),
+    "reward": Section("Rewards", (Reward, Bound)),
+    "observation": Section("Observations", (Observation,)),
+    "rta": Section("Filters", (RTA, Stage, Strengthening)),
+    "backups": Section("Backup controllers", (BackupController,)),
+    "terminal_set": Section("Terminal sets", (TerminalSet,)),
+    "agent": Section("Agents", (Agent, Features, Network)),
+    "ppo": Section("PPO", (PPO,)),
+}
+"""The sections, most of them by the name of the field where their types stand."""
+
+
+class Row(NamedTuple):
+    """What is known of a field."""
+
+    name: str
+    takes: str
+    default: str
+    """It is empty if the field must be given."""
+    text: str
+
+
+class Entry(NamedTuple):
+    """What is known of a type."""
+
+    name: str
+    paragraphs: list[str]
+    rows: list[Row]
+    """Its fields, except the name, which is the user's choice."""
+
+    @property
+    def summary(self) -> str:
+        """The first paragraph, in one line."""
+        return _line(next(iter(self.paragraphs), ""))
+
+
+def find(name: str) -> list[type[Component]]:
+    """Return the types of a section, or those of a name.
+
+    Raises:
+        ConfigError: there is neither.
+    """
+    # `region` means the section `regions`.
+    sections = {section.rstrip("s"): found for section, found in SECTIONS.items()}
+    if name.rstrip("s") in sections:
+        return types_of(sections[name.rstrip("s")], with_users=True)
+    known = [cls for section in SECTIONS.values() for cls in types_of(section, with_users=True)]
+    found = [cls for cls in dict.fromkeys(known) if title(cls) == name]
+    if not found:
+        near = difflib.get_close_matches(name, [*SECTIONS, *map(title, known)], n=3, cutoff=0.6)
+        hint = f". Did you mean {' or '.join(map(repr, dict.fromkeys(near)))}?" if near else ""
+        raise ConfigError(
+            f"types: nothing is called {show(name)}; choose from the types and from the sections "
+            f"{', '.join(SECTIONS)}{hint}"
+        )
+    return found
+
+
+def types_of(section: Section, with_users: bool = False) -> list[type[Component]]:
+    """Return the types of a section, and on demand those that a user has defined."""
+    return [cls for base in section.bases for cls in _classes(base, with_users)]
+
+
+def describe(cls: type[Component], with_users: bool = False) -> Entry:
+    """Return what is known of a type."""
+    docs = field_docs(cls)
+    rows = [
+        Row(
+            name=name,
+            takes=_takes(field, with_users),
+            default=_default(field),
+            text=_line(docs.get(name, "")),
+        )
+        for name, field in fields(cls).items()
+        if name != "name"
+    ]
+    paragraphs = inspect.cleandoc(cls.__doc__ or "").split("\n\n")
+    return Entry(name=title(cls), paragraphs=paragraphs, rows=rows)
+
+
+def title(cls: type[Component]) -> str:
+    """Return what YAML calls a type, or what the catalogue calls one that YAML has no name for."""
+    return cls.type_name or cls.__name__.lower()
+
+
+def number(value: Any) -> str:
+    """Return a number, or a list of them, as one reads it.
+
+    Fractions of π are written as such where they are exact in float32.
+    """
+    if np.ndim(value):
+        return "[" + ", ".join(map(number, value)) + "]"
+    scalar = np.float32(value)
+    share = Fraction(float(scalar) / np.pi).limit_denominator(180)
+    if (
+        share
+        and abs(float(share) * np.pi / float(scalar) - 1.0) < 1e-6
+        and share.denominator * abs(share.numerator) < 400
+    ):
+        top = {1: "π", -1: "-π"}.get(share.numerator, f"{share.numerator}π")
+        text = top if share.denominator == 1 else f"{top}/{share.denominator}"
+    else:
+        text = np.format_float_positional(scalar, trim="-")
+    return text.replace("-", "−")
+
+
+def _classes(base: type[Component], with_users: bool) -> list[type[Component]]:
+    found = choices(base).values()
+    own = [cls for cls in found if with_users or cls.__module__.startswith("jaxsafe.")]
+    return own or [base]
+
+
+def _takes(field: Field, with_users: bool) -> str:
+    """Return what a field takes: which types, a name of which section, or as errors say it."""
+    core = bare(field.hint)
+    inner = typing.get_args(core)
+    base = inner[0] if typing.get_origin(core) is tuple and inner else core
+    if isinstance(base, type) and issubclass(base, Component):
+        types = ", ".join(f"`{title(cls)}`" for cls in _classes(base, with_users))
+        return ("a list of " if inner else "one of " if "," in types else "") + types
+    if field.refers and core is str:
+        return f"a name of `{field.refers.section}`"
+    return expects(field)
+
+
+def _default(field: Field) -> str:
+    value = field.default
+    if value is dataclasses.MISSING:
+        return ""
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, Component) and not fields(type(value)):
+        return f"`{value.type_name}`"
+    if isinstance(value, str):
+        return f"`{value}`"
+    if field.unit:
+        return number(value)
+    return f"`{to_data(value)}`"
+
+
+def _line(text: str) -> str:
+    return " ".join(text.split())
