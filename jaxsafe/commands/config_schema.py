@@ -46,7 +46,7 @@ def main(argv: Sequence[str]) -> int:
 def environment_schema() -> dict[str, Any]:
     """Return the schema of a file with an environment, its imports and its recipes."""
     from jaxsafe.environment import Environment
-    from jaxsafe.envs import TASKS
+    from jaxsafe.envs import STARTERS, TASKS
     from jaxsafe.schema.json_schema import json_schema, options_schema
     from jaxsafe.train.host.options import NO_RECIPE, TrainConfig
 
@@ -58,7 +58,7 @@ def environment_schema() -> dict[str, Any]:
             "description": "Modules that define parts of the environment.",
         },
         "recipe": {
-            "anyOf": [{"enum": [*TASKS, NO_RECIPE]}, {"type": "string"}],
+            "anyOf": [{"enum": [*TASKS, *STARTERS, NO_RECIPE]}, {"type": "string"}],
             "description": "The task or the file whose recipe trains the environment.",
         },
         "recipes": {

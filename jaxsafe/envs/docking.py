@@ -53,12 +53,17 @@ DOCKING_RADIUS = 0.5
 """Radius of the docking region around the chief [m], Section 3."""
 
 DOCKING_TIES: Ties = {
-    "status.velocity_limit.slope": Tie(to="deputy.mean_motion", times=2.0),  # ν₁ = 2n, Eq. (14)
     "deputy.start.velocity.floor": Tie(to="status.velocity_limit.floor"),
     "deputy.start.velocity.slope": Tie(to="status.velocity_limit.slope"),
     "reward.success.time_scale": Tie(to="terminal.timeout.limit"),  # t_max of Table 8
 }
 """Numbers that follow others. A start is within the speed limit."""
+
+ORBIT_TIES: Ties = {
+    **DOCKING_TIES,
+    "status.velocity_limit.slope": Tie(to="deputy.mean_motion", times=2.0),  # ν₁ = 2n, Eq. (14)
+}
+"""Numbers that follow others where there is an orbit."""
 
 ONE_DEGREE = jnp.pi / 180.0
 
@@ -87,7 +92,7 @@ def docking(dimension: Literal[1, 2, 3]) -> Environment:
             Observe(name="velocity", of="deputy", what="velocity", scale=0.5),
             *speed_observation(),
         ),
-        tied=DOCKING_TIES,
+        tied=DOCKING_TIES if dimension == 1 else ORBIT_TIES,
     )
 
 
@@ -122,7 +127,7 @@ def docking_oriented() -> Environment:
             Observe(name="attitude_rate", of="deputy", what="attitude_rate", scale=RATE_LIMIT),
             *speed_observation(),
         ),
-        tied=DOCKING_TIES,
+        tied=ORBIT_TIES,
     )
 
 
