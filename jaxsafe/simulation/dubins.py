@@ -147,7 +147,7 @@ class Dubins3DState(Record):
     @property
     def velocity(self) -> Float[Array, " 3"]:
         """Velocity v (cos ψ cos γ, sin ψ cos γ, −sin γ)."""
-        forward = _forward(sin_cos(self.heading), sin_cos(self.flight_path_angle))
+        forward = flight_direction(sin_cos(self.heading), sin_cos(self.flight_path_angle))
         return self.speed[..., None] * jnp.stack(forward, axis=-1)
 
     @property
@@ -252,12 +252,14 @@ class Dubins3D(Platform, type="dubins3d"):
         nodes = [[ramp(*quantity, begin + node * length) for quantity in ramps] for node in NODES]
         turns = [self._turn_rate(sin_cos_acute(roll), speed) * length for roll, _, speed in nodes]
         for (_, gamma, speed), weight, partial in zip(nodes, WEIGHTS, PARTIAL_WEIGHTS, strict=True):
-            forward = _forward(sin_cos(heading + _dot(partial, turns)), sin_cos_acute(gamma))
+            forward = flight_direction(
+                sin_cos(heading + weighted_sum(partial, turns)), sin_cos_acute(gamma)
+            )
             moved = [
                 total + weight * length * speed * part
                 for total, part in zip(moved, forward, strict=True)
             ]
-        return (heading + _dot(WEIGHTS, turns), *moved)
+        return (heading + weighted_sum(WEIGHTS, turns), *moved)
 
     def _arrived(
         self,
@@ -326,7 +328,7 @@ def _control(controls: Controls, name: str, like: Array) -> Array:
     return jnp.asarray(controls.get(name, 0.0), like.dtype)
 
 
-def _forward(
+def flight_direction(
     heading: tuple[Array, Array], gamma: tuple[Array, Array]
 ) -> tuple[Array, Array, Array]:
     """Return the direction of flight (cos ψ cos γ, sin ψ cos γ, −sin γ).
@@ -340,7 +342,8 @@ def _forward(
     return cos_heading * cos_gamma, sin_heading * cos_gamma, -sin_gamma
 
 
-def _dot(weights: Sequence[float], values: Sequence[Array]) -> Any:
+def weighted_sum(weights: Sequence[float], values: Sequence[Array]) -> Any:
+    """Return the sum of some values, each times its weight."""
     return sum(weight * value for weight, value in zip(weights, values, strict=True))
 
 

@@ -10,14 +10,20 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
+import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.controllers import Controls
-from jaxsafe.simulation.dubins import Dubins2D, Dubins2DState, Dubins3D, Dubins3DState
-from jaxsafe.simulation.geometry import direction
+from jaxsafe.simulation.dubins import (
+    Dubins2D,
+    Dubins2DState,
+    Dubins3D,
+    Dubins3DState,
+    flight_direction,
+    weighted_sum,
+)
 from jaxsafe.simulation.integrate import (
     NODES,
     PARTIAL_WEIGHTS,
@@ -25,6 +31,7 @@ from jaxsafe.simulation.integrate import (
     lagged,
     lagged_integral,
     lagged_ramp,
+    turning_time,
 )
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.simulation.trig import sin_cos, sin_cos_acute
@@ -68,17 +75,27 @@ class LaggedDubins2D(Dubins2D, type="dubins2d_lag"):
         turn = _command(controls, "heading_rate", self.heading_rate_lag, state.heading_rate)
         push = _command(controls, "acceleration", self.acceleration_lag, state.acceleration)
         first_speed = jnp.clip(state.speed, *self.speed_limits)
+        turning = turning_time(*push)
 
         def heading(t: Number) -> Array:
             return state.heading + lagged_integral(*turn, t)
 
         def speed(t: Number) -> Array:
-            return lagged_ramp(first_speed, *push, limits=self.speed_limits, t=t)
+            return lagged_ramp(first_speed, *push, turning, limits=self.speed_limits, t=t)
 
-        times, weights = _quadrature(self.substeps, dt)
-        moved = jnp.sum((weights * speed(times))[:, None] * direction(heading(times)), axis=0)
+        def one_part(moved: list[Array], begin: Array) -> tuple[list[Array], None]:
+            for node, weight in zip(NODES, WEIGHTS, strict=True):
+                t = begin + node * h
+                way = weight * h * speed(t)
+                sine, cosine = sin_cos(heading(t))
+                moved = [moved[0] + way * cosine, moved[1] + way * sine]
+            return moved, None
+
+        h = dt / self.substeps
+        still = [jnp.zeros_like(state.speed)] * 2
+        moved, _ = jax.lax.scan(one_part, still, h * jnp.arange(self.substeps, dtype=h.dtype))
         return LaggedDubins2DState(
-            position=state.position + moved,
+            position=state.position + jnp.stack(moved),
             heading=heading(dt),
             speed=speed(dt),
             heading_rate=lagged(*turn, dt),
@@ -158,30 +175,44 @@ class LaggedDubins3D(Dubins3D, type="dubins3d_lag"):
         """
         rates = self._rates(state, controls)
         limits = self._limits()
+        turning = {name: turning_time(*rate) for name, rate in rates.items()}
 
         def at(t: Number) -> list[Array]:
             return [
-                lagged_ramp(jnp.clip(value, *limits[name]), *rates[name], limits=limits[name], t=t)
-                for name, value in _limited_fields(state).items()
+                lagged_ramp(
+                    jnp.clip(getattr(state, name), *limits[name]),
+                    *rates[name],
+                    turning[name],
+                    limits=limits[name],
+                    t=t,
+                )
+                for name in ("roll", "flight_path_angle", "speed")
             ]
 
-        times, weights = _quadrature(self.substeps, dt)
-        rolls, gammas, speeds = at(times)
-        turns = self._turn_rate(sin_cos_acute(rolls), speeds).reshape(self.substeps, len(NODES))
+        def one_part(before: list[Array], begin: Array) -> tuple[list[Array], None]:
+            heading, *moved = before
+            nodes = [at(begin + node * h) for node in NODES]
+            turns = [h * self._turn_rate(sin_cos_acute(roll), speed) for roll, _, speed in nodes]
+            for (_, gamma, speed), weight, partial in zip(
+                nodes, WEIGHTS, PARTIAL_WEIGHTS, strict=True
+            ):
+                ahead = sin_cos(heading + weighted_sum(partial, turns))
+                forward = flight_direction(ahead, sin_cos_acute(gamma))
+                way = weight * h * speed
+                moved = [total + way * part for total, part in zip(moved, forward, strict=True)]
+            return [heading + weighted_sum(WEIGHTS, turns), *moved], None
+
         h = dt / self.substeps
-        turned = h * jnp.sum(turns * jnp.asarray(WEIGHTS, turns.dtype), axis=1)
-        begun = jnp.cumsum(turned) - turned
-        partial = jnp.asarray(PARTIAL_WEIGHTS, turns.dtype)
-        inside = h * jnp.sum(turns[:, None, :] * partial, axis=-1)
-        headings = state.heading + (begun[:, None] + inside).reshape(-1)
-        ways = weights * speeds
-        (sin_heading, cos_heading), (sin_gamma, cos_gamma) = sin_cos(headings), sin_cos(gammas)
-        forward = [cos_heading * cos_gamma, sin_heading * cos_gamma, -sin_gamma]
-        moved = jnp.stack([jnp.sum(ways * part) for part in forward])
+        still = jnp.zeros_like(state.speed)
+        (heading, *moved), _ = jax.lax.scan(
+            one_part,
+            [state.heading, still, still, still],
+            h * jnp.arange(self.substeps, dtype=h.dtype),
+        )
         roll, gamma, speed = at(dt)
         return LaggedDubins3DState(
-            position=state.position + moved,
-            heading=state.heading + jnp.sum(turned),
+            position=state.position + jnp.stack(moved),
+            heading=heading,
             speed=speed,
             flight_path_angle=gamma,
             roll=roll,
@@ -253,14 +284,6 @@ class LaggedDubins3D(Dubins3D, type="dubins3d_lag"):
         }
 
 
-def _limited_fields(state: LaggedDubins3DState) -> dict[str, Array]:
-    return {
-        "roll": state.roll,
-        "flight_path_angle": state.flight_path_angle,
-        "speed": state.speed,
-    }
-
-
 def _command(controls: Controls, name: str, time_constant: Number, rate: Array) -> Command:
     """Return a rate, the command that it follows, and the time constant of its lag."""
     return rate, jnp.asarray(controls.get(name, 0.0), rate.dtype), time_constant
@@ -274,10 +297,3 @@ def _slope(command: Command) -> Array:
 def _change_of_product(factor: Any, factor_change: Any, rate: Any, rate_change: Any) -> Any:
     """Return a bound on the change of a product, given bounds on its factors and their changes."""
     return factor * rate_change + factor_change * rate
-
-
-def _quadrature(substeps: int, dt: Seconds) -> tuple[Float[Array, " k"], Float[Array, " k"]]:
-    """Return times [s] and weights [s] of Gauss-Legendre nodes in equal parts of a step."""
-    shares = (np.arange(substeps)[:, None] + np.array(NODES)).reshape(-1) / substeps
-    weights = np.tile(np.array(WEIGHTS) / substeps, substeps)
-    return dt * jnp.asarray(shares, dt.dtype), dt * jnp.asarray(weights, dt.dtype)

@@ -34,6 +34,13 @@ PARTIAL_WEIGHTS = np.linalg.solve(
 """Weights of the integrals from 0 to each Gauss-Legendre node, one list per node."""
 
 
+AHEAD = (0.0, 1 / 2, 1 / 2, 1.0)
+"""How far ahead the stages of the classical Runge-Kutta method are, in lengths of a step."""
+
+STAGE_WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+"""Weights of these stages."""
+
+
 def ramp(x: Number, rate: Number | None, limits: Float[Array, " 2"], t: Number) -> Any:
     """Return clip(x + rate·t, low, high): a state that its rate moves until it rests on a limit.
 
@@ -115,11 +122,28 @@ def lag_within_rate(
     return total / dt, lagged(x, target, time_constant, left)
 
 
+def turning_time(rate: Number, target: Number, time_constant: Number) -> Any:
+    """Return the time [s] at which a rate that follows a target with a lag is 0.
+
+    It is infinite if the rate never changes its sign. Like `time_to_limit` it has no derivative.
+
+    Args:
+        rate: the rate at time 0.
+        target: the constant target.
+        time_constant: time constant of the lag [s].
+    """
+    turns = rate * target < 0.0
+    quotient = jnp.where(turns, -rate / jnp.where(turns, target, 1.0), 0.0)
+    time = jnp.where(turns, time_constant * jnp.log1p(quotient), jnp.inf)
+    return jax.lax.stop_gradient(time)
+
+
 def lagged_ramp(
     x: Number,
     rate: Number,
     target: Number,
     time_constant: Number,
+    turning: Number,
     limits: Float[Array, " 2"],
     t: Number,
 ) -> Any:
@@ -133,16 +157,14 @@ def lagged_ramp(
         rate: its rate of change at time 0.
         target: the constant rate that the rate follows.
         time_constant: time constant of the lag [s].
+        turning: the `turning_time` of the rate [s].
         limits: lowest and highest state.
         t: time [s].
     """
-    turns = rate * target < 0.0
-    quotient = jnp.where(turns, -rate / jnp.where(turns, target, 1.0), 0.0)
-    turning_time = jax.lax.stop_gradient(time_constant * jnp.log1p(quotient))
-    extreme_time = jnp.where(turns, jnp.minimum(t, turning_time), t)
-    extreme = x + lagged_integral(rate, target, time_constant, extreme_time)
-    excess = extreme - jnp.clip(extreme, limits[0], limits[1])
     free = x + lagged_integral(rate, target, time_constant, t)
+    before = jnp.minimum(t, turning)
+    extreme = x + lagged_integral(rate, target, time_constant, before)
+    excess = extreme - jnp.clip(extreme, limits[0], limits[1])
     return jnp.clip(free - excess, limits[0], limits[1])
 
 
@@ -163,21 +185,49 @@ def runge_kutta(
         limit: brings a state back into its limits. It is applied after each of these steps.
     """
     h = dt / substeps
+    split, join = _in_scalars(state)
 
-    def moved(state: T, rates: T, time: Number) -> T:
-        return jax.tree.map(lambda x, rate: x + time * rate, state, rates)
+    # The stages are a loop over single numbers. Without a loop XLA would compute a stage again for
+    # each use of it. With vectors it would interleave their elements in a batch.
+    def one_step(numbers: list[Array]) -> list[Array]:
+        def one_stage(
+            carry: tuple[list[Array], list[Array]], stage: tuple[Array, Array]
+        ) -> tuple[tuple[list[Array], list[Array]], None]:
+            slopes, totals = carry
+            ahead, weight = stage
+            now = [x + ahead * slope for x, slope in zip(numbers, slopes, strict=True)]
+            slopes = split(derivative(join(now)))
+            totals = [total + weight * slope for total, slope in zip(totals, slopes, strict=True)]
+            return (slopes, totals), None
 
-    def one_step(state: T) -> T:
-        k1 = derivative(state)
-        k2 = derivative(moved(state, k1, 0.5 * h))
-        k3 = derivative(moved(state, k2, 0.5 * h))
-        k4 = derivative(moved(state, k3, h))
-        mean = jax.tree.map(lambda a, b, c, d: (a + 2.0 * (b + c) + d) / 6.0, k1, k2, k3, k4)
-        return limit(moved(state, mean, h))
+        still = [jnp.zeros_like(number) for number in numbers]
+        stages = (h * jnp.asarray(AHEAD, h.dtype), h * jnp.asarray(STAGE_WEIGHTS, h.dtype))
+        (_, totals), _ = jax.lax.scan(one_stage, (still, numbers), stages)
+        return split(limit(join(totals)))
 
+    numbers = split(state)
     if substeps == 1:
-        return one_step(state)
-    return jax.lax.scan(lambda state, _: (one_step(state), None), state, length=substeps)[0]
+        return join(one_step(numbers))
+    return join(jax.lax.scan(lambda x, _: (one_step(x), None), numbers, length=substeps)[0])
+
+
+def _in_scalars(tree: T) -> tuple[Callable[[T], list[Array]], Callable[[list[Array]], T]]:
+    """Return functions from trees like this one to the list of their numbers, and back."""
+    leaves, structure = jax.tree.flatten(tree)
+    shapes = [jnp.shape(leaf) for leaf in leaves]
+    ends = np.cumsum([math.prod(shape) for shape in shapes])
+
+    def split(tree: T) -> list[Array]:
+        return [number for leaf in jax.tree.leaves(tree) for number in jnp.ravel(leaf)]
+
+    def join(numbers: list[Array]) -> T:
+        parts = [
+            jnp.stack(numbers[end - math.prod(shape) : end]).reshape(shape)
+            for shape, end in zip(shapes, ends, strict=True)
+        ]
+        return jax.tree.unflatten(structure, parts)
+
+    return split, join
 
 
 def pieces(stops: Sequence[Any], dt: Number) -> tuple[Float[Array, " s"], Float[Array, " s"]]:

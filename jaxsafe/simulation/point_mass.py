@@ -57,7 +57,7 @@ class PointMassAircraft(Dubins3D, type="point_mass_aircraft"):
     largest_lift: LiftCoefficient = 1.4
     thrust_limits: Annotated[Number, Unit("lbf", length=2), Range(largest=1e9)] = (0.0, 2_050.0)
     load_factor_limits: Annotated[Number, Unit("1", length=2), Range(largest=1e3)] = (-2.5, 6.0)
-    substeps: Annotated[int, Range(1, largest=1000)] = 4
+    substeps: Annotated[int, Range(1, largest=1000)] = 2
 
     @property
     def inputs(self) -> tuple[str, ...]:
