@@ -26,10 +26,20 @@ from jaxsafe.simulation.controllers import (
     Controller,
     Discrete,
 )
-from jaxsafe.simulation.geometry import Offset, Region, direction, rotation, safe_norm, to_body
+from jaxsafe.simulation.geometry import (
+    Offset,
+    Region,
+    angle_between,
+    direction,
+    rotation,
+    safe_norm,
+    to_body,
+    to_global,
+)
 from jaxsafe.simulation.initializers import Direction, Initializer
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.simulation.scripted import Command, Scripted
+from jaxsafe.simulation.vectors import Vector
 from jaxsafe.types import (
     AnyStatusName,
     ConstraintName,
@@ -43,6 +53,7 @@ from jaxsafe.types import (
     Number,
     OutcomeName,
     PerSecond,
+    PlaceName,
     PlatformName,
     Positive,
     Radians,
@@ -52,8 +63,10 @@ from jaxsafe.types import (
     RegionState,
     RTAInfo,
     Seconds,
+    ShapeName,
     Sim,
     StatusName,
+    place,
 )
 
 __all__ = [
@@ -91,6 +104,7 @@ __all__ = [
     "Offset",
     "OutcomeName",
     "PerSecond",
+    "PlaceName",
     "Platform",
     "PlatformName",
     "Positive",
@@ -107,6 +121,7 @@ __all__ = [
     "Reward",
     "Scripted",
     "Seconds",
+    "ShapeName",
     "Sim",
     "Status",
     "StatusName",
@@ -115,9 +130,13 @@ __all__ = [
     "TerminalSet",
     "Tie",
     "Unit",
+    "Vector",
+    "angle_between",
     "direction",
+    "place",
     "register",
     "rotation",
     "safe_norm",
     "to_body",
+    "to_global",
 ]

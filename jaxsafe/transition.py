@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsafe.schema.dotted_paths import references
 from jaxsafe.schema.errors import part
+from jaxsafe.simulation.between import regions_on_the_way
 from jaxsafe.simulation.controllers import Controls
-from jaxsafe.types import Sim
+from jaxsafe.types import RefersInDetail, Sim
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
@@ -123,10 +125,26 @@ def undirected(platform: Platform, sim: Sim) -> Controls:
 def place_regions(env: Environment, sim: Sim) -> Sim:
     """Return the simulation with its regions where the platforms put them."""
     regions = {}
+    moving, measured = _in_detail(env)
     for region in env.regions:
         with part("regions", region.name):
-            regions[region.name] = region.place(sim.platforms)
+            regions[region.name] = region.place(
+                sim.platforms,
+                regions,
+                moves=region.name in moving,
+                measures=region.name in measured,
+            )
     return sim.replace(regions=regions)
+
+
+def _in_detail(env: Environment) -> tuple[set[str], set[str]]:
+    """Return the regions whose motion, and those whose distances, are named by some part."""
+    if not env.regions:
+        return set(), set()
+    named = [found for found in references(env, "") if isinstance(found[1], RefersInDetail)]
+    moving = {name for _, refers, name in named if refers.section == "places"}
+    measured = {name for _, refers, name in named if refers.section == "regions"}
+    return moving, measured
 
 
 def update_statuses(
@@ -167,13 +185,15 @@ def judge(env: Environment, sim: Sim, before: Sim | None = None) -> Sim:
     Args:
         env: the environment.
         sim: the simulation to judge.
-        before: the simulation one step earlier. If it is given, distances are lower bounds on the
-            way from there, so that nothing slips through between two instants.
+        before: the simulation one step earlier. If it is given, distances, and depths inside
+            regions, are lower bounds on the way from there, so that nothing slips through between
+            two instants.
     """
     if before is None:
         return update_statuses(env, sim.replace(status={}), None)[0]
     earlier = judge(env, before)
     sim = place_regions(env, sim.replace(status={}))
+    sim = sim.replace(regions=regions_on_the_way(env, earlier, sim))
     for status in env.status:
         sim = sim.replace(status={**sim.status, status.name: status.on_the_way(env, earlier, sim)})
     return sim
@@ -200,7 +220,7 @@ def smallest_margin(
     now = judge(env, sim)
     on_the_way = now if before is None else judge(env, sim, before)
     margins = [
-        constraint.margin(on_the_way if constraint.between else now)
+        constraint.margin_between(now, on_the_way)
         for constraint in env.constraints
         if names is None or constraint.name in names
     ]

@@ -62,8 +62,27 @@ Kilograms = Annotated[
 ]
 Seconds = Annotated[Number, Unit("s"), Positive]
 
+
+@dataclasses.dataclass(frozen=True)
+class RefersInDetail(Refers):
+    """Mark of a name for which a region also tells how it moves, or how far away its boundary is.
+
+    Regions that nothing names in this way do without, see `RegionState`. The section `places` is
+    that of the platforms and that of the regions.
+    """
+
+    @property
+    def where(self) -> str:
+        return "`platforms` or `regions`" if self.section == "places" else super().where
+
+
 PlatformName = Annotated[str, Refers("platforms")]
 RegionName = Annotated[str, Refers("regions")]
+"""Name of a region, of which position and content are needed."""
+ShapeName = Annotated[str, RefersInDetail("regions")]
+"""Name of a region, of which the distances of platforms to its boundary are needed too."""
+PlaceName = Annotated[str, RefersInDetail("places")]
+"""Name of a platform or of a region, of which position, velocity and orientation are needed."""
 StatusName = Annotated[str, Refers("status", boolean=False)]
 """Name of a numeric status."""
 FlagName = Annotated[str, Refers("status", boolean=True)]
@@ -146,6 +165,11 @@ def _named(values: Mapping[str, tuple[Any, str]]) -> str:
     return ", ".join(parts)
 
 
+def place(sim: Sim, name: str) -> Any:
+    """Return the state of a platform or of a region. A platform hides a region of its name."""
+    return sim.platforms[name] if name in sim.platforms else sim.regions[name]
+
+
 def is_key(x: Any) -> bool:
     """Return whether this is a typed PRNG key, an array of keys, or the shape of either.
 
@@ -173,6 +197,14 @@ class RegionState(Record):
 
     position: Float[Array, " d"]  # of its centre, in the unit of the platforms
     inside: Mapping[str, Bool[Array, ""]]  # by platform name
+    # The next two are () unless a part names the region as a `PlaceName`.
+    velocity: Any = ()  # of its centre, shape (d,)
+    orientation: Any = ()  # rotation from its axes to the global frame, shape (d, d)
+    # By platform name, {} unless a part names the region as a `ShapeName`: the distance to the
+    # boundary, which is negative inside, and the depth below the boundary, which is its opposite. A
+    # filter predicts a step with lower bounds of both on the way, see `transition.judge`.
+    distance: Mapping[str, Float[Array, ""]] = dataclasses.field(default_factory=dict)
+    depth: Mapping[str, Float[Array, ""]] = dataclasses.field(default_factory=dict)
 
 
 def _no_control() -> Float[Array, " 0"]:

@@ -36,6 +36,7 @@ from jaxsafe.simulation.geometry import Offset, Region
 from jaxsafe.simulation.initializers import Direction, Initializer
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.simulation.scripted import Command
+from jaxsafe.simulation.vectors import Vector
 from jaxsafe.train.ppo import PPO
 
 
@@ -53,6 +54,7 @@ SECTIONS = {
     "commands": Section("Commands of a script", (Command,)),
     "start": Section("Starts", (Initializer, Direction)),
     "regions": Section("Regions", (Region, Offset)),
+    "vector": Section("Vectors", (Vector,)),
     "status": Section("Statuses", (Status,)),
     "constraints": Section("Constraints", (Constraint,)),
     "terminal": Section("Ends", (Terminal,)),
@@ -176,7 +178,7 @@ def _takes(field: Field, with_users: bool) -> str:
         types = ", ".join(f"`{title(cls)}`" for cls in _classes(base, with_users))
         return ("a list of " if inner else "one of " if "," in types else "") + types
     if field.refers and core is str:
-        return f"a name of `{field.refers.section}`"
+        return f"a name of {field.refers.where}"
     return expects(field)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from jaxsafe.config.check import check
@@ -15,7 +16,7 @@ from jaxsafe.config.tied import settle
 from jaxsafe.environment import Environment
 from jaxsafe.rta.filter import RTA
 from jaxsafe.schema.component import normalise
-from jaxsafe.schema.convert import to_component, to_data
+from jaxsafe.schema.convert import DIRECTORY, to_component, to_data
 from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.schema.user_modules import import_modules, modules
 
@@ -60,7 +61,11 @@ def load(source: str | os.PathLike) -> Environment:
 
     text = isinstance(source, str) and "\n" in source
     data = yaml12.parse(str(source), "environment") if text else yaml12.read(source)
-    return from_data(_without_recipes(data), "")
+    directory = DIRECTORY.set(Path() if text else Path(source).parent)
+    try:
+        return from_data(_without_recipes(data), "")
+    finally:
+        DIRECTORY.reset(directory)
 
 
 def load_filter(path: str | os.PathLike) -> RTA:

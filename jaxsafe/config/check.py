@@ -18,14 +18,12 @@ from jax.core import Tracer
 
 from jaxsafe.config.tied import check_ties
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.processors.observation import Observe, ObserveAngle
-from jaxsafe.schema.component import ANY, Component, choices, fields
+from jaxsafe.schema.component import ANY, Component, fields
 from jaxsafe.schema.convert import expects, to_value
 from jaxsafe.schema.dotted_paths import join, references, set_path
 from jaxsafe.schema.errors import ConfigError, nearest, show, summarise_error
 from jaxsafe.schema.ties import follow
 from jaxsafe.schema.user_modules import modules
-from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.transition import judge
 from jaxsafe.types import Sim
@@ -55,14 +53,24 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
         _once(section, found)
     _once("outcomes", env.outcomes)
     names["outcomes"] = list(env.outcomes[1:])
+    names["places"] = names["platforms"] + names["regions"]
     _reference("agent", env.agent, names["platforms"])
     for section in _SECTIONS:
         for index, part in enumerate(getattr(env, section)):
+            earlier = names[section][:index]
             for place, refers, name in references(part, f"{section}.{part.name}"):
-                # Later parts are not there yet when a start is drawn or a status is evaluated.
-                early = section == "status" or place.startswith(f"platforms.{part.name}.start")
-                ordered = refers.section == section and early
-                known = names[refers.section][: index if ordered else None]
+                # Later parts are not there yet when a start is drawn, a region is placed or a
+                # status is evaluated.
+                early = section in ("status", "regions") or place.startswith(
+                    f"platforms.{part.name}.start"
+                )
+                known = names[refers.section]
+                ordered = early and refers.section == section
+                if ordered:
+                    known = earlier
+                elif section == "regions" and refers.section == "places":
+                    known = names["platforms"] + earlier
+                    ordered = name in names["regions"]
                 _reference(place, name, known, " listed before it" if ordered else "")
     for place, refers, name in references(env.rta, "rta") if env.rta else ():
         _reference(place, name, names[refers.section])
@@ -141,33 +149,22 @@ def _check_space(env: Environment) -> None:
     if len(set(dimensions.values())) > 1:
         found = ", ".join(f"{name} {dimension}" for name, dimension in dimensions.items())
         raise ConfigError(f"platforms: expected the same dimension for all, found {found}")
-    known = {platform.name: platform.quantities() for platform in env.platforms}
-    for item in env.observation:
-        if not isinstance(item, (Observe, ObserveAngle)):
-            continue
-        for platform in (item.of, getattr(item, "relative_to", None) or item.of):
-            if item.what not in known[platform]:
-                raise ConfigError(
-                    f"observation.{item.name}.what: {platform} has no quantity {item.what!r};"
-                    f" choose from {nearest(item.what, known[platform])}"
-                )
-    for region in env.regions:
-        space = env.agent_platform.dimension
-        if space not in region.dimensions:
-            fitting = [name for name, kind in choices(Region).items() if space in kind.dimensions]
-            raise ConfigError(
-                f"regions.{region.name}: a {region.type_name} is no part "
-                f"of a space of {space} dimensions; choose from {nearest('', sorted(fitting))}"
-            )
-        for status in env.status:
-            if (
-                getattr(status, "region", None) == region.name
-                and getattr(status, "of", None) == region.on
-            ):
-                raise ConfigError(
-                    f"status.{status.name}.of: region {region.name!r} is on {region.on!r} itself; "
-                    "choose another"
-                )
+    for section in _SECTIONS:
+        for part in getattr(env, section):
+            for place, misfit in _misfits(env, part, f"{section}.{part.name}"):
+                raise ConfigError(f"{place}: {misfit}")
+
+
+def _misfits(env: Environment, component: Component, place: str) -> Iterator[tuple[str, str]]:
+    """Yield what of a component and of those inside it does not fit, each with its place."""
+    for name in fields(type(component)):
+        value = getattr(component, name)
+        for inner in value if isinstance(value, tuple) else (value,):
+            if isinstance(inner, Component):
+                inner_place = join(join(place, name), getattr(inner, "name", ""))
+                yield from _misfits(env, inner, inner_place)
+    for name, misfit in component.misfits(env).items():
+        yield join(place, name), misfit
 
 
 def _check_platform(platform: Platform, is_agent: bool) -> None:
@@ -193,10 +190,12 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
     rest = vars(platform.rest())
     for initializer in platform.start:
         here = f"{place}.start.{initializer.name}"
-        if initializer.name not in rest:
-            raise ConfigError(
-                f"{here}: no such state field; choose from {nearest(initializer.name, rest)}"
-            )
+        for name in initializer.draws:
+            if name not in rest:
+                which = "" if name == initializer.name else f"{name}: "
+                raise ConfigError(
+                    f"{here}: {which}no such state field; choose from {nearest(name, rest)}"
+                )
         if getattr(initializer, "direction", None) is not None:
             drawn = initializer.direction.dimension  # type: ignore[attr-defined]
             if (drawn,) != rest[initializer.name].shape:

@@ -16,7 +16,7 @@ from matplotlib.ticker import FixedLocator, MaxNLocator
 
 from jaxsafe.environment import control_unit as control_unit
 from jaxsafe.environment import length_unit as length_unit
-from jaxsafe.processors.constraint import Separation, SpeedLimit
+from jaxsafe.processors.constraint import ConeConstraint, KeepIn, KeepOut, Separation, SpeedLimit
 from jaxsafe.processors.status import Distance
 from jaxsafe.schema.dotted_paths import references
 from jaxsafe.schema.errors import ConfigError, printable
@@ -89,7 +89,12 @@ def margin_unit(constraint: Any, length: str | None) -> str | None:
     """
     if length is None:
         return None
-    units_by_class = {SpeedLimit: f"{length}/s", Separation: length}
+    units_by_class = {
+        SpeedLimit: f"{length}/s",
+        Separation: length,
+        KeepOut: length,
+        ConeConstraint: "rad",
+    }
     return next((unit for cls, unit in units_by_class.items() if isinstance(constraint, cls)), None)
 
 
@@ -133,7 +138,8 @@ def kept_out(env: Environment) -> set[str]:
 
     goals = [part for part in env.terminal if part.name in env.successes]
     failures = [part for part in env.terminal if part.name not in env.successes]
-    return watched([*env.constraints, *failures]) - watched(goals)
+    forbidding = [part for part in env.constraints if not isinstance(part, KeepIn)]
+    return watched([*forbidding, *failures]) - watched(goals)
 
 
 def region_patch(region: Any, from_the_side: bool, forbidden: bool = False) -> Any:

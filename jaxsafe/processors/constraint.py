@@ -5,12 +5,32 @@ They are evaluated at every step for `cost`, for `margins` and for the safety me
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.schema.component import Component
-from jaxsafe.types import Extent, Length, Sim, StatusName
+from jaxsafe.processors.status import on_itself
+from jaxsafe.schema.component import Component, Range, Unit
+from jaxsafe.simulation.geometry import angle_between
+from jaxsafe.simulation.vectors import Vector
+from jaxsafe.types import (
+    Extent,
+    Length,
+    Number,
+    PlatformName,
+    Radians,
+    Reach,
+    ShapeName,
+    Sim,
+    StatusName,
+)
+
+Bound = Annotated[Number, Unit("physical"), Range(largest=1e12)]
+"""A limit of a status, in the unit of the status."""
+
+Scale = Annotated[Number, Unit("physical"), Range(0.0, open_low=True, smallest=1e-12, largest=1e12)]
+"""The violation −h, in the unit of h, whose severity is 1."""
 
 
 class Constraint(Component):
@@ -33,6 +53,15 @@ class Constraint(Component):
     def limit(self, sim: Sim) -> Float[Array, ""]:
         """Return the limit at this step, which is positive."""
         raise NotImplementedError
+
+    def margin_between(self, now: Sim, on_the_way: Sim) -> Float[Array, ""]:
+        """Return the h of a predicted step, a lower bound if `between`.
+
+        Args:
+            now: the simulation after the step.
+            on_the_way: the same with lower bounds of distances and depths within the step.
+        """
+        return self.margin(on_the_way if self.between else now)
 
 
 class SpeedLimit(Constraint, type="speed_limit"):
@@ -60,3 +89,92 @@ class Separation(Constraint, type="separation"):
 
     def limit(self, sim: Sim) -> Float[Array, ""]:
         return self.minimum
+
+
+class LowerLimit(Constraint, type="lower_limit"):
+    """The margin h = status − minimum.
+
+    A filter bounds it between two samples where the status is a distance, or falls with one.
+    """
+
+    between: ClassVar[bool] = True
+    status: StatusName
+    minimum: Bound
+    scale: Scale = 1.0
+
+    def margin(self, sim: Sim) -> Float[Array, ""]:
+        return sim.status[self.status] - self.minimum
+
+    def limit(self, sim: Sim) -> Float[Array, ""]:
+        return self.scale
+
+    def margin_between(self, now: Sim, on_the_way: Sim) -> Float[Array, ""]:
+        # A status that grows where a distance falls is no lower bound on the way.
+        return jnp.minimum(self.margin(now), self.margin(on_the_way))
+
+
+class UpperLimit(Constraint, type="upper_limit"):
+    """The margin h = maximum − status. A filter keeps it at samples."""
+
+    status: StatusName
+    maximum: Bound
+    scale: Scale = 1.0
+
+    def margin(self, sim: Sim) -> Float[Array, ""]:
+        return self.maximum - sim.status[self.status]
+
+    def limit(self, sim: Sim) -> Float[Array, ""]:
+        return self.scale
+
+
+class KeepOut(Constraint, type="keep_out"):
+    """The margin h = distance to the boundary of a region − clearance, negative inside the region.
+
+    A filter bounds it between two samples, so nothing slips through a corner of the region.
+    """
+
+    between: ClassVar[bool] = True
+    of: PlatformName
+    region: ShapeName
+    clearance: Annotated[Length, Reach] = 0.0
+    scale: Annotated[Length, Extent] = 1.0
+
+    def margin(self, sim: Sim) -> Float[Array, ""]:
+        return sim.regions[self.region].distance[self.of] - self.clearance
+
+    def limit(self, sim: Sim) -> Float[Array, ""]:
+        return self.scale
+
+    def misfits(self, env: Any) -> dict[str, str]:
+        return on_itself(env, self.of, self.region)
+
+
+class KeepIn(KeepOut, type="keep_in"):
+    """The margin h = depth below the boundary of a region − clearance, negative outside the region.
+
+    A filter bounds it between two samples.
+    """
+
+    def margin(self, sim: Sim) -> Float[Array, ""]:
+        return sim.regions[self.region].depth[self.of] - self.clearance
+
+
+class ConeConstraint(Constraint, type="cone"):
+    """The margin between an angle and the half angle of a cone [rad].
+
+    The angle is that between the `axis` of the cone and the direction to a target. `keep` says
+    whether the target must stay inside the cone, as a docking port in a camera's view, or outside,
+    as the sun. A filter keeps it at samples.
+    """
+
+    axis: Vector
+    target: Vector
+    half_angle: Annotated[Radians, Range(0.0, jnp.pi, open_low=True)]
+    keep: Literal["inside", "outside"]
+
+    def margin(self, sim: Sim) -> Float[Array, ""]:
+        room = self.half_angle - angle_between(self.axis.value(sim), self.target.value(sim))
+        return room if self.keep == "inside" else -room
+
+    def limit(self, sim: Sim) -> Float[Array, ""]:
+        return self.half_angle

@@ -1,22 +1,39 @@
 """Observations (Tables 5 and 6).
 
-Each is divided by its scale and clipped. Together they are one vector.
+Each is shifted by its offset, divided by its scale and clipped. Together they are one vector.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.processors.processor import Processor
 from jaxsafe.schema.component import ANY, Range, Unit
+from jaxsafe.schema.errors import nearest
 from jaxsafe.simulation.geometry import direction, mag_norm, to_body
-from jaxsafe.types import AnyStatusName, Number, PlatformName, RegionName, Sim
+from jaxsafe.simulation.vectors import Vector
+from jaxsafe.types import (
+    MAX_DISTANCE,
+    AnyStatusName,
+    Number,
+    PlaceName,
+    PlatformName,
+    RegionName,
+    Sim,
+    place,
+)
+
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
 
 Scale = Annotated[Number, Unit("as observed", length=ANY), Range(nonzero=True, smallest=1e-12)]
 """One divisor for all elements of an observation, or one for each."""
+
+Shift = Annotated[Number, Unit("as observed", length=ANY), Range(largest=MAX_DISTANCE)]
+"""One offset of all elements of an observation, or one for each."""
 
 Clip = Annotated[Number, Unit("1", length=2), Range(infinite=True)]
 """Lowest and highest value of an observation after scaling."""
@@ -25,13 +42,14 @@ Clip = Annotated[Number, Unit("1", length=2), Range(infinite=True)]
 class Observation(Processor):
     """Base of all observations.
 
-    A subclass writes `measure`, which returns a vector in physical units. The vector is then
-    divided by `scale`, which is one divisor for all elements or one for each, and clipped to
-    `clip`.
+    A subclass writes `measure`, which returns a vector in physical units. What is observed is
+    (vector − `offset`)/`scale`, clipped to `clip`. So an offset that is the mean and a scale that
+    is the standard deviation standardise it. Each is one number for all elements or one for each.
     """
 
     scale: Scale = 1.0
     clip: Clip | None = None
+    offset: Shift | None = None
 
     def measure(self, memory: Any, sim: Sim) -> Float[Array, " k"]:
         """Return the observed vector in physical units, shape (k,)."""
@@ -46,22 +64,26 @@ class Observation(Processor):
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, " k"]:
         measured = self.measure(memory, sim)
-        if jnp.shape(self.scale) not in ((), measured.shape):
-            raise ValueError(
-                f"scale: expected 1 or {measured.size} numbers, found {jnp.size(self.scale)}"
-            )
-        scaled = measured / self.scale
+        for name in ("scale", "offset"):
+            value = getattr(self, name)
+            if value is not None and jnp.shape(value) not in ((), measured.shape):
+                raise ValueError(
+                    f"{name}: expected 1 or {measured.size} numbers, found {jnp.size(value)}"
+                )
+        shifted = measured if self.offset is None else measured - self.offset
+        scaled = shifted / self.scale
         return scaled if self.clip is None else jnp.clip(scaled, self.clip[0], self.clip[1])
 
 
 class VectorObservation(Observation):
     """Base of observed vectors, given in a frame and in a form.
 
-    `frame` names the platform whose body frame is used. None stands for the global frame. The form
-    `rectangular` is the components, and `magnorm` is the magnitude and the direction, Eq. (21).
+    `frame` names the platform or region whose body frame is used. None stands for the global
+    frame. The form `rectangular` is the components, and `magnorm` is the magnitude and the
+    direction, Eq. (21).
     """
 
-    frame: PlatformName | None = None
+    frame: PlaceName | None = None
     form: Literal["rectangular", "magnorm"] = "rectangular"
 
     def vector(self, sim: Sim) -> Float[Array, " d"]:
@@ -71,7 +93,7 @@ class VectorObservation(Observation):
     def measure(self, memory: Any, sim: Sim) -> Float[Array, " k"]:
         vector = jnp.atleast_1d(self.vector(sim))
         if self.frame is not None:
-            vector = to_body(sim.platforms[self.frame].orientation, vector)
+            vector = to_body(place(sim, self.frame).orientation, vector)
         return mag_norm(vector) if self.form == "magnorm" else vector
 
     def labels(self, sim: Sim) -> tuple[str, ...]:
@@ -91,6 +113,9 @@ class Observe(VectorObservation, type="observe"):
     what: str
     relative_to: PlatformName | None = None
 
+    def misfits(self, env: Environment) -> dict[str, str]:
+        return _not_observable(env, self.what, self.of, self.relative_to or self.of)
+
     def vector(self, sim: Sim) -> Float[Array, " d"]:
         own = getattr(sim.platforms[self.of], self.what)
         if self.relative_to is None:
@@ -99,16 +124,73 @@ class Observe(VectorObservation, type="observe"):
 
 
 class ObserveRegion(VectorObservation, type="observe_region"):
-    """The position of a region's centre, relative to a platform if one is named."""
+    """The position of a region's centre, relative to a platform or region if one is named."""
 
     region: RegionName
-    relative_to: PlatformName | None = None
+    relative_to: PlaceName | None = None
 
     def vector(self, sim: Sim) -> Float[Array, " d"]:
         centre = sim.regions[self.region].position
         if self.relative_to is None:
             return centre
-        return centre - sim.platforms[self.relative_to].position
+        return centre - place(sim, self.relative_to).position
+
+
+class ObserveVector(VectorObservation, type="observe_vector"):
+    """A vector of the world, such as the velocity of a region or the direction of the sun."""
+
+    what: Vector
+
+    def vector(self, sim: Sim) -> Float[Array, " d"]:
+        return self.what.value(sim)
+
+
+class ObserveOrientation(Observation, type="observe_orientation"):
+    """The orientation of a platform or region, which does not jump.
+
+    In the plane it is [cos θ, sin θ] of the angle θ of the body's x axis. In space it is the first
+    two columns of the rotation matrix, which are the body's x and y axes; the z axis follows from
+    them. With `frame` the axes are seen from the body frame of that platform or region.
+    """
+
+    of: PlaceName
+    frame: PlaceName | None = None
+
+    def measure(self, memory: Any, sim: Sim) -> Float[Array, " k"]:
+        orientation = place(sim, self.of).orientation
+        axes = [orientation[:, i] for i in range(orientation.shape[0] - 1)]
+        if self.frame is not None:
+            seen_from = place(sim, self.frame).orientation
+            axes = [to_body(seen_from, axis) for axis in axes]
+        return jnp.concatenate(axes)
+
+    def labels(self, sim: Sim) -> tuple[str, ...]:
+        if self.measure((), sim).size == 2:
+            return (f"{self.name}.cos", f"{self.name}.sin")
+        return tuple(f"{self.name}.{axis}_axis.{component}" for axis in "xy" for component in "xyz")
+
+
+class ObserveControl(Observation, type="observe_control"):
+    """The control of the last step in physical units, 0 at reset, in the order of the action.
+
+    `actual` is the control that acted, after run time assurance, and `desired` is what the agent
+    asked for. A scale of the limits gives the last action in [−1, 1].
+    """
+
+    which: Literal["actual", "desired"] = "actual"
+
+    def measure(self, memory: Any, sim: Sim) -> Float[Array, " actuators"]:
+        return sim.control_actual if self.which == "actual" else sim.control_desired
+
+    def labels(self, sim: Sim) -> tuple[str, ...]:
+        return tuple(f"{self.name}.{index}" for index in range(sim.control_actual.size))
+
+
+class ObserveTime(Observation, type="observe_time"):
+    """The time [s] since the start of the episode."""
+
+    def measure(self, memory: Any, sim: Sim) -> Float[Array, " 1"]:
+        return sim.time[None]
 
 
 class ObserveAngle(Observation, type="observe_angle"):
@@ -116,6 +198,9 @@ class ObserveAngle(Observation, type="observe_angle"):
 
     of: PlatformName
     what: str
+
+    def misfits(self, env: Environment) -> dict[str, str]:
+        return _not_observable(env, self.what, self.of)
 
     def measure(self, memory: Any, sim: Sim) -> Float[Array, " 2"]:
         return direction(getattr(sim.platforms[self.of], self.what))
@@ -131,6 +216,16 @@ class ObserveStatus(Observation, type="observe_status"):
 
     def measure(self, memory: Any, sim: Sim) -> Float[Array, " k"]:
         return jnp.atleast_1d(jnp.asarray(sim.status[self.status], jnp.result_type(float)))
+
+
+def _not_observable(env: Environment, what: str, *platforms: str) -> dict[str, str]:
+    """Return what is wrong with a quantity that one of some platforms does not have."""
+    for name in platforms:
+        known = env.platform(name).quantities()
+        if what not in known:
+            found = f"{name} has no quantity {what!r}; choose from {nearest(what, known)}"
+            return {"what": found}
+    return {}
 
 
 def _axis_names(size: int) -> list[str]:

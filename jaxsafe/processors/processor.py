@@ -5,10 +5,32 @@ A processor has a memory. `increment` moves it once a step, and `process` only r
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
-from jaxsafe.schema.component import Component
+from jaxtyping import Array, Bool
+
+from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.types import Number, Sim
+
+Limit = Annotated[Number, Unit("physical"), Range(infinite=True)]
+"""A limit of a status, in the unit of the status. Infinity means no limit."""
+
+Side = Literal["above", "below"]
+"""The side of a limit."""
+
+
+def beyond(value: Number, limit: Number, side: Side, inclusive: bool) -> Bool[Array, ""]:
+    """Return whether a number is on one side of a limit.
+
+    Args:
+        value: the number.
+        limit: the limit.
+        side: the side.
+        inclusive: whether the limit itself counts.
+    """
+    if side == "above":
+        return value >= limit if inclusive else value > limit
+    return value <= limit if inclusive else value < limit
 
 
 class Processor(Component):

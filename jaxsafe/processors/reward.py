@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.processors.processor import Processor
+from jaxsafe.processors.processor import Limit, Processor, Side, beyond
 from jaxsafe.processors.terminal import Ends
 from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.types import (
@@ -46,6 +46,59 @@ class Reward(Processor):
     """Base of all reward terms. Any term may carry a bound."""
 
     bound: Bound | None = None
+
+
+class ConditionalReward(Reward):
+    """Base of rewards that are paid on every step, or only while a boolean status is true."""
+
+    condition: FlagName | None = None
+
+    def amount(self, sim: Sim) -> Float[Array, ""]:
+        """Return the reward of a step on which the condition holds."""
+        raise NotImplementedError
+
+    def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
+        amount = self.amount(sim)
+        return (
+            amount if self.condition is None else jnp.where(sim.status[self.condition], amount, 0)
+        )
+
+
+class ConstantReward(ConditionalReward, type="constant"):
+    """The same reward on every step, or on every step on which the condition is true."""
+
+    value: Pay
+
+    def amount(self, sim: Sim) -> Float[Array, ""]:
+        return self.value
+
+
+class Proportional(ConditionalReward, type="proportional"):
+    """The term offset + scale·status, of any status that is a number."""
+
+    status: StatusName
+    scale: Pay
+    offset: Pay = 0.0
+
+    def amount(self, sim: Sim) -> Float[Array, ""]:
+        return self.offset + self.scale * sim.status[self.status]
+
+
+class ThresholdReward(ConditionalReward, type="threshold"):
+    """A reward on each step on which a status is above or below a limit.
+
+    If `inclusive`, the limit itself counts.
+    """
+
+    status: StatusName
+    limit: Limit
+    side: Side
+    inclusive: bool = False
+    value: Pay
+
+    def amount(self, sim: Sim) -> Float[Array, ""]:
+        held = beyond(sim.status[self.status], self.limit, self.side, self.inclusive)
+        return jnp.where(held, self.value, 0.0)
 
 
 class Potential(Record):

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
+from jaxsafe.processors.processor import Limit, beyond
 from jaxsafe.schema.component import Component, Range
 from jaxsafe.simulation.clock import later, reached
 from jaxsafe.types import FlagName, Length, Number, Reach, Seconds, Sim, StatusName
@@ -66,6 +67,28 @@ class Crashed(Terminal, type="crashed"):
         )
 
 
+class Above(Terminal, type="above"):
+    """A status is above a limit. If `inclusive`, the limit itself counts."""
+
+    status: StatusName
+    limit: Limit
+    inclusive: bool = False
+
+    def reached(self, sim: Sim) -> Bool[Array, ""]:
+        return beyond(sim.status[self.status], self.limit, "above", self.inclusive)
+
+
+class Below(Terminal, type="below"):
+    """A status is below a limit. If `inclusive`, the limit itself counts."""
+
+    status: StatusName
+    limit: Limit
+    inclusive: bool = False
+
+    def reached(self, sim: Sim) -> Bool[Array, ""]:
+        return beyond(sim.status[self.status], self.limit, "below", self.inclusive)
+
+
 class TooFar(Terminal, type="too_far"):
     """A distance is above a limit. If `inclusive`, the limit itself counts as too far."""
 
@@ -74,8 +97,7 @@ class TooFar(Terminal, type="too_far"):
     inclusive: bool = False
 
     def reached(self, sim: Sim) -> Bool[Array, ""]:
-        distance = sim.status[self.distance]
-        return distance >= self.limit if self.inclusive else distance > self.limit
+        return beyond(sim.status[self.distance], self.limit, "above", self.inclusive)
 
 
 class TooClose(Terminal, type="too_close"):
@@ -86,8 +108,7 @@ class TooClose(Terminal, type="too_close"):
     inclusive: bool = True
 
     def reached(self, sim: Sim) -> Bool[Array, ""]:
-        distance = sim.status[self.distance]
-        return distance <= self.limit if self.inclusive else distance < self.limit
+        return beyond(sim.status[self.distance], self.limit, "below", self.inclusive)
 
 
 class Held(Terminal, type="held"):
@@ -106,7 +127,7 @@ class Held(Terminal, type="held"):
 
 
 class Holds(Terminal, type="holds"):
-    """A boolean status is true, for instance one that says that the agent is in a keep-out zone."""
+    """A boolean status is true: any flag, for instance that the agent is in a keep-out zone."""
 
     status: FlagName
 

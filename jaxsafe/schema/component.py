@@ -100,6 +100,11 @@ class Refers:
     section: str
     boolean: bool | None = None
 
+    @property
+    def where(self) -> str:
+        """Where the part is listed, in words."""
+        return f"`{self.section}`"
+
 
 @dataclasses.dataclass(frozen=True)
 class Field:
@@ -143,12 +148,36 @@ class Component:
         cls.type_name = type
         _register(cls)
 
+    @classmethod
+    def prepared(cls, entries: dict[str, Any], place: str) -> dict[str, Any]:
+        """Return the fields for what a user wrote, for instance read from a file that it names.
+
+        Args:
+            entries: what stands in a configuration file, by name.
+            place: the place for messages of errors.
+        """
+        return entries
+
     def problem(self) -> str | None:
         """Return what is wrong with the fields taken together, or None if nothing is.
 
         It is called when a user's values enter.
         """
         return None
+
+    def misfits(self, env: Any) -> dict[str, str]:
+        """Return what of the fields does not fit the other parts of an environment.
+
+        It is called once, when the environment is built and the names that its parts refer to are
+        there. It looks at names, types and shapes, because numbers may be traced.
+
+        Args:
+            env: the environment to which the component belongs.
+
+        Returns:
+            What is wrong, in words, by the name of the field; `""` stands for the whole component.
+        """
+        return {}
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed. Unlike `jaxsafe.override`, check nothing."""

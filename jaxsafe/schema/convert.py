@@ -11,6 +11,8 @@ import sys
 import types
 import typing
 from collections.abc import Mapping
+from contextvars import ContextVar
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import jax
@@ -33,6 +35,9 @@ from jaxsafe.schema.component import field as field_of
 from jaxsafe.schema.dotted_paths import join
 from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.schema.user_modules import import_modules
+
+DIRECTORY: ContextVar[Path] = ContextVar("DIRECTORY", default=Path())
+"""The directory at which paths in a configuration begin: that of its file while it is read."""
 
 _SHAPES = {
     None: "a number",
@@ -66,6 +71,7 @@ def to_component(data: Any, base: type[Kind], place: str) -> Kind:
     cls, entries = choose_class(dict(data), base, place)
     table = fields(cls)
     label = f"{place} ({cls.type_name})" if cls.type_name else place or "environment"
+    entries = cls.prepared(entries, label)
     for name in entries:
         if name not in table:
             raise ConfigError(

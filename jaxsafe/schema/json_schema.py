@@ -73,7 +73,7 @@ def _object(cls: type[Component], definitions: dict[str, Schema]) -> Schema:
 
 
 def _description(entry: Field, text: str) -> Schema:
-    takes = f"a name of `{entry.refers.section}`" if entry.refers else expects(entry)
+    takes = f"a name of {entry.refers.where}" if entry.refers else expects(entry)
     described: Schema = {"description": " ".join(f"{text} {takes[0].upper()}{takes[1:]}.".split())}
     default = to_data(entry.default)
     if default is not dataclasses.MISSING and _is_json(default):

@@ -1,4 +1,4 @@
-"""The plant: platforms and their dynamics, controllers, geometry and initializers.
+"""The plant: platforms and their dynamics, controllers, geometry, vectors and initializers.
 
 Figs. 8 and 9 of the paper show these parts.
 """
@@ -29,25 +29,34 @@ from jaxsafe.simulation.dubins_lag import (
 )
 from jaxsafe.simulation.geometry import (
     Aspect,
+    BodyDisplacement,
+    Box,
     Circle,
+    Cone,
     Cylinder,
     Displacement,
+    HalfSpace,
     Offset,
     Region,
     Sphere,
+    angle_between,
     direction,
     rotation,
     safe_norm,
     to_body,
+    to_global,
 )
 from jaxsafe.simulation.initializers import (
     AroundAtAltitude,
     AtDistance,
     BelowSpeedLimit,
+    Cases,
     Direction,
     Fixed,
     Initializer,
+    Normal,
     Uniform,
+    read_cases,
 )
 from jaxsafe.simulation.oriented import OrientedSpacecraft, OrientedState
 from jaxsafe.simulation.platform import Platform
@@ -56,6 +65,7 @@ from jaxsafe.simulation.reaction_wheel import ReactionWheelSpacecraft, ReactionW
 from jaxsafe.simulation.scripted import Command, Constant, Schedule, Scripted, Sinusoid
 from jaxsafe.simulation.two_body import TwoBody, TwoBodyState
 from jaxsafe.simulation.two_body_j2 import TwoBodyJ2, TwoBodyJ2State
+from jaxsafe.simulation.vectors import BodyDirection, FixedDirection, Position, Vector, Velocity
 
 __all__ = [
     "Actuator",
@@ -65,8 +75,13 @@ __all__ = [
     "Aspect",
     "AtDistance",
     "BelowSpeedLimit",
+    "BodyDirection",
+    "BodyDisplacement",
+    "Box",
+    "Cases",
     "Circle",
     "Command",
+    "Cone",
     "Constant",
     "Continuous",
     "Controller",
@@ -80,16 +95,20 @@ __all__ = [
     "Dubins3D",
     "Dubins3DState",
     "Fixed",
+    "FixedDirection",
+    "HalfSpace",
     "Initializer",
     "LaggedDubins2D",
     "LaggedDubins2DState",
     "LaggedDubins3D",
     "LaggedDubins3DState",
+    "Normal",
     "Offset",
     "OrientedSpacecraft",
     "OrientedState",
     "Platform",
     "PointMassAircraft",
+    "Position",
     "ReactionWheelSpacecraft",
     "ReactionWheelState",
     "Region",
@@ -106,10 +125,15 @@ __all__ = [
     "TwoBodyState",
     "Uncontrolled",
     "Uniform",
+    "Vector",
+    "Velocity",
+    "angle_between",
     "cwh_acceleration",
     "cwh_flow",
     "direction",
+    "read_cases",
     "rotation",
     "safe_norm",
     "to_body",
+    "to_global",
 ]

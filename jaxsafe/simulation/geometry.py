@@ -1,6 +1,7 @@
 """Norms with safe gradients, directions, rotations, and regions.
 
-Regions are described in Section 4 and in Tables 3 and 4.
+Regions are described in Section 4 and in Tables 3 and 4. The signed distance of a point to a region
+is negative inside; where it has a kink, its gradient is finite.
 """
 
 from __future__ import annotations
@@ -10,11 +11,22 @@ from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.schema.component import Component, Unit
+from jaxsafe.schema.component import Component, Range, Unit, choices
+from jaxsafe.schema.errors import nearest
 from jaxsafe.simulation.trig import sin_cos
-from jaxsafe.types import Length, Number, Place, PlatformName, Radians, Reach, RegionState, Turn
+from jaxsafe.types import (
+    Length,
+    Number,
+    Place,
+    PlaceName,
+    Radians,
+    Reach,
+    RegionState,
+    Turn,
+)
 
 
 def safe_norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
@@ -109,11 +121,53 @@ def to_body(orientation: Float[Array, "d d"], vector: Float[Array, " d"]) -> Flo
     )
 
 
+def to_global(orientation: Float[Array, "d d"], vector: Float[Array, " d"]) -> Float[Array, " d"]:
+    """Return a vector of the body frame in the global frame, Rv.
+
+    Args:
+        orientation: R, the rotation from the body frame to the global frame, shape (d, d).
+        vector: v in the body frame, shape (d,).
+    """
+    return to_body(jnp.swapaxes(orientation, -1, -2), vector)
+
+
+def turn_between(before: Float[Array, "d d"], after: Float[Array, "d d"]) -> Float[Array, ""]:
+    """Return the angle between two orientations [rad], from 0 to π."""
+    half_sine = safe_norm(jnp.ravel(after - before)) / (2.0 * 2.0**0.5)
+    return 2.0 * jnp.arcsin(jnp.minimum(half_sine, 1.0))
+
+
+def angle_between(first: Float[Array, " d"], second: Float[Array, " d"]) -> Float[Array, ""]:
+    """Return the angle between two vectors [rad], from 0 to π.
+
+    It is 0 if one of the two is 0, which has no direction. Its gradient is finite everywhere.
+    """
+    first = mag_norm(first)[1:]
+    second = mag_norm(second)[1:]
+    known = jnp.any(first != 0.0) & jnp.any(second != 0.0)
+    cosine = jnp.sum(first * second)
+    sine = safe_norm(second - cosine * first)
+    return jnp.arctan2(jnp.where(known, sine, 0.0), jnp.where(known, cosine, 1.0))
+
+
+Coordinates = Annotated[Number, Unit("m or ft", length=0), Place]
+"""A vector of lengths, one number for each dimension of space."""
+
+Sizes = Annotated[Number, Unit("m or ft", length=0), Reach]
+"""Lengths that are not negative, one for each dimension of space."""
+
+Heading = Annotated[Number, Unit("1", length=0), Place]
+"""A vector that is not 0, one number for each dimension. Only its direction counts."""
+
+
 class Offset(Component):
-    """Position of a region's centre relative to the platform that carries the region."""
+    """Position of a region's centre relative to what carries the region."""
+
+    turns: ClassVar[bool] = True
+    """Whether the offset turns with what carries the region."""
 
     def vector(self, platform: Any) -> Float[Array, " d"]:
-        """Return the offset in the global frame, given the platform's state."""
+        """Return the offset in the global frame, given the state of what carries the region."""
         raise NotImplementedError
 
 
@@ -134,48 +188,171 @@ class Aspect(Offset, type="aspect"):
 class Displacement(Offset, type="displacement"):
     """Constant offset along the axes of the global frame."""
 
-    by: Annotated[Number, Unit("m or ft", length=0), Place]
+    turns: ClassVar[bool] = False
+    by: Coordinates
 
     def vector(self, platform: Any) -> Float[Array, " d"]:
         return self.by
 
 
+class BodyDisplacement(Offset, type="body_displacement"):
+    """Constant offset along the body axes of what carries the region, with which it turns."""
+
+    by: Coordinates
+
+    def vector(self, platform: Any) -> Float[Array, " d"]:
+        if self.by.shape != platform.position.shape:
+            return self.by  # of a wrong size, which `Region.place` reports
+        return to_global(platform.orientation, self.by)
+
+
 class Region(Component):
-    """A part of space attached to a platform.
+    """A part of space that is carried by a platform or by an earlier region.
 
     It is a pure function of the platforms and is recomputed at every step.
     """
 
     dimensions: ClassVar[tuple[int, ...]] = (1, 2, 3)
     """Dimensions of space in which the region is what its name says."""
+    convex: ClassVar[bool] = False
+    """Whether the region is convex. The distance on a line is then largest at an end."""
     name: str
-    on: PlatformName
-    offset: Offset | None = None  # None: centred on the platform
+    on: PlaceName | None
+    """What carries the region. null stands for the origin, so that the region stays in place."""
+    offset: Offset | None = None
+    """The way from what carries the region to its centre."""
 
     def contains(self, offset: Float[Array, " d"]) -> Bool[Array, ""]:
-        """Return whether a point is inside, given its offset from the region's centre."""
+        """Return whether a point is inside.
+
+        Args:
+            offset: of the point from the centre, in the region's axes, shape (d,).
+        """
         raise NotImplementedError
 
-    def place(self, platforms: Mapping[str, Any]) -> RegionState:
+    def signed_distance(self, offset: Float[Array, " d"]) -> Float[Array, ""]:
+        """Return the distance of a point to the boundary, negative inside.
+
+        It changes by no more than the point moves. Its absolute value may be less than the true
+        distance, and then the docstring of the region says where.
+
+        Args:
+            offset: of the point from the centre, in the region's axes, shape (d,).
+        """
+        raise NotImplementedError(f"a {self.type_name} knows no distance to its boundary")
+
+    def nearest(self, before: Float[Array, " d"], after: Float[Array, " d"]) -> Float[Array, ""]:
+        """Return a lower bound of the signed distance on the straight line between two offsets."""
+        return _distance_on_line(self, before, after, -1.0)
+
+    def farthest(self, before: Float[Array, " d"], after: Float[Array, " d"]) -> Float[Array, ""]:
+        """Return an upper bound of the signed distance on the straight line between two offsets."""
+        if self.convex:
+            return jnp.maximum(self.signed_distance(before), self.signed_distance(after))
+        return _distance_on_line(self, before, after, 1.0)
+
+    def axes(self, carrier: Any) -> Float[Array, "d d"] | None:
+        """Return the rotation from the region's axes to the global frame, given its carrier.
+
+        None stands for the axes of the global frame.
+        """
+        return None
+
+    def misfits(self, env: Any) -> dict[str, str]:
+        if self.on is None and self.offset is not None and self.offset.turns:
+            return {"offset": f"a {self.offset.type_name} turns with what carries it; give `on`"}
+        space = env.agent_platform.dimension
+        if space not in self.dimensions:
+            fitting = [name for name, kind in choices(Region).items() if space in kind.dimensions]
+            return {
+                "": f"a {self.type_name} is no part of a space of {space} dimensions;"
+                f" choose from {nearest('', sorted(fitting))}"
+            }
+        return {}
+
+    def place(
+        self,
+        platforms: Mapping[str, Any],
+        regions: Mapping[str, RegionState] | None = None,
+        moves: bool = False,
+        measures: bool = False,
+    ) -> RegionState:
         """Return where the region is and which of the other platforms are inside.
 
         Args:
             platforms: the states of all platforms, by name.
+            regions: the states of the regions that are listed before this one, by name.
+            moves: whether its velocity and orientation are needed.
+            measures: whether the distances of the platforms to its boundary are needed.
 
         Raises:
-            ValueError: the offset has another dimension than the platform's position.
+            ValueError: the offset has another dimension than the positions.
         """
-        centre = platforms[self.on].position
+        positions = [state.position for state in platforms.values()]
+        carrier = None if self.on is None else {**(regions or {}), **platforms}[self.on]
+        centre = jnp.zeros_like(positions[0]) if carrier is None else carrier.position
         if self.offset is not None:
-            offset = self.offset.vector(platforms[self.on])
+            offset = self.offset.vector(carrier)
             if offset.shape != centre.shape:
                 raise ValueError(
                     f"expected an offset of {centre.size} numbers, found {offset.size}"
                 )
             centre = centre + offset
-        others = {name: other for name, other in platforms.items() if name != self.on}
-        inside = {name: self.contains(other.position - centre) for name, other in others.items()}
-        return RegionState(position=centre, inside=inside)
+        axes = self.axes(carrier)
+        others = {
+            name: other.position - centre for name, other in platforms.items() if name != self.on
+        }
+        if axes is not None:
+            others = {name: to_body(axes, offset) for name, offset in others.items()}
+        state = RegionState(
+            position=centre,
+            inside={name: self.contains(offset) for name, offset in others.items()},
+        )
+        if moves:
+            state = state.replace(
+                velocity=self._velocity(carrier, centre),
+                orientation=jnp.eye(centre.size, dtype=centre.dtype) if axes is None else axes,
+            )
+        if measures:
+            distance = {name: self.signed_distance(offset) for name, offset in others.items()}
+            depth = {name: -value for name, value in distance.items()}
+            state = state.replace(distance=distance, depth=depth)
+        return state
+
+    def _velocity(self, carrier: Any, centre: Float[Array, " d"]) -> Float[Array, " d"]:
+        """Return the velocity of the centre.
+
+        Where the state of the carrier has an `attitude_rate`, the turn of the offset counts. The
+        turn of an aircraft is a control and no part of its state, so there it is left out.
+        """
+        if carrier is None:
+            return jnp.zeros_like(centre)
+        rate = getattr(carrier, "attitude_rate", None)
+        if rate is None or self.offset is None or not self.offset.turns:
+            return carrier.velocity
+        x, y = centre - carrier.position
+        return carrier.velocity + rate * jnp.stack([-y, x])
+
+
+LINE_SAMPLES = 8
+"""Number of parts of a line on which the distance to a region is bounded.
+
+The bound is off by at most a sixteenth of the length of the line.
+"""
+
+
+def _distance_on_line(
+    region: Region, before: Float[Array, " d"], after: Float[Array, " d"], side: float
+) -> Float[Array, ""]:
+    """Return a bound of the signed distance on a straight line: an upper one for `side` 1, else −1.
+
+    Between two samples the distance leaves their mean by no more than half the way between them.
+    """
+    shares = jnp.linspace(0.0, 1.0, LINE_SAMPLES + 1, dtype=before.dtype)
+    offsets = [before + share * (after - before) for share in shares]
+    distances = jnp.stack([region.signed_distance(offset) for offset in offsets])
+    half_way = safe_norm(after - before) / (2.0 * LINE_SAMPLES)
+    return side * jnp.max(side * (distances[:-1] + distances[1:]) / 2.0 + half_way)
 
 
 class Sphere(Region, type="sphere"):
@@ -184,10 +361,17 @@ class Sphere(Region, type="sphere"):
     In the plane it is a disc, and on a line an interval.
     """
 
+    convex: ClassVar[bool] = True
     radius: Annotated[Length, Reach]
 
     def contains(self, offset: Float[Array, " d"]) -> Bool[Array, ""]:
         return safe_norm(offset) <= self.radius
+
+    def signed_distance(self, offset: Float[Array, " d"]) -> Float[Array, ""]:
+        return safe_norm(offset) - self.radius
+
+    def nearest(self, before: Float[Array, " d"], after: Float[Array, " d"]) -> Float[Array, ""]:
+        return closest_approach(before, after) - self.radius
 
 
 class Circle(Sphere, type="circle"):
@@ -196,7 +380,18 @@ class Circle(Sphere, type="circle"):
     dimensions: ClassVar[tuple[int, ...]] = (2,)
 
 
-class Cylinder(Region, type="cylinder"):
+class Turned(Region):
+    """Base of regions whose axes may turn with what carries them."""
+
+    convex: ClassVar[bool] = True
+    turns: bool = False
+    """Whether the region's axes turn with what carries it. Else they are those of the world."""
+
+    def axes(self, carrier: Any) -> Float[Array, "d d"] | None:
+        return carrier.orientation if self.turns and carrier is not None else None
+
+
+class Cylinder(Turned, type="cylinder"):
     """All points within `radius` of the centre in x and y and half the `height` in z, Eq. (10)."""
 
     dimensions: ClassVar[tuple[int, ...]] = (3,)
@@ -206,3 +401,99 @@ class Cylinder(Region, type="cylinder"):
     def contains(self, offset: Float[Array, " 3"]) -> Bool[Array, ""]:
         x, y, z = offset
         return (safe_norm(jnp.stack([x, y])) <= self.radius) & (jnp.abs(z) <= self.height / 2.0)
+
+    def signed_distance(self, offset: Float[Array, " 3"]) -> Float[Array, ""]:
+        x, y, z = offset
+        beside = safe_norm(jnp.stack([x, y])) - self.radius
+        return _beyond(jnp.stack([beside, jnp.abs(z) - self.height / 2.0]))
+
+
+class Box(Turned, type="box"):
+    """All points no farther from the centre than half the `size` along each axis."""
+
+    size: Sizes
+
+    def problem(self) -> str | None:
+        return None if self.size.size else "expected a size of a number for each dimension"
+
+    def contains(self, offset: Float[Array, " d"]) -> Bool[Array, ""]:
+        return jnp.all(jnp.abs(offset) <= self.size / 2.0)
+
+    def signed_distance(self, offset: Float[Array, " d"]) -> Float[Array, ""]:
+        return _beyond(jnp.abs(offset) - self.size / 2.0)
+
+    def misfits(self, env: Any) -> dict[str, str]:
+        return super().misfits(env) or wrong_size(env, size=self.size)
+
+
+class HalfSpace(Turned, type="half_space"):
+    """All points on one side of a plane through the centre: that to which `towards` points."""
+
+    towards: Heading
+
+    def problem(self) -> str | None:
+        return no_direction(self.towards, "towards")
+
+    def contains(self, offset: Float[Array, " d"]) -> Bool[Array, ""]:
+        return self.signed_distance(offset) <= 0.0
+
+    def signed_distance(self, offset: Float[Array, " d"]) -> Float[Array, ""]:
+        return -jnp.sum(offset * mag_norm(self.towards)[1:])
+
+    def nearest(self, before: Float[Array, " d"], after: Float[Array, " d"]) -> Float[Array, ""]:
+        return jnp.minimum(self.signed_distance(before), self.signed_distance(after))
+
+    def misfits(self, env: Any) -> dict[str, str]:
+        return super().misfits(env) or wrong_size(env, towards=self.towards)
+
+
+class Cone(Turned, type="cone"):
+    """All points whose direction from the centre is within `half_angle` of the vector `towards`.
+
+    The centre is the tip. With a `length` the cone ends that far along `towards`; outside, behind
+    its end, the distance may then be less than the true one.
+    """
+
+    dimensions: ClassVar[tuple[int, ...]] = (2, 3)
+    towards: Heading
+    half_angle: Annotated[Radians, Range(0.0, jnp.pi / 2, open_low=True, open_high=True)]
+    length: Annotated[Length, Reach] | None = None
+
+    def problem(self) -> str | None:
+        return no_direction(self.towards, "towards")
+
+    def contains(self, offset: Float[Array, " d"]) -> Bool[Array, ""]:
+        return self.signed_distance(offset) <= 0.0
+
+    def signed_distance(self, offset: Float[Array, " d"]) -> Float[Array, ""]:
+        axis = mag_norm(self.towards)[1:]
+        along = jnp.sum(offset * axis)
+        beside = safe_norm(offset - along * axis)
+        sine, cosine = sin_cos(self.half_angle)
+        to_side = beside * cosine - along * sine
+        behind_tip = along * cosine + beside * sine < 0.0
+        distance = jnp.where(behind_tip, safe_norm(offset), to_side)
+        return distance if self.length is None else jnp.maximum(distance, along - self.length)
+
+    def misfits(self, env: Any) -> dict[str, str]:
+        return super().misfits(env) or wrong_size(env, towards=self.towards)
+
+
+def _beyond(excess: Float[Array, " k"]) -> Float[Array, ""]:
+    """Return the signed distance to a box, given how far a point is beyond each of its sides."""
+    return safe_norm(jnp.maximum(excess, 0.0)) + jnp.minimum(jnp.max(excess), 0.0)
+
+
+def no_direction(vector: Float[Array, " d"], name: str) -> str | None:
+    """Return what is wrong with a vector that must have a direction, or None if nothing is."""
+    return None if np.any(np.asarray(vector) != 0.0) else f"expected a `{name}` other than 0"
+
+
+def wrong_size(env: Any, **vectors: Float[Array, " d"]) -> dict[str, str]:
+    """Return by name what is wrong with vectors of another size than the space."""
+    space = env.agent_platform.dimension
+    return {
+        name: f"expected {space} numbers, found {vector.size}"
+        for name, vector in vectors.items()
+        if vector.size != space
+    }

@@ -1,4 +1,4 @@
-"""Random starts: each initializer draws one field of a platform's state.
+"""Random starts: each initializer draws a field of a platform's state, or several together.
 
 They are described in Section 4 "Initialization" and in Tables 3 and 4. Initializers run in the
 order in which they are listed, platform after platform. So a later one may refer to a field that is
@@ -7,8 +7,11 @@ drawn earlier or to an earlier platform.
 
 from __future__ import annotations
 
+import csv
+import dataclasses
+import os
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -16,8 +19,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsafe.schema.component import ANY, Component, Range, Unit
+from jaxsafe.schema.convert import DIRECTORY
+from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.simulation.geometry import direction, safe_norm
 from jaxsafe.types import (
+    MAX_DISTANCE,
     Key,
     MetresPerSecond,
     Number,
@@ -34,16 +40,22 @@ TWO_PI = 2.0 * jnp.pi
 Interval = Annotated[Number, Unit("m or ft", length=2), Place]
 Distances = Annotated[Number, Unit("m or ft", length=2), Reach]
 Angles = Annotated[Number, Unit("rad", length=2), Turn]
+Bounds = Annotated[Number, Unit("physical", length=ANY), Range(infinite=True)]
 Shares = Annotated[Number, Unit("1", length=2), Range(0.0, largest=1e3)]
 
 
 class Initializer(Component):
-    """Base of initializers. Each draws the state field that it is named after."""
+    """Base of initializers. Each draws the state field that it is named after, or several."""
 
     name: str
 
-    def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Array:
-        """Return a value of the field.
+    @property
+    def draws(self) -> tuple[str, ...]:
+        """Names of the state fields that it draws."""
+        return (self.name,)
+
+    def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Array | dict[str, Array]:
+        """Return a value of the field, or values by field if it draws several.
 
         Args:
             key: a typed PRNG key.
@@ -116,6 +128,140 @@ class Uniform(Initializer, type="uniform"):
         return self.low + (self.high - self.low) * jax.random.uniform(
             key, self.low.shape, self.low.dtype
         )
+
+
+class Normal(Initializer, type="normal"):
+    """A value drawn from a normal distribution, independently in each component.
+
+    With bounds the distribution is truncated: what lies outside is not drawn.
+    """
+
+    mean: Annotated[Number, Unit("physical", length=ANY), Place]
+    deviation: Annotated[
+        Number,
+        Unit("physical", length=ANY),
+        Range(0.0, open_low=True, smallest=1e-12, largest=MAX_DISTANCE),
+    ]
+    low: Bounds | None = None
+    high: Bounds | None = None
+
+    def problem(self) -> str | None:
+        low, high = self._bounds()
+        sizes = {jnp.shape(value) for value in (self.mean, self.deviation, low, high)}
+        if len(sizes) > 1:
+            return "expected mean, deviation and bounds of the same number of elements"
+        if not np.all(np.asarray(low) < np.asarray(high)):
+            return f"expected low < high, found {low.tolist()} and {high.tolist()}"
+        return None
+
+    def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Array:
+        shape, dtype = self.mean.shape, self.mean.dtype
+        if self.low is None and self.high is None:
+            return self.mean + self.deviation * jax.random.normal(key, shape, dtype)
+        low, high = self._bounds()
+        lowest, highest = [(bound - self.mean) / self.deviation for bound in (low, high)]
+        share = jax.random.truncated_normal(key, lowest, highest, shape, dtype)
+        # The sum may be rounded across a bound.
+        return jnp.clip(self.mean + self.deviation * share, low, high)
+
+    def _bounds(self) -> tuple[Array, Array]:
+        low = jnp.full_like(self.mean, -jnp.inf) if self.low is None else self.low
+        high = jnp.full_like(self.mean, jnp.inf) if self.high is None else self.high
+        return low, high
+
+
+class Cases(Initializer, type="cases"):
+    """A start drawn uniformly from a list of cases.
+
+    A case gives one or several fields of the state, which are drawn together. `values` has a list
+    for each number of a case. Its name is the field, such as `heading`, or the field and an axis,
+    such as `position.x`. All lists have the same length, the number of cases.
+    """
+
+    values: Mapping[str, Annotated[Number, Unit("physical", length=0), Place]] = dataclasses.field(
+        default_factory=dict
+    )
+    file: str | None = None
+    """A CSV file with the values, whose first row is their names. Its path begins at the YAML file.
+    It is read once, and `jaxsafe config` prints the values."""
+
+    @classmethod
+    def prepared(cls, entries: dict[str, Any], place: str) -> dict[str, Any]:
+        path = entries.get("file")
+        if bool(entries.get("values")) == (path is not None):
+            found = "neither" if path is None else "both"
+            raise ConfigError(f"{place}: expected `values` or the `file` of them, found {found}")
+        if path is None:
+            return entries
+        return {**entries, "values": read_cases(path, place), "file": None}
+
+    @property
+    def draws(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(column.partition(".")[0] for column in self.values))
+
+    def problem(self) -> str | None:
+        if self.file is not None:
+            return "a `file` is read only where the whole start is given"
+        lengths = {column: jnp.size(values) for column, values in self.values.items()}
+        if not lengths or 0 in lengths.values():
+            return "expected at least one case"
+        if len(set(lengths.values())) > 1:
+            found = ", ".join(f"{column} {length}" for column, length in lengths.items())
+            return f"expected lists of the same length, found {found}"
+        for field in self.draws:
+            columns = self._columns(field)
+            axes = [f"{field}.{axis}" for axis in "xyz"[: len(columns)]]
+            if columns not in ([field], axes):
+                return f"expected {field!r}, or {', '.join(axes)}; found {', '.join(columns)}"
+        return None
+
+    def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> dict[str, Array]:
+        count = min(values.size for values in self.values.values())
+        index = jax.random.randint(key, (), 0, count)
+        case = {column: values[index] for column, values in self.values.items()}
+        return {
+            field: case[field]
+            if field in case
+            else jnp.stack([case[column] for column in self._columns(field)])
+            for field in self.draws
+        }
+
+    def _columns(self, field: str) -> list[str]:
+        """Return the names of the numbers of a field, in order."""
+        return sorted(column for column in self.values if column.partition(".")[0] == field)
+
+
+def read_cases(path: Any, place: str = "cases") -> dict[str, list[float]]:
+    """Read the `values` of `Cases` from a CSV file. Its first row has their names.
+
+    Args:
+        path: the path, which begins at the directory of the configuration file that is being read,
+            else at the working directory.
+        place: the place for messages of errors.
+
+    Raises:
+        ConfigError: the file cannot be read, or a row has no number for each name.
+    """
+    if not isinstance(path, str | os.PathLike):
+        raise ConfigError(f"{place}: file: expected the path of a CSV file, found {show(path)}")
+    full_path = DIRECTORY.get() / path
+    try:
+        with full_path.open(newline="", encoding="utf-8-sig") as file:
+            names, *rows = list(csv.reader(file)) or [[]]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise ConfigError(f"{place}: cannot read {full_path}: {error}") from None
+    names = [name.strip() for name in names]
+    if not names or len(set(names)) < len(names):
+        raise ConfigError(f"{place}: {full_path}: expected different names in row 1, found {names}")
+    columns: dict[str, list[float]] = {name: [] for name in names}
+    for number, row in enumerate(rows, start=2):
+        try:
+            for name, text in zip(names, row, strict=True):
+                columns[name].append(float(text))
+        except ValueError:
+            found = f"row {number}: expected {len(names)} numbers, found {show(row)}"
+            raise ConfigError(f"{place}: {full_path}: {found}") from None
+    return columns
 
 
 class AtDistance(Initializer, type="at_distance"):

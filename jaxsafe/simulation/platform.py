@@ -38,7 +38,7 @@ class Platform(Component):
     @property
     def random_fields(self) -> tuple[str, ...]:
         """Names of the state fields that `start` draws."""
-        return tuple(initializer.name for initializer in self.start)
+        return tuple(name for initializer in self.start for name in initializer.draws)
 
     def rest(self) -> Any:
         """Return the state record before any initializer ran: at the origin, at rest."""
@@ -113,13 +113,16 @@ class Platform(Component):
         keys = jax.random.split(key, max(len(self.start), 1))
         for initializer, key_i in zip(self.start, keys, strict=False):
             value = initializer.draw(key_i, drawn, sim)
-            drawn[initializer.name] = value
-            expected = getattr(rest, initializer.name).shape
-            if value.shape != expected:
-                raise ConfigError(
-                    f"platforms.{self.name}.start.{initializer.name}: expected shape {expected},"
-                    f" found {value.shape}"
-                )
+            values = value if isinstance(value, dict) else {initializer.name: value}
+            for name, value in values.items():
+                drawn[name] = value
+                expected = getattr(rest, name).shape
+                if value.shape != expected:
+                    which = "" if name == initializer.name else f"{name}: "
+                    raise ConfigError(
+                        f"platforms.{self.name}.start.{initializer.name}: {which}expected shape"
+                        f" {expected}, found {value.shape}"
+                    )
         return self.settle(rest.replace(**drawn))
 
     def place(self, values: Mapping[str, Any] | Record) -> Any:

@@ -1544,17 +1544,17 @@ def test_a_value_is_shown_by_its_first_letters_however_large_it_is() -> None:
         (
             "docking3d",
             {"type": "circle", "radius": 1},
-            "3 dimensions; choose from cylinder, sphere$",
+            "3 dimensions; choose from box, cone, cylinder, half_space, sphere$",
         ),
         (
             "rejoin3d",
             {"type": "circle", "radius": 1},
-            "3 dimensions; choose from cylinder, sphere$",
+            "3 dimensions; choose from box, cone, cylinder, half_space, sphere$",
         ),
         (
             "docking2d",
             {"type": "cylinder", "radius": 1, "height": 1},
-            "2 dimensions; choose from circle, sphere$",
+            "2 dimensions; choose from box, circle, cone, half_space, sphere$",
         ),
         ("docking2d", {"type": "sphere", "radius": 1}, None),
         ("docking3d", {"type": "cylinder", "radius": 1, "height": 1}, None),

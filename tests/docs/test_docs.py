@@ -22,6 +22,18 @@ from default_cases import thorough
 import jaxsafe
 from jaxsafe.config import dump, load
 from jaxsafe.envs import TASKS
+from jaxsafe.parts import (
+    Constraint,
+    Initializer,
+    Observation,
+    Region,
+    Reward,
+    Status,
+    Terminal,
+    Vector,
+)
+from jaxsafe.schema import yaml12
+from jaxsafe.schema.convert import to_component
 from jaxsafe.train.host.options import recipe
 
 ROOT = Path(__file__).parents[2]
@@ -236,6 +248,33 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_pa
     process = run(["program.py"], tmp_path)
     assert process.returncode == 0, process.stderr
     assert process.stdout.split(f"{MARK}\n")[:-1] == expected
+
+
+def test_every_part_in_the_tables_of_the_vocabulary_is_one() -> None:
+    bases = {
+        "Regions": Region,
+        "Vectors": Vector,
+        "Statuses": Status,
+        "Constraints": Constraint,
+        "Ends": Terminal,
+        "Rewards": Reward,
+        "Observations": Observation,
+        "Starts": Initializer,
+    }
+    page = (ROOT / "docs" / "compose.md").read_text(encoding="utf-8")
+    vocabulary = page.split("## The vocabulary\n")[1].split("\n## ")[0]
+    [_, *sections] = re.split(rf"\*\*({'|'.join(bases)})\*\*", vocabulary)
+    found = set()
+    for heading, text in zip(sections[::2], sections[1::2], strict=True):
+        base = bases[heading]
+        needed = {"on": None} if base is Region else {}
+        needed = needed if base is Vector else {"name": "part", **needed}
+        for written in re.findall(r"`(\{type.*?\})`", text.replace("\n", " ")):
+            data = yaml12.parse(written.replace("VECTOR", "{type: position, of: deputy}"), "page")
+            if "file" not in data:
+                assert isinstance(to_component({**needed, **data}, base, written), base)
+            found.add(data["type"])
+    assert len(found) >= 40
 
 
 @pytest.mark.thorough

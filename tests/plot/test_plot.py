@@ -19,10 +19,12 @@ from jaxsafe.plot.curves import EVALUATIONS, FEW, TRAINING, evaluation_rows, tra
 from jaxsafe.plot.figures import speed_distance, trajectories
 from jaxsafe.plot.learning import learning_curves
 from jaxsafe.plot.profiles import performance_profiles
-from jaxsafe.plot.style import GREEN, GREY, ORANGE, kept_out, save
+from jaxsafe.plot.style import GREEN, GREY, ORANGE, kept_out, margin_unit, save
+from jaxsafe.processors.constraint import KeepIn, KeepOut
 from jaxsafe.runs.figures import _episodes, draw_all
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.simulation.geometry import Sphere
 from jaxsafe.storage.files import read_csv, read_rows, write_rows
 from jaxsafe.train.ppo import DIAGNOSTICS
 
@@ -451,6 +453,19 @@ def test_evaluations_are_the_main_curves_of_a_comparison() -> None:
     assert main.get_color() == training.get_color() != other.get_color()
     assert main.get_linewidth() == other.get_linewidth() > training.get_linewidth()
     assert entries(figure) == ["one", "other", EVALUATIONS, TRAINING, FEW]
+
+
+@pytest.mark.parametrize(("kind", "forbidden"), [(KeepOut, {"zone"}), (KeepIn, set())])
+def test_a_region_to_stay_in_is_not_drawn_as_one_to_stay_out_of(
+    kind: type[KeepOut], forbidden: set[str]
+) -> None:
+    env = jaxsafe.make("docking2d")
+    zone = Sphere(name="zone", on="chief", radius=200.0)
+    constraint = kind(name="zone", of="deputy", region="zone")
+    changes = {"regions": [*env.regions, zone], "constraints": [*env.constraints, constraint]}
+    env = jaxsafe.override(env, changes)
+    assert kept_out(env) == forbidden
+    assert [margin_unit(one, "m") for one in env.constraints] == ["m/s", "m"]
 
 
 def test_what_to_stay_out_of_is_not_drawn_like_the_goal() -> None:

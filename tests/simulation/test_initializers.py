@@ -6,6 +6,7 @@ comparison in a thousand.
 """
 
 from itertools import combinations
+from pathlib import Path
 from types import SimpleNamespace
 
 import chex
@@ -13,13 +14,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scipy.stats import kstest, spearmanr
+from scipy.stats import chisquare, kstest, spearmanr
 
 import jaxsafe
 from jaxsafe.environment import Environment
 from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.geometry import direction
-from jaxsafe.simulation.initializers import AroundAtAltitude, Direction, Fixed, Uniform, uniform
+from jaxsafe.simulation.initializers import (
+    AroundAtAltitude,
+    Cases,
+    Direction,
+    Fixed,
+    Normal,
+    Uniform,
+    uniform,
+)
 from jaxsafe.types import Sim
 
 NUM_STARTS = 4000
@@ -265,3 +274,132 @@ def test_an_oriented_start_has_any_attitude_and_no_turn_rate() -> None:
     assert is_uniform(distance, 100.0, 150.0)
     for sample in (distance, deputy.position[:, 0], deputy.velocity[:, 1]):
         assert spearmanr(deputy.attitude, sample).pvalue > LEVEL
+
+
+# Normal distributions and lists of cases
+
+
+def test_a_normal_start_has_its_mean_and_deviation_in_each_component() -> None:
+    normal = normalise(Normal(name="position", mean=(1.0, -20.0), deviation=(0.5, 3.0)))
+    keys = jax.random.split(jax.random.key(0), NUM_STARTS)
+    sample = np.asarray(jax.vmap(lambda key: normal.draw(key, {}, NOWHERE))(keys), float)
+    assert kstest(sample[:, 0], "norm", (1.0, 0.5)).pvalue > LEVEL
+    assert kstest(sample[:, 1], "norm", (-20.0, 3.0)).pvalue > LEVEL
+    assert spearmanr(*sample.T).pvalue > LEVEL
+
+
+def test_a_normal_start_with_bounds_is_truncated_and_not_clipped() -> None:
+    normal = normalise(Normal(name="speed", mean=10.0, deviation=2.0, low=9.0, high=13.0))
+    keys = jax.random.split(jax.random.key(1), NUM_STARTS)
+    sample = np.asarray(jax.vmap(lambda key: normal.draw(key, {}, NOWHERE))(keys), float)
+    assert kstest(sample, "truncnorm", (-0.5, 1.5, 10.0, 2.0)).pvalue > LEVEL
+    above = normalise(Normal(name="speed", mean=10.0, deviation=2.0, low=9.0))
+    assert float(jax.vmap(lambda key: above.draw(key, {}, NOWHERE))(keys).max()) > 14.0
+
+
+@pytest.mark.parametrize(
+    ("numbers", "fault"),
+    [
+        ({"mean": (0.0, 0.0), "deviation": 1.0}, "of the same number of elements"),
+        ({"mean": 0.0, "deviation": 1.0, "low": (0.0, 1.0)}, "of the same number of elements"),
+        ({"mean": 0.0, "deviation": 1.0, "low": 2.0, "high": 1.0}, "expected low < high"),
+        ({"mean": 0.0, "deviation": 1.0, "low": -2.0, "high": 1.0}, None),
+    ],
+)
+def test_a_normal_start_needs_numbers_that_fit(numbers: dict, fault: str | None) -> None:
+    problem = normalise(Normal(name="x", **numbers)).problem()
+    assert problem is None if fault is None else fault in (problem or "")
+
+
+CASES = {
+    "position.x": (1.0, 2.0, 3.0),
+    "heading": (10.0, 20.0, 30.0),
+    "position.y": (4.0, 5.0, 6.0),
+}
+
+
+def test_the_fields_of_a_case_are_drawn_together_and_all_cases_alike() -> None:
+    cases = normalise(Cases(name="start", values=CASES))
+    assert set(cases.draws) == {"position", "heading"}
+    keys = jax.random.split(jax.random.key(0), 3000)
+    drawn = jax.vmap(lambda key: cases.draw(key, {}, NOWHERE))(keys)
+    index = np.asarray(drawn["position"][:, 0], int)
+    np.testing.assert_array_equal(drawn["position"][:, 1], index + 3.0)
+    np.testing.assert_array_equal(drawn["heading"], 10.0 * index)
+    assert chisquare(np.bincount(index)[1:]).pvalue > LEVEL
+
+
+@pytest.mark.parametrize(
+    ("values", "fault"),
+    [
+        ({}, "expected at least one case"),
+        ({"speed": ()}, "expected at least one case"),
+        ({"speed": (1.0,), "heading": (1.0, 2.0)}, "same length, found heading 2, speed 1"),
+        ({"position.x": (1.0,), "position.z": (1.0,)}, "or position.x, position.y; found"),
+        ({"position": (1.0,), "position.x": (1.0,)}, "found position, position.x"),
+    ],
+)
+def test_cases_need_columns_that_fit(values: dict, fault: str) -> None:
+    assert fault in (normalise(Cases(name="start", values=values)).problem() or "")
+
+
+ENVIRONMENT = """\
+agent: deputy
+platforms:
+- type: spacecraft
+  name: deputy
+  dimension: 2
+  start: [{type: cases, name: start, file: starts.csv}]
+  controller: {type: continuous, actuators: [{name: thrust_x, low: -1, high: 1}]}
+terminal: [{type: timeout, name: timeout, limit: 10}]
+reward: [{type: constant, name: time, value: -1}]
+observation: [{type: observe, name: position, of: deputy, what: position}]
+"""
+
+
+def test_cases_are_read_beside_their_file_and_dumped_whole(tmp_path: Path) -> None:
+    (tmp_path / "starts.csv").write_text("position.x, position.y,velocity.x,velocity.y\n1,2,3,4\n")
+    path = tmp_path / "mine.yaml"
+    path.write_text(ENVIRONMENT)
+    env = jaxsafe.make(str(path))
+    deputy = env.reset(jax.random.key(0))[0].sim.platforms["deputy"]
+    assert deputy.position.tolist() == [1.0, 2.0]
+    assert deputy.velocity.tolist() == [3.0, 4.0]
+    (tmp_path / "starts.csv").unlink()
+    text = jaxsafe.config.dump(env)
+    assert "starts.csv" not in text
+    assert jaxsafe.config.load(text) == env
+    with pytest.raises(jaxsafe.ConfigError, match=r"deputy\.velocity is missing: it is random"):
+        jaxsafe.reset_to(env, {"deputy": {"position": [0.0, 0.0]}})
+
+
+@pytest.mark.parametrize("extra", [", values: {heading: [1]}, file: starts.csv", ""])
+def test_cases_have_either_values_or_a_file(extra: str) -> None:
+    text = ENVIRONMENT.replace(", file: starts.csv", extra)
+    with pytest.raises(jaxsafe.ConfigError, match="expected `values` or the `file` of them"):
+        jaxsafe.config.load(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, r"start \(cases\): cannot read .*starts\.csv: .*No such file"),
+        ("", r"expected different names in row 1, found \[\]"),
+        ("position.x,position.x\n1,2\n", "expected different names in row 1"),
+        ("position.x,position.y\n1\n", "row 2: expected 2 numbers, found"),
+        ("position.x,position.y\n1,2\n1,b\n", "row 3: expected 2 numbers, found"),
+        ("position.x,position.y\n1,nan\n", r"values\.position\.y: expected a list of numbers"),
+        ("position.x\n1\n", r"start\.start: position: expected shape \(2,\), found \(1,\)"),
+        ("place\n1\n", r"start\.start: place: no such state field; choose from"),
+    ],
+)
+def test_a_wrong_file_of_cases_is_told_in_one_line(
+    text: str | None, message: str, tmp_path: Path
+) -> None:
+    if text is not None:
+        (tmp_path / "starts.csv").write_text(text)
+    path = tmp_path / "mine.yaml"
+    path.write_text(ENVIRONMENT)
+    with pytest.raises(jaxsafe.ConfigError, match=message) as caught:
+        jaxsafe.make(str(path))
+    assert "\n" not in str(caught.value)
