@@ -91,7 +91,7 @@ from jaxsafe.devices.seed_mapper import claim_cores
 
 claim_cores()
 from jaxsafe.devices import memory
-from jaxsafe.train.__main__ import main
+from jaxsafe.commands.train import main
 
 def resident(which):
     lines = Path("/proc/self/status").read_text().splitlines()
