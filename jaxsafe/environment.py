@@ -14,7 +14,7 @@ import dataclasses
 import functools
 import operator
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ from jaxsafe.processors.constraint import Constraint
 from jaxsafe.processors.observation import Observation
 from jaxsafe.processors.reward import Reward
 from jaxsafe.processors.status import Status
-from jaxsafe.processors.terminal import Terminal
+from jaxsafe.processors.terminal import Terminal, time_limit
 from jaxsafe.rta.filter import RTA
 from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.schema.describe import Described, Rows, brief, unbroken
@@ -64,6 +64,9 @@ DIVERGED = "diverged"
 class Environment(Component, Described):
     """A task: platforms and regions, and the processors that give their state a meaning.
 
+    The world moves `dt` seconds a step. The agent acts on every `decision_period`-th of these
+    steps, and its control is held in between.
+
     `randomize` names numbers of the environment by dotted path, each with the interval from which
     every episode draws it. `tied` names numbers that follow other numbers when these are changed or
     drawn, such as a slope that is twice the mean motion.
@@ -75,6 +78,7 @@ class Environment(Component, Described):
 
     agent: PlatformName
     dt: Annotated[Number, Unit("s"), Range(0.0, open_low=True, smallest=1e-6, largest=1e5)] = 1.0
+    decision_period: Annotated[int, Range(1, largest=10_000)] = 1
     platforms: tuple[Platform, ...]
     regions: tuple[Region, ...] = ()
     status: tuple[Status, ...] = ()
@@ -93,7 +97,7 @@ class Environment(Component, Described):
         return reset(self, key)
 
     def step(self, state: State, action: Array) -> tuple[State, TimeStep]:
-        """Advance one time step: `jaxsafe.step(env, state, action)`."""
+        """Advance by one action: `jaxsafe.step(env, state, action)`."""
         return step(self, state, action)
 
     @property
@@ -164,11 +168,19 @@ class Environment(Component, Described):
 
     @property
     def num_action_points(self) -> tuple[int, ...]:
-        """The number of choices for each element of a discrete action.
+        """The number of choices for each element of an action, 0 for a continuous element.
 
-        It is `()` if actions are continuous.
+        It is `()` if all are continuous.
         """
         return self.agent_platform.controller.points
+
+    @property
+    def action_kind(self) -> Literal["continuous", "discrete", "mixed"]:
+        """The kind of actions: vectors of numbers, of indices, or of both."""
+        points = self.num_action_points
+        if not any(points):
+            return "continuous"
+        return "discrete" if all(points) else "mixed"
 
     @functools.cached_property  # asked for often, and each answer traces a reset
     def observation_names(self) -> tuple[str, ...]:
@@ -204,7 +216,8 @@ class Environment(Component, Described):
     def _rows(self) -> Rows:
         others = [platform.name for platform in self.platforms if platform.name != self.agent]
         beside = f" beside {', '.join(others)}" if others else ""
-        yield "agent", f"{self.agent}{beside}, {brief(self.dt)} s a step"
+        held = f", an action for {self.decision_period} steps" if self.decision_period > 1 else ""
+        yield "agent", f"{self.agent}{beside}, {brief(self.dt)} s a step{held}"
         try:
             names = self.observation_names
         except Exception:  # in a transformation of JAX, leaves may be no numbers
@@ -271,22 +284,35 @@ def control_unit(name: str, length: str | None) -> str | None:
 
 
 def action_bounds(env: Environment) -> tuple[list[Any], list[Any]]:
-    """Return the lowest and the highest value of each element of a continuous action.
+    """Return the lowest and the highest value of each element of an action that make a difference.
 
-    They are −1 and 1 where the actuator rescales, and else the actuator's own limits in physical
-    units. If episodes draw a limit at random, the widest that can be drawn is returned.
+    They are −1 and 1 where the actuator rescales, −∞ and ∞ where it takes the tanh of an action,
+    and else the actuator's own limits in physical units. If episodes draw a limit at random, the
+    widest that can be drawn is returned. For an index they are 0 and points − 1.
     """
-    if not acts_in_physical_units(env):
+    if env.action_kind == "continuous" and acts_within_one(env):
         return [-1.0] * env.action_size, [1.0] * env.action_size
-    pairs = list(zip(*map(_listed_actuators, extremes(env)), strict=True))
-    low = [-1.0 if a.rescale else jnp.minimum(a.low, b.low) for a, b in pairs]
-    high = [1.0 if a.rescale else jnp.maximum(a.high, b.high) for a, b in pairs]
+    pairs = list(zip(*map(_action_ranges, extremes(env)), strict=True))
+    low = [jnp.minimum(a[0], b[0]) for a, b in pairs]
+    high = [jnp.maximum(a[1], b[1]) for a, b in pairs]
     return low, high
 
 
-def acts_in_physical_units(env: Environment) -> bool:
-    """Return whether some actuator does not rescale its element of a continuous action."""
-    return not all(actuator.rescale for actuator in _listed_actuators(env))
+def acts_within_one(env: Environment) -> bool:
+    """Return whether every continuous element of an action is in [−1, 1]."""
+    return all(
+        actuator.rescale and actuator.post_activation == "clip"
+        for actuator in _listed_actuators(env)
+    )
+
+
+def _action_ranges(env: Environment) -> list[tuple[Any, Any]]:
+    actuators = _listed_actuators(env)
+    points = env.num_action_points or (0,) * len(actuators)
+    return [
+        (0.0, count - 1.0) if count else actuator.action_range
+        for actuator, count in zip(actuators, points, strict=True)
+    ]
 
 
 def _listed_actuators(env: Environment) -> tuple[Actuator, ...]:
@@ -296,18 +322,20 @@ def _listed_actuators(env: Environment) -> tuple[Actuator, ...]:
 
 def action_text(env: Environment) -> str:
     """Return what an action is: its kind, and each control that it sets with bounds and unit."""
-    points = env.num_action_points
+    points = env.num_action_points or (0,) * env.action_size
     parts = []
     for index, name in enumerate(env.action_names):
-        text = f"{name}, {points[index]} points" if points else name
+        text = f"{name}, {points[index]} points" if points[index] else name
         if env.actuators:
             actuator = env.actuators[index]
             text += f" from {brief(actuator.low)} to {brief(actuator.high)}"
             text += f" {control_unit(name, length_unit(env)) or ''}"
         parts.append(unbroken(text))
-    kind = (
-        "indices" if points else "numbers" if acts_in_physical_units(env) else "numbers in [-1, 1]"
-    )
+    kind = {
+        "continuous": "numbers in [-1, 1]" if acts_within_one(env) else "numbers",
+        "discrete": "indices",
+        "mixed": "numbers and indices",
+    }[env.action_kind]
     return f"{env.action_size} {kind}: {'; '.join(parts)}"
 
 
@@ -374,15 +402,18 @@ def reset_to(
 
 
 def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep]:
-    """Advance one time step.
+    """Advance one time step, or as many as `decision_period` says.
 
-    A step never resets by itself, and never looks at an earlier outcome.
+    A step never resets by itself, and never looks at an earlier outcome. With a `decision_period`
+    the control of the action is held. The filter, statuses and rewards see every step of the world.
+    Nothing moves after a step that ends the episode. `Info` says what is summed over these steps.
 
     Args:
         env: the environment.
         state: the state that `reset` or `step` returned.
         action: floats in [−1, 1] of shape (action_size,), which are clipped. Discrete actions are
-            int indices of the same shape, clipped to 0 … points − 1.
+            int indices of the same shape, clipped to 0 … points − 1. Mixed actions are floats of
+            the same shape, in which indices are rounded to whole numbers.
 
     Returns:
         The next state, and the time step that led there.
@@ -395,6 +426,31 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
     action = _checked(env, action)
     controls = env.agent_platform.controller.control(action, state.sim)
     desired = jnp.stack([controls[name] for name in env.action_names])
+    taken = _world_step(env, state, desired)
+    if env.decision_period == 1:
+        return taken
+
+    def hold(taken: tuple[State, TimeStep], _: None) -> tuple[tuple[State, TimeStep], None]:
+        before, so_far = taken
+        after, timestep = _world_step(env, before, desired)
+        following = (after, _together(env, so_far, timestep))
+        return jax.tree.map(lambda a, b: jnp.where(so_far.done, a, b), taken, following), None
+
+    (after, timestep), _ = jax.lax.scan(hold, taken, length=env.decision_period - 1)
+    # So far the controls that acted are summed up.
+    count = (after.num_steps - state.num_steps).astype(desired.dtype)
+    info = timestep.info.replace(control_actual=timestep.info.control_actual / count)
+    return after, timestep.replace(info=info)
+
+
+def _world_step(env: Environment, state: State, desired: Array) -> tuple[State, TimeStep]:
+    """Advance the world by `dt` seconds.
+
+    Args:
+        env: the environment, with the numbers of this episode.
+        state: the state before the step.
+        desired: the control that the agent asks for, in physical units and action order.
+    """
     actual, rta_memory, rta_info = _filtered(env, state, desired)
     later = advance(env, state.sim, actual)
     num_steps = state.num_steps + 1
@@ -429,6 +485,41 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
         parameters=state.parameters,
     )
     return state, timestep
+
+
+def _together(env: Environment, before: TimeStep, now: TimeStep) -> TimeStep:
+    """Return the time step of several steps of the world, given that of the steps before this one.
+
+    What is not named here is that of the last step. The controls that acted are added up.
+    """
+    earlier = before.info
+    info = now.info
+    add = functools.partial(jax.tree.map, jnp.add)
+    summed = {status.name for status in env.status if status.per_step}
+    status = {
+        name: earlier.status[name] + value if name in summed else value
+        for name, value in info.status.items()
+    }
+    rta = info.rta
+    if rta is not None and earlier.rta is not None:
+        rta = rta.replace(
+            correction=jnp.maximum(earlier.rta.correction, rta.correction),
+            feasible=earlier.rta.feasible & rta.feasible,
+            certified=earlier.rta.certified & rta.certified,
+            predicted_margin=jnp.minimum(earlier.rta.predicted_margin, rta.predicted_margin),
+        )
+    info = info.replace(
+        status=status,
+        reward_terms=add(earlier.reward_terms, info.reward_terms),
+        control_actual=earlier.control_actual + info.control_actual,
+        intervening=earlier.intervening | info.intervening,
+        margins=jax.tree.map(jnp.minimum, earlier.margins, info.margins),
+        severity=jax.tree.map(jnp.maximum, earlier.severity, info.severity),
+        rta=rta,
+    )
+    return now.replace(
+        reward=before.reward + now.reward, cost=jnp.maximum(before.cost, now.cost), info=info
+    )
 
 
 def _with_own_buffers(started: tuple[State, TimeStep], others: Any) -> tuple[State, TimeStep]:
@@ -495,6 +586,20 @@ def extremes(env: Environment) -> tuple[Environment, Environment]:
     low = {path: interval[0] for path, interval in env.randomize.items()}
     high = {path: interval[1] for path, interval in env.randomize.items()}
     return drawn(env, low), drawn(env, high)
+
+
+def longest_episode(env: Environment) -> Float[Array, ""] | None:
+    """Return the number of actions after which every episode has ended by its time limit.
+
+    A time limit or a length of a step that is random counts with its worst value. It is None if the
+    task has no time limit.
+    """
+    low, high = extremes(env)
+    limit = time_limit(high)
+    if limit is None:
+        return None
+    # Two more: a timeout needs t > limit, and limit / dt may round down.
+    return jnp.ceil((jnp.ceil(limit / low.dt) + 2.0) / env.decision_period)
 
 
 def _empty_sim(env: Environment) -> Sim:
@@ -566,7 +671,10 @@ def _checked(env: Environment, action: Array) -> Array:
         raise ConfigError(
             f"action: expected shape {(env.action_size,)} ({names}), found {action.shape}"
         )
-    if env.num_action_points and not jnp.issubdtype(action.dtype, jnp.integer):
+    kind = env.action_kind
+    if kind == "mixed":
+        return action.astype(env.dt.dtype)
+    if kind == "discrete" and not jnp.issubdtype(action.dtype, jnp.integer):
         raise ConfigError(
             f"action: expected whole numbers, indices of {env.num_action_points} points, "
             f"found {action.dtype}"

@@ -25,6 +25,7 @@ from jaxsafe.simulation.controllers import (
     Continuous,
     Controller,
     Discrete,
+    Mixed,
 )
 from jaxsafe.simulation.geometry import (
     Offset,
@@ -97,6 +98,7 @@ __all__ = [
     "Kilograms",
     "Length",
     "MetresPerSecond",
+    "Mixed",
     "Network",
     "Newtons",
     "Number",

@@ -349,7 +349,7 @@ def step_or_reset_batch(
         state: the states before the step.
         action: the actions.
         key: a typed PRNG key for the starts.
-        max_episode_steps: number of steps after which an episode that is still running is
+        max_episode_steps: number of actions after which an episode that is still running is
             truncated, without an outcome.
         shard: the part of the batch that this device has.
         axis: the axis of the environments in everything that goes in and comes out. With −1 it is
@@ -359,7 +359,7 @@ def step_or_reset_batch(
         What `step_or_reset` returns, for each environment.
     """
     state, timestep = jax.vmap(step, in_axes=(None, axis, axis), out_axes=axis)(env, state, action)
-    timestep = cut_short(state, timestep, max_episode_steps)
+    timestep = cut_short(env, state, timestep, max_episode_steps)
     first = shard.first(action.shape[axis])
 
     def draw(parameters: tuple[Environment, Key, Array], indices: Array) -> tuple[State, Array]:
@@ -377,9 +377,13 @@ def step_or_reset_batch(
     return carry, timestep
 
 
-def cut_short(state: State, timestep: TimeStep, max_episode_steps: Array | float) -> TimeStep:
-    """Return the time step, truncated if its episode still runs after `max_episode_steps` steps."""
+def cut_short(
+    env: Environment, state: State, timestep: TimeStep, max_episode_steps: Array | float
+) -> TimeStep:
+    """Return the time step, truncated if its episode runs on after `max_episode_steps` actions."""
     number = jnp.result_type(float)
     steps = state.num_steps.astype(number)
+    if env.decision_period > 1:
+        steps = steps / env.decision_period
     cut = ~timestep.done & (steps >= jnp.asarray(max_episode_steps, number))
     return timestep.replace(truncated=timestep.truncated | cut)

@@ -251,13 +251,18 @@ class State(Record):
     sim: Sim
     memory: Memory
     reward_totals: Mapping[str, Float[Array, ""]]  # each reward term summed over the episode so far
-    num_steps: Int[Array, ""]  # steps taken in this episode
+    num_steps: Int[Array, ""]  # steps of the world taken in this episode
     # Numbers of the environment drawn for this episode, by dotted path.
     parameters: Mapping[str, Float[Array, ""]]
 
 
 class RTAInfo(Record):
-    """What run time assurance did on a step."""
+    """What run time assurance did on a step.
+
+    Of the several steps of a `decision_period` it is the worst: the largest correction, the
+    smallest margin, and whether all were feasible and certified. The backup controller is that of
+    the last step.
+    """
 
     correction: Float[Array, ""]  # ‖u_act − u_des‖, physical units
     feasible: Bool[Array, ""]  # whether some control met the filter's constraints
@@ -268,7 +273,14 @@ class RTAInfo(Record):
 
 
 class Info(Record):
-    """Facts about a step that are not part of the learning signal."""
+    """Facts about a step that are not part of the learning signal.
+
+    With a `decision_period` a time step may be several steps of the world. Then the reward and its
+    terms are sums over these steps. Margins are the smallest ones, severity and cost the largest.
+    `control_actual` is the mean, and `intervening` says whether any control was changed. Outcome,
+    totals, observation and statuses are those of the last step that was taken. A status that
+    belongs to a step, such as `delta_v`, is a sum.
+    """
 
     outcome: Int[Array, ""]  # index into `env.outcomes`, 0 while running
     status: Mapping[str, Array]  # by name

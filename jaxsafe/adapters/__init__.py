@@ -16,7 +16,7 @@ import numpy as np
 from jaxsafe.config import override
 from jaxsafe.environment import Environment
 from jaxsafe.environment import action_bounds as action_bounds
-from jaxsafe.environment import acts_in_physical_units as acts_in_physical_units
+from jaxsafe.environment import acts_within_one as acts_within_one
 from jaxsafe.envs import make
 from jaxsafe.schema.errors import ConfigError, nearest, show
 
@@ -117,3 +117,19 @@ def observation_bounds(env: Environment) -> tuple[list[float], list[float]]:
             else (float(item.clip[0]), float(item.clip[1]))
         ]
     return [low for low, _ in bounds], [high for _, high in bounds]
+
+
+def elements(env: Environment, action: Mapping[str, Any]) -> list[Any]:
+    """Return the elements of a mixed action in the order of the actuators.
+
+    Args:
+        env: the environment.
+        action: the element of each actuator by its name.
+
+    Raises:
+        ConfigError: these are not the actuators of the environment.
+    """
+    if set(action) != set(env.action_names):
+        names = ", ".join(env.action_names)
+        raise ConfigError(f"action: expected {names}, found {', '.join(map(str, action))}")
+    return [action[name] for name in env.action_names]

@@ -62,7 +62,7 @@ class BraxEnv(Env):
             if (low, high) != (-1.0, 1.0):
                 raise ConfigError(
                     f"actuator {name}: Brax's agents act in [-1, 1], found [{low:g}, {high:g}];"
-                    " leave rescale on"
+                    " leave rescale on and post_activation: clip"
                 )
 
     def reset(self, rng: Key) -> State:
@@ -102,7 +102,8 @@ class BraxEnv(Env):
 
     @property
     def dt(self) -> Array:
-        return self.env.dt
+        """Seconds between two actions."""
+        return self.env.dt * self.env.decision_period
 
     def _metrics(self, timestep: TimeStep) -> dict[str, Array]:
         terms = {f"reward_{name}": value for name, value in timestep.info.reward_terms.items()}

@@ -24,7 +24,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from jaxsafe.adapters import FORKED, checked_count, environment, refuse_fork
+from jaxsafe.adapters import FORKED, checked_count, elements, environment, refuse_fork
 from jaxsafe.adapters.gymnasium_spaces import facts, masked, spaces
 from jaxsafe.adapters.packed_batch import Episodes, PackedBatch
 from jaxsafe.environment import Environment, reset_to
@@ -94,7 +94,7 @@ class _Chains:
         self._unseeded &= ~begin
 
 
-class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
+class GymEnv(_Chains, gym.Env[np.ndarray, Any]):
     """One environment with Gymnasium's interface.
 
     `reset(seed=s)` starts a chain of keys from `jax.random.key(s)`, and each reset takes the next
@@ -173,8 +173,12 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
         observation, _, _, _, info = self._receive(self._batch.now)
         return observation, info
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+    def step(self, action: Any) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Advance one time step of the task.
+
+        Args:
+            action: the action. A mixed one is a mapping from the name of each actuator to its
+                element, or the vector of these.
 
         Raises:
             ResetNeeded: there was no reset before.
@@ -226,7 +230,7 @@ class GymEnv(_Chains, gym.Env[np.ndarray, np.ndarray]):
         return timestep.observation.copy(), float(timestep.reward), *flags, info
 
 
-class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class GymVectorEnv(_Chains, VectorEnv[np.ndarray, Any, np.ndarray]):
     """Many environments, stepped by one compiled program.
 
     Each environment does what a `GymEnv` of its own would do with the same seed. `reset(seed=s)`
@@ -341,13 +345,12 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             facts(self.env, episodes.timestep), mask
         )
 
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
+    def step(self, actions: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict]:
         """Advance every environment one time step of the task.
 
         Args:
-            actions: an action for each environment, [num_envs, action].
+            actions: an action for each environment, [num_envs, action]. Mixed actions may also be
+                a mapping from the name of each actuator to its elements, [num_envs].
 
         Returns:
             The observations, [num_envs, observation]; rewards, `terminated` and `truncated`,
@@ -369,10 +372,9 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 " reset them with options={'reset_mask': …}"
             )
         action = _checked_action(self.env, actions)
-        if action.shape != self.action_space.shape:
-            raise ConfigError(
-                f"actions: expected shape {self.action_space.shape}, found {action.shape}"
-            )
+        wanted = (self.num_envs, self.env.action_size)
+        if action.shape != wanted:
+            raise ConfigError(f"actions: expected shape {wanted}, found {action.shape}")
         self._batch.step(action)
         restarted, final = np.zeros_like(over), {}
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and over.any():
@@ -597,9 +599,20 @@ def _checked_action(env: Environment, action: Any) -> np.ndarray:
     """Return an action as an array of one dtype, so that the step is compiled only once.
 
     Discrete actions that are not integers are passed on as they are and fail in the step.
+
+    Raises:
+        ConfigError: elements by name are not those of the actuators, or have different shapes.
     """
+    if isinstance(action, Mapping):
+        parts = list(map(np.asarray, elements(env, action)))
+        shapes = {part.shape for part in parts}
+        if len(shapes) > 1:
+            raise ConfigError(
+                f"action: expected one shape of all elements, found {', '.join(map(str, shapes))}"
+            )
+        action = np.stack(parts, axis=-1)
     array = np.asarray(action)
-    whole = array.dtype.kind in "iub" and env.num_action_points
+    whole = array.dtype.kind in "iub" and env.action_kind == "discrete"
     return array.astype(np.int32 if whole else jnp.result_type(float))
 
 

@@ -13,7 +13,7 @@ from jaxsafe.adapters import action_bounds, observation_bounds
 from jaxsafe.environment import Environment
 from jaxsafe.types import TimeStep
 
-Space = gym.spaces.Box | gym.spaces.MultiDiscrete
+Space = gym.spaces.Box | gym.spaces.MultiDiscrete | gym.spaces.Dict
 
 _FACTS = (
     "margins",
@@ -31,14 +31,22 @@ _FACTS = (
 def spaces(env: Environment) -> tuple[gym.spaces.Box, Space]:
     """Return the space of observations and the space of actions.
 
-    Discrete actions have a `MultiDiscrete` space, continuous ones a `Box`.
+    Discrete actions have a `MultiDiscrete` space, continuous ones a `Box`. Mixed actions have a
+    `Dict` with a `Discrete` or a `Box` of shape () by the name of each actuator.
     """
     dtype = jnp.result_type(float)
     low, high = observation_bounds(env)
     observation = gym.spaces.Box(np.array(low, dtype), np.array(high, dtype), dtype=dtype)
-    if env.num_action_points:
+    if env.action_kind == "discrete":
         return observation, gym.spaces.MultiDiscrete(list(env.num_action_points))
     low, high = action_bounds(env)
+    if env.action_kind == "mixed":
+        parts: dict[str, gym.Space] = {}
+        for index, name in enumerate(env.action_names):
+            count = env.num_action_points[index]
+            ends = np.array([low[index], high[index]], np.float32)
+            parts[name] = gym.spaces.Discrete(count) if count else gym.spaces.Box(*ends, shape=())
+        return observation, gym.spaces.Dict(parts)
     return observation, gym.spaces.Box(
         np.array(low, np.float32), np.array(high, np.float32), dtype=np.float32
     )

@@ -22,8 +22,9 @@ from jaxtyping import Array
 from jaxsafe.adapters import (
     MAX_COUNT,
     action_bounds,
-    acts_in_physical_units,
+    acts_within_one,
     checked_count,
+    elements,
     environment,
     observation_bounds,
 )
@@ -64,7 +65,8 @@ class GymnaxEnv:
 
     `info` holds `cost`, `is_success`, `terminated`, `truncated` and `final_observation`. The final
     observation is the one that the step led to, before any reset. Discrete actions are one choice
-    for each actuator. Here they become one choice among all their combinations.
+    for each actuator. Here they become one choice among all their combinations. Mixed actions are a
+    mapping from the name of each actuator to its element, or the vector of these.
     """
 
     def __init__(
@@ -115,11 +117,11 @@ class GymnaxEnv:
     def num_actions(self) -> int:
         """Return the number of combinations of discrete actions.
 
-        If actions are continuous, it is the number of elements of one.
+        If actions are continuous or mixed, it is the number of elements of one.
         """
         return (
             math.prod(self.env.num_action_points)
-            if self.env.num_action_points
+            if self.env.action_kind == "discrete"
             else self.env.action_size
         )
 
@@ -127,14 +129,24 @@ class GymnaxEnv:
         """Return the space of actions.
 
         It is `Discrete` over all combinations of discrete actions, and a `Box` of continuous ones.
-        The box is [−1, 1] for actuators that rescale. For the others it has the limits that they
-        have in `params`.
+        The box is [−1, 1] for actuators that rescale, and without bounds for those that take the
+        tanh of an action. For the others it has the limits that they have in `params`. Mixed
+        actions have a `Dict` with a `Discrete` or a `Box` by the name of each actuator.
         """
-        if self.env.num_action_points:
+        kind = self.env.action_kind
+        if kind == "discrete":
             return spaces.Discrete(self.num_actions)
-        if not acts_in_physical_units(self.env):
+        if kind == "continuous" and acts_within_one(self.env):
             return spaces.Box(-1.0, 1.0, (self.env.action_size,), dtype=jnp.float32)
         low, high = action_bounds((params or self.default_params).env)
+        if kind == "mixed":
+            parts = zip(self.env.action_names, self.env.num_action_points, low, high, strict=True)
+            return spaces.Dict(
+                {
+                    name: spaces.Discrete(count) if count else spaces.Box(least, most, ())
+                    for name, count, least, most in parts
+                }
+            )
         arrays = [
             jnp.stack(jnp.broadcast_arrays(*bounds), axis=-1).astype(jnp.float32)
             for bounds in (low, high)
@@ -161,12 +173,18 @@ def _reset(key: Key, params: GymnaxParams) -> tuple[Array, State]:
 
 @jax.jit
 def _step(
-    key: Key, state: State, action: Array, params: GymnaxParams
+    key: Key, state: State, action: Any, params: GymnaxParams
 ) -> tuple[Array, State, Array, dict[str, Array]]:
     points = params.env.num_action_points
-    chosen = jnp.stack(jnp.unravel_index(action, points)).astype(jnp.int32) if points else action
+    chosen = action
+    if params.env.action_kind == "discrete":
+        chosen = jnp.stack(jnp.unravel_index(action, points)).astype(jnp.int32)
+    elif isinstance(action, Mapping):
+        number = jnp.result_type(float)
+        parts = elements(params.env, action)
+        chosen = jnp.stack([jnp.asarray(element, number) for element in parts], axis=-1)
     state, timestep = step(params.env, state, chosen)
-    timestep = cut_short(state, timestep, params.max_steps_in_episode)
+    timestep = cut_short(params.env, state, timestep, params.max_steps_in_episode)
     following, observation = restarted(params.env, state, timestep, key)
     info = {
         "cost": timestep.cost,

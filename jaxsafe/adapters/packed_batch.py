@@ -275,8 +275,9 @@ def advance(layout: Layout, env: Array, words: Array, action: Array, limit: floa
         limit: number of steps after which an episode is truncated.
     """
     state, timestep = layout.episodes.unpack(words)
-    state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(layout.env.unpack(env), state, action)
-    return layout.episodes.pack(Episodes(state, cut_short(state, timestep, limit)))
+    unpacked = layout.env.unpack(env)
+    state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(unpacked, state, action)
+    return layout.episodes.pack(Episodes(state, cut_short(unpacked, state, timestep, limit)))
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -65,11 +65,11 @@ class SafetyEnv:
         """Start an episode, as `GymEnv.reset` or `GymVectorEnv.reset`."""
         return self.env.reset(seed=seed, options=options)
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, Any, Any, Any, Any, dict]:
+    def step(self, action: Any) -> tuple[np.ndarray, Any, Any, Any, Any, dict]:
         """Advance one time step of the task.
 
         Args:
-            action: the action, or [num_envs, action].
+            action: the action as `GymEnv.step` or `GymVectorEnv.step` takes it.
 
         Returns:
             The observation, reward, cost, `terminated`, `truncated` and `info`.

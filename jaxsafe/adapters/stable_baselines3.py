@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxsafe.adapters import action_bounds
 from jaxsafe.adapters.gymnasium import GymVectorEnv
 from jaxsafe.adapters.gymnasium_spaces import of_environment
 from jaxsafe.environment import Environment
@@ -50,9 +51,11 @@ class SB3VecEnv(VecEnv):
             options: the other arguments of `GymVectorEnv`, except `autoreset_mode`.
 
         Raises:
-            ConfigError: as `jaxsafe.make`.
+            ConfigError: as `jaxsafe.make`; or actions are mixed or without bounds.
+                Stable-Baselines3 knows no such actions.
         """
         self.env = GymVectorEnv(task, num_envs, overrides, autoreset_mode="SameStep", **options)
+        _check_actions(self.env.env)
         super().__init__(num_envs, self.env.single_observation_space, self.env.single_action_space)
 
     def reset(self) -> np.ndarray:
@@ -133,3 +136,21 @@ class SB3VecEnv(VecEnv):
     def _chosen(self, indices: Any) -> list[int]:
         found: Iterable[int] = self._get_indices(indices)
         return list(found)
+
+
+def _check_actions(env: Environment) -> None:
+    """Refuse actions that Stable-Baselines3 does not know.
+
+    Raises:
+        ConfigError: actions are mixed or without bounds.
+    """
+    if env.action_kind == "mixed":
+        raise ConfigError(
+            "actions: Stable-Baselines3 knows no mixed actions; choose continuous or discrete"
+        )
+    for name, low, high in zip(env.action_names, *action_bounds(env), strict=True):
+        if not np.isfinite([low, high]).all():
+            raise ConfigError(
+                f"actuator {name}: Stable-Baselines3 needs actions with bounds;"
+                " leave post_activation: clip"
+            )

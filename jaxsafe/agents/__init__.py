@@ -5,7 +5,7 @@ the files of their weights.
 """
 
 from jaxsafe.agents.agent import Agent
-from jaxsafe.agents.distributions import Categorical, Gaussian
+from jaxsafe.agents.distributions import Categorical, Gaussian, Joint
 from jaxsafe.agents.features import (
     ApproachFeatures,
     DockingFeatures,
@@ -26,6 +26,7 @@ __all__ = [
     "DockingFeatures",
     "Features",
     "Gaussian",
+    "Joint",
     "Network",
     "PlainFeatures",
     "RejoinFeatures",

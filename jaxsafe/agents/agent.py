@@ -17,7 +17,7 @@ import numpy as np
 from jax.lax import broadcast_to_rank
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.agents.distributions import Categorical, Gaussian
+from jaxsafe.agents.distributions import Categorical, Gaussian, Joint, split_outputs
 from jaxsafe.agents.features import Features, PlainFeatures
 from jaxsafe.agents.networks import (
     MLP,
@@ -34,6 +34,9 @@ from jaxsafe.schema.component import ANY, Component, Range, Unit
 from jaxsafe.schema.errors import ConfigError, summarise_error
 from jaxsafe.schema.user_modules import modules
 from jaxsafe.types import Dimensionless, Key, Number
+
+Distribution = Gaussian | Categorical | Joint
+"""A distribution over actions."""
 
 
 class Sequences(NamedTuple):
@@ -109,9 +112,17 @@ class Agent(Component):
                 for own_key, (name, given) in zip(keys, arguments.items(), strict=True)
             }
 
-        log_std = jnp.log(self.prior_std) if env.num_action_points else jnp.asarray(self.log_std)
         params = from_one_draw(key, build)
-        return {**params, "log_std": jnp.broadcast_to(log_std, env.action_size)}
+        return {**params, "log_std": jnp.broadcast_to(self._first_log_std(env), env.action_size)}
+
+    def _first_log_std(self, env: Environment) -> Array:
+        """Return the initial log_std, one number or one for each actuator."""
+        if env.action_kind == "continuous":
+            return jnp.asarray(self.log_std)
+        if env.action_kind == "discrete":
+            return jnp.log(self.prior_std)
+        choices = np.array(env.num_action_points) > 0
+        return jnp.where(choices, jnp.log(self.prior_std), jnp.asarray(self.log_std))
 
     def first_outputs(self, env: Environment) -> dict[str, Array]:
         """Return by name what networks with fresh parameters say of an observation of zeros."""
@@ -148,7 +159,7 @@ class Agent(Component):
         params: Params,
         inputs: Float[Array, "*batch i"],
         sequences: Sequences | None = None,
-    ) -> Gaussian | Categorical:
+    ) -> Distribution:
         """Return the policy, a distribution over actions.
 
         Args:
@@ -162,7 +173,7 @@ class Agent(Component):
 
     def distribution_step(
         self, env: Environment, params: Params, inputs: Float[Array, "*batch i"], memory: Memory
-    ) -> tuple[Gaussian | Categorical, Memory]:
+    ) -> tuple[Distribution, Memory]:
         """Return the policy for one step, and what the actor remembers then.
 
         Args:
@@ -178,13 +189,33 @@ class Agent(Component):
 
     def _head(
         self, env: Environment, params: Params, out: Float[Array, "*batch o"]
-    ) -> Gaussian | Categorical:
+    ) -> Distribution:
         """Return the distribution over actions that the outputs of the actor stand for."""
-        points = env.num_action_points
-        if not points:
-            return Gaussian(mean=out, log_std=params["log_std"])
+        points, log_std = env.num_action_points, params["log_std"]
+        if env.action_kind == "continuous":
+            return Gaussian(mean=out, log_std=log_std)
+        if env.action_kind == "discrete":
+            return self._choices(out, log_std, points)
+        mean, logits = split_outputs(out, points)
+        width, sharpness = split_outputs(log_std, [min(count, 1) for count in points])
+        return Joint(
+            normal=Gaussian(mean=mean, log_std=width),
+            choices=self._choices(logits, sharpness, tuple(filter(None, points))),
+            points=points,
+        )
+
+    def _choices(
+        self, out: Float[Array, "*batch points"], log_std: Array, points: tuple[int, ...]
+    ) -> Categorical:
+        """Return the choices that outputs of the actor stand for.
+
+        Args:
+            out: the outputs.
+            log_std: what the sharpness of each actuator's choice follows from.
+            points: the number of choices of each actuator.
+        """
         # There is one sharpness for each actuator. Below it is repeated for each of its logits.
-        sharpness = (self.prior_std * jnp.exp(-params["log_std"])) ** 2
+        sharpness = (self.prior_std * jnp.exp(-log_std)) ** 2
         sharpness = jnp.sum(
             sharpness[:, None] * np.repeat(np.eye(len(points), dtype=np.float32), points, axis=1),
             axis=0,
@@ -348,7 +379,7 @@ def check_agent(agent: Agent, env: Environment, place: str = "agent") -> None:
 
 def num_outputs(env: Environment) -> int:
     """Return how many outputs the actor has: one for each action or each discrete choice."""
-    return sum(env.num_action_points) or env.action_size
+    return sum(count or 1 for count in env.num_action_points) or env.action_size
 
 
 def _prior(points: Sequence[int], std: Array | float) -> Float[Array, " points"]:

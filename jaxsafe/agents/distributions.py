@@ -1,9 +1,12 @@
 """The distributions over actions.
 
-Continuous actions have normal distributions. Discrete actions are one choice per actuator.
+Continuous actions have normal distributions. Discrete actions are one choice per actuator. Mixed
+actions have some elements of each kind.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -74,3 +77,64 @@ class Categorical(Component):
     def _blocks(self) -> list[Array]:
         ends = [sum(self.points[: i + 1]) for i in range(len(self.points))]
         return jnp.split(self.logits, ends[:-1], axis=-1)
+
+
+class Joint(Component):
+    """Normal distributions of the continuous elements of an action, and choices of the others.
+
+    All are independent. An action is a vector of floats in the order of the actuators, in which
+    choices are indices. Log-probability and entropy are sums over both parts.
+    """
+
+    normal: Gaussian
+    """The distributions of the continuous elements, in their order."""
+    choices: Categorical
+    """The choices, in their order."""
+    points: tuple[int, ...]
+    """The number of choices of each actuator, 0 for a continuous one."""
+
+    def mode(self) -> Float[Array, "*batch a"]:
+        return self._action(self.normal.mode(), self.choices.mode())
+
+    def sample(self, key: Key, shard: Shard = WHOLE) -> Float[Array, "*batch a"]:
+        key_normal, key_choices = jax.random.split(key)
+        return self._action(
+            self.normal.sample(key_normal, shard), self.choices.sample(key_choices, shard)
+        )
+
+    def log_prob(self, action: Float[Array, "*batch a"]) -> Float[Array, "*batch"]:
+        numbers = [action[..., i] for i, count in enumerate(self.points) if not count]
+        indices = [action[..., i] for i, count in enumerate(self.points) if count]
+        chosen = jnp.stack(indices, axis=-1).astype(jnp.int32)
+        return self.normal.log_prob(jnp.stack(numbers, axis=-1)) + self.choices.log_prob(chosen)
+
+    def entropy(self) -> Float[Array, "*batch"]:
+        return self.normal.entropy() + self.choices.entropy()
+
+    def _action(self, numbers: Array, indices: Array) -> Float[Array, "*batch a"]:
+        """Return the elements of both parts in the order of the actuators."""
+        parts = {False: numbers, True: indices.astype(numbers.dtype)}
+        taken = {False: 0, True: 0}
+        columns = []
+        for is_choice in (count > 0 for count in self.points):
+            columns.append(parts[is_choice][..., taken[is_choice]])
+            taken[is_choice] += 1
+        return jnp.stack(columns, axis=-1)
+
+
+def split_outputs(
+    outputs: Float[Array, "*batch o"], points: Sequence[int]
+) -> tuple[Float[Array, "*batch n"], Float[Array, "*batch p"]]:
+    """Return the means of the continuous elements, and the logits of the others.
+
+    Args:
+        outputs: outputs of an actor in the order of the actuators: a mean, or as many logits as
+            there are choices.
+        points: the number of choices of each actuator, 0 for a continuous one.
+    """
+    parts: dict[bool, list[Array]] = {False: [], True: []}
+    end = 0
+    for count in points:
+        start, end = end, end + (count or 1)
+        parts[count > 0].append(outputs[..., start:end])
+    return jnp.concatenate(parts[False], axis=-1), jnp.concatenate(parts[True], axis=-1)

@@ -1,7 +1,8 @@
 """Policies that were trained elsewhere: an ONNX graph, or layers in an .npz.
 
 They take the paper's observation. A continuous policy returns the action in [−1, 1]. A discrete
-policy returns the logits of each actuator's choices, one actuator after the other.
+policy returns the logits of each actuator's choices, one actuator after the other. For mixed
+actions it returns, one actuator after the other, the element of the action or the logits.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.agents.distributions import Categorical, Gaussian
+from jaxsafe.agents.agent import Distribution, num_outputs
+from jaxsafe.agents.distributions import Categorical, Gaussian, Joint, split_outputs
 from jaxsafe.agents.networks import MAX_LAYERS, Params
 from jaxsafe.agents.onnx_reader import Network, read_graph
 from jaxsafe.environment import Environment
@@ -48,14 +50,20 @@ class ForeignAgent:
         """Return the observation as it is. It is what the network sees."""
         return observation
 
-    def distribution(
-        self, env: Environment, params: Params, inputs: Array
-    ) -> Categorical | Gaussian:
+    def distribution(self, env: Environment, params: Params, inputs: Array) -> Distribution:
         """Return a distribution for one observation or a batch. Only its mode means something."""
         out = jnp.vectorize(lambda one: self.network(params, one), signature="(o)->(a)")(inputs)
-        if env.num_action_points:
-            return Categorical(logits=out, points=env.num_action_points)
-        return Gaussian(mean=out, log_std=jnp.zeros(env.action_size))
+        points = env.num_action_points
+        if env.action_kind == "continuous":
+            return Gaussian(mean=out, log_std=jnp.zeros(env.action_size))
+        if env.action_kind == "discrete":
+            return Categorical(logits=out, points=points)
+        mean, logits = split_outputs(out, points)
+        return Joint(
+            normal=Gaussian(mean=mean, log_std=jnp.zeros(mean.shape[-1])),
+            choices=Categorical(logits=logits, points=tuple(filter(None, points))),
+            points=points,
+        )
 
     def policy(self, env: Environment, params: Params, deterministic: Array | bool) -> Policy:
         """Return a function of key and observations that returns an action for each observation."""
@@ -107,7 +115,7 @@ def _check(path: Path, env: Environment, network: Network, weights: Mapping[str,
     Raises:
         ConfigError: it does not.
     """
-    wanted = sum(env.num_action_points) or env.action_size
+    wanted = num_outputs(env)
     observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
     try:
         found = jax.eval_shape(network, weights, observation)

@@ -154,7 +154,7 @@ def trained_policy(
 
 
 def _within_bounds(env: Environment, action: Array) -> Array:
-    """Return continuous actions as the controller itself clips them."""
+    """Return actions of floats as the controller itself clips them."""
     if not isinstance(env.agent_platform.controller, Continuous):
         return action
     low, high = (jnp.asarray(bound, action.dtype) for bound in action_bounds(env))

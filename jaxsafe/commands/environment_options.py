@@ -9,7 +9,7 @@ from jaxsafe.commands.options import CommandOptions, Option
 from jaxsafe.environment import Environment
 from jaxsafe.envs import adapt, default_filter, unchanged
 
-Actions = Annotated[Literal["continuous", "discrete"], Option(kind="kind")]
+Actions = Annotated[Literal["continuous", "discrete", "mixed"], Option(kind="kind")]
 """Name of a kind of actions."""
 
 Variant = Annotated[Literal["paper", "released"], Option(kind="variant")]

@@ -103,12 +103,8 @@ class PolicyOptions(EnvironmentOptions):
         for what in ("observation_names", "action_names", "num_action_points"):
             found, needed = getattr(env, what), getattr(trained, what)
             if found != needed:
-                kind = "discrete" if trained.num_action_points else "continuous"
-                advice = (
-                    f"; give actions={kind}"
-                    if bool(env.num_action_points) != bool(trained.num_action_points)
-                    else ""
-                )
+                kind = trained.action_kind
+                advice = f"; give actions={kind}" if env.action_kind != kind else ""
                 where = "the change gives" if self.env is None else f"{self.env} has"
                 raise ConfigError(
                     f"env: {where} {what} {found}, the policies of {self.run} have {needed}{advice}"

@@ -324,7 +324,7 @@ def _check_tracing(env: Environment) -> None:
 
     def episode(env: Environment) -> Any:
         start, first = reset(env, jax.random.key(0))
-        action = jnp.zeros(env.action_size, int if env.num_action_points else None)
+        action = jnp.zeros(env.action_size, int if env.action_kind == "discrete" else None)
         return (start, first), step(env, start, action)
 
     try:

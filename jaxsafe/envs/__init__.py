@@ -28,7 +28,7 @@ from jaxsafe.envs.task import (
 from jaxsafe.rta.filter import RTA
 from jaxsafe.schema.dotted_paths import get_path, set_path
 from jaxsafe.schema.errors import ConfigError, nearest, show
-from jaxsafe.simulation.controllers import Continuous, Discrete
+from jaxsafe.simulation.controllers import AgentController, Continuous, Discrete, Mixed
 
 __all__ = [
     "STARTERS",
@@ -57,14 +57,18 @@ VARIANTS = ("paper", "released")
 `paper` is the task as it is declared. `released` has the semantics of the published SafeRL code.
 """
 
-_ACTIONS = {"continuous": Continuous, "discrete": Discrete}
+_ACTIONS: dict[str, type[AgentController]] = {
+    "continuous": Continuous,
+    "discrete": Discrete,
+    "mixed": Mixed,
+}
 
 
 def make(
     task: str | os.PathLike,
     overrides: Mapping[str, Any] | None = None,
     *,
-    actions: Literal["continuous", "discrete"] | None = None,
+    actions: Literal["continuous", "discrete", "mixed"] | None = None,
     variant: Literal["paper", "released"] | None = None,
     randomize: Mapping[str, Sequence[float]] | None = None,
     rta: str | RTA | None = None,
@@ -76,8 +80,9 @@ def make(
             `python -m jaxsafe.config`. `MODULE:NAME` first imports the module that registers the
             task.
         overrides: new values by dotted path, for instance `{"reward.delta_v.scale": -0.02}`.
-        actions: `continuous` for actions in [−1, 1], or `discrete` for indices of points, one for
-            each actuator. None leaves what the task has. The tasks by name are continuous.
+        actions: `continuous` for actions in [−1, 1], `discrete` for indices of points, one for each
+            actuator, or `mixed` for indices where an actuator has `discrete: true`. None leaves
+            what the task has. The tasks by name are continuous.
         variant: `paper`, or `released` for the semantics of the published SafeRL code. None stands
             for `paper`.
         randomize: intervals, by dotted path, of numbers that are drawn again for each episode, for
@@ -205,4 +210,7 @@ def _with_actions(env: Environment, actions: str) -> Environment:
         raise ConfigError(
             f"actions: unknown kind {show(actions)}; choose from {nearest(actions, _ACTIONS)}"
         )
-    return set_path(env, f"{env.agent}.controller", _ACTIONS[actions](actuators=env.actuators))
+    actuators = env.actuators
+    if actions == "continuous":
+        actuators = tuple(actuator.replace(discrete=False) for actuator in actuators)
+    return set_path(env, f"{env.agent}.controller", _ACTIONS[actions](actuators=actuators))

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.environment import Environment, drawn, extremes, step
+from jaxsafe import environment
+from jaxsafe.environment import Environment, drawn, step
 from jaxsafe.evaluate.adversaries import ADVERSARIES
-from jaxsafe.processors.terminal import time_limit
 from jaxsafe.rollout import reset_batch
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError
@@ -122,12 +122,10 @@ def longest_episode(env: Environment) -> int:
     Raises:
         ConfigError: the task has no time limit.
     """
-    low, high = extremes(env)
-    limit = time_limit(high)
-    if limit is None:
+    steps = environment.longest_episode(env.replace(decision_period=1))
+    if steps is None:
         raise ConfigError("steps: the task has no time limit, so give the number of steps")
-    # Two more: a timeout needs t > limit, and limit / dt may round down.
-    return math.ceil(float(limit) / float(low.dt)) + 2
+    return int(steps)
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2, 3))
@@ -322,6 +320,11 @@ def _unsafe(first: TimeStep) -> Array:
 
 
 def _with_physical_actions(env: Environment) -> Environment:
-    """Return the environment with the agent's actions in physical units."""
-    actuators = tuple(actuator.replace(rescale=False) for actuator in env.actuators)
+    """Return the environment with the agent's actions in physical units, one for every step.
+
+    An adversary that acts on every step can do all that one can whose action is held.
+    """
+    physical = {"rescale": False, "post_activation": "clip", "discrete": False}
+    actuators = tuple(actuator.replace(**physical) for actuator in env.actuators)
+    env = env.replace(decision_period=1)
     return set_path(env, f"{env.agent}.controller", Continuous(actuators=actuators))

@@ -5,14 +5,16 @@ They are its network, its action on an observation, its control of a state, and 
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.agents.agent import Agent, num_outputs
+from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.distributions import Gaussian, Joint
 from jaxsafe.agents.imported_policy import ForeignPolicy
 from jaxsafe.agents.policy_file import SavedPolicy
 from jaxsafe.environment import Environment, reset_to, step
@@ -34,20 +36,22 @@ def network(saved: SavedPolicy) -> Exported:
     """Return the actor alone.
 
     It is a function from the features that the actor sees to the means of its actions. If actions
-    are discrete, it returns their logits.
+    are discrete, it returns their logits. If they are mixed, it returns the means of the continuous
+    ones and then the logits of the others.
     """
     _require_no_memory(saved)
     observation = jax.ShapeDtypeStruct((saved.env.observation_size,), jnp.float32)
     size = jax.eval_shape(lambda x: saved.agent.inputs(saved.env, x), observation).shape[0]
-    names = (
-        tuple(f"logit_{i}" for i in range(num_outputs(saved.env)))
-        if saved.env.num_action_points
-        else saved.env.action_names
-    )
+    points = saved.env.num_action_points or (0,) * saved.env.action_size
+    means = [name for name, count in zip(saved.env.action_names, points, strict=True) if not count]
+    names = (*means, *(f"logit_{i}" for i in range(sum(points))))
 
     def function(features: Array) -> Array:
         distribution = saved.agent.distribution(saved.env, saved.params, features)
-        return distribution.mean if hasattr(distribution, "mean") else distribution.logits  # type: ignore[union-attr]
+        if isinstance(distribution, Joint):
+            parts = [distribution.normal.mean, distribution.choices.logits]
+            return jnp.concatenate(parts, axis=-1)
+        return distribution.mean if isinstance(distribution, Gaussian) else distribution.logits
 
     return Exported(function, tuple(f"feature_{i}" for i in range(size)), names)
 
@@ -88,7 +92,7 @@ def control(saved: SavedPolicy | ForeignPolicy) -> Exported:
     act = action(saved).function
 
     def one(start: Array) -> Array:
-        env = saved.env
+        env = saved.env.replace(decision_period=1)
         state, timestep = reset_to(env, _placed(env, start))
         _, following = step(env, state, _as_action(env, act(timestep.observation)))
         return following.info.control_actual
@@ -99,7 +103,8 @@ def control(saved: SavedPolicy | ForeignPolicy) -> Exported:
 def closed_loop(saved: SavedPolicy | ForeignPolicy, steps: int, unrolled: bool = False) -> Exported:
     """Return the function from a start to every safety margin h on the way.
 
-    The margins are those at the start and after each step. The way is safe if all are ≥ 0.
+    The margins are those at the start and the smallest of each step. The way is safe if all are
+    ≥ 0.
 
     Args:
         saved: the policy.
@@ -108,13 +113,20 @@ def closed_loop(saved: SavedPolicy | ForeignPolicy, steps: int, unrolled: bool =
             minutes to compile it.
     """
     act, env = action(saved).function, saved.env
+    world = env.replace(decision_period=1)
 
     def margins(timestep: TimeStep) -> Array:
         return jnp.stack([timestep.info.margins[constraint.name] for constraint in env.constraints])
 
-    def advance(carry: tuple[State, Array], _: None) -> tuple[tuple[State, Array], Array]:
-        state, timestep = step(env, carry[0], _as_action(env, act(carry[1])))
-        return (state, timestep.observation), margins(timestep)
+    def advance(carry: tuple[State, Array], _: Any) -> tuple[tuple[State, Array], Array]:
+        state, observation = carry
+        action = _as_action(env, act(observation))
+        found = []
+        for _ in range(env.decision_period):
+            state, timestep = step(world, state, action)
+            observation = timestep.observation
+            found.append(margins(timestep))
+        return (state, observation), functools.reduce(jnp.minimum, found)
 
     def one(start: Array) -> Array:
         state, timestep = reset_to(env, _placed(env, start))
@@ -169,4 +181,4 @@ def _placed(env: Environment, start: Array) -> dict[str, dict[str, Array]]:
 
 
 def _as_action(env: Environment, action: Array) -> Array:
-    return action.astype(jnp.int32) if env.num_action_points else action
+    return action.astype(jnp.int32) if env.action_kind == "discrete" else action

@@ -412,7 +412,7 @@ class Scene:
             reach = nice(needed)
         end = self.moments[-1].time
         if end > self._end or first:
-            room = FIRST_STEPS * float(self.env.dt)
+            room = FIRST_STEPS * float(self.env.dt) * self.env.decision_period
             # The end of a film is known from the start.
             end = end if first and end > room else max(room, 2.0 * end)
         else:

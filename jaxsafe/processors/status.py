@@ -6,7 +6,7 @@ They are computed in order, so a later status may use an earlier one.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -44,6 +44,12 @@ Weight = Annotated[Number, Unit("physical"), Range(largest=1e12)]
 
 class Status(Processor):
     """Base of all statuses."""
+
+    per_step: ClassVar[bool] = False
+    """Whether the value belongs to the last step and not to the instant after it.
+
+    `info` has the sum of such values over the steps of a `decision_period`.
+    """
 
     def on_the_way(self, env: Environment, before: Sim, sim: Sim) -> Any:
         """Return the output over the step from `before` to `sim`.
@@ -190,6 +196,7 @@ class DeltaV(Status, type="delta_v"):
     The control u is the one that acted, after run time assurance.
     """
 
+    per_step: ClassVar[bool] = True
     of: PlatformName
     norm: Literal["l1", "l2"] = "l2"
 

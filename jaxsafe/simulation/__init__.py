@@ -9,6 +9,7 @@ from jaxsafe.simulation.controllers import (
     Continuous,
     Controller,
     Discrete,
+    Mixed,
     Uncontrolled,
 )
 from jaxsafe.simulation.cwh import (
@@ -102,6 +103,7 @@ __all__ = [
     "LaggedDubins2DState",
     "LaggedDubins3D",
     "LaggedDubins3DState",
+    "Mixed",
     "Normal",
     "Offset",
     "OrientedSpacecraft",

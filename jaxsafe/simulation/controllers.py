@@ -8,7 +8,7 @@ order in which the actuators are listed.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -31,14 +31,22 @@ RateLimit = Annotated[
 Controls = Mapping[str, Float[Array, ""]]
 """Controls in physical units, by name."""
 
+MAX_TANH = 0.999
+"""Largest tanh of an action that stands for a given control.
+
+The action of a limit itself would be infinite, and no policy could learn from it.
+"""
+
 
 class Actuator(Component):
     """One named input of a platform and its limits, in physical units.
 
     Continuous actions in [−1, 1] are clipped and mapped affinely to [low, high]. With
+    `post_activation: tanh` actions may be any numbers, and their hyperbolic tangent is mapped. With
     `zero_centred` the map is piecewise linear, so that 0 stays 0. Without `rescale` actions are
     physical already and are only clipped. Discrete actions choose one of `points` values, spaced
-    equally from low to high, both included.
+    equally from low to high, both included. `discrete` says that the controller `mixed` takes
+    discrete actions here.
 
     An actuator acts at once, unless it has a `time_constant` τ of a first-order lag or a
     `rate_limit` R. Then its value x follows the control u by ẋ = (u − x)/τ, no faster than R, and
@@ -52,6 +60,8 @@ class Actuator(Component):
     points: Annotated[int, Range(2, largest=2**16)] = 11
     rescale: bool = True
     zero_centred: bool = False
+    post_activation: Literal["clip", "tanh"] = "clip"
+    discrete: bool = False
     time_constant: TimeConstant | None = None
     rate_limit: RateLimit | None = None
 
@@ -73,25 +83,44 @@ class Actuator(Component):
         return lag_within_rate(value, control, self.time_constant, self.rate_limit, dt)
 
     def problem(self) -> str | None:
+        if self.post_activation == "tanh" and not self.rescale:
+            return "post_activation: tanh gives shares of the limits, so leave rescale on"
         return (
             None
             if self.low <= self.high
             else f"expected low ≤ high, found {self.low:g} and {self.high:g}"
         )
 
+    @property
+    def action_range(self) -> tuple[Number, Number]:
+        """The lowest and the highest continuous action that makes a difference."""
+        if not self.rescale:
+            return self.low, self.high
+        return (-jnp.inf, jnp.inf) if self.post_activation == "tanh" else (-1.0, 1.0)
+
     def from_continuous(self, action: Float[Array, ""]) -> Float[Array, ""]:
         """Return the physical control of an action."""
         if not self.rescale:
             return jnp.clip(action, self.low, self.high)
-        share = jnp.clip(action, -1.0, 1.0)
+        share = jnp.tanh(action) if self.post_activation == "tanh" else jnp.clip(action, -1.0, 1.0)
         if self.zero_centred:
             return jnp.where(share < 0.0, -self.low * share, self.high * share)
         return self.low + (share + 1.0) * (self.high - self.low) / 2.0
 
     def to_continuous(self, control: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the action that gives a physical control within the limits."""
+        """Return the action that gives a physical control within the limits.
+
+        With tanh, a control at a limit has the action of one that is `MAX_TANH` of the way there.
+        """
         if not self.rescale:
             return control
+        share = self._share(control)
+        if self.post_activation == "tanh":
+            return jnp.arctanh(jnp.clip(share, -MAX_TANH, MAX_TANH))
+        return share
+
+    def _share(self, control: Float[Array, ""]) -> Float[Array, ""]:
+        """Return where in the limits a control is, from −1 to 1."""
         if self.zero_centred:
             bound = jnp.where(control < 0.0, -self.low, self.high)
             return control / jnp.where(bound > 0.0, bound, 1.0)
@@ -116,7 +145,10 @@ class Controller(Component):
 
     @property
     def points(self) -> tuple[int, ...]:
-        """Number of choices of each actuator. It is empty if actions are continuous."""
+        """Number of choices of each actuator, 0 for one that takes continuous actions.
+
+        It is empty if all actions are continuous.
+        """
         return ()
 
     def control(self, action: Array, sim: Sim) -> Controls:
@@ -150,6 +182,15 @@ class AgentController(Controller):
 class Continuous(AgentController, type="continuous"):
     """Controller of an agent whose action has shape (actuators,), each a number in [−1, 1]."""
 
+    def problem(self) -> str | None:
+        discrete = [actuator.name for actuator in self.actuators if actuator.discrete]
+        return (
+            f"expected continuous actuators, found {discrete[0]!r} with discrete: true;"
+            " choose type mixed"
+            if discrete
+            else None
+        )
+
     def control(self, action: Float[Array, " actuators"], sim: Sim) -> Controls:
         return {
             actuator.name: actuator.from_continuous(action[i])
@@ -178,5 +219,30 @@ class Discrete(AgentController, type="discrete"):
     def control(self, action: Array, sim: Sim) -> Controls:
         return {
             actuator.name: actuator.from_discrete(action[i])
+            for i, actuator in enumerate(self.actuators)
+        }
+
+
+class Mixed(Continuous, type="mixed"):
+    """Controller of an agent with continuous and discrete actions, as each actuator says itself.
+
+    The action has shape (actuators,) and is a vector of floats. An actuator with `discrete: true`
+    takes the index of a point, which is rounded to a whole number and clipped to 0 … points − 1.
+    The others take numbers as they do in the controller `continuous`.
+    """
+
+    def problem(self) -> str | None:
+        return None
+
+    @property
+    def points(self) -> tuple[int, ...]:
+        points = tuple(actuator.points if actuator.discrete else 0 for actuator in self.actuators)
+        return points if any(points) else ()
+
+    def control(self, action: Float[Array, " actuators"], sim: Sim) -> Controls:
+        return {
+            actuator.name: actuator.from_discrete(jnp.round(action[i]))
+            if actuator.discrete
+            else actuator.from_continuous(action[i])
             for i, actuator in enumerate(self.actuators)
         }

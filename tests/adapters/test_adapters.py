@@ -1,4 +1,5 @@
 import importlib
+import math
 import sys
 
 import pytest
@@ -61,3 +62,11 @@ def test_actions_are_bounded_by_the_actuators_that_do_not_rescale() -> None:
         randomize={f"{THRUST_X}.low": [-4.0, -2.0], f"{THRUST_X}.high": [0.25, 2.0]},
     )
     assert action_bounds(drawn) == ([-4.0, -1.0], [2.0, 1.0])
+
+
+def test_an_action_without_bounds_and_an_index_have_bounds_of_their_own() -> None:
+    thrust_y = "deputy.controller.actuators.thrust_y"
+    env = make("docking2d", {f"{THRUST_X}.post_activation": "tanh"})
+    assert action_bounds(env) == ([-math.inf, -1.0], [math.inf, 1.0])
+    mixed = make("docking2d", {**PHYSICAL, f"{thrust_y}.discrete": True}, actions="mixed")
+    assert action_bounds(mixed) == ([-3.0, 0.0], [0.5, 10.0])

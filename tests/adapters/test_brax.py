@@ -164,6 +164,10 @@ def test_a_return_has_a_gradient(brax: Any) -> None:
     assert np.abs(gradient).min() > 0.0
 
 
+def test_the_time_of_a_step_is_that_between_two_actions(brax: Any) -> None:
+    assert brax.BraxEnv("docking2d", {"dt": 0.5, "decision_period": 4}).dt == 2.0
+
+
 def test_mistakes_are_named(brax: Any) -> None:
     with pytest.raises(ConfigError, match="actions: Brax's agents need continuous actions"):
         brax.BraxEnv("docking2d", actions="discrete")
@@ -173,6 +177,11 @@ def test_mistakes_are_named(brax: Any) -> None:
         match=r"actuator acceleration: Brax's agents act in \[-1, 1\], found \[-96.5, 96.5\]",
     ):
         brax.BraxEnv("rejoin2d", physical)
+    tanh = {"deputy.controller.actuators.thrust_x.post_activation": "tanh"}
+    with pytest.raises(
+        ConfigError, match=r"found \[-inf, inf\]; leave rescale on and post_activation: clip"
+    ):
+        brax.BraxEnv("docking2d", tanh)
     with pytest.raises(ConfigError, match="action_repeat: expected a whole number ≥ 1, found 0"):
         brax.wrap(brax.BraxEnv("docking2d"), action_repeat=0)
     with pytest.raises(ConfigError, match="randomization_fn: give BraxEnv randomize="):

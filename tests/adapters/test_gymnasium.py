@@ -405,6 +405,43 @@ def test_the_whole_action_space_and_no_more_reaches_the_actuators() -> None:
     assert np.array_equal(env.step(2.0 * bound)[-1]["control_actual"], bound)
 
 
+MIXED = {"deputy.controller.actuators.thrust_y.discrete": True}
+
+
+def test_a_mixed_action_is_a_dict_by_actuator_or_one_vector() -> None:
+    env = GymEnv("docking2d", MIXED, actions="mixed")
+    box = gym.spaces.Box(-1.0, 1.0, ())
+    assert env.action_space == gym.spaces.Dict(
+        {"thrust_x": box, "thrust_y": gym.spaces.Discrete(11)}
+    )
+    assert env.action_space == SafetyEnv("docking2d", overrides=MIXED, actions="mixed").action_space
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    assert env.observation_space.contains(env.step(env.action_space.sample())[0])
+    control = env.step({"thrust_y": 10, "thrust_x": np.float32(0.5)})[-1]["control_actual"]
+    assert control.tolist() == [0.5, 1.0]
+    assert env.step([0.5, 10.0])[-1]["control_actual"].tolist() == [0.5, 1.0]
+    with pytest.raises(ConfigError, match="action: expected thrust_x, thrust_y, found thrust_x"):
+        env.step({"thrust_x": 0.0})
+
+    batch = GymVectorEnv("docking2d", 2, MIXED, actions="mixed")
+    batch.reset(seed=0)
+    sample = batch.action_space.sample()
+    assert sample["thrust_y"].shape == (2,)
+    batch.step(sample)
+    actions = {"thrust_x": np.array([0.5, -0.5]), "thrust_y": np.array([0, 10])}
+    controls = batch.step(actions)[-1]["control_actual"]
+    assert controls.tolist() == [[0.5, -1.0], [-0.5, 1.0]]
+    with pytest.raises(ConfigError, match=r"action: expected one shape of all elements"):
+        batch.step({"thrust_x": np.zeros(2), "thrust_y": 3})
+
+
+def test_a_limit_of_steps_counts_actions() -> None:
+    env = GymEnv("docking2d", {"decision_period": 4}, max_episode_steps=2)
+    env.reset(seed=0)
+    assert [env.step([0.0, 0.0])[3] for _ in range(2)] == [False, True]
+
+
 def test_a_window_shows_every_step_and_the_picture_that_an_array_has(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

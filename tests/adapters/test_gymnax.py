@@ -140,6 +140,24 @@ def test_the_action_space_is_the_actuators(make: Any) -> None:
     assert env.action_space(wide).high.tolist() == [2.0, 1.0]
 
 
+def test_a_mixed_action_is_a_dict_by_actuator_or_one_vector(make: Any) -> None:
+    env = make(
+        "docking2d", {"deputy.controller.actuators.thrust_y.discrete": True}, actions="mixed"
+    )
+    action = env.action_space(env.default_params).sample(jax.random.key(0))
+    assert action["thrust_x"].shape == action["thrust_y"].shape == ()
+    assert env.num_actions == 2
+    _, state = env.reset(jax.random.key(0))
+    step = jax.vmap(env.step, in_axes=(None, None, 0))
+    by_name = {"thrust_x": jnp.array([0.5, -0.5]), "thrust_y": jnp.array([0, 10])}
+    vector = jnp.array([[0.5, 0.0], [-0.5, 10.0]])
+    for action in (by_name, vector):
+        _, after, *_ = step(jax.random.key(0), state, action)
+        np.testing.assert_allclose(
+            after.sim.platforms["deputy"].delta_v * 12.0, [[0.5, -1.0], [-0.5, 1.0]], rtol=1e-5
+        )
+
+
 MODES = CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING
 
 

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from test_modes import CHECKED_WHILE_RUNNING, CHECKED_WHILE_TRACING
 
+from jaxsafe import ConfigError
+
 pytestmark = [pytest.mark.peer, pytest.mark.filterwarnings("default")]
 
 
@@ -129,3 +131,13 @@ def test_it_works_in_every_mode_of_jax(make: Any, mode: str) -> None:
             observation, _, done, _ = env.step(np.zeros((3, 2), np.float32))
             assert np.isfinite(observation).all()
             assert done.all() == (step == 1)
+
+
+def test_actions_that_the_library_does_not_know_are_refused(make: Any) -> None:
+    thrust_x = "deputy.controller.actuators.thrust_x"
+    with pytest.raises(ConfigError, match=r"^actions: Stable-Baselines3 knows no mixed actions"):
+        make("docking2d", 1, {f"{thrust_x}.discrete": True}, actions="mixed")
+    with pytest.raises(
+        ConfigError, match=r"^actuator thrust_x: Stable-Baselines3 needs actions with"
+    ):
+        make("docking2d", 1, {f"{thrust_x}.post_activation": "tanh"})

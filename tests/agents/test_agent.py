@@ -5,11 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.special
 import scipy.stats
 
 import jaxsafe
-from jaxsafe.agents.agent import Agent
-from jaxsafe.agents.distributions import Categorical, Gaussian
+from jaxsafe.agents.agent import Agent, num_outputs
+from jaxsafe.agents.distributions import Categorical, Gaussian, Joint
 from jaxsafe.agents.features import DockingFeatures
 from jaxsafe.schema.component import normalise
 
@@ -61,6 +62,50 @@ def test_categorical_samples_have_the_stated_frequencies() -> None:
         np.asarray(Categorical(logits=logits, points=(3,)).sample(KEY))[:, 0], minlength=3
     )
     assert scipy.stats.chisquare(counts, 6000 * np.array([0.2, 0.3, 0.5])).pvalue > 0.001
+
+
+def test_a_joint_distribution_is_the_product_of_its_parts() -> None:
+    normal = Gaussian(mean=jax.random.normal(KEY, (6, 2)), log_std=jnp.array([-0.7, 0.4]))
+    logits = jax.random.normal(jax.random.key(1), (6, 5))
+    policy = Joint(
+        normal=normal, choices=Categorical(logits=logits, points=(2, 3)), points=(2, 0, 3, 0)
+    )
+    action = np.asarray(policy.sample(jax.random.key(2)))
+    assert action.shape == (6, 4)
+    first, second = (scipy.special.softmax(part, axis=1) for part in (logits[:, :2], logits[:, 2:]))
+    chosen = action[:, [0, 2]].astype(int)
+    np.testing.assert_array_equal(action[:, [0, 2]], chosen)
+    reference = scipy.stats.norm(np.asarray(normal.mean), np.exp(np.asarray(normal.log_std)))
+    rows = np.arange(6)
+    choices = np.log(first[rows, chosen[:, 0]] * second[rows, chosen[:, 1]])
+    expected = reference.logpdf(action[:, [1, 3]]).sum(-1) + choices
+    np.testing.assert_allclose(policy.log_prob(action), expected, rtol=1e-5)
+    entropy = np.broadcast_to(reference.entropy(), (6, 2)).sum(-1)
+    entropy = entropy + sum(scipy.stats.entropy(part, axis=1) for part in (first, second))
+    np.testing.assert_allclose(policy.entropy(), entropy, rtol=1e-5)
+    np.testing.assert_array_equal(policy.mode()[:, 1], normal.mean[:, 0])
+    np.testing.assert_array_equal(policy.mode()[:, 2], jnp.argmax(logits[:, 2:], axis=1))
+
+
+def test_outputs_of_a_mixed_actor_belong_to_the_actuators_in_their_order() -> None:
+    thrust_y = "deputy.controller.actuators.thrust_y"
+    env = jaxsafe.make(
+        "docking2d", {f"{thrust_y}.discrete": True, f"{thrust_y}.points": 3}, actions="mixed"
+    )
+    assert num_outputs(env) == 4
+    agent = normalise(Agent(log_std=-1.2, prior_std=0.3))
+    params = jax.eval_shape(lambda: agent.init(KEY, env))
+    assert params["log_std"].shape == (2,)
+    first = agent._first_log_std(env)
+    np.testing.assert_allclose(first, [-1.2, np.log(0.3)], rtol=1e-6)
+    out = jnp.array([0.5, 1.0, 2.0, 4.0])
+    policy = agent._head(env, {"log_std": first}, out)
+    assert isinstance(policy, Joint)
+    np.testing.assert_array_equal(policy.normal.mean, [0.5])
+    # The sharpness is 1 at the start, and a prior makes the middle likely.
+    np.testing.assert_allclose(
+        policy.choices.logits, [1.0 - 0.5 / 0.09, 2.0, 4.0 - 0.5 / 0.09], rtol=1e-5
+    )
 
 
 @pytest.mark.thorough

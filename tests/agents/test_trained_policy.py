@@ -68,3 +68,20 @@ def test_a_policy_that_remembers_is_described_and_checked_too(tmp_path: Path) ->
     assert memory.shape == (5, 3)
     with pytest.raises(ConfigError, match="observation: expected 6 numbers"):
         policy.act(jax.random.key(0), jnp.zeros(5), policy.memory)
+
+
+def test_a_policy_of_mixed_actions_comes_back_from_its_file(tmp_path: Path) -> None:
+    env = jaxsafe.make(
+        "docking2d", {"deputy.controller.actuators.thrust_y.discrete": True}, actions="mixed"
+    )
+    agent = Agent(log_std=1.0)
+    params = agent.init(jax.random.key(0), env)
+    save_policy(tmp_path / "mixed.npz", env, agent, params, {"env": "docking2d"})
+    policy = jaxsafe.load_policy(tmp_path / "mixed.npz", deterministic=False)
+    line = "2 numbers and indices: thrust_x from -1 to 1 N; thrust_y, 11 points from -1 to 1 N"
+    assert line in repr(policy)
+    assert policy.env.num_action_points == (0, 11)
+    action = np.asarray(policy(jax.random.key(1), jnp.zeros((200, 6))))
+    assert np.abs(action[:, 0]).max() == 1.0
+    assert set(action[:, 1]) <= set(range(11))
+    assert len(set(action[:, 1])) > 3

@@ -94,6 +94,62 @@ def test_discrete_policies_choose_alike() -> None:
     np.testing.assert_allclose(computed, distribution.logits, rtol=1e-4, atol=1e-3)  # type: ignore[union-attr]
 
 
+def mixed() -> SavedPolicy:
+    """Return a policy of docking2d that chooses one thrust and gives the other as a number."""
+    policy = saved("docking2d")
+    thrust_y = "deputy.controller.actuators.thrust_y"
+    env = jaxsafe.make(
+        "docking2d", {f"{thrust_y}.discrete": True, f"{thrust_y}.points": 5}, actions="mixed"
+    )
+    params = policy.agent.init(jax.random.key(0), env)
+    params = {
+        "actor": jax.tree.map(lambda x: 30.0 * x, params["actor"]),
+        "log_std": jnp.array([-1.5, -2.0]),
+    }
+    return policy._replace(env=env, params=params)
+
+
+@pytest.mark.thorough
+def test_mixed_policies_choose_alike() -> None:
+    policy = mixed()
+    observations = np.random.default_rng(0).uniform(-1, 1, (500, 6)).astype(np.float32)
+    expected = unclipped(policy, observations)
+    computed = run(to_onnx(functions.action(policy).function, observations.shape), observations)
+    np.testing.assert_allclose(computed[:, 0], expected[:, 0], atol=1e-4)
+    assert np.mean(computed[:, 1] == expected[:, 1]) > 0.99
+    assert len(np.unique(computed[:, 1])) >= 2
+    network = functions.network(policy)
+    assert network.outputs == ("thrust_x", *(f"logit_{i}" for i in range(5)))
+    inputs = np.asarray(policy.agent.inputs(policy.env, jnp.asarray(observations)))
+    outputs = run(to_onnx(network.function, inputs.shape), inputs)
+    np.testing.assert_allclose(outputs[:, 0], expected[:, 0], atol=1e-4)
+    assert np.mean(outputs[:, 1:].argmax(axis=1) == expected[:, 1]) > 0.99
+
+
+@pytest.mark.thorough
+def test_a_held_action_is_exported_as_its_steps() -> None:
+    policy = mixed()
+    held = policy._replace(env=jaxsafe.override(policy.env, {"decision_period": 3}))
+    start = np.array([[80.0, 30.0, -0.1, 0.05]], np.float32)
+    loops = [
+        np.asarray(functions.closed_loop(one, steps).function(start))[0]
+        for one, steps in ((policy, 3), (held, 1))
+    ]
+    assert len(loops[1]) == 2
+    state, timestep = jaxsafe.reset_to(
+        held.env, {"deputy": {"position": start[0, :2], "velocity": start[0, 2:]}}
+    )
+    act: Any = held.agent.policy(held.env, held.params, True)
+    _, timestep = jaxsafe.step(held.env, state, act(jax.random.key(0), timestep.observation))
+    np.testing.assert_allclose(loops[1][1], timestep.info.margins["velocity_limit"], atol=1e-5)
+    for exported in (
+        functions.control(held),
+        functions.closed_loop(held, 2, unrolled=True),
+    ):
+        model = to_onnx(exported.function, start.shape)
+        np.testing.assert_allclose(run(model, start), exported.function(start), atol=1e-4)
+
+
 def test_the_state_goes_in_and_the_control_comes_out() -> None:
     policy = saved("docking2d")
     exported = functions.control(policy)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import jaxsafe
 from jaxsafe.schema.component import normalise
-from jaxsafe.simulation.controllers import Actuator, Continuous, Discrete, Uncontrolled
+from jaxsafe.simulation.controllers import Actuator, Continuous, Discrete, Mixed, Uncontrolled
 from jaxsafe.types import Sim
 
 SIM = Sim(jnp.zeros(()), {}, {}, {}, {}, jnp.zeros((), bool))
@@ -44,6 +44,35 @@ def test_without_rescaling_an_action_is_physical_and_only_clipped(
     action: float, control: float
 ) -> None:
     assert actuator(rescale=False).from_continuous(jnp.float32(action)) == control
+
+
+def test_tanh_brings_any_action_within_the_limits() -> None:
+    thrust = actuator(post_activation="tanh")
+    controls = [float(thrust.from_continuous(jnp.float32(a))) for a in (-30.0, 0.0, 0.5, 30.0)]
+    np.testing.assert_allclose(controls, [-1.0, 0.5, 0.5 + 1.5 * np.tanh(0.5), 2.0], rtol=1e-6)
+    centred = actuator(post_activation="tanh", zero_centred=True)
+    assert centred.from_continuous(jnp.float32(0.0)) == 0.0
+    assert jax.grad(thrust.from_continuous)(0.0) == 1.5
+    assert thrust.action_range == (-np.inf, np.inf)
+
+
+@pytest.mark.parametrize("zero_centred", [False, True])
+def test_tanh_leads_back_to_an_action_that_gives_the_control(zero_centred: bool) -> None:
+    thrust = actuator(post_activation="tanh", zero_centred=zero_centred)
+    controls = jnp.linspace(-0.95, 1.9, 7)
+    actions = jax.vmap(thrust.to_continuous)(controls)
+    np.testing.assert_allclose(jax.vmap(thrust.from_continuous)(actions), controls, atol=1e-5)
+    # The action of a limit is finite, and gives a control that is nearly there.
+    actions = jax.vmap(thrust.to_continuous)(jnp.array([-1.0, 2.0]))
+    assert jnp.isfinite(actions).all()
+    ends = jax.vmap(thrust.from_continuous)(actions)
+    np.testing.assert_allclose(ends, [-1.0, 2.0], atol=0.003)
+
+
+def test_tanh_needs_rescaling() -> None:
+    assert actuator(post_activation="tanh", rescale=False).problem() == (
+        "post_activation: tanh gives shares of the limits, so leave rescale on"
+    )
 
 
 @settings(deadline=None, max_examples=50)
@@ -119,6 +148,38 @@ def test_actions_are_positional_and_controls_are_named() -> None:
     assert discrete.points == (3, 5)
     assert continuous.takes_actions
     assert discrete.takes_actions
+
+
+BOTH_KINDS = (
+    Actuator(name="a", low=-10.0, high=10.0),
+    Actuator(name="b", low=0.0, high=1.0, points=3, discrete=True),
+)
+
+
+def test_a_mixed_action_has_numbers_and_indices_in_one_vector() -> None:
+    mixed = normalise(Mixed(actuators=BOTH_KINDS))
+    assert mixed.points == (0, 3)
+    assert mixed.control(jnp.asarray([0.5, 1.0]), SIM) == {"a": 5.0, "b": 0.5}
+    # Indices are rounded, then clipped.
+    for index, control in ((0.4, 0.0), (0.6, 0.5), (-7.0, 0.0), (9.0, 1.0)):
+        assert mixed.control(jnp.asarray([0.0, index]), SIM)["b"] == control
+    assert jnp.isnan(mixed.control(jnp.asarray([0.0, jnp.nan]), SIM)["b"])
+
+
+def test_a_controller_says_which_actuators_it_cannot_have() -> None:
+    assert Mixed(actuators=BOTH_KINDS).problem() is None
+    assert Discrete(actuators=BOTH_KINDS).problem() is None
+    assert Continuous(actuators=BOTH_KINDS[:1]).problem() is None
+    assert Continuous(actuators=BOTH_KINDS).problem() == (
+        "expected continuous actuators, found 'b' with discrete: true; choose type mixed"
+    )
+
+
+def test_a_mixed_controller_with_actuators_of_one_kind_has_actions_of_that_kind() -> None:
+    numbers, indices = (normalise(Mixed(actuators=(one,))) for one in BOTH_KINDS)
+    assert (numbers.points, indices.points) == ((), (3,))
+    assert numbers.control(jnp.asarray([0.5]), SIM) == {"a": 5.0}
+    assert indices.control(jnp.asarray([1]), SIM) == {"b": 0.5}
 
 
 def test_an_uncontrolled_platform_has_no_controls_and_takes_no_actions() -> None:

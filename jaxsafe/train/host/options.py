@@ -95,7 +95,7 @@ class TrainConfig(Component):
     """
     steps: Steps = 500_000
     """Number of environment steps of each seed."""
-    actions: Literal["continuous", "discrete"] | None = None
+    actions: Literal["continuous", "discrete", "mixed"] | None = None
     """The kind of actions. By default it is what the environment says."""
     variant: Literal["paper", "released"] | None = None
     """The variant of the environment. By default it is `paper`."""
