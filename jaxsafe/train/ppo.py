@@ -20,6 +20,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jax.core import Tracer
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
@@ -28,10 +29,11 @@ from jaxsafe.agents.networks import Memory, Params, unroll
 from jaxsafe.autoreset import choose
 from jaxsafe.devices.backend import accelerated, packing, scan_packed
 from jaxsafe.devices.shard import WHOLE, Shard
-from jaxsafe.environment import Environment
+from jaxsafe.environment import Environment, longest_episode
 from jaxsafe.metrics import Episode, accumulate, begin
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 from jaxsafe.schema.component import Component, Range
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.recent_episodes import Window, empty_window, latest_cost, push
 from jaxsafe.train.shuffle import shuffle
 from jaxsafe.types import Dimensionless, Key, Positive, Record, State, TimeStep
@@ -85,6 +87,13 @@ class PPO(Component):
     """Number of steps of each environment between two updates."""
     max_episode_steps: Annotated[Dimensionless, Range(1.0)] = 1e6
     """Number of steps after which episodes of training are truncated."""
+    complete_episodes: bool = False
+    """Whether to learn from whole episodes only, as in the paper's docking training.
+
+    Every update then starts all environments afresh. An episode counts if it would have ended
+    within `num_steps` however long it had lasted, so `num_steps` must be at least the longest one.
+    What follows it in its environment is not learnt from.
+    """
     num_epochs: Annotated[int, Range(1, largest=10_000)] = 10
     """Number of times that an update goes through its samples."""
     num_minibatches: Annotated[int, Range(1, largest=MAX_COUNT)] = 2
@@ -196,6 +205,8 @@ class Batch(NamedTuple):
     value_target: Array
     cost_target: Any = ()
     """(1 − γ) times the discounted cost to come, if there is a critic of it."""
+    weight: Any = ()
+    """The weight of each sample, with `complete_episodes`. The mean over the whole batch is 1."""
     sequences: Sequences | None = None
     """What recurrent networks need to know of sequences. Samples are sequences then, [n, t, …]."""
 
@@ -272,16 +283,22 @@ def update(
         The state after the update, and the diagnostics of the update.
     """
     key_collect, key_learn = jax.random.split(jax.random.fold_in(state.key, state.num_updates))
+    if ppo.complete_episodes:
+        key_start, key_collect = jax.random.split(key_collect)
+        state = _start_afresh(env, agent, ppo, state, key_start, shard)
     memory = state.memory
     state, transitions = collect(env, agent, ppo, state, key_collect, shard)
     progress = state.num_updates / total_updates
     gamma = discount(ppo, progress)
     step_size = learning_rate(ppo, progress)
-    state, batch, explained = _to_batch(agent, ppo, gamma, state, transitions, memory, shard)
+    counts = _counts(env, ppo, transitions) if ppo.complete_episodes else None
+    state, batch, explained = _to_batch(
+        agent, ppo, gamma, state, transitions, memory, counts, shard
+    )
     params, optimizer, losses = learn(env, agent, ppo, step_size, state, batch, key_learn, shard)
     params = {**params, "log_std": params["log_std"] - ppo.noise_decay / total_updates}
-    episode, done = shard.join((transitions.episode, transitions.done), axis=1)
-    window = push(state.window, episode, done)
+    episode, done, counts = shard.join((transitions.episode, transitions.done, counts), axis=1)
+    window = push(state.window, episode, done, counts)
     multiplier = dual_ascent(ppo, state.multiplier, window, done) if agent.cost_critic else ()
     share = 1.0 / jnp.maximum(ppo.averaging * total_updates, 1.0)
     average = jax.tree.map(
@@ -306,6 +323,60 @@ def update(
     return state, {name: jnp.asarray(value, dtype) for name, value in diagnostics.items()}
 
 
+def check_complete_episodes(env: Environment, ppo: PPO) -> None:
+    """Check that `num_steps` are enough for a whole episode, where only such episodes are used.
+
+    Raises:
+        ConfigError: they are not, or the episodes have no longest length.
+    """
+    if not ppo.complete_episodes:
+        return
+    longest = _longest(env, ppo)
+    if isinstance(longest, Tracer) or longest <= ppo.num_steps:
+        return
+    if longest_episode(env) is None and longest == PPO.max_episode_steps:
+        raise ConfigError(
+            "ppo.complete_episodes: the task has no time limit, so an episode may never end;"
+            " give ppo.max_episode_steps"
+        )
+    raise ConfigError(
+        f"ppo.num_steps: expected at least {int(longest):,}, the longest episode, with"
+        f" ppo.complete_episodes, found {ppo.num_steps:,}"
+    )
+
+
+def _longest(env: Environment, ppo: PPO) -> Array:
+    """Return the number of steps after which every episode of the training has ended."""
+    limit = longest_episode(env)
+    most = jnp.asarray(ppo.max_episode_steps)
+    return most if limit is None else jnp.minimum(limit, most)
+
+
+def _start_afresh(
+    env: Environment, agent: Agent, ppo: PPO, state: TrainState, key: Key, shard: Shard
+) -> TrainState:
+    """Return the state with a fresh start in every environment."""
+    env_state, timestep = reset_batch(env, key, ppo.num_envs, shard)
+    return state.replace(
+        env_state=env_state,
+        observation=timestep.observation,
+        episode=begin(timestep),
+        memory=_fresh_memory(agent, timestep.observation.shape[0]),
+    )
+
+
+def _counts(env: Environment, ppo: PPO, transitions: Transition) -> Bool[Array, "t n"]:
+    """Return which steps are part of an episode that counts.
+
+    Whether an episode counts follows from its first step alone. If short episodes counted because
+    they ended in time, the policy would learn to end its episodes.
+    """
+    steps = jnp.arange(ppo.num_steps)[:, None]
+    first = steps + 1 - transitions.episode.length
+    longest = _longest(env, ppo)
+    return first.astype(longest.dtype) + longest <= ppo.num_steps
+
+
 def no_diagnostics(agent: Agent) -> Diagnostics:
     """Return the diagnostics of an update that does not take place. All are NaN."""
     names = [name for name in DIAGNOSTICS if name != "cost_value_loss" or agent.cost_critic]
@@ -322,12 +393,24 @@ def action_std(params: Params) -> Array:
     return jnp.mean(jnp.exp(params["log_std"]))
 
 
-def explained_variance(target: Array, value: Array) -> Array:
+def explained_variance(target: Array, value: Array, weight: Array | tuple = ()) -> Array:
     """Return the share of the targets' variance that the values explain.
 
-    It is 1 for a perfect critic and 0 for one that says the same of all states.
+    It is 1 for a perfect critic and 0 for one that says the same of all states. Samples may have
+    weights, whose mean is 1.
     """
-    return 1.0 - jnp.var(target - value) / jnp.var(target)
+    return 1.0 - _variance(target - value, weight) / _variance(target, weight)
+
+
+def _mean(values: Array, weight: Array | tuple) -> Array:
+    """Return the mean of samples. They may have weights, whose mean over the whole batch is 1."""
+    return jnp.mean(values if isinstance(weight, tuple) else weight * values)
+
+
+def _variance(values: Array, weight: Array | tuple) -> Array:
+    if isinstance(weight, tuple):
+        return jnp.var(values)
+    return _mean((values - _mean(values, weight)) ** 2, weight)
 
 
 def diverged(state: TrainState) -> Bool[Array, ""]:
@@ -561,9 +644,10 @@ def loss(
 ) -> tuple[Array, Diagnostics]:
     """Return the clipped surrogate loss + value error − entropy bonus, averaged over the batch.
 
-    The second value has the terms of the loss, and how far the policy is from the one that
-    collected the batch.
+    Samples count by their weights, if they have any. The second value has the terms of the loss,
+    and how far the policy is from the one that collected the batch.
     """
+    mean = partial(_mean, weight=batch.weight)
     policy = agent.distribution(env, params, batch.inputs, batch.sequences)
     log_ratio = policy.log_prob(batch.action) - batch.log_prob
     bounded = jax.lax.stop_gradient(jnp.minimum(log_ratio, MAX_LOG_RATIO))
@@ -579,19 +663,19 @@ def loss(
     # Without the barrier XLA fuses the gradient otherwise, and the last bits of a training change.
     alone = jax.lax.optimization_barrier(jax.lax.stop_gradient(policy))
     terms = {
-        "policy_loss": -jnp.mean(surrogate),
-        "value_loss": jnp.mean(value_error),
-        "entropy": jnp.mean(alone.entropy()),
+        "policy_loss": -mean(surrogate),
+        "value_loss": mean(value_error),
+        "entropy": mean(alone.entropy()),
         # Never negative, and of less variance than the mean of −bounded (Schulman 2020).
-        "approx_kl": jnp.mean(ratio - 1.0 - bounded),
-        "clip_fraction": jnp.mean(outside.astype(ratio.dtype)),
+        "approx_kl": mean(ratio - 1.0 - bounded),
+        "clip_fraction": mean(outside.astype(ratio.dtype)),
     }
     if agent.cost_critic:
         rate = agent.critic_output("cost_critic", params, seen, batch.sequences)
         cost_error = 0.5 * (rate - batch.cost_target) ** 2
-        terms["cost_value_loss"] = jnp.mean(cost_error)
+        terms["cost_value_loss"] = mean(cost_error)
         value_error += cost_error
-    total = jnp.mean(
+    total = mean(
         -surrogate + ppo.value_coefficient * value_error - ppo.entropy_coefficient * entropy
     )
     return total, terms
@@ -604,6 +688,7 @@ def _to_batch(
     state: TrainState,
     transitions: Transition,
     memory: Mapping[str, Memory],
+    counts: Bool[Array, "t n"] | None,
     shard: Shard = WHOLE,
 ) -> tuple[TrainState, Batch, Array]:
     """Return the samples to learn from, with advantages and targets of the critics.
@@ -617,6 +702,7 @@ def _to_batch(
         state: the state after the transitions.
         transitions: the transitions.
         memory: what the networks remembered before the transitions.
+        counts: which transitions count. None stands for all.
         shard: the part of the environments that this device has.
 
     Returns:
@@ -640,11 +726,19 @@ def _to_batch(
         cost_target = cost_advantage + rate
         advantage -= state.multiplier * cost_advantage / (1.0 - gamma)
     part = Batch(t.inputs, t.totals, t.action, t.log_prob, advantage, target, cost_target)
+    if counts is not None:
+        part = part._replace(weight=counts.astype(value.dtype))
     done = t.done if agent.recurrent else ()
     batch, value, done = shard.join((part, value, done), axis=1)
-    explained = explained_variance(batch.value_target, value)
-    advantage = (batch.advantage - batch.advantage.mean()) / (batch.advantage.std() + 1e-8)
-    batch = batch._replace(advantage=advantage)
+    if counts is not None:
+        share = jnp.maximum(jnp.mean(batch.weight), 1e-8)
+        batch = batch._replace(weight=batch.weight / share)
+    explained = explained_variance(batch.value_target, value, batch.weight)
+    mean, std = batch.advantage.mean(), batch.advantage.std()
+    if counts is not None:
+        mean = _mean(batch.advantage, batch.weight)
+        std = jnp.sqrt(_variance(batch.advantage, batch.weight))
+    batch = batch._replace(advantage=(batch.advantage - mean) / (std + 1e-8))
     state = state.replace(memory=after)
     if not agent.recurrent:
         batch = jax.tree.map(lambda x: x.reshape(ppo.batch_size, *x.shape[2:]), batch)

@@ -43,7 +43,12 @@ def empty_window(like: Episode) -> Window:
     return Window(episodes, none, none, none)
 
 
-def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
+def push(
+    window: Window,
+    episodes: Episode,
+    done: Bool[Array, "t n"],
+    counts: Bool[Array, "t n"] | None = None,
+) -> Window:
     """Add the episodes that ended to the window, in order of time.
 
     Args:
@@ -51,8 +56,11 @@ def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
         episodes: sums of the episodes after each step, each field [num_steps, num_envs].
         done: whether the episode ended with the step. Episodes that have not ended by the last step
             still run.
+        counts: which steps are part of an episode that counts. The others are left out of the
+            window and of the number of episodes, and what they cost is added up. Episodes do not go
+            on after the last step then. None stands for all.
     """
-    finished = done.ravel()
+    finished = (done if counts is None else done & counts).ravel()
     order = jnp.cumsum(finished, dtype=jnp.int32) - 1
     latest = finished & (order >= order[-1] + 1 - SIZE)
     slot = jnp.where(latest, (window.count + order) % SIZE, SIZE)  # SIZE is out of range: dropped
@@ -63,6 +71,9 @@ def push(window: Window, episodes: Episode, done: Bool[Array, "t n"]) -> Window:
     )
     cost = jnp.sum(jnp.where(done, episodes.violating_steps, 0), dtype=jnp.int32)
     running_cost = jnp.sum(jnp.where(done[-1], 0, episodes.violating_steps[-1]), dtype=jnp.int32)
+    if counts is not None:
+        cost = cost + running_cost
+        running_cost = jnp.zeros_like(running_cost)
     return Window(ring, window.count + order[-1] + 1, window.cost + cost, running_cost)
 
 

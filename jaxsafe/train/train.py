@@ -74,7 +74,11 @@ def train(
 
     Returns:
         The state and the curves. `state.average` holds the parameters for `agent.policy`.
+
+    Raises:
+        ConfigError: an episode may be longer than the batch with `complete_episodes`.
     """
+    ppo.check_complete_episodes(env, hyperparameters)
     shared = (env, normalise(agent), normalise(hyperparameters))
     state = _begin(shared, key)
     if params is not None:

@@ -24,7 +24,7 @@ from jaxsafe.schema.errors import ConfigError, ConfigWarning, nearest, show
 from jaxsafe.schema.retype import set_paths
 from jaxsafe.train.host.sinks import LIBRARIES, library
 from jaxsafe.train.host.warm_start import agent_options
-from jaxsafe.train.ppo import MAX_COUNT, PPO
+from jaxsafe.train.ppo import MAX_COUNT, PPO, check_complete_episodes
 from jaxsafe.types import Dimensionless, Positive
 
 Count = Annotated[int, Range(1, largest=MAX_COUNT)]
@@ -272,6 +272,7 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         raise ConfigError(
             f"ppo.num_envs × ppo.num_steps: expected less than 2³¹, found {config.ppo.batch_size:,}"
         )
+    check_complete_episodes(env, config.ppo)
     if config.num_updates >= 2**31:
         raise ConfigError(
             f"steps: expected less than 2³¹ updates of {config.ppo.batch_size:,}, "
