@@ -36,7 +36,7 @@ class Options(CommandOptions):
     }
 
     env: Annotated[str, Option(first=True, examples=("env=docking2d",))] | None = None
-    """The task, or the file of an environment. It is left out only with resume."""
+    """The task, or the file of an environment. It is left out only with resume or with like."""
     sweep: Annotated[
         Mapping[str, Any],
         Option(

@@ -73,9 +73,9 @@ def carry(before: Environment, after: Environment, changed: Iterable[str]) -> En
             del ties[path]
         elif path in random or path in given or _differs(before, after, path):
             del ties[path]
-            what = "is random" if path in random else "changes"
+            what = "random" if path in random else "set apart"
             warnings.warn(
-                f"{path} {what} alone: it followed {tie.rule}, and does so no longer",
+                f"{path} is {what}: it followed {tie.rule}, and does so no longer",
                 ConfigWarning,
                 stacklevel=3,
             )

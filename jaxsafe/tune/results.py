@@ -49,7 +49,8 @@ def create(out: str | None, request: Mapping[str, Any], first: Setting) -> Path:
     Returns:
         The directory.
     """
-    path = run_directory.make(out, Path("runs"), f"tune_{Path(str(request['env'])).stem}")
+    source = request["env"] if "env" in request else request["like"]
+    path = run_directory.make(out, Path("runs"), f"tune_{Path(str(source)).stem}")
     whole = run_directory.described(first.config, first.env)
     write_text(
         path / "sweep.yaml",

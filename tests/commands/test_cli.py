@@ -727,7 +727,7 @@ def test_a_warning_is_one_line_and_the_command_goes_on(
     captured = capsys.readouterr()
     assert exit_info.value.code == 0
     assert captured.err.startswith(
-        "warning: reward.success.time_scale changes alone: it followed terminal.timeout.limit, and"
+        "warning: reward.success.time_scale is set apart: it followed terminal.timeout.limit, and"
     )
     assert captured.err.count("\n") == 1
     assert "time_scale: 50.0" in captured.out

@@ -72,7 +72,7 @@ def test_a_change_moves_the_numbers_that_follow(
 
 
 def test_a_number_that_is_changed_itself_follows_no_longer(env: Environment) -> None:
-    message = rf"^{SLOPE} changes alone: it followed 2 × {MOTION}, and does so no longer$"
+    message = rf"^{SLOPE} is set apart: it followed 2 × {MOTION}, and does so no longer$"
     with pytest.warns(ConfigWarning, match=message):
         changed = jaxsafe.override(env, {SLOPE: 0.01})
     assert SLOPE not in changed.tied

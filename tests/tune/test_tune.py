@@ -303,3 +303,10 @@ def test_an_interrupted_sweep_says_how_to_go_on(
         "stopped with 0 of 4 settings; go on with:"
         f" python -m jaxsafe.tune resume={tmp_path / 'sweep'}"
     )
+
+
+def test_the_settings_of_a_sweep_may_be_like_a_run(whole: Path) -> None:
+    arguments = Arguments({"like": str(whole), "ppo.num_envs": 8})
+    found = settings(arguments, {"ppo.gamma": [0.5, 0.75]}, None, 0)
+    assert [float(setting.config.ppo.gamma) for setting in found] == [0.5, 0.75]
+    assert {(setting.config.ppo.num_envs, setting.config.steps) for setting in found} == {(8, 1280)}
