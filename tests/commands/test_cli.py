@@ -74,7 +74,7 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
             ["env=doking3d"],
             "env: unknown task 'doking3d' and not a .yaml file; choose from rejoin2d, rejoin3d,"
             " docking2d, "
-            "docking3d, docking2d_oriented. Did you mean 'docking3d'?",
+            "docking3d, docking2d_oriented, docking1d. Did you mean 'docking3d'?",
         ),
         (["seeds=2"], "env: missing; for instance env=docking3d"),
         (["env="], "env: expected a name or a path, found None"),
