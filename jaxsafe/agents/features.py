@@ -217,11 +217,17 @@ def _elements(
         features: name of the features that need it, for the message.
 
     Raises:
-        ConfigError: the environment does not observe it.
+        ConfigError: the environment does not observe it, or observes it with an offset.
     """
     if name not in env.observation_names:
         raise ConfigError(
             f"agent.features: {features!r} needs an observation called {name!r}; choose none"
+        )
+    part = name.partition(".")[0]
+    if any(one.name == part and one.offset is not None for one in env.observation):
+        raise ConfigError(
+            f"agent.features: {features!r} needs the observation {part!r} without an offset;"
+            " choose none"
         )
     index = env.observation_names.index(name)
     return observation[..., index : index + 1]

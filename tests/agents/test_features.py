@@ -164,3 +164,10 @@ def test_features_of_another_task_are_refused(features: Features, task: str, mis
     message = f"agent.features: '{features.type_name}' needs an observation called '{missing}'"
     with pytest.raises(ConfigError, match=message):
         features(env, jnp.zeros(env.observation_size))
+
+
+def test_features_of_an_observation_with_an_offset_are_refused() -> None:
+    env = jaxsafe.make("docking2d", {"observation.position.offset": [50.0, 0.0]})
+    message = "agent.features: 'docking' needs the observation 'position' without an offset"
+    with pytest.raises(ConfigError, match=message):
+        Agent(features=DockingFeatures()).inputs(env, jnp.zeros(6))
