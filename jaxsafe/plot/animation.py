@@ -343,7 +343,7 @@ class Scene:
             look = FORBIDDEN if region.name in forbidden else GOAL
             entries.append(Patch(label=plain(region.name), **look))
             if not self._spatial:
-                patch = region_patch(region, False, region.name in forbidden)
+                patch = region_patch(region, False, region.name in forbidden, self._turned)
                 patch.set_animated(True)
                 self._regions[region.name] = self.map.add_patch(patch)
         radii = keep_away_distances(self.env)

@@ -128,7 +128,7 @@ def trajectories(
                 if spatial:
                     region_surface(panel, region, place, kept_out)
                     continue
-                patch = panel.add_patch(region_patch(region, view == (0, 2), kept_out))
+                patch = panel.add_patch(region_patch(region, view == (0, 2), kept_out, turned))
                 centre_patch(patch, place[axes])
                 patch.set_label(plain(region.name))
             for radius in keep_away:

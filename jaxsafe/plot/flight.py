@@ -122,7 +122,8 @@ def _draw_path(panel: Any, view: tuple[int, ...], env: Environment, states: Stat
         if spatial:
             region_surface(panel, region, place, region.name in forbidden)
             continue
-        patch = panel.add_patch(region_patch(region, False, region.name in forbidden))
+        turned = _heads(env, states) is not None
+        patch = panel.add_patch(region_patch(region, False, region.name in forbidden, turned))
         centre_patch(patch, place[axes])
         patch.set_label(plain(region.name))
     for radius in keep_away_distances(env):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import FixedLocator, MaxNLocator
 
 from jaxsafe.environment import control_unit as control_unit
@@ -20,10 +20,14 @@ from jaxsafe.processors.constraint import ConeConstraint, KeepIn, KeepOut, Separ
 from jaxsafe.processors.status import Distance
 from jaxsafe.schema.dotted_paths import references
 from jaxsafe.schema.errors import ConfigError, printable
+from jaxsafe.simulation.geometry import Box, Cone, HalfSpace
 from jaxsafe.storage.files import write_bytes
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
+
+FAR = 1e6
+"""How far a region without an end is drawn, in the unit of lengths. No map shows as much."""
 
 ZERO_WIDTH_SPACE = "\u200b"
 
@@ -142,17 +146,62 @@ def kept_out(env: Environment) -> set[str]:
     return watched([*forbidding, *failures]) - watched(goals)
 
 
-def region_patch(region: Any, from_the_side: bool, forbidden: bool = False) -> Any:
+class Outline(Polygon):
+    """The outline of a region around its centre."""
+
+    def __init__(self, corners: np.ndarray, **style: Any) -> None:
+        super().__init__(corners, closed=True, **style)
+        self._corners = corners
+
+    def move(self, centre: np.ndarray) -> None:
+        """Put the centre to a place, shape (2,)."""
+        self.set_xy(self._corners + centre)
+
+
+def region_patch(
+    region: Any, from_the_side: bool, forbidden: bool = False, turned: bool = False
+) -> Any:
     """Return a patch of a region around the origin, seen from above or from the side.
 
-    Seen from the side, a region with a height is a rectangle. A region to stay out of is hatched.
+    Seen from the side, a region with a height is a rectangle. A region to stay out of is hatched. A
+    box, and in the plane a cone or a half-space, is drawn where its axes are those of the map, and
+    else only its centre.
+
+    Args:
+        region: the region.
+        from_the_side: whether the map shows x and z, else x and y.
+        forbidden: whether it is a region to stay out of.
+        turned: whether the map turns with a platform.
     """
     style = FORBIDDEN if forbidden else GOAL
+    if isinstance(region, Box | Cone | HalfSpace):
+        aligned = not turned and not region.turns
+        corners = _corners(region, [0, 2 if from_the_side else 1]) if aligned else None
+        return Outline(np.zeros((1, 2)) if corners is None else corners, **style)
     if from_the_side and hasattr(region, "height"):
         width = 2.0 * float(region.radius)
         height = float(region.height)
         return Rectangle((-width / 2.0, -height / 2.0), width, height, **style)
     return Circle((0.0, 0.0), float(getattr(region, "radius", 0.0)), **style)
+
+
+def _corners(region: Box | Cone | HalfSpace, axes: list[int]) -> np.ndarray | None:
+    """Return the corners of a region in the plane of two axes, or None where it has none there."""
+    if isinstance(region, Box):
+        size = np.asarray(region.size, float)
+        if len(size) < 2:
+            return None
+        return np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * size[axes]
+    if len(region.towards) != 2:
+        return None
+    ahead = np.asarray(region.towards, float)
+    ahead /= np.linalg.norm(ahead)
+    left = np.array([-ahead[1], ahead[0]])
+    if isinstance(region, HalfSpace):
+        return FAR * np.array([left, left + ahead, ahead - left, -left])
+    length = FAR if region.length is None else float(region.length)
+    aside = np.tan(float(region.half_angle)) * left
+    return length * np.array([0.0 * ahead, ahead + aside, ahead - aside])
 
 
 class Ball(NamedTuple):
@@ -162,7 +211,9 @@ class Ball(NamedTuple):
 
 
 def region_surface(panel: Any, region: Any, centre: np.ndarray, forbidden: bool = False) -> Any:
-    """Draw and return the surface of a region in space, a ball or an upright cylinder.
+    """Draw and return the surface of a region in space: a ball, an upright cylinder or a box.
+
+    Of another region, or a box that turns, only the centre is drawn.
 
     Args:
         panel: axes in space.
@@ -179,6 +230,11 @@ def region_surface(panel: Any, region: Any, centre: np.ndarray, forbidden: bool 
         across = radius * np.cos(np.pi * rise)
         up = radius * np.sin(np.pi * rise)
     surface = [across * np.cos(turn), across * np.sin(turn), up * np.ones_like(turn)]
+    if isinstance(region, Box) and not region.turns:
+        # A ball that is blown up until it touches the sides of a cube.
+        ball = [np.cos(np.pi * rise) * np.cos(turn), np.cos(np.pi * rise) * np.sin(turn)]
+        ball = np.stack([*ball, np.sin(np.pi * rise)])
+        surface = ball / np.abs(ball).max(axis=0) * np.reshape(region.size, (3, 1, 1)) / 2.0
     look = FORBIDDEN if forbidden else GOAL
     return panel.plot_surface(
         *(part + offset for part, offset in zip(surface, centre, strict=True)),
@@ -261,6 +317,8 @@ def centre_patch(patch: Any, centre: np.ndarray) -> None:
     y = float(centre[1])
     if isinstance(patch, Circle):
         patch.set_center((x, y))
+    elif isinstance(patch, Outline):
+        patch.move(np.array([x, y]))
     else:
         patch.set_xy((x - patch.get_width() / 2.0, y - patch.get_height() / 2.0))
 

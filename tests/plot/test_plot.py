@@ -19,12 +19,23 @@ from jaxsafe.plot.curves import EVALUATIONS, FEW, TRAINING, evaluation_rows, tra
 from jaxsafe.plot.figures import speed_distance, trajectories
 from jaxsafe.plot.learning import learning_curves
 from jaxsafe.plot.profiles import performance_profiles
-from jaxsafe.plot.style import GREEN, GREY, ORANGE, kept_out, margin_unit, save
+from jaxsafe.plot.style import (
+    FAR,
+    GREEN,
+    GREY,
+    ORANGE,
+    centre_patch,
+    kept_out,
+    margin_unit,
+    region_patch,
+    save,
+)
 from jaxsafe.processors.constraint import KeepIn, KeepOut
 from jaxsafe.runs.figures import _episodes, draw_all
 from jaxsafe.schema import yaml12
+from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.simulation.geometry import Sphere
+from jaxsafe.simulation.geometry import Box, Cone, HalfSpace, Sphere
 from jaxsafe.storage.files import read_csv, read_rows, write_rows
 from jaxsafe.train.ppo import DIAGNOSTICS
 
@@ -453,6 +464,31 @@ def test_evaluations_are_the_main_curves_of_a_comparison() -> None:
     assert main.get_color() == training.get_color() != other.get_color()
     assert main.get_linewidth() == other.get_linewidth() > training.get_linewidth()
     assert entries(figure) == ["one", "other", EVALUATIONS, TRAINING, FEW]
+
+
+@pytest.mark.parametrize(
+    ("region", "corners"),
+    [
+        (Box(name="r", on=None, size=(4.0, 2.0)), {(1, 0), (5, 0), (5, 2), (1, 2)}),
+        (
+            Cone(name="r", on=None, towards=(0.0, 3.0), half_angle=np.pi / 4, length=2.0),
+            {(3, 1), (5, 3), (1, 3)},
+        ),
+        (
+            HalfSpace(name="r", on=None, towards=(5.0, 0.0)),
+            {(3, FAR + 1), (3, 1 - FAR), (FAR + 3, FAR + 1), (FAR + 3, 1 - FAR)},
+        ),
+        (Box(name="r", on="deputy", size=(4.0, 2.0), turns=True), {(3, 1)}),
+    ],
+)
+def test_the_outline_of_a_region_has_its_corners_about_its_centre(
+    region: Any, corners: set[tuple[float, float]]
+) -> None:
+    patch = region_patch(normalise(region), from_the_side=False)
+    centre_patch(patch, np.array([3.0, 1.0]))
+    assert {tuple(np.round(corner, 4)) for corner in patch.get_xy()} == corners
+    still = region_patch(normalise(region), from_the_side=False, turned=True)
+    assert not still.get_xy().any()
 
 
 @pytest.mark.parametrize(("kind", "forbidden"), [(KeepOut, {"zone"}), (KeepIn, set())])
