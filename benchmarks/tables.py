@@ -161,6 +161,18 @@ def environments(results: Results, names: Iterable[str] = tuple(ENVIRONMENTS)) -
     )
 
 
+def dynamics(results: Results) -> str:
+    """Return the table of million steps a second of each model, and of the task's own model."""
+    own: dict[str, float] = {}
+    rows = []
+    for run in results["runs"]:
+        rate = run["steps_per_s"]
+        base = own.setdefault(run["task"], rate)
+        rows.append([f"`{run['model']}`", run["task"], _three(rate / 1e6), f"{rate / base:.2f}"])
+    heads = ["model", "task", f"million steps/s at {results['num_envs']:,} environments"]
+    return markdown([*heads, "of the first model of the task"], rows)
+
+
 def ppo(results: Results) -> str:
     """Return the table of thousand samples a second, medians."""
     rates = _samples(results)
@@ -789,6 +801,7 @@ def _program(row: Results) -> list[str]:
 TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("", speed, "docs/performance.md"),
     ("environments", environments, "docs/performance.md"),
+    ("dynamics", dynamics, "docs/dynamics.md"),
     ("ppo", ppo, "docs/performance.md"),
     ("startup", startup_parts, "docs/performance.md"),
     ("startup", startup_first, "docs/performance.md"),

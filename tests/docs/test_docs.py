@@ -205,6 +205,7 @@ def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax
     "page",
     [
         "compose",
+        "dynamics",
         thorough("extend"),
         thorough("extend_rta"),
         thorough("safety/presets"),
