@@ -36,7 +36,7 @@ from jaxsafe.simulation.controllers import Actuator, AgentController
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.initializers import uniform
 from jaxsafe.simulation.platform import Platform, placed
-from jaxsafe.transition import advance, update_statuses
+from jaxsafe.transition import advance, update_statuses, with_memory
 from jaxsafe.types import (
     Info,
     Key,
@@ -507,6 +507,7 @@ def _together(env: Environment, before: TimeStep, now: TimeStep) -> TimeStep:
             feasible=earlier.rta.feasible & rta.feasible,
             certified=earlier.rta.certified & rta.certified,
             predicted_margin=jnp.minimum(earlier.rta.predicted_margin, rta.predicted_margin),
+            constraint=jnp.where(rta.constraint >= 0, rta.constraint, earlier.rta.constraint),
         )
     info = info.replace(
         status=status,
@@ -640,7 +641,7 @@ def _begin(env: Environment, sim: Sim, parameters: Parameters) -> tuple[State, T
     rta_info = None
     if env.rta is not None:
         with part("rta"):
-            rta_memory, rta_info = env.rta.begin(env, sim)
+            rta_memory, rta_info = env.rta.begin(env, with_memory(env, sim, status_memory))
     info = _info(env, ended, terms=terms, totals=terms, rta_info=rta_info)
     memory = Memory(
         status=status_memory,
@@ -790,7 +791,8 @@ def _filtered(env: Environment, state: State, desired: Array) -> tuple[Array, An
     if env.rta is None:
         return desired, (), None
     with part("rta"):
-        return env.rta.filter(env, state.sim, state.memory.rta, desired)
+        sim = with_memory(env, state.sim, state.memory.status)
+        return env.rta.filter(env, sim, state.memory.rta, desired)
 
 
 def _info(

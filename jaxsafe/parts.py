@@ -14,6 +14,7 @@ from jaxsafe.processors.constraint import Constraint
 from jaxsafe.processors.observation import Observation
 from jaxsafe.processors.reward import Bound, Reward
 from jaxsafe.processors.status import Status
+from jaxsafe.processors.strengthening import Strengthening
 from jaxsafe.processors.terminal import Terminal
 from jaxsafe.rta.filter import RTA, BackupController, CertifiedRTA, Faults, RTAMemory, TerminalSet
 from jaxsafe.schema.component import ANY, Component, Range, Refers, Unit
@@ -127,6 +128,7 @@ __all__ = [
     "Sim",
     "Status",
     "StatusName",
+    "Strengthening",
     "Task",
     "Terminal",
     "TerminalSet",

@@ -6,12 +6,13 @@ speaks about the very state that the step will reach.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsafe.schema.component import Component
 from jaxsafe.schema.dotted_paths import references
 from jaxsafe.schema.errors import part
 from jaxsafe.simulation.between import regions_on_the_way
@@ -47,7 +48,10 @@ def advance(
         controls, actuators = driven(env, sim, control)
         platforms[env.agent] = plant.step(sim.platforms[env.agent], controls, env.dt)
     later_world = later_sim(env, sim, platforms)
-    return later_world.replace(actuators=actuators, control_desired=control, control_actual=control)
+    later_world = later_world.replace(
+        actuators=actuators, control_desired=control, control_actual=control
+    )
+    return remember(env, sim, later_world, env.dt)
 
 
 def later_sim(env: Environment, sim: Sim, platforms: Others) -> Sim:
@@ -177,10 +181,68 @@ def update_statuses(
     return sim, memories
 
 
+def with_memory(env: Environment, sim: Sim, memory: Mapping[str, Any]) -> Sim:
+    """Return the simulation with what a prediction must know of the steps before it.
+
+    That is the memory of every status on which a safety constraint rests.
+
+    Args:
+        env: the environment.
+        sim: the simulation.
+        memory: what the statuses remember, by name.
+    """
+    names = remembering_statuses(env)
+    return sim.replace(remembered={name: memory[name] for name in names})
+
+
+def remembering_statuses(env: Environment, constraints: Sequence[str] | None = None) -> list[str]:
+    """Return the names of the statuses with memory on which some safety constraints rest.
+
+    Args:
+        env: the environment.
+        constraints: names of the constraints. None stands for all.
+    """
+    chosen = [item for item in env.constraints if constraints is None or item.name in constraints]
+    needed = set(status_names(chosen))
+    for status in reversed(env.status):
+        if status.name in needed:
+            needed.update(status_names([status]))
+    return [status.name for status in env.status if status.name in needed and status.remembers]
+
+
+def remember(env: Environment, before: Sim, sim: Sim, duration: Any) -> Sim:
+    """Return the simulation with what its statuses remember after a predicted step.
+
+    Args:
+        env: the environment.
+        before: the simulation before the step.
+        sim: the simulation after the step.
+        duration: length of the step [s].
+    """
+    if not before.remembered:
+        return sim
+    judged = place_regions(env, sim.replace(status={}))
+    remembered = {}
+    for status in env.status:
+        if status.name in before.remembered:
+            own = status.increment(before.remembered[status.name], judged, duration)
+            remembered[status.name] = own
+        else:
+            own = status.init(judged)
+        judged = judged.replace(status={**judged.status, status.name: status.process(own, judged)})
+    return sim.replace(remembered=remembered)
+
+
+def status_names(parts: Iterable[Component]) -> Iterator[str]:
+    """Yield the names of the statuses to which parts refer."""
+    for item in parts:
+        yield from (name for _, refers, name in references(item, "") if refers.section == "status")
+
+
 def judge(env: Environment, sim: Sim, before: Sim | None = None) -> Sim:
     """Return the simulation with regions and statuses that follow from its platforms alone.
 
-    No status remembers anything.
+    A status remembers what `sim.remembered` has of it, and otherwise what it does at a reset.
 
     Args:
         env: the environment.
@@ -189,13 +251,19 @@ def judge(env: Environment, sim: Sim, before: Sim | None = None) -> Sim:
             regions, are lower bounds on the way from there, so that nothing slips through between
             two instants.
     """
-    if before is None:
-        return update_statuses(env, sim.replace(status={}), None)[0]
-    earlier = judge(env, before)
+    earlier = None if before is None else judge(env, before)
     sim = place_regions(env, sim.replace(status={}))
-    sim = sim.replace(regions=regions_on_the_way(env, earlier, sim))
+    if earlier is not None:
+        sim = sim.replace(regions=regions_on_the_way(env, earlier, sim))
     for status in env.status:
-        sim = sim.replace(status={**sim.status, status.name: status.on_the_way(env, earlier, sim)})
+        with part("status", status.name):
+            if status.name in sim.remembered:
+                value = status.process(sim.remembered[status.name], sim)
+            elif earlier is None:
+                value = status.process(status.init(sim), sim)
+            else:
+                value = status.on_the_way(env, earlier, sim)
+        sim = sim.replace(status={**sim.status, status.name: value})
     return sim
 
 
@@ -204,10 +272,10 @@ def constraint(env: Environment, name: str) -> Constraint:
     return next(constraint for constraint in env.constraints if constraint.name == name)
 
 
-def smallest_margin(
-    env: Environment, sim: Sim, before: Sim | None = None, names: Collection[str] | None = None
-) -> Float[Array, ""]:
-    """Return the smallest margin h of some safety constraints.
+def margins_of(
+    env: Environment, sim: Sim, before: Sim | None = None, names: Sequence[str] | None = None
+) -> Float[Array, " c"]:
+    """Return the margin h of each of some safety constraints.
 
     Args:
         env: the environment.
@@ -215,16 +283,19 @@ def smallest_margin(
         before: the simulation one step earlier. If it is given, constraints that can be broken
             between two instants (`Constraint.between`) count with a lower bound on the way from
             there.
-        names: names of the constraints. None stands for all.
+        names: names of the constraints, in the order of the result. None stands for all.
     """
     now = judge(env, sim)
     on_the_way = now if before is None else judge(env, sim, before)
-    margins = [
-        constraint.margin_between(now, on_the_way)
-        for constraint in env.constraints
-        if names is None or constraint.name in names
-    ]
-    return jnp.min(jnp.stack(margins))
+    chosen = env.constraints if names is None else [constraint(env, name) for name in names]
+    return jnp.stack([item.margin_between(now, on_the_way) for item in chosen])
+
+
+def smallest_margin(
+    env: Environment, sim: Sim, before: Sim | None = None, names: Sequence[str] | None = None
+) -> Float[Array, ""]:
+    """Return the smallest h of some safety constraints. Arguments are those of `margins_of`."""
+    return jnp.min(margins_of(env, sim, before=before, names=names))
 
 
 def bounds(env: Environment) -> tuple[Float[Array, " m"], Float[Array, " m"]]:

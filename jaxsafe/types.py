@@ -231,6 +231,8 @@ class Sim(Record):
     # What each of the agent's actuators with a lag or a rate limit gives now, in physical units, by
     # name. Empty if all act at once.
     actuators: Mapping[str, Float[Array, ""]] = dataclasses.field(default_factory=dict)
+    # In a prediction what statuses remember on which safety constraints rest, by name; else empty.
+    remembered: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
 class Memory(Record):
@@ -270,6 +272,11 @@ class RTAInfo(Record):
     # Smallest h after the step as predicted. For separations also on the way.
     predicted_margin: Float[Array, ""]
     backup_index: Int[Array, ""]  # index of the backup controller in reserve
+    # Index into `env.rta.constraints` of the constraint for which the control was changed, −1 where
+    # it was not.
+    constraint: Int[Array, ""] = dataclasses.field(
+        default_factory=lambda: jnp.full((), -1, jnp.int32)
+    )
 
 
 class Info(Record):

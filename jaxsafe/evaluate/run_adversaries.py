@@ -23,7 +23,14 @@ from jaxsafe.rollout import reset_batch
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.controllers import Continuous
-from jaxsafe.transition import bounds, driven, smallest_margin, undirected
+from jaxsafe.transition import (
+    bounds,
+    driven,
+    remember,
+    smallest_margin,
+    undirected,
+    with_memory,
+)
 from jaxsafe.types import Key, Number, Sim, State, TimeStep
 
 INSTANTS_PER_STEP = 8
@@ -134,7 +141,7 @@ def _follow(env: Environment, name: str, num_steps: int, num_envs: int, key: Key
     adversary = ADVERSARIES[name]
 
     def act(state: State, key: Key) -> Float[Array, " m"]:
-        return adversary(drawn(env, state.parameters), state.sim, key)
+        return adversary(drawn(env, state.parameters), _remembering(env, state), key)
 
     def replace_ended(done: Array, fresh: State, state: State) -> State:
         return jax.tree.map(lambda a, b: jnp.where(done, a, b), fresh, state)
@@ -231,10 +238,10 @@ def _step(
     zero = jnp.zeros_like(timestep.reward)
 
     def lowest_at(state: State) -> Float[Array, ""]:
-        return smallest_margin(drawn(env, state.parameters), state.sim)
+        return smallest_margin(drawn(env, state.parameters), _remembering(env, state))
 
     def lowest_inside(state: State, control: Float[Array, " m"]) -> Float[Array, ""]:
-        return _inside(drawn(env, state.parameters), state.sim, control)
+        return _inside(drawn(env, state.parameters), _remembering(env, state), control)
 
     lowest = jax.vmap(lowest_at)(after)
     inside = jax.vmap(lowest_inside)(state, info.control_actual)
@@ -255,6 +262,10 @@ def _step(
         "lowest_inside": inside,
     }
     return after, timestep.done, {name: value.astype(jnp.float32) for name, value in facts.items()}
+
+
+def _remembering(env: Environment, state: State) -> Sim:
+    return with_memory(env, state.sim, state.memory.status)
 
 
 def _inside(env: Environment, before: Sim, control: Float[Array, " m"]) -> Float[Array, ""]:
@@ -287,7 +298,9 @@ def within_step(env: Environment, before: Sim, control: Float[Array, " m"], shar
         controls = platform.held(state, given, env.dt)
         platforms[platform.name] = platform.step(state, controls, env.dt * share)
     time = before.time + env.dt * share
-    return before.replace(time=time, platforms=platforms, regions={}, status={})
+    later = before.replace(time=time, platforms=platforms, regions={}, status={})
+    later = later.replace(control_desired=control, control_actual=control)
+    return remember(env, before, later, env.dt * share)
 
 
 def _finite(state: State) -> Array:

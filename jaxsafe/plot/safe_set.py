@@ -165,7 +165,7 @@ def draw(
     Raises:
         ConfigError: the environment has no filter that certifies, or no planes are known for it.
     """
-    if not isinstance(env.rta, CertifiedRTA):
+    if not isinstance(env.rta, CertifiedRTA) or not env.rta.backups:
         found = "none" if env.rta is None else _type_name(env.rta)
         raise ConfigError(
             f"rta: expected a filter that certifies states, for instance default, found {found}"

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.processors.status import on_itself
+from jaxsafe.processors.strengthening import Strengthening
 from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.simulation.geometry import angle_between
 from jaxsafe.simulation.vectors import Vector
@@ -32,14 +33,28 @@ Bound = Annotated[Number, Unit("physical"), Range(largest=1e12)]
 Scale = Annotated[Number, Unit("physical"), Range(0.0, open_low=True, smallest=1e-12, largest=1e12)]
 """The violation −h, in the unit of h, whose severity is 1."""
 
+SlackCost = Annotated[Number, Unit("1"), Range(0.0, open_low=True)]
+"""Cost σ of missing a constraint."""
+
 
 class Constraint(Component):
     """A signed margin h, which is safe where h ≥ 0, and a limit.
 
-    The severity of a violation is −h as a share of the limit.
+    The severity of a violation is −h as a share of the limit. The optional fields say how filters
+    treat this constraint. Where they are left out, what the filter says counts.
     """
 
     name: str
+    required_margin: Annotated[Number, Unit("as the constraint"), Range(0.0)] | None = None
+    """The h that a certificate asks for."""
+    strengthening: Strengthening | None = None
+    """The function α of the barrier row, for filters that have such rows."""
+    degree: Annotated[int, Range(1, 3)] | None = None
+    """How often h is differentiated until the control reaches it."""
+    slack: SlackCost | None = None
+    """The cost σ of missing the barrier row."""
+    priority: Annotated[int, Range(0, largest=1000)] = 0
+    """Barrier rows that cannot be met together are given up from the lowest priority on."""
     between: ClassVar[bool] = False
     """Whether h can fall far below 0 between two safe instants.
 

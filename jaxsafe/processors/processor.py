@@ -39,6 +39,11 @@ class Processor(Component):
     many_kinds: ClassVar[bool] = True
     name: str
 
+    @property
+    def remembers(self) -> bool:
+        """Whether it has a memory."""
+        return type(self).init is not Processor.init
+
     def init(self, sim: Sim) -> Any:
         """Return the memory at the start of an episode."""
         return ()

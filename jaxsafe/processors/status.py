@@ -365,8 +365,7 @@ class Accumulator(Status, type="accumulator"):
     """Sum of a status over the steps of the episode, such as the Δv that is used up.
 
     With `per_second` the status is a rate, and each step adds status·Δt. A truth value counts as 1
-    or 0. The sample at reset adds nothing. Filters predict without memory, so they do not see the
-    sum.
+    or 0. The sample at reset adds nothing. Filters predict how the sum goes on.
     """
 
     status: AnyStatusName

@@ -7,11 +7,14 @@ from jaxsafe.rta.asif import DiscreteASIF, ExplicitASIF, ImplicitASIF, Polynomia
 from jaxsafe.rta.backups import (
     AlignAndBrake,
     AlignedOrSlow,
+    AtRest,
     Brake,
+    Coast,
     MatchVelocity,
     Slow,
     VelocityMatched,
 )
+from jaxsafe.rta.backups_with_memory import HoldPosition, Latched
 from jaxsafe.rta.cascade import Cascade, Stage
 from jaxsafe.rta.filter import RTA, BackupController, CertifiedRTA, RTAMemory, TerminalSet
 from jaxsafe.rta.simplex import Blend, CollisionSimplex, Simplex
@@ -20,15 +23,19 @@ __all__ = [
     "RTA",
     "AlignAndBrake",
     "AlignedOrSlow",
+    "AtRest",
     "BackupController",
     "Blend",
     "Brake",
     "Cascade",
     "CertifiedRTA",
+    "Coast",
     "CollisionSimplex",
     "DiscreteASIF",
     "ExplicitASIF",
+    "HoldPosition",
     "ImplicitASIF",
+    "Latched",
     "MatchVelocity",
     "Polynomial",
     "RTAMemory",

@@ -8,17 +8,20 @@ of held thrust, which is what a plant with a finite step needs.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.rta.filter import CertifiedRTA
+from jaxsafe.processors.constraint import SlackCost
+from jaxsafe.processors.strengthening import Polynomial, Strengthening
+from jaxsafe.rta.filter import CertifiedRTA, Proposal
 from jaxsafe.rta.projection import project_box_ball, project_box_halfspace
-from jaxsafe.rta.qp import nearest_control
-from jaxsafe.schema.component import Component, Range, Unit
+from jaxsafe.rta.qp import nearest_solution
+from jaxsafe.schema.component import Range, Unit
 from jaxsafe.transition import advance, bounds, commanded, constraint, judge
 from jaxsafe.types import Number, Sim
 
@@ -46,6 +49,7 @@ class DiscreteASIF(CertifiedRTA, type="discrete_asif"):
     certified.
     """
 
+    backup_optional: ClassVar[bool] = True
     gamma: Annotated[Number, Unit("1"), Range(0.0, 1.0, open_low=True)] = 1.0
 
     def problem(self) -> str | None:
@@ -55,8 +59,8 @@ class DiscreteASIF(CertifiedRTA, type="discrete_asif"):
 
     def propose(
         self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
-    ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
-        required = self.required_margin(env)
+    ) -> Proposal:
+        required = self.required_margin(env, self.constraints[0])
         limited = constraint(env, self.constraints[0])
         spare = jnp.maximum(limited.margin(judge(env, sim)) - required, 0.0)
         limit = limited.limit(judge(env, sim))
@@ -118,28 +122,6 @@ def linear(function: Callable[[Array], T], at: Float[Array, " m"]) -> tuple[T, T
     return jax.vmap(along, out_axes=(None, 0))((jnp.eye(at.shape[0], dtype=at.dtype),))
 
 
-SlackCost = Annotated[Number, Unit("1"), Range(0.0, open_low=True)]
-"""Cost σ of missing a constraint."""
-
-
-class Strengthening(Component):
-    """A strengthening function α of class κ, Eq. (4)."""
-
-    def of(self, h: Float[Array, ""]) -> Float[Array, ""]:
-        """Return α(h), which increases with h and is 0 at h = 0."""
-        raise NotImplementedError
-
-
-class Polynomial(Strengthening, type="polynomial"):
-    """The strengthening function α(h) = linear·h + cubic·h³."""
-
-    linear: Annotated[Number, Unit("1"), Range(0.0)] = 1.0
-    cubic: Annotated[Number, Unit("1"), Range(0.0)] = 0.0
-
-    def of(self, h: Float[Array, ""]) -> Float[Array, ""]:
-        return self.linear * h + self.cubic * h**3
-
-
 class ExplicitASIF(CertifiedRTA, type="explicit_asif"):
     """The paper's ASIF, Eqs. (2)-(4).
 
@@ -148,34 +130,45 @@ class ExplicitASIF(CertifiedRTA, type="explicit_asif"):
 
     If the control reaches h only after differentiating `degree` times, the constraint is lifted
     first (HOCBF): ψ₀ = h and ψᵢ = ψ̇ᵢ₋₁ + α(ψᵢ₋₁). The row is then that of the last ψ. With `slack`
-    σ every row may be missed by s at a cost of σ s².
+    σ every row may be missed by s at a cost of σ s². Each constraint may have a `strengthening`, a
+    `degree` and a `slack` of its own.
+
+    If no control meets all rows without slack, those of the lowest `priority` are given up, then
+    those of the next, until the others can be met.
 
     Continuous-time barriers say nothing about a control that is held over a step. With `enforce`
     the prediction has the last word. Without it the solution acts, as in the paper.
     """
 
+    backup_optional: ClassVar[bool] = True
     strengthening: Strengthening = Polynomial()
     degree: Annotated[int, Range(1, 3)] = 1
     slack: SlackCost | None = None
 
     def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
         rows, _ = self.rows(env, sim, env.action_size)
-        reason = f"of degree {self.degree} the control has no influence on"
-        no_influence = {
-            f"{reason} {name!r}": jnp.all(row == 0.0)
-            for name, row in zip(self.constraints, rows, strict=True)
-        }
+        no_influence = {}
+        for name, row in zip(self.constraints, rows, strict=True):
+            degree = self._degree(env, name)
+            fault = f"of degree {degree} the control has no influence on {name!r}"
+            no_influence[fault] = jnp.all(row == 0.0)
         return no_influence | super().unsuited(env, sim)
 
     def propose(
         self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
-    ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
+    ) -> Proposal:
         rows, offsets = self.rows(env, sim, desired.shape[0])
+        limits = [constraint(env, name) for name in self.constraints]
         low, high = bounds(env)
-        if len(rows) == 1 and self.slack is None:
-            return project_box_halfspace(u=desired, low=low, high=high, a=rows[0], b=offsets[0])
-        return nearest_control(
-            u=desired, low=low, high=high, rows=rows, offsets=offsets, slack=self.slack
+        return nearest_by_priority(
+            u=desired,
+            low=low,
+            high=high,
+            rows=rows,
+            offsets=offsets,
+            slacks=[self.slack if limit.slack is None else limit.slack for limit in limits],
+            priorities=[limit.priority for limit in limits],
+            miss_least=not self.backups,
         )
 
     def rows(
@@ -197,30 +190,131 @@ class ExplicitASIF(CertifiedRTA, type="explicit_asif"):
     def _row(
         self, env: Environment, sim: Sim, name: str, size: int
     ) -> tuple[Float[Array, " m"], Float[Array, ""]]:
-        def h(platforms: Any) -> Array:
-            return constraint(env, name).margin(judge(env, sim.replace(platforms=platforms)))
+        limit = constraint(env, name)
+        strengthening = limit.strengthening
+        return barrier_row(
+            h=lambda platforms: limit.margin(judge(env, sim.replace(platforms=platforms))),
+            derivative=functools.partial(_derivative, env, sim),
+            state=sim.platforms,
+            still=jnp.zeros(size, env.dt.dtype),
+            alpha=(self.strengthening if strengthening is None else strengthening).of,
+            degree=self._degree(env, name),
+        )
 
-        lifted = h
-        for _ in range(self.degree - 1):
-            lifted = self._lift(env, sim, lifted, size)
+    def _degree(self, env: Environment, name: str) -> int:
+        own = constraint(env, name).degree
+        return self.degree if own is None else own
 
-        def rate(u: Float[Array, " m"]) -> tuple[Array, Array]:
-            derivative = _derivative(env, sim, sim.platforms, u)
-            value, slope = jax.jvp(lifted, (sim.platforms,), (derivative,))
-            return slope, value
 
-        (drift, value), (gains, _) = linear(rate, jnp.zeros(size, env.dt.dtype))
-        return gains, -(drift + self.strengthening.of(value))
+MISS_LEAST = 1e4
+"""Slack with which rows that cannot be met are missed hardly more than they must be."""
 
-    def _lift(self, env: Environment, sim: Sim, psi: Any, size: int) -> Any:
-        """Return ψ̇ + α(ψ) without control, as a function of the platforms' states."""
 
-        def lifted(platforms: Any) -> Array:
-            still = jnp.zeros(size, env.dt.dtype)
-            value, slope = jax.jvp(psi, (platforms,), (_derivative(env, sim, platforms, still),))
-            return slope + self.strengthening.of(value)
+def barrier_row(
+    h: Callable[[Any], Array],
+    derivative: Callable[[Any, Array], Any],
+    state: Any,
+    still: Float[Array, " m"],
+    alpha: Callable[[Array], Array],
+    degree: int,
+) -> tuple[Float[Array, " m"], Float[Array, ""]]:
+    """Return the barrier row a·u ≥ b of Eq. (4) at a state: its a of shape (m,) and its b.
+
+    Args:
+        h: the constraint as a function of the state.
+        derivative: the derivative ẋ of the state, as a function of state and control.
+        state: the state, any tree of arrays.
+        still: the control 0.
+        alpha: the strengthening function α.
+        degree: how often h is differentiated until the control reaches it.
+    """
+
+    def lift(psi: Callable[[Any], Array]) -> Callable[[Any], Array]:
+        """Return ψ̇ + α(ψ) without control, as a function of the state."""
+
+        def lifted(state: Any) -> Array:
+            value, slope = jax.jvp(psi, (state,), (derivative(state, still),))
+            return slope + alpha(value)
 
         return lifted
+
+    psi = h
+    for _ in range(degree - 1):
+        psi = lift(psi)
+
+    def rate(u: Float[Array, " m"]) -> tuple[Array, Array]:
+        value, slope = jax.jvp(psi, (state,), (derivative(state, u),))
+        return slope, value
+
+    (drift, value), (gains, _) = linear(rate, still)
+    return gains, -(drift + alpha(value))
+
+
+def nearest_by_priority(
+    u: Float[Array, " m"],
+    low: Float[Array, " m"],
+    high: Float[Array, " m"],
+    rows: Float[Array, "c m"],
+    offsets: Float[Array, " c"],
+    slacks: Sequence[Number | None],
+    priorities: Sequence[int],
+    miss_least: bool = False,
+) -> Proposal:
+    """Return the control nearest to u within its bounds and under rows a·u ≥ b.
+
+    If the rows without slack cannot be met together, those of the lowest priority are given up
+    until the others can.
+
+    Args:
+        u: the desired control, shape (m,).
+        low: lower bounds, shape (m,).
+        high: upper bounds, shape (m,).
+        rows: a of each of c rows, shape (c, m).
+        offsets: b of each row, shape (c,).
+        slacks: the cost of missing each row, None where it may not be missed.
+        priorities: the priority of each row.
+        miss_least: whether rows of the highest priority that cannot be met together are missed as
+            little as possible. Otherwise the control is then u within its bounds.
+
+    Returns:
+        The control, whether rows without slack of the highest priority could be met, and the index
+        of the row that moves the control most.
+    """
+    if len(rows) == 1 and slacks[0] is None:
+        control, feasible = project_box_halfspace(u=u, low=low, high=high, a=rows[0], b=offsets[0])
+        return control, feasible, jnp.zeros((), jnp.int32)
+
+    def solve(
+        least_priority: int, hard_slack: Number | None = None
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return control, `solved`, `feasible` and the row that moves the control most.
+
+        Rows without slack of a lower priority are left out, and the others have `hard_slack`.
+        """
+        kept = [
+            index
+            for index, (slack, priority) in enumerate(zip(slacks, priorities, strict=True))
+            if slack is not None or priority >= least_priority
+        ]
+        costs = [slacks[i] if slacks[i] is not None else hard_slack for i in kept]
+        solution = nearest_solution(
+            u, low, high, rows[np.array(kept)], offsets[np.array(kept)], costs
+        )
+        index = jnp.array(kept, jnp.int32)[jnp.argmax(solution.multipliers)]
+        return solution.control, solution.solved, solution.feasible, index
+
+    hard = {priority for slack, priority in zip(slacks, priorities, strict=True) if slack is None}
+    levels = sorted(hard) or [0]
+    chosen = solve(levels[-1])
+    for level in reversed(levels[:-1]):  # from the highest priority alone to all rows
+        more = solve(level)
+        chosen = jax.tree.map(functools.partial(jnp.where, more[1]), more, chosen)
+    control, solved, feasible, index = chosen
+    if miss_least:
+        missed, _, _, missed_index = solve(levels[-1], hard_slack=MISS_LEAST)
+        control = jnp.where(solved, control, missed)
+        index = jnp.where(solved, index, missed_index)
+    return control, feasible, index
 
 
 class ImplicitASIF(CertifiedRTA, type="implicit_asif"):
@@ -239,16 +333,17 @@ class ImplicitASIF(CertifiedRTA, type="implicit_asif"):
 
     def propose(
         self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
-    ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
+    ) -> Proposal:
         low, high = bounds(env)
         required = self.required_margin(env)
 
-        def least(u: Float[Array, " m"]) -> Float[Array, " backups"]:
-            return self.certify(env, sim, advance(env, sim, u))
+        def least(u: Float[Array, " m"]) -> tuple[Array, Array]:
+            paths = self.follow(env, sim, advance(env, sim, u))
+            return paths.values, paths.margins
 
-        def improve(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
+        def improve(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
             proposal, feasible = carry
-            values, gains = linear(least, proposal)
+            (values, margins), (gains, _margin_gains) = linear(least, proposal)
             best = jnp.argmax(values)
             known = jnp.isfinite(values[best])
             row = jnp.where(known, gains[:, best], 0.0)
@@ -257,9 +352,13 @@ class ImplicitASIF(CertifiedRTA, type="implicit_asif"):
                 u=desired, low=low, high=high, a=row, b=missing + jnp.sum(row * proposal)
             )
             safe = values[best] >= required
-            return (jnp.where(safe, proposal, projected), safe | (known & feasible)), None
+            closest = self.closest(env, margins[best])
+            return (jnp.where(safe, proposal, projected), safe | (known & feasible)), closest
 
-        return jax.lax.scan(improve, (desired, jnp.ones((), bool)), length=self.rounds)[0]
+        (control, feasible), closest = jax.lax.scan(
+            improve, (desired, jnp.ones((), bool)), length=self.rounds
+        )
+        return control, feasible, closest[0]
 
 
 def _derivative(env: Environment, sim: Sim, platforms: Any, control: Float[Array, " m"]) -> Any:

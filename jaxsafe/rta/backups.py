@@ -15,7 +15,9 @@ from jaxsafe.rta.projection import project_box_ball
 from jaxsafe.rta.proofs import (
     align_and_brake_faults,
     aligned_or_slow_faults,
+    at_rest_faults,
     brake_faults,
+    coast_faults,
     slow_faults,
     velocity_matched_faults,
 )
@@ -55,6 +57,16 @@ class Brake(BackupController, type="brake"):
         if rta.terminal is not None and type(rta.terminal) is not Slow:
             return {}  # the proof is then that of the other terminal set
         return brake_faults(env, sim, rta)
+
+
+class Coast(BackupController, type="coast"):
+    """No control at all. It keeps limits of what the agent's controls may add up to."""
+
+    def control(self, env: Environment, sim: Sim, later: Others) -> Float[Array, " m"]:
+        return jnp.zeros(env.action_size, env.dt.dtype)
+
+    def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
+        return coast_faults(env, rta) if rta.terminal is None else {}
 
 
 class AlignAndBrake(BackupController, type="align_and_brake"):
@@ -130,6 +142,21 @@ class Slow(TerminalSet, type="slow"):
 
     def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         return slow_faults(env, rta, terminal=self, keeper=Brake)
+
+
+class AtRest(TerminalSet, type="at_rest"):
+    """States of a spacecraft that hardly moves.
+
+    `brake` keeps it where it is. So whatever depends on position and velocity alone stays as it is.
+    """
+
+    speed: Annotated[Number, Unit("m/s"), Positive] = 1e-4
+
+    def contains(self, env: Environment, sim: Sim) -> Bool[Array, ""]:
+        return safe_norm(sim.platforms[env.agent].velocity) <= self.speed
+
+    def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
+        return at_rest_faults(env, sim, rta, keeper=Brake)
 
 
 class AlignedOrSlow(TerminalSet, type="aligned_or_slow"):

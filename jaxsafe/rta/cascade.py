@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.rta.filter import RTA, admissible, repeated
-from jaxsafe.schema.component import Component
+from jaxsafe.rta.filter import NO_CONSTRAINT, RTA, admissible, altered, repeated
+from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.simulation.geometry import safe_norm
-from jaxsafe.types import Record, RTAInfo, Sim
+from jaxsafe.types import Number, Record, RTAInfo, Sim
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
@@ -39,9 +40,20 @@ class Cascade(RTA, type="cascade"):
     """
 
     stages: tuple[Stage, ...]
+    tolerance: Annotated[Number, Unit("1"), Range(0.0)] = 0.0
+
+    @property
+    def constraints(self) -> tuple[str, ...]:
+        """The constraints of all stages in a row, which `info.rta.constraint` indexes."""
+        return tuple(name for stage in self.stages for name in _constraints(stage.rta))
 
     def problem(self) -> str | None:
         return repeated(self.stages) if self.stages else "expected at least one stage"
+
+    @property
+    def _first_indices(self) -> list[int]:
+        counts = [len(_constraints(stage.rta)) for stage in self.stages]
+        return [sum(counts[:index]) for index in range(len(counts))]
 
     def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
         return {
@@ -53,7 +65,7 @@ class Cascade(RTA, type="cascade"):
     def begin(self, env: Environment, sim: Sim) -> tuple[CascadeMemory, RTAInfo]:
         memories, infos = zip(*(stage.rta.begin(env, sim) for stage in self.stages), strict=True)
         memory = CascadeMemory(intervening=jnp.zeros((), bool), stages=memories)
-        return memory, _combined(infos, jnp.ones_like(infos[-1].certified))
+        return memory, _combined(infos, jnp.ones_like(infos[-1].certified), self._first_indices)
 
     def filter(
         self, env: Environment, sim: Sim, memory: CascadeMemory, desired: Float[Array, " m"]
@@ -68,23 +80,36 @@ class Cascade(RTA, type="cascade"):
             memories.append(stage_memory)
             infos.append(info)
         wanted, finite = admissible(env, desired)
-        correction = safe_norm(control - wanted)
-        info = _combined(infos, valid).replace(correction=correction)
-        intervening = (correction > 0.0) | ~finite
+        correction = control - wanted
+        intervening = altered(env, correction, self.tolerance) | ~finite
+        info = _combined(infos, valid, self._first_indices)
+        info = info.replace(
+            correction=safe_norm(correction),
+            constraint=jnp.where(intervening, info.constraint, NO_CONSTRAINT()),
+        )
         return control, CascadeMemory(intervening=intervening, stages=tuple(memories)), info
 
 
-def _combined(infos: Any, valid: Bool[Array, ""]) -> RTAInfo:
-    """Return the facts about all stages together.
+def _constraints(rta: RTA) -> tuple[str, ...]:
+    return getattr(rta, "constraints", ())
+
+
+def _combined(infos: Any, valid: Bool[Array, ""], first_indices: Sequence[int]) -> RTAInfo:
+    """Return the facts about all stages together. The last stage that changed the control says why.
 
     Args:
         infos: the facts about each stage, in order.
         valid: whether the certificates of earlier stages still count.
+        first_indices: the index of each stage's first constraint among those of all stages.
     """
+    cause = NO_CONSTRAINT()
+    for info, first in zip(infos, first_indices, strict=True):
+        cause = jnp.where(info.constraint >= 0, info.constraint + first, cause)
     last = infos[-1]
     all_certified = jnp.all(jnp.stack([info.certified for info in infos]))
     return last.replace(
         feasible=jnp.all(jnp.stack([info.feasible for info in infos])),
         certified=all_certified & valid,
         predicted_margin=jnp.min(jnp.stack([info.predicted_margin for info in infos])),
+        constraint=cause,
     )

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
@@ -23,10 +24,12 @@ from jaxsafe.transition import (
     Others,
     advance,
     bounds,
+    constraint,
     driven,
     later_sim,
+    margins_of,
     others_later,
-    smallest_margin,
+    remember,
 )
 from jaxsafe.types import ConstraintName, Number, Record, RTAInfo, Sim
 
@@ -35,6 +38,15 @@ if TYPE_CHECKING:
 
 Margin = Annotated[Number, Unit("as the constraint"), Range(0.0)]
 """A value of h, in the unit of the constraint."""
+
+NO_CONSTRAINT = functools.partial(jnp.full, (), -1, jnp.int32)
+"""The index of a constraint where there is none, as an array."""
+
+Proposal = (
+    tuple[Float[Array, " m"], Bool[Array, ""]]
+    | tuple[Float[Array, " m"], Bool[Array, ""], Int[Array, ""]]
+)
+"""A control, whether it meets a filter's own constraints, and if known for which it was changed."""
 
 Faults = dict[str, Bool[Array, ""]]
 """Reasons why a proof does not hold, in words, each with whether it applies at a given state."""
@@ -82,14 +94,19 @@ class RTAMemory(Record):
     backup_index: Int[Array, ""]  # the backup controller that the last certificate is about
     certified: Bool[Array, ""]  # whether following that backup controller is known to be safe
     ahead: Mapping[str, Any]  # platforms at the end of the certificate's horizon; empty without one
-    # `Sim.actuators` at that end.
+    # `Sim.actuators` and `Sim.remembered` at that end.
     actuators_ahead: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    remembered_ahead: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    backups: tuple[Any, ...] = ()  # what each backup controller remembers
+    backups_ahead: tuple[Any, ...] = ()  # the same at the end of the horizon
 
 
 class BackupController(Component):
     """A control law that keeps the agent safe, or leads it to states in which it does.
 
-    It has a name, because a filter may have several.
+    It has a name, because a filter may have several. A law without memory writes `control` alone.
+    One with memory writes `init` and `act`. A memory begins at the state where the controller takes
+    over, and moves only while it acts or is predicted to.
     """
 
     name: str
@@ -108,6 +125,25 @@ class BackupController(Component):
             later: the other platforms' states after the step, by name.
         """
         raise NotImplementedError
+
+    def init(self, env: Environment, sim: Sim) -> Any:
+        """Return the memory with which the controller takes over at a state, `()` for none."""
+        return ()
+
+    def act(
+        self, env: Environment, sim: Sim, later: Others, memory: Any
+    ) -> tuple[Float[Array, " m"], Any]:
+        """Return the control, as `control` does, and the memory after the step."""
+        return self.control(env, sim, later), memory
+
+    def unfinished(self, env: Environment, sim: Sim, memory: Any) -> Bool[Array, ""]:
+        """Return whether a manoeuvre is under way, which the filter lets the controller finish."""
+        return jnp.zeros((), bool)
+
+    @property
+    def proved(self) -> BackupController:
+        """The controller that the proofs of terminal sets look at: itself, or the one it wraps."""
+        return self
 
     def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         """Return reasons why this controller is not proved to keep the constraints.
@@ -145,11 +181,15 @@ class TerminalSet(Component):
 class Paths(Record):
     """Predicted ways from one state, one for each backup controller."""
 
-    least: Float[Array, " backups"]  # smallest h on the way
+    margins: Float[Array, "backups c"]  # smallest h of each constraint on the way
+    least: Float[Array, " backups"]  # the smallest of these, to be compared with the margin
     certified: Bool[Array, " backups"]  # whether all but the margin holds: terminal set and proof
-    ahead: Mapping[str, Any]  # platforms at the end, [backups, ...]; empty without a horizon
-    # `Sim.actuators` at the end, [backups]
+    memories_ahead: tuple[Any, ...]  # what each backup controller remembers at its end
+    # Platforms, `Sim.actuators` and `Sim.remembered` at the end, [backups, ...]; empty without a
+    # horizon.
+    ahead: Mapping[str, Any]
     actuators_ahead: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    remembered_ahead: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
     def values(self) -> Float[Array, " backups"]:
@@ -172,20 +212,32 @@ class CertifiedRTA(RTA):
 
     After an intervention, control returns to the agent only with `release` on top of the margin.
     Without `enforce` a feasible proposal acts whatever the prediction says. That is how filters of
-    the literature work, and it serves to compare.
+    the literature work, and it serves to compare. Some of them then need no backup controller. What
+    they propose acts, and nothing is certified.
+
+    A change of each control by at most `tolerance`, as a share of its range, is no intervention.
     """
 
     constraints: tuple[ConstraintName, ...]
     margin: Margin = 0.0
-    backups: tuple[BackupController, ...]
+    backups: tuple[BackupController, ...] = ()
     horizon: Annotated[int, Range(0, largest=10_000)] = 0
     terminal: TerminalSet | None = None
     release: Margin = 0.0
     enforce: bool = True
+    tolerance: Annotated[Number, Unit("1"), Range(0.0)] = 0.0
+
+    backup_optional: ClassVar[bool] = False
+    """Whether what the filter proposes may act by itself, without any backup controller."""
 
     def problem(self) -> str | None:
-        if not self.constraints or not self.backups:
-            return "expected at least one constraint and one backup controller"
+        alone = self.backup_optional and not self.enforce
+        if not self.constraints or not (self.backups or alone):
+            expected = "expected at least one constraint and one backup controller"
+            without = "; with enforce: false it needs no backup controller"
+            return expected + (without if self.backup_optional else "")
+        if self.horizon and not self.backups:
+            return "a horizon needs a backup controller"
         if (self.horizon > 0) != (self.terminal is not None):
             return "a horizon needs a terminal set, and a terminal set a horizon"
         if self.horizon == 0 and len(self.backups) > 1:
@@ -194,8 +246,10 @@ class CertifiedRTA(RTA):
 
     def propose(
         self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
-    ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
+    ) -> Proposal:
         """Return the control to certify and whether it meets the filter's own constraints.
+
+        A third value may say for which of `constraints` the control was changed, by its index.
 
         Args:
             env: the environment.
@@ -205,16 +259,27 @@ class CertifiedRTA(RTA):
         """
         raise NotImplementedError
 
-    def required_margin(self, env: Environment) -> Number:
+    def required_margin(self, env: Environment, name: str | None = None) -> Number:
         """Return the h to keep at samples.
 
         It is `margin`, or more where h could otherwise fall below 0 between two samples. For speed
         limits that depends on the length of a step, see docs/safety/proofs.md. Separations are
         bounded within the step instead.
+
+        Args:
+            env: the environment.
+            name: the name of a constraint, which may have a margin of its own. None stands for
+                those that have none.
         """
-        facts = [speed_limit_facts(env, name) for name in self.constraints]
+        own = {other: constraint(env, other).required_margin for other in self.constraints}
+        margin = self.margin
+        names = [other for other in self.constraints if own[other] is None]
+        if name is not None and name not in names:
+            margin = jnp.asarray(own[name])
+            names = [name]
+        facts = [speed_limit_facts(env, other) for other in names]
         least_margins = [limit.least_margin for limit in facts if limit]
-        return functools.reduce(jnp.maximum, least_margins, self.margin)
+        return functools.reduce(jnp.maximum, least_margins, margin)
 
     def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
         if not self.enforce:
@@ -243,6 +308,9 @@ class CertifiedRTA(RTA):
             certified=paths.values[best] >= self.required_margin(env),
             ahead=_selected(paths.ahead, best),
             actuators_ahead=_selected(paths.actuators_ahead, best),
+            backups=self._fresh(env, sim),
+            backups_ahead=paths.memories_ahead,
+            remembered_ahead=_selected(paths.remembered_ahead, best),
         )
         info = RTAInfo(
             correction=jnp.zeros_like(sim.time),
@@ -250,6 +318,7 @@ class CertifiedRTA(RTA):
             certified=memory.certified,
             predicted_margin=self.lowest(env, sim, sim),
             backup_index=best,
+            constraint=NO_CONSTRAINT(),
         )
         return memory, info
 
@@ -259,8 +328,12 @@ class CertifiedRTA(RTA):
         """Propose a control, certify it, else back up. Arguments and results are those of `RTA`."""
         wanted, finite = admissible(env, desired)
         later = others_later(env, sim)
-        backup = self._backup(env, sim, memory=memory, later=later)
-        proposal, feasible = self.propose(env, sim, wanted, backup)
+        backup, moved = self._backup(
+            env, sim, index=memory.backup_index, memories=memory.backups, later=later
+        )
+        proposal, feasible, *changed_for = self.propose(env, sim, wanted, backup)
+        if not self.backups:
+            backup = proposal
 
         # A certificate with a horizon takes many predicted steps, so only one is made per step.
         # From a certified state it is a certificate of the proposal. From any other state the
@@ -268,38 +341,58 @@ class CertifiedRTA(RTA):
         certified_before = memory.certified if self.enforce and self.horizon else jnp.ones((), bool)
         after_proposal = advance(env, sim, proposal, later=later)
         after_backup = advance(env, sim, backup, later=later)
-        paths = self.follow(env, sim, _where(certified_before, after_proposal, after_backup))
+        taken_over = self._fresh(env, after_proposal)
+        gone_on = self._gone_on(env, after_backup, index=memory.backup_index, moved=moved)
+        paths = self.follow(
+            env,
+            sim,
+            _where(certified_before, after_proposal, after_backup),
+            memories=_where(certified_before, taken_over, gone_on),
+        )
         best = self._best(env, paths)
         required = self.required_margin(env)
         safe = paths.values[best] >= required + jnp.where(memory.intervening, self.release, 0.0)
         passes = finite & certified_before & (safe if self.enforce else feasible)
+        passes = passes & ~self._unfinished(env, sim, memory)
 
         backup_margin = self.lowest(env, sim, after_backup)
         new_certificate = passes | ~certified_before
         if self.horizon:
-            backup_certified, ahead, actuators_ahead = self._renew(
+            backup_certified, end, memories_ahead = self._renew(
                 env, sim, memory=memory, after_backup=after_backup, backup_margin=backup_margin
             )
             backup_certified = jnp.where(
                 certified_before, backup_certified, paths.values[best] >= required
             )
-            ahead = _where(new_certificate, _selected(paths.ahead, best), ahead)
-            actuators_ahead = _where(
-                new_certificate, _selected(paths.actuators_ahead, best), actuators_ahead
+            new_ends = (paths.ahead, paths.actuators_ahead, paths.remembered_ahead)
+            ahead, actuators_ahead, remembered_ahead = _where(
+                new_certificate,
+                _selected(new_ends, best),
+                (end.platforms, end.actuators, end.remembered),
             )
+            memories_ahead = _where(new_certificate, paths.memories_ahead, memories_ahead)
         else:
             backup_certified = self.follow(env, sim, after_backup).values[0] >= required
             ahead = {}
             actuators_ahead = {}
+            remembered_ahead = {}
+            memories_ahead = paths.memories_ahead
         actual = jnp.where(passes, proposal, backup)
         correction = jnp.where(jnp.isfinite(desired), actual - wanted, actual)
         certified = jnp.where(passes, safe, backup_certified)
+        intervening = altered(env, correction, self.tolerance) | ~finite
+        cause = self.closest(env, paths.margins[best])
+        if changed_for:
+            cause = jnp.where(passes if self.backups else True, changed_for[0], cause)
         memory = RTAMemory(
-            intervening=jnp.any(correction != 0.0) | ~finite,
+            intervening=intervening,
             backup_index=jnp.where(new_certificate, best, memory.backup_index),
             certified=certified,
             ahead=ahead,
             actuators_ahead=actuators_ahead,
+            backups=_where(passes, taken_over, gone_on),
+            backups_ahead=memories_ahead,
+            remembered_ahead=remembered_ahead,
         )
         info = RTAInfo(
             correction=safe_norm(correction),
@@ -309,6 +402,7 @@ class CertifiedRTA(RTA):
                 passes, self.lowest(env, sim, after_proposal), backup_margin
             ),
             backup_index=memory.backup_index,
+            constraint=jnp.where(intervening & finite, cause, NO_CONSTRAINT()),
         )
         return actual, memory, info
 
@@ -317,13 +411,32 @@ class CertifiedRTA(RTA):
 
         For separations it is the smallest h on the way from `before`, one step earlier.
         """
-        return smallest_margin(env, sim, before=before, names=self.constraints)
+        return jnp.min(self.margins(env, before, sim))
+
+    def margins(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, " c"]:
+        """Return the h of each of the c constraints at `sim`. Arguments are those of `lowest`."""
+        return margins_of(env, sim, before=before, names=self.constraints)
+
+    def compared(self, env: Environment, margins: Float[Array, " c"]) -> Float[Array, " c"]:
+        """Return the h of each constraint, so that all are to be compared with `required_margin`.
+
+        Constraints that have a margin of their own are moved by the difference.
+        """
+        if all(constraint(env, name).required_margin is None for name in self.constraints):
+            return margins
+        own = [self.required_margin(env, name) for name in self.constraints]
+        return margins + self.required_margin(env) - jnp.stack(own)
+
+    def closest(self, env: Environment, margins: Float[Array, " c"]) -> Int[Array, ""]:
+        """Return the index of the constraint of which least is left above its margin."""
+        return jnp.argmin(self.compared(env, margins)).astype(jnp.int32)
 
     def certify(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, " backups"]:
         """Return for each backup controller the smallest h on its way from `sim`.
 
-        It is −∞ for a way that proves nothing. Such a way ends outside the terminal set, or the
-        proof of the controller or of the set does not hold for the numbers of the environment.
+        It is to be compared with `required_margin`. It is −∞ for a way that proves nothing. Such a
+        way ends outside the terminal set, or the proof of the controller or of the set does not
+        hold for the numbers of the environment.
 
         Args:
             env: the environment, with the numbers of this episode.
@@ -332,81 +445,109 @@ class CertifiedRTA(RTA):
         """
         return self.follow(env, before, sim).values
 
-    def follow(self, env: Environment, before: Sim, sim: Sim) -> Paths:
+    def follow(
+        self, env: Environment, before: Sim, sim: Sim, memories: tuple[Any, ...] | None = None
+    ) -> Paths:
         """Return the predicted way of each backup controller from `sim`.
 
         Args:
             env: the environment, with the numbers of this episode.
             before: the simulation one step before `sim`.
             sim: the simulation from which the backup controllers act.
+            memories: what each backup controller remembers there. With None they take over there.
         """
-        first = self.lowest(env, before, sim)
+        memories = self._fresh(env, sim) if memories is None else memories
+        first = self.margins(env, before, sim)
         faultless = [_none(backup.faults(env, sim, self)) for backup in self.backups]
-        proved = jnp.stack(faultless) & _finite(sim)
+        proved = jnp.stack(faultless or [jnp.zeros((), bool)]) & _finite(sim)
         if self.terminal is None:
-            return Paths(least=first[None], certified=proved & jnp.isfinite(first), ahead={})
+            least = jnp.min(self.compared(env, first))
+            return Paths(
+                margins=first[None],
+                least=least[None],
+                certified=proved & jnp.isfinite(least),
+                ahead={},
+                memories_ahead=memories,
+            )
         # The other platforms are predicted once for all backup controllers, unless they react to
         # what the agent does.
-        groups = [[backup] for backup in self.backups] if others_react(env, sim) else [self.backups]
-        predicted = [self._follow(env, backups, first=first, sim=sim) for backups in groups]
-        least, group_ends = zip(*predicted, strict=True)
+        pairs = list(zip(self.backups, memories, strict=True))
+        groups = [[pair] for pair in pairs] if others_react(env, sim) else [pairs]
+        predicted = [self._follow(env, group, first=first, sim=sim) for group in groups]
+        margins, group_ends, group_memories = zip(*predicted, strict=True)
+        margins = jnp.concatenate(margins)
         ends = [end for ends in group_ends for end in ends]
         reached = jnp.stack([self._may_end(env, end) for end in ends])
-        stacked = lambda trees: jax.tree.map(lambda *leaves: jnp.stack(leaves), *trees)  # noqa: E731
+        states = [(end.platforms, end.actuators, end.remembered) for end in ends]
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+        ahead, actuators_ahead, remembered_ahead = stacked
+        compared = jnp.stack([self.compared(env, on_the_way) for on_the_way in margins])
         return Paths(
-            least=jnp.concatenate(least),
+            margins=margins,
+            least=jnp.min(compared, axis=-1),
             certified=reached & proved,
-            ahead=stacked([end.platforms for end in ends]),
-            actuators_ahead=stacked([end.actuators for end in ends]),
+            ahead=ahead,
+            actuators_ahead=actuators_ahead,
+            remembered_ahead=remembered_ahead,
+            memories_ahead=jax.lax.stop_gradient(tuple(itertools.chain(*group_memories))),
         )
 
     def _follow(
         self,
         env: Environment,
-        backups: Sequence[BackupController],
-        first: Float[Array, ""],
+        backups: Sequence[tuple[BackupController, Any]],
+        first: Float[Array, " c"],
         sim: Sim,
-    ) -> tuple[Float[Array, " backups"], list[Sim]]:
-        """Return the smallest h on the way, and the last simulation, of each backup controller.
+    ) -> tuple[Float[Array, "backups c"], list[Sim], list[Any]]:
+        """Return the smallest margins on the way, and the last simulation and memory, by backup.
 
         Args:
             env: the environment.
-            backups: backup controllers under which the other platforms move alike. The other
-                platforms are predicted once.
-            first: the smallest h at `sim`.
+            backups: backup controllers, each with its memory, under which the other platforms move
+                alike. The other platforms are predicted once.
+            first: the h of each constraint at `sim`.
             sim: the simulation from which the backup controllers act.
         """
         low, high = bounds(env)
         plant = env.agent_platform
 
-        def with_agent(sim: Sim, agent: tuple[Any, Any]) -> Sim:
-            state, actuators = agent
+        def with_agent(sim: Sim, agent: tuple[Any, Any, Any]) -> Sim:
+            """Return the simulation with what depends on the agent.
+
+            That is its state, its actuators, and what statuses remember.
+            """
+            state, actuators, remembered = agent
             platforms = {**sim.platforms, env.agent: state}
-            return sim.replace(platforms=platforms, actuators=actuators)
+            return sim.replace(platforms=platforms, actuators=actuators, remembered=remembered)
 
         def one_step(
-            carry: tuple[Sim, list[Any], list[Array]],
-        ) -> tuple[Sim, list[Any], list[Array]]:
-            sim, agents, least = carry
+            carry: tuple[Sim, list[Any], list[Any], list[Array]],
+        ) -> tuple[Sim, list[Any], list[Any], list[Array]]:
+            sim, agents, memories, least = carry
             later = others_later(env, sim)
             after = later_sim(env, sim, {**later, env.agent: agents[0][0]})
-            for i, backup in enumerate(backups):
+            for i, (backup, _) in enumerate(backups):
                 before = with_agent(sim, agents[i])
-                control = jnp.clip(backup.control(env, before, later), low, high)
+                control, memories[i] = backup.act(env, before, later, memories[i])
+                control = jnp.clip(control, low, high)
                 move = plant.step_within_limits if backup.within_limits else plant.step
                 controls, actuators = driven(env, before, control)
-                agents[i] = (move(agents[i][0], controls, env.dt), actuators)
-                moved = with_agent(after, agents[i])
+                state = move(before.platforms[env.agent], controls, env.dt)
+                moved = with_agent(after, (state, actuators, before.remembered))
                 moved = moved.replace(control_desired=control, control_actual=control)
-                lowest = self.lowest(env, before, moved)
-                least[i] = jnp.minimum(least[i], lowest)
-            return with_agent(after, agents[0]), agents, least
+                moved = remember(env, before, moved, env.dt)
+                agents[i] = (state, actuators, moved.remembered)
+                least[i] = jnp.minimum(least[i], self.margins(env, before, moved))
+            return with_agent(after, agents[0]), agents, memories, least
 
         sim = sim.replace(regions={}, status={})
-        agent = (sim.platforms[env.agent], sim.actuators)
-        start = (sim, [agent] * len(backups), [first] * len(backups))
-        last, agents, least = repeat(one_step, start, self.horizon)
-        return jnp.stack(least), [with_agent(last, agent) for agent in agents]
+        count = len(backups)
+        memories = [memory for _, memory in backups]
+        agent = (sim.platforms[env.agent], sim.actuators, sim.remembered)
+        start = (sim, [agent] * count, memories, [first] * count)
+        last, agents, memories, least = repeat(one_step, start, self.horizon)
+        ends = [with_agent(last, agent) for agent in agents]
+        return jnp.stack(least), ends, memories
 
     def _may_end(self, env: Environment, end: Sim) -> Bool[Array, ""]:
         """Return whether a certificate may end in a state."""
@@ -421,10 +562,10 @@ class CertifiedRTA(RTA):
         memory: RTAMemory,
         after_backup: Sim,
         backup_margin: Float[Array, ""],
-    ) -> tuple[Bool[Array, ""], Mapping[str, Any], Mapping[str, Any]]:
+    ) -> tuple[Bool[Array, ""], Sim, tuple[Any, ...]]:
         """Return whether the state after a step of the backup is certified, and its horizon's end.
 
-        The end is that of all platforms, and that of the agent's actuators.
+        The end is the simulation there and the memories of the backup controllers.
 
         All steps of the new certificate but the last are steps of the one before it. So only the
         last step is predicted.
@@ -443,18 +584,20 @@ class CertifiedRTA(RTA):
             actuators=memory.actuators_ahead,
             regions={},
             status={},
+            remembered=memory.remembered_ahead,
         )
         later = others_later(env, end)
-        control = self._backup(env, end, memory=memory, later=later)
+        control, memories = self._backup(
+            env, end, index=memory.backup_index, memories=memory.backups_ahead, later=later
+        )
         new_end = advance(env, end, control, later=later)
         faultless = [_none(backup.faults(env, after_backup, self)) for backup in self.backups]
         proved = jnp.stack(faultless)[memory.backup_index]
-        last_step_keeps = self.lowest(env, end, new_end) >= self.required_margin(env)
-        keeps = last_step_keeps & (backup_margin >= 0.0)
+        last_step = jnp.min(self.compared(env, self.margins(env, end, new_end)))
+        keeps = (last_step >= self.required_margin(env)) & (backup_margin >= 0.0)
         renewed = memory.certified & keeps & self._may_end(env, new_end)
         renewed = renewed & proved & _finite(after_backup)
-        ends = (new_end.platforms, new_end.actuators)
-        return renewed, *jax.lax.stop_gradient(ends)
+        return renewed, *jax.lax.stop_gradient((new_end, memories))
 
     def _best(self, env: Environment, paths: Paths) -> Int[Array, ""]:
         """Return the index of the backup controller with the largest h on its way.
@@ -462,15 +605,64 @@ class CertifiedRTA(RTA):
         Only certified ones are compared if there are any.
         """
         certified = paths.values >= self.required_margin(env)
+        if not self.backups:
+            return jnp.full((), -1, jnp.int32)
         compared = jnp.where(jnp.any(certified), paths.values, paths.least)
         return jnp.argmax(jnp.where(jnp.isnan(compared), -jnp.inf, compared)).astype(jnp.int32)
 
     def _backup(
-        self, env: Environment, sim: Sim, memory: RTAMemory, later: Others
-    ) -> Float[Array, " m"]:
-        controls = jnp.stack([backup.control(env, sim, later) for backup in self.backups])
-        chosen = controls[memory.backup_index] if len(self.backups) > 1 else controls[0]
-        return admissible(env, chosen)[0]
+        self,
+        env: Environment,
+        sim: Sim,
+        index: Int[Array, ""],
+        memories: tuple[Any, ...],
+        later: Others,
+    ) -> tuple[Float[Array, " m"], tuple[Any, ...]]:
+        """Return the control of a backup controller by its index, and all memories after they act.
+
+        Args:
+            env: the environment.
+            sim: the simulation before the step.
+            index: the index of the controller.
+            memories: what each backup controller remembers.
+            later: the other platforms after the step.
+        """
+        if not self.backups:
+            return jnp.zeros(env.action_size, env.dt.dtype), ()
+        acts = [
+            backup.act(env, sim, later, memory)
+            for backup, memory in zip(self.backups, memories, strict=True)
+        ]
+        controls = jnp.stack([control for control, _ in acts])
+        chosen = controls[index] if len(self.backups) > 1 else controls[0]
+        return admissible(env, chosen)[0], tuple(moved for _, moved in acts)
+
+    def _fresh(self, env: Environment, sim: Sim) -> tuple[Any, ...]:
+        """Return the memories of backup controllers that take over at a state."""
+        return tuple(backup.init(env, sim) for backup in self.backups)
+
+    def _gone_on(
+        self, env: Environment, sim: Sim, index: Int[Array, ""], moved: tuple[Any, ...]
+    ) -> tuple[Any, ...]:
+        """Return the memories after a step of one backup controller.
+
+        Args:
+            env: the environment.
+            sim: the simulation after the step.
+            index: the index of the controller that acted. The others would take over now.
+            moved: the memories of all controllers, as if each had acted.
+        """
+        pairs = zip(moved, self._fresh(env, sim), strict=True)
+        return tuple(_where(index == i, acted, fresh) for i, (acted, fresh) in enumerate(pairs))
+
+    def _unfinished(self, env: Environment, sim: Sim, memory: RTAMemory) -> Bool[Array, ""]:
+        """Return whether the backup controller in reserve has a manoeuvre under way."""
+        pairs = enumerate(zip(self.backups, memory.backups, strict=True))
+        under_way = [
+            (memory.backup_index == i) & backup.unfinished(env, sim, own)
+            for i, (backup, own) in pairs
+        ]
+        return functools.reduce(jnp.logical_or, under_way, jnp.zeros((), bool))
 
 
 def admissible(
@@ -483,6 +675,18 @@ def admissible(
     low, high = bounds(env)
     finite = jnp.isfinite(control)
     return within(jnp.where(finite, control, 0.0), low, high), jnp.all(finite)
+
+
+def altered(env: Environment, correction: Float[Array, " m"], tolerance: Number) -> Bool[Array, ""]:
+    """Return whether a correction counts as an intervention.
+
+    Args:
+        env: the environment.
+        correction: the change of each control, in physical units and action order.
+        tolerance: the largest share of a control's range that does not count.
+    """
+    low, high = bounds(env)
+    return jnp.any(jnp.abs(correction) > tolerance * (high - low))
 
 
 def repeated(parts: Sequence[Any]) -> str | None:
@@ -506,5 +710,5 @@ def _where(condition: Bool[Array, ""], this: Any, other: Any) -> Any:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), this, other)
 
 
-def _selected(ahead: Mapping[str, Any], index: Int[Array, ""]) -> Mapping[str, Any]:
+def _selected(ahead: Any, index: Int[Array, ""]) -> Any:
     return jax.lax.stop_gradient(jax.tree.map(lambda leaf: leaf[index], ahead))

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from jaxsafe.processors.constraint import Separation
-from jaxsafe.processors.status import Distance
+from jaxsafe.processors.status import DeltaV, Distance
 from jaxsafe.rta.filter import BackupController, CertifiedRTA, Faults
 from jaxsafe.rta.speed_limit import (
     MAX_ORBIT_ANGLE_PER_STEP,
@@ -26,12 +26,12 @@ from jaxsafe.rta.speed_limit import (
     speed_limit_facts,
 )
 from jaxsafe.simulation.controllers import Uncontrolled
-from jaxsafe.simulation.cwh import MEAN_MOTION, Spacecraft
+from jaxsafe.simulation.cwh import MEAN_MOTION, Anchor, Spacecraft
 from jaxsafe.simulation.double_integrator import DoubleIntegrator
 from jaxsafe.simulation.dubins import Dubins2D, Dubins3D
 from jaxsafe.simulation.oriented import OrientedSpacecraft
 from jaxsafe.simulation.scripted import Command, Constant, Scripted
-from jaxsafe.transition import constraint
+from jaxsafe.transition import bounds, constraint, remembering_statuses, status_names
 from jaxsafe.types import Number, Sim
 
 if TYPE_CHECKING:
@@ -97,12 +97,12 @@ def brake_faults(env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
     if isinstance(speed_limits, str):
         return {speed_limits: _true()}
     distance, speed = distance_and_speed(env, sim)
-    margin = rta.required_margin(env)
     faults = {"the chief is not at the origin": off_centre(env, sim)}
-    for facts in speed_limits:
+    for name, facts in zip(rta.constraints, speed_limits, strict=True):
+        margin = rta.required_margin(env, name)
         farthest = facts.farthest(distance, speed)
         known = jnp.where(jnp.isfinite(farthest), farthest, 0.0)
-        faults |= {
+        of_limit = {
             "mean motion and step are too large": facts.mean_motion * env.dt
             > MAX_ORBIT_ANGLE_PER_STEP,
             "margin is not below the speed limit at the chief": ~(margin < facts.floor),
@@ -112,6 +112,8 @@ def brake_faults(env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
                 facts.needed_margin(known) <= margin
             ),
         }
+        for fault, applies in of_limit.items():  # several limits may share a fault
+            faults[fault] = applies | faults.get(fault, False)
     return faults
 
 
@@ -138,7 +140,7 @@ def align_and_brake_faults(
         return {speed_limits: _true()}
     (facts,) = speed_limits
     kept = 2.0 * backup.least_kept(env)
-    required = rta.required_margin(env)
+    required = rta.required_margin(env, backup.constraint)
     wheel = env.actuators[1]
     distance, _ = distance_and_speed(env, sim)
     n = facts.mean_motion
@@ -189,12 +191,66 @@ def slow_faults(
         return {"slow is proved to be kept by brake alone": _true()}
     if late := _slow_actuators(env, "slow"):
         return late
-    limits = [facts for name in rta.constraints if (facts := speed_limit_facts(env, name))]
-    above = [terminal.speed + rta.required_margin(env) > facts.floor for facts in limits]
+    above = [
+        terminal.speed + rta.required_margin(env, name) > facts.floor
+        for name in rta.constraints
+        if (facts := speed_limit_facts(env, name))
+    ]
     if not above:
         return {}
     fault = "speed of slow is too close to the speed limit at the chief"
     return {fault: jnp.any(jnp.stack(above))}
+
+
+def at_rest_faults(
+    env: Environment, sim: Sim, rta: CertifiedRTA, keeper: type[BackupController]
+) -> Faults:
+    """Return what is missing for Proposition 9: `brake` keeps a spacecraft at rest in its place."""
+    plant: Any = env.agent_platform
+    if type(plant) is not Spacecraft or not set(plant.inputs) <= set(env.action_names):
+        return {"at_rest is proved for a spacecraft with all thrusters alone": _true()}
+    if late := _slow_actuators(env, "at_rest"):
+        return late
+    if _packaged_but(keeper, rta):
+        return {"at_rest is proved to be kept by brake alone": _true()}
+    moving = [
+        platform.name
+        for platform in env.platforms
+        if platform.name != env.agent and type(platform) is not Anchor
+    ]
+    if moving:
+        return {f"at_rest is proved where all others rest, and {moving[0]!r} may move": _true()}
+    remembering = remembering_statuses(env, rta.constraints)
+    if remembering:
+        fault = f"at_rest is proved for constraints without memory, and {remembering[0]!r} has one"
+        return {fault: _true()}
+    distance, _ = distance_and_speed(env, sim)
+    low, high = bounds(env)
+    weakest = jnp.min(jnp.minimum(-low, high)) / plant.mass
+    n = jnp.abs(plant.mean_motion)
+    faults = {
+        "mean motion and step are too large": n * env.dt > MAX_ORBIT_ANGLE_PER_STEP,
+        "thrust cannot hold the spacecraft at rest": ~(3.0 * n**2 * distance < 0.9 * weakest),
+    }
+    for name in rta.constraints:
+        facts = speed_limit_facts(env, name)
+        if facts:
+            fault = f"margin of {name!r} is too small for what the limit changes within a step"
+            required = rta.required_margin(env, name)
+            faults[fault] = ~(facts.needed_margin(distance) <= required)
+    return faults
+
+
+def coast_faults(env: Environment, rta: CertifiedRTA) -> Faults:
+    """Return what is missing for the proof that `coast` keeps the constraints."""
+    if late := _slow_actuators(env, "coast"):
+        return late
+    low, high = bounds(env)
+    faults = {"coast needs actuators that can give no control": jnp.any((low > 0.0) | (high < 0.0))}
+    for name in rta.constraints:
+        if not _is_budget(env, name):
+            faults[f"coast is proved to keep budgets alone, and {name!r} is none"] = _true()
+    return faults
 
 
 def aligned_or_slow_faults(
@@ -212,8 +268,10 @@ def aligned_or_slow_faults(
     speed_limits = _speed_limits(env, rta)
     if isinstance(speed_limits, str):
         return {speed_limits: _true()}
-    margin = rta.required_margin(env)
-    too_far = [~(_farthest(env, sim, facts) <= _held_to(facts, margin)) for facts in speed_limits]
+    too_far = [
+        ~(_farthest(env, sim, facts) <= _held_to(facts, rta.required_margin(env, name)))
+        for name, facts in zip(rta.constraints, speed_limits, strict=True)
+    ]
     too_fast = [terminal.speed > CLOSE * 0.75 * facts.floor for facts in speed_limits]
     return {
         "thrust cannot hold the speed limit where the turn along the velocity leads": jnp.any(
@@ -266,7 +324,8 @@ def velocity_matched_faults(
         return late
     if type(lead) is not type(plant):
         return {"velocity_matched is proved for two aircraft of one kind": _true()}
-    leads = [backup.lead for backup in rta.backups if type(backup) is keeper]
+    proved = [backup.proved for backup in rta.backups]
+    leads = [backup.lead for backup in proved if type(backup) is keeper]
     if _packaged_but(keeper, rta) or any(followed != name for followed in leads):
         fault = f"velocity_matched is proved to be kept by match_velocity of {name!r} alone"
         return {fault: _true()}
@@ -282,7 +341,6 @@ def velocity_matched_faults(
         for control in lead.inputs
     }
     state = sim.platforms[name]
-    margin = rta.required_margin(env)
     slowest, fastest = plant.speed_limits
     least, most = extremes["acceleration"]
     steady = (least == 0.0) & (most == 0.0)
@@ -290,14 +348,19 @@ def velocity_matched_faults(
     any_speed = (lead.speed_limits[0] >= slowest) & (lead.speed_limits[1] <= fastest)
     faults = {
         "clearance of velocity_matched is below the separation and the margin": jnp.any(
-            jnp.stack([~(limit.minimum + margin <= terminal.clearance) for limit in limits])
+            jnp.stack(
+                [
+                    ~(limit.minimum + rta.required_margin(env, limit.name) <= terminal.clearance)
+                    for limit in limits
+                ]
+            )
         ),
         f"{name!r} may fly at speeds that the agent cannot": ~jnp.where(
             steady, own_speed, any_speed
         ),
     }
     if type(plant) is Dubins2D:
-        zones = [backup.dead_zone for backup in rta.backups if type(backup) is keeper]
+        zones = [backup.dead_zone for backup in proved if type(backup) is keeper]
         return faults | _faults_in_plane(
             env, terminal=terminal, dead_zones=zones, name=name, extremes=extremes
         )
@@ -411,6 +474,18 @@ def _slow_actuators(env: Environment, proved: str) -> Faults:
     return {fault: _true()}
 
 
+def _is_budget(env: Environment, name: str) -> bool:
+    """Return whether a constraint rests on sums of the agent's Δv alone."""
+    statuses = {status.name: status for status in env.status}
+    sums = [statuses[other] for other in status_names([constraint(env, name)])]
+    added = [statuses[other] for other in status_names(sums)]
+    return (
+        bool(sums and added)
+        and all(total.remembers for total in sums)
+        and all(type(status) is DeltaV and status.of == env.agent for status in added)
+    )
+
+
 def _true() -> Bool[Array, ""]:
     return jnp.ones((), bool)
 
@@ -436,10 +511,8 @@ def _packaged_but(keeper: type[BackupController], rta: CertifiedRTA) -> bool:
 
     Nothing is known here of the backup controllers of users, so they do not count.
     """
-    return any(
-        type(backup).__module__ == keeper.__module__ and type(backup) is not keeper
-        for backup in rta.backups
-    )
+    found = [type(backup.proved) for backup in rta.backups]
+    return any(kind.__module__ == keeper.__module__ and kind is not keeper for kind in found)
 
 
 def _separates(env: Environment, limit: Any, platforms: set[str]) -> bool:

@@ -18,7 +18,20 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsafe.rta.projection import within
-from jaxsafe.types import Number
+from jaxsafe.types import Number, Record
+
+Slack = Number | Sequence[Number | None] | None
+"""Cost σ of missing a row: one for all rows, one for each, or None where no row may be missed."""
+
+
+class Solution(Record):
+    """The nearest control, and what is known of it."""
+
+    control: Float[Array, " m"]
+    solved: Bool[Array, ""]  # whether some control meets all rows without slack
+    feasible: Bool[Array, ""]  # whether besides each row with slack can be met by itself
+    # By row, how much the nearest control would move per unit of the row. 0 where it is not active.
+    multipliers: Float[Array, " c"]
 
 
 def nearest_control(
@@ -27,12 +40,27 @@ def nearest_control(
     high: Float[Array, " m"],
     rows: Float[Array, "c m"],
     offsets: Float[Array, " c"],
-    slack: Number | None = None,
+    slack: Slack = None,
     tolerance: Number | None = None,
 ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
-    """Return the nearest control argmin ‖w − u‖² + σ‖s‖².
+    """Return control and flag of `nearest_solution`, whose arguments these are."""
+    solution = nearest_solution(u, low, high, rows, offsets, slack=slack, tolerance=tolerance)
+    return solution.control, solution.feasible
 
-    It is subject to rows·w + s ≥ offsets, s ≥ 0 and low ≤ w ≤ high. Without a `slack` σ, s = 0.
+
+def nearest_solution(
+    u: Float[Array, " m"],
+    low: Float[Array, " m"],
+    high: Float[Array, " m"],
+    rows: Float[Array, "c m"],
+    offsets: Float[Array, " c"],
+    slack: Slack = None,
+    tolerance: Number | None = None,
+) -> Solution:
+    """Return the nearest control argmin ‖w − u‖² + Σ σ s².
+
+    It is subject to rows·w + s ≥ offsets, s ≥ 0 and low ≤ w ≤ high. A row without a `slack` σ has s
+    = 0.
 
     For a pattern with free elements F and active rows S the solution is w_F = u_F + A_SFᵀλ, where
     (A_SF A_SFᵀ + I/σ) λ = b_S − A_S w⁰, and w⁰ is u on F and the bounds elsewhere. The optimum is
@@ -46,28 +74,29 @@ def nearest_control(
         high: upper bounds, finite, shape (m,).
         rows: normals A of the constraints, shape (c, m).
         offsets: right-hand sides b of the constraints, shape (c,).
-        slack: cost σ > 0 of missing a constraint. With None no constraint may be missed.
+        slack: cost σ > 0 of missing a constraint, one for all rows or one for each. A row with None
+            may not be missed.
         tolerance: by how much a row of unit length may be missed and still count as met. None
             stands for 30 times the rounding unit, which is 4e-6 in float32.
 
     Returns:
-        The solution and a flag. Without slack the flag says whether there is a solution. If there
-        is none, the first is u within its bounds. With slack there always is a solution, and the
-        flag says whether each row by itself can be met.
+        The solution. If there is none, its control is u within its bounds.
     """
     count, size = rows.shape
+    slacks = list(slack) if isinstance(slack, Sequence) else [slack] * count
     squared = jnp.sum(rows * rows, axis=-1)
     scale = jnp.sqrt(
         jnp.where(squared > 0.0, squared, 1.0)
     )  # the length of a row of zeros has no derivative
     rows = rows / scale[:, None]
     offsets = offsets / scale
-    cost = None if slack is None else slack * scale**2
+    costs = [None if sigma is None else sigma * scale[i] ** 2 for i, sigma in enumerate(slacks)]
+    soft = [cost is not None for cost in costs]
     allowed = 30.0 * float(jnp.finfo(u.dtype).eps) if tolerance is None else tolerance
 
     # Vectors and matrices are lists of their elements. Each element is an array over the patterns,
     # because SIMD runs along the long axis.
-    sides, actives = _patterns(size, count, soft=slack is not None)
+    sides, actives = _patterns(size, soft)
     w0 = [
         jnp.where(side == 0, u[k], jnp.where(side < 0, low[k], high[k]))
         for k, side in enumerate(sides)
@@ -83,7 +112,9 @@ def nearest_control(
         for free_row, active in zip(free_rows, actives, strict=True)
     ]
     for i, active in enumerate(actives):
-        gram[i][i] = jnp.where(active, gram[i][i] + (0.0 if cost is None else 1.0 / cost[i]), 1.0)
+        cost = costs[i]
+        softening = 0.0 if cost is None else 1.0 / cost
+        gram[i][i] = jnp.where(active, gram[i][i] + softening, 1.0)
     gap = [
         jnp.where(active, offsets[i] - _dot(w0, rows[i]), 0.0) for i, active in enumerate(actives)
     ]
@@ -95,29 +126,36 @@ def nearest_control(
 
     missing = [jnp.maximum(offsets[i] - _dot(w, rows[i]), 0.0) for i in range(count)]
     value = sum((w[k] - u[k]) ** 2 for k in range(size))
-    if cost is None:
-        met = [amount <= allowed for amount in missing]
-        valid = functools.reduce(jnp.logical_and, met, regular)
-        feasible = jnp.any(valid)
-    else:
-        valid = regular
-        value = value + sum(cost[i] * missing[i] ** 2 for i in range(count))
+    met = [amount <= allowed for amount, is_soft in zip(missing, soft, strict=True) if not is_soft]
+    valid = functools.reduce(jnp.logical_and, met, regular)
+    solved = jnp.any(valid)
+    feasible = solved
+    if any(soft):
+        paid = zip(costs, missing, strict=True)
+        value = value + sum(cost * amount**2 for cost, amount in paid if cost is not None)
         highest = jnp.sum(jnp.where(rows > 0.0, rows * high, rows * low), axis=-1)
-        feasible = jnp.all(highest >= offsets)
+        reached = jnp.all((highest >= offsets) | ~np.array(soft))
+        feasible = reached if all(soft) else reached & solved
     best = jnp.argmin(jnp.where(valid, value, jnp.inf))
     # If u is on a bound, several patterns give u itself. The first of them holds it on the bound
     # and so has no derivative there. Therefore u is taken with its own derivative.
     unaltered = jnp.all(jnp.sum(rows * u, axis=-1) >= offsets) & jnp.all((u >= low) & (u <= high))
     chosen = jnp.where(unaltered, u, jnp.stack([element[best] for element in w]))
-    return jnp.where(jnp.any(valid), chosen, within(u, low, high)), feasible
+    largest = jnp.stack([multiplier[best] for multiplier in multipliers])
+    return Solution(
+        control=jnp.where(solved, chosen, within(u, low, high)),
+        solved=solved,
+        feasible=feasible,
+        multipliers=jnp.where(unaltered | ~solved, 0.0, largest),
+    )
 
 
-def _patterns(size: int, count: int, *, soft: bool) -> tuple[np.ndarray, np.ndarray]:
+def _patterns(size: int, soft: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
     """Return for each pattern the side of every element and whether each row is active.
 
-    A side is −1 for the low bound, 0 for a free element and 1 for the high bound. Without slack, no
-    more rows than free elements can be active without depending on each other. With slack (`soft`)
-    all rows can.
+    A side is −1 for the low bound, 0 for a free element and 1 for the high bound. No more rows
+    without slack than free elements can be active without depending on each other. All rows with
+    slack (`soft`) can.
 
     Returns:
         Sides of shape (size, patterns) and activity of shape (count, patterns).
@@ -125,8 +163,9 @@ def _patterns(size: int, count: int, *, soft: bool) -> tuple[np.ndarray, np.ndar
     patterns = [
         (side, active)
         for side in itertools.product((-1, 0, 1), repeat=size)
-        for active in itertools.product((False, True), repeat=count)
-        if soft or sum(active) <= side.count(0)
+        for active in itertools.product((False, True), repeat=len(soft))
+        if sum(on and not is_soft for on, is_soft in zip(active, soft, strict=True))
+        <= side.count(0)
     ]
     sides = np.array([side for side, _ in patterns]).T
     actives = np.array([active for _, active in patterns]).T

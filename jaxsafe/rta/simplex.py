@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
-from jaxsafe.rta.filter import RTA, CertifiedRTA, RTAMemory, admissible
+from jaxsafe.rta.filter import RTA, CertifiedRTA, Proposal, RTAMemory, admissible
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.geometry import direction, safe_norm, to_body
 from jaxsafe.transition import advance, undirected
@@ -24,7 +24,7 @@ class Simplex(CertifiedRTA, type="simplex"):
 
     def propose(
         self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
-    ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
+    ) -> Proposal:
         return desired, jnp.ones((), bool)
 
 
@@ -40,14 +40,21 @@ class Blend(CertifiedRTA, type="blend"):
 
     def propose(
         self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
-    ) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
+    ) -> Proposal:
         shares = jnp.arange(1, self.parts + 1, dtype=desired.dtype) / self.parts
         mixed = backup + shares[:, None] * (desired - backup)
         mixed = mixed.at[-1].set(desired)  # the sum above may differ from it in the last bit
-        values = jax.vmap(lambda u: jnp.max(self.certify(env, sim, advance(env, sim, u))))(mixed)
+
+        def predict(u: Float[Array, " m"]) -> tuple[Array, Array]:
+            paths = self.follow(env, sim, advance(env, sim, u))
+            best = jnp.argmax(paths.values)
+            return paths.values[best], self.closest(env, paths.margins[best])
+
+        values, closest = jax.vmap(predict)(mixed)
         certified = values >= self.required_margin(env)
         largest = self.parts - 1 - jnp.argmax(certified[::-1])
-        return jnp.where(jnp.any(certified), mixed[largest], backup), jnp.any(certified)
+        control = jnp.where(jnp.any(certified), mixed[largest], backup)
+        return control, jnp.any(certified), closest[-1]
 
 
 class CollisionSimplex(RTA, type="collision_simplex"):
@@ -70,6 +77,11 @@ class CollisionSimplex(RTA, type="collision_simplex"):
     )
     engage: Annotated[Length, Positive] = 200.0
     release: Annotated[Length, Positive] = 250.0
+
+    @property
+    def constraints(self) -> tuple[str, ...]:
+        """No names, because the filter looks at no constraint of the environment."""
+        return ()
 
     def begin(self, env: Environment, sim: Sim) -> tuple[RTAMemory, RTAInfo]:
         false = jnp.zeros((), bool)
