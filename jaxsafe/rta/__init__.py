@@ -17,6 +17,7 @@ from jaxsafe.rta.backups import (
 from jaxsafe.rta.backups_with_memory import HoldPosition, Latched
 from jaxsafe.rta.cascade import Cascade, Stage
 from jaxsafe.rta.filter import RTA, BackupController, CertifiedRTA, RTAMemory, TerminalSet
+from jaxsafe.rta.own_simulator import Barrier, Plant, filter_by_asif, filter_by_simplex
 from jaxsafe.rta.simplex import Blend, CollisionSimplex, Simplex
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "AlignedOrSlow",
     "AtRest",
     "BackupController",
+    "Barrier",
     "Blend",
     "Brake",
     "Cascade",
@@ -37,6 +39,7 @@ __all__ = [
     "ImplicitASIF",
     "Latched",
     "MatchVelocity",
+    "Plant",
     "Polynomial",
     "RTAMemory",
     "Simplex",
@@ -45,4 +48,6 @@ __all__ = [
     "Strengthening",
     "TerminalSet",
     "VelocityMatched",
+    "filter_by_asif",
+    "filter_by_simplex",
 ]

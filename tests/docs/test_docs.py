@@ -208,6 +208,7 @@ def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax
         "dynamics",
         thorough("extend"),
         thorough("extend_rta"),
+        thorough("safety/own_simulator"),
         thorough("safety/presets"),
         thorough("safety/proofs"),
         "deviations",

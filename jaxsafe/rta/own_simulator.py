@@ -1,0 +1,253 @@
+"""Filters without an environment, for a simulator of one's own.
+
+They are pure functions of a state and a control, so they compile, batch and differentiate. A state
+is a vector or any tree of arrays.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxsafe.processors.strengthening import Polynomial
+from jaxsafe.rta.asif import barrier_row, nearest_by_priority
+from jaxsafe.rta.filter import NO_CONSTRAINT
+from jaxsafe.rta.projection import within
+from jaxsafe.schema.errors import ConfigError
+from jaxsafe.simulation.geometry import safe_norm
+from jaxsafe.simulation.platform import Platform
+from jaxsafe.types import Number, RTAInfo
+
+Control = Float[Array, " m"]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Plant:
+    """What a filter needs to know of a plant: a derivative for an ASIF, a step for a Simplex.
+
+    Attributes:
+        low: the lowest control, shape (m,).
+        high: the highest control, shape (m,).
+        derivative: the function (x, u) ↦ ẋ, for instance f(x) + g(x) u.
+        step: the function (x, u) ↦ x⁺ over a step, in which the control is held.
+    """
+
+    low: Any
+    high: Any
+    derivative: Callable[[Any, Control], Any] | None = None
+    step: Callable[[Any, Control], Any] | None = None
+
+    @classmethod
+    def of(cls, platform: Platform, dt: Number) -> Plant:
+        """Return the plant of a platform of jaxsafe, whose states are records.
+
+        Args:
+            platform: a platform with actuators.
+            dt: length of a step [s].
+        """
+        actuators = getattr(platform.controller, "actuators", ())
+        if not actuators:
+            raise ConfigError(f"platforms.{platform.name}.controller: expected actuators")
+        names = [actuator.name for actuator in actuators]
+        return cls(
+            low=jnp.stack([actuator.low for actuator in actuators]),
+            high=jnp.stack([actuator.high for actuator in actuators]),
+            derivative=lambda x, u: platform.derivative(x, dict(zip(names, u, strict=True))),
+            step=lambda x, u: platform.step(x, dict(zip(names, u, strict=True)), dt),
+        )
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Barrier:
+    """A constraint h(x) ≥ 0 with what filters may ask of it. A function h alone has the defaults.
+
+    Attributes:
+        h: the function of a state.
+        alpha: the strengthening function α, for instance `Polynomial(linear=0.1, cubic=0.5).of`.
+        degree: how often h is differentiated until the control reaches it.
+        slack: the cost of missing the row, or None if it may not be missed.
+        priority: rows that cannot be met together are given up from the lowest priority on.
+        margin: the h that a certificate asks for.
+    """
+
+    h: Callable[[Any], Array]
+    alpha: Callable[[Array], Array] = Polynomial().of
+    degree: int = 1
+    slack: Number | None = None
+    priority: int = 0
+    margin: Number = 0.0
+
+
+Constraints = Sequence[Callable[[Any], Array] | Barrier]
+
+
+def filter_by_asif(
+    plant: Plant, constraints: Constraints, state: Any, control: Control
+) -> tuple[Control, RTAInfo]:
+    """Return the control nearest to the desired one under a barrier row for each constraint.
+
+    This is the active set invariance filter of Eqs. (2)-(4). It needs no backup controller and
+    certifies nothing. Rows that cannot be met at all are missed as little as possible.
+
+    Args:
+        plant: the plant, with its derivative.
+        constraints: functions h(x), or barriers.
+        state: the state x.
+        control: the desired control, shape (m,). Elements that are not numbers count as 0.
+
+    Returns:
+        The control that acts, and what happened. `predicted_margin` is the smallest h at x.
+
+    Raises:
+        ConfigError: the plant has no derivative, or there is no constraint.
+    """
+    derivative = _given(plant.derivative, "filter_by_asif: the plant needs a `derivative`")
+    barriers = _barriers(constraints)
+    state = jax.tree.map(jnp.asarray, state)
+    wanted, finite = _admissible(plant, control)
+    rows = [
+        barrier_row(
+            h=barrier.h,
+            derivative=derivative,
+            state=state,
+            still=jnp.zeros_like(wanted),
+            alpha=barrier.alpha,
+            degree=barrier.degree,
+        )
+        for barrier in barriers
+    ]
+    actual, feasible, *cause = nearest_by_priority(
+        u=wanted,
+        low=_bound(plant.low, wanted),
+        high=_bound(plant.high, wanted),
+        rows=jnp.stack([a for a, _ in rows]),
+        offsets=jnp.stack([b for _, b in rows]),
+        slacks=[barrier.slack for barrier in barriers],
+        priorities=[barrier.priority for barrier in barriers],
+        miss_least=True,
+    )
+    changed = jnp.any(actual != wanted)
+    info = RTAInfo(
+        correction=safe_norm(actual - wanted),
+        feasible=feasible & finite,
+        certified=jnp.zeros((), bool),
+        predicted_margin=jnp.min(_margins(barriers, state)),
+        backup_index=jnp.full((), -1, jnp.int32),
+        constraint=jnp.where(changed, cause[0], NO_CONSTRAINT()),
+    )
+    return actual, info
+
+
+def filter_by_simplex(
+    plant: Plant,
+    constraints: Constraints,
+    state: Any,
+    control: Control,
+    backup: Callable[[Any], Control],
+    horizon: int = 0,
+    terminal: Callable[[Any], Bool[Array, ""]] | None = None,
+) -> tuple[Control, RTAInfo]:
+    """Return the desired control if the state after it is certified, else that of the backup.
+
+    This is the Simplex filter of Eq. (1). A state is certified if every constraint keeps its margin
+    there and while the backup acts for `horizon` steps, and the last state is in the terminal set.
+
+    Args:
+        plant: the plant, with its step.
+        constraints: functions h(x), or barriers.
+        state: the state x.
+        control: the desired control, shape (m,). If it is not finite the backup acts.
+        backup: the backup controller x ↦ u. Its control is brought within the bounds.
+        horizon: the number of predicted steps.
+        terminal: whether a state is in the set from which the backup stays safe for ever. A horizon
+            needs it.
+
+    Returns:
+        The control that acts, and what happened. `certified` says so of the state after it.
+
+    Raises:
+        ConfigError: the plant has no step, there is no constraint, or only one of horizon and
+            terminal set is given.
+    """
+    step = _given(plant.step, "filter_by_simplex: the plant needs a `step`")
+    barriers = _barriers(constraints)
+    if (horizon > 0) != (terminal is not None):
+        raise ConfigError(
+            "filter_by_simplex: a horizon needs a terminal set, and the set a horizon"
+        )
+    state = jax.tree.map(jnp.asarray, state)
+    wanted, finite = _admissible(plant, control)
+
+    def back_up(x: Any) -> Control:
+        return _admissible(plant, backup(x))[0]
+
+    def certify(x: Any) -> tuple[Float[Array, " c"], Bool[Array, ""]]:
+        """Return the least h − margin of each constraint on the way, and whether that certifies."""
+
+        def one_step(carry: tuple[Any, Array], _: None) -> tuple[tuple[Any, Array], None]:
+            x, least = carry
+            after = step(x, back_up(x))
+            return (after, jnp.minimum(least, _spare(barriers, after))), None
+
+        (last, least), _ = jax.lax.scan(one_step, (x, _spare(barriers, x)), length=horizon)
+        inside = jnp.ones((), bool) if terminal is None else terminal(last)
+        return least, jnp.all(least >= 0.0) & inside
+
+    after_wanted = step(state, wanted)
+    after_backup = step(state, back_up(state))
+    least, safe = certify(after_wanted)
+    passes = safe & finite
+    actual = jnp.where(passes, wanted, back_up(state))
+    changed = jnp.any(actual != wanted)
+    after = jax.tree.map(lambda a, b: jnp.where(passes, a, b), after_wanted, after_backup)
+    info = RTAInfo(
+        correction=safe_norm(actual - wanted),
+        feasible=jnp.ones((), bool),
+        certified=passes | certify(after_backup)[1],
+        predicted_margin=jnp.min(_margins(barriers, after)),
+        backup_index=jnp.zeros((), jnp.int32),
+        constraint=jnp.where(
+            changed & finite, jnp.argmin(least).astype(jnp.int32), NO_CONSTRAINT()
+        ),
+    )
+    return actual, info
+
+
+def _given(function: Callable | None, fault: str) -> Callable:
+    if function is None:
+        raise ConfigError(fault)
+    return function
+
+
+def _barriers(constraints: Constraints) -> list[Barrier]:
+    if not constraints:
+        raise ConfigError("constraints: expected at least one function h(x) or barrier")
+    return [item if isinstance(item, Barrier) else Barrier(h=item) for item in constraints]
+
+
+def _admissible(plant: Plant, control: Any) -> tuple[Control, Bool[Array, ""]]:
+    """Return a control within its bounds, and whether it was finite."""
+    control = jnp.asarray(control, jnp.result_type(float))
+    finite = jnp.isfinite(control)
+    numbers = jnp.where(finite, control, 0.0)
+    inside = within(numbers, _bound(plant.low, control), _bound(plant.high, control))
+    return inside, jnp.all(finite)
+
+
+def _bound(bound: Any, control: Control) -> Control:
+    return jnp.broadcast_to(jnp.asarray(bound, control.dtype), control.shape)
+
+
+def _margins(barriers: Sequence[Barrier], state: Any) -> Float[Array, " c"]:
+    return jnp.stack([barrier.h(state) for barrier in barriers])
+
+
+def _spare(barriers: Sequence[Barrier], state: Any) -> Float[Array, " c"]:
+    return _margins(barriers, state) - jnp.stack(
+        [jnp.asarray(barrier.margin, jnp.result_type(float)) for barrier in barriers]
+    )
