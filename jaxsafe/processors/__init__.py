@@ -24,6 +24,7 @@ from jaxsafe.processors.observation import (
     ObserveTime,
     ObserveVector,
 )
+from jaxsafe.processors.proximity import BrakingDistance, DriftDistance
 from jaxsafe.processors.reward import (
     Bound,
     ConstantReward,
@@ -86,6 +87,7 @@ __all__ = [
     "Angle",
     "Below",
     "Bound",
+    "BrakingDistance",
     "Change",
     "ConeConstraint",
     "ConstantReward",
@@ -99,6 +101,7 @@ __all__ = [
     "Distance",
     "DistanceChange",
     "Docked",
+    "DriftDistance",
     "ElapsedTime",
     "Failure",
     "FirstTime",
