@@ -60,8 +60,13 @@ def outward(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
 
 
 def sideways(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Return a control across the velocity. It bends the path, and at first the speed stays."""
+    """Return a control across the velocity. It bends the path, and at first the speed stays.
+
+    On a line nothing is across the velocity, and the control is random.
+    """
     velocity = sim.platforms[env.agent].velocity
+    if velocity.size == 1:
+        return _random_bounds(env, key)
     across = jnp.stack([-velocity[1], velocity[0], *jnp.zeros(velocity.size - 2)])
     return _towards(env, sim, across, key)
 

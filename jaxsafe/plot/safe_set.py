@@ -37,7 +37,7 @@ from jaxsafe.plot.style import (
 )
 from jaxsafe.rta.filter import CertifiedRTA
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.simulation.cwh import Spacecraft
+from jaxsafe.simulation.cwh import ThrustedSpacecraft
 from jaxsafe.simulation.dubins import Dubins2D, Dubins3D
 from jaxsafe.simulation.oriented import OrientedSpacecraft
 from jaxsafe.transition import constraint
@@ -83,7 +83,7 @@ def planes(env: Environment) -> Planes:
     """
     agent = env.agent_platform
     others = [platform for platform in env.platforms if platform.name != env.agent]
-    if len(others) == 1 and isinstance(agent, (Spacecraft, OrientedSpacecraft)):
+    if len(others) == 1 and isinstance(agent, (ThrustedSpacecraft, OrientedSpacecraft)):
         return _docking(agent, others[0])
     if (
         len(others) == 1
@@ -210,9 +210,10 @@ def draw(
 def _docking(agent: Any, chief: Any) -> Planes:
     """Return planes of distance against speed, for three directions of flight.
 
-    If the thrust turns with the body, they are for three attitudes instead.
+    If the thrust turns with the body, they are for three attitudes instead. On a line there are two
+    directions.
     """
-    x, y = np.eye(agent.dimension)[:2]
+    x, *across = np.eye(agent.dimension)
 
     def start(way: np.ndarray, **fields: float) -> Start:
         def states(distance: Any, speed: Any) -> dict[str, dict[str, Any]]:
@@ -229,11 +230,10 @@ def _docking(agent: Any, chief: Any) -> Planes:
         panels = {title: start(-x, attitude=share * np.pi) for title, share in angles.items()}
         note = f"flying towards the {chief.name}"
     else:
-        panels = {
-            f"flying towards the {chief.name}": start(-x),
-            "flying across": start(y),
-            "flying away": start(x),
-        }
+        panels = {f"flying towards the {chief.name}": start(-x)}
+        if across:
+            panels["flying across"] = start(across[0])
+        panels["flying away"] = start(x)
         note = ""
     return Planes(
         x_label=f"distance to the {chief.name} [m]",

@@ -88,3 +88,15 @@ def test_a_flight_on_a_line_has_a_figure_and_a_film() -> None:
     figure = flight.plot()
     assert len(figure.axes) >= 4
     assert "docking1d" in str(flight)
+
+
+def test_adversaries_and_the_picture_of_the_safe_set_know_a_line() -> None:
+    from jaxsafe.evaluate.adversaries import ADVERSARIES
+    from jaxsafe.plot.safe_set import planes
+
+    env = jaxsafe.make("docking1d", rta="default")
+    state, _ = jax.eval_shape(env.reset, jax.random.key(0))
+    for name, adversary in ADVERSARIES.items():
+        act = lambda state, key, act=adversary: act(env, state.sim, key)  # noqa: E731
+        assert jax.eval_shape(act, state, jax.random.key(0)).shape == (1,), name
+    assert list(planes(env).panels) == ["flying towards the chief", "flying away"]
