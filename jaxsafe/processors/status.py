@@ -157,12 +157,12 @@ class ElapsedTime(Status, type="elapsed_time"):
 
 
 class Speed(Status, type="speed"):
-    """Speed ‖v‖ of a platform."""
+    """Speed ‖v‖ of a platform or of a region's centre."""
 
-    of: PlatformName
+    of: PlaceName
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
-        return safe_norm(sim.platforms[self.of].velocity)
+        return safe_norm(place(sim, self.of).velocity)
 
 
 class VelocityLimit(Status, type="velocity_limit"):

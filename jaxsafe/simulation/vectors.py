@@ -25,7 +25,10 @@ class Vector(Component):
 
 
 class Position(Vector, type="position"):
-    """The position of a platform or of a region's centre, or its way there from another one."""
+    """The position of a platform or of a region's centre.
+
+    With `relative_to` it is the way there from that platform or centre.
+    """
 
     of: PlaceName
     relative_to: PlaceName | None = None
@@ -36,7 +39,10 @@ class Position(Vector, type="position"):
 
 
 class Velocity(Vector, type="velocity"):
-    """The velocity of a platform or of a region's centre, or its difference to another one."""
+    """The velocity of a platform or of a region's centre.
+
+    With `relative_to` it is the velocity relative to that platform or centre.
+    """
 
     of: PlaceName
     relative_to: PlaceName | None = None

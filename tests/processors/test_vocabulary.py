@@ -44,6 +44,7 @@ from jaxsafe.processors.status import (
     Or,
     RelativeSpeed,
     SignedDistance,
+    Speed,
     Status,
     Threshold,
     VectorComponent,
@@ -100,6 +101,7 @@ def world(control: tuple[float, ...] = (3.0, -4.0), time: float = 2.0, **status:
         (RelativeSpeed(name="s", of="deputy", to="chief"), 1.0),
         # The port moves by ω × r = 0.1 · 3 m to the left of the body's x axis, which is −x.
         (RelativeSpeed(name="s", of="port", to="deputy"), 0.3),
+        (Speed(name="s", of="port"), math.hypot(0.3, 0.3)),
         (ElapsedTime(name="s"), 2.0),
         (Magnitude(name="s", vector=TO_CHIEF), 5.0),
         (Magnitude(name="s", vector=FixedDirection(along=(3.0, 4.0))), 1.0),
@@ -144,6 +146,30 @@ def test_a_status_is_its_formula(status: Status, value: float | bool) -> None:
     assert found.shape == ()
     assert (found.dtype == bool) == isinstance(value, bool)
     np.testing.assert_allclose(found, value, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "status",
+    [
+        Distance(name="s", of="deputy", to="chief"),
+        SignedDistance(name="s", of="chief", region="port"),
+        RelativeSpeed(name="s", of="deputy", to="chief"),
+        Magnitude(name="s", vector=TO_CHIEF),
+        Angle(name="s", first=TO_CHIEF, second=Velocity(of="deputy", relative_to="chief")),
+        ControlEffort(name="s"),
+        Norm(name="s", statuses=("a",)),
+    ],
+)
+def test_gradients_are_finite_where_all_is_zero(status: Status) -> None:
+    def value(x: jax.Array) -> jax.Array:
+        zero = SpacecraftState(jnp.zeros(2), jnp.zeros(2), jnp.zeros(2))
+        platforms = {"chief": zero, "deputy": zero.replace(position=x, velocity=x)}
+        sim = world(a=0.0).replace(platforms=platforms, control_actual=x)
+        port = normalise(PORT.replace(offset=None)).place(platforms, moves=True, measures=True)
+        sim = sim.replace(regions={"port": port}, status={"a": x[0]})
+        return normalise(status).process((), sim)
+
+    assert np.isfinite(jax.grad(value)(jnp.zeros(2))).all()
 
 
 @pytest.mark.parametrize(
