@@ -263,7 +263,7 @@ class RTAInfo(Record):
 
     Of the several steps of a `decision_period` it is the worst: the largest correction, the
     smallest margin, and whether all were feasible and certified. The backup controller is that of
-    the last step.
+    the last step, and the constraint that of the last change.
     """
 
     correction: Float[Array, ""]  # ‖u_act − u_des‖, physical units

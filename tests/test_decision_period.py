@@ -86,6 +86,7 @@ def check_sums(timestep: TimeStep, taken: Any) -> None:
             "feasible": (info.rta.feasible, rta.feasible.all()),
             "certified": (info.rta.certified, rta.certified.all()),
             "predicted": (info.rta.predicted_margin, rta.predicted_margin.min()),
+            "constraint": (info.rta.constraint, [-1, *rta.constraint[rta.constraint >= 0]][-1]),
         }
     for name, (found, wanted) in expected.items():
         jax.tree.map(

@@ -734,11 +734,12 @@ def _to_batch(
         share = jnp.maximum(jnp.mean(batch.weight), 1e-8)
         batch = batch._replace(weight=batch.weight / share)
     explained = explained_variance(batch.value_target, value, batch.weight)
-    mean, std = batch.advantage.mean(), batch.advantage.std()
-    if counts is not None:
-        mean = _mean(batch.advantage, batch.weight)
+    centred = batch.advantage - _mean(batch.advantage, batch.weight)
+    if counts is None:
+        std = batch.advantage.std()
+    else:
         std = jnp.sqrt(_variance(batch.advantage, batch.weight))
-    batch = batch._replace(advantage=(batch.advantage - mean) / (std + 1e-8))
+    batch = batch._replace(advantage=centred / (std + 1e-8))
     state = state.replace(memory=after)
     if not agent.recurrent:
         batch = jax.tree.map(lambda x: x.reshape(ppo.batch_size, *x.shape[2:]), batch)
