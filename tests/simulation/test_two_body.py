@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from default_cases import thorough
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
+import jaxsafe
 from jaxsafe.schema.component import normalise
 from jaxsafe.simulation import Spacecraft, TwoBody, TwoBodyJ2
 from jaxsafe.simulation.cwh import MEAN_MOTION
@@ -104,8 +106,17 @@ START = (np.array([120.0, -80.0, 60.0]), np.array([0.1, -0.2, 0.15]))
 THRUST = np.array([0.01, -0.02, 0.015])  # N
 
 
-@pytest.mark.parametrize("e", [0.0, 0.1, 0.7])
-@pytest.mark.parametrize("j2", [0.0, EARTH_J2])
+@pytest.mark.parametrize(
+    ("e", "j2"),
+    [
+        thorough(0.0, 0.0),
+        thorough(0.1, 0.0),
+        (0.7, 0.0),
+        thorough(0.0, EARTH_J2),
+        (0.1, EARTH_J2),
+        thorough(0.7, EARTH_J2),
+    ],
+)
 @pytest.mark.usefixtures("x64")
 def test_both_spacecraft_move_as_in_the_inertial_frame(e: float, j2: float) -> None:
     fields: Any = {"name": "own", "eccentricity": e, "true_anomaly": 2.5, "substeps": 2}
@@ -226,3 +237,18 @@ def test_the_power_keeps_its_digits_near_one(power: int) -> None:
         exact = math.expm1(-0.5 * power * math.log1p(np.float32(q)))
         found = inverse_power(jnp.float32(q), power)
         assert math.isclose(found, exact, rel_tol=1e-6, abs_tol=1e-30)
+
+
+def test_the_chiefs_orbit_may_be_random() -> None:
+    orbit = {"deputy.eccentricity": [0.1, 0.3], "deputy.true_anomaly": [0.0, 3.0]}
+    env = jaxsafe.make("docking2d", {"deputy.type": "two_body"}, randomize=orbit)
+    states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 8))
+    anomaly = states.sim.platforms["deputy"].true_anomaly
+    np.testing.assert_allclose(anomaly, states.parameters["deputy.true_anomaly"], rtol=1e-6)
+    assert len(set(anomaly.tolist())) == 8
+    later, _ = jax.vmap(jaxsafe.step, in_axes=(None, 0, None))(env, states, jnp.zeros(2))
+    e = states.parameters["deputy.eccentricity"]
+    rate = MEAN_MOTION * (1.0 + e * jnp.cos(anomaly)) ** 2 / (1.0 - e**2) ** 1.5
+    np.testing.assert_allclose(
+        later.sim.platforms["deputy"].true_anomaly - anomaly, rate, rtol=2e-3
+    )
