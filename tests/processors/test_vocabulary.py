@@ -56,7 +56,7 @@ from jaxsafe.simulation.dubins import Dubins3DState
 from jaxsafe.simulation.geometry import BodyDisplacement, Box
 from jaxsafe.simulation.oriented import OrientedState
 from jaxsafe.simulation.vectors import BodyDirection, FixedDirection, Position, Velocity
-from jaxsafe.transition import advance, smallest_margin, update_statuses
+from jaxsafe.transition import advance, smallest_margin, update_statuses, with_memory
 from jaxsafe.types import Sim
 
 CHIEF = SpacecraftState(jnp.asarray([1.0, 1.0]), jnp.asarray([0.0, 0.5]), jnp.zeros(2))
@@ -536,6 +536,57 @@ def test_a_predicted_step_through_a_zone_is_unsafe_though_both_its_ends_are_safe
     assert float(smallest_margin(env, sim, names=["zone"])) > 0.4
     assert float(smallest_margin(env, after, names=["zone"])) > 0.4
     assert float(smallest_margin(env, after, before=sim, names=["zone"])) < -0.3
+
+
+def test_a_predicted_step_adds_its_control_to_a_budget(env: Environment) -> None:
+    start = {"deputy": {"position": [20.0, 5.0], "attitude": 0.0, "velocity": [0.0, 0.0]}}
+    state, _ = jaxsafe.reset_to(env, start)
+    sim = with_memory(env, state.sim, state.memory.status)
+    for steps in (1, 2):
+        sim = advance(env, sim, jnp.asarray([0.5, 0.0]))
+        margin = smallest_margin(env, sim, names=["budget"])
+        assert float(margin) == pytest.approx(100.0 - 0.5 * steps)
+
+
+@pytest.mark.thorough
+def test_a_barrier_on_the_distance_to_a_box_keeps_out_of_it() -> None:
+    env = jaxsafe.make("docking2d")
+    zone = {
+        "type": "box",
+        "name": "zone",
+        "on": "chief",
+        "offset": {"type": "displacement", "by": [0, 60]},
+        "size": [30, 10],
+    }
+    keep_out = {"type": "keep_out", "name": "zone", "of": "deputy", "region": "zone", "degree": 2}
+    env = jaxsafe.override(
+        env,
+        {
+            "regions": [*env.regions, zone],
+            "constraints": [*env.constraints, keep_out],
+            "deputy.start.position.direction.azimuth": [1.2, 1.9],
+        },
+    )
+    asif = {
+        "type": "explicit_asif",
+        "constraints": ["zone"],
+        "enforce": False,
+        "strengthening": {"type": "polynomial", "linear": 0.02},
+    }
+
+    def towards_the_chief(key: jax.Array, observation: jax.Array) -> jax.Array:
+        return -jnp.sign(observation[:, :2])
+
+    least = [
+        float(
+            jaxsafe.rollout(one, towards_the_chief, jax.random.key(0), num_steps=200, num_envs=16)
+            .info.margins["zone"]
+            .min()
+        )
+        for one in (env, jaxsafe.override(env, {"rta": asif}))
+    ]
+    assert least[0] < -3.0
+    assert least[1] >= 0.0
 
 
 @pytest.mark.thorough
