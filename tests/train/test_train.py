@@ -28,11 +28,12 @@ from jaxsafe.devices import processes
 from jaxsafe.envs import TASKS
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import write_rows
-from jaxsafe.train.host import restore, run_directory
+from jaxsafe.train.host import checkpoint, restore, run_directory
 from jaxsafe.train.host.checkpoint import Checkpoints
 from jaxsafe.train.host.options import recipe, resolve
 from jaxsafe.train.host.session import Clock, Training
 from jaxsafe.train.ppo import DIAGNOSTICS
+from jaxsafe.types import Record
 
 
 @pytest.fixture(autouse=True)
@@ -664,6 +665,35 @@ def test_a_field_that_is_newer_than_a_checkpoint_has_its_default_in_it(whole: Pa
     before["environment"]["dt"] = 2.0
     assert restore._as_of_today(before)["environment"]["dt"] == 2.0
     assert restore._as_of_today("x") == "x"
+
+
+def test_a_checkpoint_from_before_the_controls_were_kept_is_read(
+    tmp_path: Path, whole: Path
+) -> None:
+    config, env, _ = run_directory.read(whole, "run")
+    like = restore.structure(env, config)
+    content = jax.tree.map(lambda leaf: np.ones_like(checkpoint._empty(leaf)), like)
+    checkpoints = Checkpoints(tmp_path, create=True)
+    facts = {"updates": 20, "wall_s": 1.0, "compile_s": 1.0}
+    sim = content["state"].env_state.sim
+    kept = {name: value for name, value in vars(sim).items() if name not in restore.NEWER}
+    older = type("OlderSim", (Record,), {"__annotations__": dict.fromkeys(kept, Any)})
+    state = content["state"].env_state.replace(sim=older(**kept))
+    before = {**content, "state": content["state"].replace(env_state=state)}
+    checkpoints.save(1280, before, facts)
+    assert (
+        not (tmp_path / "checkpoints" / "1280" / "state" / "_METADATA")
+        .read_text()
+        .count("control_desired")
+    )
+    found = Checkpoints(tmp_path).restore(1280, like, restore.NEWER)
+    assert not found["state"].env_state.sim.control_desired.any()
+    assert found["state"].env_state.sim.time.all()
+    jax.tree.map(np.testing.assert_array_equal, found["best"], content["best"])
+    # What is read can be written again.
+    checkpoints.restore(1280, like, restore.NEWER)
+    checkpoints.save(2560, content, facts)
+    assert checkpoints.restore(2560, like)["state"].env_state.sim.control_desired.all()
 
 
 @pytest.mark.thorough

@@ -17,7 +17,7 @@ import logging
 import shutil
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -160,7 +160,7 @@ class Checkpoints:
         check(facts, {}, f"{self.directory / str(step)}: facts")
         return facts
 
-    def restore(self, step: int, like: Any) -> Any:
+    def restore(self, step: int, like: Any, newer: Sequence[str] = ()) -> Any:
         """Read the arrays of one checkpoint, on the host.
 
         A checkpoint that was written before there were digests is read without comparing one.
@@ -168,6 +168,8 @@ class Checkpoints:
         Args:
             step: environment steps of each seed.
             like: shapes of the arrays, in the structure that the result has.
+            newer: arrays that are 0 where the checkpoint lacks them, by the last part of their
+                names.
 
         Raises:
             ConfigError: there is no checkpoint at this step, or it is broken, damaged or of another
@@ -184,7 +186,10 @@ class Checkpoints:
                 f"this process computes in {now}"
             )
         abstract = jax.tree.map(_empty, like)
-        state = self._read(step, state=self._ocp.args.StandardRestore(abstract))["state"]
+        absent = [name for name in newer if not self._has(step, name)]
+        state = (
+            self._read_older(step, abstract, absent) if absent else self._read_all(step, abstract)
+        )
         for (path, found), wanted in zip(
             jax.tree_util.tree_leaves_with_path(state), jax.tree.leaves(abstract), strict=True
         ):
@@ -195,11 +200,40 @@ class Checkpoints:
                     f"{name} has shape {found.shape}, expected {wanted.shape}"
                 )
         digest = facts.pop(DIGEST, None)
-        if (digest is not None or PRECISION in facts) and digest != _digest(state, facts):
+        if (digest is not None or PRECISION in facts) and digest != _digest(state, facts, absent):
             raise ConfigError(
                 f"{place}: checkpoint is damaged: its content is not what was written"
             )
         return jax.tree.map(_as, state, like)
+
+    def _has(self, step: int, name: str) -> bool:
+        """Return whether a checkpoint has an array of a name, as far as its index can be read."""
+        try:
+            text = (self.directory / str(step) / "state" / "_METADATA").read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError):
+            return True
+        return f"'{name}'" in text
+
+    def _read_all(self, step: int, abstract: Any) -> Any:
+        return self._read(step, state=self._ocp.args.StandardRestore(abstract))["state"]
+
+    def _read_older(self, step: int, abstract: Any, absent: Collection[str]) -> Any:
+        """Read the arrays of a checkpoint that lacks some. Those are 0."""
+        tree = _without(self._ocp.tree.serialize_tree(abstract, keep_empty_nodes=True), absent)
+        how = self._ocp.args.PyTreeRestore(item=tree, partial_restore=True)
+        # Orbax writes nothing any more where it has read in this way, so another reader does.
+        read = Checkpoints(self.directory.parent)._read(step, state=how)["state"]
+
+        def pick(path: Any, leaf: np.ndarray) -> Any:
+            names = _names(path)
+            if names[-1] in absent:
+                return np.zeros_like(leaf)
+            value = read
+            for name in names:
+                value = value[int(name) if isinstance(value, (list, tuple)) else name]
+            return value
+
+        return jax.tree_util.tree_map_with_path(pick, abstract)
 
     def _read(self, step: int, **args: Any) -> Any:
         if step not in self.steps:
@@ -269,10 +303,26 @@ def _settle(complaints: io.StringIO) -> None:
     gc.collect()
 
 
-def _digest(state: Any, facts: dict[str, Any]) -> str:
-    """Return the SHA-256 of arrays with their names, types and shapes, and of the facts."""
+def _names(path: Any) -> list[str]:
+    return [jax.tree_util.keystr((key,), simple=True) for key in path]
+
+
+def _without(tree: Any, names: Collection[str]) -> Any:
+    """Return nested mappings and lists without the entries of some names."""
+    if isinstance(tree, dict):
+        return {key: _without(value, names) for key, value in tree.items() if key not in names}
+    return [_without(value, names) for value in tree] if isinstance(tree, list) else tree
+
+
+def _digest(state: Any, facts: dict[str, Any], absent: Collection[str] = ()) -> str:
+    """Return the SHA-256 of arrays with their names, types and shapes, and of the facts.
+
+    Arrays whose names end in one of `absent` are left out.
+    """
     found = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
+        if absent and _names(path)[-1] in absent:
+            continue
         array = np.asarray(leaf)
         found.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}".encode())
         found.update(array.tobytes())

@@ -46,6 +46,12 @@ def structure(env: Environment, config: TrainConfig) -> dict[str, Any]:
     }
 
 
+NEWER = ("control_desired", "control_actual")
+"""Arrays that older checkpoints lack, by the last part of their names.
+
+They are 0 then. No part of an older environment looks at them.
+"""
+
 MAY_CHANGE = (
     "steps",
     "devices_per_seed",
@@ -111,7 +117,7 @@ def restore(
         raise ConfigError(
             f"{place}: updates: expected those of {step} steps, found {facts['updates']}"
         )
-    return checkpoints.restore(step, structure(env, config)), facts
+    return checkpoints.restore(step, structure(env, config), NEWER), facts
 
 
 def _as_of_today(before: Any) -> Any:
