@@ -46,8 +46,10 @@ def _overview() -> Iterator[str]:
     """Yield a line for each section and each of its types."""
     for name, section in SECTIONS.items():
         yield name
-        for cls in types_of(section, with_users=True):
-            line = f"  {title(cls):22} {describe(cls).summary}"
+        types = types_of(section, with_users=True)
+        width = max(len(title(cls)) for cls in types)
+        for cls in types:
+            line = f"  {title(cls):{width}}  {describe(cls).summary}"
             yield line if len(line) <= WIDTH else f"{line[: WIDTH - 1].rpartition(' ')[0]} …"
 
 
