@@ -91,8 +91,9 @@ def trajectories(
     regions = [region for region in regions if region.name in logged]
     places = [np.nan_to_num(_relative_path(last[-1:], region.name)[0]) for region in regions]
     sizes = [
-        np.abs(place).max() + float(getattr(region, "radius", 0.0))
+        np.abs(place).max() + float(region.radius)
         for region, place in zip(regions, places, strict=True)
+        if getattr(region, "radius", 0.0) > 0.0  # a region without a radius has no close-up
     ]
     colours, colour = _colours(paths)
     when = "after training" if last[0].get("final", True) else f"after {end:,} steps"

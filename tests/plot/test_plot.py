@@ -520,6 +520,21 @@ def test_what_to_stay_out_of_is_not_drawn_like_the_goal() -> None:
         assert panel.patches[0].get_hatch() == hatch
 
 
+@pytest.mark.filterwarnings("error")
+def test_only_regions_with_a_radius_have_a_close_up() -> None:
+    step, rows = episode(100, 2)
+    for row in rows:
+        row["regions"] = {"region": {"position": [0.0, 0.0]}}
+    round_one = normalise(Sphere(name="region", on="chief", radius=1e-3))
+    cone = normalise(Cone(name="region", on="chief", towards=(1.0, 0.0), half_angle=0.5))
+    titles = [
+        {panel.get_title() for panel in trajectories([(step, rows)], "title", "m", [one]).axes}
+        for one in (round_one, cone)
+    ]
+    assert "their ends" in titles[0]
+    assert "their ends" not in titles[1]
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("nasty", [FORMULA, "_$x"])
 def test_a_run_whose_every_name_is_a_formula_is_drawn(
