@@ -1,6 +1,6 @@
 """Constraints that rest on what a status remembers, such as a budget of Δv, in predictions."""
 
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,40 +10,12 @@ import pytest
 import jaxsafe
 from jaxsafe import ConfigError, Environment
 from jaxsafe.evaluate.run_adversaries import attack
-from jaxsafe.processors import Constraint, Status
+from jaxsafe.processors import Accumulator, UpperLimit
 from jaxsafe.rta import Slow
 from jaxsafe.transition import with_memory
-from jaxsafe.types import Length, Number, Positive, Sim, StatusName
+from jaxsafe.types import Sim
 
 BUDGET = 0.5
-
-
-class Total(Status, type="of_tests_total"):
-    """The sum of another status over the episode."""
-
-    status: StatusName
-
-    def init(self, sim: Sim) -> jax.Array:
-        return jnp.zeros_like(sim.time)
-
-    def increment(self, memory: jax.Array, sim: Sim, dt: Number) -> jax.Array:
-        return memory + sim.status[self.status]
-
-    def process(self, memory: jax.Array, sim: Sim) -> jax.Array:
-        return memory
-
-
-class Budget(Constraint, type="of_tests_budget"):
-    """The margin h = total − used."""
-
-    used: StatusName
-    total: Annotated[Length, Positive]
-
-    def margin(self, sim: Sim) -> jax.Array:
-        return self.total - sim.status[self.used]
-
-    def limit(self, sim: Sim) -> Number:
-        return self.total
 
 
 class Quiet(Slow, type="of_tests_quiet"):
@@ -59,8 +31,8 @@ def budgeted(**rta: Any) -> Environment:
     return jaxsafe.make(
         "docking2d",
         {
-            "status": [*bare.status, Total(name="used", status="delta_v")],
-            "constraints": [Budget(name="budget", used="used", total=BUDGET)],
+            "status": [*bare.status, Accumulator(name="used", status="delta_v")],
+            "constraints": [UpperLimit(name="budget", status="used", maximum=BUDGET)],
             "rta": {
                 "type": "simplex",
                 "constraints": ["budget"],
