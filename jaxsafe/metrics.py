@@ -179,9 +179,9 @@ def summarise(
 
     Returns:
         A value for every name of `METRICS`. Rates are fractions in [0, 1], Δv is in m/s, length in
-        steps. `control_effort` is the mean |u| of the controls that acted, each as a share of its
-        full magnitude, over controls and steps. Severity is a share of the limit; its mean is over
-        violating steps, and 0 if there are none. A value that is not finite is None too.
+        steps. `control_effort` is the mean magnitude of the controls that acted, each as a share of
+        its full magnitude, over controls and steps. Severity is a share of the limit. Its mean is
+        over violating steps, and 0 if there are none. A value that is not finite is None too.
     """
     mean = {
         name: float(np.mean(value))

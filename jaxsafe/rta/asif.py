@@ -20,6 +20,7 @@ from jaxsafe.processors.constraint import SlackCost
 from jaxsafe.processors.strengthening import Polynomial, Strengthening
 from jaxsafe.rta.filter import CertifiedRTA, Proposal
 from jaxsafe.rta.projection import project_box_ball, project_box_halfspace
+from jaxsafe.rta.proofs import slow_actuators
 from jaxsafe.rta.qp import nearest_solution
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.transition import advance, bounds, commanded, constraint, judge
@@ -152,7 +153,8 @@ class ExplicitASIF(CertifiedRTA, type="explicit_asif"):
             degree = self._degree(env, name)
             fault = f"of degree {degree} the control has no influence on {name!r}"
             no_influence[fault] = jnp.all(row == 0.0)
-        return no_influence | super().unsuited(env, sim)
+        late = slow_actuators(env, "a barrier row")
+        return no_influence | late | super().unsuited(env, sim)
 
     def propose(
         self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]

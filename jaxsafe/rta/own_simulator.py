@@ -28,31 +28,37 @@ Control = Float[Array, " m"]
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Plant:
-    """What a filter needs to know of a plant: a derivative for an ASIF, a step for a Simplex.
-
-    Attributes:
-        low: the lowest control, shape (m,).
-        high: the highest control, shape (m,).
-        derivative: the function (x, u) ↦ ẋ, for instance f(x) + g(x) u.
-        step: the function (x, u) ↦ x⁺ over a step, in which the control is held.
-    """
+    """What a filter needs to know of a plant: a derivative for an ASIF, a step for a Simplex."""
 
     low: Any
+    """The lowest control, shape (m,)."""
     high: Any
+    """The highest control, shape (m,)."""
     derivative: Callable[[Any, Control], Any] | None = None
+    """The function (x, u) ↦ ẋ, for instance f(x) + g(x) u."""
     step: Callable[[Any, Control], Any] | None = None
+    """The function (x, u) ↦ x⁺ over a step, in which the control is held."""
 
     @classmethod
     def of(cls, platform: Platform, dt: Number) -> Plant:
         """Return the plant of a platform of jaxsafe, whose states are records.
 
         Args:
-            platform: a platform with actuators.
+            platform: a platform with actuators that act at once.
             dt: length of a step [s].
+
+        Raises:
+            ConfigError: the platform has no actuators, or one has a lag or a rate limit.
         """
         actuators = getattr(platform.controller, "actuators", ())
         if not actuators:
             raise ConfigError(f"platforms.{platform.name}.controller: expected actuators")
+        for actuator in actuators:
+            if not actuator.at_once:
+                raise ConfigError(
+                    f"platforms.{platform.name}.controller.actuators.{actuator.name}: expected an"
+                    " actuator that acts at once, without time_constant and rate_limit"
+                )
         names = [actuator.name for actuator in actuators]
         return cls(
             low=jnp.stack([actuator.low for actuator in actuators]),
@@ -64,23 +70,20 @@ class Plant:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Barrier:
-    """A constraint h(x) ≥ 0 with what filters may ask of it. A function h alone has the defaults.
-
-    Attributes:
-        h: the function of a state.
-        alpha: the strengthening function α, for instance `Polynomial(linear=0.1, cubic=0.5).of`.
-        degree: how often h is differentiated until the control reaches it.
-        slack: the cost of missing the row, or None if it may not be missed.
-        priority: rows that cannot be met together are given up from the lowest priority on.
-        margin: the h that a certificate asks for.
-    """
+    """A constraint h(x) ≥ 0 and what filters may ask of it. A function h alone has the defaults."""
 
     h: Callable[[Any], Array]
+    """The function of a state."""
     alpha: Callable[[Array], Array] = Polynomial().of
+    """The strengthening function α, for instance `Polynomial(linear=0.1, cubic=0.5).of`."""
     degree: int = 1
+    """How often h is differentiated until the control reaches it."""
     slack: Number | None = None
+    """The cost of missing the row, or None if it may not be missed."""
     priority: int = 0
+    """Rows that cannot be met together are given up from the lowest priority on."""
     margin: Number = 0.0
+    """The h that a certificate asks for."""
 
 
 Constraints = Sequence[Callable[[Any], Array] | Barrier]

@@ -91,7 +91,7 @@ def brake_faults(env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
     if type(env.agent_platform) not in (Spacecraft, DoubleIntegrator):
         fault = "brake is proved to keep a speed limit for a spacecraft or double_integrator alone"
         return {fault: _true()}
-    if slow := _slow_actuators(env, "brake"):
+    if slow := slow_actuators(env, "brake"):
         return slow
     speed_limits = _speed_limits(env, rta)
     if isinstance(speed_limits, str):
@@ -125,7 +125,7 @@ def align_and_brake_faults(
     if type(plant) is not OrientedSpacecraft:
         fault = "align_and_brake is proved to keep a speed limit for an oriented spacecraft alone"
         return {fault: _true()}
-    if slow := _slow_actuators(env, "align_and_brake"):
+    if slow := slow_actuators(env, "align_and_brake"):
         return slow
     if rta.terminal is None:
         fault = "align_and_brake keeps no speed limit by itself: give a horizon and a terminal set"
@@ -189,7 +189,7 @@ def slow_faults(
     """Return what is missing for the proof that `slow` is safe and that `brake` keeps it."""
     if _packaged_but(keeper, rta):
         return {"slow is proved to be kept by brake alone": _true()}
-    if late := _slow_actuators(env, "slow"):
+    if late := slow_actuators(env, "slow"):
         return late
     above = [
         terminal.speed + rta.required_margin(env, name) > facts.floor
@@ -209,7 +209,7 @@ def at_rest_faults(
     plant: Any = env.agent_platform
     if type(plant) is not Spacecraft or not set(plant.inputs) <= set(env.action_names):
         return {"at_rest is proved for a spacecraft with all thrusters alone": _true()}
-    if late := _slow_actuators(env, "at_rest"):
+    if late := slow_actuators(env, "at_rest"):
         return late
     if _packaged_but(keeper, rta):
         return {"at_rest is proved to be kept by brake alone": _true()}
@@ -243,7 +243,7 @@ def at_rest_faults(
 
 def coast_faults(env: Environment, rta: CertifiedRTA) -> Faults:
     """Return what is missing for the proof that `coast` keeps the constraints."""
-    if late := _slow_actuators(env, "coast"):
+    if late := slow_actuators(env, "coast"):
         return late
     low, high = bounds(env)
     faults = {"coast needs actuators that can give no control": jnp.any((low > 0.0) | (high < 0.0))}
@@ -263,7 +263,7 @@ def aligned_or_slow_faults(
     """Return what is missing for Proposition 8: `align_and_brake` keeps the set."""
     if _packaged_but(keeper, rta):
         return {"aligned_or_slow is proved to be kept by align_and_brake alone": _true()}
-    if late := _slow_actuators(env, "aligned_or_slow"):
+    if late := slow_actuators(env, "aligned_or_slow"):
         return late
     speed_limits = _speed_limits(env, rta)
     if isinstance(speed_limits, str):
@@ -320,7 +320,7 @@ def velocity_matched_faults(
         }
     (name,) = others
     lead = cast(Aircraft, env.platform(name))
-    if late := _slow_actuators(env, "velocity_matched"):
+    if late := slow_actuators(env, "velocity_matched"):
         return late
     if type(lead) is not type(plant):
         return {"velocity_matched is proved for two aircraft of one kind": _true()}
@@ -457,12 +457,12 @@ def _faults_in_space(
     }
 
 
-def _slow_actuators(env: Environment, proved: str) -> Faults:
+def slow_actuators(env: Environment, proved: str) -> Faults:
     """Return what is missing where an actuator has a lag or a rate limit.
 
     Args:
         env: the environment.
-        proved: the type of the part whose proof takes it that controls act at once.
+        proved: the type of the part that takes it that controls act at once.
     """
     slow = [actuator.name for actuator in env.actuators if not actuator.at_once]
     if not slow:

@@ -121,3 +121,6 @@ def test_what_is_missing_is_told_in_one_line() -> None:
     chief = jaxsafe.make("docking2d").platform("chief")
     with pytest.raises(ConfigError, match=r"^platforms\.chief\.controller: expected actuators"):
         Plant.of(chief, 1.0)
+    late = jaxsafe.make("docking2d", {"deputy.controller.actuators.thrust_x.time_constant": 1.0})
+    with pytest.raises(ConfigError, match=r"thrust_x: expected an actuator that acts at once"):
+        Plant.of(late.platform("deputy"), 1.0)

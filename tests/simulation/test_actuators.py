@@ -95,16 +95,17 @@ def test_states_of_actuators_are_batched_and_differentiable() -> None:
 
 
 @pytest.mark.parametrize(
-    ("task", "path", "part"),
+    ("task", "rta", "path", "part"),
     [
-        ("docking1d", "thrust_x.time_constant", "brake"),
-        ("docking2d", "thrust_y.rate_limit", "brake"),
-        ("docking2d_oriented", "thrust.rate_limit", "align_and_brake"),
-        ("rejoin2d", "acceleration.time_constant", "velocity_matched"),
+        ("docking1d", "default", "thrust_x.time_constant", "brake"),
+        ("docking2d", "default", "thrust_y.rate_limit", "brake"),
+        ("docking2d", "explicit_asif", "thrust_x.time_constant", "a barrier row"),
+        ("docking2d_oriented", "default", "thrust.rate_limit", "align_and_brake"),
+        ("rejoin2d", "default", "acceleration.time_constant", "velocity_matched"),
     ],
 )
 def test_a_filter_whose_proof_needs_immediate_actuators_says_so(
-    task: str, path: str, part: str
+    task: str, rta: str, path: str, part: str
 ) -> None:
     agent = "wingman" if task.startswith("rejoin") else "deputy"
     name = path.partition(".")[0]
@@ -113,7 +114,7 @@ def test_a_filter_whose_proof_needs_immediate_actuators_says_so(
         " or a rate_limit$"
     )
     with pytest.raises(ConfigError, match=message):
-        jaxsafe.make(task, {f"{agent}.controller.actuators.{path}": 0.5}, rta="default")
+        jaxsafe.make(task, {f"{agent}.controller.actuators.{path}": 0.5}, rta=rta)
 
 
 class FullBrake(BackupController, type="full_brake_of_this_test"):
