@@ -125,7 +125,7 @@ def fitted(title: str, figure: Figure) -> str:
 def kept_out(env: Environment) -> set[str]:
     """Return the names of the regions that the agent must stay out of.
 
-    A constraint or a failure watches such a region, and no success does.
+    A constraint or a failure watches such a region, and no success or constraint to stay in does.
     """
     status = {part.name: part for part in env.status}
 
@@ -142,8 +142,9 @@ def kept_out(env: Environment) -> set[str]:
 
     goals = [part for part in env.terminal if part.name in env.successes]
     failures = [part for part in env.terminal if part.name not in env.successes]
+    allowed = [part for part in env.constraints if isinstance(part, KeepIn)]
     forbidding = [part for part in env.constraints if not isinstance(part, KeepIn)]
-    return watched([*forbidding, *failures]) - watched(goals)
+    return watched([*forbidding, *failures]) - watched([*goals, *allowed])
 
 
 class Outline(Polygon):

@@ -31,6 +31,8 @@ from jaxsafe.plot.style import (
     save,
 )
 from jaxsafe.processors.constraint import KeepIn, KeepOut
+from jaxsafe.processors.status import InRegion
+from jaxsafe.processors.terminal import Holds
 from jaxsafe.runs.figures import _episodes, draw_all
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import normalise
@@ -497,8 +499,13 @@ def test_a_region_to_stay_in_is_not_drawn_as_one_to_stay_out_of(
 ) -> None:
     env = jaxsafe.make("docking2d")
     zone = Sphere(name="zone", on="chief", radius=200.0)
-    constraint = kind(name="zone", of="deputy", region="zone")
-    changes = {"regions": [*env.regions, zone], "constraints": [*env.constraints, constraint]}
+    changes = {
+        "regions": [*env.regions, zone],
+        "status": [*env.status, InRegion(name="in_zone", of="deputy", region="zone")],
+        "constraints": [*env.constraints, kind(name="zone", of="deputy", region="zone")],
+        # A failure about the region says nothing about its side.
+        "terminal": [*env.terminal, Holds(name="zone", status="in_zone")],
+    }
     env = jaxsafe.override(env, changes)
     assert kept_out(env) == forbidden
     assert [margin_unit(one, "m") for one in env.constraints] == ["m/s", "m"]
