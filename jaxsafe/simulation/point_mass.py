@@ -42,9 +42,12 @@ class PointMassAircraft(Dubins3D, type="point_mass_aircraft"):
 
     It is steered by `thrust` [lbf], `load_factor` [g] and `roll_rate` [rad/s]. Thrust and load
     factor are brought within their limits, and the load factor also within what the wing can lift
-    at the speed. Without a `load_factor` the wing holds the flight path angle, and without a
-    `thrust` the engine holds the speed, each as far as it can. A step is integrated by `substeps`
-    Runge-Kutta steps of order 4. At a limit the speed and the angles rest.
+    at the speed. A step is integrated by `substeps` Runge-Kutta steps of order 4. At a limit the
+    speed and the angles rest.
+
+    Without a `load_factor` the wing follows a `flight_path_angle_rate` [rad/s], and without a
+    `thrust` the engine follows an `acceleration` [ft/s²], each as far as it can. So the controls of
+    `dubins3d` steer it too. Where neither is given, the angle or the speed is held.
 
     The numbers are of the size of a light jet trainer at 10,000 ft.
     """
@@ -61,7 +64,7 @@ class PointMassAircraft(Dubins3D, type="point_mass_aircraft"):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        return ("thrust", "load_factor", "roll_rate")
+        return ("thrust", "load_factor", "roll_rate", "flight_path_angle_rate", "acceleration")
 
     def step(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Dubins3DState:
         """Return the state after `dt` seconds, by Runge-Kutta steps."""
@@ -85,18 +88,18 @@ class PointMassAircraft(Dubins3D, type="point_mass_aircraft"):
         speed = state.speed
         lifting = 0.5 * self.air_density * speed**2 * self.wing_area  # q S [lbf]
         stall = lifting * self.largest_lift / self.weight
+        turning = self.gravity / speed
+        pitch_rate = controls.get("flight_path_angle_rate", 0.0)
         low, high = self.load_factor_limits
         factor = jnp.clip(
-            controls.get("load_factor", cos_gamma / cos_roll),
+            controls.get("load_factor", (cos_gamma - pitch_rate / turning) / cos_roll),
             jnp.maximum(low, -stall),
             jnp.minimum(high, stall),
         )
         lift_coefficient = factor * self.weight / lifting
         drag = lifting * (self.zero_lift_drag + self.induced_drag * lift_coefficient**2)
-        thrust = jnp.clip(
-            controls.get("thrust", drag - self.weight * sin_gamma), *self.thrust_limits
-        )
-        turning = self.gravity / speed
+        push = controls.get("acceleration", 0.0) / self.gravity - sin_gamma
+        thrust = jnp.clip(controls.get("thrust", drag + self.weight * push), *self.thrust_limits)
         return Dubins3DState(
             position=state.velocity,
             heading=turning * factor * sin_roll / cos_gamma,

@@ -29,6 +29,9 @@ class ReactionWheelSpacecraft(OrientedSpacecraft, type="reaction_wheel_spacecraf
     wheel's speed ψ is a state. Where the wheel or the body reaches its limit, the wheel keeps its
     speed for the rest of the step, and so does the body. I_zz θ̇ + D ψ never changes.
 
+    Instead of the wheel's acceleration it may be given that of the body, `attitude_acceleration` θ̈
+    [rad/s²], as `oriented_spacecraft`. The wheel then turns by −I_zz θ̈/D.
+
     The inertias are those of the 6U CubeSat of the published code, whose wheel turns at 576 rad/s
     at most.
     """
@@ -41,7 +44,7 @@ class ReactionWheelSpacecraft(OrientedSpacecraft, type="reaction_wheel_spacecraf
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        return ("thrust", "wheel_acceleration")
+        return ("thrust", "wheel_acceleration", "attitude_acceleration")
 
     def rest(self) -> ReactionWheelState:
         oriented = super().rest()
@@ -73,8 +76,9 @@ class ReactionWheelSpacecraft(OrientedSpacecraft, type="reaction_wheel_spacecraf
 
     def _turning(self, controls: Controls) -> Controls:
         """Return the controls with the body's acceleration −D ψ̇/I_zz in place of the wheel's."""
-        wheel = controls.get("wheel_acceleration", 0.0)
-        return {**controls, "attitude_acceleration": -wheel / self._ratio}
+        if "wheel_acceleration" not in controls:
+            return controls
+        return {**controls, "attitude_acceleration": -controls["wheel_acceleration"] / self._ratio}
 
     def _limited(self, state: Any) -> ReactionWheelSpacecraft:
         """Return this spacecraft with the attitude rates that the wheel's limits leave."""

@@ -28,6 +28,25 @@ def test_one_word_climbs_the_ladder() -> None:
         jax.eval_shape(jaxsafe.step, env, state, jnp.zeros(3))
 
 
+@pytest.mark.parametrize(
+    ("task", "path", "kind"),
+    [
+        ("docking2d_oriented", "deputy.type", "reaction_wheel_spacecraft"),
+        ("rejoin2d", "wingman.type", "dubins2d_lag"),
+        ("rejoin3d", "wingman.type", "dubins3d_lag"),
+        ("rejoin3d", "wingman.type", "point_mass_aircraft"),
+    ],
+)
+def test_the_actuators_of_a_task_drive_the_other_models_of_its_domain(
+    task: str, path: str, kind: str
+) -> None:
+    before = jaxsafe.make(task)
+    env = override(before, {path: kind})
+    assert env.agent_platform.type_name == kind
+    assert env.action_names == before.action_names
+    assert env.observation_names == before.observation_names
+
+
 def test_a_type_comes_first_whatever_the_order_of_the_changes() -> None:
     changes = {
         "deputy.eccentricity": 0.3,

@@ -101,6 +101,24 @@ def test_an_aircraft_that_holds_speed_and_climb_is_dubins_model() -> None:
         np.testing.assert_allclose(getattr(found, name), value, rtol=1e-6, atol=1e-6, err_msg=name)
 
 
+@pytest.mark.usefixtures("x64")
+def test_an_aircraft_follows_the_controls_of_dubins_model() -> None:
+    state = random_state(MODELS["dubins3d"], np.random.default_rng(4))
+    state = state.replace(flight_path_angle=jnp.asarray(0.1), speed=jnp.asarray(300.0))
+    controls = {
+        "roll_rate": jnp.asarray(-0.1),
+        "flight_path_angle_rate": jnp.asarray(0.05),
+        "acceleration": jnp.asarray(-20.0),
+    }
+    powerful = normalise(
+        PointMassAircraft(name="own", thrust_limits=(-1e5, 1e5), largest_lift=100.0, substeps=8)
+    )
+    found = powerful.step(state, controls, jnp.asarray(1.0))
+    expected = normalise(Dubins3D(name="own")).step(state, controls, jnp.asarray(1.0))
+    for name in ("speed", "flight_path_angle", "roll"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-9)
+
+
 def test_thrust_lift_and_drag_have_their_limits() -> None:
     aircraft = normalise(PointMassAircraft(name="own"))
     level = aircraft.rest().replace(speed=jnp.asarray(300.0))
@@ -133,6 +151,11 @@ def test_the_wheel_turns_the_body_as_its_acceleration_does() -> None:
     for name, value in vars(expected).items():
         np.testing.assert_allclose(getattr(moved, name), value, rtol=1e-12, err_msg=name)
     assert moved.attitude_rate == -jnp.pi / 90.0
+    by_turn = wheeled.rest()
+    for wheel in (10.0, -24.0, 24.0, 24.0, 24.0, 24.0):
+        turn = {"thrust": jnp.asarray(0.5), "attitude_acceleration": jnp.asarray(-wheel / ratio)}
+        by_turn = wheeled.step(by_turn, turn, dt)
+    np.testing.assert_allclose(by_turn.wheel_speed, moved.wheel_speed, rtol=1e-12)
     momentum = 0.0573 * moved.attitude_rate + 4.1e-5 * moved.wheel_speed
     np.testing.assert_allclose(momentum, 0.0, atol=1e-15)
 
