@@ -14,6 +14,7 @@ import jaxsafe
 from jaxsafe import ConfigError, Environment
 from jaxsafe.flight import Flight
 from jaxsafe.rollout import RecurrentPolicy
+from jaxsafe.simulation import Sphere
 
 LENGTH = 300
 TRACED: list[tuple[int, ...]] = []
@@ -124,6 +125,15 @@ def test_a_flight_is_drawn(task: str, tmp_path: Path) -> None:
     assert repr(flight).startswith(f"Flight of {task}: ")
     with pytest.raises(ConfigError, match=r"animate: expected a path that ends in .gif or .mp4"):
         flight.animate("episode.mov")
+
+
+@pytest.mark.parametrize(("task", "drawn"), [thorough("docking2d", True), ("rejoin2d", False)])
+def test_a_region_in_place_is_drawn_where_the_map_stays_too(task: str, drawn: bool) -> None:
+    regions = jaxsafe.make(task).regions
+    zone = Sphere(name="zone", on=None, radius=10.0)
+    env = jaxsafe.make(task, {"terminal.timeout.limit": 3, "regions": [*regions, zone]})
+    panel = jaxsafe.fly(env, lambda key, observation: observation[:2]).plot().axes[0]
+    assert ("zone" in [patch.get_label() for patch in panel.patches]) == drawn
 
 
 def test_a_filter_shows_in_a_flight() -> None:

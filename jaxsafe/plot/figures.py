@@ -83,12 +83,17 @@ def trajectories(
     paths = [(step, _relative_path(rows, _agent(rows))) for step, rows in episodes]
     last = episodes[-1][1]
     first = next(iter(last[0]["platforms"]))
+    alone = len(last[0]["platforms"]) == 1
     start = paths[0][1][0]
     end = paths[-1][0]
     after = [path for step, path in paths if step == end]
     during = [(step, path) for step, path in paths if np.allclose(path[0], start)]
     logged = last[-1].get("regions", {})  # older logs have no regions
     regions = [region for region in regions if region.name in logged]
+    origin = np.array([row["platforms"][first]["position"] for row in last], float)
+    if not alone and np.ptp(origin, axis=0).any():
+        # A region that stays in place has no one place on a map that moves.
+        regions = [region for region in regions if region.on is not None]
     places = [np.nan_to_num(_relative_path(last[-1:], region.name)[0]) for region in regions]
     sizes = [
         np.abs(place).max() + float(region.radius)
@@ -114,7 +119,6 @@ def trajectories(
     size = (side * len(columns) + COLOUR_BAR_WIDTH, side * len(views) + 0.5)
     figure = NotebookFigure(figsize=size, layout="constrained")
     grid = figure.add_gridspec(len(views), len(columns))
-    alone = len(last[0]["platforms"]) == 1
     turned = not alone and "heading" in last[0]["platforms"][first]
     labels = frame_labels(first if turned else None, unit)
     panels: list[Any] = []

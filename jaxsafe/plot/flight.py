@@ -49,7 +49,8 @@ def flight_figure(env: Environment, episode: tuple[State, TimeStep], title: str)
     """Return a figure of one episode.
 
     The path is relative to the first platform that is not the agent. If that platform has a
-    heading, x is along it. A path in space is drawn in space and from above.
+    heading, x is along it. If it moves, regions that stay in place are left out. A path in space is
+    drawn in space and from above.
 
     Args:
         env: the environment of the episode.
@@ -89,6 +90,12 @@ def _origin(env: Environment) -> str | None:
     return others[0] if others else None
 
 
+def _origin_moves(env: Environment, states: State) -> bool:
+    """Return whether the first platform that is not the agent changes its place."""
+    origin = _origin(env)
+    return origin is not None and bool(np.ptp(states.sim.platforms[origin].position, axis=0).any())
+
+
 def _heads(env: Environment, states: State) -> str | None:
     """Return the platform along whose heading x is, or None."""
     origin = _origin(env)
@@ -118,6 +125,8 @@ def _draw_path(panel: Any, view: tuple[int, ...], env: Environment, states: Stat
     spatial = len(view) == 3
     forbidden = kept_out(env)
     for region in env.regions:
+        if region.on is None and _origin_moves(env, states):
+            continue  # it has no one place on a map that moves
         place = np.nan_to_num(_relative_path(env, states, region.name)[-1])
         if spatial:
             region_surface(panel, region, place, region.name in forbidden)

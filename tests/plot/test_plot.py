@@ -317,6 +317,13 @@ def test_paths_are_seen_from_the_lead_along_its_heading_with_the_region_that_it_
     assert panel.get_xlabel() == "ahead of the lead [ft]"
     assert panel.get_ylabel() == "left of the lead [ft]"
 
+    # A region that stays in place has none on this map.
+    zone = Sphere(name="zone", on=None, radius=10.0)
+    for row in rows:
+        row["regions"]["zone"] = {"position": [0.0, 0.0]}
+    panel = trajectories([(100, rows)], "title", "ft", [*env.regions, zone]).axes[0]
+    assert [patch.get_label() for patch in panel.patches] == ["rejoin_region"]
+
 
 def test_the_speed_limit_is_drawn_from_the_log() -> None:
     panel = speed_distance([episode(100, 2)], "title").axes[0]
