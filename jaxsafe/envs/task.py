@@ -49,7 +49,8 @@ class Task:
     gymnasium_id: str | None = None
     """The id for `gymnasium.make`, for instance `my_package/Hover-v0`."""
     recipe: str | Path | None = None
-    """The file of training recipes by preset. A relative path is one in the package's `configs/`.
+    """The file of training recipes by preset, or of an environment that has such `recipes`. A
+    relative path is one in the package's `configs/`.
     Without a file there is only the preset `observation_only`, the options' defaults."""
     paper_steps: int | None = None
     """Table 2 of the paper: environment steps to 80 % success in training."""

@@ -10,6 +10,7 @@ from tiny_run import assert_same_end
 import jaxsafe
 from jaxsafe.commands import config as config_command
 from jaxsafe.commands import train as command
+from jaxsafe.envs.task import TASKS, Task
 from jaxsafe.processors.reward import Intervention
 from jaxsafe.runs.training import recipe_text
 from jaxsafe.schema.component import normalise
@@ -49,6 +50,18 @@ def test_an_edited_task_keeps_its_recipe(mine: Path) -> None:
         assert (config.recipe, name) == ("docking2d", "mine")
         assert float(env.agent_platform.mass) == 14.0
     assert recipe_text(config) == "recipe docking2d, preset many_envs"
+
+
+def test_a_task_takes_the_recipes_of_the_file_of_its_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "formation.yaml"
+    text = jaxsafe.dump(jaxsafe.make("docking1d"))
+    file.write_text(f"{text}recipes:\n  careful: {{ppo: {{gamma: 0.9}}}}\n", encoding="utf-8")
+    task = Task(name="formation", environment=lambda: jaxsafe.load(file), recipe=file)
+    monkeypatch.setitem(TASKS, "formation", task)
+    expected = {"recipe": "formation", "preset": "careful", "ppo.gamma": 0.9}
+    assert recipe("formation", None) == expected
 
 
 def test_the_recipe_of_the_command_line_wins(mine: Path) -> None:

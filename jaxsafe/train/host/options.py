@@ -507,7 +507,7 @@ def find_recipes(task: str, source: str | None = None) -> Recipes:
     while name != NO_RECIPE:
         if not is_file(name):
             file = find_task(name, place).recipe
-            presets = yaml12.read(configs() / file) if file else {}
+            presets = _presets_in(configs() / file) if file else {}
             return Recipes(name if presets else NO_RECIPE, presets)
         following = load_recipe_name(name)
         if following is None:
@@ -519,6 +519,13 @@ def find_recipes(task: str, source: str | None = None) -> Recipes:
         place = f"{name}: recipe"
         name = following
     return Recipes(NO_RECIPE, {})
+
+
+def _presets_in(path: Path) -> dict[str, Any]:
+    """Return the presets in a file of recipes, or under `recipes` in the file of an environment."""
+    content = yaml12.read(path)
+    of_environment = isinstance(content, Mapping) and "platforms" in content
+    return load_recipes(path) if of_environment else content
 
 
 def recipes(task: str) -> dict[str, Any]:
