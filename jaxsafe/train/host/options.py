@@ -521,7 +521,7 @@ def find_recipes(task: str, source: str | None = None) -> Recipes:
     return Recipes(NO_RECIPE, {})
 
 
-def _presets_in(path: Path) -> dict[str, Any]:
+def _presets_in(path: Path) -> Any:
     """Return the presets in a file of recipes, or under `recipes` in the file of an environment."""
     content = yaml12.read(path)
     of_environment = isinstance(content, Mapping) and "platforms" in content
