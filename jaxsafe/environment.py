@@ -32,7 +32,7 @@ from jaxsafe.schema.describe import Described, Rows, brief, unbroken
 from jaxsafe.schema.dotted_paths import references, set_path
 from jaxsafe.schema.errors import ConfigError, nearest, part, show
 from jaxsafe.schema.ties import Tie, follow
-from jaxsafe.simulation.controllers import Actuator, AgentController
+from jaxsafe.simulation.controllers import Actuator
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.initializers import uniform
 from jaxsafe.simulation.platform import Platform, placed
@@ -301,23 +301,16 @@ def action_bounds(env: Environment) -> tuple[list[Any], list[Any]]:
 def acts_within_one(env: Environment) -> bool:
     """Return whether every continuous element of an action is in [−1, 1]."""
     return all(
-        actuator.rescale and actuator.post_activation == "clip"
-        for actuator in _listed_actuators(env)
+        actuator.rescale and actuator.post_activation == "clip" for actuator in env.actuators
     )
 
 
 def _action_ranges(env: Environment) -> list[tuple[Any, Any]]:
-    actuators = _listed_actuators(env)
-    points = env.num_action_points or (0,) * len(actuators)
+    points = env.num_action_points or (0,) * len(env.actuators)
     return [
         (0.0, count - 1.0) if count else actuator.action_range
-        for actuator, count in zip(actuators, points, strict=True)
+        for actuator, count in zip(env.actuators, points, strict=True)
     ]
-
-
-def _listed_actuators(env: Environment) -> tuple[Actuator, ...]:
-    controller = env.agent_platform.controller
-    return controller.actuators if isinstance(controller, AgentController) else ()
 
 
 def action_text(env: Environment) -> str:
