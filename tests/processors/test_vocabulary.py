@@ -590,6 +590,48 @@ def test_a_barrier_on_the_distance_to_a_box_keeps_out_of_it() -> None:
 
 
 @pytest.mark.thorough
+def test_a_barrier_keeps_an_approach_within_its_cone() -> None:
+    cone = {
+        "type": "cone",
+        "name": "corridor",
+        "axis": {"type": "fixed", "along": [0, 1]},
+        "target": {"type": "position", "of": "deputy", "relative_to": "chief"},
+        "half_angle": 0.5,
+        "keep": "inside",
+        "degree": 2,
+    }
+    docking = jaxsafe.make("docking2d")
+    env = jaxsafe.override(
+        docking,
+        {
+            "constraints": [*docking.constraints, cone],
+            "deputy.start.position.direction.azimuth": [1.4, 1.75],
+            "deputy.start.velocity.share": [0.0, 0.2],
+        },
+    )
+    asif = {
+        "type": "explicit_asif",
+        "constraints": ["corridor"],
+        "enforce": False,
+        "strengthening": {"type": "polynomial", "linear": 0.05},
+    }
+
+    def sideways(key: jax.Array, observation: jax.Array) -> jax.Array:
+        return jnp.zeros((observation.shape[0], 2)).at[:, 0].set(1.0)
+
+    least = [
+        float(
+            jaxsafe.rollout(one, sideways, jax.random.key(0), num_steps=150, num_envs=16)
+            .info.margins["corridor"]
+            .min()
+        )
+        for one in (env, jaxsafe.override(env, {"rta": asif}))
+    ]
+    assert least[0] < -0.2
+    assert least[1] >= 0.0
+
+
+@pytest.mark.thorough
 def test_bounds_on_the_way_hold_for_a_carrier_that_turns() -> None:
     """Compare with many small steps of the same motion."""
     tree = data()
