@@ -361,7 +361,11 @@ def test_the_first_condition_that_holds_hides_those_after_it() -> None:
 
 @pytest.mark.thorough
 def test_a_condition_that_stands_apart_neither_hides_nor_is_hidden() -> None:
-    numbers = {"terminal.timeout.limit": 0.5, "terminal.distance.limit": 0.1}
+    numbers = {
+        "terminal.timeout.limit": 0.5,
+        "reward.success.time_scale": 2000.0,
+        "terminal.distance.limit": 0.1,
+    }
     for names, outcome in (
         (["success", "distance", "timeout", "crash"], "success"),
         (["distance", "success", "timeout", "crash"], "distance"),
