@@ -29,14 +29,14 @@ from jaxsafe.processors.terminal import Terminal, time_limit
 from jaxsafe.rta.filter import RTA
 from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.schema.describe import Described, Rows, brief, unbroken
-from jaxsafe.schema.dotted_paths import references, set_path
+from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError, nearest, part, show
 from jaxsafe.schema.ties import Tie, follow
 from jaxsafe.simulation.controllers import Actuator
 from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.initializers import uniform
 from jaxsafe.simulation.platform import Platform, placed
-from jaxsafe.transition import advance, update_statuses, with_memory
+from jaxsafe.transition import advance, status_names, update_statuses, with_memory
 from jaxsafe.types import (
     Info,
     Key,
@@ -714,12 +714,7 @@ def _diverged(env: Environment, sim: Sim) -> Bool[Array, ""]:
 
 def _judging_statuses(env: Environment) -> list[str]:
     """Return the names of the statuses to which terminal conditions and constraints refer."""
-    names = []
-    for judge in (*env.terminal, *env.constraints):
-        for _, refers, name in references(judge, ""):
-            if refers.section == "status":
-                names.append(name)
-    return list(dict.fromkeys(names))
+    return list(dict.fromkeys(status_names((*env.terminal, *env.constraints))))
 
 
 def _is_float(value: Array) -> bool:

@@ -27,7 +27,7 @@ from jaxsafe.rta.asif import Strengthening
 from jaxsafe.rta.cascade import Stage
 from jaxsafe.rta.filter import RTA, BackupController, TerminalSet
 from jaxsafe.schema.component import Component, Field, choices, fields
-from jaxsafe.schema.convert import bare, expects, to_data
+from jaxsafe.schema.convert import bare, expects, is_component, to_data
 from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.schema.field_docs import field_docs
 from jaxsafe.schema.ties import Tie
@@ -174,7 +174,7 @@ def _takes(field: Field, with_users: bool) -> str:
     core = bare(field.hint)
     inner = typing.get_args(core)
     base = inner[0] if typing.get_origin(core) is tuple and inner else core
-    if isinstance(base, type) and issubclass(base, Component):
+    if is_component(base):
         types = ", ".join(f"`{title(cls)}`" for cls in _classes(base, with_users))
         return ("a list of " if inner else "one of " if "," in types else "") + types
     if field.refers and core is str:

@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from jaxsafe.config.tied import check_ties
+from jaxsafe.config.tied import check_ties, one_number
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.schema.component import ANY, Component, fields
-from jaxsafe.schema.convert import expects, to_value
+from jaxsafe.schema.component import Component, fields
+from jaxsafe.schema.convert import to_value
 from jaxsafe.schema.dotted_paths import join, references, set_path
 from jaxsafe.schema.errors import ConfigError, nearest, show, summarise_error
 from jaxsafe.schema.ties import follow
@@ -213,12 +213,7 @@ def _check_randomized(env: Environment) -> None:
     """
 
     def convert(value: Any, field: Any, place: str) -> Any:
-        one = field.unit.length in (None, ANY) if field.unit else isinstance(value, Mapping)
-        if not one:
-            raise ConfigError(
-                f"{place}: expected the path of one number, found that of {expects(field)}"
-            )
-        return to_value(value, field, place)
+        return to_value(one_number(value, field, place), field, place)
 
     leaves: dict[int, str] = {}
     for path, interval in env.randomize.items():

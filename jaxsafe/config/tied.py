@@ -101,7 +101,7 @@ def check_ties(env: Environment) -> None:
                     f"of a platform, such as deputy.mass, found {end}"
                 )
             try:
-                set_path(env, end, jnp.zeros(()), _one_number)
+                set_path(env, end, jnp.zeros(()), one_number)
             except ConfigError as error:
                 raise ConfigError(f"tied: {error}") from None
             if _number(env, end) is None:
@@ -112,7 +112,7 @@ def check_ties(env: Environment) -> None:
             )
 
 
-def _one_number(value: Any, field: Field, place: str) -> Any:
+def one_number(value: Any, field: Field, place: str) -> Any:
     """Return a value of a field that holds one number or a mapping of such. Refuse other fields."""
     one = field.unit.length in (None, ANY) if field.unit else isinstance(value, dict)
     if not one:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaxsafe.schema.component import Component, Kind, choices, fields, normalise
-from jaxsafe.schema.convert import bare, choose_class, to_component, to_value
+from jaxsafe.schema.convert import bare, choose_class, is_component, to_component, to_value
 from jaxsafe.schema.dotted_paths import are_names, as_list, index_of, join, set_path
 
 TYPE = "type"
@@ -109,7 +109,7 @@ def _standing(
         if typing.get_origin(base) is tuple:
             base = bare(typing.get_args(base)[0])
         value = getattr(value, name)
-    typed = isinstance(base, type) and issubclass(base, Component) and choices(base)
+    typed = is_component(base) and choices(base)
     return (value, base) if typed and (value is None or isinstance(value, Component)) else None
 
 

@@ -16,7 +16,6 @@ from jaxsafe.config.arguments import Arguments, text
 from jaxsafe.environment import Environment, require_success
 from jaxsafe.envs import STARTERS, TASKS, adapt, find_task, is_file, make, short_name
 from jaxsafe.processors.reward import Intervention
-from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import Component, Range, normalise
 from jaxsafe.schema.convert import to_value
 from jaxsafe.schema.dotted_paths import set_path
@@ -507,7 +506,7 @@ def find_recipes(task: str, source: str | None = None) -> Recipes:
     while name != NO_RECIPE:
         if not is_file(name):
             file = find_task(name, place).recipe
-            presets = _presets_in(configs() / file) if file else {}
+            presets = load_recipes(configs() / file) if file else {}
             return Recipes(name if presets else NO_RECIPE, presets)
         following = load_recipe_name(name)
         if following is None:
@@ -519,13 +518,6 @@ def find_recipes(task: str, source: str | None = None) -> Recipes:
         place = f"{name}: recipe"
         name = following
     return Recipes(NO_RECIPE, {})
-
-
-def _presets_in(path: Path) -> Any:
-    """Return the presets in a file of recipes, or under `recipes` in the file of an environment."""
-    content = yaml12.read(path)
-    of_environment = isinstance(content, Mapping) and "platforms" in content
-    return load_recipes(path) if of_environment else content
 
 
 def recipes(task: str) -> dict[str, Any]:
