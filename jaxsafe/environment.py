@@ -621,7 +621,7 @@ def _empty_sim(env: Environment) -> Sim:
 
 def _begin(env: Environment, sim: Sim, parameters: Parameters) -> tuple[State, TimeStep]:
     """Initialise all processors from placed platforms: `init` and `process`, no `increment`."""
-    sim, status_memory = update_statuses(env, sim, None)
+    sim, status_memory = update_statuses(env, sim, {})
     ended = _update_ended(env, sim)
     observation, observation_memory = _observations(env, sim, None)
     reward_memory = {}

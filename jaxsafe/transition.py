@@ -152,7 +152,7 @@ def _in_detail(env: Environment) -> tuple[set[str], set[str]]:
 
 
 def update_statuses(
-    env: Environment, sim: Sim, memory: Mapping[str, Any] | None
+    env: Environment, sim: Sim, memory: Mapping[str, Any], duration: Any = None
 ) -> tuple[Sim, dict[str, Any]]:
     """Place the regions, then compute the statuses in order.
 
@@ -161,20 +161,22 @@ def update_statuses(
     Args:
         env: the environment.
         sim: the simulation, with its platforms.
-        memory: what the statuses remember from the step before, by name. None at the start of an
-            episode.
+        memory: what the statuses remember from the step before, by name. Statuses that are not
+            there begin anew, as all do at the start of an episode.
+        duration: length of the step [s]. None stands for `env.dt`.
 
     Returns:
         The simulation with regions and statuses, and what the statuses remember now.
     """
+    duration = env.dt if duration is None else duration
     sim = place_regions(env, sim)
     memories = {}
     for status in env.status:
         with part("status", status.name):
             own = (
-                status.init(sim)
-                if memory is None
-                else status.increment(memory[status.name], sim, env.dt)
+                status.increment(memory[status.name], sim, duration)
+                if status.name in memory
+                else status.init(sim)
             )
             sim = sim.replace(status={**sim.status, status.name: status.process(own, sim)})
         memories[status.name] = own
@@ -221,16 +223,8 @@ def remember(env: Environment, before: Sim, sim: Sim, duration: Any) -> Sim:
     """
     if not before.remembered:
         return sim
-    judged = place_regions(env, sim.replace(status={}))
-    remembered = {}
-    for status in env.status:
-        if status.name in before.remembered:
-            own = status.increment(before.remembered[status.name], judged, duration)
-            remembered[status.name] = own
-        else:
-            own = status.init(judged)
-        judged = judged.replace(status={**judged.status, status.name: status.process(own, judged)})
-    return sim.replace(remembered=remembered)
+    memories = update_statuses(env, sim.replace(status={}), before.remembered, duration)[1]
+    return sim.replace(remembered={name: memories[name] for name in before.remembered})
 
 
 def status_names(parts: Iterable[Component]) -> Iterator[str]:

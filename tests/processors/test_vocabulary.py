@@ -672,7 +672,7 @@ def test_bounds_on_the_way_hold_for_a_carrier_that_turns() -> None:
 
         def margins(share: jax.Array) -> jax.Array:
             part = env.replace(dt=env.dt * share)
-            moved = update_statuses(env, advance(part, sim, jnp.zeros(2)), None)[0]
+            moved = update_statuses(env, advance(part, sim, jnp.zeros(2)), {})[0]
             return jnp.stack([one.margin(moved) for one in env.constraints])
 
         true = jax.vmap(margins)(jnp.linspace(1e-3, 1.0, 200)).min(axis=0)
