@@ -38,7 +38,7 @@ from jaxsafe.config import override
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.run_adversaries import attack
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
-from jaxsafe.rta.qp import nearest_control
+from jaxsafe.rta.qp import nearest_solution
 from jaxsafe.schema.component import normalise
 from jaxsafe.train.ppo import PPO, init, update
 from jaxsafe.transition import bounds
@@ -224,7 +224,7 @@ def programs(repeats: int) -> list[dict[str, Any]]:
     """Measure the small quadratic program: solutions a second, and its distance from float64."""
     rng = np.random.default_rng(0)
     rows = []
-    solve = jax.jit(jax.vmap(nearest_control))
+    solve = jax.jit(jax.vmap(nearest_solution))
     for m in range(1, 7):
         problem = [
             rng.uniform(-1.0, 1.0, (BATCH, m)),
@@ -235,10 +235,11 @@ def programs(repeats: int) -> list[dict[str, Any]]:
         ]
         single = [array.astype(np.float32) for array in problem]
         seconds, _ = timed(lambda single=single: solve(*single), repeats)
-        control, feasible = solve(*single)
+        found = solve(*single)
         with jax.enable_x64():
-            exact, possible = solve(*(array.astype(np.float64) for array in single))
-        error = np.abs(control - exact).max(axis=1)[np.asarray(feasible & possible)]
+            exact = solve(*(array.astype(np.float64) for array in single))
+        both = np.asarray(found.feasible & exact.feasible)
+        error = np.abs(found.control - exact.control).max(axis=1)[both]
         rows.append(
             {
                 "variables": m,

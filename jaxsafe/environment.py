@@ -345,7 +345,7 @@ def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:
     """
     parameters = _draw_parameters(env, key)
     env = drawn(env, parameters)
-    sim = _empty_sim(env)
+    sim = empty_sim(env)
     platform_keys = jax.random.split(key, len(env.platforms))
     for platform, platform_key in zip(env.platforms, platform_keys, strict=True):
         with part("platforms", platform.name):
@@ -390,7 +390,7 @@ def reset_to(
                 f"reset_to: unknown platform {show(name)}; choose from {nearest(name, known)}"
             )
     platforms = {name: platform.place(start.get(name, {})) for name, platform in known.items()}
-    sim = _empty_sim(env).replace(platforms=platforms)
+    sim = empty_sim(env).replace(platforms=platforms)
     return _with_own_buffers(_begin(env, sim, parameters), others=(env, start))
 
 
@@ -447,7 +447,7 @@ def _world_step(env: Environment, state: State, desired: Array) -> tuple[State, 
     actual, rta_memory, rta_info = _filtered(env, state, desired)
     later = advance(env, state.sim, actual)
     num_steps = state.num_steps + 1
-    sim = _empty_sim(env).replace(
+    sim = empty_sim(env).replace(
         time=num_steps.astype(env.dt.dtype) * env.dt,
         platforms=later.platforms,
         actuators=later.actuators,
@@ -596,7 +596,7 @@ def longest_episode(env: Environment) -> Float[Array, ""] | None:
     return jnp.ceil((jnp.ceil(limit / low.dt) + 2.0) / env.decision_period)
 
 
-def _empty_sim(env: Environment) -> Sim:
+def empty_sim(env: Environment) -> Sim:
     """Return a simulation at time 0 without platforms and controls, in which nothing has ended.
 
     Actuators with a lag or a rate limit give 0, or the limit nearest to it.

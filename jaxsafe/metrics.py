@@ -151,6 +151,13 @@ def full_controls(env: Environment) -> tuple[float, ...]:
     return tuple(max(abs(float(one.low)), abs(float(one.high))) for one in env.actuators)
 
 
+def metrics_in(env: Environment, episodes: Episode) -> dict[str, float | None]:
+    """Return the metrics over a set of finished episodes of an environment, as `summarise` does."""
+    return summarise(
+        episodes, env.success_indices, **measures(env), full_controls=full_controls(env)
+    )
+
+
 def summarise(
     episodes: Episode,
     success: int | Sequence[int],

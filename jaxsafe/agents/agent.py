@@ -17,7 +17,7 @@ import numpy as np
 from jax.lax import broadcast_to_rank
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.agents.distributions import Categorical, Gaussian, Joint, split_outputs
+from jaxsafe.agents.distributions import Categorical, Distribution, action_distribution
 from jaxsafe.agents.features import Features, PlainFeatures
 from jaxsafe.agents.networks import (
     MLP,
@@ -34,9 +34,6 @@ from jaxsafe.schema.component import ANY, Component, Range, Unit
 from jaxsafe.schema.errors import ConfigError, summarise_error
 from jaxsafe.schema.user_modules import modules
 from jaxsafe.types import Dimensionless, Key, Number
-
-Distribution = Gaussian | Categorical | Joint
-"""A distribution over actions."""
 
 
 class Sequences(NamedTuple):
@@ -191,18 +188,7 @@ class Agent(Component):
         self, env: Environment, params: Params, out: Float[Array, "*batch o"]
     ) -> Distribution:
         """Return the distribution over actions that the outputs of the actor stand for."""
-        points, log_std = env.num_action_points, params["log_std"]
-        if env.action_kind == "continuous":
-            return Gaussian(mean=out, log_std=log_std)
-        if env.action_kind == "discrete":
-            return self._choices(out, log_std, points)
-        mean, logits = split_outputs(out, points)
-        width, sharpness = split_outputs(log_std, [min(count, 1) for count in points])
-        return Joint(
-            normal=Gaussian(mean=mean, log_std=width),
-            choices=self._choices(logits, sharpness, tuple(filter(None, points))),
-            points=points,
-        )
+        return action_distribution(env.num_action_points, out, params["log_std"], self._choices)
 
     def _choices(
         self, out: Float[Array, "*batch points"], log_std: Array, points: tuple[int, ...]

@@ -6,7 +6,7 @@ actions have some elements of each kind.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -138,3 +138,35 @@ def split_outputs(
         start, end = end, end + (count or 1)
         parts[count > 0].append(outputs[..., start:end])
     return jnp.concatenate(parts[False], axis=-1), jnp.concatenate(parts[True], axis=-1)
+
+
+Distribution = Gaussian | Categorical | Joint
+"""A distribution over actions."""
+
+
+def action_distribution(
+    points: tuple[int, ...],
+    outputs: Float[Array, "*batch o"],
+    log_std: Float[Array, " a"],
+    choose: Callable[[Array, Array, tuple[int, ...]], Categorical],
+) -> Distribution:
+    """Return the distribution over actions that the outputs of an actor stand for.
+
+    Args:
+        points: the number of choices of each actuator, 0 for a continuous one, or `()` if all are
+            continuous.
+        outputs: the outputs in the order of the actuators, as for `split_outputs`.
+        log_std: one number for each actuator.
+        choose: returns the choices that logits, their part of `log_std` and their points stand for.
+    """
+    if not any(points):
+        return Gaussian(mean=outputs, log_std=log_std)
+    if all(points):
+        return choose(outputs, log_std, points)
+    mean, logits = split_outputs(outputs, points)
+    width, sharpness = split_outputs(log_std, [min(count, 1) for count in points])
+    return Joint(
+        normal=Gaussian(mean=mean, log_std=width),
+        choices=choose(logits, sharpness, tuple(filter(None, points))),
+        points=points,
+    )

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.agents.agent import Distribution, num_outputs
-from jaxsafe.agents.distributions import Categorical, Gaussian, Joint, split_outputs
+from jaxsafe.agents.agent import num_outputs
+from jaxsafe.agents.distributions import Categorical, Distribution, action_distribution
 from jaxsafe.agents.networks import MAX_LAYERS, Params
 from jaxsafe.agents.onnx_reader import Network, read_graph
 from jaxsafe.environment import Environment
@@ -53,16 +53,11 @@ class ForeignAgent:
     def distribution(self, env: Environment, params: Params, inputs: Array) -> Distribution:
         """Return a distribution for one observation or a batch. Only its mode means something."""
         out = jnp.vectorize(lambda one: self.network(params, one), signature="(o)->(a)")(inputs)
-        points = env.num_action_points
-        if env.action_kind == "continuous":
-            return Gaussian(mean=out, log_std=jnp.zeros(env.action_size))
-        if env.action_kind == "discrete":
-            return Categorical(logits=out, points=points)
-        mean, logits = split_outputs(out, points)
-        return Joint(
-            normal=Gaussian(mean=mean, log_std=jnp.zeros(mean.shape[-1])),
-            choices=Categorical(logits=logits, points=tuple(filter(None, points))),
-            points=points,
+        return action_distribution(
+            env.num_action_points,
+            out,
+            log_std=jnp.zeros(env.action_size),
+            choose=lambda logits, _, points: Categorical(logits=logits, points=points),
         )
 
     def policy(self, env: Environment, params: Params, deterministic: Array | bool) -> Policy:

@@ -12,11 +12,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from jaxsafe.commands import cli
+from jaxsafe.commands import SUBCOMMANDS, cli
 from jaxsafe.commands.environment_options import TaskOptions
-
-OTHERS = ("types", "schema")
-"""First words that stand for commands of their own, each in a file of its name."""
 
 
 class Options(TaskOptions):
@@ -67,7 +64,7 @@ def _recipes(env: str, in_full: bool) -> tuple[str | None, Mapping[str, Any]]:
 def command() -> None:
     """Run the command on the words of the command line."""
     name = next(iter(sys.argv[1:]), "")
-    if name in OTHERS:
+    if f"config {name}" in SUBCOMMANDS:
         sys.argv = [f"{sys.argv[0]} {name}", *sys.argv[2:]]
         importlib.import_module(f"jaxsafe.commands.config_{name}").command()
     else:

@@ -17,7 +17,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxsafe.config.tied import check_ties, one_number
-from jaxsafe.environment import Environment, reset, step
+from jaxsafe.environment import Environment, empty_sim, reset, step
 from jaxsafe.schema.component import Component, fields
 from jaxsafe.schema.convert import to_value
 from jaxsafe.schema.dotted_paths import join, references, set_path
@@ -26,7 +26,6 @@ from jaxsafe.schema.ties import follow
 from jaxsafe.schema.user_modules import modules
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.transition import judge
-from jaxsafe.types import Sim
 
 MAX_PARTS = 1000
 """Largest number of parts of a section.
@@ -280,18 +279,7 @@ def _check_kinds(env: Environment) -> None:
 
     def statuses(env: Environment) -> Mapping[str, Any]:
         platforms = {platform.name: platform.rest() for platform in env.platforms}
-        no_control = jnp.zeros(env.action_size, env.dt.dtype)
-        sim = Sim(
-            time=jnp.zeros_like(env.dt),
-            platforms=platforms,
-            regions={},
-            status={},
-            ended={},
-            intervening=jnp.zeros((), bool),
-            control_desired=no_control,
-            control_actual=no_control,
-        )
-        return judge(env, sim).status
+        return judge(env, empty_sim(env).replace(platforms=platforms)).status
 
     try:
         found = jax.eval_shape(statuses, env)

@@ -6,7 +6,7 @@ import jax
 
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.episodes import run_episodes
-from jaxsafe.metrics import full_controls, measures, summarise
+from jaxsafe.metrics import metrics_in
 from jaxsafe.rollout import Policy, RecurrentPolicy, require_count, require_hashable
 from jaxsafe.types import Key
 
@@ -42,9 +42,4 @@ def evaluate(
     require_hashable(policy)
     key = jax.random.key(0) if key is None else key
     sums = jax.jit(run_episodes, static_argnums=(1, 3))(env, policy, key, count)
-    return summarise(
-        jax.device_get(sums),
-        env.success_indices,
-        **measures(env),
-        full_controls=full_controls(env),
-    )
+    return metrics_in(env, jax.device_get(sums))

@@ -13,7 +13,7 @@ from jaxsafe.devices.background_compile import CompiledInBackground
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.episodes import begin_recording, max_steps, record_steps, run_episodes
-from jaxsafe.metrics import METRICS, Episode, full_controls, measures, summarise
+from jaxsafe.metrics import METRICS, Episode, measures, metrics_in
 from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.types import Key, State, TimeStep
 
@@ -310,10 +310,9 @@ def given_up(env: Environment, kinds: Mapping[str, Episode]) -> dict[str, Any]:
 
 def metrics_per_seed(env: Environment, episodes: Episode) -> dict[str, list[float | None]]:
     """Return every metric of Section 5 for each seed, from sums of shape [seeds, episodes]."""
-    measured: dict[str, Any] = {**measures(env), "full_controls": full_controls(env)}
     num_seeds = np.asarray(episodes.outcome).shape[0]
     of_seeds = [jax.tree.map(lambda x, i=i: x[i], episodes) for i in range(num_seeds)]
-    metrics = [summarise(of_seed, env.success_indices, **measured) for of_seed in of_seeds]
+    metrics = [metrics_in(env, of_seed) for of_seed in of_seeds]
     return {name: [of_seed[name] for of_seed in metrics] for name in METRICS}
 
 

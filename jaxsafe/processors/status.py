@@ -325,6 +325,15 @@ class Last(Record):
     value: Array  # on the last sample
     change: Array  # since the sample before
 
+    @classmethod
+    def begin(cls, value: Array) -> Last:
+        """Return the memory at the start of an episode."""
+        return cls(value=value, change=jnp.zeros_like(value))
+
+    def move(self, value: Array) -> Last:
+        """Return the memory after a step."""
+        return Last(value=value, change=value - self.value)
+
 
 class ControlChange(ControlNorm, type="control_change"):
     """Size ‖(u_t − u_(t−1))/scale‖ of the change of the control. The first step changes it from 0.
@@ -333,12 +342,10 @@ class ControlChange(ControlNorm, type="control_change"):
     """
 
     def init(self, sim: Sim) -> Last:
-        control = self.control(sim)
-        return Last(value=control, change=jnp.zeros_like(control))
+        return Last.begin(self.control(sim))
 
     def increment(self, memory: Last, sim: Sim, dt: Number) -> Last:
-        control = self.control(sim)
-        return Last(value=control, change=control - memory.value)
+        return memory.move(self.control(sim))
 
     def process(self, memory: Last, sim: Sim) -> Float[Array, ""]:
         return self.size(memory.change)
@@ -350,12 +357,10 @@ class Change(Status, type="change"):
     status: StatusName
 
     def init(self, sim: Sim) -> Last:
-        value = sim.status[self.status]
-        return Last(value=value, change=jnp.zeros_like(value))
+        return Last.begin(sim.status[self.status])
 
     def increment(self, memory: Last, sim: Sim, dt: Number) -> Last:
-        value = sim.status[self.status]
-        return Last(value=value, change=value - memory.value)
+        return memory.move(sim.status[self.status])
 
     def process(self, memory: Last, sim: Sim) -> Float[Array, ""]:
         return memory.change

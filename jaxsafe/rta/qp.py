@@ -34,20 +34,6 @@ class Solution(Record):
     multipliers: Float[Array, " c"]
 
 
-def nearest_control(
-    u: Float[Array, " m"],
-    low: Float[Array, " m"],
-    high: Float[Array, " m"],
-    rows: Float[Array, "c m"],
-    offsets: Float[Array, " c"],
-    slack: Slack = None,
-    tolerance: Number | None = None,
-) -> tuple[Float[Array, " m"], Bool[Array, ""]]:
-    """Return control and flag of `nearest_solution`, whose arguments these are."""
-    solution = nearest_solution(u, low, high, rows, offsets, slack=slack, tolerance=tolerance)
-    return solution.control, solution.feasible
-
-
 def nearest_solution(
     u: Float[Array, " m"],
     low: Float[Array, " m"],

@@ -6,7 +6,7 @@ All are given in the global frame.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -24,32 +24,37 @@ class Vector(Component):
         raise NotImplementedError
 
 
-class Position(Vector, type="position"):
+class PlaceVector(Vector):
+    """Base of vectors that a platform or region has, as seen from another one if it is named."""
+
+    quantity: ClassVar[str]
+    """The name of the vector in the state of a platform or region."""
+    of: PlaceName
+    relative_to: PlaceName | None = None
+
+    def value(self, sim: Sim) -> Float[Array, " d"]:
+        own = getattr(place(sim, self.of), self.quantity)
+        if self.relative_to is None:
+            return own
+        return own - getattr(place(sim, self.relative_to), self.quantity)
+
+
+class Position(PlaceVector, type="position"):
     """The position of a platform or of a region's centre.
 
     With `relative_to` it is the way there from that platform or centre.
     """
 
-    of: PlaceName
-    relative_to: PlaceName | None = None
-
-    def value(self, sim: Sim) -> Float[Array, " d"]:
-        own = place(sim, self.of).position
-        return own if self.relative_to is None else own - place(sim, self.relative_to).position
+    quantity: ClassVar[str] = "position"
 
 
-class Velocity(Vector, type="velocity"):
+class Velocity(PlaceVector, type="velocity"):
     """The velocity of a platform or of a region's centre.
 
     With `relative_to` it is the velocity relative to that platform or centre.
     """
 
-    of: PlaceName
-    relative_to: PlaceName | None = None
-
-    def value(self, sim: Sim) -> Float[Array, " d"]:
-        own = place(sim, self.of).velocity
-        return own if self.relative_to is None else own - place(sim, self.relative_to).velocity
+    quantity: ClassVar[str] = "velocity"
 
 
 class BodyDirection(Vector, type="body"):

@@ -548,6 +548,23 @@ def test_a_predicted_step_adds_its_control_to_a_budget(env: Environment) -> None
         assert float(margin) == pytest.approx(100.0 - 0.5 * steps)
 
 
+def least_margins(
+    env: jaxsafe.Environment, policy: Any, name: str, strengthening: float, num_steps: int
+) -> list[float]:
+    """Return the least margin of a constraint over 16 flights, without and with a barrier on it."""
+    asif = {
+        "type": "explicit_asif",
+        "constraints": [name],
+        "enforce": False,
+        "strengthening": {"type": "polynomial", "linear": strengthening},
+    }
+    key = jax.random.key(0)
+    return [
+        float(jaxsafe.rollout(one, policy, key, num_steps, num_envs=16).info.margins[name].min())
+        for one in (env, jaxsafe.override(env, {"rta": asif}))
+    ]
+
+
 @pytest.mark.thorough
 def test_a_barrier_on_the_distance_to_a_box_keeps_out_of_it() -> None:
     env = jaxsafe.make("docking2d")
@@ -567,24 +584,11 @@ def test_a_barrier_on_the_distance_to_a_box_keeps_out_of_it() -> None:
             "deputy.start.position.direction.azimuth": [1.2, 1.9],
         },
     )
-    asif = {
-        "type": "explicit_asif",
-        "constraints": ["zone"],
-        "enforce": False,
-        "strengthening": {"type": "polynomial", "linear": 0.02},
-    }
 
     def towards_the_chief(key: jax.Array, observation: jax.Array) -> jax.Array:
         return -jnp.sign(observation[:, :2])
 
-    least = [
-        float(
-            jaxsafe.rollout(one, towards_the_chief, jax.random.key(0), num_steps=200, num_envs=16)
-            .info.margins["zone"]
-            .min()
-        )
-        for one in (env, jaxsafe.override(env, {"rta": asif}))
-    ]
+    least = least_margins(env, towards_the_chief, "zone", strengthening=0.02, num_steps=200)
     assert least[0] < -3.0
     assert least[1] >= 0.0
 
@@ -609,24 +613,11 @@ def test_a_barrier_keeps_an_approach_within_its_cone() -> None:
             "deputy.start.velocity.share": [0.0, 0.2],
         },
     )
-    asif = {
-        "type": "explicit_asif",
-        "constraints": ["corridor"],
-        "enforce": False,
-        "strengthening": {"type": "polynomial", "linear": 0.05},
-    }
 
     def sideways(key: jax.Array, observation: jax.Array) -> jax.Array:
         return jnp.zeros((observation.shape[0], 2)).at[:, 0].set(1.0)
 
-    least = [
-        float(
-            jaxsafe.rollout(one, sideways, jax.random.key(0), num_steps=150, num_envs=16)
-            .info.margins["corridor"]
-            .min()
-        )
-        for one in (env, jaxsafe.override(env, {"rta": asif}))
-    ]
+    least = least_margins(env, sideways, "corridor", strengthening=0.05, num_steps=150)
     assert least[0] < -0.2
     assert least[1] >= 0.0
 

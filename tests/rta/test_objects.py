@@ -313,17 +313,21 @@ class Calm(Slow, type="of_tests_calm"):
         return {}
 
 
-def test_a_certificate_predicts_the_memory_of_a_backup_controller() -> None:
-    """Where the backup ends after its horizon is where the certificate said, integral included."""
-    hold = HoldPosition(name="hold", **HOLD)
+def holding() -> jaxsafe.Environment:
+    """Return docking2d with a filter that holds the position."""
     rta = Simplex(
         constraints=("velocity_limit",),
         margin=1e-3,
-        backups=(hold,),
+        backups=(HoldPosition(name="hold", **HOLD),),
         horizon=6,
         terminal=Calm(speed=0.35),
     )
-    env = jaxsafe.make("docking2d", rta=rta)
+    return jaxsafe.make("docking2d", rta=rta)
+
+
+def test_a_certificate_predicts_the_memory_of_a_backup_controller() -> None:
+    """Where the backup ends after its horizon is where the certificate said, integral included."""
+    env = holding()
     start = {"deputy": {"position": [100.0, 0.0], "velocity": [0.0, 0.395]}}
     state, first = jaxsafe.reset_to(env, start)
     assert first.info.rta.certified
@@ -343,15 +347,7 @@ def test_a_certificate_predicts_the_memory_of_a_backup_controller() -> None:
 
 
 def test_a_backup_controller_takes_over_anew_each_time() -> None:
-    hold = HoldPosition(name="hold", **HOLD)
-    rta = Simplex(
-        constraints=("velocity_limit",),
-        margin=1e-3,
-        backups=(hold,),
-        horizon=6,
-        terminal=Calm(speed=0.35),
-    )
-    env = jaxsafe.make("docking2d", rta=rta)
+    env = holding()
     state, _ = jaxsafe.reset_to(env, {"deputy": {"position": [100.0, 0.0], "velocity": [0.0, 0.2]}})
     state, timestep = step(env, state, jnp.zeros(2))
     assert not timestep.info.intervening

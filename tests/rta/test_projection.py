@@ -15,10 +15,16 @@ from scipy.optimize import minimize, nnls
 
 import jaxsafe
 from jaxsafe.rta.projection import project_box_ball, project_box_halfspace
-from jaxsafe.rta.qp import nearest_control
+from jaxsafe.rta.qp import nearest_solution
 
 NUM = 1000
 TOLERANCES = [(np.float64, 1e-12), (np.float32, 5e-6)]
+
+
+def nearest_control(*arguments: Any) -> tuple[Any, Any]:
+    """Return control and flag of the nearest solution."""
+    solution = nearest_solution(*arguments)
+    return solution.control, solution.feasible
 
 
 def boxes(m: int, dtype: Any) -> tuple[np.ndarray, ...]:
