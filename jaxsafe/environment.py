@@ -33,9 +33,9 @@ from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError, nearest, part, show
 from jaxsafe.schema.ties import Tie, follow
 from jaxsafe.simulation.controllers import Actuator
-from jaxsafe.simulation.geometry import Region
 from jaxsafe.simulation.initializers import uniform
 from jaxsafe.simulation.platform import Platform, placed
+from jaxsafe.simulation.regions import Region
 from jaxsafe.transition import advance, status_names, update_statuses, with_memory
 from jaxsafe.types import (
     Info,

@@ -29,8 +29,6 @@ from jaxsafe.simulation.controllers import (
     Mixed,
 )
 from jaxsafe.simulation.geometry import (
-    Offset,
-    Region,
     angle_between,
     direction,
     rotation,
@@ -40,6 +38,7 @@ from jaxsafe.simulation.geometry import (
 )
 from jaxsafe.simulation.initializers import Direction, Initializer
 from jaxsafe.simulation.platform import Platform
+from jaxsafe.simulation.regions import Offset, Region
 from jaxsafe.simulation.scripted import Command, Scripted
 from jaxsafe.simulation.vectors import Vector
 from jaxsafe.types import (

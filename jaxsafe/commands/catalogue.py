@@ -32,9 +32,9 @@ from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.schema.field_docs import field_docs
 from jaxsafe.schema.ties import Tie
 from jaxsafe.simulation.controllers import Actuator, Controller
-from jaxsafe.simulation.geometry import Offset, Region
 from jaxsafe.simulation.initializers import Direction, Initializer
 from jaxsafe.simulation.platform import Platform
+from jaxsafe.simulation.regions import Offset, Region
 from jaxsafe.simulation.scripted import Command
 from jaxsafe.simulation.vectors import Vector
 from jaxsafe.train.ppo import PPO

@@ -33,7 +33,6 @@ from jaxsafe.schema.ties import Tie, Ties
 from jaxsafe.simulation.controllers import Actuator, Continuous
 from jaxsafe.simulation.cwh import MEAN_MOTION, Anchor, Spacecraft
 from jaxsafe.simulation.double_integrator import DoubleIntegrator
-from jaxsafe.simulation.geometry import Circle, Region, Sphere
 from jaxsafe.simulation.initializers import (
     AtDistance,
     BelowSpeedLimit,
@@ -42,6 +41,7 @@ from jaxsafe.simulation.initializers import (
     Uniform,
 )
 from jaxsafe.simulation.oriented import RATE_LIMIT, OrientedSpacecraft
+from jaxsafe.simulation.regions import Circle, Region, Sphere
 
 DOCKING_SPEED = 0.2
 """ν₀ of Eq. (14): the speed limit at the chief [m/s]."""

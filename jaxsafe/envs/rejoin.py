@@ -30,8 +30,8 @@ from jaxsafe.rta.simplex import CollisionSimplex, Simplex
 from jaxsafe.schema.ties import Tie, Ties
 from jaxsafe.simulation.controllers import Actuator, Continuous
 from jaxsafe.simulation.dubins import Dubins2D, Dubins3D
-from jaxsafe.simulation.geometry import Aspect, Circle, Cylinder
 from jaxsafe.simulation.initializers import AroundAtAltitude, AtDistance, Uniform
+from jaxsafe.simulation.regions import Aspect, Circle, Cylinder
 from jaxsafe.simulation.scripted import Constant, Scripted
 
 HOLD = 20.0

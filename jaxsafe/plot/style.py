@@ -20,7 +20,7 @@ from jaxsafe.processors.constraint import ConeConstraint, KeepIn, KeepOut, Separ
 from jaxsafe.processors.status import Distance
 from jaxsafe.schema.dotted_paths import references
 from jaxsafe.schema.errors import ConfigError, printable
-from jaxsafe.simulation.geometry import Box, Cone, HalfSpace
+from jaxsafe.simulation.regions import Box, Cone, HalfSpace
 from jaxsafe.storage.files import write_bytes
 
 if TYPE_CHECKING:

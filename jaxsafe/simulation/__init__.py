@@ -29,17 +29,6 @@ from jaxsafe.simulation.dubins_lag import (
     LaggedDubins3DState,
 )
 from jaxsafe.simulation.geometry import (
-    Aspect,
-    BodyDisplacement,
-    Box,
-    Circle,
-    Cone,
-    Cylinder,
-    Displacement,
-    HalfSpace,
-    Offset,
-    Region,
-    Sphere,
     angle_between,
     direction,
     rotation,
@@ -63,6 +52,19 @@ from jaxsafe.simulation.oriented import OrientedSpacecraft, OrientedState
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.simulation.point_mass import PointMassAircraft
 from jaxsafe.simulation.reaction_wheel import ReactionWheelSpacecraft, ReactionWheelState
+from jaxsafe.simulation.regions import (
+    Aspect,
+    BodyDisplacement,
+    Box,
+    Circle,
+    Cone,
+    Cylinder,
+    Displacement,
+    HalfSpace,
+    Offset,
+    Region,
+    Sphere,
+)
 from jaxsafe.simulation.scripted import Command, Constant, Schedule, Scripted, Sinusoid
 from jaxsafe.simulation.two_body import TwoBody, TwoBodyState
 from jaxsafe.simulation.two_body_j2 import TwoBodyJ2, TwoBodyJ2State

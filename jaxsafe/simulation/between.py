@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.simulation.geometry import Region, safe_norm, to_body, turn_between
+from jaxsafe.simulation.geometry import safe_norm, to_body, turn_between
+from jaxsafe.simulation.regions import Region
 from jaxsafe.types import RegionState, Sim, place
 
 if TYPE_CHECKING:

@@ -37,7 +37,7 @@ from jaxsafe.runs.figures import _episodes, draw_all
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.simulation.geometry import Box, Cone, HalfSpace, Sphere
+from jaxsafe.simulation.regions import Box, Cone, HalfSpace, Sphere
 from jaxsafe.storage.files import read_csv, read_rows, write_rows
 from jaxsafe.train.ppo import DIAGNOSTICS
 

@@ -45,8 +45,8 @@ from jaxsafe.processors.terminal import Crashed, Docked, Held, Holds, Timeout, T
 from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.cwh import SpacecraftState
 from jaxsafe.simulation.dubins import Dubins2DState, Dubins3DState
-from jaxsafe.simulation.geometry import Circle, Displacement
 from jaxsafe.simulation.oriented import OrientedState
+from jaxsafe.simulation.regions import Circle, Displacement
 from jaxsafe.types import Sim, State, TimeStep
 
 N = 0.001027

@@ -53,8 +53,8 @@ from jaxsafe.processors.terminal import Above, Below, TooClose, TooFar
 from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.cwh import SpacecraftState
 from jaxsafe.simulation.dubins import Dubins3DState
-from jaxsafe.simulation.geometry import BodyDisplacement, Box
 from jaxsafe.simulation.oriented import OrientedState
+from jaxsafe.simulation.regions import BodyDisplacement, Box
 from jaxsafe.simulation.vectors import BodyDirection, FixedDirection, Position, Velocity
 from jaxsafe.transition import advance, smallest_margin, update_statuses, with_memory
 from jaxsafe.types import Sim

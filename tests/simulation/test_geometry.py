@@ -12,18 +12,8 @@ from hypothesis import strategies as st
 from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.cwh import SpacecraftState
 from jaxsafe.simulation.dubins import Dubins2DState, Dubins3DState
-from jaxsafe.simulation.geometry import (
-    Aspect,
-    Circle,
-    Cylinder,
-    Displacement,
-    Sphere,
-    direction,
-    mag_norm,
-    rotation,
-    safe_norm,
-    to_body,
-)
+from jaxsafe.simulation.geometry import direction, mag_norm, rotation, safe_norm, to_body
+from jaxsafe.simulation.regions import Aspect, Circle, Cylinder, Displacement, Sphere
 
 ANGLES = st.floats(-10.0, 10.0)
 

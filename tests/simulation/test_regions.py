@@ -10,6 +10,12 @@ import pytest
 from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.cwh import SpacecraftState
 from jaxsafe.simulation.geometry import (
+    angle_between,
+    rotation,
+    turn_between,
+)
+from jaxsafe.simulation.oriented import OrientedState
+from jaxsafe.simulation.regions import (
     Aspect,
     BodyDisplacement,
     Box,
@@ -21,11 +27,7 @@ from jaxsafe.simulation.geometry import (
     Region,
     Sphere,
     Turned,
-    angle_between,
-    rotation,
-    turn_between,
 )
-from jaxsafe.simulation.oriented import OrientedState
 
 CARRIED: dict[str, Any] = {"name": "region", "on": "chief"}
 SHAPES: dict[str, Region] = {
