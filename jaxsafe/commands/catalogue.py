@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import inspect
 import typing
 from fractions import Fraction
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ import numpy as np
 from jaxsafe.agents.agent import Agent
 from jaxsafe.agents.features import Features
 from jaxsafe.agents.networks import Network
+from jaxsafe.commands.help_text import Row
 from jaxsafe.environment import Environment
 from jaxsafe.processors.constraint import Constraint
 from jaxsafe.processors.observation import Observation
@@ -29,7 +29,7 @@ from jaxsafe.rta.filter import RTA, BackupController, TerminalSet
 from jaxsafe.schema.component import Component, Field, choices, fields
 from jaxsafe.schema.convert import bare, expects, is_component, to_data
 from jaxsafe.schema.errors import ConfigError, show
-from jaxsafe.schema.field_docs import field_docs
+from jaxsafe.schema.field_docs import field_docs, paragraphs
 from jaxsafe.schema.ties import Tie
 from jaxsafe.simulation.controllers import Actuator, Controller
 from jaxsafe.simulation.initializers import Direction, Initializer
@@ -69,16 +69,6 @@ SECTIONS = {
 """The sections, most of them by the name of the field where their types stand."""
 
 
-class Row(NamedTuple):
-    """What is known of a field."""
-
-    name: str
-    takes: str
-    default: str
-    """It is empty if the field must be given."""
-    text: str
-
-
 class Entry(NamedTuple):
     """What is known of a type."""
 
@@ -86,11 +76,6 @@ class Entry(NamedTuple):
     paragraphs: list[str]
     rows: list[Row]
     """Its fields, except the name, which is the user's choice."""
-
-    @property
-    def summary(self) -> str:
-        """The first paragraph, in one line."""
-        return _line(next(iter(self.paragraphs), ""))
 
 
 def find(name: str) -> list[type[Component]]:
@@ -133,8 +118,7 @@ def describe(cls: type[Component], with_users: bool = False) -> Entry:
         for name, field in fields(cls).items()
         if name != "name"
     ]
-    paragraphs = inspect.cleandoc(cls.__doc__ or "").split("\n\n")
-    return Entry(name=title(cls), paragraphs=paragraphs, rows=rows)
+    return Entry(name=title(cls), paragraphs=paragraphs(cls), rows=rows)
 
 
 def title(cls: type[Component]) -> str:

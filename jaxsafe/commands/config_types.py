@@ -11,8 +11,9 @@ from typing import Annotated, ClassVar
 
 from jaxsafe.commands import cli
 from jaxsafe.commands.catalogue import SECTIONS, Entry, describe, find, title, types_of
-from jaxsafe.commands.help_text import WIDTH, wrapped
+from jaxsafe.commands.help_text import WIDTH, row_lines, wrapped
 from jaxsafe.commands.options import CommandOptions, Option
+from jaxsafe.schema.field_docs import summary
 from jaxsafe.schema.user_modules import import_modules
 
 Modules = Annotated[tuple[str, ...], Option(takes="names of modules")]
@@ -49,7 +50,7 @@ def _overview() -> Iterator[str]:
         types = types_of(section, with_users=True)
         width = max(len(title(cls)) for cls in types)
         for cls in types:
-            line = f"  {title(cls):{width}}  {describe(cls).summary}"
+            line = f"  {title(cls):{width}}  {summary(cls)}"
             yield line if len(line) <= WIDTH else f"{line[: WIDTH - 1].rpartition(' ')[0]} …"
 
 
@@ -60,11 +61,8 @@ def _explained(entry: Entry) -> Iterator[str]:
         yield from wrapped(paragraph, indent=2)
     width = max((len(row.name) for row in entry.rows), default=0)
     for row in entry.rows:
-        takes = f"{row.takes} (default {row.default})" if row.default else row.takes
-        first, *rest = wrapped(takes.replace("`", ""), indent=width + 6)
-        yield f"    {row.name:{width}}  {first.strip()}"
-        yield from rest
-        yield from wrapped(row.text, indent=width + 6)
+        plain = row._replace(takes=row.takes.replace("`", ""), default=row.default.replace("`", ""))
+        yield from row_lines(plain, width, indent=4)
 
 
 def command() -> None:

@@ -24,8 +24,8 @@ REST = "Options of every command."
 """Title of the options that are in no group."""
 
 
-class Entry(NamedTuple):
-    """All that is known of an option."""
+class Row(NamedTuple):
+    """All that is known of an option, or of a field of a part."""
 
     name: str
     takes: str
@@ -33,7 +33,7 @@ class Entry(NamedTuple):
     default: str
     """The default, as a user would write it. It is empty if there is none."""
     text: str
-    """What the option means."""
+    """What it means."""
 
 
 def help_text(cls: type[CommandOptions], given: Mapping[str, Any]) -> str:
@@ -56,26 +56,39 @@ def help_text(cls: type[CommandOptions], given: Mapping[str, Any]) -> str:
     width = max(len(entry.name) for entry in options)
     for title, members in grouped(cls, options).items():
         lines += ["", *([title] if title else [])]
-        for name, takes, default, text in members:
-            default = shown(defaults[name]) if name in defaults else default
-            takes = f"{takes} (default {default})" if default else takes
-            first, *rest = wrapped(takes, indent=width + 4)
-            lines += [f"  {name:{width}}  {first.strip()}", *rest]
-            lines += wrapped(text, indent=width + 4)
+        for row in members:
+            if row.name in defaults:
+                row = row._replace(default=shown(defaults[row.name]))
+            lines += row_lines(row, width, indent=2)
     return "\n".join(lines)
 
 
-def grouped(cls: type[CommandOptions], options: Iterable[Entry]) -> dict[str, list[Entry]]:
+def row_lines(row: Row, width: int, indent: int) -> Iterator[str]:
+    """Yield the lines about an option or a field.
+
+    Args:
+        row: what is known of it.
+        width: number of letters for the name.
+        indent: number of spaces before the name.
+    """
+    takes = f"{row.takes} (default {row.default})" if row.default else row.takes
+    first, *rest = wrapped(takes, indent=indent + width + 2)
+    yield f"{' ' * indent}{row.name:{width}}  {first.strip()}"
+    yield from rest
+    yield from wrapped(row.text, indent=indent + width + 2)
+
+
+def grouped(cls: type[CommandOptions], options: Iterable[Row]) -> dict[str, list[Row]]:
     """Return the options of a command by the title of their group. Options of no group are last."""
     left = {entry.name: entry for entry in options}
-    groups: dict[str, list[Entry]] = {}
+    groups: dict[str, list[Row]] = {}
     for title, patterns in cls.groups.items():
         names = [name for pattern in patterns for name in left if fnmatch(name, pattern)]
         groups[title] = [left.pop(name) for name in names]
     return groups | {REST if groups else "": [*left.values()]}
 
 
-def entries(cls: type[Component], start: str = "") -> Iterator[Entry]:
+def entries(cls: type[Component], start: str = "") -> Iterator[Row]:
     """Yield each option.
 
     Args:
@@ -93,11 +106,11 @@ def entries(cls: type[Component], start: str = "") -> Iterator[Entry]:
             if kinds := choices(bare(field.hint)):
                 takes = f"one of {', '.join(kinds)}, or a mapping with such a type"
                 default = field.default.type_name or ""
-                yield Entry(f"{start}{name}", takes=takes, default=default, text=text)
+                yield Row(f"{start}{name}", takes=takes, default=default, text=text)
             yield from entries(type(field.default), f"{start}{name}.")
         else:
             default = "" if field.required or field.default is None else shown(field.default)
-            yield Entry(f"{start}{shown_name(field)}", _takes(field), default, text)
+            yield Row(f"{start}{shown_name(field)}", _takes(field), default, text)
 
 
 def wrapped(text: str, indent: int) -> list[str]:

@@ -1,6 +1,6 @@
-"""The texts that explain the fields of a component.
+"""The texts that explain a component and its fields.
 
-Such a text is the string below the field in the source of its class, which Sphinx shows too.
+That of a field is the string below it in the source of its class, which Sphinx shows too.
 """
 
 from __future__ import annotations
@@ -12,6 +12,16 @@ import textwrap
 from itertools import pairwise
 
 from jaxsafe.schema.component import Component
+
+
+def paragraphs(cls: type[Component]) -> list[str]:
+    """Return the paragraphs of the text about a component."""
+    return inspect.cleandoc(cls.__doc__ or "").split("\n\n")
+
+
+def summary(cls: type[Component]) -> str:
+    """Return the first paragraph of the text about a component, in one line."""
+    return " ".join(paragraphs(cls)[0].split())
 
 
 @functools.cache

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from jaxsafe.schema.component import ANY, Component, Field, Range, choices, field, fields
 from jaxsafe.schema.convert import bare, expects, is_component, is_mapping, is_optional, to_data
-from jaxsafe.schema.field_docs import field_docs
+from jaxsafe.schema.field_docs import field_docs, summary
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
@@ -171,8 +171,7 @@ def _reference(base: type[Component], definitions: dict[str, Schema]) -> Schema:
 
 def _constant(cls: type[Component]) -> Schema:
     """Return the schema of the name of a type, with its first paragraph."""
-    text = inspect.cleandoc(cls.__doc__ or "").split("\n\n")[0]
-    return {"const": cls.type_name, "description": " ".join(text.split())}
+    return {"const": cls.type_name, "description": summary(cls)}
 
 
 def _defined(cls: type[Component], definitions: dict[str, Schema]) -> Schema:
