@@ -15,7 +15,7 @@ PANELS = (
     ("cost_value_loss", "value loss of the cost", 1.0),
     ("explained_variance", "explained variance", 1.0),
     ("entropy", "entropy [nat]", 1.0),
-    ("action_std", "standard deviation of actions", 1.0),
+    ("action_std", "deviation of actions", 1.0),
     ("approx_kl", "approximate KL [nat]", 1.0),
     ("clip_fraction", "clip fraction [%]", 100.0),
     ("grad_norm", "gradient norm", 1.0),

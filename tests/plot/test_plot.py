@@ -1,6 +1,7 @@
 import json
 import re
 import shutil
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -377,6 +378,17 @@ def test_what_is_learnt_is_drawn_as_the_median_and_the_range_of_the_seeds() -> N
     assert panels["explained variance"].lines[0].get_xdata()[0] == 0.2
     assert figure.get_supxlabel() == "environment steps per seed [k]"
     assert figure.get_suptitle() == "title\neach update, median and range of the seeds"
+
+
+def test_every_title_of_what_is_learnt_fits_into_its_row() -> None:
+    figure = learning_curves(diagnostics(), "steps", "title")
+    assert figure is not None
+    figure.draw_without_rendering()
+    titles = [panel.title for panel in figure.axes if panel.axison]
+    extents = [title.get_window_extent() for title in titles]
+    assert max(extent.x1 for extent in extents) <= figure.bbox.x1
+    for left, right in pairwise(extents):
+        assert left.x1 < right.x0 or right.x0 < left.x0  # beside it, or in the next row
 
 
 def test_the_figure_of_what_is_learnt_has_what_the_log_has() -> None:
