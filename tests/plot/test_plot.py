@@ -380,8 +380,10 @@ def test_what_is_learnt_is_drawn_as_the_median_and_the_range_of_the_seeds() -> N
     assert figure.get_suptitle() == "title\neach update, median and range of the seeds"
 
 
-def test_every_title_of_what_is_learnt_fits_into_its_row() -> None:
-    figure = learning_curves(diagnostics(), "steps", "title")
+@pytest.mark.parametrize("left_out", [(), ("cost_value_loss",)])
+def test_every_title_of_what_is_learnt_fits_into_its_row(left_out: tuple[str, ...]) -> None:
+    log = [row | dict.fromkeys(left_out) for row in diagnostics()]
+    figure = learning_curves(log, "steps", "title")
     assert figure is not None
     figure.draw_without_rendering()
     titles = [panel.title for panel in figure.axes if panel.axison]
