@@ -34,20 +34,6 @@ jax.config.update("jax_compilation_cache_dir", str(_cache))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
-SHARED_FIXTURES = {"whole": "training", "swept": "training", "three": "seeds"}
-"""Fixtures that take longest, each with the group of the tests that need it."""
-
-
-@pytest.hookimpl(tryfirst=True)  # pytest-xdist reads the groups in the same hook
-def pytest_collection_modifyitems(items: list[pytest.Function]) -> None:
-    """Give the tests that share a long fixture to one worker, so that it is made only once."""
-    for item in items:
-        for fixture, group in SHARED_FIXTURES.items():
-            if fixture in item.fixturenames:
-                item.add_marker(pytest.mark.xdist_group(group))
-                break
-
-
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the directory of a finished training run that nobody interrupted."""
