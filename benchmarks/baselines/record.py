@@ -5,15 +5,14 @@ So a report can be made in parts and at different times.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from baselines.plan import Item
-from baselines.run import FILM_FILE, answers, options_of
+from baselines.run import FILM_FILE, answers, options_of, same_options
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.storage.files import finite, read_csv, read_json, write_bytes, write_csv, write_json
+from jaxsafe.storage.files import read_csv, read_json, write_bytes, write_csv, write_json
 from jaxsafe.storage.forms import NULL, NUMBER_OR_NULL, OTHERS, TEXT, check
 from jaxsafe.train.host.log import NEEDS, check_order, read_progress
 from jaxsafe.train.host.results import check_results, read_results
@@ -84,7 +83,7 @@ def kept(items: Iterable[Item], files: Path) -> tuple[list[Record], list[str]]:
             continue
         try:
             content = read_json(path, {"options": {}})
-            if content["options"] != json.loads(json.dumps(finite(options_of(item)))):
+            if not same_options(item, content["options"], f"{path}: options."):
                 left_out.append(
                     f"{path}: was made with other options and is left out; report it again"
                 )

@@ -24,7 +24,7 @@ from jaxsafe.storage.files import read_json, write_bytes
 from jaxsafe.train.host.options import resolve
 from jaxsafe.train.host.results import read_results
 from jaxsafe.train.host.run_config import read_content
-from jaxsafe.train.host.run_directory import described
+from jaxsafe.train.host.run_directory import described, from_described
 
 FILM_FILE = "episode_deterministic.gif"
 
@@ -93,20 +93,43 @@ def options_of(item: Item) -> dict[str, Any]:
     Where the run and its progress go is left out.
     """
     config, env, _ = resolve(Arguments.parse(item.words).options)
-    return _without_places(described(config, env))
+    return _without(described(config, env), training=PLACES)
 
 
-def _without_places(content: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of a `config.yaml` without the options that say where things go."""
-    places = ("out", "wandb", "mlflow")
-    training = {key: value for key, value in content["training"].items() if key not in places}
-    return {**content, "training": training}
+def same_options(item: Item, content: Mapping[str, Any], place: str) -> bool:
+    """Return whether options of a training, maybe of an older version, are an item's of today.
+
+    What has come since then has its default. Whose recipe it was, and which numbers would follow
+    others, changes no number.
+
+    Args:
+        item: what would be trained today.
+        content: the content of a `config.yaml`, or what `options_of` once returned.
+        place: what stands before places in messages of errors.
+
+    Raises:
+        ConfigError: the content cannot be read.
+    """
+    aside = {"training": (*PLACES, "recipe", "like"), "environment": ("tied",)}
+    then = described(*from_described(content, place))
+    return _without(then, **aside) == _without(options_of(item), **aside)
+
+
+PLACES = ("out", "wandb", "mlflow")
+"""Options that say where a run and its progress go."""
+
+
+def _without(content: Mapping[str, Any], **aside: Sequence[str]) -> dict[str, Any]:
+    """Return the content of a `config.yaml` without some keys of its parts."""
+    return {
+        part: {key: value for key, value in values.items() if key not in aside.get(part, ())}
+        for part, values in content.items()
+    }
 
 
 def _refuse_other(item: Item, run: Path) -> None:
     """Refuse an old run with other options. Its numbers must not pass as those of a new recipe."""
-    content = _without_places(read_content(run))
-    if any(content[part] != value for part, value in options_of(item).items()):
+    if not same_options(item, read_content(run), f"{run / 'config.yaml'}: "):
         raise ConfigError(
             f"runs: {run} was trained with other options; remove it, or give another directory"
         )

@@ -116,7 +116,9 @@ def test_sequences_are_replayed_as_they_were_flown(critic: MLP | None) -> None:
         memory = state.memory
         state, transitions = collect(env, agent, SMALL, state, jax.random.key(index))
         gamma = jnp.asarray(0.9)
-        state, batch, _ = ppo_module._to_batch(agent, SMALL, gamma, state, transitions, memory)
+        state, batch, _ = ppo_module._to_batch(
+            agent, SMALL, gamma, state, transitions, memory, None
+        )
         policy = agent.distribution(env, state.params, batch.inputs, batch.sequences)
         np.testing.assert_allclose(policy.log_prob(batch.action), batch.log_prob, atol=1e-5)
         target = ppo_module.gae(

@@ -137,6 +137,14 @@ def test_a_report_in_parts_makes_the_page_of_one(
 
     record = Path("parts/baselines/docking2d-engineered_features.json")
     content = json.loads(record.read_text())
+    for option in ("recipe", "like"):  # an older version had no such options
+        del content["options"]["training"][option]
+    del content["options"]["training"]["ppo"]["complete_episodes"]
+    del content["options"]["environment"]["tied"]
+    record.write_text(json.dumps(content))
+    assert command.main([*words, "kinds=observation_only", "out=parts"]) == 0
+    assert pages("parts") == parts
+
     content["options"]["training"]["ppo"]["gamma"] = 0.5
     record.write_text(json.dumps(content))
     capsys.readouterr()

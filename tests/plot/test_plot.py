@@ -579,11 +579,10 @@ def test_a_run_whose_every_name_is_a_formula_is_drawn(
             return {renamed(key): renamed(item) for key, item in value.items()}
         if isinstance(value, list):
             return [renamed(item) for item in value]
-        return (
-            f"{value}{nasty}"
-            if value in ("docking2d", "chief", "deputy", "docking_region")
-            else value
-        )
+        first, *rest = value.split(".") if isinstance(value, str) else [value]
+        if first not in ("docking2d", "chief", "deputy", "docking_region"):
+            return value
+        return ".".join([f"{first}{nasty}", *rest])
 
     monkeypatch.chdir(tmp_path)
     run = tmp_path / nasty
