@@ -358,7 +358,7 @@ def _check_suited(env: Environment) -> None:
         found = _faults_of_starts(env, jax.random.split(jax.random.key(0), 8))
         for fault, everywhere in found.items():
             if everywhere.all():
-                raise ConfigError(f"rta: {fault}")
+                raise ConfigError(fault if fault.startswith("rta.") else f"rta: {fault}")
 
 
 @lru_cache(maxsize=256)

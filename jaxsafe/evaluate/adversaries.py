@@ -134,7 +134,7 @@ def drain(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
         if not isinstance(env.rta, CertifiedRTA):
             return smallest_margin(env, later)
         least = jnp.max(env.rta.certify(env, sim, later))
-        return jnp.where(least >= env.rta.required_margin(env), least, jnp.inf)
+        return jnp.where(least >= env.rta.margin_to_certify(env, u), least, jnp.inf)
 
     values = jax.lax.map(value, controls)
     return controls[jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values))]

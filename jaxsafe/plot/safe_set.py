@@ -184,7 +184,7 @@ def draw(
     figure = Figure(layout="compressed" if plane.spatial else "constrained")
     height = width * (high - low) / (right - left) if plane.spatial else 0.9 * width
     figure.set_size_inches(width * len(surveys) + 1.0, height + (1.2 if plane.spatial else 1.5))
-    required = float(env.rta.required_margin(env))
+    required = float(env.rta.margin_to_certify(env))
     panels = np.atleast_1d(figure.subplots(1, len(surveys), sharex=True, sharey=True))
     for panel, (name, (H, h)) in zip(panels, surveys.items(), strict=True):
         panel.pcolormesh(across, up, H, norm=scale, cmap=SHADES, shading="nearest", rasterized=True)

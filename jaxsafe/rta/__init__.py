@@ -15,6 +15,7 @@ from jaxsafe.rta.backups import (
     VelocityMatched,
 )
 from jaxsafe.rta.backups_with_memory import HoldPosition, Latched
+from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.cascade import Cascade, Stage
 from jaxsafe.rta.filter import RTA, BackupController, CertifiedRTA, RTAMemory, TerminalSet
 from jaxsafe.rta.own_simulator import Barrier, Plant, filter_by_asif, filter_by_simplex
@@ -47,6 +48,7 @@ __all__ = [
     "Stage",
     "Strengthening",
     "TerminalSet",
+    "UncertaintyBound",
     "VelocityMatched",
     "filter_by_asif",
     "filter_by_simplex",

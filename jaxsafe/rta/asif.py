@@ -66,12 +66,32 @@ class DiscreteASIF(CertifiedRTA, type="discrete_asif"):
         spare = jnp.maximum(limited.margin(judge(env, sim)) - required, 0.0)
         limit = limited.limit(judge(env, sim))
         rounding = ROUNDINGS_INSIDE * jnp.finfo(desired.dtype).eps * limit
-        margin = required + (1.0 - self.gamma) * spare + rounding
-        beta, p, k = speed_ball(
-            env, sim, control=jnp.zeros_like(desired), name=self.constraints[0], margin=margin
-        )
         low, high = bounds(env)
-        return project_box_ball(u=desired, low=low, high=high, beta=beta, p=p, k=k)
+
+        def project(margin: Number) -> tuple[Array, Array]:
+            """Return the nearest control that keeps a margin, and whether there is one."""
+            beta, p, k = speed_ball(
+                env, sim, control=jnp.zeros_like(desired), name=self.constraints[0], margin=margin
+            )
+            return project_box_ball(u=desired, low=low, high=high, beta=beta, p=p, k=k)
+
+        margin = required + (1.0 - self.gamma) * spare + rounding
+        if self.bound is None:
+            return project(margin)
+
+        # What is lost depends on the control. So project with what the strongest control loses,
+        # then with what the control just found loses. A control that loses no more than it was
+        # found with replaces the one before. Of two rounds, at least one finds such a control.
+        control, feasible = project(margin + self.lost(env, jnp.maximum(-low, high)))
+        lost = self.lost(env, control)
+        for _ in range(2):
+            nearer, exists = project(margin + lost)
+            own = self.lost(env, nearer)
+            better = exists & (own <= lost)
+            control = jnp.where(better, nearer, control)
+            feasible = feasible | better
+            lost = own
+        return control, feasible
 
 
 def speed_ball(
@@ -337,7 +357,6 @@ class ImplicitASIF(CertifiedRTA, type="implicit_asif"):
         self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
     ) -> Proposal:
         low, high = bounds(env)
-        required = self.required_margin(env)
 
         def least(u: Float[Array, " m"]) -> tuple[Array, Array]:
             paths = self.follow(env, sim, advance(env, sim, u))
@@ -349,6 +368,7 @@ class ImplicitASIF(CertifiedRTA, type="implicit_asif"):
             best = jnp.argmax(values)
             known = jnp.isfinite(values[best])
             row = jnp.where(known, gains[:, best], 0.0)
+            required = self.margin_to_certify(env, proposal)
             missing = jnp.where(known, required + self.spare - values[best], 0.0)
             projected, feasible = project_box_halfspace(
                 u=desired, low=low, high=high, a=row, b=missing + jnp.sum(row * proposal)

@@ -42,6 +42,8 @@ class Brake(BackupController, type="brake"):
     Where the bounds do not allow that, the thrust brings it as near to 0 as they do.
     """
 
+    knows_bound: ClassVar[bool] = True
+
     def control(self, env: Environment, sim: Sim, later: Others) -> Float[Array, " m"]:
         plant = env.agent_platform
         names = env.action_names

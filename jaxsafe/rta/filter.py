@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.prediction import others_react, repeat
 from jaxsafe.rta.projection import within
 from jaxsafe.rta.speed_limit import speed_limit_facts
@@ -115,6 +116,8 @@ class BackupController(Component):
 
     Prediction is then cheaper.
     """
+    knows_bound: ClassVar[bool] = False
+    """Whether `faults` takes the `bound` of a filter into account."""
 
     def control(self, env: Environment, sim: Sim, later: Others) -> Float[Array, " m"]:
         """Return the control in physical units and action order. The filter clips it.
@@ -216,6 +219,9 @@ class CertifiedRTA(RTA):
     they propose acts, and nothing is certified.
 
     A change of each control by at most `tolerance`, as a share of its range, is no intervention.
+
+    A `bound` says how far the true world may be from the one that the filter predicts with. The
+    filter then keeps so much more of a speed limit that its certificates hold in the true world.
     """
 
     constraints: tuple[ConstraintName, ...]
@@ -226,6 +232,7 @@ class CertifiedRTA(RTA):
     release: Margin = 0.0
     enforce: bool = True
     tolerance: Annotated[Number, Unit("1"), Range(0.0)] = 0.0
+    bound: UncertaintyBound | None = None
 
     backup_optional: ClassVar[bool] = False
     """Whether what the filter proposes may act by itself, without any backup controller."""
@@ -242,6 +249,8 @@ class CertifiedRTA(RTA):
             return "a horizon needs a terminal set, and a terminal set a horizon"
         if self.horizon == 0 and len(self.backups) > 1:
             return "without a horizon there is one backup controller"
+        if self.bound is not None and not self.enforce:
+            return "a bound needs enforce: true"
         return repeated(self.backups)
 
     def propose(
@@ -281,10 +290,48 @@ class CertifiedRTA(RTA):
         least_margins = [limit.least_margin for limit in facts if limit]
         return functools.reduce(jnp.maximum, least_margins, margin)
 
+    def margin_to_certify(
+        self, env: Environment, control: Float[Array, " m"] | None = None
+    ) -> Number:
+        """Return the h that a predicted state must have to be certified.
+
+        It is `required_margin`, and with a `bound` also what the true h may be below the predicted.
+
+        Args:
+            env: the environment.
+            control: the control of the step to that state. The weaker it is, the less is unknown
+                of it. None stands for the state before a step.
+        """
+        required = self.required_margin(env)
+        return required if self.bound is None else required + self.lost(env, control)
+
+    def lost(self, env: Environment, control: Float[Array, " m"] | None = None) -> Float[Array, ""]:
+        """Return how far the true h may be below that of a prediction, within the `bound`.
+
+        It is infinite if nothing is proved with a bound. Arguments are those of
+        `margin_to_certify`.
+        """
+        if self.bound is None:
+            return jnp.zeros_like(env.dt)
+        facts = [speed_limit_facts(env, name) for name in self.constraints]
+        known = [limit for limit in facts if limit]
+        if len(known) < len(facts) or not self._bound_is_proved:
+            return jnp.full_like(env.dt, jnp.inf)
+        acceleration = None if control is None else safe_norm(control) / known[0].mass
+        return self.bound.lost(known, acceleration)
+
+    @property
+    def _bound_is_proved(self) -> bool:
+        return not self.horizon and all(backup.proved.knows_bound for backup in self.backups)
+
     def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
         if not self.enforce:
             return {}
-        faults = dict(self.terminal.faults(env, sim, self)) if self.terminal else {}
+        faults = {}
+        if self.bound is not None and not self._bound_is_proved:
+            faults["rta.bound is proved for brake without a horizon alone"] = jnp.ones((), bool)
+        if self.terminal:
+            faults |= self.terminal.faults(env, sim, self)
         for backup in self.backups:
             faults |= backup.faults(env, sim, self)
             if self.horizon:
@@ -305,7 +352,7 @@ class CertifiedRTA(RTA):
         memory = RTAMemory(
             intervening=jnp.zeros((), bool),
             backup_index=best,
-            certified=paths.values[best] >= self.required_margin(env),
+            certified=paths.values[best] >= self.margin_to_certify(env),
             ahead=_selected(paths.ahead, best),
             actuators_ahead=_selected(paths.actuators_ahead, best),
             backups=self._fresh(env, sim),
@@ -350,8 +397,9 @@ class CertifiedRTA(RTA):
             memories=_where(certified_before, taken_over, gone_on),
         )
         best = self._best(env, paths)
-        required = self.required_margin(env)
-        safe = paths.values[best] >= required + jnp.where(memory.intervening, self.release, 0.0)
+        to_pass = self.margin_to_certify(env, proposal)
+        to_back_up = self.margin_to_certify(env, backup)
+        safe = paths.values[best] >= to_pass + jnp.where(memory.intervening, self.release, 0.0)
         passes = finite & certified_before & (safe if self.enforce else feasible)
         passes = passes & ~self._unfinished(env, sim, memory)
 
@@ -362,7 +410,7 @@ class CertifiedRTA(RTA):
                 env, sim, memory=memory, after_backup=after_backup, backup_margin=backup_margin
             )
             backup_certified = jnp.where(
-                certified_before, backup_certified, paths.values[best] >= required
+                certified_before, backup_certified, paths.values[best] >= to_back_up
             )
             new_ends = (paths.ahead, paths.actuators_ahead, paths.remembered_ahead)
             ahead, actuators_ahead, remembered_ahead = _where(
@@ -372,7 +420,7 @@ class CertifiedRTA(RTA):
             )
             memories_ahead = _where(new_certificate, paths.memories_ahead, memories_ahead)
         else:
-            backup_certified = self.follow(env, sim, after_backup).values[0] >= required
+            backup_certified = self.follow(env, sim, after_backup).values[0] >= to_back_up
             ahead = {}
             actuators_ahead = {}
             remembered_ahead = {}
@@ -434,8 +482,8 @@ class CertifiedRTA(RTA):
     def certify(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, " backups"]:
         """Return for each backup controller the smallest h on its way from `sim`.
 
-        It is to be compared with `required_margin`. It is −∞ for a way that proves nothing. Such a
-        way ends outside the terminal set, or the proof of the controller or of the set does not
+        It is to be compared with `margin_to_certify`. It is −∞ for a way that proves nothing. Such
+        a way ends outside the terminal set, or the proof of the controller or of the set does not
         hold for the numbers of the environment.
 
         Args:

@@ -87,7 +87,7 @@ CLOSE = 1.001
 
 
 def brake_faults(env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
-    """Return what is missing for Propositions 3 and 4: `brake` keeps a speed limit."""
+    """Return what is missing for Propositions 3, 4 and 11: `brake` keeps a speed limit."""
     if type(env.agent_platform) not in (Spacecraft, DoubleIntegrator):
         fault = "brake is proved to keep a speed limit for a spacecraft or double_integrator alone"
         return {fault: _true()}
@@ -98,16 +98,25 @@ def brake_faults(env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         return {speed_limits: _true()}
     distance, speed = distance_and_speed(env, sim)
     faults = {"the chief is not at the origin": off_centre(env, sim)}
+    bound = rta.bound
+    within = "" if bound is None else " within rta.bound"
     for name, facts in zip(rta.constraints, speed_limits, strict=True):
         margin = rta.required_margin(env, name)
+        braking = facts
+        needed = margin
         farthest = facts.farthest(distance, speed)
+        if bound is not None:
+            braking = bound.reduced(facts)
+            needed = margin + bound.lost([facts], facts.strongest)
+            errors = bound.errors_after(facts, bound.errors(facts), facts.strongest)
+            farthest = braking.farthest(distance + errors.position, speed + errors.velocity)
         known = jnp.where(jnp.isfinite(farthest), farthest, 0.0)
         of_limit = {
             "mean motion and step are too large": facts.mean_motion * env.dt
             > MAX_ORBIT_ANGLE_PER_STEP,
-            "margin is not below the speed limit at the chief": ~(margin < facts.floor),
-            "thrust cannot stop the spacecraft": ~jnp.isfinite(farthest),
-            "thrust cannot hold the speed limit": ~(facts.room(known, margin) > 0.0),
+            f"margin is not below the speed limit at the chief{within}": ~(needed < facts.floor),
+            f"thrust cannot stop the spacecraft{within}": ~jnp.isfinite(farthest),
+            f"thrust cannot hold the speed limit{within}": ~(braking.room(known, margin) > 0.0),
             "margin is too small for what the limit changes within a step": ~(
                 facts.needed_margin(known) <= margin
             ),

@@ -45,6 +45,7 @@ class SpeedLimitFacts(Record):
     strongest: Float[Array, ""]  # largest acceleration by thrust [m/s²]
     spin: Float[Array, ""]  # highest rate at which the thrust turns [rad/s]
     axes: Float[Array, ""]  # number of axes of a point mass
+    mass: Float[Array, ""]  # m [kg]
     dt: Float[Array, ""]  # length of a step [s]
 
     def limit(self, distance: Number) -> Any:
@@ -175,6 +176,7 @@ def speed_limit_facts(env: Environment, name: str) -> SpeedLimitFacts | None:
         strongest=strongest * len(pushes) ** 0.5 / plant.mass,
         spin=spin,
         axes=zero + len(pushes),
+        mass=plant.mass,
         dt=env.dt,
     )
 
