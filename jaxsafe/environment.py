@@ -36,6 +36,7 @@ from jaxsafe.simulation.controllers import Actuator
 from jaxsafe.simulation.initializers import uniform
 from jaxsafe.simulation.platform import Platform, placed
 from jaxsafe.simulation.regions import Region
+from jaxsafe.simulation.uncertainty import Uncertainty
 from jaxsafe.transition import advance, status_names, update_statuses, with_memory
 from jaxsafe.types import (
     Info,
@@ -49,6 +50,16 @@ from jaxsafe.types import (
     State,
     TimeStep,
     units,
+)
+from jaxsafe.uncertain import (
+    begun,
+    disturbed,
+    episode_words,
+    measured,
+    part_key,
+    random_parts,
+    received,
+    step_key,
 )
 
 Parameters = Mapping[str, Float[Array, ""]]
@@ -70,6 +81,9 @@ class Environment(Component, Described):
     `randomize` names numbers of the environment by dotted path, each with the interval from which
     every episode draws it. `tied` names numbers that follow other numbers when these are changed or
     drawn, such as a slope that is twice the mean motion.
+
+    `uncertainty` lists how the world differs from its model: disturbances, faults, delays. No
+    filter knows of them.
     """
 
     shorthand: ClassVar[str | None] = "platforms"
@@ -83,6 +97,7 @@ class Environment(Component, Described):
     regions: tuple[Region, ...] = ()
     status: tuple[Status, ...] = ()
     constraints: tuple[Constraint, ...] = ()
+    uncertainty: tuple[Uncertainty, ...] = ()
     terminal: tuple[Terminal, ...]
     reward: tuple[Reward, ...]
     observation: tuple[Observation, ...]
@@ -231,6 +246,8 @@ class Environment(Component, Described):
         yield "ends", ", ".join(cut)
         yield "constraints", ", ".join(constraint.name for constraint in self.constraints)
         yield "filter", filter_name(self)
+        if self.uncertainty:
+            yield "uncertainty", ", ".join(item.name for item in self.uncertainty)
         for path, interval in self.randomize.items():
             yield "random", f"{path} in {brief(interval)}"
 
@@ -351,13 +368,14 @@ def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:
         with part("platforms", platform.name):
             platform_state = platform.reset(platform_key, sim)
             sim = sim.replace(platforms={**sim.platforms, platform.name: platform_state})
-    return _with_own_buffers(_begin(env, sim, parameters), others=env)
+    return _with_own_buffers(_begin(env, sim, parameters, key), others=env)
 
 
 def reset_to(
     env: Environment,
     start: Mapping[str, Mapping[str, Any]],
     parameters: Mapping[str, Any] | None = None,
+    key: Key | None = None,
 ) -> tuple[State, TimeStep]:
     """Start an episode from chosen platform states.
 
@@ -369,13 +387,15 @@ def reset_to(
             reset must be given.
         parameters: the numbers that `env.randomize` draws, by dotted path. All of them must be
             given.
+        key: a typed PRNG key, from which disturbances and errors of sensors are drawn. It must be
+            given where there are any.
 
     Returns:
         The state and the first time step, as `reset` returns them.
 
     Raises:
         ConfigError: a platform, field or parameter is unknown, or a random one is missing or has
-            another shape.
+            another shape, or the key is missing.
     """
     arguments = {"platforms": start, "parameters": {} if parameters is None else parameters}
     for label, argument in arguments.items():
@@ -391,7 +411,10 @@ def reset_to(
             )
     platforms = {name: platform.place(start.get(name, {})) for name, platform in known.items()}
     sim = empty_sim(env).replace(platforms=platforms)
-    return _with_own_buffers(_begin(env, sim, parameters), others=(env, start))
+    random = random_parts(env)
+    if random and key is None:
+        raise ConfigError(f"reset_to: {random[0]} is random in every step, so give a key")
+    return _with_own_buffers(_begin(env, sim, parameters, key), others=(env, start, key))
 
 
 def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep]:
@@ -445,11 +468,14 @@ def _world_step(env: Environment, state: State, desired: Array) -> tuple[State, 
         desired: the control that the agent asks for, in physical units and action order.
     """
     actual, rta_memory, rta_info = _filtered(env, state, desired)
-    later = advance(env, state.sim, actual)
     num_steps = state.num_steps + 1
+    key = step_key(state.key, num_steps)
+    arriving, uncertainty_memory = received(env, state, key, actual)
+    later = advance(env, state.sim, arriving)
+    platforms = disturbed(env, uncertainty_memory, later.platforms)
     sim = empty_sim(env).replace(
         time=num_steps.astype(env.dt.dtype) * env.dt,
-        platforms=later.platforms,
+        platforms=platforms,
         actuators=later.actuators,
     )
     intervening = jnp.zeros((), bool) if rta_info is None else rta_memory.intervening
@@ -458,7 +484,9 @@ def _world_step(env: Environment, state: State, desired: Array) -> tuple[State, 
     sim, status_memory = update_statuses(env, sim, state.memory.status)
     sim = _update_ended(env, sim)
     sim, reward_memory, terms, totals = _rewards(env, sim, state)
-    observation, observation_memory = _observations(env, sim, state.memory.observation)
+    observation, observation_memory, readings = _observations(
+        env, measured(env, sim, uncertainty_memory), key, state.memory
+    )
 
     info = _info(env, sim, terms=terms, totals=totals, rta_info=rta_info)
     timestep = _time_step(
@@ -469,6 +497,8 @@ def _world_step(env: Environment, state: State, desired: Array) -> tuple[State, 
         reward=reward_memory,
         observation=observation_memory,
         rta=rta_memory,
+        uncertainty=uncertainty_memory,
+        sensors=readings,
     )
     state = State(
         sim=sim,
@@ -476,6 +506,7 @@ def _world_step(env: Environment, state: State, desired: Array) -> tuple[State, 
         reward_totals=totals,
         num_steps=num_steps,
         parameters=state.parameters,
+        key=state.key,
     )
     return state, timestep
 
@@ -619,11 +650,20 @@ def empty_sim(env: Environment) -> Sim:
     )
 
 
-def _begin(env: Environment, sim: Sim, parameters: Parameters) -> tuple[State, TimeStep]:
+def _begin(
+    env: Environment, sim: Sim, parameters: Parameters, key: Key | None
+) -> tuple[State, TimeStep]:
     """Initialise all processors from placed platforms: `init` and `process`, no `increment`."""
+    # The key has a stream of its own, so that platforms start alike with and without uncertainty.
+    words: Any = ()
+    if key is not None and random_parts(env):
+        words = episode_words(key, len(env.platforms) + 1)
+    first_key = step_key(words, jnp.zeros((), jnp.int32))
     sim, status_memory = update_statuses(env, sim, {})
+    uncertainty_memory = begun(env, sim, first_key)
+    seen = measured(env, sim, uncertainty_memory)
     ended = _update_ended(env, sim)
-    observation, observation_memory = _observations(env, sim, None)
+    observation, observation_memory, readings = _observations(env, seen, first_key, None)
     reward_memory = {}
     for term in env.reward:
         with part("reward", term.name):
@@ -634,13 +674,17 @@ def _begin(env: Environment, sim: Sim, parameters: Parameters) -> tuple[State, T
     rta_info = None
     if env.rta is not None:
         with part("rta"):
-            rta_memory, rta_info = env.rta.begin(env, with_memory(env, sim, status_memory))
+            rta_memory, rta_info = env.rta.begin(
+                modelled(env), with_memory(env, seen, status_memory)
+            )
     info = _info(env, ended, terms=terms, totals=terms, rta_info=rta_info)
     memory = Memory(
         status=status_memory,
         reward=reward_memory,
         observation=observation_memory,
         rta=rta_memory,
+        uncertainty=uncertainty_memory,
+        sensors=readings,
     )
     state = State(
         sim=ended,
@@ -648,6 +692,7 @@ def _begin(env: Environment, sim: Sim, parameters: Parameters) -> tuple[State, T
         reward_totals=terms,
         num_steps=jnp.zeros((), jnp.int32),
         parameters=parameters,
+        key=words,
     )
     # In `sim` nothing has ended, because the first step is always taken.
     timestep = _time_step(env, sim, observation=observation, reward=zero, info=info)
@@ -750,25 +795,36 @@ def _rewards(env: Environment, sim: Sim, state: State) -> tuple[Sim, dict, dict,
 
 
 def _observations(
-    env: Environment, sim: Sim, memory: Mapping[str, Any] | None
-) -> tuple[Float[Array, " observation"], dict[str, Any]]:
-    """Return the observation, and what its parts remember by name.
+    env: Environment, sim: Sim, key: Any, memory: Memory | None
+) -> tuple[Float[Array, " observation"], dict[str, Any], dict[str, Any]]:
+    """Return the observation, and by name what its parts remember and the readings under way.
 
     Args:
         env: the environment.
-        sim: the simulation.
-        memory: what the parts remember from the step before. None at the start of an episode.
+        sim: the simulation, as it is measured.
+        key: the key of the step, () if nothing is random.
+        memory: the memory before the step. None at the start of an episode.
     """
     memories = {}
+    readings = {}
     values = []
-    for item in env.observation:
-        with part("observation", item.name):
+    for index, item in enumerate(env.observation):
+        name = item.name
+        with part("observation", name):
             own = (
-                item.init(sim) if memory is None else item.increment(memory[item.name], sim, env.dt)
+                item.init(sim)
+                if memory is None
+                else item.increment(memory.observation[name], sim, env.dt)
             )
-            values.append(item.process(own, sim))
-        memories[item.name] = own
-    return jnp.concatenate(values), memories
+            if item.exact:
+                values.append(item.process(own, sim))
+            else:
+                under_way = None if memory is None else memory.sensors[name]
+                own_key = part_key(key, len(env.uncertainty) + index)
+                reading, readings[name] = item.read(item.measure(own, sim), under_way, own_key)
+                values.append(item.scaled(reading))
+        memories[name] = own
+    return jnp.concatenate(values), memories, readings
 
 
 def _filtered(env: Environment, state: State, desired: Array) -> tuple[Array, Any, RTAInfo | None]:
@@ -779,8 +835,14 @@ def _filtered(env: Environment, state: State, desired: Array) -> tuple[Array, An
     if env.rta is None:
         return desired, (), None
     with part("rta"):
-        sim = with_memory(env, state.sim, state.memory.status)
-        return env.rta.filter(env, sim, state.memory.rta, desired)
+        sim = measured(env, state.sim, state.memory.uncertainty)
+        sim = with_memory(env, sim, state.memory.status)
+        return env.rta.filter(modelled(env), sim, state.memory.rta, desired)
+
+
+def modelled(env: Environment) -> Environment:
+    """Return the environment as its filter takes it to be, with the numbers of `rta.model`."""
+    return env if env.rta is None else drawn(env, env.rta.model)
 
 
 def _info(

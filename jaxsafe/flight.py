@@ -256,7 +256,7 @@ def fly(
     """
     require_hashable(policy)
     key_start, key_act = jax.random.split(jax.random.key(0) if key is None else key)
-    state, timestep = _reset(env, key_start) if start is None else _started(env, start)
+    state, timestep = _reset(env, key_start) if start is None else _started(env, start, key_start)
     # A weakly typed number would compile the program again.
     state, timestep = jax.tree.map(lambda x: jnp.asarray(x, x.dtype), (state, timestep))
     pieces = [jax.tree.map(lambda x: np.asarray(x)[None], (state, timestep))]
@@ -299,9 +299,9 @@ def _fly_on(
     return jax.lax.scan(one_step, position, before + jnp.arange(RECORDED_STEPS_PER_CALL))
 
 
-def _started(env: Environment, start: Any) -> tuple[State, TimeStep]:
+def _started(env: Environment, start: Any, key: Key) -> tuple[State, TimeStep]:
     if isinstance(start, Mapping):
-        return reset_to(env, start)
+        return reset_to(env, start, key=key)
     if isinstance(start, tuple) and [type(part) for part in start] == [State, TimeStep]:
         return start
     raise ConfigError(

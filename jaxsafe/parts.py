@@ -40,6 +40,7 @@ from jaxsafe.simulation.initializers import Direction, Initializer
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.simulation.regions import Offset, Region
 from jaxsafe.simulation.scripted import Command, Scripted
+from jaxsafe.simulation.uncertainty import ActuatorFault, Disturbance, Uncertainty
 from jaxsafe.simulation.vectors import Vector
 from jaxsafe.types import (
     AnyStatusName,
@@ -74,6 +75,7 @@ __all__ = [
     "ANY",
     "RTA",
     "Actuator",
+    "ActuatorFault",
     "AgentController",
     "AnyStatusName",
     "BackupController",
@@ -89,6 +91,7 @@ __all__ = [
     "Dimensionless",
     "Direction",
     "Discrete",
+    "Disturbance",
     "Environment",
     "Faults",
     "Features",
@@ -132,6 +135,7 @@ __all__ = [
     "Terminal",
     "TerminalSet",
     "Tie",
+    "Uncertainty",
     "Unit",
     "Vector",
     "angle_between",

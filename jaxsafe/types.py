@@ -245,6 +245,10 @@ class Memory(Record):
     reward: Mapping[str, Any]
     observation: Mapping[str, Any]
     rta: Any  # what run time assurance remembers
+    # What the parts of `env.uncertainty` remember, by name, and the readings under way of sensors
+    # that make errors, by the name of the observation. Both are empty in a world without errors.
+    uncertainty: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    sensors: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
 class State(Record):
@@ -256,6 +260,9 @@ class State(Record):
     num_steps: Int[Array, ""]  # steps of the world taken in this episode
     # Numbers of the environment drawn for this episode, by dotted path.
     parameters: Mapping[str, Float[Array, ""]]
+    # Words of the key from which the episode's disturbances and errors of sensors are drawn,
+    # uint32 of shape (2,), or () if nothing is random.
+    key: Any = ()
 
 
 class RTAInfo(Record):

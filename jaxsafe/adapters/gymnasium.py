@@ -29,6 +29,8 @@ from jaxsafe.adapters.gymnasium_spaces import facts, masked, spaces
 from jaxsafe.adapters.packed_batch import Episodes, PackedBatch
 from jaxsafe.environment import Environment, reset_to
 from jaxsafe.schema.errors import ConfigError, nearest
+from jaxsafe.types import Key
+from jaxsafe.uncertain import random_parts
 
 
 class _Chains:
@@ -59,21 +61,26 @@ class _Chains:
         self._np_random_seed = -1
         self._unseeded[:] = True
 
-    def _start(
-        self, mask: np.ndarray, seeds: Sequence[int | None], placed: Episodes | None
-    ) -> None:
+    def _start(self, mask: np.ndarray, seeds: Sequence[int | None], placed: _Placed | None) -> None:
         """Start an episode in each environment of the mask.
 
         Args:
             mask: which environments to start, [num_envs].
             seeds: a seed for each environment of the batch, or None.
-            placed: the start of the episodes. None stands for random starts.
+            placed: the chosen start of the episodes. None stands for random starts.
         """
         self._begin_chains(mask, seeds)
-        if placed is None:
+        if placed is None or placed.random:
             self._batch.restart(mask)
-        else:
-            self._batch.place(mask, placed)
+        if placed is None:
+            return
+        if not placed.random:
+            self._batch.place(mask, placed.episode)
+            return
+        keys = self._batch.now.state.key  # each environment has disturbances of its own
+        for index in np.flatnonzero(mask):
+            alone = np.arange(len(mask)) == index
+            self._batch.place(alone, placed.with_key(jax.random.wrap_key_data(keys[index])))
 
     def _begin_chains(self, mask: np.ndarray, seeds: Sequence[int | None]) -> None:
         """Begin a chain in each environment of the mask that has a seed or needs a chain."""
@@ -628,14 +635,29 @@ def _grouped(
     return [(one, own == key) for key, one in groups.items()]
 
 
-def _placed(env: Environment, chosen: Mapping[str, Any]) -> Episodes | None:
-    """Return an episode at the start that the options choose, or None if they choose none."""
-    refuse_fork()
-    return (
-        Episodes(*reset_to(env, chosen.get("start", {}), chosen.get("parameters")))
-        if chosen
-        else None
-    )
+class _Placed:
+    """The start of an episode that options choose.
+
+    Attributes:
+        episode: an episode that begins there.
+        random: whether disturbances and errors of sensors are random. Each episode then needs a key
+            of its own.
+    """
+
+    def __init__(self, env: Environment, chosen: Mapping[str, Any]) -> None:
+        refuse_fork()
+        self._arguments = (env, chosen.get("start", {}), chosen.get("parameters"))
+        self.random = bool(random_parts(env))
+        self.episode = self.with_key(jax.random.key(0) if self.random else None)
+
+    def with_key(self, key: Key | None) -> Episodes:
+        """Return an episode that begins there, with disturbances from a key."""
+        return Episodes(*reset_to(*self._arguments, key=key))
+
+
+def _placed(env: Environment, chosen: Mapping[str, Any]) -> _Placed | None:
+    """Return the start that the options choose, or None if they choose none."""
+    return _Placed(env, chosen) if chosen else None
 
 
 def _checked_options(

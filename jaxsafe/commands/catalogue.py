@@ -36,6 +36,7 @@ from jaxsafe.simulation.initializers import Direction, Initializer
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.simulation.regions import Offset, Region
 from jaxsafe.simulation.scripted import Command
+from jaxsafe.simulation.uncertainty import Uncertainty
 from jaxsafe.simulation.vectors import Vector
 from jaxsafe.train.ppo import PPO
 
@@ -57,6 +58,7 @@ SECTIONS = {
     "vector": Section("Vectors", (Vector,)),
     "status": Section("Statuses", (Status,)),
     "constraints": Section("Constraints", (Constraint,)),
+    "uncertainty": Section("Uncertainty", (Uncertainty,)),
     "terminal": Section("Ends", (Terminal,)),
     "reward": Section("Rewards", (Reward, Bound)),
     "observation": Section("Observations", (Observation,)),

@@ -33,7 +33,16 @@ MAX_PARTS = 1000
 Each part is traced by itself, which takes about ten seconds for this many.
 """
 
-_SECTIONS = ("platforms", "regions", "status", "constraints", "terminal", "reward", "observation")
+_SECTIONS = (
+    "platforms",
+    "regions",
+    "status",
+    "constraints",
+    "uncertainty",
+    "terminal",
+    "reward",
+    "observation",
+)
 
 
 def check(env: Environment, before: Environment | None = None) -> Environment:
@@ -72,7 +81,8 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
                     ordered = name in names["regions"]
                 _reference(place, name, known, " listed before it" if ordered else "")
     for place, refers, name in references(env.rta, "rta") if env.rta else ():
-        _reference(place, name, names[refers.section])
+        if refers.section != "parameters":
+            _reference(place, name, names[refers.section])
     _check_problems(env)
     for platform in env.platforms:
         _check_platform(platform, is_agent=platform.name == env.agent)
@@ -82,6 +92,7 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
             raise ConfigError(f"{required}: an environment needs at least one")
     check_ties(env)
     _check_randomized(env)
+    _check_model(env)
     if before is None or _shapes(env) != _shapes(before):
         _check_computable(*_shapes(env), jnp.result_type(float))
     # What a filter proves depends on the numbers, so the filter is asked in either case.
@@ -246,6 +257,28 @@ def _check_randomized(env: Environment) -> None:
                 f"randomize: {path} and {leaves[index]} are the same number; leave one out"
             )
         leaves[index] = path
+
+
+def _check_model(env: Environment) -> None:
+    """Check that a filter's own numbers are each allowed in the place of one of the environment."""
+
+    def convert(value: Any, field: Any, place: str) -> Any:
+        return to_value(one_number(value, field, place), field, place)
+
+    for path, value in env.rta.model.items() if env.rta else ():
+        if isinstance(value, Tracer):
+            continue
+        try:
+            if path.split(".")[0] in ("rta", "randomize", "tied", "uncertainty"):
+                raise ConfigError(
+                    f"{path}: expected the path of a number that a filter predicts with"
+                )
+            changed = set_path(env, path, np.asarray(value).tolist(), convert)
+            if _shapes(changed) != _shapes(env):
+                raise ConfigError(f"{path}: expected the path of one number, found that of a list")
+            _check_problems(changed)
+        except ConfigError as error:
+            raise ConfigError(f"rta.model: {error}") from None
 
 
 def _shapes(env: Environment) -> tuple[Any, tuple]:

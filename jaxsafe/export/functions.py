@@ -20,6 +20,7 @@ from jaxsafe.agents.policy_file import SavedPolicy
 from jaxsafe.environment import Environment, reset_to, step
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.types import State, TimeStep
+from jaxsafe.uncertain import random_parts
 
 Function = Callable[[Float[Array, "batch i"]], Float[Array, "batch o"]]
 
@@ -89,6 +90,7 @@ def control(saved: SavedPolicy | ForeignPolicy) -> Exported:
 
     The start is the state in which an episode begins, with the elements of `state_names`.
     """
+    _require_nothing_random(saved.env)
     act = action(saved).function
 
     def one(start: Array) -> Array:
@@ -112,6 +114,7 @@ def closed_loop(saved: SavedPolicy | ForeignPolicy, steps: int, unrolled: bool =
         unrolled: whether the function has no loop. An ONNX graph needs it so. XLA would take
             minutes to compile it.
     """
+    _require_nothing_random(saved.env)
     act, env = action(saved).function, saved.env
     world = env.replace(decision_period=1)
 
@@ -167,6 +170,19 @@ def _fields(env: Environment) -> list[tuple[str, int]]:
             shape = jnp.shape(getattr(rest, initializer.name))
             found.append((f"{platform.name}.{initializer.name}", shape[0] if shape else 0))
     return found
+
+
+def _require_nothing_random(env: Environment) -> None:
+    """Refuse an environment with disturbances or errors that are drawn in every step.
+
+    Raises:
+        ConfigError: the environment has some.
+    """
+    random = random_parts(env)
+    if random:
+        raise ConfigError(
+            f"{random[0]} is random in every step, and an exported function is not; take it out"
+        )
 
 
 def _placed(env: Environment, start: Array) -> dict[str, dict[str, Array]]:

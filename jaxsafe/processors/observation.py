@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -39,17 +40,39 @@ Clip = Annotated[Number, Unit("1", length=2), Range(infinite=True)]
 """Lowest and highest value of an observation after scaling."""
 
 
+Deviation = Annotated[Number, Unit("as observed", length=ANY), Range(0.0, largest=MAX_DISTANCE)]
+"""One standard deviation for all elements of an observation, or one for each."""
+
+
 class Observation(Processor):
     """Base of all observations.
 
     A subclass writes `measure`, which returns a vector in physical units. What is observed is
     (vector − `offset`)/`scale`, clipped to `clip`. So an offset that is the mean and a scale that
     is the standard deviation standardise it. Each is one number for all elements or one for each.
+
+    A sensor adds its `bias` and normal `noise` of a standard deviation in physical units. With the
+    probability `dropout` it gives all elements of the last reading again. What it gives arrives
+    `delay` actions late; the first reading of an episode arrives at once.
     """
 
     scale: Scale = 1.0
     clip: Clip | None = None
     offset: Shift | None = None
+    bias: Shift | None = None
+    noise: Deviation | None = None
+    dropout: Annotated[Number, Unit("1"), Range(0.0, 1.0)] | None = None
+    delay: Annotated[int, Range(0, largest=1000)] = 0
+
+    @property
+    def exact(self) -> bool:
+        """Whether the sensor makes no error."""
+        return self.bias is None and not (self.draws or self.delay)
+
+    @property
+    def draws(self) -> bool:
+        """Whether the sensor draws random numbers."""
+        return self.noise is not None or self.dropout is not None
 
     def measure(self, memory: Any, sim: Sim) -> Float[Array, " k"]:
         """Return the observed vector in physical units, shape (k,)."""
@@ -63,13 +86,46 @@ class Observation(Processor):
         return tuple(f"{self.name}.{axis}" for axis in _axis_names(size))
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, " k"]:
-        measured = self.measure(memory, sim)
-        for name in ("scale", "offset"):
+        return self.scaled(self.measure(memory, sim))
+
+    def read(
+        self, measured: Float[Array, " k"], readings: Float[Array, "delay+1 k"] | None, key: Any
+    ) -> tuple[Float[Array, " k"], Float[Array, "delay+1 k"]]:
+        """Return what arrives from the sensor, and the readings under way, the oldest one first.
+
+        Args:
+            measured: the true vector.
+            readings: the readings under way before, or None at the start of an episode.
+            key: a key for this sensor and this instant, not used by a sensor that draws nothing.
+        """
+        self._check_lengths(measured, ("bias", "noise"))
+        reading = measured if self.bias is None else measured + self.bias
+        if self.draws:
+            noise_key, dropout_key = jax.random.split(key)
+            if self.noise is not None:
+                normal = jax.random.normal(noise_key, measured.shape, measured.dtype)
+                reading = reading + self.noise * normal
+            if self.dropout is not None and readings is not None:
+                dropped = jax.random.bernoulli(dropout_key, self.dropout)
+                reading = jnp.where(dropped, readings[-1], reading)
+        if readings is None:
+            readings = jnp.tile(reading, (self.delay + 1, 1))
+        else:
+            readings = jnp.concatenate([readings[1:], reading[None]])
+        return readings[0], readings
+
+    def _check_lengths(self, measured: Float[Array, " k"], names: tuple[str, ...]) -> None:
+        """Check that fields have one number, or one for each element of the measured vector."""
+        for name in names:
             value = getattr(self, name)
             if value is not None and jnp.shape(value) not in ((), measured.shape):
                 raise ValueError(
                     f"{name}: expected 1 or {measured.size} numbers, found {jnp.size(value)}"
                 )
+
+    def scaled(self, measured: Float[Array, " k"]) -> Float[Array, " k"]:
+        """Return the vector that is observed for one in physical units."""
+        self._check_lengths(measured, ("scale", "offset"))
         shifted = measured if self.offset is None else measured - self.offset
         scaled = shifted / self.scale
         return scaled if self.clip is None else jnp.clip(scaled, self.clip[0], self.clip[1])

@@ -32,7 +32,7 @@ from jaxsafe.transition import (
     others_later,
     remember,
 )
-from jaxsafe.types import ConstraintName, Number, Record, RTAInfo, Sim
+from jaxsafe.types import ConstraintName, Number, ParameterPath, Record, RTAInfo, Sim
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
@@ -57,7 +57,14 @@ class RTA(Component):
     """A filter between desired and actual control (Section 2, Fig. 2).
 
     It is pure. What it remembers is part of the environment's state.
+
+    It predicts with the numbers of the environment, or by `model` with numbers of its own, by
+    dotted path. So a filter with `{deputy.mass: 12}` takes the mass for 12 kg, whatever it is.
     """
+
+    model: Mapping[ParameterPath, Annotated[Number, Unit("physical")]] = dataclasses.field(
+        default_factory=dict
+    )
 
     def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
         """Return reasons why the filter would be useless, each with whether it applies at a state.

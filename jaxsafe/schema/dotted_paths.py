@@ -109,6 +109,9 @@ def _set(
         return component.replace(**{head: _set(content, rest, value, convert, field_place)})
     if isinstance(content, tuple):
         return component.replace(**{head: _set_item(content, rest, value, convert, field_place)})
+    if isinstance(content, Mapping) and _by_path(table[head]):
+        entries = {**content, ".".join(rest): value}
+        return component.replace(**{head: convert(entries, table[head], field_place)})
     if isinstance(content, Mapping) and len(rest) == 1:
         if rest[0] not in content:
             raise ConfigError(
@@ -119,6 +122,11 @@ def _set(
         return component.replace(**{head: convert(entries, table[head], field_place)})
     reason = " because it is not set" if content is None else ""
     raise ConfigError(f"{join(field_place, rest[0])}: {field_place} has no fields{reason}")
+
+
+def _by_path(field: Field) -> bool:
+    """Return whether a field is a mapping of which the names are dotted paths, as `randomize`."""
+    return any(refers.section == "parameters" for refers in _item_references(field.hint))
 
 
 def _set_item(items: tuple, path: list[str], value: Any, convert: Convert, place: str) -> tuple:

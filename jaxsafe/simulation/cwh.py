@@ -58,6 +58,10 @@ class Anchor(Platform, type="anchor"):
         zeros = jnp.zeros(self.dimension, jnp.result_type(float))
         return SpacecraftState(position=zeros, velocity=zeros, delta_v=zeros)
 
+    @property
+    def can_be_pushed(self) -> bool:
+        return type(self) is not Anchor
+
     def step(self, state: SpacecraftState, controls: Controls, dt: Seconds) -> SpacecraftState:
         return state
 

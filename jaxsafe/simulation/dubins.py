@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.controllers import Controls
-from jaxsafe.simulation.geometry import direction, rotation
+from jaxsafe.simulation.geometry import direction, rotation, safe_norm
 from jaxsafe.simulation.integrate import (
     NODES,
     PARTIAL_WEIGHTS,
@@ -126,6 +126,29 @@ class Dubins2D(Platform, type="dubins2d"):
             position=state.position + moved,
             heading=state.heading + turn * dt,
             speed=final_speed,
+        )
+
+    @property
+    def can_be_pushed(self) -> bool:
+        return True
+
+    def pushed(
+        self,
+        state: Dubins2DState,
+        acceleration: Float[Array, " 2"],
+        wind: Float[Array, " 2"],
+        dt: Seconds,
+    ) -> Dubins2DState:
+        """Return the state after a step in which a disturbance acted besides the controls.
+
+        The velocity that it leaves decides heading and speed, which stay within
+        the limits.
+        """
+        velocity = state.velocity + dt * acceleration
+        return state.replace(
+            position=state.position + dt * (wind + 0.5 * dt * acceleration),
+            heading=state.heading + _turn(state.velocity, velocity),
+            speed=jnp.clip(safe_norm(velocity), *self.speed_limits),
         )
 
     def derivative(self, state: Dubins2DState, controls: Controls) -> Dubins2DState:
@@ -278,6 +301,33 @@ class Dubins3D(Platform, type="dubins3d"):
             roll=roll,
         )
 
+    @property
+    def can_be_pushed(self) -> bool:
+        return True
+
+    def pushed(
+        self,
+        state: Dubins3DState,
+        acceleration: Float[Array, " 3"],
+        wind: Float[Array, " 3"],
+        dt: Seconds,
+    ) -> Dubins3DState:
+        """Return the state after a step in which a disturbance acted besides the controls.
+
+        The velocity that it leaves decides heading, flight path angle and speed, which stay within
+        the limits.
+        """
+        velocity = state.velocity + dt * acceleration
+        across = safe_norm(velocity[:2])
+        return state.replace(
+            position=state.position + dt * (wind + 0.5 * dt * acceleration),
+            heading=state.heading + _turn(state.velocity, velocity),
+            flight_path_angle=jnp.clip(
+                jnp.arctan2(-velocity[2], across), *self.flight_path_angle_limits
+            ),
+            speed=jnp.clip(safe_norm(velocity), *self.speed_limits),
+        )
+
     def derivative(self, state: Dubins3DState, controls: Controls) -> Dubins3DState:
         """Return the right-hand side of Eq. (9), which holds within the limits.
 
@@ -322,6 +372,12 @@ class Dubins3D(Platform, type="dubins3d"):
         if "heading_rate" not in controls:
             return controls.get("roll_rate")
         return (arctan(controls["heading_rate"] * state.speed / self.gravity) - state.roll) / dt
+
+
+def _turn(before: Float[Array, " d"], after: Float[Array, " d"]) -> Float[Array, ""]:
+    """Return the angle from one velocity to another in the horizontal plane [rad]."""
+    across = before[0] * after[1] - before[1] * after[0]
+    return jnp.arctan2(across, before[0] * after[0] + before[1] * after[1])
 
 
 def _control(controls: Controls, name: str, like: Array) -> Array:

@@ -98,6 +98,32 @@ class Platform(Component):
         """
         return 0.15 * safe_norm(after.velocity - before.velocity) * dt  # 0.15 ≥ 1/8 · 32/27 = 0.148
 
+    @property
+    def can_be_pushed(self) -> bool:
+        """Whether `pushed` is defined."""
+        return "velocity" in vars(self.rest())
+
+    def pushed(
+        self,
+        state: Any,
+        acceleration: Float[Array, " d"],
+        wind: Float[Array, " d"],
+        dt: Seconds,
+    ) -> Any:
+        """Return the state after a step in which a disturbance acted besides the controls.
+
+        Args:
+            state: the state record after the step without it.
+            acceleration: a disturbing acceleration a, which adds aΔt to the velocity and aΔt²/2 to
+                the position, shape (d,).
+            wind: a velocity w that adds wΔt to the position, shape (d,).
+            dt: length of the step [s].
+        """
+        return state.replace(
+            position=state.position + dt * (wind + 0.5 * dt * acceleration),
+            velocity=state.velocity + dt * acceleration,
+        )
+
     def derivative(self, state: Any, controls: Controls) -> Any:
         """Return the time derivative f(x) + g(x)u, Eq. (3), as a record of the state's class."""
         raise NotImplementedError
