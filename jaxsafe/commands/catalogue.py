@@ -24,6 +24,7 @@ from jaxsafe.processors.reward import Bound, Reward
 from jaxsafe.processors.status import Status
 from jaxsafe.processors.terminal import Terminal
 from jaxsafe.rta.asif import Strengthening
+from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.cascade import Stage
 from jaxsafe.rta.filter import RTA, BackupController, TerminalSet
 from jaxsafe.schema.component import Component, Field, choices, fields
@@ -62,7 +63,7 @@ SECTIONS = {
     "terminal": Section("Ends", (Terminal,)),
     "reward": Section("Rewards", (Reward, Bound)),
     "observation": Section("Observations", (Observation,)),
-    "rta": Section("Filters", (RTA, Stage, Strengthening)),
+    "rta": Section("Filters", (RTA, UncertaintyBound, Stage, Strengthening)),
     "backups": Section("Backup controllers", (BackupController,)),
     "terminal_set": Section("Terminal sets", (TerminalSet,)),
     "agent": Section("Agents", (Agent, Features, Network)),

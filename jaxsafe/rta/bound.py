@@ -6,7 +6,7 @@ Proposition 11 of docs/safety/proofs.md says which margin of a speed limit makes
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Self
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -37,7 +37,20 @@ class UncertaintyBound(Component):
     velocity: Annotated[Number, Unit("m/s"), Range(0.0, largest=1e6)] = 0.0
     """The largest error of the agent's measured velocity."""
     delay: Annotated[int, Range(0, largest=100)] = 0
-    """The number of steps after which a control acts. It is exact, not a bound."""
+    """The number of steps after which a control begins to act, which is known exactly."""
+
+    @property
+    def measured(self) -> Errors:
+        """The errors of the measured state."""
+        return Errors(position=jnp.asarray(self.position), velocity=jnp.asarray(self.velocity))
+
+    def after_delay(self, errors: Errors) -> Self:
+        """Return the bound for the state in which a control begins to act.
+
+        Args:
+            errors: the errors of that state.
+        """
+        return self.replace(position=errors.position, velocity=errors.velocity, delay=0)
 
     def errors(self, facts: SpeedLimitFacts) -> Errors:
         """Return the errors of the state in which the next control begins to act.
@@ -45,7 +58,7 @@ class UncertaintyBound(Component):
         That is the measured state, and with a delay the one that is predicted from it. Until then
         controls may be as strong as can be.
         """
-        errors = Errors(position=jnp.asarray(self.position), velocity=jnp.asarray(self.velocity))
+        errors = self.measured
         for _ in range(self.delay):
             errors = self.errors_after(facts, errors, facts.strongest)
         return errors

@@ -48,7 +48,13 @@ class Cascade(RTA, type="cascade"):
         return tuple(name for stage in self.stages for name in _constraints(stage.rta))
 
     def problem(self) -> str | None:
-        return repeated(self.stages) if self.stages else "expected at least one stage"
+        if not self.stages:
+            return "expected at least one stage"
+        for stage in self.stages[:-1]:
+            bound = getattr(stage.rta, "bound", None)
+            if bound is not None and bound.delay:
+                return f"stage {stage.name!r} has a bound.delay, which only the last stage may have"
+        return repeated(self.stages)
 
     @property
     def _first_indices(self) -> list[int]:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsafe.rta.bound import UncertaintyBound
+from jaxsafe.rta.bound import Errors, UncertaintyBound
 from jaxsafe.rta.prediction import others_react, repeat
 from jaxsafe.rta.projection import within
 from jaxsafe.rta.speed_limit import speed_limit_facts
@@ -95,6 +95,13 @@ class RTA(Component):
         raise NotImplementedError
 
 
+class UnderWay(Record):
+    """Controls that have been chosen but do not act yet, the next one first."""
+
+    controls: Float[Array, "delay m"]
+    certified: Bool[Array, " delay"]  # whether the state after each is known to be safe
+
+
 class RTAMemory(Record):
     """Memory of a filter."""
 
@@ -107,6 +114,7 @@ class RTAMemory(Record):
     remembered_ahead: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     backups: tuple[Any, ...] = ()  # what each backup controller remembers
     backups_ahead: tuple[Any, ...] = ()  # the same at the end of the horizon
+    under_way: UnderWay | tuple[()] = ()  # empty without a delay
 
 
 class BackupController(Component):
@@ -352,8 +360,17 @@ class CertifiedRTA(RTA):
     def begin(self, env: Environment, sim: Sim) -> tuple[RTAMemory, RTAInfo]:
         """Return the memory at the start of an episode and the facts about the start.
 
-        The memory holds the backup controller that is safest from there.
+        The memory holds the backup controller that is safest from there. With a delay the controls
+        under way are 0, as near as their bounds allow. The states after them must be safe as well.
         """
+        if self.bound is not None and self.bound.delay:
+            none, _ = admissible(env, jnp.zeros(env.action_size, env.dt.dtype))
+            controls = jnp.tile(none, (self.bound.delay, 1))
+            _, start = self.replace(bound=self.bound.replace(delay=0)).begin(env, sim)
+            ahead, later, certified = self._ahead(env, sim, controls)
+            memory, info = ahead.begin(env, later)
+            memory = memory.replace(under_way=UnderWay(controls=controls, certified=certified))
+            return memory, info.replace(certified=start.certified & jnp.all(certified))
         paths = self.follow(env, sim, sim)
         best = self._best(env, paths)
         memory = RTAMemory(
@@ -379,7 +396,22 @@ class CertifiedRTA(RTA):
     def filter(
         self, env: Environment, sim: Sim, memory: RTAMemory, desired: Float[Array, " m"]
     ) -> tuple[Float[Array, " m"], RTAMemory, RTAInfo]:
-        """Propose a control, certify it, else back up. Arguments and results are those of `RTA`."""
+        """Propose a control, certify it, else back up. Arguments and results are those of `RTA`.
+
+        With a delay this is done in the state in which the control will begin to act. It is
+        certified only if the controls that act before it are.
+        """
+        if self.bound is not None and self.bound.delay:
+            assert isinstance(memory.under_way, UnderWay)
+            controls, certified = memory.under_way.controls, memory.under_way.certified
+            ahead, later, _ = self._ahead(env, sim, controls)
+            control, memory, info = ahead.filter(env, later, memory, desired)
+            under_way = UnderWay(
+                controls=jnp.concatenate([controls[1:], control[None]]),
+                certified=jnp.append(certified[1:], info.certified),
+            )
+            info = info.replace(certified=info.certified & jnp.all(certified))
+            return control, memory.replace(under_way=under_way), info
         wanted, finite = admissible(env, desired)
         later = others_later(env, sim)
         backup, moved = self._backup(
@@ -460,6 +492,38 @@ class CertifiedRTA(RTA):
             constraint=jnp.where(intervening & finite, cause, NO_CONSTRAINT()),
         )
         return actual, memory, info
+
+    def _ahead(
+        self, env: Environment, sim: Sim, controls: Float[Array, "delay m"]
+    ) -> tuple[CertifiedRTA, Sim, Bool[Array, " delay"]]:
+        """Return what remains to be filtered after the controls under way have acted.
+
+        Args:
+            env: the environment.
+            sim: the simulation, as it is measured.
+            controls: the controls under way.
+
+        Returns:
+            This filter without delay, whose measured state has the errors of the prediction, the
+            predicted simulation, and whether the state after each control is certified.
+        """
+        bound = self.bound
+        assert bound is not None
+        facts = [speed_limit_facts(env, name) for name in self.constraints]
+
+        def one_step(carry: tuple[Sim, Errors], control: Float[Array, " m"]) -> Any:
+            sim, errors = carry
+            later = advance(env, sim, control)
+            if facts[0] is not None:
+                acceleration = safe_norm(control) / facts[0].mass
+                errors = bound.errors_after(facts[0], errors, acceleration)
+            there = self.replace(bound=bound.after_delay(errors))
+            value = there.follow(env, sim, later).values[0]
+            return (later, errors), value >= there.margin_to_certify(env)
+
+        start = sim.replace(regions={}, status={})
+        (sim, errors), certified = jax.lax.scan(one_step, (start, bound.measured), controls)
+        return self.replace(bound=bound.after_delay(errors)), sim, certified
 
     def lowest(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, ""]:
         """Return the smallest h of the constraints at `sim`.

@@ -12,7 +12,8 @@ from default_cases import thorough
 
 import jaxsafe
 from jaxsafe import ConfigError, Environment
-from jaxsafe.rta import UncertaintyBound
+from jaxsafe.envs.docking import BRAKE
+from jaxsafe.rta import Cascade, Simplex, Stage, UncertaintyBound
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.transition import advance
@@ -111,6 +112,8 @@ def fly(
     worlds: UncertaintyBound,
     policy: Callable[[Sim], jax.Array],
     num_steps: int = 150,
+    delay: int = 0,
+    known_delay: int | None = None,
 ) -> Flights:
     """Fly eight episodes in each of some worlds.
 
@@ -120,25 +123,32 @@ def fly(
         worlds: how far each world differs from what the filter knows.
         policy: what the agent asks for.
         num_steps: number of steps of an episode. It does not end before.
+        delay: the number of steps after which a control acts.
+        known_delay: what the filter is told of it. None stands for the truth.
     """
 
     def episode(bound: UncertaintyBound, world: UncertaintyBound, key: jax.Array) -> Flights:
-        rta = env.rta.replace(bound=bound)
+        known = delay if known_delay is None else known_delay
+        rta = env.rta.replace(bound=bound.replace(delay=known))
         sim = jaxsafe.reset(env.replace(rta=None), key)[0].sim.replace(regions={}, status={})
         memory, start = rta.begin(env, measured(env, sim, world))
 
         def one_step(carry: Any, _: None) -> Any:
-            sim, memory = carry
-            control, memory, info = rta.filter(env, measured(env, sim, world), memory, policy(sim))
+            sim, memory, queue = carry
+            chosen, memory, info = rta.filter(env, measured(env, sim, world), memory, policy(sim))
+            queue = jnp.concatenate([queue, chosen[None]])
+            control, queue = queue[0], queue[1:]
 
             def h_at(part: jax.Array) -> jax.Array:
                 later = true_step(env.replace(dt=part * env.dt), sim, control, world)
                 return rta.lowest(env, later, later)
 
             h = jax.vmap(h_at)(jnp.array(PARTS))
-            return (true_step(env, sim, control, world), memory), (h[-1], h.min(), info.certified)
+            after = (true_step(env, sim, control, world), memory, queue)
+            return after, (h[-1], h.min(), info.certified)
 
-        _, flown = jax.lax.scan(one_step, (sim, memory), length=num_steps)
+        queue = jnp.zeros((delay, env.action_size))
+        _, flown = jax.lax.scan(one_step, (sim, memory, queue), length=num_steps)
         return Flights(*flown, start=start.certified)
 
     many = jax.vmap(jax.vmap(episode, in_axes=(None, None, 0)), in_axes=(0, 0, None))
@@ -181,6 +191,51 @@ def test_whatever_is_certified_is_safe_within_the_bound_and_not_beyond(
         assert untold.certified.all()
         assert (untold.h.min(axis=(1, 2)) < 0.0).all()  # the same worlds break a filter without it
         assert (beyond.h.min(axis=(1, 2)) < 0.0).sum() >= 4
+
+
+@pytest.mark.parametrize(
+    ("task", "preset", "delay"),
+    [
+        ("docking1d", "explicit_simplex", 2),
+        thorough("docking2d", "default", 2),
+        thorough("docking3d", "default", 1),
+        thorough("docking2d", "explicit_simplex", 3),
+        thorough("docking1d", "default", 5),
+    ],
+)
+def test_a_known_delay_costs_nothing_and_an_unknown_one_breaks_the_limit(
+    task: str, preset: str, delay: int
+) -> None:
+    world = {"process": 0.002, "mass": 0.02, "misalignment": 0.01, "velocity": 0.003}
+    env = jaxsafe.make(task, {"rta.bound": {**world, "delay": delay}}, rta=preset)
+    worlds = stacked([{}, world])
+    flights = fly(env, worlds, worlds, inward, delay=delay)
+    certified = flights.certified
+    assert certified[..., delay:].all()  # before, what the start had under way may not be
+    assert flights.start.mean() > 0.8
+    least = np.where(certified, flights.h, np.inf).min(axis=(1, 2))
+    assert least.min() >= 0.99 * MARGIN
+    assert flights.inside[..., delay + 1 :].min() >= 0.0
+    if preset == "default":
+        assert least[0] < 1.1 * MARGIN
+    unknown = fly(env, worlds, worlds, inward, delay=delay, known_delay=0)
+    assert (unknown.h.min(axis=(1, 2)) < -0.01).all()
+    assert unknown.certified.mean() > 0.5
+
+
+def test_a_start_that_no_thrust_would_lead_beyond_the_limit_is_not_certified_with_a_delay() -> None:
+    env = jaxsafe.make("docking2d", {"rta.bound": {"delay": 2}}, rta="default")
+    # The limit falls by 0.0009 m/s a step, and h is 0.001 m/s at first.
+    start = {"position": [0.0, 120.0], "velocity": [0.0, -(0.2 + 0.002054 * 120.0 - 0.001)]}
+    state, first = jaxsafe.reset_to(env, {"deputy": start})
+    assert first.info.rta is not None
+    assert not first.info.rta.certified
+    assert state.memory.rta.under_way.controls.shape == (2, 2)
+    without = jaxsafe.override(env, {"rta.bound.delay": 0})
+    state, first = jaxsafe.reset_to(without, {"deputy": start})
+    assert first.info.rta is not None
+    assert first.info.rta.certified
+    assert state.memory.rta.under_way == ()
 
 
 @pytest.mark.thorough
@@ -231,6 +286,16 @@ def test_a_bound_that_cannot_be_kept_is_refused_in_one_line(
     with pytest.raises(ConfigError, match=message) as caught:
         jaxsafe.make("docking2d", {"rta.bound": bound}, rta=preset)
     assert "\n" not in str(caught.value)
+
+
+def test_only_the_last_filter_of_a_cascade_may_have_a_delay() -> None:
+    """The others do not know which control will act."""
+    delayed = Simplex(**BRAKE, bound=UncertaintyBound(delay=1))
+    first = Stage(name="first", rta=delayed)
+    last = Stage(name="last", rta=Simplex(**BRAKE))
+    with pytest.raises(ConfigError, match=r"rta: stage 'first' has a bound.delay, which only the"):
+        jaxsafe.make("docking2d", rta=Cascade(stages=(first, last)))
+    assert Cascade(stages=(last, first)).problem() is None
 
 
 @pytest.mark.thorough
