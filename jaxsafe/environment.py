@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
+from jaxsafe import worst_case as worst_case  # its parts can stand in `uncertainty`
 from jaxsafe.processors.constraint import Constraint
 from jaxsafe.processors.observation import Observation
 from jaxsafe.processors.reward import Reward

@@ -85,7 +85,7 @@ def received(
         key: the key of the step, () if nothing is random.
         control: the control of the step, after run time assurance.
     """
-    memories = {}
+    memories: dict[str, Any] = {}
     for index, item in enumerate(env.uncertainty):
         with part("uncertainty", item.name):
             memory = item.increment(
@@ -94,6 +94,15 @@ def received(
             control = item.received(env, state.sim, memory, control)
         memories[item.name] = memory
     return control, memories
+
+
+def arriving(
+    env: Environment, sim: Sim, memory: Mapping[str, Any], control: Float[Array, " m"]
+) -> Float[Array, " m"]:
+    """Return the control that the plant receives in a step of which the memories are known."""
+    for item in env.uncertainty:
+        control = item.received(env, sim, memory[item.name], control)
+    return control
 
 
 def disturbed(

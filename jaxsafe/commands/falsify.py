@@ -3,6 +3,9 @@
 Every adversary acts on whole episodes from the task's own starts. The last one searches for
 sequences of controls that defeat the filter. Violations are counted at the samples and inside the
 steps, see `jaxsafe.evaluate.run_adversaries.attack`. The exit code is 1 if there was a violation.
+
+A filter with a bound on the uncertainty is attacked in worlds that are as bad as the bound, or
+worse: `levels=0.5,1,2` are multiples of it. Violations beyond level 1 break no promise.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ from jaxsafe.commands.options import Count, File, Option, Seed
 from jaxsafe.config.arguments import MAX_COUNT
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.evaluate.adversaries import ADVERSARIES
+from jaxsafe.evaluate.bounded_worlds import world_at
 from jaxsafe.evaluate.run_adversaries import SEARCH, attack, longest_episode
 from jaxsafe.schema.component import Range
 from jaxsafe.schema.errors import ConfigError
@@ -40,7 +44,7 @@ class Options(TaskOptions):
 
     groups: ClassVar = {
         "The filter and its environment.": ("env", "env.PATH", "actions", "variant", "rta"),
-        "The attack.": ("policies", "num_envs", "steps", "seed", "out"),
+        "The attack.": ("policies", "levels", "num_envs", "steps", "seed", "out"),
     }
 
     env: Annotated[str, Option(first=True, examples=("env=docking3d",))]
@@ -59,6 +63,15 @@ class Options(TaskOptions):
     """
     policies: Annotated[tuple[str, ...], Option(kind="policy", names=POLICIES)] | None = None
     """The adversaries, with commas between them. By default all of them act in turn."""
+    levels: (
+        Annotated[tuple[float, ...], Range(0.0, high=1e6), Option(takes="numbers from 0 to 1e6")]
+        | None
+    ) = None
+    """Multiples of the filter's bound, with commas between them. Each is a world to attack in.
+
+    The disturbance has the worst direction in every step, and so have the errors of navigation. The
+    search chooses the disturbance together with the controls.
+    """
     seed: Seed = 0
     """Seed of the starts and of the adversaries."""
     out: File | None = None
@@ -129,26 +142,29 @@ def main(argv: Sequence[str]) -> int:
         if options.steps is None
         else -(-options.steps // options.num_envs)
     )
-    rows = []
-    for name in options.policies or POLICIES:
-        rows.append(attack(env, name, length, options.num_envs, jax.random.key(options.seed)))
-        print(
-            report(rows[-1:]).splitlines()[1]
-            if len(rows) > 1
-            else "\n".join(report(rows).splitlines()[:2]),
-            flush=True,
-        )
-        # The file is written after each adversary, so that nothing is lost if the run is stopped.
-        if options.out:
-            write_text(
-                Path(options.out),
-                json.dumps({**facts, "policies": rows}, indent=1, ensure_ascii=False) + "\n",
-            )
-    if report(rows).splitlines()[-1].endswith("confidence"):
-        print(report(rows).splitlines()[-1])
+    rows: list[dict[str, Any]] = []
+    for level in options.levels or (None,):
+        of_level: list[dict[str, Any]] = []
+        for name in options.policies or POLICIES:
+            world = env if level is None else world_at(env, level, searched=name == SEARCH)
+            row = attack(world, name, length, options.num_envs, jax.random.key(options.seed))
+            of_level.append(row if level is None else {"level": level, **row})
+            if level is not None and len(of_level) == 1:
+                print(f"{level:g} times the bound")
+            first, *lines = report(of_level[-1:]).splitlines()
+            print(f"{first}\n{lines[0]}" if len(of_level) == 1 else lines[0], flush=True)
+            # The file is written after each adversary, so that nothing is lost if the run is
+            # stopped.
+            if options.out:
+                content = {**facts, "policies": [*rows, *of_level]}
+                text = json.dumps(content, indent=1, ensure_ascii=False)
+                write_text(Path(options.out), f"{text}\n")
+        if report(of_level).splitlines()[-1].endswith("confidence"):
+            print(report(of_level).splitlines()[-1])
+        rows += of_level
     if options.out:
         print(f"written to {options.out}")
-    return int(any(map(violated, rows)))
+    return int(any(violated(row) for row in rows if row.get("level", 0.0) <= 1.0))
 
 
 def command() -> None:

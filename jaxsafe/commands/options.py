@@ -235,6 +235,8 @@ def _convert(value: Any, field: Field, key: str) -> Any:
         return arguments.count(value, key, least=limits.low, most=limits.largest)
     if hint == tuple[float, float]:
         return _interval(value, field, key)
+    if hint == tuple[float, ...]:
+        return _numbers(value, field, key)
     if hint == tuple[str, ...]:
         items = value if isinstance(value, list) else [value]
         if not items:
@@ -259,6 +261,15 @@ def _interval(value: Any, field: Field, key: str) -> tuple[float, float]:
     if not numbers or len(value) != 2 or not value[0] < value[1]:
         raise ConfigError(f"{key}: expected {option(field).takes}, found {show(value)}")
     return float(value[0]), float(value[1])
+
+
+def _numbers(value: Any, field: Field, key: str) -> tuple[float, ...]:
+    items = value if isinstance(value, list) else [value]
+    known = all(isinstance(item, int | float) and not isinstance(item, bool) for item in items)
+    limits = field.range or Range()
+    if not items or not known or not all(item in limits for item in items):
+        raise ConfigError(f"{key}: expected {option(field).takes}, found {show(value)}")
+    return tuple(map(float, items))
 
 
 def _refuse(given: Iterable[str], known: Iterable[str]) -> None:

@@ -8,7 +8,9 @@ checked between two instants as well. A margin or a state that is not a number i
 from __future__ import annotations
 
 import functools
+import itertools
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -23,6 +25,7 @@ from jaxsafe.rollout import reset_batch
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.controllers import Continuous
+from jaxsafe.simulation.uncertainty import ChosenDisturbance
 from jaxsafe.transition import (
     bounds,
     driven,
@@ -32,6 +35,7 @@ from jaxsafe.transition import (
     with_memory,
 )
 from jaxsafe.types import Key, Number, Sim, State, TimeStep
+from jaxsafe.uncertain import arriving, disturbed
 
 INSTANTS_PER_STEP = 8
 """Number of instants of a step at which violations inside it are looked for."""
@@ -70,7 +74,7 @@ def attack(env: Environment, name: str, num_steps: int, num_envs: int, key: Key)
         name: one of `adversaries.ADVERSARIES`, or `search`. The search starts from random starts
             and minimises the smallest h on the way against the filter. It is the cross-entropy
             method on sequences of `SEARCH_CONTROLS` controls, each held for `SEARCH_HOLD_STEPS`
-            steps.
+            steps. Disturbances of type `chosen` are searched together with the controls.
         num_steps: the number of steps in each environment. `longest_episode` gives whole episodes.
             The search divides all steps into its sequences.
         num_envs: the number of environments that run side by side.
@@ -173,6 +177,9 @@ def _search(env: Environment, num_starts: int, key: Key) -> Counts:
     low, high = bounds(env)
     middle = (high + low) / 2.0
     half = (high - low) / 2.0
+    chosen = [item for item in env.uncertainty if isinstance(item, ChosenDisturbance)]
+    sizes = [env.platform(item.on).dimension for item in chosen]
+    splits = list(itertools.accumulate([low.shape[0], *sizes]))[:-1]
 
     def run(state: State, controls: Float[Array, "t p m"]) -> Counts:
         """Run all sequences of a population from one state."""
@@ -181,6 +188,9 @@ def _search(env: Environment, num_starts: int, key: Key) -> Counts:
             carry: tuple[State, Array, Counts], control: Array
         ) -> tuple[tuple[State, Array, Counts], None]:
             state, running, counts = carry
+            control, *pushes = jnp.split(control, splits, axis=-1)
+            for item, push in zip(chosen, pushes, strict=True):
+                state = _with_push(state, item.name, item.bound * push)
             after, done, facts = _step(env, state, control)
             counted = {
                 name: jnp.where(running, value, jnp.inf if name in _LOWEST else 0.0)
@@ -201,7 +211,9 @@ def _search(env: Environment, num_starts: int, key: Key) -> Counts:
         """Draw a population about a mean and return mean and spread of its best sequences."""
         mean, spread = carry
         population = mean + spread * jax.random.normal(key, (SEARCH_POPULATION, *mean.shape))
-        controls = middle + half * jnp.clip(population, -1.0, 1.0)
+        shares = jnp.clip(population, -1.0, 1.0)
+        controls = middle + half * shares[..., : low.shape[0]]
+        controls = jnp.concatenate([controls, shares[..., low.shape[0] :]], axis=-1)
         held = jnp.repeat(jnp.moveaxis(controls, 0, 1), SEARCH_HOLD_STEPS, axis=0)
         counts = run(state, held)
         best = population[jnp.argsort(counts["lowest_inside"])[:SEARCH_ELITE]]
@@ -211,7 +223,7 @@ def _search(env: Environment, num_starts: int, key: Key) -> Counts:
     def search_from_start(key: Key) -> Counts:
         key_start, key_search = jax.random.split(key)
         state, first = jax.tree.map(lambda leaf: leaf[0], reset_batch(env, key_start, 1))
-        shape = (SEARCH_CONTROLS, low.shape[0])
+        shape = (SEARCH_CONTROLS, low.shape[0] + sum(sizes))
         begin = (jnp.zeros(shape), jnp.full(shape, 2.0))
         keys = jax.random.split(key_search, SEARCH_ROUNDS)
         _, counts = jax.lax.scan(functools.partial(improve, state=state), begin, keys)
@@ -223,6 +235,12 @@ def _search(env: Environment, num_starts: int, key: Key) -> Counts:
         return counts | {"unsafe_starts": _unsafe(first) * begun}
 
     return jax.lax.map(search_from_start, jax.random.split(key, num_starts))
+
+
+def _with_push(state: State, name: str, push: Float[Array, "n d"]) -> State:
+    """Return states in which a chosen disturbance is what it shall be in the next step."""
+    uncertainty = {**state.memory.uncertainty, name: push}
+    return state.replace(memory=state.memory.replace(uncertainty=uncertainty))
 
 
 def _step(
@@ -240,11 +258,15 @@ def _step(
     def lowest_at(state: State) -> Float[Array, ""]:
         return smallest_margin(drawn(env, state.parameters), _remembering(env, state))
 
-    def lowest_inside(state: State, control: Float[Array, " m"]) -> Float[Array, ""]:
-        return _inside(drawn(env, state.parameters), _remembering(env, state), control)
+    def lowest_inside(
+        state: State, memory: Mapping[str, Any], control: Float[Array, " m"]
+    ) -> Float[Array, ""]:
+        now = drawn(env, state.parameters)
+        sim = _remembering(env, state)
+        return _inside(now, sim, memory, arriving(now, sim, memory, control))
 
     lowest = jax.vmap(lowest_at)(after)
-    inside = jax.vmap(lowest_inside)(state, info.control_actual)
+    inside = jax.vmap(lowest_inside)(state, after.memory.uncertainty, info.control_actual)
     finite = jax.vmap(_finite)(after)
     lowest = jnp.where(jnp.isnan(lowest), -jnp.inf, lowest)
     inside = jnp.where(jnp.isnan(inside), -jnp.inf, inside)
@@ -268,11 +290,26 @@ def _remembering(env: Environment, state: State) -> Sim:
     return with_memory(env, state.sim, state.memory.status)
 
 
-def _inside(env: Environment, before: Sim, control: Float[Array, " m"]) -> Float[Array, ""]:
-    """Return the smallest h within a step."""
+def _inside(
+    env: Environment, before: Sim, memory: Mapping[str, Any], control: Float[Array, " m"]
+) -> Float[Array, ""]:
+    """Return the smallest h within a step.
+
+    Args:
+        env: the environment, with the numbers of this episode.
+        before: the simulation before the step.
+        memory: what the parts of `uncertainty` remember in that step.
+        control: the control that the plant receives, shape (m,).
+    """
     before = before.replace(regions={}, status={})
     shares = jnp.arange(1, INSTANTS_PER_STEP + 1) / INSTANTS_PER_STEP
-    later = jax.vmap(lambda share: within_step(env, before, control, share))(shares)
+
+    def at(share: Number) -> Sim:
+        later = within_step(env, before, control, share)
+        so_far = env.replace(dt=env.dt * share)
+        return later.replace(platforms=disturbed(so_far, memory, later.platforms))
+
+    later = jax.vmap(at)(shares)
     earlier = jax.tree.map(
         lambda first, instants: jnp.concatenate([first[None], instants[:-1]]), before, later
     )

@@ -304,24 +304,15 @@ class ActionDelay(Uncertainty, type="delay"):
         return memory[0]
 
 
-class NavigationError(Uncertainty, type="navigation"):
-    """An error of what is known of a platform, as filters and observations see it.
+class StateError(Uncertainty):
+    """Base of errors of what is known of a platform, as filters and observations see it.
 
-    It is added to the field `what` of the platform's state and is drawn anew every step, uniformly
-    from the ball of radius `bound` or from a normal distribution of standard deviation `deviation`.
-    `bias` is added to it. Statuses, rewards and the end of an episode follow the true state.
+    The memory is the error of the field `what` of the platform's state. Statuses, rewards and the
+    end of an episode follow the true state.
     """
 
-    draws: ClassVar[bool] = True
     of: PlatformName
     what: str = "position"
-    bound: Size | None = None
-    deviation: Size | None = None
-    bias: Annotated[Number, Unit("physical", length=ANY), Range(largest=1e9)] = 0.0
-
-    def problem(self) -> str | None:
-        both = self.bound is not None and self.deviation is not None
-        return "expected bound or deviation, found both" if both else None
 
     def misfits(self, env: Environment) -> dict[str, str]:
         fields = [name for name in vars(env.platform(self.of).rest()) if name != "orientation"]
@@ -330,8 +321,32 @@ class NavigationError(Uncertainty, type="navigation"):
             return {"what": f"{found}; choose from {nearest(self.what, fields)}"}
         return {}
 
+    def true(self, sim: Sim) -> Array:
+        """Return the true value of what is measured."""
+        return jnp.asarray(getattr(sim.platforms[self.of], self.what))
+
+    def measured(self, sim: Sim, memory: Any) -> Sim:
+        state = sim.platforms[self.of].replace(**{self.what: self.true(sim) + memory})
+        return sim.replace(platforms={**sim.platforms, self.of: state})
+
+
+class NavigationError(StateError, type="navigation"):
+    """An error of navigation that is drawn anew every step, with a `bias`.
+
+    It is uniform in the ball of radius `bound`, or normal with the standard deviation `deviation`.
+    """
+
+    draws: ClassVar[bool] = True
+    bound: Size | None = None
+    deviation: Size | None = None
+    bias: Annotated[Number, Unit("physical", length=ANY), Range(largest=1e9)] = 0.0
+
+    def problem(self) -> str | None:
+        both = self.bound is not None and self.deviation is not None
+        return "expected bound or deviation, found both" if both else None
+
     def init(self, env: Environment, sim: Sim, key: Key) -> Any:
-        like = jnp.asarray(getattr(sim.platforms[self.of], self.what))
+        like = self.true(sim)
         error = jnp.zeros_like(like)
         if self.bound is not None:
             error = self.bound * in_unit_ball(key, jnp.ravel(like)).reshape(like.shape)
@@ -343,11 +358,6 @@ class NavigationError(Uncertainty, type="navigation"):
         self, env: Environment, sim: Sim, key: Key, memory: Any, control: Float[Array, " m"]
     ) -> Any:
         return self.init(env, sim, key)
-
-    def measured(self, sim: Sim, memory: Any) -> Sim:
-        state = sim.platforms[self.of]
-        state = state.replace(**{self.what: getattr(state, self.what) + memory})
-        return sim.replace(platforms={**sim.platforms, self.of: state})
 
 
 def in_unit_ball(key: Key, like: Float[Array, " d"]) -> Float[Array, " d"]:

@@ -1,0 +1,74 @@
+"""Disturbances and errors in the direction that brings the agent nearest to a violation.
+
+They are parts of `uncertainty` for adversaries, and for training against them. Each looks one step
+ahead: at the gradient of the smallest margin h of all safety constraints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.simulation.geometry import safe_norm
+from jaxsafe.simulation.uncertainty import Disturbance, Size, StateError
+from jaxsafe.transition import advance, smallest_margin
+from jaxsafe.types import Key, Sim
+
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
+
+
+class WorstDisturbance(Disturbance, type="worst"):
+    """A disturbance of the size `bound` that lowers the smallest h after the step most steeply.
+
+    It knows the control of the step. Where the disturbance has no influence on h it is 0.
+    """
+
+    bound: Size
+
+    def increment(
+        self, env: Environment, sim: Sim, key: Key, memory: Any, control: Float[Array, " m"]
+    ) -> Any:
+        after = advance(env, sim, control)
+
+        def h(vector: Float[Array, " d"]) -> Float[Array, ""]:
+            platforms = self.moved(env, vector, after.platforms)
+            return smallest_margin(env, after.replace(platforms=platforms))
+
+        return -self.bound * steepest(h, jnp.zeros_like(memory))
+
+
+class WorstNavigationError(StateError, type="worst_navigation"):
+    """An error of navigation of the size `bound` that makes the smallest h look largest.
+
+    So a filter believes to be farther from a violation than it is.
+    """
+
+    bound: Size
+
+    def init(self, env: Environment, sim: Sim, key: Key) -> Any:
+        like = self.true(sim)
+
+        def h(error: Float[Array, " k"]) -> Float[Array, ""]:
+            seen = self.measured(sim, error.reshape(like.shape))
+            return smallest_margin(env, seen.replace(regions={}, status={}))
+
+        flat = jnp.zeros_like(jnp.ravel(like))
+        return (self.bound * steepest(h, flat)).reshape(like.shape)
+
+    def increment(
+        self, env: Environment, sim: Sim, key: Key, memory: Any, control: Float[Array, " m"]
+    ) -> Any:
+        return self.init(env, advance(env, sim, control), key)
+
+
+def steepest(h: Callable[[Array], Array], at: Float[Array, " d"]) -> Float[Array, " d"]:
+    """Return the direction of length 1 in which h grows most steeply, or 0 where it is flat."""
+    slope = jax.grad(h)(at)
+    slope = jnp.where(jnp.isfinite(slope), slope, 0.0)
+    length = safe_norm(slope)
+    return slope / jnp.where(length > 0.0, length, 1.0)
