@@ -17,7 +17,7 @@ from jaxsafe.rta import Cascade, Simplex, Stage, UncertaintyBound
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.transition import advance
-from jaxsafe.types import Sim
+from jaxsafe.types import Sim, TimeStep
 
 MARGIN = 2.5e-4
 """What the presets keep at samples [m/s]."""
@@ -319,3 +319,56 @@ def test_whatever_may_not_be_promised_is_not_certified() -> None:
         start = {"position": [0.0, 120.0], "velocity": [0.0, -0.1]}
         info: Any = jaxsafe.reset_to(too_much, {"deputy": start})[1].info
         assert info.rta.certified == certified
+
+
+def pushing_inward(env: Environment, num_steps: int) -> TimeStep:
+    """Return the time steps of 32 episodes in which the agent pushes towards the chief."""
+
+    @jax.jit
+    @jax.vmap
+    def episode(key: jax.Array) -> TimeStep:
+        def one_step(state: Any, _: None) -> Any:
+            return jaxsafe.step(env, state, inward(state.sim))
+
+        return jax.lax.scan(one_step, jaxsafe.reset(env, key)[0], length=num_steps)[1]
+
+    return jax.tree.map(np.asarray, episode(jax.random.split(jax.random.key(0), 32)))
+
+
+def uncertain(task: str, delay: int = 0) -> dict[str, Any]:
+    """Return changes to a task, so that its world differs from what a filter knows."""
+    thrusters = [f"thrust_{axis}" for axis in "xyz"[: jaxsafe.make(task).action_size]]
+    seen = {"type": "navigation", "of": "deputy"}
+    late = [{"type": "delay", "name": "late", "steps": delay}] if delay else []
+    return {
+        "uncertainty": [
+            {"type": "bounded", "name": "push", "on": "deputy", "bound": 0.001},
+            {"type": "misaligned", "name": "turned", "thrusters": thrusters, "angle": 0.02},
+            {**seen, "name": "where", "what": "position", "bound": 0.1},
+            {**seen, "name": "how_fast", "what": "velocity", "bound": 0.001},
+            *late,
+        ],
+        "deputy.mass": 11.8,
+        "rta.model": {"deputy.mass": 12},
+    }
+
+
+@pytest.mark.parametrize(
+    ("task", "delay"), [("docking2d", 0), thorough("docking3d", 0), thorough("docking3d", 2)]
+)
+def test_the_preset_is_safe_in_an_uncertain_environment_within_its_bound(
+    task: str, delay: int
+) -> None:
+    changes = uncertain(task, delay) | {"rta.bound.delay": delay}
+    info: Any = pushing_inward(jaxsafe.make(task, changes, rta="robust"), 150).info
+    assert info.rta.certified[:, delay:].mean() > 0.99
+    assert info.margins["velocity_limit"][info.rta.certified].min() >= 0.99 * MARGIN
+    assert info.intervening.mean() > 0.5
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("task", ["docking2d", "docking3d"])
+def test_the_same_environment_breaks_the_default_filter_while_it_certifies(task: str) -> None:
+    timesteps = pushing_inward(jaxsafe.make(task, uncertain(task), rta="default"), 150)
+    info: Any = timesteps.info
+    assert timesteps.cost[info.rta.certified].mean() > 0.1
