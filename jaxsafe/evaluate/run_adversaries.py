@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsafe import environment
+from jaxsafe.config.arguments import MAX_COUNT
 from jaxsafe.environment import Environment, drawn, step
 from jaxsafe.evaluate.adversaries import ADVERSARIES
 from jaxsafe.rollout import reset_batch
@@ -128,7 +129,8 @@ def attack(env: Environment, name: str, num_steps: int, num_envs: int, key: Key)
 def longest_episode(env: Environment) -> int:
     """Return the number of steps after which every episode has ended by its time limit.
 
-    A time limit or a length of a step that is random counts with its worst value.
+    A time limit or a length of a step that is random counts with its worst value. The number is at
+    most `MAX_COUNT`, also where the time limit is so large that it stands for none.
 
     Raises:
         ConfigError: the task has no time limit.
@@ -136,7 +138,7 @@ def longest_episode(env: Environment) -> int:
     steps = environment.longest_episode(env.replace(decision_period=1))
     if steps is None:
         raise ConfigError("steps: the task has no time limit, so give the number of steps")
-    return int(steps)
+    return int(min(float(steps), MAX_COUNT))  # single precision may give ∞
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2, 3))

@@ -11,6 +11,7 @@ import pytest
 from default_cases import thorough
 
 import jaxsafe
+from jaxsafe.commands import falsify
 from jaxsafe.commands.falsify import main, report
 from jaxsafe.environment import drawn
 from jaxsafe.evaluate.adversaries import ADVERSARIES
@@ -81,6 +82,26 @@ def test_episodes_are_what_is_counted_and_whole_ones_unless_told_otherwise(
     printed = capsys.readouterr().out
     assert " 160 " in printed
     assert "less than a share of 0.6 of the episodes has one" in printed
+
+
+def test_a_time_limit_that_means_none_leaves_episodes_that_are_cut(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The limit is more steps than single precision holds."""
+
+    class Attacked(Exception):
+        pass
+
+    def attack(env: Any, name: str, num_steps: int, num_envs: int, key: Any) -> Any:
+        raise Attacked(num_steps, num_envs)
+
+    monkeypatch.setattr(falsify, "attack", attack)
+    for limit, length in (("1e38", 15_625), ("50", 502)):  # 15,625 · 64 = 1,000,000
+        with pytest.raises(Attacked) as caught:
+            main(
+                ["env=docking2d", "rta=none", "env.dt=0.1", f"env.terminal.timeout.limit={limit}"]
+            )
+        assert caught.value.args == (length, 64)
 
 
 @pytest.mark.thorough
