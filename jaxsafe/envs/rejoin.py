@@ -26,6 +26,7 @@ from jaxsafe.processors.status import Distance, InRegion, RegionDistance, Status
 from jaxsafe.processors.terminal import Held, Terminal, Timeout, TooClose, TooFar
 from jaxsafe.rta.asif import ExplicitASIF, ImplicitASIF, Polynomial
 from jaxsafe.rta.backups import MatchVelocity, VelocityMatched
+from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.simplex import CollisionSimplex, Simplex
 from jaxsafe.schema.ties import Tie, Ties
 from jaxsafe.simulation.controllers import Actuator, Continuous
@@ -249,6 +250,17 @@ MATCH_2D: dict[str, Any] = {
 }
 """Filters that keep a way out open: turn left or right until the wingman flies as the lead does."""
 
+ROBUST_2D: dict[str, Any] = MATCH_2D | {
+    "backups": tuple(
+        MatchVelocity(name=turn, lead="lead", clearance=157.0, turn=turn, dead_zone=0.5)
+        for turn in ("left", "right")
+    ),
+    "horizon": 44,
+    "terminal": VelocityMatched(of="wingman", to="lead", tolerance=10.0, clearance=107.0),
+    "bound": UncertaintyBound(process=1.0),  # [ft/s²]
+}
+"""Filters that keep a way out open within a bound. The distances suffice for the largest one."""
+
 MATCH_3D: dict[str, Any] = {
     "constraints": ("collision",),
     "margin": 2.0,
@@ -288,6 +300,7 @@ FILTERS_2D: Filters = {
     "default": lambda: Simplex(**MATCH_2D),
     "implicit_simplex": lambda: Simplex(**MATCH_2D),
     "implicit_asif": lambda: ImplicitASIF(**MATCH_2D),
+    "robust": lambda: Simplex(**ROBUST_2D),
     "explicit_asif": lambda: _explicit_asif(MATCH_2D["backups"][0]),
     "released": lambda: CollisionSimplex(other="lead"),
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, cast
 
 import jax
@@ -10,9 +11,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsafe.rta.asif import linear, speed_ball
+from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.filter import BackupController, CertifiedRTA, Faults, TerminalSet
 from jaxsafe.rta.projection import project_box_ball
 from jaxsafe.rta.proofs import (
+    AWAY_GAIN,
     align_and_brake_faults,
     aligned_or_slow_faults,
     at_rest_faults,
@@ -22,6 +25,7 @@ from jaxsafe.rta.proofs import (
     velocity_matched_faults,
 )
 from jaxsafe.rta.speed_limit import speed_limit_facts
+from jaxsafe.rta.tube import Tube, after_step, largest_turn, measured
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.dubins import Dubins2D, Dubins3D
 from jaxsafe.simulation.geometry import direction, safe_norm
@@ -34,6 +38,12 @@ if TYPE_CHECKING:
     from jaxsafe.environment import Environment
 
 Aircraft = Dubins2D | Dubins3D
+
+LOST = 1e6
+"""Radius [ft] of a tube of which nothing is known."""
+
+ROUNDING = 1e-4
+"""Error [rad] of headings in single precision, with a large reserve."""
 
 
 class Brake(BackupController, type="brake"):
@@ -207,13 +217,12 @@ class MatchVelocity(BackupController, type="match_velocity"):
         lead = sim.platforms[self.lead]
         lead_after = later[self.lead]
         plant = cast(Aircraft, env.agent_platform)
-        sign = 1.0 if self.turn == "left" else -1.0
         away = self._away(own.position - lead.position)
         level_squared = jnp.sum(lead.velocity[:2] ** 2)
         faster = jnp.sum(away * lead.velocity) / lead.speed
         goal = lead_after.heading if self.climb is None else lead.heading
         goal += (lead.velocity[0] * away[1] - lead.velocity[1] * away[0]) / level_squared
-        error = sign * wrap(sign * (goal - own.heading), -self.dead_zone, 2.0 * jnp.pi)
+        error = self._sign * wrap(self._sign * (goal - own.heading), -self.dead_zone, 2.0 * jnp.pi)
         speed = jnp.clip(lead_after.speed + faster, plant.speed_limits[0], plant.speed_limits[1])
         controls = {"acceleration": (speed - own.speed) / env.dt}
         if self.climb is None:
@@ -242,12 +251,58 @@ class MatchVelocity(BackupController, type="match_velocity"):
             return {fault: jnp.ones((), bool)}
         return {}
 
+    @property
+    def has_tubes(self) -> bool:
+        return self.climb is None
+
+    def first_tube(
+        self, env: Environment, before: Sim, after: Sim, bound: UncertaintyBound
+    ) -> Tube:
+        own = before.platforms[env.agent]
+        tube = measured(bound, own)
+        return after_step(env, bound, tube=tube, before=own, after=after.platforms[env.agent])
+
+    def next_tube(
+        self, env: Environment, before: Sim, after: Sim, bound: UncertaintyBound, tube: Tube
+    ) -> Tube:
+        own = before.platforms[env.agent]
+        lead = before.platforms[self.lead]
+        asked = dict(zip(env.action_names, self.control(env, before, after.platforms), strict=True))
+
+        # The true control goes for another velocity than the predicted one, by so much.
+        reach = tube.position + bound.position
+        distance = safe_norm(own.position - lead.position)
+        too_close = jnp.maximum(self.clearance - (distance - reach), 0.0)
+        apart = AWAY_GAIN * jnp.minimum(reach, 2.0 * too_close)
+        plant = cast(Dubins2D, env.agent_platform)
+        slowest = plant.speed_limits[0] - bound.process * env.dt
+        own_speed = jnp.maximum(own.speed - tube.speed, slowest)
+        wrong_heading = largest_turn(bound.velocity, own_speed) + apart / lead.speed
+        kept = tube.replace(
+            heading=jnp.maximum(tube.heading - _spare(env, asked, "heading_rate"), wrong_heading),
+            speed=jnp.maximum(
+                tube.speed - _spare(env, asked, "acceleration"), bound.velocity + apart
+            ),
+        )
+        wider = after_step(
+            env, bound, tube=tube, before=own, after=after.platforms[env.agent], kept=kept
+        )
+
+        # Where one of them may turn the long way round and the other one not, nothing is known.
+        to_turn = self._sign * asked["heading_rate"] * env.dt + self.dead_zone
+        doubt = tube.heading + wrong_heading + ROUNDING
+        same_way = (to_turn >= doubt) & (to_turn + doubt < 2.0 * jnp.pi)
+        return wider.replace(position=jnp.where(same_way, wider.position, LOST))
+
+    @property
+    def _sign(self) -> float:
+        return 1.0 if self.turn == "left" else -1.0
+
     def _away(self, apart: Float[Array, " d"]) -> Float[Array, " d"]:
         """Return w, the velocity away from the lead where the agent is too close."""
         distance = safe_norm(apart)
-        return (
-            0.1 * jnp.maximum(self.clearance - distance, 0.0) * apart / jnp.maximum(distance, 1.0)
-        )
+        missing = jnp.maximum(self.clearance - distance, 0.0)
+        return AWAY_GAIN * missing * apart / jnp.maximum(distance, 1.0)
 
     def _in_space(
         self, env: Environment, own: Any, error: Array, lead_turn: Array, angle: Array
@@ -289,6 +344,7 @@ class VelocityMatched(TerminalSet, type="velocity_matched"):
     clearance: Annotated[Length, Positive]
     drift: Annotated[Number, Unit("s"), Range(0.0)] = 1.0
     lag: Annotated[Number, Unit("s"), Range(0.0)] = 0.0
+    knows_bound: ClassVar[bool] = True
 
     def contains(self, env: Environment, sim: Sim) -> Bool[Array, ""]:
         of = sim.platforms[self.of]
@@ -297,6 +353,14 @@ class VelocityMatched(TerminalSet, type="velocity_matched"):
         speed = safe_norm(of.velocity - to.velocity) + self.lag * safe_norm(acceleration)
         distance = safe_norm(of.position - to.position)
         return (speed < self._tolerance(env)) & (distance >= self.clearance + self.drift * speed)
+
+    def contains_tube(self, env: Environment, sim: Sim, tube: Tube) -> Bool[Array, ""]:
+        of = sim.platforms[self.of]
+        to = sim.platforms[self.to]
+        speed = safe_norm(of.velocity - to.velocity)
+        speed += tube.velocity(sim.platforms[env.agent].speed)
+        distance = safe_norm(of.position - to.position) - tube.position
+        return (speed < self.tolerance) & (distance >= self.clearance + self.drift * speed)
 
     def _tolerance(self, env: Environment) -> Number:
         """Return `tolerance`, or less if in space the proof or the actuators allow only less.
@@ -328,6 +392,13 @@ def _acceleration(env: Environment, sim: Sim, name: str) -> Float[Array, " d"]:
     controls = {} if name == env.agent else undirected(platform, sim)
     derivative = platform.derivative(state, controls)
     return jax.jvp(lambda state: state.velocity, (state,), (derivative,))[1]
+
+
+def _spare(env: Environment, asked: Mapping[str, Number], name: str) -> Any:
+    """Return by how much a control could be changed within its bounds, times the step."""
+    actuator = next(actuator for actuator in env.actuators if actuator.name == name)
+    spare = jnp.minimum(asked[name] - actuator.low, actuator.high - asked[name])
+    return env.dt * jnp.maximum(spare, 0.0)
 
 
 def misalignment(state: Any) -> Float[Array, ""]:

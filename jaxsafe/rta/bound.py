@@ -1,6 +1,7 @@
 """A bound on how far the true world may be from the one that a filter predicts with.
 
-Proposition 11 of docs/safety/proofs.md says which margin of a speed limit makes up for it.
+Proposition 11 of docs/safety/proofs.md says which margin of a speed limit makes up for it. For
+aircraft, `jaxsafe.rta.tube` has tubes.
 """
 
 from __future__ import annotations
@@ -26,15 +27,15 @@ class Errors(Record):
 class UncertaintyBound(Component):
     """Limits of what the filter does not know. Whatever it certifies is safe within them."""
 
-    process: Annotated[Number, Unit("m/s²"), Range(0.0, largest=1e6)] = 0.0
+    process: Annotated[Number, Unit("m/s² or ft/s²"), Range(0.0, largest=1e6)] = 0.0
     """The largest acceleration ‖a‖ that disturbs the agent. It is held over a step."""
     mass: Annotated[Number, Unit("1"), Range(0.0, 1.0, open_high=True)] = 0.0
     """The share by which the true mass may differ from the mass that the filter knows."""
     misalignment: Annotated[Number, Unit("rad"), Range(0.0, 3.15)] = 0.0
     """The largest angle between the true thrust and the thrust that was asked for."""
-    position: Annotated[Number, Unit("m"), Range(0.0, largest=1e6)] = 0.0
+    position: Annotated[Number, Unit("m or ft"), Range(0.0, largest=1e6)] = 0.0
     """The largest error of the agent's measured position."""
-    velocity: Annotated[Number, Unit("m/s"), Range(0.0, largest=1e6)] = 0.0
+    velocity: Annotated[Number, Unit("m/s or ft/s"), Range(0.0, largest=1e6)] = 0.0
     """The largest error of the agent's measured velocity."""
     delay: Annotated[int, Range(0, largest=100)] = 0
     """The number of steps after which a control begins to act, which is known exactly."""

@@ -19,6 +19,7 @@ from jaxsafe.rta.bound import Errors, UncertaintyBound
 from jaxsafe.rta.prediction import others_react, repeat
 from jaxsafe.rta.projection import within
 from jaxsafe.rta.speed_limit import speed_limit_facts
+from jaxsafe.rta.tube import Tube
 from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.transition import (
@@ -180,6 +181,33 @@ class BackupController(Component):
         """Return the longest time [s] to the terminal set, 0 where that is not known."""
         return jnp.zeros_like(env.dt)
 
+    @property
+    def has_tubes(self) -> bool:
+        """Whether it has tubes, without which it is not proved with a `bound` and a horizon."""
+        return False
+
+    def first_tube(
+        self, env: Environment, before: Sim, after: Sim, bound: UncertaintyBound
+    ) -> Tube:
+        """Return the tube about a state that is predicted from a measured one.
+
+        Args:
+            env: the environment.
+            before: the measured simulation.
+            after: the simulation that is predicted one step later, whatever the control is.
+            bound: how far the true world may be from the predicted one.
+        """
+        raise NotImplementedError
+
+    def next_tube(
+        self, env: Environment, before: Sim, after: Sim, bound: UncertaintyBound, tube: Tube
+    ) -> Tube:
+        """Return the tube after a step in which this controller acts, given the one before it.
+
+        In the prediction it acts on the predicted state, in truth on the measured one.
+        """
+        raise NotImplementedError
+
 
 class TerminalSet(Component):
     """Set of states from which the backup controllers stay safe for ever.
@@ -187,8 +215,18 @@ class TerminalSet(Component):
     A certificate may end in it.
     """
 
+    knows_bound: ClassVar[bool] = False
+    """Whether `faults` takes the `bound` of a filter into account, and `contains_tube` is known."""
+
     def contains(self, env: Environment, sim: Sim) -> Bool[Array, ""]:
         """Return whether a state is in the set."""
+        raise NotImplementedError
+
+    def contains_tube(self, env: Environment, sim: Sim, tube: Tube) -> Bool[Array, ""]:
+        """Return whether all states of a tube about a predicted one are in the set.
+
+        With a `bound` the backup controllers must stay safe from there within it.
+        """
         raise NotImplementedError
 
     def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
@@ -237,6 +275,8 @@ class CertifiedRTA(RTA):
 
     A `bound` says how far the true world may be from the one that the filter predicts with. The
     filter then keeps so much more of a speed limit that its certificates hold in the true world.
+    With a horizon it predicts a tube that holds all ways of the true world. Such a certificate is
+    true for as long as its backup controller acts, so it is not renewed.
     """
 
     constraints: tuple[ConstraintName, ...]
@@ -326,7 +366,7 @@ class CertifiedRTA(RTA):
         It is infinite if nothing is proved with a bound. Arguments are those of
         `margin_to_certify`.
         """
-        if self.bound is None:
+        if self.bound is None or self._has_tubes:
             return jnp.zeros_like(env.dt)
         facts = [speed_limit_facts(env, name) for name in self.constraints]
         known = [limit for limit in facts if limit]
@@ -337,14 +377,25 @@ class CertifiedRTA(RTA):
 
     @property
     def _bound_is_proved(self) -> bool:
-        return not self.horizon and all(backup.proved.knows_bound for backup in self.backups)
+        known = all(backup.proved.knows_bound for backup in self.backups)
+        return self._has_tubes or (not self.horizon and known)
+
+    @property
+    def _has_tubes(self) -> bool:
+        """Whether its certificates are about all states of a tube."""
+        if self.bound is None or self.terminal is None:
+            return False
+        return self.terminal.knows_bound and all(backup.has_tubes for backup in self.backups)
 
     def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
         if not self.enforce:
             return {}
         faults = {}
         if self.bound is not None and not self._bound_is_proved:
-            faults["rta.bound is proved for brake without a horizon alone"] = jnp.ones((), bool)
+            faults[
+                "rta.bound is proved for brake without a horizon"
+                " and for match_velocity in the plane alone"
+            ] = jnp.ones((), bool)
         if self.terminal:
             faults |= self.terminal.faults(env, sim, self)
         for backup in self.backups:
@@ -444,7 +495,15 @@ class CertifiedRTA(RTA):
 
         backup_margin = self.lowest(env, sim, after_backup)
         new_certificate = passes | ~certified_before
-        if self.horizon:
+        if self._has_tubes:
+            backup_certified = jnp.where(
+                certified_before, _finite(after_backup), paths.values[best] >= to_back_up
+            )
+            ahead = {}
+            actuators_ahead = {}
+            remembered_ahead = {}
+            memories_ahead = paths.memories_ahead
+        elif self.horizon:
             backup_certified, end, memories_ahead = self._renew(
                 env, sim, memory=memory, after_backup=after_backup, backup_margin=backup_margin
             )
@@ -592,12 +651,17 @@ class CertifiedRTA(RTA):
         # what the agent does.
         pairs = list(zip(self.backups, memories, strict=True))
         groups = [[pair] for pair in pairs] if others_react(env, sim) else [pairs]
-        predicted = [self._follow(env, group, first=first, sim=sim) for group in groups]
-        margins, group_ends, group_memories = zip(*predicted, strict=True)
+        predicted = [
+            self._follow(env, group, first=first, earlier=before, sim=sim) for group in groups
+        ]
+        margins, group_ends, group_memories, group_arrived = zip(*predicted, strict=True)
         margins = jnp.concatenate(margins)
-        ends = [end for ends in group_ends for end in ends]
-        reached = jnp.stack([self._may_end(env, end) for end in ends])
+        ends = list(itertools.chain(*group_ends))
+        arrived = itertools.chain(*group_arrived)
+        reached = jnp.stack([self._may_end(env, *pair) for pair in zip(ends, arrived, strict=True)])
         states = [(end.platforms, end.actuators, end.remembered) for end in ends]
+        if self._has_tubes:  # nothing is renewed
+            states = [({}, {}, {})]
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
         ahead, actuators_ahead, remembered_ahead = stacked
         compared = jnp.stack([self.compared(env, on_the_way) for on_the_way in margins])
@@ -616,17 +680,25 @@ class CertifiedRTA(RTA):
         env: Environment,
         backups: Sequence[tuple[BackupController, Any]],
         first: Float[Array, " c"],
+        earlier: Sim,
         sim: Sim,
-    ) -> tuple[Float[Array, "backups c"], list[Sim], list[Any]]:
+    ) -> tuple[Float[Array, "backups c"], list[Sim], list[Any], list[Any]]:
         """Return the smallest margins on the way, and the last simulation and memory, by backup.
+
+        With tubes a way ends where its tube is in the terminal set. The last list says whether it
+        ever was, and holds None without tubes.
 
         Args:
             env: the environment.
             backups: backup controllers, each with its memory, under which the other platforms move
                 alike. The other platforms are predicted once.
             first: the h of each constraint at `sim`.
+            earlier: the simulation one step before `sim`.
             sim: the simulation from which the backup controllers act.
         """
+        assert self.terminal is not None
+        terminal = self.terminal
+        bound = self.bound if self._has_tubes else None
         low, high = bounds(env)
         plant = env.agent_platform
 
@@ -640,9 +712,9 @@ class CertifiedRTA(RTA):
             return sim.replace(platforms=platforms, actuators=actuators, remembered=remembered)
 
         def one_step(
-            carry: tuple[Sim, list[Any], list[Any], list[Array]],
-        ) -> tuple[Sim, list[Any], list[Any], list[Array]]:
-            sim, agents, memories, least = carry
+            carry: tuple[Sim, list[Any], list[Any], list[Array], list[Any]],
+        ) -> tuple[Sim, list[Any], list[Any], list[Array], list[Any]]:
+            sim, agents, memories, least, tubes = carry
             later = others_later(env, sim)
             after = later_sim(env, sim, {**later, env.agent: agents[0][0]})
             for i, (backup, _) in enumerate(backups):
@@ -656,22 +728,43 @@ class CertifiedRTA(RTA):
                 moved = moved.replace(control_desired=control, control_actual=control)
                 moved = remember(env, before, moved, env.dt)
                 agents[i] = (state, actuators, moved.remembered)
-                least[i] = jnp.minimum(least[i], self.margins(env, before, moved))
-            return with_agent(after, agents[0]), agents, memories, least
+                h = self.margins(env, before, moved)
+                if bound is not None:
+                    tube, arrived = tubes[i]
+                    tube = backup.next_tube(env, before, moved, bound, tube)
+                    h = jnp.where(arrived, least[i], h - tube.position)
+                    tubes[i] = (tube, arrived | terminal.contains_tube(env, moved, tube))
+                least[i] = jnp.minimum(least[i], h)
+            return with_agent(after, agents[0]), agents, memories, least, tubes
 
         sim = sim.replace(regions={}, status={})
         count = len(backups)
         memories = [memory for _, memory in backups]
         agent = (sim.platforms[env.agent], sim.actuators, sim.remembered)
-        start = (sim, [agent] * count, memories, [first] * count)
-        last, agents, memories, least = repeat(one_step, start, self.horizon)
+        least = [first] * count
+        tubes = []
+        if bound is not None:
+            first_tubes = [backup.first_tube(env, earlier, sim, bound) for backup, _ in backups]
+            least = [first - tube.position for tube in first_tubes]
+            tubes = [(tube, terminal.contains_tube(env, sim, tube)) for tube in first_tubes]
+        start = (sim, [agent] * count, memories, least, tubes)
+        last, agents, memories, least, tubes = repeat(one_step, start, self.horizon)
         ends = [with_agent(last, agent) for agent in agents]
-        return jnp.stack(least), ends, memories
+        arrived = [arrived for _, arrived in tubes] or [None] * count
+        return jnp.stack(least), ends, memories, arrived
 
-    def _may_end(self, env: Environment, end: Sim) -> Bool[Array, ""]:
-        """Return whether a certificate may end in a state."""
+    def _may_end(
+        self, env: Environment, end: Sim, arrived: Bool[Array, ""] | None = None
+    ) -> Bool[Array, ""]:
+        """Return whether a certificate may end in a state.
+
+        Args:
+            env: the environment.
+            end: the simulation at the end of the horizon.
+            arrived: whether the tube was in the terminal set on the way. None without tubes.
+        """
         assert self.terminal is not None
-        inside = self.terminal.contains(env, end)
+        inside = self.terminal.contains(env, end) if arrived is None else arrived
         return inside & _none(self.terminal.faults(env, end, self)) & _finite(end)
 
     def _renew(

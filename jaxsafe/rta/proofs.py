@@ -82,6 +82,9 @@ PROVED_THRUST = (2.0 / 12.0) / 0.2
 PROVED_MARGIN = 2.5e-4 / 0.2
 """Margin that the first step of a certificate must gain, as a share of that speed limit."""
 
+AWAY_GAIN = 0.1
+"""Speed away from the lead of `match_velocity` per foot that the agent is too close [1/s]."""
+
 CLOSE = 1.001
 """Numbers of this ratio count as equal to those of a proof, because the proof has more reserve."""
 
@@ -315,7 +318,7 @@ def velocity_matched_faults(
     terminal: VelocityMatched,
     keeper: type[MatchVelocity],
 ) -> Faults:
-    """Return what is missing for Propositions 6 and 7: `match_velocity` keeps the set."""
+    """Return what is missing for Propositions 6, 7 and 12: `match_velocity` keeps the set."""
     agent = env.agent
     others = {terminal.of, terminal.to} - {agent}
     plant = cast(Aircraft, env.agent_platform)
@@ -368,6 +371,17 @@ def velocity_matched_faults(
             steady, own_speed, any_speed
         ),
     }
+    if rta.bound is not None:
+        followed = [backup for backup in proved if type(backup) is keeper]
+        return faults | _faults_with_bound(
+            env,
+            rta,
+            terminal=terminal,
+            backups=followed,
+            state=state,
+            name=name,
+            extremes=extremes,
+        )
     if type(plant) is Dubins2D:
         zones = [backup.dead_zone for backup in proved if type(backup) is keeper]
         return faults | _faults_in_plane(
@@ -413,6 +427,87 @@ def _faults_in_plane(
         "an aircraft turns too far within a step": ~(
             functools.reduce(jnp.maximum, turns) * env.dt <= 0.85
         ),
+    }
+
+
+def _faults_with_bound(
+    env: Environment,
+    rta: CertifiedRTA,
+    terminal: VelocityMatched,
+    backups: Sequence[MatchVelocity],
+    state: Any,
+    name: str,
+    extremes: Mapping[str, tuple[Number, Number]],
+) -> Faults:
+    """Return what is missing for Propositions 12 and 13.
+
+    Args:
+        env: the environment.
+        rta: the filter, which has a bound.
+        terminal: the terminal set.
+        backups: the backup controllers `match_velocity`.
+        state: the state of the lead.
+        name: the name of the lead.
+        extremes: the smallest and the largest value of each of the lead's controls.
+    """
+    bound = rta.bound
+    assert bound is not None
+    plant = env.agent_platform
+    if type(plant) is not Dubins2D:
+        return {"rta.bound is proved for aircraft in the plane alone": _true()}
+    if bound.delay:
+        return {"rta.bound.delay is not proved for aircraft": _true()}
+    dt = env.dt
+    slowest, fastest = plant.speed_limits
+    limits = [cast(Separation, constraint(env, limit)) for limit in rta.constraints]
+    kept = jnp.stack([limit.minimum + rta.required_margin(env, limit.name) for limit in limits])
+    minimum = jnp.min(jnp.stack([limit.minimum for limit in limits]))
+    outer = jnp.stack([backup.clearance for backup in backups])
+    zones = jnp.stack([backup.dead_zone for backup in backups])
+    ranges = {actuator.name: (actuator.low, actuator.high) for actuator in env.actuators}
+    authority = {
+        control: dt * jnp.minimum(-low, high) for control, (low, high) in ranges.items()
+    } | {control: jnp.zeros_like(dt) for control in plant.inputs if control not in ranges}
+
+    unknown = bound.velocity + AWAY_GAIN * bound.position
+    wrong = 1.2 * (unknown + bound.process * dt)  # η
+    away = AWAY_GAIN * (jnp.max(outer) - terminal.clearance + 0.5 * dt * wrong)  # A
+    difference = terminal.tolerance + away + unknown
+    turn = dt * jnp.maximum(*map(jnp.abs, extremes["heading_rate"]))
+    angle = turn + 1.05 * difference / slowest
+    return {
+        "rta.bound.mass is not proved for aircraft": bound.mass > 0.0,
+        "rta.bound.misalignment is not proved for aircraft": bound.misalignment > 0.0,
+        "rta.bound is larger than velocity_matched is proved for": ~(
+            (wrong <= CLOSE * 0.02 * slowest) & ((away + wrong) * dt <= 0.1 * jnp.min(kept))
+        ),
+        f"rta.bound is proved for a lead of constant speed, and {name!r} may change its speed": (
+            jnp.any(jnp.stack(extremes["acceleration"]) != 0.0)
+        ),
+        f"rta.bound: {name!r} flies too close to the agent's slowest or fastest speed": ~(
+            (state.speed - away - unknown >= slowest) & (state.speed + away + unknown <= fastest)
+        ),
+        f"rta.bound: {name!r} may turn faster than the agent can copy within it": ~(
+            (angle <= authority["heading_rate"]) & (turn <= CLOSE * 0.17)
+        ),
+        "rta.bound: the agent accelerates too slowly for tolerance of velocity_matched": ~(
+            difference <= authority["acceleration"]
+        ),
+        "rta.bound: dead_zone of match_velocity is too small": ~(angle <= jnp.min(zones)),
+        "drift of velocity_matched is less than a step": ~(terminal.drift * CLOSE >= dt),
+        "rta.bound: tolerance of velocity_matched is too small or too large": ~(
+            (terminal.tolerance >= 1.04 * away + wrong)
+            & (terminal.tolerance <= CLOSE * 0.05 * slowest)
+        ),
+        "rta.bound: clearance of velocity_matched is too small": ~(
+            terminal.clearance * CLOSE >= jnp.max(kept) + 1.5 * dt * wrong
+        ),
+        "rta.bound: clearance of match_velocity is too small or too large": ~(
+            (jnp.min(outer) * CLOSE >= terminal.clearance + wrong / (0.8 * AWAY_GAIN))
+            & (jnp.max(outer) <= 2.0 * (minimum - bound.position))
+            & (away <= 0.03 * slowest)
+        ),
+        "rta.bound is proved for steps of at most 1 s": dt > CLOSE,
     }
 
 
