@@ -108,6 +108,10 @@ def test_a_run_has_the_policies_that_it_saved(run: Any, whole: Path) -> None:
         run.policy(seed=3)
     with pytest.raises(ConfigError, match="checkpoint: found 'lest'; choose from last, best"):
         run.policy(checkpoint="lest")
+    with pytest.raises(ConfigError, match=r"checkpoint: found '9+\.\.\.; choose from last, best"):
+        run.policy(checkpoint="9" * 5000)
+    with pytest.raises(ConfigError, match="no step a number of thousands of digits in"):
+        run.policy(checkpoint="9" * 4000)
 
 
 @pytest.mark.thorough

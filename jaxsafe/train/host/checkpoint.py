@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.devices import processes
-from jaxsafe.schema.errors import ConfigError, nearest
+from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.storage.forms import check
 from jaxsafe.types import is_key
 
@@ -238,7 +238,7 @@ class Checkpoints:
     def _read(self, step: int, **args: Any) -> Any:
         if step not in self.steps:
             raise ConfigError(
-                f"checkpoint: no step {step} in {self.directory}; "
+                f"checkpoint: no step {show(step)} in {self.directory}; "
                 f"choose from {nearest(step, self.steps) or 'none'}"
             )
         read, reason = {}, ""

@@ -205,10 +205,13 @@ def load_params(
     checkpoints = Checkpoints(run)
     if not checkpoints.steps:
         raise ConfigError(f"run: {run} has no checkpoint yet")
-    if which not in ("last", "best") and not which.isdecimal():
+    try:
+        step = checkpoints.steps[-1] if which in ("last", "best") else int(which)
+    except ValueError:  # no whole number, or one of thousands of digits
         choices = ["last", "best", *map(str, checkpoints.steps)]
-        raise ConfigError(f"checkpoint: found {which!r}; choose from {nearest(which, choices)}")
-    step = int(which) if which.isdecimal() else checkpoints.steps[-1]
+        raise ConfigError(
+            f"checkpoint: found {show(which)}; choose from {nearest(which, choices)}"
+        ) from None
     content, _ = restore(checkpoints, step, env, config)
     return mapper.place(
         content["best"]["params"] if which == "best" else content["state"].average
