@@ -15,6 +15,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from numpy.lib import format as npy
 
 from jaxsafe import commands
 from jaxsafe.agents import policy_file as policy_module
@@ -342,6 +343,32 @@ def test_policy_files_cannot_run_code_and_broken_ones_are_told_in_one_line(tmp_p
         read_policy(tmp_path / "other.npz")
     with pytest.raises(ConfigError, match="cannot be read: No such file"):
         read_policy(tmp_path / "none.npz")
+
+
+TEBIBYTE = io.BytesIO()
+npy.write_array_header_1_0(TEBIBYTE, {"descr": "<f4", "fortran_order": False, "shape": (2**38,)})
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"no array", b"\x93NUMPY\x03\x00", TEBIBYTE.getvalue()],
+    ids=["empty", "no array", "another version", "1 TiB"],
+)
+@pytest.mark.parametrize("which", [0, -1])
+def test_a_member_of_a_policy_file_that_is_no_array_is_told(
+    tmp_path: Path, content: bytes, which: int
+) -> None:
+    path = tmp_path / "x.npz"
+    with (
+        zipfile.ZipFile(policy_module.find_policy("docking2d")) as old,
+        zipfile.ZipFile(path, "w") as new,
+    ):
+        names = sorted(old.namelist(), key="header.npy".__ne__)
+        for name in names:
+            new.writestr(name, content if name == names[which] else old.read(name))
+    with pytest.raises(ConfigError, match=r"x\.npz: ") as caught:
+        read_policy(path)
+    assert "\n" not in str(caught.value)
 
 
 def rewritten(

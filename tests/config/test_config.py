@@ -1015,6 +1015,22 @@ def test_a_memory_that_changes_its_form_is_told_with_its_part(
     assert re.search(message, fault(lambda: compose(tree)))
 
 
+class LosesVelocity(Spacecraft, type="loses_velocity_of_test"):
+    """A platform whose velocity is of another type after a step."""
+
+    def step(self, state: Any, controls: Any, dt: Any) -> Any:
+        after = super().step(state, controls, dt)
+        return after.replace(velocity=after.velocity.astype(int))
+
+
+def test_a_platform_that_changes_its_form_is_told_with_its_field(tree: dict[str, Any]) -> None:
+    [deputy] = [platform for platform in tree["platforms"] if platform["name"] == "deputy"]
+    deputy["type"] = "loses_velocity_of_test"
+    assert fault(lambda: compose(tree)) == (
+        "platforms.deputy.velocity: is float32[2] after reset and int32[2] after a step"
+    )
+
+
 CYLINDER = {"type": "cylinder", "name": "docking_region", "on": "chief", "radius": 1, "height": 1}
 
 

@@ -103,6 +103,19 @@ def test_every_override_of_the_released_variant_is_explained(task: str) -> None:
     assert [path for path in TASKS[task].released if f"`{path}`" not in page] == []
 
 
+def test_what_no_variant_reproduces_is_told_with_its_numbers() -> None:
+    page = (ROOT / "docs" / "deviations.md").read_text(encoding="utf-8")
+    section = " ".join(page.split("## What no variant reproduces")[1].split("\n## ")[0].split())
+    env = jaxsafe.make("docking2d")
+    [deputy] = [platform for platform in env.platforms if platform.name == env.agent]
+    mean_motion = float(deputy.mean_motion)
+    assert "**Fastest start in docking.**" in section
+    assert "the smaller of 0.2 + 2n‖r‖ and 10 m/s" in section
+    assert f"from {(10.0 - 0.2) / (2.0 * mean_motion):,.0f} m on" in section
+    assert "**Region offsets in space.**" in section
+    assert "by the lead's whole attitude" in section
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_links_lead_to_files(page: Path) -> None:
     links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
@@ -336,6 +349,14 @@ def test_commands_are_those_of_any_shell(page: Path) -> None:
     assert [word for word in words if re.match(r"[\w.]+=.*[\[*?]", word)] == []
     assert [line for line in commands if not line.startswith("#") and " # " in line] == []
     assert re.findall(r"`[\w.]+=\[", text) == []
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=lambda page: page.stem)
+def test_extras_are_installed_from_a_clone_and_quoted(page: Path) -> None:
+    """No index of packages has jaxsafe yet. In zsh bare brackets are a pattern."""
+    installs = re.findall(r"pip install ([^`\n]*)", page.read_text(encoding="utf-8"))
+    assert [words for words in installs if "[" in re.sub(r"'[^']*'", "", words)] == []
+    assert [words for words in installs if re.match(r"(-\S+ )*'?jaxsafe", words)] == []
 
 
 @pytest.mark.slow

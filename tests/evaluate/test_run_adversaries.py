@@ -89,18 +89,16 @@ def test_a_time_limit_that_means_none_leaves_episodes_that_are_cut(
 ) -> None:
     """The limit is more steps than single precision holds."""
 
-    class Attacked(Exception):
+    class AttackError(Exception):
         pass
 
     def attack(env: Any, name: str, num_steps: int, num_envs: int, key: Any) -> Any:
-        raise Attacked(num_steps, num_envs)
+        raise AttackError(num_steps, num_envs)
 
     monkeypatch.setattr(falsify, "attack", attack)
     for limit, length in (("1e38", 15_625), ("50", 502)):  # 15,625 · 64 = 1,000,000
-        with pytest.raises(Attacked) as caught:
-            main(
-                ["env=docking2d", "rta=none", "env.dt=0.1", f"env.terminal.timeout.limit={limit}"]
-            )
+        with pytest.raises(AttackError) as caught:
+            main(["env=docking2d", "rta=none", "env.dt=0.1", f"env.terminal.timeout.limit={limit}"])
         assert caught.value.args == (length, 64)
 
 

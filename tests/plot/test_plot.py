@@ -34,7 +34,7 @@ from jaxsafe.plot.style import (
 from jaxsafe.processors.constraint import KeepIn, KeepOut
 from jaxsafe.processors.status import InRegion
 from jaxsafe.processors.terminal import Holds
-from jaxsafe.runs.figures import _episodes, draw_all
+from jaxsafe.runs.figures import _episodes, draw, draw_all
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
@@ -83,6 +83,11 @@ def entries(figure: Any) -> list[str]:
     """Return the texts of the legend, which is below the panels or in a spare one."""
     legends = [*figure.legends, *(panel.get_legend() for panel in figure.axes)]
     return [text.get_text() for legend in legends if legend for text in legend.get_texts()]
+
+
+def title(figure: Any) -> str:
+    """Return the title of a figure in one line."""
+    return " ".join(figure.get_suptitle().split())
 
 
 def long(panel: Any, line: str = "-") -> list[Any]:
@@ -149,6 +154,18 @@ def test_an_evaluation_is_the_mean_of_its_episodes() -> None:
         "violating_share": 0.2,
         "intervention_share": None,
     }
+
+
+def test_a_share_of_an_evaluation_is_the_mean_of_the_shares_of_its_episodes() -> None:
+    """Episodes count alike here, however long they are. Of all 100 steps 20 % violate."""
+    counts = ((10, 5, 1), (90, 15, 45))
+    log = [
+        {**row, "length": length, "violating_steps": violating, "interventions": interventions}
+        for row, (length, violating, interventions) in zip(evaluated(1, (0,)), counts, strict=True)
+    ]
+    [mean] = evaluation_rows(log, rows(num_seeds=1))
+    assert mean["violating_share"] == pytest.approx((5 / 10 + 15 / 90) / 2)
+    assert mean["intervention_share"] == pytest.approx((1 / 10 + 45 / 90) / 2)
 
 
 @pytest.mark.parametrize("num_seeds", [1, 4])
@@ -346,6 +363,35 @@ def test_figures_come_from_the_log_files_alone(whole: Path, tmp_path: Path) -> N
         image = imread(run / "figures" / name)
         assert image.shape[0] > 300
         assert image[..., :3].std() > 0.05  # the picture is not blank
+
+
+def test_the_title_of_a_figure_tells_what_the_run_is(whole: Path, tmp_path: Path) -> None:
+    for name in ("config.yaml", "progress.jsonl"):
+        shutil.copy(whole / name, tmp_path / name)
+    told = "docking2d, preset engineered_features, ppo, rta none, 3 seeds"
+    for name, figure in draw(tmp_path).items():
+        assert told in title(figure), name
+
+
+def test_the_title_of_a_comparison_tells_what_the_runs_share(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for run in ("one", "other"):
+        (tmp_path / run).mkdir()
+        for name in ("config.yaml", "progress.jsonl", "results.json"):
+            shutil.copy(whole / name, tmp_path / run)
+    titles = []
+
+    def keep(figure: Any, path: Path) -> Path:
+        titles.append(title(figure))
+        return path
+
+    monkeypatch.setattr("jaxsafe.plot.style.save", keep)
+    out = tmp_path / "both.png"
+    assert main([f"run=[{tmp_path / 'one'},{tmp_path / 'other'}]", f"out={out}"]) == 0
+    assert len(titles) == 2
+    told = "docking2d, preset engineered_features, ppo, rta none, 3 seeds"
+    assert all(told in title for title in titles)
 
 
 def diagnostics(num_seeds: int = 4) -> list[dict]:

@@ -455,6 +455,7 @@ def test_a_state_that_is_not_a_number_still_gives_a_control(preset: str) -> None
     _, timestep = step(env, broken, jnp.array([0.5, -0.5]))
     assert np.isfinite(timestep.info.control_actual).all()
     assert not timestep.info.rta.certified
+    assert timestep.info.intervening
 
 
 @pytest.mark.parametrize("task", one_of_each_kind(TASKS, [*DOCKING, "rejoin2d"]))

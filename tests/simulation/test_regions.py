@@ -9,6 +9,7 @@ import pytest
 
 from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.cwh import SpacecraftState
+from jaxsafe.simulation.dubins import Dubins3D
 from jaxsafe.simulation.geometry import (
     angle_between,
     rotation,
@@ -163,6 +164,14 @@ def test_what_is_inside_turns_with_what_carries_the_region() -> None:
     ):
         found = region.place(platforms).inside
         assert {name for name, flag in found.items() if flag} == {inside}
+
+
+def test_an_offset_behind_an_aircraft_stays_level_while_it_climbs_and_banks() -> None:
+    offset = normalise(Aspect(distance=500.0, angle=1.0))
+    level = normalise(Dubins3D(name="lead")).rest().replace(heading=jnp.asarray(2.0))
+    tilted = level.replace(flight_path_angle=jnp.asarray(0.3), roll=jnp.asarray(0.9))
+    np.testing.assert_array_equal(offset.vector(tilted), offset.vector(level))
+    assert float(offset.vector(level)[2]) == 0.0
 
 
 @pytest.mark.parametrize("angle", [0.0, 1.0, -2.5])

@@ -86,6 +86,19 @@ def test_averages_are_over_the_filled_part_only() -> None:
         assert float(means(window, ENV.outcomes, successes)["success_rate"]) == rate
 
 
+def test_a_share_of_steps_is_the_mean_of_the_shares_of_the_episodes() -> None:
+    """Episodes count alike here, however long they are. Of all 100 steps 20 % violate."""
+    episodes = episodes_like(np.zeros((1, 2), np.float32)).replace(
+        length=jnp.array([[10, 90]]),
+        violating_steps=jnp.array([[5, 15]]),
+        interventions=jnp.array([[1, 45]]),
+    )
+    window = push(empty_window(episodes), episodes, jnp.ones((1, 2), bool))
+    row = means(window, ENV.outcomes, ENV.successes)
+    assert float(row["violating_share"]) == pytest.approx((5 / 10 + 15 / 90) / 2)
+    assert float(row["intervention_share"]) == pytest.approx((1 / 10 + 45 / 90) / 2)
+
+
 @pytest.mark.thorough
 def test_the_latest_cost_is_that_of_the_last_episodes() -> None:
     rng = np.random.default_rng(1)

@@ -544,6 +544,31 @@ def test_a_damaged_progress_log_is_told_before_anything_is_done(
 
 
 @pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ('"many"', "not a row of this log: episodes: expected"),
+        ("[1, 2]", "not a row of this log: episodes: expected"),
+        ("[" * 40 + "]" * 40, "not a line of JSON"),
+        ("[" * 10**5 + "]" * 10**5, "not a line of JSON"),
+    ],
+    ids=["text", "list", "nested", "deeply nested"],
+)
+def test_a_run_does_not_go_on_from_a_row_of_another_form(
+    tmp_path: Path, whole: Path, value: str, message: str
+) -> None:
+    run = tmp_path / "run"
+    shutil.copytree(whole, run)
+    (run / "results.json").unlink()
+    log = run / "progress.jsonl"
+    first, second, *others = log.read_text().splitlines(keepends=True)
+    second = re.sub(r'"episodes": \d+', f'"episodes": {value}', second)
+    log.write_text("".join([first, second, *others]))
+    with pytest.raises(ConfigError, match=rf"progress\.jsonl, line 2: {message}"):
+        command.main([f"resume={run}"])
+
+
+@pytest.mark.thorough
 def test_a_run_that_an_older_version_began_does_not_go_on(tmp_path: Path, whole: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(whole, run)
