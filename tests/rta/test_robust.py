@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +13,10 @@ from default_cases import thorough
 import jaxsafe
 from jaxsafe import ConfigError, Environment
 from jaxsafe.envs.docking import BRAKE
-from jaxsafe.rta import Cascade, Simplex, Stage, UncertaintyBound
+from jaxsafe.rta import BackupController, Brake, Cascade, Simplex, Stage, UncertaintyBound
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.simulation.geometry import safe_norm
-from jaxsafe.transition import advance
+from jaxsafe.transition import Others, advance
 from jaxsafe.types import Sim, TimeStep
 
 MARGIN = 2.5e-4
@@ -303,6 +303,24 @@ def test_only_the_last_filter_of_a_cascade_may_have_a_delay() -> None:
 def test_a_bound_is_refused_where_nothing_is_proved_of_it(task: str) -> None:
     with pytest.raises(ConfigError, match=r"^rta\.bound is proved for brake without a horizon"):
         jaxsafe.make(task, {"rta.bound": {"process": 0.001}}, rta="default")
+
+
+class Halt(BackupController, type="halt_of_robust_test"):
+    def control(self, env: Environment, sim: Sim, later: Others) -> jax.Array:
+        return Brake(name="").control(env, sim, later)
+
+
+class ProvedHalt(Halt, type="proved_halt_of_robust_test"):
+    knows_bound: ClassVar[bool] = True
+
+
+def test_a_backup_of_ones_own_must_say_that_its_proof_knows_a_bound() -> None:
+    bound = {"rta.bound": {"process": 0.001}}
+    halt = Simplex(constraints=("velocity_limit",), margin=MARGIN, backups=(Halt(name="halt"),))
+    with pytest.raises(ConfigError, match=r"^rta\.bound is proved for brake without a horizon"):
+        jaxsafe.make("docking2d", bound, rta=halt)
+    proved = halt.replace(backups=(ProvedHalt(name="halt"),))
+    assert jaxsafe.make("docking2d", bound, rta=proved).rta is not None
 
 
 def test_whatever_may_not_be_promised_is_not_certified() -> None:
