@@ -273,6 +273,7 @@ MODES = {
     "double_precision": lambda: jax.enable_x64(True),
     "rank_promotion": lambda: jax.numpy_rank_promotion("raise"),
     "dtype_promotion": lambda: jax.numpy_dtype_promotion("strict"),
+    "tracer_leaks": jax.checking_leaks,
     "no_jit": lambda: jax.disable_jit(),
 }
 

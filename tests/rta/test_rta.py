@@ -305,6 +305,23 @@ def test_an_uncertified_start_becomes_certified_under_an_agent_that_asks_for_not
 
 
 @pytest.mark.thorough
+def test_an_uncertified_start_in_front_of_the_lead_becomes_certified() -> None:
+    """The wingman flies towards the lead, too near for any turn to be certified at first."""
+    env = jaxsafe.make("rejoin2d", rta="default")
+    lead = {"position": [0.0, 0.0], "heading": 0.0, "speed": 275.0}
+    wingman = {"position": [800.0, 0.0], "heading": jnp.pi, "speed": 300.0}
+    state, first = jaxsafe.reset_to(env, {"lead": lead, "wingman": wingman})
+    certified = [bool(first.info.rta.certified)]
+    for _ in range(6):
+        state, timestep = step(env, state, jnp.full(2, jnp.nan))
+        certified.append(bool(timestep.info.rta.certified))
+        assert timestep.info.margins["collision"] > 0.0
+    assert not certified[0]
+    assert certified[-1]
+    assert sorted(certified) == certified
+
+
+@pytest.mark.thorough
 def test_a_certificate_that_is_not_renewed_ends_before_anything_is_violated() -> None:
     """A lead turns faster than it was certified for.
 
