@@ -173,6 +173,36 @@ def dynamics(results: Results) -> str:
     return markdown([*heads, "of the first model of the task"], rows)
 
 
+def robustness(results: Results) -> str:
+    """Return what happens at each level of uncertainty, without a filter and with two."""
+    heads = (
+        "task, uncertainty",
+        "filter",
+        "attacked: violating steps",
+        "worst h [m/s]",
+        "policy: violating steps",
+        "success",
+        "Δv [m/s]",
+        "steps altered",
+        "change of control a step",
+    )
+    rows = [
+        (
+            f"{row['task']}, {row['level']:g} × bound",
+            f"`{row['rta']}`",
+            f"{row['attacked']:.1%}",
+            f"{row['attacked_worst_margin']:.4f}",
+            f"{row['episode_safety_violation_rate']:.2%}",
+            f"{row['success_rate']:.1%}",
+            f"{row['control_usage']:.2f}",
+            "–" if row["rta"] == "none" else f"{row['intervention_rate']:.1%}",
+            f"{row['chatter']:.2%}",
+        )
+        for row in sorted(results["rows"], key=lambda row: (row["task"], row["level"]))
+    ]
+    return markdown(heads, rows)
+
+
 def ppo(results: Results) -> str:
     """Return the table of thousand samples a second, medians."""
     rates = _samples(results)
@@ -818,6 +848,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("scaling", scaling, "docs/scaling.md"),
     ("scaling", projection, "docs/scaling.md"),
     ("memory", memory, "docs/scaling.md"),
+    ("robustness", robustness, "docs/safety/attacks.md"),
     ("adapters", adapters, "docs/adapters/gymnasium.md"),
     ("rta", filter_calls, "docs/safety/cost.md"),
     ("rta", filter_changes, "docs/safety/cost.md"),

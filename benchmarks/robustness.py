@@ -1,0 +1,144 @@
+"""Measure what a bound on the uncertainty costs, and what the world does to a filter without one.
+
+The filter `robust` has the bound `BOUND`, and the worlds are as bad as that or worse:
+`jaxsafe.evaluate.bounded_worlds.world_at`. In them fly the policies that come with the package, and
+an adversary that pushes towards the chief: without a filter, with the `default` filter, which has
+no bound, and with `robust`.
+
+Results are written to `benchmarks/results/robustness.json`, the figure to
+`docs/figures_robust.png`, and the table of docs/safety/attacks.md is printed:
+
+    python benchmarks/robustness.py [episodes=200] [levels=0,0.5,1] [tasks=docking2d,docking3d]
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from isolated import words
+from matplotlib.figure import Figure
+from tables import robustness
+
+import jaxsafe
+from jaxsafe.config import override
+from jaxsafe.environment import Environment
+from jaxsafe.evaluate.bounded_worlds import world_at
+from jaxsafe.evaluate.run_adversaries import attack
+from jaxsafe.plot.style import GREY, save, styled
+from jaxsafe.storage import provenance
+from jaxsafe.storage.files import write_json
+from jaxsafe.transition import bounds
+
+OUT = Path(__file__).parent / "results" / "robustness.json"
+FIGURE = Path(__file__).parent.parent / "docs" / "figures_robust.png"
+FILTERS = ("none", "default", "robust")
+BOUND = {"process": 0.01, "mass": 0.05, "misalignment": 0.05, "position": 1.0, "velocity": 0.01}
+"""A push of 1 cm/s a step, 5 % of the mass, 3° of the thrust, and errors of 1 m and 1 cm/s."""
+
+ATTACK_STEPS = 400
+"""Number of steps of the adversary in each episode."""
+
+CHATTER_STEPS = 300
+"""Number of steps in which the changes of controls are measured."""
+
+
+def world(task: str, rta: str, level: float) -> Environment:
+    """Return a world at a level, in which another filter may fly, or none."""
+    robust = world_at(jaxsafe.make(task, {"rta.bound": BOUND}, rta="robust"), level)
+    if rta == "robust":
+        return robust
+    if rta == "none":
+        return override(robust, {"rta": None})
+    model = {f"rta.model.{path}": value for path, value in robust.rta.model.items()}
+    nominal = jaxsafe.make(task, rta=rta)
+    return override(robust, {"rta": nominal.rta, **model})
+
+
+def chatter(env: Environment, policy: Any, episodes: int) -> float:
+    """Return the mean change of a control from step to step, as a share of its range."""
+    low, high = bounds(env)
+    steps = jaxsafe.rollout(env, policy, jax.random.key(1), CHATTER_STEPS, num_envs=episodes)
+    control = steps.info.control_actual
+    change = jnp.mean(jnp.abs(control[1:] - control[:-1]) / (high - low), axis=-1)
+    return float(jnp.sum(jnp.where(steps.done[:-1], 0.0, change)) / jnp.sum(~steps.done[:-1]))
+
+
+def measure(task: str, rta: str, level: float, episodes: int) -> dict[str, Any]:
+    """Fly whole episodes and return what users ask for."""
+    env = world(task, rta, level)
+    policy = jaxsafe.load_policy(task)
+    found = jaxsafe.evaluate(env, policy, jax.random.key(0), episodes)
+    names = (
+        "success_rate",
+        "control_usage",
+        "episode_length",
+        "safety_violation_rate",
+        "episode_safety_violation_rate",
+        "episode_violation_severity_max",
+        "intervention_rate",
+    )
+    row = {"task": task, "rta": rta, "level": level, "episodes": episodes}
+    row |= {name: found[name] for name in names} | {"chatter": chatter(env, policy, episodes)}
+    pushed = attack(env, "inward", ATTACK_STEPS, episodes, jax.random.key(2))
+    row["attacked"] = pushed["violating_steps"] / pushed["steps"]
+    row["attacked_worst_margin"] = pushed["worst_margin_inside"]
+    print(json.dumps(row), flush=True)
+    return row
+
+
+@styled
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Draw violations, success and control usage against the level, a row of panels a task."""
+    tasks = list(dict.fromkeys(row["task"] for row in rows))
+    figure = Figure(figsize=(9.6, 2.9 * len(tasks)), layout="constrained")
+    panels = np.atleast_2d(figure.subplots(len(tasks), 3))
+    quantities = {
+        "attacked": ("violating steps under attack [%]", 100.0),
+        "success_rate": ("success rate [%]", 100.0),
+        "control_usage": ("control usage Δv [m/s]", 1.0),
+    }
+    for task, line in zip(tasks, panels, strict=True):
+        for (name, (label, unit)), panel in zip(quantities.items(), line, strict=True):
+            for rta in FILTERS:
+                mine = [row for row in rows if (row["task"], row["rta"]) == (task, rta)]
+                levels = [row["level"] for row in mine]
+                values = [unit * row[name] for row in mine]
+                panel.plot(levels, values, marker="o", markersize=3, label=rta)
+            panel.axvline(1.0, color=GREY, linewidth=0.8, linestyle=":")
+            panel.set_xlabel("uncertainty, as a multiple of the bound")
+            panel.set_ylabel(label)
+            panel.set_title(task)
+    panels[0][0].legend(title="filter")
+    save(figure, path)
+
+
+def main() -> None:
+    """Run the command."""
+    options = words(episodes="200", levels="0,0.5,1,1.5,2", tasks="docking2d,docking3d")
+    episodes = int(options["episodes"])
+    rows = [
+        measure(task, rta, level, episodes)
+        for task in options["tasks"].split(",")
+        for rta in FILTERS
+        for level in map(float, options["levels"].split(","))
+    ]
+    results = {
+        "command": f"python benchmarks/robustness.py {' '.join(sys.argv[1:])}".strip(),
+        "bound": BOUND,
+        "commit": provenance.commit(),
+        "versions": provenance.versions(),
+        "rows": rows,
+    }
+    write_json(OUT, results)
+    draw(rows, FIGURE)
+    print(robustness(results))
+
+
+if __name__ == "__main__":
+    main()
