@@ -198,7 +198,7 @@ def test_braxs_own_trainers_run(algorithm: str, monkeypatch: pytest.MonkeyPatch)
     assert brax_docking2d.train(algorithm)["eval/episode_reward"] > -2.0
 
 
-MODES = CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING
+MODES = CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING | {"disable_jit": jax.disable_jit}
 
 
 @pytest.mark.parametrize("mode", MODES)

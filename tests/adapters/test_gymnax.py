@@ -158,7 +158,7 @@ def test_a_mixed_action_is_a_dict_by_actuator_or_one_vector(make: Any) -> None:
         )
 
 
-MODES = CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING
+MODES = CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING | {"disable_jit": jax.disable_jit}
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -1,5 +1,6 @@
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 from test_modes import CHECKED_WHILE_RUNNING, CHECKED_WHILE_TRACING
@@ -117,7 +118,7 @@ def test_its_ppo_learns_docking(monkeypatch: pytest.MonkeyPatch) -> None:
         assert example.success_rate(model, deterministic) >= 0.95
 
 
-MODES = CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING
+MODES = CHECKED_WHILE_TRACING | CHECKED_WHILE_RUNNING | {"disable_jit": jax.disable_jit}
 
 
 @pytest.mark.parametrize("mode", MODES)
