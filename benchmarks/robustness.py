@@ -55,7 +55,8 @@ def world(task: str, rta: str, level: float) -> Environment:
         return robust
     if rta == "none":
         return override(robust, {"rta": None})
-    model = {f"rta.model.{path}": value for path, value in robust.rta.model.items()}
+    known = {} if robust.rta is None else robust.rta.model
+    model = {f"rta.model.{path}": value for path, value in known.items()}
     nominal = jaxsafe.make(task, rta=rta)
     return override(robust, {"rta": nominal.rta, **model})
 

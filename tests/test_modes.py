@@ -174,3 +174,24 @@ def test_a_state_may_be_donated_after_an_eager_start(rta: str | None) -> None:
         kept = jax.tree.leaves((env, place, given, timestep))
         assert not any(leaf.is_deleted() for leaf in kept)
         np.testing.assert_array_equal(timestep.observation, before)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("rta", "mode"),
+    [
+        ("explicit_simplex", "rbg"),
+        ("explicit_simplex", "unsafe_rbg"),
+        ("explicit_asif", "nans"),
+        ("implicit_asif", "tracer_leaks"),
+        ("robust", "nans"),
+        ("robust", "key_reuse"),
+    ],
+)
+def test_other_filters_run_in_the_modes_that_are_checked_while_running(rta: str, mode: str) -> None:
+    jax.clear_caches()
+    with CHECKED_WHILE_RUNNING[mode]():
+        env = jaxsafe.make("docking2d", rta=rta)
+        state, _ = jaxsafe.reset(env, jax.random.key(0))
+        _, timestep = jax.jit(jaxsafe.step)(env, state, jnp.ones(2))
+        assert jnp.isfinite(timestep.info.rta.predicted_margin)
