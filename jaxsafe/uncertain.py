@@ -66,7 +66,12 @@ def step_key(words: Any, num_steps: Array) -> Any:
     """Return the key of a step, given the words of that of the episode, or () for ()."""
     if isinstance(words, tuple):
         return words
-    return jax.random.fold_in(jax.random.wrap_key_data(words, impl="threefry2x32"), num_steps)
+    return jax.random.fold_in(episode_key(words), num_steps)
+
+
+def episode_key(words: Array) -> Key:
+    """Return the key that `episode_words` stand for, whatever kind of keys JAX makes."""
+    return jax.random.wrap_key_data(words, impl="threefry2x32")
 
 
 def part_key(key: Any, index: int) -> Any:

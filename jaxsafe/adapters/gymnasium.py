@@ -30,7 +30,7 @@ from jaxsafe.adapters.packed_batch import Episodes, PackedBatch
 from jaxsafe.environment import Environment, reset_to
 from jaxsafe.schema.errors import ConfigError, nearest
 from jaxsafe.types import Key
-from jaxsafe.uncertain import random_parts
+from jaxsafe.uncertain import episode_key, random_parts
 
 
 class _Chains:
@@ -80,7 +80,7 @@ class _Chains:
         keys = self._batch.now.state.key  # each environment has disturbances of its own
         for index in np.flatnonzero(mask):
             alone = np.arange(len(mask)) == index
-            self._batch.place(alone, placed.with_key(jax.random.wrap_key_data(keys[index])))
+            self._batch.place(alone, placed.with_key(episode_key(keys[index])))
 
     def _begin_chains(self, mask: np.ndarray, seeds: Sequence[int | None]) -> None:
         """Begin a chain in each environment of the mask that has a seed or needs a chain."""

@@ -221,10 +221,6 @@ def _check_randomized(env: Environment) -> None:
 
     Every path must lead to one number, and every number of its interval must be allowed there.
     """
-
-    def convert(value: Any, field: Any, place: str) -> Any:
-        return to_value(one_number(value, field, place), field, place)
-
     leaves: dict[int, str] = {}
     for path, interval in env.randomize.items():
         if path.split(".")[0] == "randomize":
@@ -239,7 +235,7 @@ def _check_randomized(env: Environment) -> None:
             raise ConfigError(f"randomize.{path}: expected finite bounds, found [{low}, {high}]")
         for value in (low, high, *([0.0] if low < 0.0 < high else [])):
             try:
-                changed = set_path(env, path, value, convert)
+                changed = set_path(env, path, value, _as_one_number)
                 changed = follow(changed, env.tied, [path], to_value)
                 if _shapes(changed) != _shapes(env):
                     raise ConfigError(
@@ -259,12 +255,13 @@ def _check_randomized(env: Environment) -> None:
         leaves[index] = path
 
 
+def _as_one_number(value: Any, field: Any, place: str) -> Any:
+    """Convert a value for `set_path`, of a field that holds one number or a mapping of such."""
+    return to_value(one_number(value, field, place), field, place)
+
+
 def _check_model(env: Environment) -> None:
     """Check that a filter's own numbers are each allowed in the place of one of the environment."""
-
-    def convert(value: Any, field: Any, place: str) -> Any:
-        return to_value(one_number(value, field, place), field, place)
-
     for path, value in env.rta.model.items() if env.rta else ():
         if isinstance(value, Tracer):
             continue
@@ -273,7 +270,7 @@ def _check_model(env: Environment) -> None:
                 raise ConfigError(
                     f"{path}: expected the path of a number that a filter predicts with"
                 )
-            changed = set_path(env, path, np.asarray(value).tolist(), convert)
+            changed = set_path(env, path, np.asarray(value).tolist(), _as_one_number)
             if _shapes(changed) != _shapes(env):
                 raise ConfigError(f"{path}: expected the path of one number, found that of a list")
             _check_problems(changed)

@@ -132,21 +132,8 @@ class Dubins2D(Platform, type="dubins2d"):
     def can_be_pushed(self) -> bool:
         return True
 
-    def pushed(
-        self,
-        state: Dubins2DState,
-        acceleration: Float[Array, " 2"],
-        wind: Float[Array, " 2"],
-        dt: Seconds,
-    ) -> Dubins2DState:
-        """Return the state after a step in which a disturbance acted besides the controls.
-
-        The velocity that it leaves decides heading and speed, which stay within
-        the limits.
-        """
-        velocity = state.velocity + dt * acceleration
+    def with_velocity(self, state: Dubins2DState, velocity: Float[Array, " 2"]) -> Dubins2DState:
         return state.replace(
-            position=state.position + dt * (wind + 0.5 * dt * acceleration),
             heading=state.heading + _turn(state.velocity, velocity),
             speed=jnp.clip(safe_norm(velocity), *self.speed_limits),
         )
@@ -305,26 +292,11 @@ class Dubins3D(Platform, type="dubins3d"):
     def can_be_pushed(self) -> bool:
         return True
 
-    def pushed(
-        self,
-        state: Dubins3DState,
-        acceleration: Float[Array, " 3"],
-        wind: Float[Array, " 3"],
-        dt: Seconds,
-    ) -> Dubins3DState:
-        """Return the state after a step in which a disturbance acted besides the controls.
-
-        The velocity that it leaves decides heading, flight path angle and speed, which stay within
-        the limits.
-        """
-        velocity = state.velocity + dt * acceleration
-        across = safe_norm(velocity[:2])
+    def with_velocity(self, state: Dubins3DState, velocity: Float[Array, " 3"]) -> Dubins3DState:
+        climb = jnp.arctan2(-velocity[2], safe_norm(velocity[:2]))
         return state.replace(
-            position=state.position + dt * (wind + 0.5 * dt * acceleration),
             heading=state.heading + _turn(state.velocity, velocity),
-            flight_path_angle=jnp.clip(
-                jnp.arctan2(-velocity[2], across), *self.flight_path_angle_limits
-            ),
+            flight_path_angle=jnp.clip(climb, *self.flight_path_angle_limits),
             speed=jnp.clip(safe_norm(velocity), *self.speed_limits),
         )
 

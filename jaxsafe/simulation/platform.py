@@ -119,10 +119,12 @@ class Platform(Component):
             wind: a velocity w that adds wΔt to the position, shape (d,).
             dt: length of the step [s].
         """
-        return state.replace(
-            position=state.position + dt * (wind + 0.5 * dt * acceleration),
-            velocity=state.velocity + dt * acceleration,
-        )
+        pushed = self.with_velocity(state, state.velocity + dt * acceleration)
+        return pushed.replace(position=state.position + dt * (wind + 0.5 * dt * acceleration))
+
+    def with_velocity(self, state: Any, velocity: Float[Array, " d"]) -> Any:
+        """Return a state with another velocity, shape (d,), within the limits of the platform."""
+        return state.replace(velocity=velocity)
 
     def derivative(self, state: Any, controls: Controls) -> Any:
         """Return the time derivative f(x) + g(x)u, Eq. (3), as a record of the state's class."""

@@ -672,20 +672,22 @@ def test_importing_jaxsafe_is_enough() -> None:
     )
 
 
-def test_disturbances_differ_between_environments_that_start_alike() -> None:
-    gusts = {
-        "type": "gusts",
-        "name": "gusts",
-        "on": "deputy",
-        "deviation": 0.01,
-        "time_constant": 9,
-    }
-    envs = GymVectorEnv("docking2d", 2, overrides={"uncertainty": [gusts]})
-    start = {"deputy": {"position": [100.0, 0.0], "velocity": [0.0, 0.1]}}
-    rows = []
-    for _ in range(2):
-        observations, _ = envs.reset(seed=3, options={"start": start})
-        np.testing.assert_array_equal(observations[0], observations[1])
-        rows.append(envs.step(np.zeros((2, 2), np.float32))[0])
-    assert not np.array_equal(rows[0][0], rows[0][1])
-    np.testing.assert_array_equal(rows[0], rows[1])  # equal seeds give equal episodes
+@pytest.mark.parametrize("kind", ["threefry2x32", "rbg"])
+def test_disturbances_differ_between_environments_that_start_alike(kind: str) -> None:
+    with jax.default_prng_impl(kind):
+        gusts = {
+            "type": "gusts",
+            "name": "gusts",
+            "on": "deputy",
+            "deviation": 0.01,
+            "time_constant": 9,
+        }
+        envs = GymVectorEnv("docking2d", 2, overrides={"uncertainty": [gusts]})
+        start = {"deputy": {"position": [100.0, 0.0], "velocity": [0.0, 0.1]}}
+        rows = []
+        for _ in range(2):
+            observations, _ = envs.reset(seed=3, options={"start": start})
+            np.testing.assert_array_equal(observations[0], observations[1])
+            rows.append(envs.step(np.zeros((2, 2), np.float32))[0])
+        assert not np.array_equal(rows[0][0], rows[0][1])
+        np.testing.assert_array_equal(rows[0], rows[1])  # equal seeds give equal episodes
