@@ -299,7 +299,7 @@ def test_only_the_last_filter_of_a_cascade_may_have_a_delay() -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("task", ["docking2d_oriented", "rejoin2d"])
+@pytest.mark.parametrize("task", ["docking2d_oriented", "rejoin3d"])
 def test_a_bound_is_refused_where_nothing_is_proved_of_it(task: str) -> None:
     with pytest.raises(ConfigError, match=r"^rta\.bound is proved for brake without a horizon"):
         jaxsafe.make(task, {"rta.bound": {"process": 0.001}}, rta="default")
