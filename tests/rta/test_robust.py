@@ -299,9 +299,15 @@ def test_only_the_last_filter_of_a_cascade_may_have_a_delay() -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("task", ["docking2d_oriented", "rejoin3d"])
-def test_a_bound_is_refused_where_nothing_is_proved_of_it(task: str) -> None:
-    with pytest.raises(ConfigError, match=r"^rta\.bound is proved for brake without a horizon"):
+@pytest.mark.parametrize(
+    ("task", "proved"),
+    [
+        ("docking2d_oriented", "brake without a horizon"),
+        ("rejoin3d", "aircraft in the plane alone"),
+    ],
+)
+def test_a_bound_is_refused_where_nothing_is_proved_of_it(task: str, proved: str) -> None:
+    with pytest.raises(ConfigError, match=rf"^rta\.bound is proved for {proved}"):
         jaxsafe.make(task, {"rta.bound": {"process": 0.001}}, rta="default")
 
 
