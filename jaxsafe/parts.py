@@ -8,6 +8,7 @@ docs/extend_rta.md show each kind.
 
 from jaxsafe.agents.features import Features
 from jaxsafe.agents.networks import Network
+from jaxsafe.control.law import ControlLaw
 from jaxsafe.environment import Environment
 from jaxsafe.envs.task import Task, register
 from jaxsafe.processors.constraint import Constraint
@@ -87,6 +88,7 @@ __all__ = [
     "Constraint",
     "ConstraintName",
     "Continuous",
+    "ControlLaw",
     "Controller",
     "Dimensionless",
     "Direction",

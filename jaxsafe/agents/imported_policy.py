@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsafe.agents.agent import num_outputs
-from jaxsafe.agents.distributions import Categorical, Distribution, action_distribution
+from jaxsafe.agents.distributions import Categorical, action_distribution
 from jaxsafe.agents.networks import MAX_LAYERS, Params
 from jaxsafe.agents.onnx_reader import Network, read_graph
 from jaxsafe.environment import Environment
-from jaxsafe.rollout import Policy
+from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.schema.errors import ConfigError, nearest
 from jaxsafe.storage.archive import open_archive
 
@@ -34,6 +34,14 @@ ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {
 
 MAX_NAMES = 200
 """Most letters that a message repeats of the names in a file."""
+
+
+class Choice(Protocol):
+    """What is known of the actions of a policy: their mode."""
+
+    def mode(self) -> Array:
+        """Return the actions."""
+        ...
 
 
 @jax.tree_util.register_static
@@ -50,7 +58,7 @@ class ForeignAgent:
         """Return the observation as it is. It is what the network sees."""
         return observation
 
-    def distribution(self, env: Environment, params: Params, inputs: Array) -> Distribution:
+    def distribution(self, env: Environment, params: Params, inputs: Array) -> Choice:
         """Return a distribution for one observation or a batch. Only its mode means something."""
         out = jnp.vectorize(lambda one: self.network(params, one), signature="(o)->(a)")(inputs)
         return action_distribution(
@@ -60,7 +68,9 @@ class ForeignAgent:
             choose=lambda logits, _, points: Categorical(logits=logits, points=points),
         )
 
-    def policy(self, env: Environment, params: Params, deterministic: Array | bool) -> Policy:
+    def policy(
+        self, env: Environment, params: Params, deterministic: Array | bool
+    ) -> Policy | RecurrentPolicy:
         """Return a function of key and observations that returns an action for each observation."""
         return lambda key, observation: self.distribution(
             env, params, self.inputs(env, observation)

@@ -10,19 +10,21 @@ import io
 import json
 import os
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.agents.agent import Agent, check_agent
+from jaxsafe.agents.callables import CONTROLLER, find_law
 from jaxsafe.agents.networks import OUTPUT, Params
 from jaxsafe.agents.trained_policy import (
     TrainedPolicy,
     TrainedRecurrentPolicy,
     trained_policy,
 )
+from jaxsafe.control.law import LawPolicy
 from jaxsafe.environment import Environment
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.convert import to_component, to_data
@@ -127,22 +129,41 @@ def with_networks(agent: Any) -> Any:
     return {"actor": {"type": "mlp", "hidden": agent["hidden"]}, **rest}
 
 
+@overload
 def load_policy(
-    policy: str | os.PathLike, deterministic: bool = True
-) -> TrainedPolicy | TrainedRecurrentPolicy:
+    policy: str | os.PathLike, deterministic: bool = True, env: None = None
+) -> TrainedPolicy | TrainedRecurrentPolicy: ...
+
+
+@overload
+def load_policy(
+    policy: str | os.PathLike, deterministic: bool = True, *, env: Environment
+) -> TrainedPolicy | TrainedRecurrentPolicy | LawPolicy: ...
+
+
+def load_policy(
+    policy: str | os.PathLike, deterministic: bool = True, env: Environment | None = None
+) -> TrainedPolicy | TrainedRecurrentPolicy | LawPolicy:
     """Return `policy(key, observation) -> action`. Observations may have leading batch axes.
 
     A policy that remembers is a `RecurrentPolicy`, which `rollout` and `evaluate` take as well.
 
     Args:
         policy: the name of a task, for the policy that comes with the package, or a policy file
-            such as `runs/docking3d/policy/seed_0.npz`.
+            such as `runs/docking3d/policy/seed_0.npz`, or `controller/NAME` for a classical
+            controller.
         deterministic: whether to act by the mode of the distribution over actions. The key then
             means nothing.
+        env: the environment that a classical controller shall fly. Other policies know theirs.
 
     Raises:
         ConfigError: there is no such policy, or the file holds something else.
     """
+    name = str(policy)
+    if name.startswith(CONTROLLER):
+        if env is None:
+            raise ConfigError(f"env: missing; the environment in which {name} shall act")
+        return find_law(name, env).policy(env)
     return trained_policy(*read_policy(find_policy(policy)), deterministic=deterministic)
 
 

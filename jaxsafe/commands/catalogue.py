@@ -17,6 +17,7 @@ from jaxsafe.agents.agent import Agent
 from jaxsafe.agents.features import Features
 from jaxsafe.agents.networks import Network
 from jaxsafe.commands.help_text import Row
+from jaxsafe.control.law import ControlLaw
 from jaxsafe.environment import Environment
 from jaxsafe.processors.constraint import Constraint
 from jaxsafe.processors.observation import Observation
@@ -66,6 +67,7 @@ SECTIONS = {
     "rta": Section("Filters", (RTA, UncertaintyBound, Stage, Strengthening)),
     "backups": Section("Backup controllers", (BackupController,)),
     "terminal_set": Section("Terminal sets", (TerminalSet,)),
+    "control_laws": Section("Control laws", (ControlLaw,)),
     "agent": Section("Agents", (Agent, Features, Network)),
     "ppo": Section("PPO", (PPO,)),
 }

@@ -61,6 +61,7 @@ def main(argv: Sequence[str]) -> int:
     """Run the command and return its exit code."""
     claim_cores()
     enable_compilation_cache()
+    from jaxsafe.agents.callables import draws
     from jaxsafe.commands.evaluation import Film, evaluate
     from jaxsafe.commands.policies import load, load_foreign
     from jaxsafe.train.host.results import table
@@ -69,12 +70,13 @@ def main(argv: Sequence[str]) -> int:
     foreign = options.is_foreign()
     if foreign:
         options.refuse_beside(["checkpoint"], "for a policy from elsewhere")
-    if foreign and options.deterministic is False:
+    if foreign and options.deterministic is False and not draws(options.run):
         raise ConfigError(
             "deterministic: expected true or nothing, found False; "
             "a policy from elsewhere acts by its mode"
         )
-    kinds = KINDS[True if foreign else options.deterministic]
+    chosen = options.deterministic
+    kinds = KINDS[True if foreign and chosen is None else chosen]
     film = None
     if options.render is None:
         options.refuse_beside(["film", "film_seed"], "without render=gif or render=mp4")

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.callables import is_callable
 from jaxsafe.agents.imported_policy import ForeignAgent
 from jaxsafe.agents.networks import Params
 from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
@@ -47,9 +48,10 @@ class Subject(NamedTuple):
 
 
 def load_foreign(options: PolicyOptions) -> Subject:
-    """Return a policy that was trained elsewhere, to act in a task.
+    """Return a policy that was trained elsewhere or not at all, to act in a task.
 
-    Which files can be read stands in `jaxsafe.agents.imported_policy`.
+    Which files can be read stands in `jaxsafe.agents.imported_policy`, and which names are known in
+    `jaxsafe.agents.callables`.
 
     Args:
         options: the options of the command, which name the policy and the task.
@@ -63,7 +65,7 @@ def load_foreign(options: PolicyOptions) -> Subject:
     about = {
         "env": options.task,
         "preset": path.name,
-        "algorithm": "unknown",
+        "algorithm": "not trained" if is_callable(options.run) else "unknown",
         "seeds": 1,
         "seed": 0,
         "steps": 0,
@@ -75,7 +77,7 @@ def load_foreign(options: PolicyOptions) -> Subject:
         mapper=mapper,
         params=params,
         facts=about,
-        place=Path("evaluations") / path.stem,
+        place=Path("evaluations") / path.stem.replace(":", "_"),
     )
 
 

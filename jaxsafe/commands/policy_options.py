@@ -10,6 +10,7 @@ import zipfile
 from pathlib import Path
 from typing import Annotated, Any
 
+from jaxsafe.agents.callables import is_callable, read_callable
 from jaxsafe.agents.imported_policy import ACTIVATIONS, ForeignPolicy, read_foreign
 from jaxsafe.commands.environment_options import EnvironmentOptions
 from jaxsafe.commands.options import Option
@@ -27,8 +28,10 @@ class PolicyOptions(EnvironmentOptions):
     ]
     """A run directory, a policy file (.npz), or pretrained/TASK for one that comes with jaxsafe.
 
-    With env=TASK it may also be a policy from elsewhere: an .onnx file, or an .npz with the layers
-    kernel_0, bias_0, kernel_1, … Add actions=discrete if it returns logits.
+    With env=TASK it may also be controller/NAME for a classical controller of the task, or
+    MODULE:NAME for a function policy(key, observation) of your own. Or it is a policy from
+    elsewhere: an .onnx file, or an .npz with the layers kernel_0, bias_0, kernel_1, … Add
+    actions=discrete if it returns logits.
     """
     env: str | None = None
     """Another environment with the same observation and action: a task or a file.
@@ -53,7 +56,7 @@ class PolicyOptions(EnvironmentOptions):
         return short_name(self.env or "")
 
     def is_foreign(self) -> bool:
-        """Return whether the policy was trained elsewhere.
+        """Return whether the policy was trained elsewhere, or not at all.
 
         Raises:
             ConfigError: the options do not fit the policy.
@@ -63,9 +66,10 @@ class PolicyOptions(EnvironmentOptions):
                 f"run: {self.run} is a task; name a run of it, "
                 f"or pretrained/{self.run} for the policy that comes with jaxsafe"
             )
+        named = is_callable(self.run)
         names = _names(self.run) if self.run.endswith(".npz") else set()
         graph = self.run.endswith(".onnx")
-        if self.env is None and (graph or "kernel_0.npy" in names):
+        if self.env is None and (named or graph or "kernel_0.npy" in names):
             raise ConfigError(
                 f"env: missing; the task in which {self.run} shall act, for instance env=docking2d"
             )
@@ -74,15 +78,18 @@ class PolicyOptions(EnvironmentOptions):
         self.refuse_beside(
             [] if layers else ["activation"], "but for the layers in an .npz with env=TASK"
         )
-        return graph or layers
+        return named or graph or layers
 
     def read_foreign(self) -> ForeignPolicy:
-        """Return the policy, which was trained elsewhere.
+        """Return the policy, which was trained elsewhere or not at all.
 
         Raises:
-            ConfigError: there is no such environment, or `read_foreign` refuses the policy.
+            ConfigError: there is no such environment or policy, or the policy does not fit.
         """
-        return read_foreign(Path(self.run), self.make(str(self.env)), self.activation)
+        env = self.make(str(self.env))
+        if is_callable(self.run):
+            return read_callable(self.run, env)
+        return read_foreign(Path(self.run), env, self.activation)
 
     def change(self, trained: Environment, name: str) -> Environment:
         """Return the environment in which the policies of a run act.

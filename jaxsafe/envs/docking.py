@@ -11,8 +11,9 @@ from typing import Any, Literal
 
 import jax.numpy as jnp
 
+from jaxsafe.control.docking import LQR, MPC, PD, Align
 from jaxsafe.environment import Environment
-from jaxsafe.envs.task import Filters, Task
+from jaxsafe.envs.task import Controllers, Filters, Task
 from jaxsafe.processors.constraint import Constraint, SpeedLimit
 from jaxsafe.processors.observation import Observation, Observe, ObserveAngle, ObserveStatus
 from jaxsafe.processors.reward import (
@@ -329,12 +330,17 @@ FILTERS_ORIENTED: Filters = {
     "explicit_asif": lambda: _explicit_asif(TURN["backups"][0]),
 }
 
+CONTROLLERS: Controllers = {"pd": PD, "lqr": LQR, "mpc": MPC}
+
+CONTROLLERS_ORIENTED: Controllers = {"align": Align}
+
 TASKS = (
     Task(
         name="docking2d",
         environment=lambda: docking(2),
         released=RELEASED,
         filters=FILTERS,
+        controllers=CONTROLLERS,
         gymnasium_id="jaxsafe/Docking2D-v0",
         recipe="docking2d.yaml",
         paper_steps=340_000,
@@ -344,6 +350,7 @@ TASKS = (
         environment=lambda: docking(3),
         released=RELEASED,
         filters=FILTERS,
+        controllers=CONTROLLERS,
         gymnasium_id="jaxsafe/Docking3D-v0",
         recipe="docking3d.yaml",
         paper_steps=660_000,
@@ -353,6 +360,7 @@ TASKS = (
         environment=docking_oriented,
         released=RELEASED_ORIENTED,
         filters=FILTERS_ORIENTED,
+        controllers=CONTROLLERS_ORIENTED,
         gymnasium_id="jaxsafe/Docking2DOriented-v0",
         recipe="docking2d_oriented.yaml",
         paper_steps=1_500_000,
@@ -365,6 +373,7 @@ STARTERS = (
         name="docking1d",
         environment=lambda: docking(1),
         filters=FILTERS,
+        controllers=CONTROLLERS,
         gymnasium_id="jaxsafe/Docking1D-v0",
         recipe="docking1d.yaml",
         starter=True,

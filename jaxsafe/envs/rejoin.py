@@ -10,8 +10,9 @@ from typing import Any
 
 import jax.numpy as jnp
 
+from jaxsafe.control.pursuit import Pursuit
 from jaxsafe.environment import Environment
-from jaxsafe.envs.task import Filters, Task
+from jaxsafe.envs.task import Controllers, Filters, Task
 from jaxsafe.processors.constraint import Constraint, Separation
 from jaxsafe.processors.observation import Observation, Observe, ObserveRegion
 from jaxsafe.processors.reward import (
@@ -312,12 +313,15 @@ FILTERS_3D: Filters = {
     "explicit_asif": lambda: _explicit_asif(MATCH_3D["backups"][0]),
 }
 
+CONTROLLERS: Controllers = {"pursuit": Pursuit}
+
 TASKS = (
     Task(
         name="rejoin2d",
         environment=rejoin2d,
         released=RELEASED_2D,
         filters=FILTERS_2D,
+        controllers=CONTROLLERS,
         gymnasium_id="jaxsafe/Rejoin2D-v0",
         recipe="rejoin2d.yaml",
         paper_steps=300_000,
@@ -327,6 +331,7 @@ TASKS = (
         environment=rejoin3d,
         released=RELEASED_3D,
         filters=FILTERS_3D,
+        controllers=CONTROLLERS,
         gymnasium_id="jaxsafe/Rejoin3D-v0",
         recipe="rejoin3d.yaml",
         paper_steps=2_300_000,

@@ -18,6 +18,7 @@ from typing import Any
 
 from gymnasium.envs import registration
 
+from jaxsafe.control.law import ControlLaw
 from jaxsafe.environment import Environment
 from jaxsafe.rta.filter import RTA
 from jaxsafe.schema.errors import ConfigError, nearest, show
@@ -25,6 +26,9 @@ from jaxsafe.schema.user_modules import import_modules
 
 Filters = Mapping[str, Callable[[], RTA]]
 """Filters by the name of their preset. `default` is the recommended one."""
+
+Controllers = Mapping[str, Callable[[], ControlLaw]]
+"""Classical controllers by the name that follows `controller/`."""
 
 TASKS: dict[str, Task] = {}
 """Every registered task by its name, but for the starters."""
@@ -46,6 +50,8 @@ class Task:
     """What `variant="released"` changes, by dotted path: the semantics of the released code."""
     filters: Filters = dataclasses.field(default_factory=dict)
     """What `rta=…` knows by name."""
+    controllers: Controllers = dataclasses.field(default_factory=dict)
+    """What `run=controller/…` knows by name."""
     gymnasium_id: str | None = None
     """The id for `gymnasium.make`, for instance `my_package/Hover-v0`."""
     recipe: str | Path | None = None
