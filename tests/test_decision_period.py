@@ -98,6 +98,7 @@ def check_sums(timestep: TimeStep, taken: Any) -> None:
         )
 
 
+@pytest.mark.thorough
 def test_the_filter_acts_within_a_decision() -> None:
     action = jnp.array([-1.0, 0.0])
     for rta, cost in (("none", 1.0), ("explicit_simplex", 0.0)):

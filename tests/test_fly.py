@@ -136,6 +136,7 @@ def test_a_region_in_place_is_drawn_where_the_map_stays_too(task: str, drawn: bo
     assert ("zone" in [patch.get_label() for patch in panel.patches]) == drawn
 
 
+@pytest.mark.thorough
 def test_a_filter_shows_in_a_flight() -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 60}, rta="explicit_simplex")
     flight = jaxsafe.fly(env, lambda key, observation: jnp.ones(2))

@@ -292,6 +292,7 @@ def test_a_rollout_of_no_number_of_steps_or_environments_is_refused(
         )
 
 
+@pytest.mark.thorough
 def test_transitions_are_the_same_rollout(env: Environment, batch: TimeStep) -> None:
     arguments = (env, policy, jax.random.key(0), NUM_STEPS, NUM_ENVS)
     position, steps = recorded(*arguments, record="transitions")
@@ -321,6 +322,7 @@ def test_states_are_those_before_each_step(env: Environment) -> None:
         assert int(after.num_steps) == int(state.num_steps) + 1
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("num_envs", [pytest.param(None, marks=pytest.mark.thorough), 3])
 def test_a_rollout_goes_on_where_another_stopped(env: Environment, num_envs: int | None) -> None:
     """Episodes of four steps are cut after six, so the second half begins within one."""

@@ -672,7 +672,7 @@ def test_importing_jaxsafe_is_enough() -> None:
     )
 
 
-@pytest.mark.parametrize("kind", ["threefry2x32", "rbg"])
+@pytest.mark.parametrize("kind", [thorough("threefry2x32"), "rbg"])
 def test_disturbances_differ_between_environments_that_start_alike(kind: str) -> None:
     with jax.default_prng_impl(kind):
         gusts = {

@@ -36,6 +36,7 @@ def flown(task: str, episodes: int) -> float:
     return float(np.mean(env.succeeded(np.asarray(episode_batch.outcome))))
 
 
+@pytest.mark.thorough
 def test_the_policy_of_docking_docks() -> None:
     assert flown("docking2d", 50) >= 0.98
 

@@ -55,6 +55,7 @@ def test_another_observation_is_refused_in_one_line() -> None:
         jaxsafe.rollout(env, policy, jax.random.key(0), num_steps=1)
 
 
+@pytest.mark.thorough
 def test_a_policy_that_remembers_is_described_and_checked_too(tmp_path: Path) -> None:
     env = jaxsafe.make("docking2d")
     agent = Agent(actor=GRU(hidden=(4,), units=3))
@@ -70,6 +71,7 @@ def test_a_policy_that_remembers_is_described_and_checked_too(tmp_path: Path) ->
         policy.act(jax.random.key(0), jnp.zeros(5), policy.memory)
 
 
+@pytest.mark.thorough
 def test_a_policy_of_mixed_actions_comes_back_from_its_file(tmp_path: Path) -> None:
     env = jaxsafe.make(
         "docking2d", {"deputy.controller.actuators.thrust_y.discrete": True}, actions="mixed"

@@ -799,6 +799,7 @@ def test_a_command_is_called_by_its_name(
         assert callable(importlib.import_module(f"jaxsafe.commands.{name}").command)
 
 
+@pytest.mark.thorough
 def test_renamed_values_still_work_and_their_new_names_are_told() -> None:
     for option, names in RENAMED.items():
         for old, new in names.items():

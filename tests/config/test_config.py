@@ -638,6 +638,7 @@ def test_every_misspelt_type_choice_or_reference_is_refused(task: str) -> None:
             assert f"Did you mean '{name}'?" in message
 
 
+@pytest.mark.thorough
 @pytest.mark.filterwarnings("ignore:.* because it follows ")
 def test_every_missing_field_without_a_default_is_named(tree: dict[str, Any]) -> None:
     places = [(mapping, key) for mapping in mappings(tree) for key in mapping]
@@ -703,6 +704,7 @@ def test_a_missing_field_is_named_with_what_it_takes(tree: dict[str, Any]) -> No
     )
 
 
+@pytest.mark.thorough
 def test_every_number_replaced_by_a_word_a_truth_value_or_nan_is_refused(
     tree: dict[str, Any],
 ) -> None:

@@ -383,6 +383,7 @@ def test_every_discrete_index_means_what_it_meant(recording: str) -> None:
         )
 
 
+@pytest.mark.thorough
 def test_every_state_on_a_boundary_is_judged_as_recorded() -> None:
     edges = json.loads((GOLDEN / "edges.json").read_text())
     judged = []

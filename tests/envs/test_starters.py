@@ -36,6 +36,7 @@ def test_docking1d_has_the_numbers_of_docking2d_on_a_line() -> None:
     assert line.actuators == plane.actuators[:1]
 
 
+@pytest.mark.thorough
 def test_a_line_has_two_directions_and_both_are_drawn() -> None:
     env = jaxsafe.make("docking1d")
     states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), 200))
@@ -55,6 +56,7 @@ def test_a_deputy_that_arrives_slowly_has_docked() -> None:
     assert timestep.terminated
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("rta", one_of_each_kind(STARTERS["docking1d"].filters, ["default"]))
 def test_a_filter_keeps_the_speed_limit_on_a_line(rta: str) -> None:
     env = jaxsafe.make("docking1d", rta=rta)

@@ -54,6 +54,7 @@ def test_no_adversary_breaks_a_robust_filter_within_its_bound(task: str, policy:
     assert counts["uncertified_steps"] <= counts["unsafe_starts"] * counts["steps"]
 
 
+@pytest.mark.thorough
 def test_a_world_has_every_part_of_the_bound() -> None:
     small = {name: value / 20.0 for name, value in BOUND.items()}
     env = jaxsafe.make("docking3d", {"rta.bound": {**small, "delay": 2}}, rta="default")

@@ -68,6 +68,7 @@ def test_a_policy_file_gives_the_results_of_its_seed_and_a_film(
         main([f"run={file}", "checkpoint=best"])
 
 
+@pytest.mark.thorough
 def test_a_film_shows_the_episode_that_is_asked_for(
     whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -492,6 +492,7 @@ def env() -> Environment:
     return from_data(data(), "")
 
 
+@pytest.mark.thorough
 def test_an_environment_of_general_parts_steps_in_batches(env: Environment) -> None:
     state, _ = jax.vmap(jaxsafe.reset, in_axes=(None, 0))(
         env, jax.random.split(jax.random.key(0), 3)

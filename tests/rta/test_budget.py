@@ -44,6 +44,7 @@ def budgeted(**rta: Any) -> Environment:
     )
 
 
+@pytest.mark.thorough
 def test_a_filter_keeps_a_budget_to_its_end() -> None:
     row = attack(budgeted(), "accelerate", 40, 4, jax.random.key(0))
     assert row["violating_steps"] == row["violating_steps_inside"] == 0

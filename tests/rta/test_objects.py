@@ -144,6 +144,7 @@ def keeper(**changes: Any) -> Environment:
     return jaxsafe.make("docking2d", {"constraints": [SPEED_LIMIT, keep_out], "rta": rta | changes})
 
 
+@pytest.mark.thorough
 def test_the_info_names_the_constraint_that_caused_an_intervention() -> None:
     env = keeper()
     assert env.rta is not None
@@ -228,6 +229,7 @@ def test_a_filter_of_ones_own_needs_no_index_of_a_constraint() -> None:
 ALONE = {"constraints": ["velocity_limit"], "enforce": False}
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["explicit_asif", thorough("discrete_asif")])
 def test_an_asif_that_is_not_enforced_needs_no_backup(kind: str) -> None:
     """It acts as the same filter does with one, and certifies nothing."""
@@ -280,6 +282,7 @@ def test_backup_controllers_of_the_tasks_remember_nothing() -> None:
     assert len(jax.tree.leaves(memory)) == 3
 
 
+@pytest.mark.thorough
 def test_a_latched_manoeuvre_is_finished() -> None:
     latched = Latched(name="latched", backup=Brake(name="brake"), at_least=3.0)
     rta = Simplex(constraints=("velocity_limit",), margin=2.5e-4, backups=(latched,))
@@ -325,6 +328,7 @@ def holding() -> jaxsafe.Environment:
     return jaxsafe.make("docking2d", rta=rta)
 
 
+@pytest.mark.thorough
 def test_a_certificate_predicts_the_memory_of_a_backup_controller() -> None:
     """Where the backup ends after its horizon is where the certificate said, integral included."""
     env = holding()

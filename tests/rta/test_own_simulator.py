@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from default_cases import thorough
 
 import jaxsafe
 from jaxsafe import ConfigError
@@ -38,7 +39,7 @@ def speed_left(x: Any) -> jax.Array:
     return 0.2 + 0.002054 * jnp.linalg.norm(x.position) - jnp.linalg.norm(x.velocity)
 
 
-@pytest.mark.parametrize("preset", ["explicit_simplex", "explicit_asif"])
+@pytest.mark.parametrize("preset", [thorough("explicit_simplex"), "explicit_asif"])
 def test_a_filter_by_itself_acts_as_that_of_an_environment(preset: str) -> None:
     env = jaxsafe.make("docking2d", rta=preset)
     state, desired = states(env, 50)

@@ -196,7 +196,7 @@ def test_whatever_is_certified_is_safe_within_the_bound_and_not_beyond(
 @pytest.mark.parametrize(
     ("task", "preset", "delay"),
     [
-        ("docking1d", "explicit_simplex", 2),
+        thorough("docking1d", "explicit_simplex", 2),
         thorough("docking2d", "default", 2),
         thorough("docking3d", "default", 1),
         thorough("docking2d", "explicit_simplex", 3),
@@ -223,6 +223,7 @@ def test_a_known_delay_costs_nothing_and_an_unknown_one_breaks_the_limit(
     assert unknown.certified.mean() > 0.5
 
 
+@pytest.mark.thorough
 def test_a_start_that_no_thrust_would_lead_beyond_the_limit_is_not_certified_with_a_delay() -> None:
     env = jaxsafe.make("docking2d", {"rta.bound": {"delay": 2}}, rta="default")
     # The limit falls by 0.0009 m/s a step, and h is 0.001 m/s at first.
@@ -378,7 +379,8 @@ def uncertain(task: str, delay: int = 0) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("task", "delay"), [("docking2d", 0), thorough("docking3d", 0), thorough("docking3d", 2)]
+    ("task", "delay"),
+    [thorough("docking2d", 0), thorough("docking3d", 0), thorough("docking3d", 2)],
 )
 def test_the_preset_is_safe_in_an_uncertain_environment_within_its_bound(
     task: str, delay: int

@@ -148,6 +148,7 @@ def beside(env: Any, key: jax.Array, near: bool, count: int) -> Sim:
     return sim.replace(platforms={**sim.platforms, "wingman": own})
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("random", [False, thorough(True)])
 @pytest.mark.parametrize("near", [False, thorough(True)])
 def test_a_tube_holds_every_way_that_is_flown_along_a_backup(near: bool, random: bool) -> None:
@@ -168,6 +169,7 @@ def test_a_tube_holds_every_way_that_is_flown_along_a_backup(near: bool, random:
             assert np.max((apart / radius)[known]) > 0.8
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("world", [*WORLDS[:2], *map(thorough, [WORLDS[2], {"process": 3.3}])])
 def test_the_widened_terminal_set_is_never_left_to_the_lead(world: dict[str, float]) -> None:
     """A wingman at its edge is pushed towards the lead while the backup acts, for 150 s."""

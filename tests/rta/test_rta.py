@@ -30,7 +30,7 @@ slow = partial(pytest.param, marks=pytest.mark.slow)  # slow to compile
 
 DOCKING = ("docking2d", "docking3d")
 SHORT = [
-    ("discrete_asif", "docking2d", ("greedy",)),
+    thorough("discrete_asif", "docking2d", ("greedy",)),
     thorough("discrete_asif", "docking2d", ("bang_bang",)),
     thorough("discrete_asif", "docking3d", ("sideways", "search")),
     ("explicit_simplex", "docking3d", ("greedy",)),
@@ -339,7 +339,7 @@ def test_a_certificate_that_is_not_renewed_ends_before_anything_is_violated() ->
         assert not timestep.info.rta.certified
 
 
-@pytest.mark.parametrize("task", ["docking2d", "rejoin2d"])
+@pytest.mark.parametrize("task", ["docking2d", thorough("rejoin2d")])
 def test_a_state_that_is_not_a_number_is_not_certified(task: str) -> None:
     env = jaxsafe.make(task, rta="default")
     state, _ = reset(env, jax.random.key(0))

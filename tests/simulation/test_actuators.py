@@ -79,6 +79,7 @@ def test_a_ramp_needs_its_time_and_starts_within_the_limits() -> None:
     np.testing.assert_allclose(state.sim.actuators["thrust_x"], 0.7, rtol=1e-6)
 
 
+@pytest.mark.thorough
 def test_states_of_actuators_are_batched_and_differentiable() -> None:
     env = jaxsafe.make("docking1d", {**LAG, **RATE})
 

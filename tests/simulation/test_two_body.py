@@ -239,6 +239,7 @@ def test_the_power_keeps_its_digits_near_one(power: int) -> None:
         assert math.isclose(found, exact, rel_tol=1e-6, abs_tol=1e-30)
 
 
+@pytest.mark.thorough
 def test_the_chiefs_orbit_may_be_random() -> None:
     orbit = {"deputy.eccentricity": [0.1, 0.3], "deputy.true_anomaly": [0.0, 3.0]}
     env = jaxsafe.make("docking2d", {"deputy.type": "two_body"}, randomize=orbit)

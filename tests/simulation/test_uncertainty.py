@@ -200,6 +200,7 @@ def test_a_disturbance_chosen_from_outside_acts_and_is_cut_to_its_bound() -> Non
     np.testing.assert_allclose(pushed.velocity - plain.velocity, [0.03, 0.04], atol=1e-6)
 
 
+@pytest.mark.thorough
 def test_a_step_is_differentiable_in_the_sizes_of_disturbances() -> None:
     env = uncertain({"type": "bounded", "on": "deputy", "bound": 1e-3})
     state = jaxsafe.reset_to(env, PLACED, key=KEY)[0]

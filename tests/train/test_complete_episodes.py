@@ -67,6 +67,7 @@ def whole_episodes(done: np.ndarray) -> list[tuple[slice, int]]:
     return found
 
 
+@pytest.mark.thorough
 def test_an_episode_counts_if_it_began_early_enough_for_any_length() -> None:
     env, _, _, transitions = collected()
     done = np.asarray(transitions.done)
@@ -81,6 +82,7 @@ def test_an_episode_counts_if_it_began_early_enough_for_any_length() -> None:
     assert len(lengths) > 1
 
 
+@pytest.mark.thorough
 def test_the_gradient_is_that_of_a_batch_of_these_episodes_alone() -> None:
     env, state, after, transitions = collected()
     gamma = jnp.array(0.9)
@@ -134,6 +136,7 @@ def test_what_does_not_count_changes_nothing() -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), found, wanted)
 
 
+@pytest.mark.thorough
 def test_an_update_starts_afresh_and_logs_what_counts_and_all_costs() -> None:
     env = task()
     state = init(env, AGENT, PPO_WHOLE, jax.random.key(0))

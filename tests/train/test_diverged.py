@@ -135,6 +135,7 @@ def test_its_best_checkpoint_is_one_from_before(run: Path) -> None:
     assert not np.isfinite(content["state"].params["log_std"][1]).any()
 
 
+@pytest.mark.thorough
 def test_an_evaluation_says_the_same(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

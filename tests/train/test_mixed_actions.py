@@ -76,6 +76,7 @@ def pair() -> Environment:
     )
 
 
+@pytest.mark.thorough
 def test_ppo_learns_a_number_and_a_choice_at_once() -> None:
     env = pair()
     agent = normalise(Agent(actor=MLP(hidden=(16,))))
@@ -89,6 +90,7 @@ def test_ppo_learns_a_number_and_a_choice_at_once() -> None:
     assert curves["entropy"][-1] < curves["entropy"][0]
 
 
+@pytest.mark.thorough
 def test_a_control_that_acted_is_no_choice_to_learn_from() -> None:
     options = {
         "env": "docking2d",

@@ -94,6 +94,7 @@ def test_the_critic_learns_a_constant() -> None:
     assert value(state, 1.0) == pytest.approx(1.0, abs=0.05)
 
 
+@pytest.mark.thorough
 def test_the_critic_learns_from_the_observation() -> None:
     state = train(probe(Position(name="reward")))
     assert value(state, 1.0) == pytest.approx(1.0, abs=0.1)
@@ -118,6 +119,7 @@ def test_what_is_learnt_does_not_depend_on_how_many_samples_go_through_the_netwo
     )
 
 
+@pytest.mark.thorough
 def test_a_terminated_episode_counts_nothing_beyond_its_end() -> None:
     state = train(probe(Constant(name="reward"), steps=2), updates=80)
     # The two steps look alike, so the critic learns the mean of 1 and 1 + γ.
@@ -133,6 +135,7 @@ def test_a_critic_that_sees_the_totals_tells_first_steps_from_second_ones() -> N
         assert float(agent.value(state.params, inputs)) == pytest.approx(expected, abs=0.1)
 
 
+@pytest.mark.thorough
 def test_a_truncated_episode_counts_what_would_follow() -> None:
     state = train(probe(Constant(name="reward"), steps=2, ends="truncated"), updates=150)
     assert value(state, 1.0) == pytest.approx(1.0 / (1.0 - 0.9), rel=0.1)
@@ -227,6 +230,7 @@ def test_the_discount_of_an_update_is_that_of_its_progress() -> None:
     assert at_the_start > 1e-4
 
 
+@pytest.mark.thorough
 def test_hyperparameters_are_leaves_that_vmap() -> None:
     env = probe(Constant(name="reward"))
     rates = jnp.array([1e-3, 3e-3])
@@ -318,7 +322,7 @@ class Push(Match):
 
 @pytest.mark.parametrize(
     ("limit", "low", "high"),
-    [(0.5, 0.0, 0.5), thorough(0.1, 0.0, 0.1), thorough(5.0, 0.95, 1.0)],
+    [thorough(0.5, 0.0, 0.5), thorough(0.1, 0.0, 0.1), thorough(5.0, 0.95, 1.0)],
 )
 def test_costs_are_kept_within_their_limit(limit: float, low: float, high: float) -> None:
     # The reward pays to break the rule. An episode has one step, so it costs 0 or 1.

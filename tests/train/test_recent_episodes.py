@@ -36,6 +36,7 @@ def test_the_window_keeps_the_last_hundred_finished_episodes_in_order() -> None:
     assert int(window.count) == len(finished) > SIZE
 
 
+@pytest.mark.thorough
 def test_the_cost_counts_the_violating_steps_of_all_finished_episodes() -> None:
     episodes = episodes_like(np.zeros((150, 2), np.float32))
     episodes = episodes.replace(violating_steps=jnp.arange(300).reshape(150, 2))

@@ -146,6 +146,7 @@ def test_what_is_given_wins_over_the_other_run(whole: Path) -> None:
     assert float(env.terminal[-1].limit) == 2000.0
 
 
+@pytest.mark.thorough
 def test_what_follows_from_an_option_of_the_other_run_follows_from_a_new_one(
     whole: Path, tmp_path: Path
 ) -> None:

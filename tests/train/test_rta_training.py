@@ -171,6 +171,7 @@ def test_an_evaluation_switches_the_filter(
         evaluate([f"run={run}", "rta=of"])
 
 
+@pytest.mark.thorough
 def test_a_run_of_an_older_version_is_read_by_the_new_names(tmp_path: Path) -> None:
     config, env = resolved("rta=default", f"out={tmp_path / 'run'}")
     run = run_directory.create(config, env, "docking2d")

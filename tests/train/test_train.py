@@ -387,6 +387,7 @@ def test_resuming_a_complete_run_changes_nothing(
     assert {path: path.stat().st_mtime_ns for path in whole.rglob("*")} == before
 
 
+@pytest.mark.thorough
 def test_runs_without_a_name_take_the_next_free_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -512,6 +513,7 @@ def test_a_recipe_travels_with_the_file_of_an_environment(
     assert resolve({"env": "mine.yaml"})[0].steps == 500_000
 
 
+@pytest.mark.thorough
 def test_nothing_is_lost_when_checkpoints_are_missing(
     tmp_path: Path, whole: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
