@@ -44,7 +44,7 @@ def measured(env: Environment, sim: Sim, memory: Mapping[str, Any]) -> Sim:
     """
     for item in env.uncertainty:
         with part("uncertainty", item.name):
-            sim = item.measured(sim, memory[item.name])
+            sim = item.measured(env, sim, memory[item.name])
     return sim
 
 

@@ -14,9 +14,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.simulation.geometry import safe_norm
+from jaxsafe.simulation.platform import Platform
 from jaxsafe.simulation.uncertainty import Disturbance, Size, StateError
 from jaxsafe.transition import advance, smallest_margin
-from jaxsafe.types import Key, Sim
+from jaxsafe.types import Key, Seconds, Sim
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
@@ -45,7 +46,8 @@ class WorstDisturbance(Disturbance, type="worst"):
 class WorstNavigationError(StateError, type="worst_navigation"):
     """An error of navigation of the size `bound` that makes the smallest h look largest.
 
-    So a filter believes to be farther from a violation than it is.
+    So a filter believes to be farther from a violation than it is. The h is that of platforms that
+    have flown on for a step with their velocities, because h need not depend on a velocity itself.
     """
 
     bound: Size
@@ -54,8 +56,12 @@ class WorstNavigationError(StateError, type="worst_navigation"):
         like = self.true(sim)
 
         def h(error: Float[Array, " k"]) -> Float[Array, ""]:
-            seen = self.measured(sim, error.reshape(like.shape))
-            return smallest_margin(env, seen.replace(regions={}, status={}))
+            seen = self.measured(env, sim, error.reshape(like.shape))
+            ahead = {
+                platform.name: _drifted(platform, seen.platforms[platform.name], env.dt)
+                for platform in env.platforms
+            }
+            return smallest_margin(env, seen.replace(platforms=ahead, regions={}, status={}))
 
         flat = jnp.zeros_like(jnp.ravel(like))
         return (self.bound * steepest(h, flat)).reshape(like.shape)
@@ -64,6 +70,11 @@ class WorstNavigationError(StateError, type="worst_navigation"):
         self, env: Environment, sim: Sim, key: Key, memory: Any, control: Float[Array, " m"]
     ) -> Any:
         return self.init(env, advance(env, sim, control), key)
+
+
+def _drifted(platform: Platform, state: Any, dt: Seconds) -> Any:
+    """Return the state of a platform that has flown on for `dt` with its velocity."""
+    return platform.pushed(state, jnp.zeros_like(state.velocity), state.velocity, dt)
 
 
 def steepest(h: Callable[[Array], Array], at: Float[Array, " d"]) -> Float[Array, " d"]:

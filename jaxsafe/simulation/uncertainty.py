@@ -77,7 +77,7 @@ class Uncertainty(Component):
         """Return the platforms after the step, given those that the model predicts, by name."""
         return platforms
 
-    def measured(self, sim: Sim, memory: Any) -> Sim:
+    def measured(self, env: Environment, sim: Sim, memory: Any) -> Sim:
         """Return the simulation as it is measured."""
         return sim
 
@@ -307,15 +307,16 @@ class ActionDelay(Uncertainty, type="delay"):
 class StateError(Uncertainty):
     """Base of errors of what is known of a platform, as filters and observations see it.
 
-    The memory is the error of the field `what` of the platform's state. Statuses, rewards and the
-    end of an episode follow the true state.
+    The memory is the error of the field `what` of the platform's state, or of its velocity.
+    Statuses, rewards and the end of an episode follow the true state.
     """
 
     of: PlatformName
     what: str = "position"
 
     def misfits(self, env: Environment) -> dict[str, str]:
-        fields = [name for name in vars(env.platform(self.of).rest()) if name != "orientation"]
+        rest = env.platform(self.of).rest()
+        fields = [name for name in {**vars(rest), "velocity": None} if name != "orientation"]
         if self.what not in fields:
             found = f"{self.of} has no {self.what!r} in its state"
             return {"what": f"{found}; choose from {nearest(self.what, fields)}"}
@@ -325,8 +326,13 @@ class StateError(Uncertainty):
         """Return the true value of what is measured."""
         return jnp.asarray(getattr(sim.platforms[self.of], self.what))
 
-    def measured(self, sim: Sim, memory: Any) -> Sim:
-        state = sim.platforms[self.of].replace(**{self.what: self.true(sim) + memory})
+    def measured(self, env: Environment, sim: Sim, memory: Any) -> Sim:
+        state = sim.platforms[self.of]
+        wrong = self.true(sim) + memory
+        if self.what == "velocity":  # of an aircraft it is no field of the state
+            state = env.platform(self.of).with_velocity(state, wrong)
+        else:
+            state = state.replace(**{self.what: wrong})
         return sim.replace(platforms={**sim.platforms, self.of: state})
 
 

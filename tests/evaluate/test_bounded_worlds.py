@@ -16,6 +16,7 @@ from jaxsafe.config import override
 from jaxsafe.evaluate.bounded_worlds import world_at
 from jaxsafe.evaluate.run_adversaries import attack
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.uncertain import measured
 
 BOUND = {"process": 1e-2, "mass": 0.05, "misalignment": 0.02, "position": 0.5, "velocity": 1e-3}
 AT_THE_LIMIT = {"deputy": {"position": [100.0, 0.0], "velocity": [-0.3, 0.0]}}
@@ -97,3 +98,18 @@ def test_levels_need_a_bound() -> None:
         world_at(jaxsafe.make("docking2d", rta="default"), 1.0)
     with pytest.raises(ConfigError, match=r"levels: expected numbers from 0 to 1e6, found -1"):
         falsify.main(["env=docking2d", "levels=-1"])
+
+
+def test_a_wrong_velocity_makes_an_aircraft_seem_to_close_in_more_slowly() -> None:
+    """The distance does not depend on the velocity, but the distance a step later does."""
+    bound = {"process": 0.5, "velocity": 2.0}
+    env = world_at(jaxsafe.make("rejoin2d", {"rta.bound": bound}, rta="robust"), 1.0)
+    lead = {"position": [0.0, 0.0], "heading": 0.0, "speed": 250.0}
+    wingman = {"position": [-2000.0, 500.0], "heading": 0.1, "speed": 300.0}
+    state, _ = jaxsafe.reset_to(env, {"lead": lead, "wingman": wingman})
+    own = state.sim.platforms["wingman"]
+    seen = measured(env, state.sim, state.memory.uncertainty).platforms["wingman"]
+    error = np.asarray(seen.velocity - own.velocity)
+    np.testing.assert_allclose(np.linalg.norm(error), 2.0, rtol=1e-4)
+    away = np.asarray(own.position + own.velocity - np.array([250.0, 0.0]))
+    np.testing.assert_allclose(error / 2.0, away / np.linalg.norm(away), atol=1e-2)
