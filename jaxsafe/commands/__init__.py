@@ -32,6 +32,8 @@ def main() -> None:
     name, *words = sys.argv[1:] or ["help"]
     if name in HELP and words:
         name, *words = *words, HELP[0]
+    if name in COMMANDS and words == ["--version"]:
+        name = words.pop()
     if name in (*HELP, "--version"):
         from jaxsafe.commands.streams import lasting_streams
         from jaxsafe.storage.provenance import version

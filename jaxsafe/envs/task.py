@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -92,12 +92,13 @@ def registered(name: str) -> Task | None:
     return TASKS.get(task) or STARTERS.get(task)
 
 
-def find_task(name: str, place: str = "env") -> Task:
+def find_task(name: str, place: str = "env", others: Sequence[str] = ()) -> Task:
     """Return the task of a name. `MODULE:NAME` imports the user's module first, which registers it.
 
     Args:
         name: the name.
         place: where the name stands. Messages of errors begin with it.
+        others: what may stand there besides tasks and files, for the message of an error.
 
     Raises:
         ConfigError: the module cannot be imported, or there is no such task.
@@ -109,7 +110,7 @@ def find_task(name: str, place: str = "env") -> Task:
     if known is None:
         raise ConfigError(
             f"{place}: unknown task {show(task)} and not a .yaml file; "
-            f"choose from {nearest(task, [*TASKS, *STARTERS])}"
+            f"choose from {nearest(task, [*TASKS, *STARTERS, *others])}"
         )
     return known
 

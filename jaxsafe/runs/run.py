@@ -116,7 +116,7 @@ class Run(Described):
             found = show(seed)
             raise ConfigError(f"seed: expected one of {_span(self.seeds)}, found {found}")
         mapper = SeedMapper(self.config.seeds)
-        which = str(checkpoint)
+        which = checkpoint if isinstance(checkpoint, str) else show(checkpoint)
         params, step = load_params(mapper, self.path, self.config, self.env, which)
         index = seed - self.config.seed
         params = jax.tree.map(lambda x: x[index], mapper.gather(params))

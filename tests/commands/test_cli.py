@@ -772,10 +772,11 @@ def test_alone_the_program_lists_its_commands(
     ] == []
 
 
+@pytest.mark.parametrize("words", [["--version"], ["train", "--version"]])
 def test_the_version_is_told(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    words: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["jaxsafe", "--version"])
+    monkeypatch.setattr(sys, "argv", ["jaxsafe", *words])
     commands.main()
     assert re.fullmatch(r"jaxsafe \d+\.\d+\.\d+\n", capsys.readouterr().out)
 

@@ -95,7 +95,7 @@ def test_a_recipe_comes_from_a_file(mine: Path) -> None:
 def test_a_recipe_that_is_not_there_is_told(mine: Path) -> None:
     message = refused(env="docking2d", recipe="dockin2d")
     assert message.startswith("recipe: unknown task 'dockin2d' and not a .yaml file; choose from ")
-    assert "Did you mean 'docking2d'?" in message
+    assert "docking1d, none. Did you mean 'docking2d'?" in message
     assert refused(env="docking2d", recipe="no.yaml").startswith("no.yaml: cannot be read")
     text = mine.read_text(encoding="utf-8")
     for name, told in (

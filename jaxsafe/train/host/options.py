@@ -505,7 +505,8 @@ def find_recipes(task: str, source: str | None = None) -> Recipes:
     seen: list[str] = []
     while name != NO_RECIPE:
         if not is_file(name):
-            file = find_task(name, place).recipe
+            others = () if place == "env" else (NO_RECIPE,)
+            file = find_task(name, place, others).recipe
             presets = load_recipes(configs() / file) if file else {}
             return Recipes(name if presets else NO_RECIPE, presets)
         following = load_recipe_name(name)
