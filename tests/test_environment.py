@@ -213,6 +213,7 @@ class LastControl(Reward):
         return sim.control_actual[0] - sim.control_desired[0]
 
 
+@pytest.mark.thorough
 def test_rewards_see_the_desired_and_the_actual_control_of_their_step() -> None:
     env = jaxsafe.make("docking2d", rta="default")
     env = jaxsafe.override(env, {"reward": [*env.reward, LastControl(name="correction")]})

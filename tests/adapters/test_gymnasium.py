@@ -235,7 +235,9 @@ def test_environments_of_a_batch_are_seeded_one_by_one() -> None:
     assert not np.array_equal(*unseeded)
 
 
-@pytest.mark.parametrize("copied", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize(
+    "copied", [thorough(copy.deepcopy), lambda env: pickle.loads(pickle.dumps(env))]
+)
 @pytest.mark.parametrize(
     "build",
     [
@@ -504,6 +506,7 @@ def test_an_episode_can_be_watched() -> None:
 START = {**FAST, "parameters": {"deputy.mass": 13.0}}
 
 
+@pytest.mark.thorough
 def test_a_batch_starts_where_single_environments_do() -> None:
     options: dict[str, Any] = {
         "overrides": SOON,
@@ -672,7 +675,7 @@ def test_importing_jaxsafe_is_enough() -> None:
     )
 
 
-@pytest.mark.parametrize("kind", [thorough("threefry2x32"), "rbg"])
+@pytest.mark.parametrize("kind", [thorough("threefry2x32"), thorough("rbg")])
 def test_disturbances_differ_between_environments_that_start_alike(kind: str) -> None:
     with jax.default_prng_impl(kind):
         gusts = {

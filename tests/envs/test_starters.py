@@ -69,6 +69,7 @@ def test_a_filter_keeps_the_speed_limit_on_a_line(rta: str) -> None:
     assert float(steps.info.intervening.mean()) > 0.1
 
 
+@pytest.mark.thorough
 def test_without_a_filter_the_limit_is_exceeded() -> None:
     env = jaxsafe.make("docking1d")
     worst = lambda key, observation: jnp.sign(observation[:, :1])  # noqa: E731

@@ -317,6 +317,7 @@ def test_a_row_of_zeros_has_derivatives(slack: float | None) -> None:
     assert np.abs(slopes).max() > 0.0
 
 
+@pytest.mark.thorough
 def test_a_control_on_its_bound_keeps_its_derivative() -> None:
     low = -jnp.ones(2)
     high = jnp.ones(2)

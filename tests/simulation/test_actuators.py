@@ -132,6 +132,7 @@ class Creeping(TerminalSet, type="creeping_in_this_test"):
         return jnp.abs(sim.platforms[env.agent].velocity[0]) <= 0.15
 
 
+@pytest.mark.thorough
 def test_a_prediction_moves_the_actuators_too() -> None:
     """The filter predicts what the environment then does, also many steps ahead."""
     rta = Simplex(

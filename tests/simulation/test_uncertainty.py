@@ -149,6 +149,7 @@ def test_controls_arrive_late() -> None:
     np.testing.assert_array_equal(deputy(late, actions).velocity, expected.velocity)
 
 
+@pytest.mark.thorough
 def test_sensors_are_biased_noisy_late_and_drop_readings() -> None:
     def positions(steps: int = 6, **sensor: Any) -> np.ndarray:
         options = {f"observation.position.{name}": value for name, value in sensor.items()}

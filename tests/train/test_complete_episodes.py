@@ -116,6 +116,7 @@ def test_the_gradient_is_that_of_a_batch_of_these_episodes_alone() -> None:
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), found, wanted)
 
 
+@pytest.mark.thorough
 def test_what_does_not_count_changes_nothing() -> None:
     env, state, after, transitions = collected()
     counts = _counts(env, PPO_WHOLE, transitions)

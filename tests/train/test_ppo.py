@@ -344,6 +344,7 @@ def test_the_critic_of_costs_expects_what_a_step_costs() -> None:
     )
 
 
+@pytest.mark.thorough
 def test_the_multiplier_follows_the_excess() -> None:
     env = probe(Constant(name="reward"), most=-1.0)
     state = init(env, AGENT.replace(cost_critic=True), SMALL, jax.random.key(0))

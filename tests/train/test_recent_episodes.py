@@ -45,6 +45,7 @@ def test_the_cost_counts_the_violating_steps_of_all_finished_episodes() -> None:
     assert int(window.cost) == 2 * sum(range(0, 300, 3))
 
 
+@pytest.mark.thorough
 def test_the_cost_of_the_training_counts_every_violating_step_once() -> None:
     rng = np.random.default_rng(2)
     window = empty_window(episodes_like(np.zeros(1, np.float32)))

@@ -47,6 +47,7 @@ def test_all_seeds_start_from_one_policy(whole: Path, tmp_path: Path) -> None:
         jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-6), params, before)
 
 
+@pytest.mark.thorough
 def test_python_starts_from_parameters() -> None:
     config, env, _ = resolve({"env": "docking2d", "ppo.num_envs": 4, "ppo.num_steps": 8})
     key = jax.random.key(0)

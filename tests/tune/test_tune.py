@@ -124,6 +124,7 @@ def test_what_cannot_be_swept_is_said_in_one_line(words: list[str], message: str
     assert str(raised.value).startswith(message)
 
 
+@pytest.mark.thorough
 def test_a_setting_learns_what_the_same_training_learns(swept: Path, whole: Path) -> None:
     """The other training is that of the fixture `whole`.
 
@@ -164,6 +165,7 @@ def test_a_setting_learns_what_the_same_training_learns(swept: Path, whole: Path
     assert other["training_return"] != row["training_return"]
 
 
+@pytest.mark.thorough
 def test_the_table_ranks_every_setting(swept: Path) -> None:
     rows = list(csv.DictReader((swept / "results.csv").read_text().splitlines()))
     assert sorted(row["setting"] for row in rows) == ["0", "1", "2", "3"]
@@ -195,6 +197,7 @@ def test_each_rank_has_its_best_first(rank: str, order: list[int]) -> None:
     assert sorted(range(3), key=lambda index: _key(rows[index], rank)) == order
 
 
+@pytest.mark.thorough
 def test_the_table_leaves_out_violations_that_were_not_counted(swept: Path) -> None:
     row = results(swept)[0]
     assert "violating" in _flat(row, ())
@@ -209,6 +212,7 @@ def test_a_group_of_one_trains_once() -> None:
     assert BatchedTraining(chosen[0], 1).at_once == 1
 
 
+@pytest.mark.thorough
 def test_a_sweep_does_not_go_on_by_another_recipe(swept: Path, tmp_path: Path) -> None:
     path = tmp_path / "older"
     shutil.copytree(swept, path)
@@ -233,6 +237,7 @@ def test_a_killed_sweep_goes_on_and_ends_the_same(swept: Path, tmp_path: Path) -
     assert (path / "results.csv").read_text() == (swept / "results.csv").read_text()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
