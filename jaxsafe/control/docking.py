@@ -120,7 +120,7 @@ class MPC(ControlLaw, type="mpc"):
 
         `gradient` is that of the cost, and `offset` the constrained quantities of a plan without
         thrust, both per state x. `rows` are the constrained quantities per plan: all velocities as
-        shares of ν₀, all positions times ν₁/ν₀. `step` is (H + ρ (I + GᵀG))⁻¹.
+        multiples of a speed limit, all positions times ν₁ likewise. `step` is (H + ρ (I + GᵀG))⁻¹.
         """
         a, b = linear_model(env)
         size = b.shape[1]
@@ -146,7 +146,7 @@ class MPC(ControlLaw, type="mpc"):
         gradient = np.einsum("kxu,kxy,kyz->uz", responses, weights, powers)
 
         limit = speed_limit(env)
-        scale = np.array([limit.slope] * size + [1.0] * size) / float(limit.floor)
+        scale = np.array([limit.slope] * size + [1.0] * size) / float(self._unit(limit))
         rows = (scale[:, None] * responses).reshape(-1, count * size)
         offset = (scale[:, None] * powers).reshape(-1, 2 * size)
         gram = np.eye(count * size) + rows.T @ rows
@@ -160,6 +160,10 @@ class MPC(ControlLaw, type="mpc"):
         }
         return {name: jnp.asarray(value, env.dt.dtype) for name, value in found.items()}
 
+    def _unit(self, limit: VelocityLimit) -> Number:
+        """Return the speed [m/s] that counts as 1: ν₀, or the limit at `position` if that is 0."""
+        return jnp.maximum(limit.floor, limit.slope * self.position)
+
     def control(self, env: Environment, design: Any, sim: Sim) -> Float[Array, " m"]:
         state = sim.platforms[env.agent]
         size = state.position.size
@@ -170,14 +174,15 @@ class MPC(ControlLaw, type="mpc"):
         x = jnp.concatenate([state.position, state.velocity])
         gradient = design["gradient"] @ x
         offset = design["offset"] @ x
-        lost = limit.slope * limit.constant_to / limit.floor
+        unit = self._unit(limit)
+        floor = (limit.floor - limit.slope * limit.constant_to) / unit
 
         def allowed(plan: Array, moved: Array) -> tuple[Array, Array]:
             """Return the nearest plan within the box, and the nearest states in the cones."""
             plan = jnp.clip(plan.reshape(-1, size), low / largest, high / largest).ravel()
             position, velocity = jnp.split(moved.reshape(-1, 2 * size), 2, axis=1)
             height = position @ outwards
-            speed, change = _into_cone(safe_norm(velocity), 1.0 - lost + height, self.share)
+            speed, change = _into_cone(safe_norm(velocity), floor + height, self.share)
             velocity = velocity * (speed / jnp.maximum(safe_norm(velocity), 1e-9))[:, None]
             position = position + change[:, None] * outwards
             return plan, jnp.concatenate([position, velocity], axis=1).ravel()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -126,15 +125,3 @@ def action_of(env: Environment, control: Float[Array, " m"]) -> Array:
             elements.append(actuator.to_continuous(value))
     action = jnp.stack(elements)
     return action.astype(jnp.int32) if env.action_kind == "discrete" else action
-
-
-def mass_of(env: Environment) -> jax.Array:
-    """Return the mass of the agent's platform [kg].
-
-    Raises:
-        ConfigError: it has none.
-    """
-    plant = env.agent_platform
-    if not hasattr(plant, "mass"):
-        raise ConfigError(f"controller: {env.agent} ({plant.type_name}) has no mass to accelerate")
-    return plant.mass  # type: ignore[attr-defined]

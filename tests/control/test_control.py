@@ -308,6 +308,11 @@ def test_a_controller_is_exported(own: str) -> None:
     observation = np.random.default_rng(0).normal(size=(3, 8)).astype(np.float32)
     (found,) = session.run(None, {session.get_inputs()[0].name: observation})
     np.testing.assert_allclose(found, LQR().policy(env)(None, observation), atol=1e-5)
+    assert export(["run=controller/mpc", "env=docking2d", "format=stablehlo"]) == 0
+    stored = jax.export.deserialize(bytearray(Path("mpc_docking2d.stablehlo").read_bytes()))
+    plan = MPC().policy(jaxsafe.make("docking2d"))
+    seen = observation[:, :6]
+    np.testing.assert_allclose(stored.call(seen), plan(None, seen), atol=1e-4)
     with pytest.raises(ConfigError, match="the policy remembers"):
         export([f"run={own}:remembering", "env=docking2d"])
 
