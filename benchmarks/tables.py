@@ -203,6 +203,49 @@ def robustness(results: Results) -> str:
     return markdown(heads, rows)
 
 
+def controllers(results: Results) -> str:
+    """Return how controllers and the packaged policies fly without a filter, and bounds."""
+    rows = []
+    unfiltered = [row for row in results["rows"] if row["rta"] == "none"]
+    for task in dict.fromkeys(row["task"] for row in unfiltered):
+        mine = [row for row in unfiltered if row["task"] == task]
+        for row in mine:
+            known = TASKS[task].paper_steps if row["policy"] == "ppo" else None
+            rows.append([task, *_flown(row, f"{row['training_steps']:,}")])
+            rows[-1].insert(3, f"{known:,}" if known else "–")
+        bound = results["bounds"][task]
+        best = f"≤ {bound['return']:.3f}" if "return" in bound else "–"
+        rows.append([task, "*bound*", *["–"] * 4, best, f"≥ {bound['length']:.0f}", "–"])
+    heads = ["task", "policy", "steps of training", "80 % after, paper's Table 2", "success"]
+    heads.append("violating steps")
+    return markdown([*heads, "return", "length [s]", "Δv [m/s]"], rows)
+
+
+def controllers_filtered(results: Results) -> str:
+    """Return how the same policies fly with the default filter."""
+    rows = [
+        [row["task"], *_flown(row, f"{row['intervention_rate']:.1%}")]
+        for row in results["rows"]
+        if row["rta"] == "default"
+    ]
+    heads = ["with `rta=default`", "policy", "steps altered", "success", "violating steps"]
+    return markdown([*heads, "return", "length [s]", "Δv [m/s]"], rows)
+
+
+def _flown(row: Mapping[str, Any], second: str) -> list[str]:
+    """Return the cells of a policy, the second of which is given."""
+    usage = row["control_usage"]
+    return [
+        "PPO, packaged" if row["policy"] == "ppo" else f"`{row['policy']}`",
+        second,
+        f"{row['success_rate']:.1%}",
+        f"{row['episode_safety_violation_rate']:.2%}",
+        f"{row['average_return']:.3f}",
+        f"{row['episode_length']:.0f}",
+        "–" if usage is None else f"{usage:.2f}",
+    ]
+
+
 def ppo(results: Results) -> str:
     """Return the table of thousand samples a second, medians."""
     rates = _samples(results)
@@ -849,6 +892,8 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("scaling", projection, "docs/scaling.md"),
     ("memory", memory, "docs/scaling.md"),
     ("robustness", robustness, "docs/safety/attacks.md"),
+    ("controllers", controllers, "docs/controllers.md"),
+    ("controllers", controllers_filtered, "docs/controllers.md"),
     ("adapters", adapters, "docs/adapters/gymnasium.md"),
     ("rta", filter_calls, "docs/safety/cost.md"),
     ("rta", filter_changes, "docs/safety/cost.md"),

@@ -190,6 +190,13 @@ def test_mpc_finds_the_optimal_plan_within_limits() -> None:
         np.testing.assert_allclose(exact, best.x[:2], atol=1e-3)
 
 
+def test_mpc_plans_where_the_speed_limit_has_no_floor() -> None:
+    env = jaxsafe.make("docking2d", {"status.velocity_limit.floor": 0.0})
+    control = MPC().policy(env).control(placed(env, [100.0, 0.0], [0.0, 0.0]).sim)
+    assert np.isfinite(control).all()
+    assert control[0] < -0.1  # towards the chief
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize(("task", "name"), PAIRS)
 def test_controllers_succeed_from_a_thousand_starts(task: str, name: str) -> None:

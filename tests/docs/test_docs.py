@@ -236,6 +236,7 @@ def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax
         thorough("safety/own_simulator"),
         thorough("safety/presets"),
         thorough("safety/proofs"),
+        thorough("controllers"),
         "deviations",
         thorough("own_training_loop"),
         thorough("adapters/gymnasium"),
