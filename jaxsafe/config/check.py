@@ -17,7 +17,7 @@ import numpy as np
 from jax.core import Tracer
 
 from jaxsafe.config.tied import check_ties, one_number
-from jaxsafe.environment import Environment, empty_sim, reset, step
+from jaxsafe.environment import Environment, empty_sim, modelled, reset, step
 from jaxsafe.schema.component import Component, fields
 from jaxsafe.schema.convert import to_value
 from jaxsafe.schema.dotted_paths import join, references, set_path
@@ -377,6 +377,8 @@ def _check_tracing(env: Environment) -> None:
 def _check_suited(env: Environment) -> None:
     """Reject a filter that reports a fault at every one of eight sampled starts.
 
+    It judges them by the numbers that it predicts with, those of `rta.model`.
+
     An environment with traced numbers passes, because they cannot be judged.
     """
     if env.rta is None or any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(env)):
@@ -409,7 +411,7 @@ def _can_report(structure: Any, shapes: tuple, precision: Any) -> bool:
 def _faults(env: Environment, key: jax.Array) -> Mapping[str, jax.Array]:
     assert env.rta is not None
     start, _ = reset(env.replace(rta=None, randomize=_without_filter(env.randomize)), key)
-    return env.rta.unsuited(env, start.sim)
+    return env.rta.unsuited(modelled(env), start.sim)
 
 
 def _without_filter(paths: Mapping[str, Any]) -> dict[str, Any]:

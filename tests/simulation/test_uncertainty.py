@@ -192,6 +192,17 @@ def test_a_filter_predicts_with_numbers_of_its_own() -> None:
     assert info.rta.predicted_margin == predicted != info.margins["velocity_limit"]
 
 
+def test_a_filter_is_judged_by_the_numbers_that_it_predicts_with() -> None:
+    """A spacecraft of 5000 kg cannot brake, whatever the true mass is."""
+    heavy = {"deputy.mass": 5000.0}
+    with pytest.raises(ConfigError, match="rta: thrust cannot hold the speed limit"):
+        jaxsafe.make("docking2d", {"rta.model": heavy}, rta="default")
+    with pytest.raises(ConfigError, match="rta: thrust cannot hold the speed limit"):
+        jaxsafe.make("docking2d", heavy, rta="default")
+    known_wrongly = {**heavy, "rta.model.deputy.mass": 12.0}
+    assert jaxsafe.make("docking2d", known_wrongly, rta="default").rta is not None
+
+
 def test_a_disturbance_chosen_from_outside_acts_and_is_cut_to_its_bound() -> None:
     env = uncertain({"type": "chosen", "on": "deputy", "bound": 0.05})
     state = jaxsafe.reset_to(env, PLACED)[0]
