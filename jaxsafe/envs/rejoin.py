@@ -282,6 +282,26 @@ MATCH_3D: dict[str, Any] = {
 }
 """Filters in space, which may also climb or dive."""
 
+ROBUST_3D: dict[str, Any] = MATCH_3D | {
+    "backups": tuple(
+        MatchVelocity(
+            name=f"{turn}_{climb}",
+            lead="lead",
+            clearance=204.0,
+            turn=turn,
+            climb=climb,
+            dead_zone=0.5,
+            away_time=25,
+        )
+        for turn in ("left", "right")
+        for climb in ("up", "down")
+    ),
+    "horizon": 72,
+    "terminal": VelocityMatched(of="wingman", to="lead", tolerance=0.75, clearance=204.0),
+    "bound": UncertaintyBound(process=0.3),  # [ft/s²]
+}
+"""Filters that keep a way out open within a bound. In space turning takes longer."""
+
 _ALPHA = Polynomial(linear=0.2)
 """Strengthening function of the filters from the literature, Eq. (3)."""
 
@@ -310,6 +330,7 @@ FILTERS_3D: Filters = {
     "default": lambda: Simplex(**MATCH_3D),
     "implicit_simplex": lambda: Simplex(**MATCH_3D),
     "implicit_asif": lambda: ImplicitASIF(**MATCH_3D),
+    "robust": lambda: Simplex(**ROBUST_3D),
     "explicit_asif": lambda: _explicit_asif(MATCH_3D["backups"][0]),
 }
 

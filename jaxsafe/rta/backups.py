@@ -13,9 +13,9 @@ from jaxtyping import Array, Bool, Float
 from jaxsafe.rta.asif import linear, speed_ball
 from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.filter import BackupController, CertifiedRTA, Faults, TerminalSet
+from jaxsafe.rta.formation import in_formation
 from jaxsafe.rta.projection import project_box_ball
 from jaxsafe.rta.proofs import (
-    AWAY_GAIN,
     align_and_brake_faults,
     aligned_or_slow_faults,
     at_rest_faults,
@@ -26,6 +26,14 @@ from jaxsafe.rta.proofs import (
 )
 from jaxsafe.rta.speed_limit import speed_limit_facts
 from jaxsafe.rta.tube import Tube, after_step, largest_turn, measured
+from jaxsafe.rta.tube_in_space import (
+    TURN_GAIN,
+    Pursuit,
+    TubeInSpace,
+    first_in_space,
+    next_in_space,
+    wrong_course,
+)
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.dubins import Dubins2D, Dubins3D
 from jaxsafe.simulation.geometry import direction, safe_norm
@@ -202,7 +210,7 @@ class MatchVelocity(BackupController, type="match_velocity"):
 
     Far from the origin, rounding moves two aircraft of equal velocity closer or apart by 0.01 ft a
     step. So where the agent is closer than `clearance`, it takes the lead's velocity plus
-    w = 0.1 s⁻¹ (`clearance` − ‖r‖) r/‖r‖, to first order.
+    w = (`clearance` − ‖r‖) r/‖r‖ / `away_time`, to first order. That time is in whole seconds.
     """
 
     lead: PlatformName
@@ -210,6 +218,7 @@ class MatchVelocity(BackupController, type="match_velocity"):
     turn: Literal["left", "right"]
     climb: Literal["up", "down"] | None = None  # None in the plane
     dead_zone: Annotated[Radians, Range(0.0)] = 0.2
+    away_time: Annotated[int, Range(1, largest=1000)] = 10
     within_limits: ClassVar[bool] = True
 
     def control(self, env: Environment, sim: Sim, later: Others) -> Float[Array, " m"]:
@@ -217,12 +226,7 @@ class MatchVelocity(BackupController, type="match_velocity"):
         lead = sim.platforms[self.lead]
         lead_after = later[self.lead]
         plant = cast(Aircraft, env.agent_platform)
-        away = self._away(own.position - lead.position)
-        level_squared = jnp.sum(lead.velocity[:2] ** 2)
-        faster = jnp.sum(away * lead.velocity) / lead.speed
-        goal = lead_after.heading if self.climb is None else lead.heading
-        goal += (lead.velocity[0] * away[1] - lead.velocity[1] * away[0]) / level_squared
-        error = self._sign * wrap(self._sign * (goal - own.heading), -self.dead_zone, 2.0 * jnp.pi)
+        away, faster, level_squared, error = self._aim(own, lead, lead_after)
         speed = jnp.clip(lead_after.speed + faster, plant.speed_limits[0], plant.speed_limits[1])
         controls = {"acceleration": (speed - own.speed) / env.dt}
         if self.climb is None:
@@ -233,6 +237,19 @@ class MatchVelocity(BackupController, type="match_velocity"):
             angle = lead_after.flight_path_angle + steeper
             controls |= self._in_space(env, own, error=error, lead_turn=lead_turn, angle=angle)
         return jnp.stack([controls[name] for name in env.action_names])
+
+    def _aim(self, own: Any, lead: Any, lead_after: Any) -> tuple[Array, Array, Array, Array]:
+        """Return w, its part along the lead's velocity, and the heading error.
+
+        The third of four values is the square of the lead's horizontal speed.
+        """
+        away = self._away(own.position - lead.position)
+        level_squared = jnp.sum(lead.velocity[:2] ** 2)
+        faster = jnp.sum(away * lead.velocity) / lead.speed
+        goal = lead_after.heading if self.climb is None else lead.heading
+        goal += (lead.velocity[0] * away[1] - lead.velocity[1] * away[0]) / level_squared
+        error = self._sign * wrap(self._sign * (goal - own.heading), -self.dead_zone, 2.0 * jnp.pi)
+        return away, faster, level_squared, error
 
     def duration(self, env: Environment) -> Number:
         """Return the time [s] of a full turn and, in space, of the roll that begins it."""
@@ -253,46 +270,87 @@ class MatchVelocity(BackupController, type="match_velocity"):
 
     @property
     def has_tubes(self) -> bool:
-        return self.climb is None
+        return True
 
     def first_tube(
         self, env: Environment, before: Sim, after: Sim, bound: UncertaintyBound
     ) -> Tube:
         own = before.platforms[env.agent]
+        moved = after.platforms[env.agent]
+        if self.climb is not None:
+            return first_in_space(env, bound, before=own, after=moved)
         tube = measured(bound, own)
-        return after_step(env, bound, tube=tube, before=own, after=after.platforms[env.agent])
+        return after_step(env, bound, tube=tube, before=own, after=moved)
 
     def next_tube(
         self, env: Environment, before: Sim, after: Sim, bound: UncertaintyBound, tube: Tube
     ) -> Tube:
         own = before.platforms[env.agent]
         lead = before.platforms[self.lead]
+        moved = after.platforms[env.agent]
         asked = dict(zip(env.action_names, self.control(env, before, after.platforms), strict=True))
 
         # The true control goes for another velocity than the predicted one, by so much.
         reach = tube.position + bound.position
         distance = safe_norm(own.position - lead.position)
         too_close = jnp.maximum(self.clearance - (distance - reach), 0.0)
-        apart = AWAY_GAIN * jnp.minimum(reach, 2.0 * too_close)
-        plant = cast(Dubins2D, env.agent_platform)
-        slowest = plant.speed_limits[0] - bound.process * env.dt
-        own_speed = jnp.maximum(own.speed - tube.speed, slowest)
-        wrong_heading = largest_turn(bound.velocity, own_speed) + apart / lead.speed
-        kept = tube.replace(
-            heading=jnp.maximum(tube.heading - _spare(env, asked, "heading_rate"), wrong_heading),
-            speed=jnp.maximum(
-                tube.speed - _spare(env, asked, "acceleration"), bound.velocity + apart
-            ),
-        )
-        wider = after_step(
-            env, bound, tube=tube, before=own, after=after.platforms[env.agent], kept=kept
-        )
+        apart = self.away_gain * jnp.minimum(reach, 2.0 * too_close)
+        if self.climb is not None:
+            tube = cast(TubeInSpace, tube)
+            plant = cast(Dubins3D, env.agent_platform)
+            # Where the agent is closer than half the clearance w turns faster than it grows.
+            apart *= jnp.maximum(too_close / jnp.maximum(distance - reach, 1.0), 1.0)
+            *_, error = self._aim(own, lead, after.platforms[self.lead])
+            pursuit = Pursuit(
+                error=error,
+                apart=apart,
+                lead_level_speed=safe_norm(lead.velocity[:2]),
+                spare_acceleration=_spare(env, asked, "acceleration"),
+                spare_climb=_spare(env, asked, "flight_path_angle_rate"),
+                climb_by_error=jnp.zeros_like(error),
+            )
+            wrong_heading = wrong_course(plant, bound, tube, own, pursuit)
+            largest = tube.heading + wrong_heading
+            share = _climb_share(jnp.abs(error))
+            changes = [
+                _climb_share(jnp.abs(error) + largest) - share,
+                share - _climb_share(jnp.maximum(jnp.abs(error) - largest, 0.0)),
+            ]
+            lowest, highest = plant.flight_path_angle_limits
+            steep = lowest if self.climb == "up" else highest
+            to_steep = jnp.abs(steep - lead.flight_path_angle)
+            to_steep += self.away_gain * too_close / lead.speed
+            by_error = jnp.minimum(to_steep, highest - lowest) * jnp.maximum(*changes)
+            pursuit = pursuit.replace(climb_by_error=by_error)
+            wider: Tube = next_in_space(
+                env, bound, tube=tube, before=own, after=moved, pursuit=pursuit
+            )
+            to_turn = self._sign * error + self.dead_zone
+        else:
+            plant = cast(Dubins2D, env.agent_platform)
+            slowest = plant.speed_limits[0] - bound.process * env.dt
+            own_speed = jnp.maximum(own.speed - tube.speed, slowest)
+            wrong_heading = largest_turn(bound.velocity, own_speed) + apart / lead.speed
+            kept = tube.replace(
+                heading=jnp.maximum(
+                    tube.heading - _spare(env, asked, "heading_rate"), wrong_heading
+                ),
+                speed=jnp.maximum(
+                    tube.speed - _spare(env, asked, "acceleration"), bound.velocity + apart
+                ),
+            )
+            wider = after_step(env, bound, tube=tube, before=own, after=moved, kept=kept)
+            to_turn = self._sign * asked["heading_rate"] * env.dt + self.dead_zone
 
         # Where one of them may turn the long way round and the other one not, nothing is known.
-        to_turn = self._sign * asked["heading_rate"] * env.dt + self.dead_zone
         doubt = tube.heading + wrong_heading + ROUNDING
         same_way = (to_turn >= doubt) & (to_turn + doubt < 2.0 * jnp.pi)
         return wider.replace(position=jnp.where(same_way, wider.position, LOST))
+
+    @property
+    def away_gain(self) -> float:
+        """Speed away from the lead per foot that the agent is too close [1/s]."""
+        return 1.0 / self.away_time
 
     @property
     def _sign(self) -> float:
@@ -302,7 +360,7 @@ class MatchVelocity(BackupController, type="match_velocity"):
         """Return w, the velocity away from the lead where the agent is too close."""
         distance = safe_norm(apart)
         missing = jnp.maximum(self.clearance - distance, 0.0)
-        return AWAY_GAIN * missing * apart / jnp.maximum(distance, 1.0)
+        return self.away_gain * missing * apart / jnp.maximum(distance, 1.0)
 
     def _in_space(
         self, env: Environment, own: Any, error: Array, lead_turn: Array, angle: Array
@@ -317,12 +375,12 @@ class MatchVelocity(BackupController, type="match_velocity"):
             angle: the flight path angle to fly once the error is small [rad].
         """
         plant = cast(Dubins3D, env.agent_platform)
-        bank = arctan(own.speed * (0.25 * error + lead_turn) / plant.gravity)
+        bank = arctan(own.speed * (TURN_GAIN * error + lead_turn) / plant.gravity)
         bank = jnp.clip(bank, plant.roll_limits[0], plant.roll_limits[1])
         lowest, highest = plant.flight_path_angle_limits
         steep = lowest if self.climb == "up" else highest  # ż = −v sin γ
         level = jnp.clip(angle, lowest, highest)
-        share = jnp.clip((jnp.abs(error) - 0.15) / 0.3, 0.0, 1.0)
+        share = _climb_share(jnp.abs(error))
         gamma = level + share * (steep - level)
         return {
             "roll_rate": (bank - own.roll) / env.dt,
@@ -357,6 +415,15 @@ class VelocityMatched(TerminalSet, type="velocity_matched"):
     def contains_tube(self, env: Environment, sim: Sim, tube: Tube) -> Bool[Array, ""]:
         of = sim.platforms[self.of]
         to = sim.platforms[self.to]
+        if isinstance(tube, TubeInSpace):
+            plant = cast(Dubins3D, env.agent_platform)
+            own, lead = (of, to) if self.of == env.agent else (to, of)
+            matched = in_formation(
+                own, lead, plant.gravity, plant.speed_limits[0], tube, tolerance=self.tolerance
+            )
+            return matched & (
+                safe_norm(of.position - to.position) - tube.position >= self.clearance
+            )
         speed = safe_norm(of.velocity - to.velocity)
         speed += tube.velocity(sim.platforms[env.agent].speed)
         distance = safe_norm(of.position - to.position) - tube.position
@@ -399,6 +466,11 @@ def _spare(env: Environment, asked: Mapping[str, Number], name: str) -> Any:
     actuator = next(actuator for actuator in env.actuators if actuator.name == name)
     spare = jnp.minimum(asked[name] - actuator.low, actuator.high - asked[name])
     return env.dt * jnp.maximum(spare, 0.0)
+
+
+def _climb_share(error: Array) -> Any:
+    """Return the share of the steepest climb that is flown at a size of the heading error."""
+    return jnp.clip((error - 0.15) / 0.3, 0.0, 1.0)
 
 
 def misalignment(state: Any) -> Float[Array, ""]:

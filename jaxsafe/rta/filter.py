@@ -393,8 +393,7 @@ class CertifiedRTA(RTA):
         faults = {}
         if self.bound is not None and not self._bound_is_proved:
             faults[
-                "rta.bound is proved for brake without a horizon"
-                " and for match_velocity in the plane alone"
+                "rta.bound is proved for brake without a horizon and for match_velocity alone"
             ] = jnp.ones((), bool)
         if self.terminal:
             faults |= self.terminal.faults(env, sim, self)

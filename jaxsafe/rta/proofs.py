@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool
 from jaxsafe.processors.constraint import Separation
 from jaxsafe.processors.status import DeltaV, Distance
 from jaxsafe.rta.filter import BackupController, CertifiedRTA, Faults
+from jaxsafe.rta.formation import formation_faults
 from jaxsafe.rta.speed_limit import (
     MAX_ORBIT_ANGLE_PER_STEP,
     SpeedLimitFacts,
@@ -82,8 +83,8 @@ PROVED_THRUST = (2.0 / 12.0) / 0.2
 PROVED_MARGIN = 2.5e-4 / 0.2
 """Margin that the first step of a certificate must gain, as a share of that speed limit."""
 
-AWAY_GAIN = 0.1
-"""Speed away from the lead of `match_velocity` per foot that the agent is too close [1/s]."""
+PLANAR_AWAY_TIME = 10
+"""The `away_time` [s] of `match_velocity` for which Proposition 13 is proved."""
 
 CLOSE = 1.001
 """Numbers of this ratio count as equal to those of a proof, because the proof has more reserve."""
@@ -318,7 +319,7 @@ def velocity_matched_faults(
     terminal: VelocityMatched,
     keeper: type[MatchVelocity],
 ) -> Faults:
-    """Return what is missing for Propositions 6, 7 and 12: `match_velocity` keeps the set."""
+    """Return what is missing for Propositions 6, 7 and 12 to 15: `match_velocity` keeps the set."""
     agent = env.agent
     others = {terminal.of, terminal.to} - {agent}
     plant = cast(Aircraft, env.agent_platform)
@@ -439,7 +440,7 @@ def _faults_with_bound(
     name: str,
     extremes: Mapping[str, tuple[Number, Number]],
 ) -> Faults:
-    """Return what is missing for Propositions 12 and 13.
+    """Return what is missing for Propositions 12 and 13, or in space for 14 and 15.
 
     Args:
         env: the environment.
@@ -453,10 +454,19 @@ def _faults_with_bound(
     bound = rta.bound
     assert bound is not None
     plant = env.agent_platform
-    if type(plant) is not Dubins2D:
-        return {"rta.bound is proved for aircraft in the plane alone": _true()}
     if bound.delay:
         return {"rta.bound.delay is not proved for aircraft": _true()}
+    unknown_thrust: Faults = {
+        "rta.bound.mass is not proved for aircraft": bound.mass > 0.0,
+        "rta.bound.misalignment is not proved for aircraft": bound.misalignment > 0.0,
+    }
+    if type(plant) is Dubins3D:
+        return unknown_thrust | formation_faults(
+            env, rta, terminal=terminal, backups=backups, state=state, name=name, extremes=extremes
+        )
+    plant = cast(Dubins2D, plant)
+    if any(backup.away_time != PLANAR_AWAY_TIME for backup in backups):
+        return {"rta.bound in the plane is proved for an away_time of 10 s alone": _true()}
     dt = env.dt
     slowest, fastest = plant.speed_limits
     limits = [cast(Separation, constraint(env, limit)) for limit in rta.constraints]
@@ -469,15 +479,14 @@ def _faults_with_bound(
         control: dt * jnp.minimum(-low, high) for control, (low, high) in ranges.items()
     } | {control: jnp.zeros_like(dt) for control in plant.inputs if control not in ranges}
 
-    unknown = bound.velocity + AWAY_GAIN * bound.position
+    away_gain = 1.0 / PLANAR_AWAY_TIME
+    unknown = bound.velocity + away_gain * bound.position
     wrong = 1.2 * (unknown + bound.process * dt)  # η
-    away = AWAY_GAIN * (jnp.max(outer) - terminal.clearance + 0.5 * dt * wrong)  # A
+    away = away_gain * (jnp.max(outer) - terminal.clearance + 0.5 * dt * wrong)  # A
     difference = terminal.tolerance + away + unknown
     turn = dt * jnp.maximum(*map(jnp.abs, extremes["heading_rate"]))
     angle = turn + 1.05 * difference / slowest
-    return {
-        "rta.bound.mass is not proved for aircraft": bound.mass > 0.0,
-        "rta.bound.misalignment is not proved for aircraft": bound.misalignment > 0.0,
+    return unknown_thrust | {
         "rta.bound is larger than velocity_matched is proved for": ~(
             (wrong <= CLOSE * 0.02 * slowest) & ((away + wrong) * dt <= 0.1 * jnp.min(kept))
         ),
@@ -503,7 +512,7 @@ def _faults_with_bound(
             terminal.clearance * CLOSE >= jnp.max(kept) + 1.5 * dt * wrong
         ),
         "rta.bound: clearance of match_velocity is too small or too large": ~(
-            (jnp.min(outer) * CLOSE >= terminal.clearance + wrong / (0.8 * AWAY_GAIN))
+            (jnp.min(outer) * CLOSE >= terminal.clearance + wrong / (0.8 * away_gain))
             & (jnp.max(outer) <= 2.0 * (minimum - bound.position))
             & (away <= 0.03 * slowest)
         ),

@@ -112,9 +112,7 @@ def test_a_run_has_the_policies_that_it_saved(run: Any, whole: Path) -> None:
         run.policy(checkpoint="9" * 5000)
     with pytest.raises(ConfigError, match="no step a number of thousands of digits in"):
         run.policy(checkpoint="9" * 4000)
-    with pytest.raises(
-        ConfigError, match="found 'a number of thousands of digits'; choose"
-    ):
+    with pytest.raises(ConfigError, match="found 'a number of thousands of digits'; choose"):
         run.policy(checkpoint=10**5000)
 
 

@@ -1,0 +1,303 @@
+"""Tubes about the predicted way of an aircraft in space, which banks in order to turn.
+
+Proposition 14 of docs/safety/proofs.md proves them, for steps of 1 s. So no length of a step
+appears in the formulas of the turn.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, cast
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.rta.bound import UncertaintyBound
+from jaxsafe.rta.tube import Tube, largest_turn, measured
+from jaxsafe.simulation.dubins import Dubins3D
+from jaxsafe.simulation.geometry import safe_norm
+from jaxsafe.simulation.trig import arctan
+from jaxsafe.types import Number, Record
+
+if TYPE_CHECKING:
+    from jaxsafe.environment import Environment
+
+TURN_GAIN = 0.25
+"""Turn rate per heading error that `match_velocity` asks for in space [1/s]."""
+
+SLOW_MODE = 0.7192
+"""Time c [s] for which ψ + c ψ̇ shrinks by the factor 0.6952 in each step of the turn."""
+
+FAST_MODE = 2.7808
+"""Time c [s] for which ψ + c ψ̇ shrinks by the factor 0.1798 in each step of the turn."""
+
+
+class TubeInSpace(Tube):
+    """How far the true state of an aircraft in space may be from the predicted one."""
+
+    climb: Float[Array, ""]  # of the flight path angle [rad]
+    sideways: Float[Array, ""]  # of g tan φ, the acceleration across the velocity [ft/s²]
+    # Of ψ + c g tan φ/v̄, with the predicted speed v̄ and the two c above [rad].
+    slow: Float[Array, ""]
+    fast: Float[Array, ""]
+
+    def velocity(self, speed: Number) -> Any:
+        return self.speed + speed * safe_norm(jnp.stack([self.heading, self.climb]))
+
+
+class Pursuit(Record):
+    """What `match_velocity` asks for in a step of the prediction, and how wrong that may be."""
+
+    error: Float[Array, ""]  # heading error ē [rad]
+    apart: Float[Array, ""]  # difference of the velocities that are aimed at [ft/s]
+    lead_level_speed: Float[Array, ""]  # horizontal speed of the lead [ft/s]
+    spare_acceleration: Float[Array, ""]  # by which the command could be changed, times 1 s [ft/s]
+    spare_climb: Float[Array, ""]  # the same of the flight path angle [rad]
+    climb_by_error: Float[Array, ""]  # change of the angle aimed at, by that of ē [rad]
+
+
+def first_in_space(
+    env: Environment, bound: UncertaintyBound, before: Any, after: Any
+) -> TubeInSpace:
+    """Return the tube one step after a measured state, with the same control on both ways.
+
+    Args:
+        env: the environment.
+        bound: the bound on what is not known.
+        before: the measured state.
+        after: the predicted state after the step.
+    """
+    plant = cast(Dubins3D, env.agent_platform)
+    plain = measured(bound, before)
+    climb = plain.heading
+    heading = largest_turn(bound.velocity, before.speed * _level(plant, before, climb))
+    none = jnp.zeros_like(plain.position)
+    tube = TubeInSpace(
+        position=plain.position,
+        heading=heading,
+        speed=plain.speed,
+        climb=climb,
+        sideways=none,
+        slow=heading,
+        fast=heading,
+    )
+    by_speed = _turn_by_speed(plant, before, after, speed=tube.speed, sideways=none)
+    turned = heading + by_speed
+    kept = tube.replace(heading=turned, slow=turned, fast=turned)
+    return _moved(env, bound, tube=tube, kept=kept, turn=by_speed, before=before, after=after)
+
+
+def next_in_space(
+    env: Environment,
+    bound: UncertaintyBound,
+    tube: TubeInSpace,
+    before: Any,
+    after: Any,
+    pursuit: Pursuit,
+) -> TubeInSpace:
+    """Return the tube after a step in which both ways turn to the heading of the lead.
+
+    Args:
+        env: the environment.
+        bound: the bound on what is not known.
+        tube: the tube before the step.
+        before: the predicted state before the step.
+        after: the predicted state after the step.
+        pursuit: what the controller asks for.
+    """
+    plant = cast(Dubins3D, env.agent_platform)
+    g = plant.gravity
+    own_speed = jnp.maximum(before.speed - tube.speed, plant.speed_limits[0])
+    wrong_heading = wrong_course(plant, bound, tube, before, pursuit)
+    wrong_climb = largest_turn(bound.velocity, own_speed) + pursuit.climb_by_error
+    wrong_climb += pursuit.apart / pursuit.lead_level_speed
+    speed = jnp.maximum(tube.speed - pursuit.spare_acceleration, bound.velocity + pursuit.apart)
+    climb = jnp.maximum(tube.climb - pursuit.spare_climb, wrong_climb)
+
+    # The bank that is asked for, as g tan φ, and by how much it may be another one.
+    speed_error = tube.speed + bound.velocity
+    asked = TURN_GAIN * before.speed * pursuit.error
+    noise = (before.speed + speed_error) * wrong_heading
+    noise = TURN_GAIN * (noise + speed_error * (jnp.abs(pursuit.error) + tube.heading))
+    change = noise + TURN_GAIN * before.speed * tube.heading
+    lowest, highest = g * jnp.tan(plant.roll_limits[0]), g * jnp.tan(plant.roll_limits[1])
+    least_asked = jnp.clip(asked - change, lowest, highest)
+    most_asked = jnp.clip(asked + change, lowest, highest)
+    asked_kept = jnp.clip(asked, lowest, highest)
+    change_kept = jnp.maximum(most_asked - asked_kept, asked_kept - least_asked)
+    now = g * jnp.tan(before.roll)
+    least_roll = arctan(jnp.maximum(now - tube.sideways, lowest) / g)
+    most_roll = arctan(jnp.minimum(now + tube.sideways, highest) / g)
+
+    # Which of the ways to change the bank may act on the true way or between the two.
+    roll = next(actuator for actuator in env.actuators if actuator.name == "roll_rate")
+    down, up = roll.low * env.dt, roll.high * env.dt
+    least_step = arctan(least_asked / g) - most_roll
+    most_step = arctan(most_asked / g) - least_roll
+    only_down = most_step <= down
+    only_up = least_step >= up
+    may_down = (least_step < down) | only_down
+    may_up = (most_step > up) | only_up
+    only_limit = (least_asked == most_asked) & ~may_down & ~may_up
+    may_follow = ~(only_down | only_up | only_limit)
+    may_rest = (asked + change > highest) | (asked - change < lowest)
+    may_rest = may_rest & ~(only_down | only_up)
+    downwards = _stretches(plant, least_roll, most_roll, down)
+    upwards = _stretches(plant, least_roll, most_roll, up)
+    # Of a mixture of ways the rows are its corners: the share of what is asked for, and that of the
+    # bank before.
+    follows = jnp.stack([1.0 + 0.0 * g, *[0.0 * g] * 5])
+    stays = jnp.stack([0.0 * g, 0.0 * g, *downwards, *upwards])
+    allowed = jnp.stack([may_follow, may_rest, may_down, may_down, may_up, may_up])
+    first = jnp.argmax(allowed)
+    follows = jnp.where(allowed, follows, follows[first])
+    stays = jnp.where(allowed, stays, stays[first])
+
+    # ψ after the step is ψ + a δ₀ + b δ₁, with the turn rates δ = g tan φ/v at its ends.
+    widest = jnp.maximum(jnp.where(may_follow, change_kept, 0.0), jnp.max(stays) * tube.sideways)
+    bank = jnp.maximum(jnp.abs(least_roll), jnp.abs(most_roll))
+    bank = jnp.maximum(bank, arctan((g * jnp.tan(jnp.abs(after.roll)) + widest) / g))
+    bank = jnp.minimum(bank, jnp.maximum(plant.roll_limits[1], -plant.roll_limits[0]))
+    rolled = jnp.abs(after.roll - before.roll) + (tube.sideways + widest) / g
+    rolled = jnp.minimum(rolled, jnp.maximum(up, -down))
+    stretch = (jnp.cos(jnp.maximum(bank - rolled, 0.0)) / jnp.cos(bank)) ** 2
+    slow = jnp.minimum(before.speed, after.speed)
+    fast = jnp.maximum(before.speed, after.speed)
+    least = (0.5 - rolled * jnp.tan(bank) / 3.0) * after.speed / fast
+    most = (0.5 + (stretch - 1.0) / 6.0) * after.speed / slow
+    ratio = before.speed / after.speed
+
+    # Axes: g tan φ, ψ and its two mixtures with δ; the corners of a and b; the ways of the bank.
+    whole = jnp.array([0.0, 1.0, 1.0, 1.0])
+    delay = jnp.array([1.0, 0.0, SLOW_MODE, FAST_MODE])
+    of_last = whole[:, None] * jnp.stack([least, most, least, most]) + delay[:, None]
+    of_first = whole[:, None] * jnp.stack([least, least, most, most])
+    known = _combined(
+        tube,
+        before.speed,
+        of_heading=whole[:, None, None] - TURN_GAIN * ratio * of_last[..., None] * follows,
+        of_turn=ratio * (of_first[..., None] + of_last[..., None] * stays),
+    )
+    by_noise = jnp.max(follows) * (whole * most + delay) * noise / after.speed
+    turned, heading, slow_mode, fast_mode = known + by_noise
+
+    sideways = jnp.minimum(widest, after.speed * turned)
+    by_speed = _turn_by_speed(
+        plant,
+        before,
+        after,
+        speed=jnp.maximum(tube.speed, speed),
+        sideways=stretch * jnp.maximum(tube.sideways, sideways),
+    )
+    turn = stretch * jnp.maximum(tube.sideways, sideways) / slow + by_speed
+    kept = tube.replace(
+        heading=jnp.minimum(tube.heading + turn, heading + by_speed),
+        speed=speed,
+        climb=climb,
+        sideways=sideways,
+        slow=slow_mode + by_speed,
+        fast=fast_mode + by_speed,
+    )
+    return _moved(env, bound, tube=tube, kept=kept, turn=turn, before=before, after=after)
+
+
+def _combined(
+    tube: TubeInSpace,
+    speed: Number,
+    of_heading: Float[Array, "k corners ways"],
+    of_turn: Float[Array, "k corners ways"],
+) -> Float[Array, " k"]:
+    """Return the largest sums of heading and turn rate in a tube, each with its factors.
+
+    Any two of the four bounds that a tube has of them bound such a sum. The best pair counts.
+    """
+    widths_and_times = ((tube.heading, 0.0), (tube.slow, SLOW_MODE), (tube.fast, FAST_MODE))
+    turn = tube.sideways / speed
+    largest = []
+    for i, (one, one_time) in enumerate(widths_and_times):
+        rest = of_turn - one_time * of_heading
+        largest.append(jnp.abs(of_heading) * one + jnp.abs(rest) * turn)
+        for other, other_time in widths_and_times[i + 1 :]:
+            of_other = rest / (other_time - one_time)
+            largest.append(jnp.abs(of_heading - of_other) * one + jnp.abs(of_other) * other)
+    return jnp.min(jnp.max(jnp.stack(largest), axis=(-2, -1)), axis=0)
+
+
+def _stretches(plant: Dubins3D, low: Number, high: Number, step: Number) -> tuple[Any, Any]:
+    """Return the least and largest ratio of 1/cos² of a bank after a step of it and before.
+
+    Args:
+        plant: the aircraft.
+        low: the least bank before the step [rad].
+        high: the largest bank before the step [rad].
+        step: what is added to it [rad]. Beyond the limits of the bank nothing is.
+    """
+    limits = plant.roll_limits
+    ends = [
+        jnp.clip(bank, limits[0] - jnp.minimum(step, 0.0), limits[1] - jnp.maximum(step, 0.0))
+        for bank in (low, high)
+    ]
+    ratios = [(jnp.cos(end) / jnp.cos(end + step)) ** 2 for end in ends]
+    return jnp.minimum(*ratios), jnp.maximum(*ratios)
+
+
+def wrong_course(
+    plant: Dubins3D, bound: UncertaintyBound, tube: TubeInSpace, before: Any, pursuit: Pursuit
+) -> Any:
+    """Return by how much the heading error of the true control is measured wrongly [rad]."""
+    own_speed = jnp.maximum(before.speed - tube.speed, plant.speed_limits[0])
+    level_speed = own_speed * _level(plant, before, tube.climb)
+    return largest_turn(bound.velocity, level_speed) + pursuit.apart / pursuit.lead_level_speed
+
+
+def _moved(
+    env: Environment,
+    bound: UncertaintyBound,
+    tube: TubeInSpace,
+    kept: TubeInSpace,
+    turn: Number,
+    before: Any,
+    after: Any,
+) -> TubeInSpace:
+    """Return the tube after a step at whose end the disturbance has changed the velocity.
+
+    Args:
+        env: the environment.
+        bound: the bound on what is not known.
+        tube: the tube before the step.
+        kept: what the controls leave of it by the end of the step, without the disturbance.
+        turn: how far the headings may move apart within the step [rad].
+        before: the predicted state before the step.
+        after: the predicted state after the step.
+    """
+    plant = cast(Dubins3D, env.agent_platform)
+    push = bound.process * env.dt
+    own_speed = jnp.maximum(after.speed - kept.speed, plant.speed_limits[0])
+    turned = largest_turn(push, own_speed * _level(plant, after, kept.climb))
+    fastest = jnp.maximum(before.speed, after.speed)
+    within = tube.replace(heading=tube.heading + turn, speed=kept.speed, climb=kept.climb)
+    apart = tube.velocity(fastest) + within.velocity(fastest)
+    return kept.replace(
+        position=tube.position + 0.5 * env.dt * (apart + push),
+        heading=kept.heading + turned,
+        speed=kept.speed + push,
+        climb=kept.climb + largest_turn(push, own_speed),
+        slow=kept.slow + turned,
+        fast=kept.fast + turned,
+    )
+
+
+def _level(plant: Dubins3D, state: Any, climb: Number) -> Any:
+    """Return the least cosine of a flight path angle in a tube."""
+    limits = plant.flight_path_angle_limits
+    steepest = jnp.maximum(limits[1], -limits[0])
+    return jnp.cos(jnp.minimum(jnp.abs(state.flight_path_angle) + climb, steepest))
+
+
+def _turn_by_speed(
+    plant: Dubins3D, before: Any, after: Any, speed: Number, sideways: Number
+) -> Any:
+    """Return how far other speeds turn the true heading from the predicted one in a step [rad]."""
+    slow = jnp.minimum(before.speed, after.speed)
+    bank = jnp.maximum(jnp.abs(before.roll), jnp.abs(after.roll))
+    acceleration = plant.gravity * jnp.tan(bank) + sideways
+    return acceleration * speed / (slow * jnp.maximum(slow - speed, plant.speed_limits[0]))
