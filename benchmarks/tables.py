@@ -871,6 +871,25 @@ def _program(row: Results) -> list[str]:
     return [f"{row['compile_s']:.2g}", "–" if memory is None else f"{memory / 2**20:.0f}"]
 
 
+def verification(results: Results) -> str:
+    """Return the table of what was proved from a box of starts, and how long it took."""
+    rows = (
+        [
+            f"`{row['policy']}`" if row["policy"].startswith("pretrained/") else row["policy"],
+            str(row["steps"]),
+            row["arithmetic"],
+            row["result"],
+            f"{row['proved']:.1%}",
+            f"{row['bounded']:,}",
+            f"{row['seconds']:.1f}",
+            "" if row["check_seconds"] is None else f"{row['check_seconds']:.0f}",
+        ]
+        for row in results["rows"]
+    )
+    heads = "policy | steps | arithmetic | result | proved | boxes bounded | seconds | check [s]"
+    return markdown(heads.split(" | "), rows)
+
+
 TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("", speed, "docs/performance.md"),
     ("environments", environments, "docs/performance.md"),
@@ -892,6 +911,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("scaling", projection, "docs/scaling.md"),
     ("memory", memory, "docs/scaling.md"),
     ("robustness", robustness, "docs/safety/attacks.md"),
+    ("verification", verification, "docs/verification.md"),
     ("controllers", controllers, "docs/controllers.md"),
     ("controllers", controllers_filtered, "docs/controllers.md"),
     ("adapters", adapters, "docs/adapters/gymnasium.md"),

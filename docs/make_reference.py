@@ -35,7 +35,8 @@ def options() -> str:
             " `python -m jaxsafe.rta.falsify` and `python -m jaxsafe.plot.safe_set`."
         ),
         "The exit code is 0, or 2 after a mistake in an option or a file, 3 if a seed diverged, and"
-        " 130 after Ctrl-C. `falsify` exits with 1 if there was a violation.",
+        " 130 after Ctrl-C. `falsify` and `verify` exit with 1 if there was a"
+        " violation, and `verify` with 3 if it is open.",
     ]
     for command in (*COMMANDS, *SUBCOMMANDS):
         module = importlib.import_module(f"jaxsafe.commands.{command.replace(' ', '_')}")

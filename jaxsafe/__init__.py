@@ -17,11 +17,12 @@ if TYPE_CHECKING:
     from jaxsafe.flight import fly
     from jaxsafe.runs.run import open_run
     from jaxsafe.runs.training import train
+    from jaxsafe.verify.verify import verify
 
     TASKS: tuple[str, ...]
     __version__: str
 else:
-    from jaxsafe import evaluate, train  # packages that can be called
+    from jaxsafe import evaluate, train, verify  # packages that can be called
 
 __all__ = [
     "TASKS",
@@ -41,6 +42,7 @@ __all__ = [
     "rollout",
     "step",
     "train",
+    "verify",
 ]
 
 _LATER = {"fly": "jaxsafe.flight", "open_run": "jaxsafe.runs.run"}

@@ -12,6 +12,7 @@ COMMANDS = {
     "tune": "train many settings as one program and rank them",
     "export": "write a policy as ONNX, StableHLO or VNN-LIB",
     "config": "print an environment as YAML",
+    "verify": "prove that a policy is safe from every start in a box",
     "falsify": "let adversaries try to break a filter",
     "safe_set": "draw where a filter certifies",
 }

@@ -43,7 +43,14 @@ Squares of larger numbers are infinite in single precision, and so is every marg
 """
 
 
-class Options(PolicyOptions):
+class SingleOptions(PolicyOptions):
+    """The options of a command that takes one policy."""
+
+    seed: Seed = 0
+    """Which policy of a run."""
+
+
+class Options(SingleOptions):
     """The options of `jaxsafe export`."""
 
     groups: ClassVar = {
@@ -66,8 +73,6 @@ class Options(PolicyOptions):
     leads from the features to the output of the network, by matrix products and tanh only. state
     leads from the state at a start to the control in physical units.
     """
-    seed: Seed = 0
-    """Which policy of a run."""
     batch: Count = 1
     """Number of inputs at once, with format=onnx."""
     steps: Annotated[int, Range(1, largest=MAX_STEPS)] = 40
@@ -95,7 +100,7 @@ def main(argv: Sequence[str]) -> int:
 
     options = Options.parse(argv)
     run, form, out = options.run, options.format, options.out
-    saved, stem = _policy(options)
+    saved, stem = single_policy(options)
     _require_finite(run, saved)
     kinds = {
         "observation": lambda: functions.action(saved),
@@ -161,7 +166,7 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-def _policy(options: Options) -> tuple[SavedPolicy | ForeignPolicy, str]:
+def single_policy(options: SingleOptions) -> tuple[SavedPolicy | ForeignPolicy, str]:
     """Return the policy that the options name, and the first part of the names of files.
 
     Raises:

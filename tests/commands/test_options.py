@@ -106,7 +106,7 @@ def test_the_value_of_the_first_option_may_stand_alone_as_the_first_word() -> No
 def test_every_command_has_an_option_that_may_stand_first() -> None:
     for name in commands.COMMANDS:
         options = importlib.import_module(f"jaxsafe.commands.{name}").Options
-        expected = "run" if name in ("evaluate", "plot", "export") else "env"
+        expected = "run" if name in ("evaluate", "plot", "export", "verify") else "env"
         assert options.arguments(["x"]) == {expected: "x"}
 
 

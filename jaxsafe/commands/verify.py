@@ -1,0 +1,140 @@
+"""Prove that a policy keeps the speed limit from every start in a box, or find a violation.
+
+The proof is about the closed loop that `jaxsafe.step` runs, between samples too, and with its
+rounding. The exit code is 0 if the property is proved, 1 if a start violates it, and 3 if it is
+open. A certificate is written, which `jaxsafe/verify/check.py` checks with NumPy alone.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from jaxsafe.commands import cli
+from jaxsafe.commands.export import BOX, SingleOptions, single_policy
+from jaxsafe.commands.options import Count, File, Option
+from jaxsafe.devices.compilation_cache import enable_compilation_cache
+from jaxsafe.schema.component import Range
+from jaxsafe.schema.errors import ConfigError
+
+if TYPE_CHECKING:
+    from jaxsafe.verify.verify import Verification
+
+MAX_STEPS = 2000
+"""Largest number of steps. A docking episode has as many."""
+
+EXIT_CODES = {"proved": 0, "refuted": 1, "open": 3}
+
+BETWEEN_LINES = 2.0
+"""Seconds between two lines about the progress."""
+
+
+class Options(SingleOptions):
+    """The options of `jaxsafe verify`."""
+
+    groups: ClassVar = {
+        "The policy.": ("run", "seed", "activation"),
+        "The environment in which it acts.": ("env", "env.PATH", "actions", "variant", "rta"),
+        "What is proved.": ("property", "steps", "box.FIELD", "arithmetic"),
+        "The search.": ("minutes", "boxes", "everything", "resume", "out"),
+    }
+
+    property: Literal["safe"] = "safe"
+    """What is proved. safe means that the margin of the speed limit is never negative."""
+    steps: Annotated[int, Range(1, largest=MAX_STEPS)] = 40
+    """Number of steps."""
+    box: Annotated[
+        Mapping[str, Any],
+        Option(prefix="box.", placeholder="FIELD", lists=True, takes="[low,high] or one per axis"),
+    ]
+    """The starts, for instance box.deputy.velocity=[[-0.1,0.1],[0,0.2]].
+
+    By default the position is within [70, 106] m and the velocity within [-0.28, 0.28] m/s.
+    """
+    arithmetic: Literal["float32", "real"] = "float32"
+    """The arithmetic of the loop: single precision as it runs, or real numbers."""
+    minutes: Annotated[int, Range(1, largest=100_000)] | None = None
+    """When to stop. What is left is open then. By default there is no limit."""
+    boxes: Count = 100_000
+    """How many boxes to bound at most."""
+    everything: bool = False
+    """Whether to go on after a violation, for a map of the whole box."""
+    resume: File | None = None
+    """A certificate of the same loop and box to go on from."""
+    out: File | None = None
+    """The certificate to write. By default it has the name of the policy."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command and return its exit code."""
+    enable_compilation_cache()
+    from jaxsafe.storage.provenance import versions
+    from jaxsafe.verify.certificate import load_certificate, save_certificate
+    from jaxsafe.verify.verify import verify
+
+    options = Options.parse(argv)
+    known = load_certificate(options.resume) if options.resume else None
+    saved, stem = single_policy(options)
+    out = Path(options.out or f"{stem}_{options.property}.npz")
+    if out.suffix != ".npz":
+        raise ConfigError(f"out: expected NAME.npz, found {out}")
+    found = verify(
+        saved.env,
+        saved.agent.policy(saved.env, saved.params, True),
+        {**BOX, **options.box},
+        options.steps,
+        arithmetic=options.arithmetic,
+        seconds=math.inf if options.minutes is None else 60.0 * options.minutes,
+        max_boxes=options.boxes,
+        everything=options.everything,
+        resume=known,
+        progress=_Progress(),
+    )
+    save_certificate(out, found, {"policy": stem, "jaxsafe": versions()["jaxsafe"]})
+    print(f"{_line(found)}\n{found.result}: {_reason(found)}\nwritten to {out}")
+    if found.result == "open":
+        print(f"go on with the same options and resume={out}")
+    return EXIT_CODES[found.result]
+
+
+class _Progress:
+    """Prints what is known from time to time."""
+
+    def __init__(self) -> None:
+        self.last = time.monotonic()
+
+    def __call__(self, known: Verification) -> None:
+        if time.monotonic() - self.last < BETWEEN_LINES:
+            return
+        self.last = time.monotonic()
+        rest = known.shares()["open"]
+        left = f", about {known.seconds * rest / (1.0 - rest):.0f} s left" if rest < 1.0 else ""
+        print(f"{_line(known)}{left}", flush=True)
+
+
+def _line(known: Verification) -> str:
+    shares = ", ".join(f"{share:.2%} {name}" for name, share in known.shares().items())
+    return f"{shares} after {known.bounded:,} boxes and {known.seconds:.1f} s"
+
+
+def _reason(found: Verification) -> str:
+    violation = found.counterexample
+    if violation is not None:
+        start = json.dumps(violation.start)
+        return f"margin {violation.margin:.4g} after {violation.step} steps from reset_to {start}"
+    if found.result == "open":
+        return f"{len(found.open.low):,} boxes are left"
+    count = len(found.proved.low)
+    return (
+        f"h ≥ {found.margin:.3g} m/s on all ways of {found.steps} steps from {count:,} boxes, "
+        "between samples too"
+    )
+
+
+def command() -> None:
+    """Run the command on the words of the command line."""
+    cli.run(main, Options)

@@ -1,0 +1,8 @@
+"""Proofs about learned controllers: the closed loop keeps its speed limit from a whole box.
+
+`jaxsafe.verify(env, policy, box)` proves or refutes it, see `jaxsafe.verify.verify.verify`.
+"""
+
+from jaxsafe.schema.callable_package import make_callable
+
+make_callable(__name__, "jaxsafe.verify.verify")

@@ -1,0 +1,127 @@
+"""Certificates: what a verification knows as an .npz file of numbers and one JSON text.
+
+A certificate holds the closed loop as a list of operations with its numbers, the boxes, and for
+each proved box what the proof says of the policy in every step. `check.py` needs nothing else.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import math
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsafe.schema.errors import ConfigError
+from jaxsafe.storage.archive import open_archive
+from jaxsafe.storage.files import parse_json, write_bytes
+from jaxsafe.verify.loop import Loop, Plant
+from jaxsafe.verify.program import RULED, Constant, Op, Program
+from jaxsafe.verify.tube import Claims
+from jaxsafe.verify.verify import Boxes, Counterexample, Verification
+
+FORMAT = "jaxsafe certificate 1"
+"""What a header says of the form of the file."""
+
+PROGRAMS = ("first", "following")
+
+
+def save_certificate(path: str | os.PathLike, known: Verification, about: dict[str, Any]) -> None:
+    """Write a certificate.
+
+    Args:
+        path: the file.
+        known: what is known.
+        about: what else the header says, such as the policy and the version.
+    """
+    arrays = {f"{name}/{end}": x for name, end, x in _boxes(known)}
+    arrays |= {f"claims/{name}": x for name, x in known.claims._asdict().items()}
+    programs = {}
+    for name in PROGRAMS:
+        program = getattr(known.loop, name)
+        rows = []
+        for index, op in enumerate(program.ops):
+            rows.append([op.kind, list(op.inputs), op.output, op.size, len(op.constants)])
+            for number, constant in enumerate(op.constants):
+                place = f"{name}/{index}/{number}"
+                arrays |= {f"{place}/{key}": x for key, x in constant._asdict().items()}
+        programs[name] = {"ops": rows, "input": program.input, "output": program.output}
+    violation = known.counterexample
+    header = {
+        "format": FORMAT,
+        "property": "safe",
+        "result": known.result,
+        "steps": known.steps,
+        "unit": known.loop.following.unit,
+        "dimension": known.loop.dimension,
+        "actions": known.loop.actions,
+        "plant": known.loop.plant._asdict(),
+        "programs": programs,
+        "margin": known.margin if math.isfinite(known.margin) else None,
+        "counterexample": None if violation is None else violation._asdict(),
+        "seconds": known.seconds,
+        "bounded": known.bounded,
+        **about,
+    }
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
+    write_bytes(Path(path), buffer.getvalue())
+
+
+def _boxes(known: Verification) -> Iterator[tuple[str, str, np.ndarray]]:
+    for name in ("box", "proved", "refuted", "open"):
+        for end, array in getattr(known, name)._asdict().items():
+            yield name, end, array
+
+
+def load_certificate(path: str | os.PathLike) -> Verification:
+    """Read a certificate, to look at it or to go on from it.
+
+    Raises:
+        ConfigError: the file cannot be read, or is no certificate.
+    """
+    with open_archive(path, "no certificate, or a damaged one") as archive:
+        header = parse_json(str(archive.read("header")), infinite=False)
+        if not isinstance(header, dict) or header.get("format") != FORMAT:
+            raise ConfigError(f"{path}: no certificate: expected format {FORMAT!r}")
+        arrays = {name: archive.read(name) for name in archive.names if name != "header"}
+        boxes = {
+            name: Boxes(*(arrays[f"{name}/{end}"] for end in Boxes._fields))
+            for name in ("box", "proved", "refuted", "open")
+        }
+        programs = {name: _program(header, arrays, name) for name in PROGRAMS}
+        violation = header["counterexample"]
+        return Verification(
+            result=header["result"],
+            claims=Claims(*(arrays[f"claims/{name}"] for name in Claims._fields)),
+            margin=math.inf if header["margin"] is None else header["margin"],
+            counterexample=None if violation is None else Counterexample(**violation),
+            loop=Loop(
+                **programs,
+                dimension=header["dimension"],
+                actions=header["actions"],
+                plant=Plant(**header["plant"]),
+            ),
+            steps=header["steps"],
+            seconds=header["seconds"],
+            bounded=header["bounded"],
+            **boxes,
+        )
+
+
+def _program(header: dict[str, Any], arrays: dict[str, np.ndarray], name: str) -> Program:
+    data = header["programs"][name]
+    ops = []
+    for index, (kind, inputs, output, size, count) in enumerate(data["ops"]):
+        if kind not in RULED:
+            raise ValueError(f"unknown operation {kind!r}")
+        constants = (
+            Constant(*(arrays[f"{name}/{index}/{number}/{key}"] for key in Constant._fields))
+            for number in range(count)
+        )
+        ops.append(Op(kind, tuple(inputs), output, size, tuple(constants)))
+    return Program(tuple(ops), data["input"], data["output"], header["unit"])

@@ -1,0 +1,274 @@
+"""Check a certificate of `jaxsafe verify`: `python check.py proof.npz [other.npz]`.
+
+This file needs NumPy alone and shares no code with the search. It checks that the proved boxes
+fill the whole box, and follows the set of states from each of them with its own bounds. With a
+second certificate it also checks that both are about the same loop. It prints one line, and exits
+with 0 if the proof holds and with 1 if it does not.
+"""
+
+import json
+import sys
+
+import numpy as np
+
+E = 2.0**-42  # bounds the relative rounding of sums of up to 1,000 terms in float64
+TURNS = {  # the points at which the derivative of a function is k
+    "tanh": lambda k: [t := np.arctanh(np.sqrt(np.clip(1 - k, 0, 1))), -t],
+    "exp": lambda k: [np.log(k)],
+    "log": lambda k: [1 / k],
+    "sqrt": lambda k: [0.25 / k**2],
+    "square": lambda k: [0.5 * k],
+    "abs": lambda k: [0 * k],
+    "reciprocal": lambda k: [t := 1 / np.sqrt(-k), -t],
+}
+CALLS = {"reciprocal": lambda x: 1 / x, "max": np.maximum, "min": np.minimum}
+UNITS = {"affine": 0, "max": 0, "min": 0, "abs": 0, "tanh": 16, "exp": 16, "log": 16}
+
+
+def need(fact, text):
+    """Refuse the certificate unless a fact holds."""
+    if not np.all(fact):
+        sys.exit(f"refused: {text}")
+
+
+def up(x):
+    """Round upwards, past the rounding of a sum."""
+    return np.nextafter(x * (1 + E), np.inf)
+
+
+def times(a, x):
+    """Multiply a batch of matrices and a batch of vectors."""
+    return (a @ x[..., None])[..., 0]
+
+
+def fill(low, high, first, last):
+    """Check that boxes fill the box from first to last: cut it until one box fills each part."""
+    flat = first == last
+    meets = np.where(flat, (low <= first) & (high >= last), (low < last) & (high > first)).all(1)
+    low, high = np.maximum(low[meets], first), np.minimum(high[meets], last)
+    if np.any(np.all((low == first) & (high == last), axis=1)):
+        return
+    for axis in np.argsort(first - last):
+        cuts = np.unique(np.concatenate([low[:, axis], high[:, axis]]))
+        cuts = cuts[(cuts > first[axis]) & (cuts < last[axis])]
+        if len(cuts):
+            left, right = last.copy(), first.copy()
+            left[axis] = right[axis] = cuts[len(cuts) // 2]
+            fill(low, high, first, left)
+            return fill(low, high, right, last)
+    need(False, f"no box covers the starts from {first} to {last}")
+
+
+def ends(f, sets):
+    """Return the interval of a form (slope, centre, radius, low, high) over sets of states."""
+    centre, wide, thin, reach = sets
+    half = np.abs(f[0] @ wide).sum(-1) + times(np.abs(f[0]), thin) + f[2]
+    half = up(half) + 4 * E * (times(np.abs(f[0]), reach) + np.abs(f[1]))
+    middle = times(f[0], centre) + f[1]
+    return np.maximum(middle - half, f[3]), np.minimum(middle + half, f[4])
+
+
+def terms(f, sets):
+    """Bound the size of the terms of a form."""
+    return up(times(np.abs(f[0]), sets[3]) + np.abs(f[1]))
+
+
+def size(f, sets):
+    """Bound the size of the values of a form."""
+    return np.minimum(up(terms(f, sets) + f[2]), np.maximum(np.abs(f[3]), np.abs(f[4])))
+
+
+def linearise(kind, constants, x, sets):
+    """Return coefficients, offset, noise and interval of an operation."""
+    if kind == "affine":
+        (low, noise), *matrices = constants
+        high, far = low, np.abs(low)
+        for (m, radius), f in zip(matrices, x, strict=True):
+            noise = noise + size(f, sets) @ radius.T
+            if (
+                m.size > 1024
+            ):  # here forms alone are tighter, and intervals are not worth their time
+                low, high = low - np.inf, high + np.inf
+                continue
+            a, b = (np.where(m != 0, m * v[:, None], 0) for v in f[3:])
+            low, high = low + np.minimum(a, b).sum(-1), high + np.maximum(a, b).sum(-1)
+            far = far + np.maximum(np.abs(a), np.abs(b)).sum(-1)
+        slack = up(noise) + np.where(np.isfinite(far), E * far, 0)
+        return [m for m, _ in matrices], constants[0][0], up(noise), low - slack, high + slack
+    spans = [ends(f, sets) for f in x]
+    low, high = spans[0]
+    far = np.maximum(np.abs(low), np.abs(high))
+    if kind == "mul":
+        (a, b), (p, q) = [(0.5 * (c + d), np.maximum(d - c, 0)) for c, d in spans]
+        corners = np.stack([c * d for c in spans[0] for d in spans[1]])
+        return [p, a], -a * p, up(b * q) / 4 * (1 + E), corners.min(0), corners.max(0)
+    if kind == "norm":
+        middle = 0.5 * (low + high)
+        length = np.sqrt((middle**2).sum(-1, keepdims=True))
+        w = np.divide(middle, length, out=np.zeros_like(middle), where=length > 0)
+        split = np.concatenate([w[:, None], np.eye(w.shape[1]) - w[:, :, None] * w[:, None]], 1)
+        radius = times(np.abs(split), x[0][2]) + 4 * E * terms(x[0], sets).sum(-1)[:, None]
+        a, b = ends((split @ x[0][0], times(split, x[0][1]), radius, -np.inf, np.inf), sets)
+        far, near = (np.sqrt((v**2).sum(-1)) for v in (far, np.maximum(np.maximum(low, -high), 0)))
+        rest = (np.maximum(np.abs(a), np.abs(b))[:, 1:] ** 2).sum(-1)
+        gap = np.divide(rest / 2, a[:, 0], out=np.full_like(rest, np.inf), where=a[:, 0] > 0)
+        gap, far = (up(np.minimum(gap, far - a[:, 0])) + 4 * E * far)[:, None], far[:, None]
+        return [w], gap / 2, gap / 2 + 4 * E * far, near[:, None] * (1 - 4 * E), up(up(far))
+    fixed = [value for value, _ in constants]
+    call = CALLS.get(kind) or getattr(np, kind)
+    wide = high - low > 1e-9 * (np.abs(low) + np.abs(high))
+    k = np.where(wide, (call(high, *fixed) - call(low, *fixed)) / np.where(wide, high - low, 1), 0)
+    points = np.stack([low, high, *(np.clip(t, low, high) for t in fixed or TURNS[kind](k))])
+    values = call(points, *fixed)
+    gaps = values - k * points
+    rough = 4 * E * (np.abs(values).max(0) + np.abs(k) * far) + sum(r for _, r in constants)
+    fits = {"log": low > 0, "sqrt": low >= 0, "reciprocal": low * high > 0}.get(kind, True)
+    need(fits, f"{kind} of an interval that leaves its domain")
+    middle, noise = 0.5 * (gaps.max(0) + gaps.min(0)), up(0.5 * (gaps.max(0) - gaps.min(0)))
+    return [k], middle, noise + rough, values.min(0) - rough, values.max(0) + rough
+
+
+def act(kind, a, v):
+    """Return what an input with coefficients a adds, for slopes or columns v."""
+    if kind == "affine":
+        return a @ v
+    return (a[..., None] * v).sum(1, keepdims=True) if kind == "norm" else a[..., None] * v
+
+
+def bound(program, unit, sets, low, high):
+    """Return slope, centre, radius and least value of each output of a program."""
+    zero = np.zeros_like(low)
+    forms, tape = (
+        {program["input"]: (np.eye(low.shape[1]) + zero[..., None], zero, zero, low, high)},
+        [],
+    )
+    for kind, keys, key, constants in program["ops"]:
+        x = [forms[k] for k in keys]
+        local, offset, noise, bottom, top = linearise(kind, constants, x, sets)
+        pairs = list(zip(local, x, strict=True))
+        slope = np.sum([act(kind, a, f[0]) for a, f in pairs], 0)
+        centre = np.sum([act(kind, a, f[1][..., None])[..., 0] for a, f in pairs], 0) + offset
+        rest = [np.stack([terms(f, sets), f[2]], -1) for f in x]
+        both = np.sum([act(kind, np.abs(a), v) for a, v in zip(local, rest, strict=True)], 0)
+        fine = 4 * E * (both[..., 0] + np.abs(offset))
+        units = (2.1 * x[0][0].shape[1] if kind == "norm" else UNITS.get(kind, 2.1)) * unit
+        form = (slope, centre, both[..., 1] + noise, bottom, top)
+        noise = up(noise + fine + units * size(form, sets)) + 2.0**-60
+        low, high = (
+            v + s * ((units + 4 * E) * np.abs(v) + 2.0**-60) for v, s in ((bottom, -1), (top, 1))
+        )
+        forms[key] = (slope, centre, up(both[..., 1] + noise), low, high)
+        tape.append((kind, keys, key, local, noise))
+    out = forms[program["output"]]
+    rows, radius = {program["output"]: np.eye(out[1].shape[1]) + 0 * out[1][..., None]}, 0
+    for kind, keys, key, local, noise in reversed(tape):
+        row = rows.pop(key)
+        radius = radius + times(np.abs(row), noise)
+        for k, a in zip(keys, local, strict=True):
+            rows[k] = rows.get(k, 0) + (row @ a if kind == "affine" else row * a[:, None])
+    return (*out[:2], np.minimum(up(radius) + 4 * E * out[2], out[2]), *ends(out, sets))
+
+
+def gap(plant, speed, far, near):
+    """Return by how much h may fall inside a step below its values at both ends."""
+    n, dt, a = plant["mean_motion"], plant["dt"], plant["acceleration"]
+    v = (speed + dt / 2 * (a + 3 * n**2 * far)) / (1 - n * dt - 0.75 * (n * dt) ** 2)
+    jerk = 3 * n**2 * v + 2 * n * (first := a + 2 * n * v + 3 * n**2 * (far + dt / 2 * v))
+    chord = np.maximum(near - dt * v, 1e-300)
+    lag = np.minimum(2 * dt * v, (dt * v) ** 2 / 2 / chord)
+    return 0.25 * (dt**2 / 2 * jerk + plant["slope"] * (dt**2 / 2 * first + lag)) * (1 + 1e-9)
+
+
+def follow(head, low, high, claims):
+    """Check the claims of some boxes, and return a lower bound of h on all ways from them."""
+    d, m = head["dimension"], head["actions"]
+    zeros = np.zeros((len(low), m))
+    low, high = (np.concatenate([v, zeros], axis=1) for v in (low, high))
+    centre = 0.5 * (low + high)
+    wide = up(np.maximum(high - centre, centre - low))[:, :, None] * np.eye(2 * d + m)
+    thin, worst, before = 0 * wide, np.full(len(low), np.inf), None
+    for t, (slope, middle, radius) in enumerate(zip(*claims, strict=True)):
+        box = up(np.abs(thin).sum(-1))
+        reach = up(np.abs(centre) + np.abs(wide).sum(-1) + box)
+        sets = (centre, wide, box, reach)
+        program = head["programs"]["following" if t else "first"]
+        s, c, r, bottom, top = bound(program, head["unit"], sets, low, high)
+        x, u = slice(0, 2 * d), slice(2 * d, 2 * d + m)
+        off = times(np.abs(s[:, u] - slope), reach) + np.abs(c[:, u] - middle) + r[:, u]
+        need(up(off) <= radius, f"the policy leaves its claimed bounds in step {t}")
+        s, c = np.concatenate([s[:, x], slope], 1), np.concatenate([c[:, x], middle], 1)
+        fine = 4 * E * (times(np.abs(s), reach) + np.abs(c))
+        fine[:, x] += r[:, x]
+        centre = times(s, centre) + c
+        wide = np.concatenate(
+            [s @ wide, np.concatenate([0 * s[:, x, :m], radius[:, :, None] * np.eye(m)], 1)], 2
+        )
+        thin = np.concatenate([s @ thin, fine[:, :, None] * np.eye(2 * d + m)], 2)
+        half = up(np.abs(wide).sum(-1) + np.abs(thin).sum(-1)) + E * np.abs(centre)
+        low, high = (
+            np.maximum(bottom[:, : 2 * d + m], centre - half),
+            np.minimum(top[:, : 2 * d + m], centre + half),
+        )
+        far, near = np.maximum(np.abs(low), np.abs(high)), np.maximum(np.maximum(low, -high), 0)
+        norms = [np.sqrt((v**2).sum(1)) for v in (far[:, d : 2 * d], far[:, :d], -near[:, :d])]
+        now = (bottom[:, -1], up(norms[0]), up(norms[1]), norms[2] * (1 - E))
+        if before is None:
+            worst = now[0]
+        else:
+            top_of = [np.maximum(a, b) for a, b in zip(before[1:], now[1:], strict=True)]
+            worst = np.minimum(worst, np.minimum(before[0], now[0]) - gap(head["plant"], *top_of))
+        before = now
+    return worst
+
+
+def read(path):
+    """Return the header of a certificate with its numbers in place, and its arrays."""
+    with np.load(path, allow_pickle=False) as file:
+        arrays = {name: file[name] for name in file.files}
+    head = json.loads(str(arrays["header"]))
+    for name, program in head["programs"].items():
+        program["ops"] = [
+            (
+                kind,
+                keys,
+                key,
+                [
+                    [arrays[f"{name}/{i}/{j}/{x}"] for x in ("value", "radius")]
+                    for j in range(count)
+                ],
+            )
+            for i, (kind, keys, key, _, count) in enumerate(program["ops"])
+        ]
+    return head, arrays
+
+
+def main(path, *others):
+    """Check a certificate, and that others are about the same loop."""
+    head, arrays = read(path)
+    for other in others:
+        a, b = (
+            json.dumps(
+                [h["programs"], h["plant"], h["unit"], h["steps"]], default=np.ndarray.tolist
+            )
+            for h in (head, read(other)[0])
+        )
+        need(a == b, "the loop is not that of the other certificate")
+    low, high = arrays["proved/low"], arrays["proved/high"]
+    fill(low, high, arrays["box/low"][0], arrays["box/high"][0])
+    claims = [np.moveaxis(arrays[f"claims/{name}"], 1, 0) for name in ("slope", "centre", "radius")]
+    need(
+        [len(c) == head["steps"] + 1 and c.shape[1] == len(low) for c in claims],
+        "claims are missing",
+    )
+    worst = np.inf
+    for i in range(0, len(low), 32):
+        part = slice(i, i + 32)
+        margins = follow(head, low[part], high[part], [c[:, part] for c in claims])
+        need(margins >= 0, "the margin of a box may be negative")
+        worst = min(worst, margins.min())
+    print(f"proved: {len(low)} boxes fill the box, h >= {worst:.3g} for {head['steps']} steps")
+
+
+if __name__ == "__main__":
+    with np.errstate(all="ignore"):
+        main(*sys.argv[1:])

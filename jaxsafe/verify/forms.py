@@ -1,0 +1,388 @@
+"""Affine bounds of a program: one form per vector, with a rule per operation.
+
+A form says of a vector v, a function of the loop's state y, that |v − slope·y − centre| ≤ radius
+and low ≤ v ≤ high, for every y of a domain. Each operation adds what its linearisation and the
+rounding leave open as a noise. The noises of all operations are carried to the outputs at once,
+backwards, so that they may cancel on the way as far as the network lets them.
+
+All functions work on a batch of domains. Each operation is a program of its own, which is compiled
+once per size. One program for a whole step took XLA minutes to compile.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsafe.verify.program import BASIC, ELEMENTARY, FINE, Constant, Program
+
+TINY = 2.0**-60
+"""A bound on what an operation of the loop loses by underflow in single precision.
+
+The square of a number below 1.1e-19 is 0 there, so that a norm loses as much.
+"""
+
+MAX_INTERVALS = 1024
+"""Largest number of coefficients for which intervals are summed beside forms."""
+
+
+class Domain(NamedTuple):
+    """A set of states: centre + generators·e + rounding·f, |e|, |f| ≤ 1, between low and high."""
+
+    centre: Float[Array, " d"]
+    generators: Float[Array, "d k"]
+    rounding: Float[Array, "d l"]
+    """Generators that are so short that only the box around them counts."""
+    low: Float[Array, " d"]
+    high: Float[Array, " d"]
+
+    @property
+    def box(self) -> Float[Array, " d"]:
+        """Half the box around the rounding."""
+        return (1.0 + FINE) * jnp.abs(self.rounding).sum(-1)
+
+    @property
+    def reach(self) -> Float[Array, " d"]:
+        """A bound on the size of the terms of each element."""
+        return jnp.abs(self.centre) + jnp.abs(self.generators).sum(-1) + self.box
+
+
+class Form(NamedTuple):
+    """Bounds of a vector, see the module."""
+
+    slope: Float[Array, "s d"]
+    centre: Float[Array, " s"]
+    radius: Float[Array, " s"]
+    low: Float[Array, " s"]
+    high: Float[Array, " s"]
+    mass: Float[Array, " s"]
+    """A bound on the size of the terms of slope·y + centre."""
+
+    @property
+    def size(self) -> Float[Array, " s"]:
+        """A bound on |v|."""
+        largest = jnp.maximum(jnp.abs(self.low), jnp.abs(self.high))
+        return jnp.minimum(self.mass + self.radius, largest)
+
+
+class Linearised(NamedTuple):
+    """An operation as coefficients of its inputs, an offset, and what these leave open."""
+
+    coefficients: Sequence[Any]
+    offset: Any
+    noise: Any
+    low: Any = -jnp.inf
+    """A lower bound of the exact operation."""
+    high: Any = jnp.inf
+    rounding: float = BASIC
+    """The relative error of the loop's own operation, in units."""
+
+
+class Bounds(NamedTuple):
+    """Bounds of the outputs of a program: those of a form without `mass`."""
+
+    slope: Float[Array, "o d"]
+    centre: Float[Array, " o"]
+    radius: Float[Array, " o"]
+    low: Float[Array, " o"]
+    high: Float[Array, " o"]
+
+
+def spread(slope: Float[Array, "s d"], domain: Domain) -> Float[Array, " s"]:
+    """Return a bound on |slope·(y − centre)|, before rounding."""
+    return jnp.abs(slope @ domain.generators).sum(-1) + jnp.abs(slope) @ domain.box
+
+
+def interval(form: Form, domain: Domain) -> tuple[Array, Array]:
+    """Return the lowest and the highest value of a form."""
+    middle = form.slope @ domain.centre + form.centre
+    half = (1.0 + FINE) * (spread(form.slope, domain) + form.radius) + FINE * form.mass
+    return jnp.maximum(middle - half, form.low), jnp.minimum(middle + half, form.high)
+
+
+def bound(program: Program, domain: Domain) -> Bounds:
+    """Return bounds of the outputs of a program over each of a batch of domains."""
+    forms = {program.input: _start(domain)}
+    noises = {}
+    coefficients = {}
+    for op in program.ops:
+        given = [forms[key] for key in op.inputs]
+        out = _forwards(op.kind, program.unit, op.constants, domain, given)
+        forms[op.output], noises[op.output], coefficients[op.output] = out
+    form = forms[program.output]
+    rows = {
+        program.output: jnp.broadcast_to(
+            jnp.eye(form.centre.shape[-1]), (*form.centre.shape, form.centre.shape[-1])
+        )
+    }
+    together = jnp.zeros_like(form.radius)
+    for op in reversed(program.ops):
+        matrices = [constant.value for constant in op.constants[1:]]
+        local = matrices if op.kind == "affine" else coefficients[op.output]
+        before = [rows.get(key) for key in op.inputs]
+        moved, together = _backwards(
+            op.kind, local, rows.pop(op.output), noises[op.output], together, before
+        )
+        rows |= dict(zip(op.inputs, moved, strict=True))
+    return _bounds(form, domain, together)
+
+
+@jax.jit
+@jax.vmap
+def _start(domain: Domain) -> Form:
+    size = domain.centre.shape[0]
+    zeros = jnp.zeros(size)
+    return Form(jnp.eye(size), zeros, zeros, domain.low, domain.high, domain.reach)
+
+
+@jax.jit
+@jax.vmap
+def _bounds(form: Form, domain: Domain, together: Array) -> Bounds:
+    low, high = interval(form, domain)
+    # `form.radius` bounds the noises along all paths by themselves.
+    radius = jnp.minimum(form.radius, (1.0 + FINE) * together + FINE * form.radius)
+    return Bounds(form.slope, form.centre, radius, low, high)
+
+
+def _apply(kind: str, coefficient: Any, vector: Array) -> Array:
+    """Return what an input contributes to the result of an operation."""
+    if kind == "affine":
+        return coefficient @ vector
+    product = (coefficient if vector.ndim == 1 else coefficient[:, None]) * vector
+    return product.sum(0, keepdims=True) if kind == "norm" else product
+
+
+def _total(arrays: Iterable[Array]) -> Array:
+    return functools.reduce(jnp.add, arrays)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+@functools.partial(jax.vmap, in_axes=(None, None, None, 0, 0))
+def _forwards(
+    kind: str, unit: float, constants: Any, domain: Domain, x: list[Form]
+) -> tuple[Form, Array, Any]:
+    """Return the form of the result of an operation, its noise and its coefficients.
+
+    Args:
+        kind: the kind of the operation.
+        unit: the unit roundoff of the loop.
+        constants: the constants of the operation.
+        domain: the domain.
+        x: the forms of its inputs.
+    """
+    rule = RULES[kind]
+    coefficients, offset, noise, low, high, rounding = rule(domain, constants, x)
+    pairs = list(zip(coefficients, x, strict=True))
+    slope = _total(_apply(kind, a, form.slope) for a, form in pairs)
+    centre = _total(_apply(kind, a, form.centre) for a, form in pairs) + offset
+    both = _total(
+        _apply(kind, jnp.abs(a), jnp.stack([form.mass, form.radius], axis=-1)) for a, form in pairs
+    )
+    fine = both[:, 0] + jnp.abs(offset)
+    carried = both[:, 1]
+    mass = jnp.abs(slope) @ domain.reach + jnp.abs(centre)
+    largest = jnp.maximum(jnp.abs(low), jnp.abs(high))
+    exact = jnp.minimum(mass + FINE * fine + carried + noise, largest)
+    noise = noise + FINE * fine + rounding * unit * exact + TINY
+    share = rounding * unit + FINE
+    form = Form(
+        slope=slope,
+        centre=centre,
+        radius=(1.0 + FINE) * (carried + noise),
+        low=jnp.broadcast_to(low - share * jnp.abs(low) - TINY, centre.shape),
+        high=jnp.broadcast_to(high + share * jnp.abs(high) + TINY, centre.shape),
+        mass=(1.0 + FINE) * mass,
+    )
+    return form, noise, () if kind == "affine" else coefficients
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _backwards(
+    kind: str, coefficients: Any, row: Array, noise: Array, together: Array, before: list[Any]
+) -> tuple[list[Array], Array]:
+    """Carry what the outputs get of an operation's result to its inputs.
+
+    Args:
+        kind: the kind of the operation.
+        coefficients: those of its inputs.
+        row: how much of the result each output gets, `[batch, outputs, size]`.
+        noise: the noise of the operation `[batch, size]`.
+        together: how far noises have moved the outputs so far `[batch, outputs]`.
+        before: what the outputs get of the inputs through later operations, None for nothing.
+    """
+    together = together + (jnp.abs(row) * noise[:, None]).sum(-1)
+    moved = []
+    for a, rows in zip(coefficients, before, strict=True):
+        own = row @ a if kind == "affine" else row * a[:, None]
+        moved.append(own if rows is None else rows + own)
+    return moved, together
+
+
+def _affine(domain: Domain, constants: Sequence[Constant], x: list[Form]) -> Linearised:
+    """Add matrices times vectors. Their radii include the rounding of the loop."""
+    offset, *matrices = constants
+    noise = offset.radius
+    low = high = offset.value
+    slack: Any = 0.0
+    for matrix, form in zip(matrices, x, strict=True):
+        noise = noise + matrix.radius @ form.size
+        if matrix.value.size > MAX_INTERVALS:
+            low, high = -jnp.inf, jnp.inf
+            continue
+        ends = [
+            jnp.where(matrix.value != 0.0, matrix.value * end, 0.0) for end in (form.low, form.high)
+        ]
+        low = low + jnp.minimum(*ends).sum(-1)
+        high = high + jnp.maximum(*ends).sum(-1)
+        slack = slack + FINE * jnp.maximum(*map(jnp.abs, ends)).sum(-1)
+    slack = slack + noise
+    values = [matrix.value for matrix in matrices]
+    return Linearised(values, offset.value, noise, low - slack, high + slack, rounding=0.0)
+
+
+def _mul(domain: Domain, constants: Sequence[Constant], x: list[Form]) -> Linearised:
+    """Multiply. The product is linearised at the middles of the intervals."""
+    first, second = (interval(form, domain) for form in x)
+    corners = jnp.stack([a * b for a in first for b in second])
+    (a, half_a), (b, half_b) = _middle(*first), _middle(*second)
+    noise = half_a * half_b * (1.0 + FINE)
+    return Linearised([b, a], -a * b, noise, corners.min(0), corners.max(0))
+
+
+def _middle(low: Array, high: Array) -> tuple[Array, Array]:
+    """Return a point of an interval and a bound on the distance to its ends."""
+    middle = 0.5 * (low + high)
+    return middle, jnp.maximum(high - middle, middle - low) * (1.0 + FINE)
+
+
+def _norm(domain: Domain, constants: Sequence[Constant], x: list[Form]) -> Linearised:
+    """Bound a Euclidean norm by its tangent.
+
+    With w a unit vector, p = w·x and q the rest of x, p ≤ ‖x‖ = √(p² + q²) ≤ p + q²/(2p) where
+    p > 0.
+    """
+    [form] = x
+    low, high = interval(form, domain)
+    middle = 0.5 * (low + high)
+    length = jnp.sqrt((middle**2).sum())
+    along = jnp.where(length > 0.0, middle / jnp.where(length > 0.0, length, 1.0), 0.0)
+    # The part along w and the rest are forms of their own, narrower than those of the elements.
+    split = jnp.concatenate([along[None], jnp.eye(along.size) - jnp.outer(along, along)])
+    slope = split @ form.slope
+    radius = jnp.abs(split) @ form.radius + FINE * form.mass.sum()
+    half = (1.0 + FINE) * (spread(slope, domain) + radius)
+    centre = slope @ domain.centre + split @ form.centre
+    least_part = centre[0] - half[0]
+    rest = ((jnp.abs(centre[1:]) + half[1:]) ** 2).sum()
+    largest = jnp.sqrt((jnp.maximum(jnp.abs(low), jnp.abs(high)) ** 2).sum())
+    least = jnp.sqrt((jnp.maximum(jnp.maximum(low, -high), 0.0) ** 2).sum())
+    forwards = least_part > 0.0
+    above = jnp.where(forwards, 0.5 * rest / jnp.where(forwards, least_part, 1.0), jnp.inf)
+    above = (1.0 + FINE) * jnp.minimum(above, largest - least_part) + FINE * largest
+    noise = (0.5 * above + FINE * largest)[None]
+    ends = (least * (1.0 - FINE))[None], (largest * (1.0 + FINE))[None]
+    # The squares of all elements are rounded, and their sum.
+    return Linearised([along], 0.5 * above[None], noise, *ends, rounding=BASIC * along.size)
+
+
+Rule = Callable[[Domain, Sequence[Constant], list[Form]], Linearised]
+
+
+def _univariate(
+    function: Callable[..., Array],
+    turns: Callable[[Array], Sequence[Array]],
+    within: tuple[float, float] = (-jnp.inf, jnp.inf),
+    rounding: float = BASIC,
+    valid: Callable[[Array, Array], Any] | None = None,
+    rising: bool = True,
+) -> Rule:
+    """Return the rule of a function of one number: two parallel lines around its graph.
+
+    Args:
+        function: the function. It is monotone. It may take a constant as a second argument, at
+            which it has its only kink.
+        turns: the points at which its derivative is a given slope.
+        within: its range.
+        rounding: the relative error of the loop's own function, in units.
+        valid: whether the rule holds on an interval.
+        rising: whether the function rises.
+    """
+
+    def rule(domain: Domain, constants: Sequence[Constant], x: list[Form]) -> Linearised:
+        low, high = interval(x[0], domain)
+        fixed = [constant.value for constant in constants]
+        ends = function(low, *fixed), function(high, *fixed)
+        width = high - low
+        wide = width > 1e-9 * (jnp.abs(low) + jnp.abs(high))
+        slope = jnp.where(wide, (ends[1] - ends[0]) / jnp.where(wide, width, 1.0), 0.0)
+        inner = [jnp.clip(point, low, high) for point in fixed or turns(slope)]
+        points = jnp.stack([low, high, *inner])
+        values = function(points, *fixed)
+        gaps = values - slope * points
+        size = jnp.abs(slope) * jnp.maximum(jnp.abs(low), jnp.abs(high)) + jnp.abs(values).max(0)
+        rough = FINE * size + sum(constant.radius for constant in constants)
+        noise = 0.5 * (gaps.max(0) - gaps.min(0)) * (1.0 + FINE) + rough
+        if valid is not None:
+            noise = jnp.where(valid(low, high), noise, jnp.nan)
+        bottom, top = ends if rising else ends[::-1]
+        return Linearised(
+            [slope],
+            0.5 * (gaps.min(0) + gaps.max(0)),
+            noise,
+            jnp.maximum(bottom - rough, within[0]),
+            jnp.minimum(top + rough, within[1]),
+            rounding,
+        )
+
+    return rule
+
+
+def _even(function: Callable[[Array], Array], turns: Any, rounding: float = BASIC) -> Rule:
+    """Return the rule of a function that falls to 0 and rises from there."""
+    rule = _univariate(function, turns, rounding=rounding)
+
+    def bounded(domain: Domain, constants: Sequence[Constant], x: list[Form]) -> Linearised:
+        largest = jnp.maximum(*map(jnp.abs, interval(x[0], domain)))
+        high = (1.0 + FINE) * function(largest)
+        return rule(domain, constants, x)._replace(low=jnp.zeros_like(high), high=high)
+
+    return bounded
+
+
+def _tanh_turns(slope: Array) -> list[Array]:
+    point = jnp.arctanh(jnp.sqrt(jnp.clip(1.0 - slope, 0.0, 1.0)))
+    return [point, -point]
+
+
+def _reciprocal_turns(slope: Array) -> list[Array]:
+    point = 1.0 / jnp.sqrt(-slope)
+    return [point, -point]
+
+
+RULES: Mapping[str, Rule] = {
+    "affine": _affine,
+    "mul": _mul,
+    "norm": _norm,
+    "tanh": _univariate(jnp.tanh, _tanh_turns, within=(-1.0, 1.0), rounding=ELEMENTARY),
+    "exp": _univariate(jnp.exp, lambda slope: [jnp.log(slope)], rounding=ELEMENTARY),
+    "log": _univariate(
+        jnp.log,
+        lambda slope: [1.0 / slope],
+        rounding=ELEMENTARY,
+        valid=lambda low, high: low > 0.0,
+    ),
+    "sqrt": _univariate(jnp.sqrt, lambda slope: [0.25 / slope**2], valid=lambda low, _: low >= 0.0),
+    "reciprocal": _univariate(
+        lambda x: 1.0 / x, _reciprocal_turns, valid=lambda low, high: low * high > 0.0, rising=False
+    ),
+    "max": _univariate(jnp.maximum, lambda slope: [], rounding=0.0),
+    "min": _univariate(jnp.minimum, lambda slope: [], rounding=0.0),
+    "square": _even(jnp.square, lambda slope: [0.5 * slope]),
+    "abs": _even(jnp.abs, lambda slope: [jnp.zeros_like(slope)], rounding=0.0),
+}
+"""The rule of each operation."""

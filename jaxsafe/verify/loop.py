@@ -1,0 +1,228 @@
+"""The closed loop that is proved: its state, its first and its following step, and its property.
+
+The state of the loop is what the agent's platform is, and the action that is held until the next
+step. One step of the loop is `jaxsafe.step` followed by the policy.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.interpreters import partial_eval
+from jaxtyping import Array, Float
+
+from jaxsafe.environment import Environment, action_bounds, reset_to, step
+from jaxsafe.processors.constraint import SpeedLimit
+from jaxsafe.processors.status import Distance, Speed, VelocityLimit
+from jaxsafe.rollout import Policy
+from jaxsafe.schema.errors import ConfigError
+from jaxsafe.simulation.cwh import Anchor, Spacecraft, ThrustedSpacecraft
+from jaxsafe.simulation.double_integrator import DoubleIntegrator
+from jaxsafe.types import State
+from jaxsafe.verify.program import Program, trace
+
+FIELDS = ("position", "velocity")
+"""The fields of the agent's platform that move."""
+
+SINGLE = 2.0**-24
+"""Unit roundoff of single precision."""
+
+
+class Plant(NamedTuple):
+    """What the bound between two samples needs to know."""
+
+    mean_motion: float
+    acceleration: float
+    """The largest acceleration by the thrust [m/s²]."""
+    slope: float
+    """The growth of the speed limit with the distance [1/s]."""
+    dt: float
+
+
+class Loop(NamedTuple):
+    """A closed loop of which something can be proved.
+
+    Its state is (position, velocity, action). The programs return the next state and the margin h
+    that belongs to it.
+    """
+
+    first: Program
+    """From a start, whose action is not looked at."""
+    following: Program
+    dimension: int
+    """Number of axes of the position."""
+    actions: int
+    plant: Plant
+
+
+def closed_loop(env: Environment, policy: Policy, arithmetic: str = "float32") -> Loop:
+    """Return the closed loop of an environment and a policy.
+
+    Args:
+        env: the environment.
+        policy: `policy(key, observation)` returns actions for a batch of observations. It must be
+            deterministic.
+        arithmetic: `float32` for the loop as it runs in single precision, `real` for that of real
+            numbers with the same parameters.
+
+    Raises:
+        ConfigError: the loop is random, remembers, or has a part of which nothing can be proved.
+    """
+    _require_provable(env)
+    unit = {"float32": SINGLE, "real": 0.0}[arithmetic]
+    with jax.enable_x64(True):
+        env = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), env)
+        dimension = env.agent_platform.dimension
+        names = [constraint.name for constraint in env.constraints]
+        low, high = (
+            jnp.stack([jnp.asarray(x, jnp.float64) for x in ends]) for ends in action_bounds(env)
+        )
+        template = reset_to(env, start_of(env, jnp.ones(2 * dimension)))[0]
+        _require_markov(env, template, dimension)
+
+        def act(observation: Array) -> Array:
+            action = policy(jax.random.key(0), observation[None])[0]
+            return jnp.clip(action.astype(observation.dtype), low, high)
+
+        def outputs(state: State, timestep: Any) -> Array:
+            own = state.sim.platforms[env.agent]
+            margins = jnp.stack([timestep.info.margins[name] for name in names])
+            return jnp.concatenate([own.position, own.velocity, act(timestep.observation), margins])
+
+        def first(y: Array) -> Array:
+            return outputs(*reset_to(env, start_of(env, y[: 2 * dimension])))
+
+        def following(y: Array) -> Array:
+            state = placed(env, template, y[: 2 * dimension])
+            return outputs(*step(env, state, y[2 * dimension :]))
+
+        size = 2 * dimension + env.action_size
+        return Loop(
+            first=trace(first, size, unit),
+            following=trace(following, size, unit),
+            dimension=dimension,
+            actions=env.action_size,
+            plant=_plant(env),
+        )
+
+
+def placed(env: Environment, state: State, x: Float[Array, " 2d"]) -> State:
+    """Return a state with the agent's platform at (position, velocity)."""
+    own = state.sim.platforms[env.agent]
+    position, velocity = jnp.split(x, 2)
+    own = own.replace(position=position, velocity=velocity)
+    platforms = {**state.sim.platforms, env.agent: own}
+    return state.replace(sim=state.sim.replace(platforms=platforms))
+
+
+def start_of(env: Environment, x: Float[Array, " 2d"]) -> dict[str, dict[str, Any]]:
+    """Return a start for `reset_to` from (position, velocity) of the agent's platform."""
+    half = x.shape[0] // 2
+    return {env.agent: {"position": x[:half], "velocity": x[half:]}}
+
+
+def _require_provable(env: Environment) -> None:
+    """Refuse loops of which nothing can be proved.
+
+    Raises:
+        ConfigError: the loop is one.
+    """
+    if env.rta is not None:
+        raise ConfigError(
+            "rta: no rule for a filter in the loop; prove the policy alone with rta=none, "
+            "and see docs/safety for what the filter itself guarantees"
+        )
+    if env.randomize:
+        path = next(iter(env.randomize))
+        raise ConfigError(f"env: {path} is random in every episode; give it one value")
+    if env.uncertainty:
+        raise ConfigError(f"env: uncertainty.{env.uncertainty[0].name} is in the loop; take it out")
+    for item in env.observation:
+        if not item.exact:
+            raise ConfigError(f"env: observation.{item.name} has errors of a sensor; take them out")
+    if env.decision_period != 1:
+        raise ConfigError(f"env: decision_period: expected 1, found {env.decision_period}")
+    if env.action_kind != "continuous":
+        raise ConfigError(f"env: expected continuous actions, found {env.action_kind} ones")
+    plant = env.agent_platform
+    if type(plant) not in (Spacecraft, DoubleIntegrator):
+        kind = plant.type_name or type(plant).__name__
+        raise ConfigError(
+            f"env: no bound between two steps for the platform {kind!r}; "
+            "choose from spacecraft, double_integrator"
+        )
+    for actuator in env.actuators:
+        if not actuator.at_once:
+            raise ConfigError(f"env: the actuator {actuator.name} has a lag, which is a memory")
+    if not env.constraints:
+        raise ConfigError("property: safe needs a safety constraint, and the environment has none")
+    for constraint in env.constraints:
+        problem = _wrong_limit(env, constraint)
+        if problem:
+            raise ConfigError(f"env: no bound between two steps for {constraint.name}: {problem}")
+    if len(env.constraints) != 1:
+        raise ConfigError(f"env: expected one constraint, found {len(env.constraints)}")
+
+
+def _wrong_limit(env: Environment, constraint: Any) -> str:
+    """Return why a constraint is not that of Eq. (14), or an empty string."""
+    if type(constraint) is not SpeedLimit:
+        return "it is no speed_limit"
+    status = {item.name: item for item in env.status}
+    limit, speed = status[constraint.velocity_limit], status[constraint.speed]
+    if type(limit) is not VelocityLimit or type(speed) is not Speed:
+        return "its limit or its speed is another status"
+    distance = status[limit.distance]
+    if type(distance) is not Distance or {distance.of, speed.of} != {env.agent}:
+        return "its distance is another status"
+    if distance.to not in {one.name for one in env.platforms if type(one) is Anchor}:
+        return "its distance is not to an anchor"
+    return "constant_to is not 0" if float(limit.constant_to) else ""
+
+
+def _plant(env: Environment) -> Plant:
+    platform = env.agent_platform
+    assert isinstance(platform, ThrustedSpacecraft)
+    largest = [max(abs(float(a.low)), abs(float(a.high))) for a in env.actuators]
+    limit = next(item for item in env.status if isinstance(item, VelocityLimit))
+    grown = 1.0 + 1e-6  # the loop rounds the acceleration
+    return Plant(
+        mean_motion=float(getattr(platform, "mean_motion", 0.0)),
+        acceleration=grown * float(np.linalg.norm(largest)) / float(platform.mass),
+        slope=float(limit.slope),
+        dt=float(env.dt),
+    )
+
+
+def _require_markov(env: Environment, template: State, dimension: int) -> None:
+    """Check that position, velocity and action decide everything that a step and a policy see.
+
+    Raises:
+        ConfigError: something else of the state changes, and is looked at.
+    """
+    leaves, tree = jax.tree.flatten(template)
+    paths = [
+        jax.tree_util.keystr(path, simple=True, separator=".")
+        for path, _ in jax.tree.leaves_with_path(template)
+    ]
+
+    def looked_at(leaves: list[Array], action: Array) -> Any:
+        state, timestep = step(env, jax.tree.unflatten(tree, leaves), action)
+        own = state.sim.platforms[env.agent]
+        seen = (own.position, own.velocity, timestep.observation, timestep.info.margins)
+        return seen, jax.tree.leaves(state)
+
+    closed, shapes = jax.make_jaxpr(looked_at, return_shape=True)(
+        leaves, jnp.zeros(env.action_size)
+    )
+    count = len(jax.tree.leaves(shapes[0]))
+    jaxpr = closed.jaxpr
+    kept = [jaxpr.outvars[count + i] is jaxpr.invars[i] for i in range(len(leaves))]
+    used = partial_eval.dce_jaxpr(jaxpr, [i < count for i in range(len(jaxpr.outvars))])[1]
+    moving = {f"sim.platforms.{env.agent}.{field}" for field in FIELDS}
+    for path, stays, needed in zip(paths, kept, used, strict=False):
+        if needed and not stays and path not in moving:
+            raise ConfigError(f"env: the loop remembers {path}; a proof needs one that does not")

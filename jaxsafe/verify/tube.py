@@ -1,0 +1,202 @@
+"""Tubes: bounds of the loop's states over many steps from a box of starts.
+
+The set of states is a zonotope. The plant maps it without loss, and the policy adds one generator
+per actuator in every step, as wide as what its linearisation leaves open.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsafe.verify.forms import Bounds, Domain, bound
+from jaxsafe.verify.loop import Loop, Plant
+from jaxsafe.verify.program import FINE
+
+ROOM = 2.0**-20
+"""Share by which the radii of a tube are wider than they were computed."""
+
+
+class Claims(NamedTuple):
+    """What a tube says of the policy in every step: |action − slope·y − centre| ≤ radius.
+
+    y is the state before the step. The first entry is about the action at the start.
+    """
+
+    slope: Float[Array | np.ndarray, "t m d"]
+    centre: Float[Array | np.ndarray, "t m"]
+    radius: Float[Array | np.ndarray, "t m"]
+
+
+class Tube(NamedTuple):
+    """What is known of all ways from a box."""
+
+    margin: Float[Array, " t"]
+    """A lower bound of h at the start, and of the smallest h of each step, between samples too."""
+    claims: Claims
+    low: Float[Array, "t d"]
+    """The lowest state at each sample."""
+    high: Float[Array, "t d"]
+
+
+class _Sample(NamedTuple):
+    """What the bound between two samples needs to know of the states at one."""
+
+    margin: Array
+    speed: Array
+    distance: Array
+    nearest: Array
+
+
+def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n s"]) -> Tube:
+    """Return bounds of all ways from the starts between two corners, for a batch of boxes.
+
+    Args:
+        loop: the closed loop.
+        steps: number of steps.
+        low: the lowest (position, velocity) of each box.
+        high: the highest.
+    """
+    size, total = low.shape[-1], low.shape[-1] + loop.actions
+    domain = _boxes(low, high, loop.actions, steps)
+    samples, claims, lows, highs = [], [], [], []
+    for t in range(steps + 1):
+        bounds = _with_room(bound(loop.following if t else loop.first, domain))
+        domain, sample = _following(bounds, domain, size, loop.dimension, t)
+        samples.append(sample)
+        claims.append(Claims(*(x[:, size:total] for x in bounds[:3])))
+        lows.append(domain.low)
+        highs.append(domain.high)
+
+    def stack(*x: Array) -> Array:
+        return jnp.stack(x, axis=1)
+
+    margin = _with_gaps(loop.plant, jax.tree.map(stack, *samples))
+    return Tube(margin, jax.tree.map(stack, *claims), stack(*lows), stack(*highs))
+
+
+@jax.jit
+def _with_room(bounds: Bounds) -> Bounds:
+    """Return bounds that a checker with other roundings can confirm."""
+    return bounds._replace(radius=bounds.radius * (1.0 + ROOM) + FINE)
+
+
+@functools.partial(jax.jit, static_argnums=(2, 3))
+@functools.partial(jax.vmap, in_axes=(0, 0, None, None))
+def _boxes(low: Array, high: Array, actions: int, steps: int) -> Domain:
+    """Return the set of starts of each box. The actions are 0."""
+    size = low.shape[0]
+    total = size + actions
+    middle = 0.5 * (low + high)
+    half = (1.0 + FINE) * jnp.maximum(high - middle, middle - low)
+
+    def pad(x: Array) -> Array:
+        return jnp.concatenate([x, jnp.zeros(actions)])
+
+    generators = jnp.zeros((total, size + actions * (steps + 1)))
+    return Domain(
+        centre=pad(middle),
+        generators=generators.at[:size, :size].set(jnp.diag(half)),
+        rounding=jnp.zeros((total, total * (steps + 1))),
+        low=pad(low),
+        high=pad(high),
+    )
+
+
+@functools.partial(jax.jit, static_argnums=(2, 3))
+@functools.partial(jax.vmap, in_axes=(0, 0, None, None, None))
+def _following(
+    bounds: Bounds, domain: Domain, size: int, dimension: int, t: Any
+) -> tuple[Domain, _Sample]:
+    """Return the states after a step, and what the bound between samples needs of them.
+
+    Args:
+        bounds: bounds of the step's outputs.
+        domain: the states before it.
+        size: number of elements of position and velocity.
+        dimension: number of elements of a position.
+        t: the number of the step. It has generators of its own.
+    """
+    total = domain.centre.shape[0]
+    actions = total - size
+    slope, radius = bounds.slope[:total], bounds.radius[:total]
+    fine = FINE * (jnp.abs(slope) @ domain.reach + jnp.abs(bounds.centre[:total]))
+    acts = jnp.arange(total) >= size
+    rounded = jnp.diag((1.0 + FINE) * (jnp.where(acts, 0.0, radius) + fine))
+    new = jnp.diag(radius)[:, size:]
+    put = jax.lax.dynamic_update_slice
+    following = Domain(
+        centre=slope @ domain.centre + bounds.centre[:total],
+        generators=put(slope @ domain.generators, new, (0, size + actions * t)),
+        rounding=put(slope @ domain.rounding, rounded, (0, total * t)),
+        low=bounds.low[:total],
+        high=bounds.high[:total],
+    )
+    half = jnp.abs(following.generators).sum(-1) + following.box
+    half = (1.0 + FINE) * half + FINE * jnp.abs(following.centre)
+    following = following._replace(
+        low=jnp.maximum(following.low, following.centre - half),
+        high=jnp.minimum(following.high, following.centre + half),
+    )
+    return following, _sample(following, bounds.low[total], dimension)
+
+
+def _sample(domain: Domain, margin: Array, dimension: int) -> _Sample:
+    far = jnp.maximum(jnp.abs(domain.low), jnp.abs(domain.high))
+    near = jnp.maximum(jnp.maximum(domain.low, -domain.high), 0.0)
+
+    def length(x: Array) -> Array:
+        return jnp.sqrt((x**2).sum())
+
+    return _Sample(
+        margin=margin,
+        speed=length(far[dimension : 2 * dimension]) * (1.0 + FINE),
+        distance=length(far[:dimension]) * (1.0 + FINE),
+        nearest=length(near[:dimension]) * (1.0 - FINE),
+    )
+
+
+@jax.jit
+def _with_gaps(plant: Plant, samples: _Sample) -> Float[Array, " t"]:
+    """Return lower bounds of h over each step from what is known at its ends.
+
+    See docs/verification.md for the proof.
+    """
+    before = jax.tree.map(lambda x: x[:, :-1], samples)
+    after = jax.tree.map(lambda x: x[:, 1:], samples)
+    gap = between(
+        plant,
+        speed=jnp.maximum(before.speed, after.speed),
+        distance=jnp.maximum(before.distance, after.distance),
+        nearest=jnp.maximum(before.nearest, after.nearest),
+    )
+    inside = jnp.minimum(before.margin, after.margin) - gap
+    return jnp.concatenate([samples.margin[:, :1], inside], axis=1)
+
+
+def between(plant: Plant, speed: Array, distance: Array, nearest: Array) -> Array:
+    """Return by how much h may fall below its values at both ends of a step.
+
+    Args:
+        plant: numbers of the plant.
+        speed: a bound on ‖v‖ at the ends [m/s].
+        distance: a bound on ‖r‖ at the ends [m].
+        nearest: a lower bound of ‖r‖ at one end [m].
+    """
+    n, time = plant.mean_motion, plant.dt
+    share = 1.0 - n * time - 0.75 * (n * time) ** 2
+    v = (speed + 0.5 * time * (plant.acceleration + 3.0 * n**2 * distance)) / share
+    r = distance + 0.5 * time * v
+    first = plant.acceleration + 2.0 * n * v + 3.0 * n**2 * r  # ‖r̈‖
+    second = 3.0 * n**2 * v + 2.0 * n * first  # ‖v̈‖
+    way = time * v
+    chord = jnp.maximum(nearest - way, 0.0)
+    bend = jnp.where(chord > 0.0, 0.5 * way**2 / jnp.where(chord > 0.0, chord, 1.0), jnp.inf)
+    lag = jnp.minimum(2.0 * way, bend)
+    drop = 0.25 * (0.5 * time**2 * second + plant.slope * (0.5 * time**2 * first + lag))
+    return jnp.where(share > 0.0, drop, jnp.inf) * (1.0 + 1e-6)

@@ -1,0 +1,415 @@
+"""Proofs about closed loops: every bound holds, and a certificate that says too much is refused."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxsafe
+from jaxsafe.commands.verify import EXIT_CODES, main
+from jaxsafe.rollout import RecurrentPolicy
+from jaxsafe.schema.errors import ConfigError
+from jaxsafe.simulation.cwh import cwh_flow
+from jaxsafe.verify import check, forms
+from jaxsafe.verify.certificate import load_certificate, save_certificate
+from jaxsafe.verify.forms import Domain, bound
+from jaxsafe.verify.loop import closed_loop, start_of
+from jaxsafe.verify.program import ELEMENTARY, FUNCTIONS, RULED, trace
+from jaxsafe.verify.tube import between, tube
+from jaxsafe.verify.verify import Verification, verify
+
+PUBLISHED = Path(os.environ.get("JAXSAFE_PUBLISHED_NETWORK", "docking2d_published.onnx"))
+"""The network of the community's docking benchmark, which does not come with this package."""
+
+SMALL_BOX = {"position": [[80, 92], [80, 86]], "velocity": [[-0.125, 0.03125], [0.0, 0.0625]]}
+GAINS = np.array([[-0.3, 0.1, -0.9, 0.0, 0.1, 0.0], [0.0, -0.4, 0.1, -0.8, 0.0, -0.1]])
+
+
+def braking(key: Any, observation: Any) -> Any:
+    """Return a smooth action that flies to the chief and brakes."""
+    direction = observation[..., :2] / (
+        jnp.linalg.norm(observation[..., :2], axis=-1)[..., None] + 0.1
+    )
+    return jnp.tanh(0.2 * (observation @ GAINS.T) - 0.1 * direction)
+
+
+def speeding(key: Any, observation: Any) -> Any:
+    """Return an action that breaks the speed limit."""
+    return jnp.ones((*observation.shape[:-1], 2))
+
+
+def domain(key: int, size: int, width: float) -> Domain:
+    rng = np.random.default_rng(key)
+    centre = rng.uniform(0.5, 2.0, size)
+    generators = width * rng.normal(size=(size, 4))
+    rounding = 1e-9 * rng.normal(size=(size, 2))
+    half = np.abs(generators).sum(1) + np.abs(rounding).sum(1)
+    return Domain(
+        *(
+            jnp.asarray(x)[None]
+            for x in (centre, generators, rounding, centre - half, centre + half)
+        )
+    )
+
+
+def points(domain: Domain, num: int) -> jax.Array:
+    rng = np.random.default_rng(0)
+    own = jax.tree.map(lambda x: x[0], domain)
+    # Many coefficients are at their limits, where bounds are tight.
+    e = np.clip(rng.normal(size=(num, 4), scale=2.0), -1, 1)
+    f = np.clip(rng.normal(size=(num, 2), scale=2.0), -1, 1)
+    return own.centre + e @ own.generators.T + f @ own.rounding.T
+
+
+COMPOSED: dict[str, Callable[[Any], Any]] = {
+    "mul": lambda y: y[:2] * y[2:],
+    "max": lambda y: jnp.maximum(y, 1.2),
+    "min": lambda y: jnp.minimum(y[:2], y[2:]),
+    "norm": lambda y: jnp.sqrt(jnp.sum(y * y))[None],
+    "reciprocal": lambda y: 1.0 / (y + 2.0),
+    "affine": lambda y: jnp.asarray(GAINS[:, :4]) @ y - 0.3,
+    **{name: (lambda y, f=FUNCTIONS[name]: f(y + 2.0)) for name in ("exp", "log", "sqrt")},
+    **{name: (lambda y, f=FUNCTIONS[name]: f(y - 1.2)) for name in ("tanh", "abs", "square")},
+    "network": lambda y: jnp.tanh(jnp.tanh(GAINS[:, :4] @ y) @ GAINS[:, :5]) / (1.0 + y[0] ** 2),
+    "features": lambda y: jnp.log(jnp.sqrt(jnp.sum(y[:2] ** 2)) + 0.1) * y[:2] / (y[2] + 3.0),
+    "clipped": lambda y: jnp.clip(jnp.exp(-y) * y, 0.2, 0.35),
+    "logistic": lambda y: jax.nn.sigmoid(3.0 * y) * y**3,
+}
+
+
+def test_every_rule_is_tried() -> None:
+    assert set(RULED) <= COMPOSED.keys()
+    assert set(RULED) == forms.RULES.keys()
+
+
+@pytest.mark.parametrize("name", COMPOSED)
+@pytest.mark.parametrize("width", [0.003, 0.1])
+def test_no_point_is_outside_of_its_bounds(name: str, width: float) -> None:
+    with jax.enable_x64(True):
+        program = trace(COMPOSED[name], 4, 0.0)
+        assert name in [op.kind for op in program.ops] or name not in RULED
+        for key in range(5):
+            states = domain(key, 4, width)
+            y = points(states, 20_000)
+            values = np.asarray(jax.vmap(COMPOSED[name])(y))
+            bounds = jax.tree.map(lambda x: np.asarray(x[0]), bound(program, states))
+            linear = np.asarray(y) @ bounds.slope.T + bounds.centre
+            assert np.isfinite(bounds.radius).all()
+            assert (np.abs(values - linear) <= bounds.radius).all()
+            assert ((values >= bounds.low) & (values <= bounds.high)).all()
+            if name not in ("abs", "max", "min", "clipped"):
+                # The bounds are not much wider than they must be.
+                spread = np.abs(values - linear).max(0)
+                assert (bounds.radius <= 6.0 * spread + 1e-8).all()
+
+
+@pytest.mark.thorough
+def test_single_precision_is_inside_of_its_bounds_too() -> None:
+    for name, function in COMPOSED.items():
+        with jax.enable_x64(True):
+            program = trace(function, 4, 2.0**-24)
+            states = domain(1, 4, 1e-9)
+            y = np.asarray(points(states, 2_000)).astype(np.float32)
+            half = np.abs(y - states.centre[0]).max(0)
+            states = states._replace(
+                rounding=jnp.diag(half)[None], low=states.centre - half, high=states.centre + half
+            )
+            bounds = jax.tree.map(lambda x: np.asarray(x[0]), bound(program, states))
+        for values in (jax.jit(jax.vmap(function))(y), jax.vmap(function)(y)):
+            linear = y.astype(np.float64) @ bounds.slope.T + bounds.centre
+            assert (np.abs(values - linear) <= bounds.radius).all(), name
+
+
+@pytest.mark.parametrize("name", ["tanh", "exp", "log"])
+def test_elementary_functions_are_as_exact_as_the_proofs_take_them_to_be(name: str) -> None:
+    x = np.exp(np.random.default_rng(0).uniform(-30.0, 4.0, 2_000_000)).astype(np.float32)
+    x = x if name == "log" else np.concatenate([x, -x])
+    exact = getattr(np, name)(x.astype(np.float64))
+    error = np.abs(np.asarray(jax.jit(getattr(jnp, name))(x)) - exact)
+    assert (error <= 0.5 * ELEMENTARY * 2.0**-24 * np.abs(exact) + 2.0**-60).all()
+
+
+@pytest.mark.thorough
+def test_the_program_is_the_loop_that_runs() -> None:
+    env = jaxsafe.make("docking2d")
+    loop = closed_loop(env, braking)
+    x = np.random.default_rng(0).uniform([-90, 60, -0.3, -0.3], [90, 120, 0.3, 0.3], (2000, 4))
+
+    def two_steps(x: jax.Array) -> jax.Array:
+        state, timestep = jaxsafe.reset_to(env, start_of(env, x))
+        for _ in range(2):
+            state, timestep = jaxsafe.step(env, state, braking(None, timestep.observation))
+        own = state.sim.platforms["deputy"]
+        margin = timestep.info.margins["velocity_limit"][None]
+        action = braking(None, timestep.observation)
+        return jnp.concatenate([own.position, own.velocity, action, margin])
+
+    flown = np.asarray(jax.jit(jax.vmap(two_steps))(jnp.asarray(x, jnp.float32)))
+    with jax.enable_x64(True):
+        y = jnp.concatenate([jnp.asarray(x.astype(np.float32), float), jnp.zeros((2000, 2))], 1)
+        for program in (loop.first, loop.following, loop.following):
+            out = jax.vmap(program)(y)
+            y = out[:, :6]
+    np.testing.assert_allclose(flown, out, rtol=2e-6, atol=2e-6)
+
+
+@pytest.fixture(scope="module")
+def proof() -> Verification:
+    return verify(jaxsafe.make("docking2d"), braking, SMALL_BOX, steps=6)
+
+
+@pytest.mark.thorough
+def test_thousands_of_flights_stay_inside_of_a_tube(proof: Verification) -> None:
+    env = jaxsafe.make("docking2d")
+    assert proof.result == "proved"
+    with jax.enable_x64(True):
+        low, high = proof.proved.low[:2], proof.proved.high[:2]
+        found = jax.device_get(tube(proof.loop, 6, jnp.asarray(low), jnp.asarray(high)))
+
+    def fly(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+        state, timestep = jaxsafe.reset_to(env, start_of(env, x))
+
+        def states(state: Any, timestep: Any) -> jax.Array:
+            own = state.sim.platforms["deputy"]
+            return jnp.concatenate(
+                [own.position, own.velocity, braking(None, timestep.observation)]
+            )
+
+        rows, margins = [states(state, timestep)], [timestep.info.margins["velocity_limit"]]
+        for _ in range(6):
+            state, timestep = jaxsafe.step(env, state, braking(None, timestep.observation))
+            rows.append(states(state, timestep))
+            margins.append(timestep.info.margins["velocity_limit"])
+        return jnp.stack(rows), jnp.stack(margins)
+
+    share = np.random.default_rng(0).choice([0.0, 1.0, 0.3], (2, 3000, 4))
+    starts = low[:, None] + share * (high - low)[:, None]
+    starts = np.clip(starts.astype(np.float32), low[:, None], high[:, None])
+    ways, margins = jax.jit(jax.vmap(jax.vmap(fly)))(starts)
+    assert (np.asarray(ways) >= found.low[:, None]).all()
+    assert (np.asarray(ways) <= found.high[:, None]).all()
+    assert (np.asarray(margins) >= found.margin[:, None]).all()
+
+
+def run_check(*paths: Path) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, check.__file__, *paths], capture_output=True, text=True)
+
+
+def test_a_certificate_is_checked_and_read_again(proof: Verification, tmp_path: Path) -> None:
+    save_certificate(tmp_path / "proof.npz", proof, {"policy": "braking"})
+    read = load_certificate(tmp_path / "proof.npz")
+    same = jax.tree.map(np.array_equal, (read.proved, read.claims), (proof.proved, proof.claims))
+    assert jax.tree.all(same)
+    checked = run_check(tmp_path / "proof.npz")
+    assert checked.returncode == 0, checked.stderr
+    assert checked.stdout.startswith("proved: ")
+
+
+def lost_box(arrays: dict[str, np.ndarray]) -> None:
+    for name in ("proved/low", "proved/high", "claims/slope", "claims/centre", "claims/radius"):
+        arrays[name] = arrays[name][1:]
+
+
+def moved_bound(arrays: dict[str, np.ndarray]) -> None:
+    arrays["proved/high"] = arrays["proved/high"] - [0.5, 0, 0, 0]
+
+
+def larger_box(arrays: dict[str, np.ndarray]) -> None:
+    arrays["box/high"] = arrays["box/high"] + [0, 0, 0, 1e-9]
+
+
+def smaller_radius(arrays: dict[str, np.ndarray]) -> None:
+    arrays["claims/radius"] = arrays["claims/radius"] * (1.0 - 1e-4)
+
+
+def wrong_slope(arrays: dict[str, np.ndarray]) -> None:
+    arrays["claims/slope"] = arrays["claims/slope"].copy()
+    arrays["claims/slope"][0, 3, 0, 0] += 1e-3
+
+
+def other_network(arrays: dict[str, np.ndarray]) -> None:
+    for name, array in arrays.items():
+        if name.startswith("following/") and name.endswith("value") and array.shape == (2, 6):
+            arrays[name] = array * 1.001
+
+
+@pytest.mark.parametrize(
+    "change", [lost_box, moved_bound, larger_box, smaller_radius, wrong_slope, other_network]
+)
+def test_a_certificate_that_says_too_much_is_refused(
+    change: Callable[[dict[str, np.ndarray]], None], proof: Verification, tmp_path: Path
+) -> None:
+    save_certificate(tmp_path / "proof.npz", proof, {})
+    with np.load(tmp_path / "proof.npz") as file:
+        arrays = dict(file)
+    before = dict(arrays)
+    change(arrays)
+    assert any(arrays[name] is not before[name] for name in arrays)
+    np.savez(tmp_path / "wrong.npz", **arrays)  # type: ignore[arg-type]
+    refused = run_check(tmp_path / "wrong.npz")
+    assert refused.returncode == 1
+    assert refused.stderr.startswith("refused: "), refused.stderr
+
+
+def test_the_certificate_of_another_loop_is_refused(proof: Verification, tmp_path: Path) -> None:
+    other = closed_loop(jaxsafe.make("docking2d", overrides={"deputy.mass": 13.0}), braking)
+    save_certificate(tmp_path / "proof.npz", proof, {})
+    save_certificate(tmp_path / "other.npz", proof._replace(loop=other), {})
+    assert run_check(tmp_path / "proof.npz", tmp_path / "proof.npz").returncode == 0
+    assert (
+        "is not that of the other"
+        in run_check(tmp_path / "proof.npz", tmp_path / "other.npz").stderr
+    )
+
+
+@pytest.mark.thorough
+def test_a_violation_is_flown_again_from_its_start() -> None:
+    env = jaxsafe.make("docking2d")
+    found = verify(env, speeding, SMALL_BOX, steps=6)
+    assert found.result == "refuted"
+    assert found.counterexample is not None
+    state, timestep = jaxsafe.reset_to(env, found.counterexample.start)
+    for _ in range(found.counterexample.step):
+        state, timestep = jaxsafe.step(env, state, speeding(None, timestep.observation))
+    assert timestep.info.margins["velocity_limit"] < 0.0
+    np.testing.assert_allclose(
+        timestep.info.margins["velocity_limit"], found.counterexample.margin, rtol=1e-3
+    )
+
+
+@pytest.mark.thorough
+def test_a_search_that_stops_goes_on_and_loses_nothing(proof: Verification, tmp_path: Path) -> None:
+    env = jaxsafe.make("docking2d")
+    wide = {"position": [[70, 106], [70, 106]], "velocity": [[-0.125, 0.03125], [0.0, 0.0625]]}
+    part = verify(env, braking, wide, steps=6, max_boxes=1)
+    save_certificate(tmp_path / "part.npz", part, {})
+    shares = part.shares()
+    assert part.result in ("open", "proved")
+    assert sum(shares.values()) == pytest.approx(1.0)
+    whole = verify(env, braking, wide, steps=6, resume=load_certificate(tmp_path / "part.npz"))
+    assert whole.result == "proved"
+    assert len(whole.proved.low) >= len(part.proved.low)
+    with pytest.raises(ConfigError, match=r"^resume: the box is not that of the certificate"):
+        verify(env, braking, SMALL_BOX, steps=6, resume=part)
+
+
+def test_nothing_dips_below_the_bound_between_two_samples() -> None:
+    loop = closed_loop(jaxsafe.make("docking2d"), braking)
+    n, limit = loop.plant.mean_motion, lambda r: 0.2 + loop.plant.slope * r
+
+    def drop(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        share = jax.random.uniform(key, (7,), minval=-1.0)
+        v = 0.4 * share[2:4]
+        # Every second one drifts through the chief.
+        thrust = jnp.where(share[6] > 0.0, jnp.sign(share[4:6]), 0.0)
+        r = jnp.where(share[6] > 0.0, 100.0 * share[:2], -0.5 * v)
+        times = jnp.linspace(0.0, 1.0, 65)
+        flow = jax.vmap(lambda t: cwh_flow(r, v, thrust / 12.0, n, t))(times)
+        distance, speed = (jnp.linalg.norm(x, axis=-1) for x in flow)
+        h = limit(distance) - speed
+        ends = jnp.array([0, -1])
+        allowed = between(
+            loop.plant,
+            speed=speed[ends].max(),
+            distance=distance[ends].max(),
+            nearest=distance[ends].max(),
+        )
+        return h[ends].min() - h.min(), allowed
+
+    with jax.enable_x64(True):
+        keys = jax.random.split(jax.random.key(0), 20_000)
+        drops, allowed = jax.device_get(jax.jit(jax.vmap(drop))(keys))
+    assert (drops <= allowed).all()
+    assert (drops > 0.5 * allowed).any()  # the bound is not far from what happens
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rta": "default"}, "rta: no rule for a filter in the loop"),
+        ({"actions": "discrete"}, "env: expected continuous actions, found discrete ones"),
+        (
+            {"variant": "released"},
+            "env: no bound between two steps for velocity_limit: constant_to",
+        ),
+        ({"overrides": {"decision_period": 2}}, "env: decision_period: expected 1, found 2"),
+        (
+            {"overrides": {"observation.position.noise": 0.1}},
+            "env: observation.position has errors",
+        ),
+        ({"overrides": {"randomize": {"deputy.mass": [11, 13]}}}, "env: deputy.mass is random"),
+    ],
+)
+def test_loops_of_which_nothing_is_proved_are_refused(change: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match="^" + message):
+        verify(jaxsafe.make("docking2d", **change), braking, SMALL_BOX)
+
+
+@pytest.mark.parametrize(
+    ("box", "message"),
+    [
+        ({"position": [0, 1]}, "box.deputy.velocity: missing"),
+        ({**SMALL_BOX, "speed": [0, 1]}, "box.speed: no field of a start"),
+        (
+            {**SMALL_BOX, "velocity": [1, 0]},
+            r"box.deputy.velocity: expected 2 intervals \[low, high",
+        ),
+        ({**SMALL_BOX, "position": [0, 1e9]}, "box.deputy.position: expected 2 intervals"),
+        ({**SMALL_BOX, "position": "far"}, "box.deputy.position: expected 2 intervals"),
+    ],
+)
+def test_what_is_no_box_of_starts_is_refused(box: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match="^" + message):
+        verify(jaxsafe.make("docking2d"), braking, box)
+
+
+def test_a_policy_that_remembers_and_an_unknown_operation_are_refused() -> None:
+    env = jaxsafe.make("docking2d")
+    remembering = RecurrentPolicy(
+        lambda key, observation, memory: (observation[..., :2], memory), ()
+    )
+    with pytest.raises(ConfigError, match=r"^run: the policy remembers"):
+        verify(env, remembering, SMALL_BOX)
+    with pytest.raises(ConfigError, match=r"^verify: no rule for the operation 'erf'"):
+        verify(env, lambda key, x: jax.lax.erf(x[..., :2]), SMALL_BOX)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not PUBLISHED.exists(), reason="the published network is not here")
+def test_the_published_network_is_safe_in_the_whole_box(tmp_path: Path) -> None:
+    overrides = {
+        "observation": ["position", "velocity"],
+        "observation.position.scale": 1.0,
+        "observation.velocity.scale": 1.0,
+    }
+    words = [f"env.{name}={value}" for name, value in overrides.items()]
+    words[0] = "env.observation=[position,velocity]"
+    command = [sys.executable, "-m", "jaxsafe.verify", f"run={PUBLISHED}", "env=docking2d", *words]
+    out = tmp_path / "published.npz"
+    done = subprocess.run([*command, f"out={out}"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "\nproved: h ≥ " in done.stdout
+    assert run_check(out).returncode == 0
+
+
+@pytest.mark.thorough
+def test_the_command_says_what_is_known_by_its_exit_code(tmp_path: Path, capsys: Any) -> None:
+    small = ["box.position=[80,81]", "steps=2"]
+    words = {
+        "proved": [*small, "box.deputy.velocity=[[0,0.01],[0,0]]"],
+        "refuted": [*small, "box.velocity=[0.5,0.6]"],
+        "open": ["steps=2", "boxes=1"],
+    }
+    for result, code in EXIT_CODES.items():
+        out = tmp_path / f"{result}.npz"
+        assert main(["run=pretrained/docking2d", *words[result], f"out={out}"]) == code
+        assert f"\n{result}: " in capsys.readouterr().out
+        assert load_certificate(out).result == result
