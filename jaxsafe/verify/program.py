@@ -143,6 +143,13 @@ class _Guarded(NamedTuple):
     value: _Affine
 
 
+class _Root(NamedTuple):
+    """The root of `_Guarded(value)`. It is 1 where the value is 0, and `norm` elsewhere."""
+
+    value: _Affine
+    norm: _Affine
+
+
 def trace(function: Callable[[Array], Array], size: int, unit: float) -> Program:
     """Return the program of a function of a vector.
 
@@ -177,7 +184,6 @@ class _Builder:
         self.unit = unit
         self.ops: list[Op] = []
         self.made: dict[int, Op] = {}
-        self.roots: dict[int, tuple[_Affine, _Affine]] = {}
         self.vectors: dict[int, tuple[_Affine, int]] = {}
         self.count = 0
 
@@ -472,14 +478,12 @@ class _Builder:
         if isinstance(which, _Zero) and isinstance(chosen, Constant):
             if otherwise is which.value and np.all(chosen.value == 1.0):
                 return _Guarded(which.value)
-            if (
-                self.roots.get(id(otherwise), (None, None))[1] is which.value
-                and not chosen.value.any()
-            ):
-                return otherwise
+            guards = isinstance(otherwise, _Root) and otherwise.value is which.value
+            if guards and not chosen.value.any():
+                return otherwise.norm
         raise ConfigError("verify: no rule for the operation 'select_n'")
 
-    def _sqrt(self, eqn: Any, x: Any) -> _Affine:
+    def _sqrt(self, eqn: Any, x: Any) -> Any:
         total = x.value if isinstance(x, _Guarded) else x
         keys = list(total.terms)
         op = self.made.get(keys[0]) if len(keys) == 1 and keys[0] is not None else None
@@ -490,8 +494,7 @@ class _Builder:
                 {key: term.reshape(*total.shape, 1) for key, term in root.terms.items()},
                 {key: error.reshape(*total.shape, 1) for key, error in root.errors.items()},
             )
-            self.roots[id(root)] = root, total  # the root is kept, so that its id stays its own
-            return root
+            return _Root(total, root) if isinstance(x, _Guarded) else root
         if isinstance(x, _Guarded):
             raise ConfigError("verify: no rule for the operation 'select_n'")
         return self.emit("sqrt", [x])

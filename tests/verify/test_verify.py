@@ -252,7 +252,7 @@ def test_a_certificate_that_says_too_much_is_refused(
     before = dict(arrays)
     change(arrays)
     assert any(arrays[name] is not before[name] for name in arrays)
-    np.savez(tmp_path / "wrong.npz", **arrays)  # type: ignore[arg-type]
+    np.savez(tmp_path / "wrong.npz", **arrays)
     refused = run_check(tmp_path / "wrong.npz")
     assert refused.returncode == 1
     assert refused.stderr.startswith("refused: "), refused.stderr
@@ -380,6 +380,15 @@ def test_a_policy_that_remembers_and_an_unknown_operation_are_refused() -> None:
         verify(env, remembering, SMALL_BOX)
     with pytest.raises(ConfigError, match=r"^verify: no rule for the operation 'erf'"):
         verify(env, lambda key, x: jax.lax.erf(x[..., :2]), SMALL_BOX)
+
+
+def test_a_guarded_root_needs_the_guard_behind_it_too() -> None:
+    def half_guarded(y: jax.Array) -> jax.Array:
+        squared = jnp.sum(y * y)
+        return jnp.sqrt(jnp.where(squared == 0.0, 1.0, squared))[None]
+
+    with jax.enable_x64(True), pytest.raises(ConfigError, match=r"^verify: no rule"):
+        trace(half_guarded, 2, 0.0)
 
 
 @pytest.mark.slow
