@@ -226,7 +226,7 @@ def larger_box(arrays: dict[str, np.ndarray]) -> None:
 
 
 def smaller_radius(arrays: dict[str, np.ndarray]) -> None:
-    arrays["claims/radius"] = arrays["claims/radius"] * (1.0 - 1e-4)
+    arrays["claims/radius"] = arrays["claims/radius"] * (1.0 - 1e-3)
 
 
 def wrong_slope(arrays: dict[str, np.ndarray]) -> None:
