@@ -15,7 +15,10 @@ printed:
 
 These are steps of the proof in `docs/safety/proofs.md`. `jaxsafe/rta/proofs.py` keeps the numbers.
 
-    python benchmarks/terminal_set.py [angle=75] [dt=1] [cells=1440]
+With `push` a disturbance of so many m/s² also turns the course, and thrust must take its effect off
+again. Nothing is proved about a filter with a bound yet, so this only says what the set would hold.
+
+    python benchmarks/terminal_set.py [angle=75] [dt=1] [cells=1440] [push=0]
 """
 
 from __future__ import annotations
@@ -44,9 +47,9 @@ SLACK = 1.01
 
 def main() -> None:
     """Prove and print."""
-    options = words(angle="75", dt="1", cells="1440")
+    options = words(angle="75", dt="1", cells="1440", push="0")
     env = jaxsafe.make("docking2d_oriented", {"dt": float(options["dt"])})
-    proof = Proof(env, float(options["angle"]), int(options["cells"]))
+    proof = Proof(env, float(options["angle"]), int(options["cells"]), float(options["push"]))
     for line in proof.lines():
         print(line)
 
@@ -54,7 +57,9 @@ def main() -> None:
 class Proof:
     """The proof. Angles are in degrees, rates in degrees a second."""
 
-    def __init__(self, env: jaxsafe.Environment, angle: float, cells: int) -> None:
+    def __init__(
+        self, env: jaxsafe.Environment, angle: float, cells: int, push: float = 0.0
+    ) -> None:
         plant: Any = env.agent_platform
         backup = TURN["backups"][0]
         wheel = plant.controller.actuators[1]
@@ -70,6 +75,7 @@ class Proof:
         self.wheel = math.degrees(float(wheel.high))
         self.spin = math.degrees(float(plant.attitude_rate_limits[1]))
         self.angle = angle
+        self.push = push * self.dt
         self.aligned = math.degrees(backup.aligned)
         edges = np.linspace(-90.0, 90.0, cells + 1)
         spins = np.linspace(-self.spin, self.spin, 161)
@@ -80,20 +86,20 @@ class Proof:
         self.num = (cells, 160)
 
     def gravity(self, share: float) -> float:
-        """Return how far gravity and the Coriolis force turn the course in a step.
+        """Return how far gravity, the Coriolis force and a push turn the course in a step.
 
         `share` is the speed as a share of the limit.
         """
-        return math.degrees((2.0 * self.n + 1.5 * self.n / share) * self.dt)
+        pushed = math.asin(min(self.push / (0.99 * share * self.floor), 1.0))
+        return math.degrees((2.0 * self.n + 1.5 * self.n / share) * self.dt + pushed)
 
     def needed(self, first: bool) -> float:
         """Return what thrust must take off in a step, as a share of the speed.
 
         The limit is then kept with twice the margin.
         """
-        return SLACK * (
-            2.0 * self.n * self.dt + first * self.margin / (self.floor - 2.0 * self.margin)
-        )
+        gained = first * self.margin + self.push
+        return SLACK * (2.0 * self.n * self.dt + gained / (self.floor - 2.0 * self.margin))
 
     def thrust_turn(self, error: np.ndarray, first: bool) -> np.ndarray:
         """Return how far the least thrust that holds the limit turns the course in a step.
@@ -215,7 +221,9 @@ class Proof:
         """
         angle = math.radians(largest + self.spin * self.dt + 1.0)
         spare = (
-            self.weakest * math.cos(angle) / SLACK - self.margin / self.dt - self.slope * self.floor
+            self.weakest * math.cos(angle) / SLACK
+            - (self.margin + self.push) / self.dt
+            - self.slope * self.floor
         )
         return spare / max(3.0 * self.n**2, self.slope**2)
 

@@ -15,7 +15,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsafe.rta.bound import Errors, UncertaintyBound
+from jaxsafe.rta.bound import UncertaintyBound
+from jaxsafe.rta.delay import ahead_of_delay
 from jaxsafe.rta.prediction import others_react, repeat
 from jaxsafe.rta.projection import within
 from jaxsafe.rta.speed_limit import speed_limit_facts
@@ -366,7 +367,7 @@ class CertifiedRTA(RTA):
         It is infinite if nothing is proved with a bound. Arguments are those of
         `margin_to_certify`.
         """
-        if self.bound is None or self._has_tubes:
+        if self.bound is None or self.has_tubes:
             return jnp.zeros_like(env.dt)
         facts = [speed_limit_facts(env, name) for name in self.constraints]
         known = [limit for limit in facts if limit]
@@ -378,10 +379,10 @@ class CertifiedRTA(RTA):
     @property
     def _bound_is_proved(self) -> bool:
         known = all(backup.proved.knows_bound for backup in self.backups)
-        return self._has_tubes or (not self.horizon and known)
+        return self.has_tubes or (not self.horizon and known)
 
     @property
-    def _has_tubes(self) -> bool:
+    def has_tubes(self) -> bool:
         """Whether its certificates are about all states of a tube."""
         if self.bound is None or self.terminal is None:
             return False
@@ -417,7 +418,7 @@ class CertifiedRTA(RTA):
             none, _ = admissible(env, jnp.zeros(env.action_size, env.dt.dtype))
             controls = jnp.tile(none, (self.bound.delay, 1))
             _, start = self.replace(bound=self.bound.replace(delay=0)).begin(env, sim)
-            ahead, later, certified = self._ahead(env, sim, controls)
+            ahead, later, certified = ahead_of_delay(self, env, sim, controls)
             memory, info = ahead.begin(env, later)
             memory = memory.replace(under_way=UnderWay(controls=controls, certified=certified))
             return memory, info.replace(certified=start.certified & jnp.all(certified))
@@ -454,7 +455,7 @@ class CertifiedRTA(RTA):
         if self.bound is not None and self.bound.delay:
             assert isinstance(memory.under_way, UnderWay)
             controls, certified = memory.under_way.controls, memory.under_way.certified
-            ahead, later, _ = self._ahead(env, sim, controls)
+            ahead, later, _ = ahead_of_delay(self, env, sim, controls)
             control, memory, info = ahead.filter(env, later, memory, desired)
             under_way = UnderWay(
                 controls=jnp.concatenate([controls[1:], control[None]]),
@@ -494,7 +495,7 @@ class CertifiedRTA(RTA):
 
         backup_margin = self.lowest(env, sim, after_backup)
         new_certificate = passes | ~certified_before
-        if self._has_tubes:
+        if self.has_tubes:
             backup_certified = jnp.where(
                 certified_before, _finite(after_backup), paths.values[best] >= to_back_up
             )
@@ -550,38 +551,6 @@ class CertifiedRTA(RTA):
             constraint=jnp.where(intervening & finite, cause, NO_CONSTRAINT()),
         )
         return actual, memory, info
-
-    def _ahead(
-        self, env: Environment, sim: Sim, controls: Float[Array, "delay m"]
-    ) -> tuple[CertifiedRTA, Sim, Bool[Array, " delay"]]:
-        """Return what remains to be filtered after the controls under way have acted.
-
-        Args:
-            env: the environment.
-            sim: the simulation, as it is measured.
-            controls: the controls under way.
-
-        Returns:
-            This filter without delay, whose measured state has the errors of the prediction, the
-            predicted simulation, and whether the state after each control is certified.
-        """
-        bound = self.bound
-        assert bound is not None
-        facts = [speed_limit_facts(env, name) for name in self.constraints]
-
-        def one_step(carry: tuple[Sim, Errors], control: Float[Array, " m"]) -> Any:
-            sim, errors = carry
-            later = advance(env, sim, control)
-            if facts[0] is not None:
-                acceleration = safe_norm(control) / facts[0].mass
-                errors = bound.errors_after(facts[0], errors, acceleration)
-            there = self.replace(bound=bound.after_delay(errors))
-            value = there.follow(env, sim, later).values[0]
-            return (later, errors), value >= there.margin_to_certify(env)
-
-        start = sim.replace(regions={}, status={})
-        (sim, errors), certified = jax.lax.scan(one_step, (start, bound.measured), controls)
-        return self.replace(bound=bound.after_delay(errors)), sim, certified
 
     def lowest(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, ""]:
         """Return the smallest h of the constraints at `sim`.
@@ -659,7 +628,7 @@ class CertifiedRTA(RTA):
         arrived = itertools.chain(*group_arrived)
         reached = jnp.stack([self._may_end(env, *pair) for pair in zip(ends, arrived, strict=True)])
         states = [(end.platforms, end.actuators, end.remembered) for end in ends]
-        if self._has_tubes:  # nothing is renewed
+        if self.has_tubes:  # nothing is renewed
             states = [({}, {}, {})]
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
         ahead, actuators_ahead, remembered_ahead = stacked
@@ -697,7 +666,7 @@ class CertifiedRTA(RTA):
         """
         assert self.terminal is not None
         terminal = self.terminal
-        bound = self.bound if self._has_tubes else None
+        bound = self.bound if self.has_tubes else None
         low, high = bounds(env)
         plant = env.agent_platform
 

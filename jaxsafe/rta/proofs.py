@@ -26,6 +26,7 @@ from jaxsafe.rta.speed_limit import (
     off_centre,
     speed_limit_facts,
 )
+from jaxsafe.rta.tube import errors_after_delay
 from jaxsafe.simulation.controllers import Uncontrolled
 from jaxsafe.simulation.cwh import MEAN_MOTION, Anchor, Spacecraft
 from jaxsafe.simulation.double_integrator import DoubleIntegrator
@@ -454,8 +455,10 @@ def _faults_with_bound(
     bound = rta.bound
     assert bound is not None
     plant = env.agent_platform
+    if bound.delay and type(plant) is Dubins3D:
+        return {"rta.bound.delay is not proved for aircraft in space": _true()}
     if bound.delay:
-        return {"rta.bound.delay is not proved for aircraft": _true()}
+        bound = bound.after_delay(errors_after_delay(env, bound))
     unknown_thrust: Faults = {
         "rta.bound.mass is not proved for aircraft": bound.mass > 0.0,
         "rta.bound.misalignment is not proved for aircraft": bound.misalignment > 0.0,

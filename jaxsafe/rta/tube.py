@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.rta.bound import UncertaintyBound
+from jaxsafe.rta.bound import Errors, UncertaintyBound
 from jaxsafe.simulation.dubins import Dubins2D
 from jaxsafe.types import Number, Record
 
@@ -73,6 +73,25 @@ def after_step(
         heading=kept.heading + largest_turn(push, own_speed),
         speed=kept.speed + push,
     )
+
+
+def errors_after_delay(env: Environment, bound: UncertaintyBound) -> Errors:
+    """Return the errors of the state in which the next control of an aircraft begins to act.
+
+    Until then both ways have the same controls. A difference of the headings counts as one of the
+    velocities, so it grows with the speed.
+    """
+    plant = cast(Dubins2D, env.agent_platform)
+    slowest, fastest = plant.speed_limits
+    gains = [actuator.high for actuator in env.actuators if actuator.name == "acceleration"]
+    faster = jnp.asarray(1.0 + sum(gains) * env.dt / slowest)
+    faster = jnp.clip(faster, 1.0, fastest / slowest)
+    position, velocity = bound.position, bound.velocity
+    push = 1.02 * bound.process * env.dt  # asin is longer than the sine
+    for _ in range(bound.delay):
+        position = position + env.dt * (0.5 * (3.0 + faster) * velocity + 0.5 * push)
+        velocity = faster * velocity + push
+    return Errors(position=jnp.asarray(position), velocity=jnp.asarray(velocity))
 
 
 def largest_turn(change: Number, speed: Number) -> Float[Array, ""]:

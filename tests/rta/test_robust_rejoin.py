@@ -11,8 +11,12 @@ from default_cases import thorough
 
 import jaxsafe
 from jaxsafe import ConfigError
+from jaxsafe.config import override
 from jaxsafe.evaluate.adversaries import ADVERSARIES
+from jaxsafe.evaluate.bounded_worlds import world_at
+from jaxsafe.evaluate.run_adversaries import attack
 from jaxsafe.rta import UncertaintyBound
+from jaxsafe.rta.tube import errors_after_delay
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.transition import advance, bounds, others_later
 from jaxsafe.types import Sim
@@ -270,13 +274,54 @@ def test_within_the_bound_there_is_no_collision(world: dict[str, float], policy:
     assert np.median(distances.min(axis=1)) < 300.0  # the agent did come close
 
 
+@pytest.mark.thorough
+def test_a_known_delay_does_no_harm_and_an_unknown_one_leads_to_collisions() -> None:
+    env = robust({"process": 0.5, "delay": 2})
+    world = world_at(env, 1.0)
+    counts = attack(world, "intercept", 120, 32, jax.random.key(0))
+    assert counts["violating_steps"] == counts["violating_steps_inside"] == 0
+    assert counts["uncertified_steps"] == 0
+    assert counts["unsafe_starts"] == 0.0
+    assert counts["intervention_rate"] > 0.05  # the agent did come close
+    unknown = override(world, {"rta.bound.delay": 0})
+    counts = attack(unknown, "intercept", 120, 32, jax.random.key(0))
+    assert counts["violating_steps"] > 0
+
+
+def test_errors_after_a_delay_hold_whatever_controls_are_under_way() -> None:
+    env = robust({"process": 0.1, "position": 0.5, "velocity": 0.1, "delay": 3})
+    bound = env.rta.bound
+    errors = errors_after_delay(env, bound)
+    key = jax.random.key(0)
+    sims = beside(env, key, near=False, count=512)
+    low, high = bounds(env)
+
+    @jax.jit
+    @jax.vmap
+    def apart(sim: Sim, controls: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        angle = 2.0 * jnp.pi * jax.random.uniform(key, (2,))
+        seen, push = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+        predicted = measured(sim, bound, seen)
+        for control in controls:
+            sim = true_step(env, bare(sim), control, bound, push)
+            predicted = advance(env, bare(predicted), control)
+        true, known = (state.platforms["wingman"] for state in (sim, predicted))
+        return safe_norm(true.position - known.position), safe_norm(true.velocity - known.velocity)
+
+    drawn = jax.random.uniform(key, (512, 3, 2))
+    controls = low + (high - low) * jnp.where(drawn > 0.3, jnp.round(drawn), drawn)
+    position, velocity = apart(sims, controls, jax.random.split(key, 512))
+    assert 0.4 * errors.position < jnp.max(position) <= errors.position + 0.01
+    assert 0.4 * errors.velocity < jnp.max(velocity) <= errors.velocity + 0.001
+
+
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
         ({"rta.bound.process": 3.4}, "rta.bound is larger than velocity_matched is proved for"),
         ({"rta.bound.mass": 0.1}, "rta.bound.mass is not proved for aircraft"),
         ({"rta.bound.misalignment": 0.1}, "rta.bound.misalignment is not proved for aircraft"),
-        ({"rta.bound.delay": 1}, "rta.bound.delay is not proved for aircraft"),
+        ({"rta.bound.delay": 2}, "rta.bound is larger than velocity_matched is proved for"),
         ({"rta.backups.left.dead_zone": 0.05}, "rta.bound: dead_zone of match_velocity"),
         ({"rta.backups.left.clearance": 110}, "rta.bound: clearance of match_velocity"),
         ({"rta.terminal.tolerance": 4}, "rta.bound: tolerance of velocity_matched"),
