@@ -97,7 +97,8 @@ class MPC(ControlLaw, type="mpc"):
     minimises Σ xᵀQx + uᵀRu + the cost of an LQR for ever after, for the linear plant, with Q and R
     as in `LQR`. After every thrust ‖v‖ ≤ `share` · (ν₀ + ν₁ e·r), where e is the present direction
     of the position r. This is a second-order cone, and lies within the speed limit, because
-    e·r ≤ ‖r‖.
+    e·r ≤ ‖r‖. From farther away than `reach` the cost is that from `reach`, because more rounds
+    would be needed for a larger one.
 
     The plan is found by `iterations` rounds of ADMM (Boyd et al. 2011), as in OSQP and SCS: one
     product with a matrix that `design` has inverted, and projections onto the box and the cones.
@@ -107,6 +108,7 @@ class MPC(ControlLaw, type="mpc"):
     speed: Annotated[MetresPerSecond, Positive] = 1.0
     thrust: Annotated[Newtons, Positive] = 1.0
     share: Share = 0.98
+    reach: Annotated[Length, Positive] = 200.0
     horizon: Annotated[int, Range(1, largest=200)] = 12
     hold: Annotated[int, Range(1, largest=1000)] = 4
     iterations: Annotated[int, Range(1, largest=10_000)] = 40
@@ -170,10 +172,11 @@ class MPC(ControlLaw, type="mpc"):
         low, high = bounds(env)
         largest = jnp.max(jnp.maximum(-low, high))
         limit = speed_limit(env)
-        outwards = state.position / jnp.maximum(safe_norm(state.position), 1e-6)
-        x = jnp.concatenate([state.position, state.velocity])
-        gradient = design["gradient"] @ x
-        offset = design["offset"] @ x
+        distance = safe_norm(state.position)
+        outwards = state.position / jnp.maximum(distance, 1e-6)
+        to_go = jnp.minimum(distance, self.reach) * outwards
+        gradient = design["gradient"] @ jnp.concatenate([to_go, state.velocity])
+        offset = design["offset"] @ jnp.concatenate([state.position, state.velocity])
         unit = self._unit(limit)
         floor = (limit.floor - limit.slope * limit.constant_to) / unit
 

@@ -207,6 +207,18 @@ def test_controllers_succeed_from_a_thousand_starts(task: str, name: str) -> Non
     assert found["episode_safety_violation_rate"] <= 0.001  # type: ignore[operator]
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("task", "name"), [("docking2d", "pd"), ("docking3d", "mpc"), ("docking2d_oriented", "align")]
+)
+def test_docking_also_succeeds_from_a_kilometre(task: str, name: str) -> None:
+    env = jaxsafe.make(task, {"deputy.start.position.distance": [1000.0, 1000.0]})
+    policy = jaxsafe.load_policy(f"controller/{name}", env=env)
+    found = jaxsafe.evaluate(env, policy, jax.random.key(0), 100)
+    assert found["success_rate"] == 1.0
+    assert found["episode_safety_violation_rate"] <= 0.001  # type: ignore[operator]
+
+
 def test_pursuit_goes_around_the_lead() -> None:
     env = jaxsafe.make("rejoin2d")
     flown = {"heading": 0.0, "speed": 250.0}
