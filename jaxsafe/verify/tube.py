@@ -69,7 +69,7 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
     domain = _boxes(low, high, loop.actions, steps)
     samples, claims, lows, highs = [], [], [], []
     for t in range(steps + 1):
-        bounds = _with_room(bound(loop.following if t else loop.first, domain))
+        bounds = _with_room(bound(loop.following if t else loop.first, domain), size)
         domain, sample = _following(bounds, domain, size, loop.dimension, t)
         samples.append(sample)
         claims.append(Claims(*(x[:, size:total] for x in bounds[:3])))
@@ -84,9 +84,11 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
 
 
 @jax.jit
-def _with_room(bounds: Bounds) -> Bounds:
-    """Return bounds that a checker with other roundings can confirm."""
-    return bounds._replace(radius=bounds.radius * (1.0 + ROOM) + FINE)
+def _with_room(bounds: Bounds, size: int) -> Bounds:
+    """Return bounds whose claims about actions a checker with other roundings can confirm."""
+    wider = bounds.radius * (1.0 + ROOM) + FINE
+    acts = jnp.arange(wider.shape[-1]) >= size
+    return bounds._replace(radius=jnp.where(acts, wider, bounds.radius))
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
