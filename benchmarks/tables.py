@@ -203,6 +203,34 @@ def robustness(results: Results) -> str:
     return markdown(heads, rows)
 
 
+TRAINED_IN = {
+    "perfect": "the perfect world",
+    "uncertain": "the uncertain world",
+    "robust": "the uncertain world, under `robust`",
+}
+
+
+def uncertain_training(results: Results) -> str:
+    """Return how policies fare in an uncertain world, by where they were trained."""
+    heads = ("task", "trained in", "tested with", "success", "worst seed", "violating steps")
+    rows = []
+    for row in results["rows"]:
+        found = row["metrics"]
+        rows.append(
+            (
+                row["task"],
+                TRAINED_IN[row["trained"]],
+                "no filter" if row["rta"] == "none" else f"`{row['rta']}`",
+                f"{_interval(found['success_rate'], 100.0, 1)} %",
+                f"{100.0 * min(found['success_rate']['per_seed']):.1f} %",
+                f"{_interval(found['episode_safety_violation_rate'], 100.0, 2)} %",
+                _share(found["intervention_rate"]) if row["rta"] != "none" else "–",
+                f"{_interval(found['control_effort'], 100.0, 1)} %",
+            )
+        )
+    return markdown((*heads, "steps altered", "share of full control"), rows)
+
+
 def controllers(results: Results) -> str:
     """Return how controllers and the packaged policies fly without a filter, and bounds."""
     rows = []
@@ -912,6 +940,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("memory", memory, "docs/scaling.md"),
     ("robustness", robustness, "docs/safety/attacks.md"),
     ("verification", verification, "docs/verification.md"),
+    ("uncertain_training", uncertain_training, "docs/safety/attacks.md"),
     ("controllers", controllers, "docs/controllers.md"),
     ("controllers", controllers_filtered, "docs/controllers.md"),
     ("adapters", adapters, "docs/adapters/gymnasium.md"),

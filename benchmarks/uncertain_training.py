@@ -1,0 +1,127 @@
+"""Measure what training in an uncertain world, and under a robust filter, is worth there.
+
+Each task is trained by its recipe in three ways: in the perfect world of the paper, in a world that
+is as bad as the bound in `BOUNDS`, and in that world under `rta=robust`. In that world the policies
+of all seeds then act by their most probable action, without a filter and under `robust`.
+
+Results are written to `benchmarks/results/uncertain_training.json`, and the table of
+docs/safety/attacks.md is printed:
+
+    python benchmarks/uncertain_training.py [tasks=docking3d,rejoin2d] [seeds=10] [episodes=1000]
+        [out=DIRECTORY]
+
+With `out` the runs are kept, and what is there already is not trained or tested again.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from isolated import several, words
+
+OUT = Path(__file__).parent / "results" / "uncertain_training.json"
+BOUNDS: dict[str, dict[str, float]] = {
+    "docking3d": {
+        "process": 0.01,
+        "mass": 0.05,
+        "misalignment": 0.05,
+        "position": 1.0,
+        "velocity": 0.01,
+    },
+    "rejoin2d": {"process": 1.0, "position": 5.0},
+}
+"""For docking3d that of `benchmarks/robustness.py`, for rejoin2d pushes of 1 ft/s² and 5 ft."""
+
+WAYS = ("perfect", "uncertain", "robust")
+"""Where a policy was trained: in the perfect world, in the uncertain one, there under `robust`."""
+
+FILTERS = ("none", "robust")
+KEPT = (
+    "success_rate",
+    "control_effort",
+    "safety_violation_rate",
+    "episode_safety_violation_rate",
+    "intervention_rate",
+)
+
+
+def write_worlds(task: str, place: Path) -> dict[str, Path]:
+    """Write the environment of each way. That of `robust` is the world with the filter in it."""
+    import jaxsafe
+    from jaxsafe.config import override
+    from jaxsafe.evaluate.bounded_worlds import world_at
+
+    robust = world_at(jaxsafe.make(task, {"rta.bound": BOUNDS[task]}, rta="robust"), 1.0)
+    envs = {
+        "perfect": jaxsafe.make(task),
+        "uncertain": override(robust, {"rta": None}),
+        "robust": robust,
+    }
+    paths = {way: place / f"{task}_{way}.yaml" for way in envs}
+    for way, env in envs.items():
+        paths[way].write_text(jaxsafe.dump(env), encoding="utf-8")
+    return paths
+
+
+def command(name: str, *options: str) -> None:
+    """Run a command of jaxsafe, which stops this program if it fails."""
+    subprocess.run([sys.executable, "-m", f"jaxsafe.{name}", *options], check=True)
+
+
+def measure(task: str, place: Path, seeds: int, episodes: int) -> list[dict[str, Any]]:
+    """Train a task in each way, test the policies, and return a row for each test."""
+    worlds = write_worlds(task, place)
+    rows = []
+    for way in WAYS:
+        run = place / f"{task}_{way}"
+        if not (run / "results.json").exists():
+            recipe = (f"recipe={task}", "preset=engineered_features")
+            command("train", f"env={worlds[way]}", *recipe, f"seeds={seeds}", f"out={run}")
+        for rta in FILTERS:
+            tested = place / f"{task}_{way}_{rta}"
+            if not (tested / "results.json").exists():
+                world = worlds["robust" if rta == "robust" else "uncertain"]
+                options = (f"env={world}", f"episodes={episodes}", f"out={tested}")
+                command("evaluate", f"run={run}", *options, "deterministic=true")
+            results = json.loads((tested / "results.json").read_text(encoding="utf-8"))
+            found = results["evaluation"]["deterministic"]
+            metrics = {name: found[name] for name in KEPT if name in found}
+            rows.append({"task": task, "trained": way, "rta": rta, "metrics": metrics})
+    return rows
+
+
+def main() -> None:
+    """Run the command."""
+    options = words(tasks=",".join(BOUNDS), seeds="10", episodes="1000", out="")
+    tasks = several("tasks", options["tasks"], BOUNDS)
+    with tempfile.TemporaryDirectory() as temporary:
+        place = Path(options["out"] or temporary).resolve()
+        place.mkdir(parents=True, exist_ok=True)
+        counts = (int(options["seeds"]), int(options["episodes"]))
+        rows = [row for task in tasks for row in measure(task, place, *counts)]
+    import tables
+
+    from jaxsafe.storage import provenance
+    from jaxsafe.storage.files import write_json
+
+    results = {
+        "command": "python benchmarks/uncertain_training.py"
+        f" tasks={options['tasks']} seeds={counts[0]} episodes={counts[1]}",
+        "bounds": {task: BOUNDS[task] for task in tasks},
+        "seeds": counts[0],
+        "episodes": counts[1],
+        "commit": provenance.commit(),
+        "versions": provenance.versions(),
+        "rows": rows,
+    }
+    write_json(OUT, results)
+    print(tables.uncertain_training(results))
+
+
+if __name__ == "__main__":
+    main()
