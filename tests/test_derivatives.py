@@ -140,7 +140,7 @@ def test_the_loss_and_its_gradient_are_finite_however_far_the_policies_are_apart
     assert terms["approx_kl"] >= 0.0
 
 
-@pytest.mark.parametrize("old", [-90.0, -1e30])
+@pytest.mark.parametrize("old", [thorough(-90.0), -1e30])
 def test_a_bad_action_that_became_far_likelier_is_still_made_less_likely(old: float) -> None:
     env = jaxsafe.make("docking2d")
     agent = normalise(Agent(actor=MLP(hidden=(4,))))

@@ -127,6 +127,7 @@ def test_a_flight_is_drawn(task: str, tmp_path: Path) -> None:
         flight.animate("episode.mov")
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("task", "drawn"), [thorough("docking2d", True), ("rejoin2d", False)])
 def test_a_region_in_place_is_drawn_where_the_map_stays_too(task: str, drawn: bool) -> None:
     regions = jaxsafe.make(task).regions

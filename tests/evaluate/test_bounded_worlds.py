@@ -100,6 +100,7 @@ def test_levels_need_a_bound() -> None:
         falsify.main(["env=docking2d", "levels=-1"])
 
 
+@pytest.mark.thorough
 def test_a_wrong_velocity_makes_an_aircraft_seem_to_close_in_more_slowly() -> None:
     """The distance does not depend on the velocity, but the distance a step later does."""
     bound = {"process": 0.5, "velocity": 2.0}

@@ -195,6 +195,7 @@ def at(env: jaxsafe.Environment, start: safe_set.Start, x: float, y: float) -> d
     return {name: vars(state) for name, state in sim.platforms.items()}
 
 
+@pytest.mark.thorough
 def test_without_a_horizon_the_safe_set_is_that_of_h() -> None:
     env = jaxsafe.make("docking2d", rta="default")
     plane = safe_set.planes(env)

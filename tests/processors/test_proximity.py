@@ -36,6 +36,7 @@ def drifted(sim: Sim, duration: float) -> jax.Array:
     return jnp.min(jax.vmap(distance)(jnp.linspace(0.0, duration, 2001)))
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("duration", [300.0, thorough(6000.0)])
 @pytest.mark.parametrize("task", ["docking2d", thorough("docking3d")])
 @pytest.mark.usefixtures("x64")

@@ -248,6 +248,7 @@ def test_a_heavier_craft_and_one_that_pushes_along_its_velocity_are_safe_as_well
     assert flights.h.min() >= 0.99 * MARGIN
 
 
+@pytest.mark.thorough
 def test_a_bound_of_nothing_changes_nothing() -> None:
     env: Any = jaxsafe.make("docking2d", rta="default")
     none = jax.tree.map(lambda leaf: leaf[0], stacked([{}]))

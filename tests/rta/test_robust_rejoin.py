@@ -262,7 +262,7 @@ def test_without_a_bound_a_disturbance_of_2_ft_per_s_leads_to_collisions() -> No
 @pytest.mark.parametrize(
     ("world", "policy"),
     [
-        (WORLDS[0], "pursue"),
+        thorough(WORLDS[0], "pursue"),
         *(thorough(world, policy) for world in WORLDS for policy in ("intercept", "head_on")),
     ],
 )
@@ -288,6 +288,7 @@ def test_a_known_delay_does_no_harm_and_an_unknown_one_leads_to_collisions() -> 
     assert counts["violating_steps"] > 0
 
 
+@pytest.mark.thorough
 def test_errors_after_a_delay_hold_whatever_controls_are_under_way() -> None:
     env = robust({"process": 0.1, "position": 0.5, "velocity": 0.1, "delay": 3})
     bound = env.rta.bound

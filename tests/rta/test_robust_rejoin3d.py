@@ -227,6 +227,7 @@ def test_within_the_bound_there_is_no_collision_and_all_is_certified(policy: str
     assert counts["worst_margin_inside"] < 400.0  # the agent did come close
 
 
+@pytest.mark.thorough
 def test_a_start_of_the_task_is_certified_within_the_bound() -> None:
     env = jaxsafe.make("rejoin3d", rta="robust")
     state, timestep = jaxsafe.reset(env, jax.random.key(0))

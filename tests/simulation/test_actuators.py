@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from default_cases import thorough
 from scipy.integrate import solve_ivp
 
 import jaxsafe
@@ -101,7 +102,7 @@ def test_states_of_actuators_are_batched_and_differentiable() -> None:
         ("docking1d", "default", "thrust_x.time_constant", "brake"),
         ("docking2d", "default", "thrust_y.rate_limit", "brake"),
         ("docking2d", "explicit_asif", "thrust_x.time_constant", "a barrier row"),
-        ("docking2d_oriented", "default", "thrust.rate_limit", "align_and_brake"),
+        thorough("docking2d_oriented", "default", "thrust.rate_limit", "align_and_brake"),
         ("rejoin2d", "default", "acceleration.time_constant", "velocity_matched"),
     ],
 )

@@ -155,6 +155,7 @@ def test_an_update_starts_afresh_and_logs_what_counts_and_all_costs() -> None:
     assert int(total_cost(twice.window)) > int(total_cost(once.window))
 
 
+@pytest.mark.thorough
 def test_without_it_nothing_is_weighed() -> None:
     _, state, after, transitions = collected()
     gamma = jnp.array(0.9)

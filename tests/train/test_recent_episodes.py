@@ -66,6 +66,7 @@ def test_the_cost_of_the_training_counts_every_violating_step_once() -> None:
         assert int(total_cost(window)) == counted
 
 
+@pytest.mark.thorough
 def test_a_batch_with_more_episodes_than_the_window_leaves_its_last_ones() -> None:
     values = np.arange(300, dtype=np.float32).reshape(100, 3)
     window = push(

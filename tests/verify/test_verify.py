@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from default_cases import thorough
 
 import jaxsafe
 from jaxsafe.commands.verify import EXIT_CODES, main
@@ -90,7 +91,7 @@ def test_every_rule_is_tried() -> None:
 
 
 @pytest.mark.parametrize("name", COMPOSED)
-@pytest.mark.parametrize("width", [0.003, 0.1])
+@pytest.mark.parametrize("width", [thorough(0.003), 0.1])
 def test_no_point_is_outside_of_its_bounds(name: str, width: float) -> None:
     with jax.enable_x64(True):
         program = trace(COMPOSED[name], 4, 0.0)
