@@ -47,6 +47,7 @@ _MOVING = [
     "transpose",
     "slice",
     "split",
+    "unstack",
     "concatenate",
     "stack",
     "copy",
