@@ -20,20 +20,20 @@ GIB = 2**30
 LEAST = 2 * GIB
 """Bytes of address space that a command needs.
 
-Devices, with threads for two cores, take 1.4 GiB before anything is compiled. Evaluating docking2d
-takes 1.8 GiB.
+JAX's devices, with threads for two cores, take 1.4 GiB before anything is compiled. An evaluation
+of docking2d takes 1.8 GiB.
 """
 
 
 def shortage() -> str | None:
-    """Return what is wrong with the limit of this process, or None if nothing is."""
+    """Return what is wrong with the address space of this process, or None if nothing is."""
     if resource is None:
         return None
-    most, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if most == resource.RLIM_INFINITY or most >= LEAST:
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    if limit == resource.RLIM_INFINITY or limit >= LEAST:
         return None
     return (
-        f"memory is short: ulimit -v leaves {most / GIB:.1f} GiB of address space,"
+        f"memory is short: ulimit -v leaves {limit / GIB:.1f} GiB of address space,"
         f" a command needs {LEAST / GIB:.1f} GiB"
     )
 
@@ -41,7 +41,7 @@ def shortage() -> str | None:
 def is_shortage(error: BaseException) -> bool:
     """Return whether an error says that there is not enough memory.
 
-    It may be Python's own error, one of JAX, or one of a library that could not be loaded.
+    The error may come from Python, from JAX, or from a library that could not be loaded.
     """
     signs = (
         "RESOURCE_EXHAUSTED",
@@ -54,7 +54,7 @@ def is_shortage(error: BaseException) -> bool:
 
 
 # While Python looks for the module of `python -m`, the first argument is still "-m". The console
-# script is called by its name. So this holds for commands only.
+# script is called by its own name. No other program that imports jaxsafe is taken for a command.
 _first = "".join(sys.argv[:1])
 _is_command = _first == "-m" or os.path.basename(_first) in ("jaxsafe", "jaxsafe.exe")
 if _is_command and (fault := shortage()):

@@ -118,7 +118,7 @@ class Environment(Component, Described):
 
     @property
     def task(self) -> str:
-        """The name under which it was made, for texts. Transformations of JAX drop it."""
+        """The name of the task, for messages. It is empty after a transformation of JAX."""
         return self._task
 
     def platform(self, name: str) -> Platform:
@@ -132,7 +132,7 @@ class Environment(Component, Described):
 
     @property
     def outcomes(self) -> tuple[str, ...]:
-        """The names that `info.outcome` indexes.
+        """The names of the outcomes, in the order in which `info.outcome` counts them.
 
         They are `running`, the terminal conditions in their order, the outcomes of bounded reward
         terms in their order, and `diverged`.
@@ -144,8 +144,8 @@ class Environment(Component, Described):
     def successes(self) -> tuple[str, ...]:
         """The names of the outcomes that count as success, in the order of `outcomes`.
 
-        They are those marked by `success: true`. The outcome called `success` needs no mark, and
-        `success: false` takes it out.
+        They are the outcomes marked by `success: true`. The outcome called `success` counts without
+        a mark, unless it is marked by `success: false`.
         """
         bounds = {term.bound.outcome: term.bound.success for term in self.reward if term.bound}
         marks = {condition.name: condition.success for condition in self.terminal} | bounds
@@ -155,16 +155,17 @@ class Environment(Component, Described):
 
     @property
     def success_indices(self) -> tuple[int, ...]:
-        """The indices in `outcomes` of those that count as success."""
+        """The indices in `outcomes` of the outcomes that count as success."""
         return tuple(map(self.outcomes.index, self.successes))
 
     def succeeded(self, outcome: Any) -> Any:
-        """Return which episodes succeeded.
+        """Return which episodes succeeded, as booleans of the shape of `outcome`.
 
         Args:
             outcome: how they ended, as `info.outcome`. It may be an array of any shape.
         """
         flags = [outcome == index for index in self.success_indices]
+        # No outcome is below 0, so without a success among the outcomes none has succeeded.
         return functools.reduce(operator.or_, flags) if flags else outcome < 0
 
     @property
@@ -236,15 +237,15 @@ class Environment(Component, Described):
         yield "agent", f"{self.agent}{beside}, {brief(self.dt)} s a step{held}"
         try:
             names = self.observation_names
-        except Exception:  # in a transformation of JAX, leaves may be no numbers
+        except Exception:  # a transformation of JAX may put other things in the place of numbers
             names = [item.name for item in self.observation]
         yield "observation", f"{len(names)} numbers: {', '.join(names)}"
         yield "action", action_text(self)
         yield "reward", ", ".join(term.name for term in self.reward)
-        cut = [
+        outcomes = [
             f"{name} ({ends})" if ends == "truncated" else name for name, ends in self._ends.items()
         ]
-        yield "ends", ", ".join(cut)
+        yield "ends", ", ".join(outcomes)
         yield "constraints", ", ".join(constraint.name for constraint in self.constraints)
         yield "filter", filter_name(self)
         if self.uncertainty:
@@ -254,7 +255,7 @@ class Environment(Component, Described):
 
     @property
     def _ends(self) -> dict[str, str]:
-        """How an episode ends, `terminated` or `truncated`, by outcome."""
+        """How an episode with an outcome ends, `terminated` or `truncated`, by outcome."""
         bounds = {term.bound.outcome: term.bound.ends for term in self.reward if term.bound}
         conditions = {condition.name: condition.ends for condition in self.terminal}
         return conditions | bounds | {DIVERGED: "terminated"}
@@ -267,9 +268,10 @@ def require_success(env: Environment) -> None:
         ConfigError: no outcome is called `success` or marked as one.
     """
     if not env.successes:
-        found = ", ".join(env.outcomes[1:-1])
+        outcomes = ", ".join(env.outcomes[1:-1])
         raise ConfigError(
-            f"terminal: no outcome counts as a success; mark one with success: true, among {found}"
+            "terminal: no outcome counts as a success; mark one with success: true, "
+            f"among {outcomes}"
         )
 
 
@@ -279,7 +281,7 @@ def filter_name(env: Environment) -> str:
 
 
 def length_unit(env: Environment) -> str | None:
-    """Return the unit of positions, m or ft, or None if the platform does not say."""
+    """Return the unit of positions, m or ft, or None if the agent's platform names none."""
     return units(type(env.agent_platform.rest())).get("position")
 
 
@@ -302,11 +304,12 @@ def control_unit(name: str, length: str | None) -> str | None:
 
 
 def action_bounds(env: Environment) -> tuple[list[Any], list[Any]]:
-    """Return the lowest and the highest value of each element of an action that make a difference.
+    """Return the lowest values that make a difference in an action, and the highest.
 
-    They are −1 and 1 where the actuator rescales, −∞ and ∞ where it takes the tanh of an action,
-    and else the actuator's own limits in physical units. If episodes draw a limit at random, the
-    widest that can be drawn is returned. For an index they are 0 and points − 1.
+    Each list has a value for each element of the action. They are −1 and 1 where the actuator
+    rescales, −∞ and ∞ where it takes the tanh of an action, and otherwise the actuator's own limits
+    in physical units. If episodes draw a limit at random, the widest one that can be drawn counts.
+    For an index they are 0 and points − 1.
     """
     if env.action_kind == "continuous" and acts_within_one(env):
         return [-1.0] * env.action_size, [1.0] * env.action_size
@@ -358,8 +361,8 @@ def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:
         key: a typed PRNG key, `jax.random.key(seed)`.
 
     Returns:
-        The state and the first time step. Its reward and cost are those of no step taken, and
-        `terminated` and `truncated` are False.
+        The state and the first time step, whose reward and cost are 0, and whose `terminated` and
+        `truncated` are False.
     """
     parameters = _draw_parameters(env, key)
     env = drawn(env, parameters)
@@ -389,7 +392,7 @@ def reset_to(
         parameters: the numbers that `env.randomize` draws, by dotted path. All of them must be
             given.
         key: a typed PRNG key, from which disturbances and errors of sensors are drawn. It must be
-            given where there are any.
+            given if the environment has any.
 
     Returns:
         The state and the first time step, as `reset` returns them.
@@ -404,13 +407,13 @@ def reset_to(
             raise ConfigError(f"reset_to: expected {label} by name, found {show(argument)}")
     parameters = _chosen_parameters(env, parameters or {})
     env = drawn(env, parameters)
-    known = {platform.name: platform for platform in env.platforms}
+    names = {platform.name: platform for platform in env.platforms}
     for name in start:
-        if name not in known:
+        if name not in names:
             raise ConfigError(
-                f"reset_to: unknown platform {show(name)}; choose from {nearest(name, known)}"
+                f"reset_to: unknown platform {show(name)}; choose from {nearest(name, names)}"
             )
-    platforms = {name: platform.place(start.get(name, {})) for name, platform in known.items()}
+    platforms = {name: platform.place(start.get(name, {})) for name, platform in names.items()}
     sim = empty_sim(env).replace(platforms=platforms)
     random = random_parts(env)
     if random and key is None:
@@ -422,8 +425,9 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
     """Advance one time step, or as many as `decision_period` says.
 
     A step never resets by itself, and never looks at an earlier outcome. With a `decision_period`
-    the control of the action is held. The filter, statuses and rewards see every step of the world.
-    Nothing moves after a step that ends the episode. `Info` says what is summed over these steps.
+    the control of the action is held for several steps of the world, and the filter, statuses and
+    rewards see each of them. Nothing moves after a step that ends the episode. `Info` says which of
+    its values are summed over these steps.
 
     Args:
         env: the environment.
@@ -454,7 +458,7 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
         return jax.tree.map(lambda a, b: jnp.where(so_far.done, a, b), taken, following), None
 
     (after, timestep), _ = jax.lax.scan(hold, taken, length=env.decision_period - 1)
-    # So far the controls that acted are summed up.
+    # `control_actual` is still a sum, and becomes the mean here.
     count = (after.num_steps - state.num_steps).astype(desired.dtype)
     info = timestep.info.replace(control_actual=timestep.info.control_actual / count)
     return after, timestep.replace(info=info)
@@ -513,9 +517,9 @@ def _world_step(env: Environment, state: State, desired: Array) -> tuple[State, 
 
 
 def _together(env: Environment, before: TimeStep, now: TimeStep) -> TimeStep:
-    """Return the time step of several steps of the world, given that of the steps before this one.
+    """Combine the time step of the earlier steps of an action with the time step of the last one.
 
-    What is not named here is that of the last step. The controls that acted are added up.
+    Values that are not named here are those of the last step. The controls that acted are summed.
     """
     earlier = before.info
     info = now.info
@@ -551,11 +555,11 @@ def _together(env: Environment, before: TimeStep, now: TimeStep) -> TimeStep:
 def _with_own_buffers(started: tuple[State, TimeStep], others: Any) -> tuple[State, TimeStep]:
     """Copy arrays that stand in several places, so that the state may be donated.
 
-    A compiled reset returns an array of its own for each place.
+    A compiled reset needs no copies, because it returns an array of its own for each place.
 
     Args:
-        started: a state and its time step. None of their arrays may stand there twice.
-        others: a tree whose arrays must not stand in `started` either.
+        started: a state and its time step. An array that stands there twice is copied.
+        others: a tree. Its arrays are copied where they stand in `started` as well.
     """
     seen = {id(leaf) for leaf in jax.tree.leaves(others)}
 
@@ -585,9 +589,9 @@ def _chosen_parameters(env: Environment, parameters: Mapping[str, Any]) -> Param
     """Check the numbers that a user chose in place of random ones, and convert them."""
     for path in parameters:
         if path not in env.randomize:
-            known = nearest(path, env.randomize) or "none"
+            choices = nearest(path, env.randomize) or "none"
             raise ConfigError(
-                f"reset_to: parameter {show(path)} is not random; choose from {known}"
+                f"reset_to: parameter {show(path)} is not random; choose from {choices}"
             )
     for path in env.randomize:
         if path not in parameters:
@@ -600,7 +604,7 @@ def _chosen_parameters(env: Environment, parameters: Mapping[str, Any]) -> Param
 def drawn(env: Environment, parameters: Parameters) -> Environment:
     """Return the environment with the numbers that an episode has drawn, `state.parameters`.
 
-    Numbers that follow them have moved after them.
+    The numbers that are tied to them follow.
     """
     for path, value in parameters.items():
         env = set_path(env, path, value)
@@ -617,8 +621,8 @@ def extremes(env: Environment) -> tuple[Environment, Environment]:
 def longest_episode(env: Environment) -> Float[Array, ""] | None:
     """Return the number of actions after which every episode has ended by its time limit.
 
-    A time limit or a length of a step that is random counts with its worst value. It is None if the
-    task has no time limit.
+    A random time limit counts with its largest value, and a random length of a step with its
+    smallest. None is returned if the task has no time limit.
     """
     low, high = extremes(env)
     limit = time_limit(high)
@@ -655,11 +659,11 @@ def _begin(
     env: Environment, sim: Sim, parameters: Parameters, key: Key | None
 ) -> tuple[State, TimeStep]:
     """Initialise all processors from placed platforms: `init` and `process`, no `increment`."""
-    # The key has a stream of its own, so that platforms start alike with and without uncertainty.
-    words: Any = ()
+    # Uncertainty has a key of its own, so that platforms start alike with and without it.
+    key_words: Any = ()
     if key is not None and random_parts(env):
-        words = episode_words(key, len(env.platforms) + 1)
-    first_key = step_key(words, jnp.zeros((), jnp.int32))
+        key_words = episode_words(key, len(env.platforms) + 1)
+    first_key = step_key(key_words, jnp.zeros((), jnp.int32))
     sim, status_memory = update_statuses(env, sim, {})
     uncertainty_memory = begun(env, sim, first_key)
     seen = measured(env, sim, uncertainty_memory)
@@ -693,9 +697,9 @@ def _begin(
         reward_totals=terms,
         num_steps=jnp.zeros((), jnp.int32),
         parameters=parameters,
-        key=words,
+        key=key_words,
     )
-    # In `sim` nothing has ended, because the first step is always taken.
+    # The time step is made of `sim`, in which nothing has ended. The first step is always taken.
     timestep = _time_step(env, sim, observation=observation, reward=zero, info=info)
     return state, timestep.replace(cost=zero)
 
@@ -725,9 +729,9 @@ def _checked(env: Environment, action: Array) -> Array:
 def _update_ended(env: Environment, sim: Sim) -> Sim:
     """Return the simulation with what ended the episode.
 
-    The first terminal condition that holds ends it. Conditions that stand apart end it beside the
-    others. A state that is not finite ends it before all of them, because no comparison with such
-    numbers means anything.
+    The first terminal condition that holds ends it. Conditions that stand apart end it besides. If
+    the state is not finite, no condition counts but `diverged`, because comparisons with such
+    numbers mean nothing.
     """
     diverged = _diverged(env, sim)
     ended = {DIVERGED: diverged}
@@ -743,9 +747,9 @@ def _update_ended(env: Environment, sim: Sim) -> Sim:
 def _diverged(env: Environment, sim: Sim) -> Bool[Array, ""]:
     """Return whether the state is not finite, or a status that ends or judges the episode is NaN.
 
-    Of the platforms other than the agent's only the position is looked at, because whatever else of
-    them is not finite shows there a step later. To look at each number by itself, or at statuses
-    that nothing needs, cost up to a third of a step.
+    Of the other platforms only the position is checked. Any other number of theirs that is not
+    finite shows in the position a step later. Checks of each number by itself, or of statuses that
+    nothing needs, took up to a third of the time of a step.
     """
     positions = [
         sim.platforms[platform.name].position
@@ -773,8 +777,8 @@ def _rewards(env: Environment, sim: Sim, state: State) -> tuple[Sim, dict, dict,
     A bounded term may end the episode, and the terms after it see that.
 
     Returns:
-        The simulation with what ended the episode, and by name the memories of the terms, their
-        values on this step, and their totals in this episode.
+        The simulation with what ended the episode. Then, each by name of the term: the memories,
+        the values of this step, and the totals in this episode.
     """
     memories = {}
     terms = {}
@@ -798,7 +802,9 @@ def _rewards(env: Environment, sim: Sim, state: State) -> tuple[Sim, dict, dict,
 def _observations(
     env: Environment, sim: Sim, key: Any, memory: Memory | None
 ) -> tuple[Float[Array, " observation"], dict[str, Any], dict[str, Any]]:
-    """Return the observation, and by name what its parts remember and the readings under way.
+    """Return the observation, what its parts remember, and the readings that are under way.
+
+    The latter two are by name of the part. A reading is under way while its sensor delays it.
 
     Args:
         env: the environment.
@@ -829,7 +835,7 @@ def _observations(
 
 
 def _filtered(env: Environment, state: State, desired: Array) -> tuple[Array, Any, RTAInfo | None]:
-    """Return the control that acts, and memory and info of run time assurance.
+    """Return the control that acts, and the memory and the info of run time assurance.
 
     Without run time assurance the desired control acts.
     """
@@ -863,10 +869,10 @@ def _info(
         with part("constraints", constraint.name):
             margin = constraint.margin(sim)
             excess = jnp.maximum(-margin, 0.0) / constraint.limit(sim)
-            # A margin that is not a number lacks the whole limit.
-            known = jnp.where(jnp.isfinite(excess), excess, 1.0)
+            # A margin that is not a number counts as a violation by the whole limit.
+            finite_excess = jnp.where(jnp.isfinite(excess), excess, 1.0)
             margins[constraint.name] = margin
-            severity[constraint.name] = jnp.where(margin >= 0.0, 0.0, known)
+            severity[constraint.name] = jnp.where(margin >= 0.0, 0.0, finite_excess)
     return Info(
         outcome=outcome,
         status=sim.status,

@@ -40,8 +40,8 @@ _reset = jax.jit(reset)
 class Flight(Described):
     """One episode on the host, as NumPy arrays over its n steps.
 
-    What belongs to an instant has n + 1 entries, the first one for the start: `times`, `platforms`,
-    `observations`, `status` and `margins`. What belongs to a step has n entries: `actions`,
+    The arrays of instants have n + 1 entries, the first one for the start: `times`, `platforms`,
+    `observations`, `status` and `margins`. The arrays of steps have n entries: `actions`,
     `control_desired`, `control_actual`, `intervening`, `rewards` and `costs`. Step k leads from
     instant k to instant k + 1.
     """
@@ -114,7 +114,7 @@ class Flight(Described):
 
     @property
     def outcome(self) -> str:
-        """How the episode ended: one of `env.outcomes`. `running` if it was given up."""
+        """How the episode ended: one of `env.outcomes`, or `running` if it was given up."""
         return self.env.outcomes[int(self.timesteps.info.outcome[-1])]
 
     def plot(self) -> Figure:
@@ -130,8 +130,8 @@ class Flight(Described):
         """Return a film of the episode, which a notebook shows.
 
         Args:
-            path: a file to write it to. It ends in `.gif`, or in `.mp4` where ffmpeg is installed.
-                None writes none.
+            path: a file to write it to. It ends in `.gif`, or in `.mp4` if ffmpeg is installed.
+                With None no file is written.
 
         Raises:
             ConfigError: the path has another ending, or ffmpeg is missing.
@@ -141,20 +141,21 @@ class Flight(Described):
         kind = "gif" if path is None else Path(path).suffix[1:]
         if kind not in FILMS:
             raise ConfigError(f"animate: expected a path that ends in .gif or .mp4, found {path}")
-        with tempfile.TemporaryDirectory() as place:
-            file = Path(place) / f"episode.{kind}" if path is None else Path(path)
+        with tempfile.TemporaryDirectory() as directory:
+            file = Path(directory) / f"episode.{kind}" if path is None else Path(path)
             animate(self.env, (self.states, self.timesteps), file, self._title())
             return Film(file.read_bytes(), kind)
 
     def columns(self) -> dict[str, np.ndarray]:
         """Return all numbers of the episode as columns [n + 1] by dotted name.
 
-        `pandas.DataFrame(flight.columns())` makes a table of them. A row has the action, the
-        controls and the reward of the step that led there. At the start the action is NaN.
+        `pandas.DataFrame(flight.columns())` makes a table of them. The row of an instant has the
+        action, the controls and the reward of the step that led there. At the start the action is
+        NaN.
         """
         info = self.timesteps.info
-        none = np.full((1, self.env.action_size), np.nan)
-        actions = np.concatenate([none, self.actions])
+        no_action = np.full((1, self.env.action_size), np.nan)
+        actions = np.concatenate([no_action, self.actions])
         names = self.env.action_names
         values = {
             "time": self.times,
@@ -244,7 +245,7 @@ def fly(
             `rollout` without `num_envs`. It may be a `RecurrentPolicy`.
         key: a typed PRNG key. It decides a random start and the noise of the policy. None stands
             for `jax.random.key(0)`.
-        start: where to start: what `reset` or `reset_to` returned, or the platform states that
+        start: the start: what `reset` or `reset_to` returned, or the platform states that
             `reset_to` takes, such as `{"deputy": {"position": [100, 0], "velocity": [0, 0]}}`.
             None stands for a random start.
 
@@ -311,14 +312,14 @@ def _started(env: Environment, start: Any, key: Key) -> tuple[State, TimeStep]:
 
 
 def _by_component(tree: Any) -> Any:
-    """Return a tree of arrays [n] and [n, k], with the latter as lists of their k columns."""
+    """Return a tree of arrays with each array [n, k] replaced by the list of its k columns."""
     if isinstance(tree, Mapping):
         return {name: _by_component(value) for name, value in tree.items()}
     return list(tree.T) if np.ndim(tree) > 1 else tree
 
 
 def _cell(value: Any) -> Any:
-    """Return a number with as many digits as its type has. What is not finite has no number."""
+    """Return a number with the digits of its own precision, or None if it is not finite."""
     if isinstance(value, np.floating):
         return float(str(value)) if np.isfinite(value) else None
     return value.item() if isinstance(value, np.generic) else value

@@ -4,7 +4,7 @@ import os
 from importlib.metadata import version
 
 if version("jaxlib") in ("0.10.0", "0.10.1"):
-    # For every program from the compilation cache these versions log an error. It is about the
-    # features +prefer-no-gather and +prefer-no-scatter of the machine. They are not features of a
-    # machine but choices of jaxlib itself. What fails still raises.
+    # These versions log an error for every program that they load from the compilation cache. The
+    # error takes +prefer-no-gather and +prefer-no-scatter for features of the machine, but they are
+    # choices of jaxlib itself. Whatever really fails still raises an exception.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")

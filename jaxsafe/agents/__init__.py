@@ -1,8 +1,4 @@
-"""Agents.
-
-The package has what they see, their networks, the distributions from which they draw actions, and
-the files of their weights.
-"""
+"""Agents: what they see, their networks, their distributions over actions, and policy files."""
 
 from jaxsafe.agents.agent import Agent
 from jaxsafe.agents.distributions import Categorical, Gaussian, Joint

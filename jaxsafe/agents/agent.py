@@ -37,7 +37,7 @@ from jaxsafe.types import Dimensionless, Key, Number
 
 
 class Sequences(NamedTuple):
-    """What a recurrent network needs to know of the sequences that it sees."""
+    """What recurrent networks need to know of the sequences that they see."""
 
     memory: dict[str, Memory]
     """The memory of each network before the first step, `[n, …]`."""
@@ -54,7 +54,7 @@ class Agent(Component):
     actor: Network = MLP()
     """The network that decides the actions: mlp, gru or one of your own."""
     critic: Network | None = None
-    """Network of the critics. None stands for one like the actor's."""
+    """The network of each critic. None stands for one like the actor's."""
     features: Features = PlainFeatures()
     """What the networks see of the observation."""
     log_std: Annotated[Number, Unit("1", length=ANY), Range(largest=20.0)] = -0.7
@@ -65,17 +65,17 @@ class Agent(Component):
     prior_std: Annotated[Dimensionless, Range(0.0, open_low=True, smallest=1e-6, largest=1e6)] = 0.3
     """Standard deviation of discrete actions at the start, in units of half the range.
 
-    Its logarithm is the initial log_std of each actuator. That is learnt like the log_std of
-    continuous actions. A smaller one sharpens the choice in all states.
+    Its logarithm is the initial log_std of each actuator, which is learnt as for continuous
+    actions. A smaller log_std makes the choice sharper in all states.
     """
     critic_sees_totals: bool = False
-    """Whether the critic also sees what each reward term has summed to in the episode.
+    """Whether the critic also sees the sum of each reward term in the episode so far.
 
-    What a term will still pay may depend on its sum, and the observation hides the sum. The policy
-    never sees it, because only training needs the critic.
+    What a term will still pay may depend on its sum, which the observation does not show. The
+    policy never sees the sums. The critic may, because only training needs it.
     """
     cost_critic: bool = False
-    """Whether a second critic expects the cost to come. `algorithm=ppo_lagrangian` sets it."""
+    """Whether a second critic estimates the future cost. `algorithm=ppo_lagrangian` sets it."""
 
     @property
     def networks(self) -> dict[str, Network]:
@@ -86,7 +86,7 @@ class Agent(Component):
 
     @property
     def recurrent(self) -> bool:
-        """Whether a network remembers, so that training needs whole sequences of steps."""
+        """Whether any network remembers, so that training needs whole sequences of steps."""
         return any(network.recurrent for network in self.networks.values())
 
     def memory(self) -> dict[str, Memory]:
@@ -105,8 +105,8 @@ class Agent(Component):
 
         def build(normal: Normal) -> Params:
             return {
-                name: self.networks[name].init(own_key, normal, self._module(name, env), *given)
-                for own_key, (name, given) in zip(keys, arguments.items(), strict=True)
+                name: self.networks[name].init(own_key, normal, self._module(name, env), *inputs)
+                for own_key, (name, inputs) in zip(keys, arguments.items(), strict=True)
             }
 
         params = from_one_draw(key, build)
@@ -122,16 +122,16 @@ class Agent(Component):
         return jnp.where(choices, jnp.log(self.prior_std), jnp.asarray(self.log_std))
 
     def first_outputs(self, env: Environment) -> dict[str, Array]:
-        """Return by name what networks with fresh parameters say of an observation of zeros."""
+        """Return the outputs of fresh networks for an observation of zeros, by name."""
         params = self.init(jax.random.key(0), env)
         outputs = {}
-        for name, given in self._first_arguments(env).items():
-            returned = self._apply(name, env, params, *given)
+        for name, inputs in self._first_arguments(env).items():
+            returned = self._apply(name, env, params, *inputs)
             outputs[name] = returned[1] if self.networks[name].recurrent else returned
         return outputs
 
     def _first_arguments(self, env: Environment) -> dict[str, tuple]:
-        """Return arguments with which each network's module can be called."""
+        """Return arguments with which the module of each network can be called, by name."""
         inputs = self.inputs(env, jnp.zeros(env.observation_size))
         totals = {term.name: jnp.zeros(()) for term in env.reward}
         arguments = {}
@@ -162,22 +162,22 @@ class Agent(Component):
         Args:
             env: the environment.
             params: the parameters.
-            inputs: what `inputs` returns, `[*batch, i]`. If the actor remembers they are sequences
+            inputs: what `inputs` returns, `[*batch, i]`. For a recurrent actor they are sequences
                 `[n, t, i]`.
-            sequences: what else a recurrent actor needs to know of sequences.
+            sequences: what else a recurrent actor needs to know of the sequences.
         """
         return self._head(env, params, self._outputs("actor", env, params, inputs, sequences))
 
     def distribution_step(
         self, env: Environment, params: Params, inputs: Float[Array, "*batch i"], memory: Memory
     ) -> tuple[Distribution, Memory]:
-        """Return the policy for one step, and what the actor remembers then.
+        """Return the policy for one step, and what the actor remembers after it.
 
         Args:
             env: the environment.
             params: the parameters.
             inputs: what `inputs` returns, `[*batch, i]`.
-            memory: what the actor remembers, `[*batch, …]`.
+            memory: what the actor remembers before it, `[*batch, …]`.
         """
         if not self.actor.recurrent:
             return self.distribution(env, params, inputs), memory
@@ -193,14 +193,14 @@ class Agent(Component):
     def _choices(
         self, out: Float[Array, "*batch points"], log_std: Array, points: tuple[int, ...]
     ) -> Categorical:
-        """Return the choices that outputs of the actor stand for.
+        """Return the distribution over discrete actions that the outputs of the actor stand for.
 
         Args:
             out: the outputs.
-            log_std: what the sharpness of each actuator's choice follows from.
+            log_std: one number for each actuator, which decides how sharp its choice is.
             points: the number of choices of each actuator.
         """
-        # There is one sharpness for each actuator. Below it is repeated for each of its logits.
+        # An actuator has one sharpness, which is repeated below for each of its logits.
         sharpness = (self.prior_std * jnp.exp(-log_std)) ** 2
         sharpness = jnp.sum(
             sharpness[:, None] * np.repeat(np.eye(len(points), dtype=np.float32), points, axis=1),
@@ -218,8 +218,8 @@ class Agent(Component):
 
         Args:
             inputs: the inputs of the actor, `[*batch, i]`.
-            reward_totals: what each reward term has summed to in the episode, `[*batch]` each. They
-                are seen with `critic_sees_totals`.
+            reward_totals: the sum of each reward term in the episode so far, `[*batch]` each. The
+                critic sees them with `critic_sees_totals`.
         """
         # The totals are sorted by name, because the order of a dict does not survive compilation.
         seen = sorted(reward_totals) if self.critic_sees_totals else ()
@@ -242,21 +242,21 @@ class Agent(Component):
     ) -> Float[Array, "*batch"]:
         """Return the output of a critic `[*batch]`.
 
-        That of `cost_critic` is (1 − γ)·V_C(s), what a step costs on average from here on.
+        The output of `cost_critic` is (1 − γ)·V_C(s), the average cost of a step from here on.
 
         Args:
             name: `critic` or `cost_critic`.
             params: the parameters.
-            critic_inputs: what `critic_inputs` returns, `[*batch, c]`. If the critic remembers they
+            critic_inputs: what `critic_inputs` returns, `[*batch, c]`. For a recurrent critic they
                 are sequences `[n, t, c]`.
-            sequences: what else a recurrent critic needs to know of sequences.
+            sequences: what else a recurrent critic needs to know of the sequences.
         """
         return self._outputs(name, None, params, critic_inputs, sequences)[..., 0]
 
     def critic_step(
         self, name: str, params: Params, critic_inputs: Float[Array, "*batch c"], memory: Memory
     ) -> tuple[Float[Array, "*batch"], Memory]:
-        """Return the output of a recurrent critic for one step, and what it remembers then."""
+        """Return the output of a recurrent critic for one step, and what it remembers after it."""
         memory, outputs = self._apply(name, None, params, memory, critic_inputs)
         return outputs[..., 0], memory
 
@@ -269,7 +269,7 @@ class Agent(Component):
         deterministic: Array | bool,
         memory: Memory = (),
     ) -> tuple[Array, Memory]:
-        """Return an action for each observation, and what the actor remembers then.
+        """Return an action for each observation, and what the actor remembers after it.
 
         Args:
             env: the environment.
@@ -278,7 +278,7 @@ class Agent(Component):
             observation: observations `[*batch, o]`.
             deterministic: whether the actions are the mode of the distribution. Otherwise they are
                 a sample.
-            memory: what the actor remembers, `[*batch, …]`.
+            memory: what the actor remembers before it, `[*batch, …]`.
         """
         inputs = self.inputs(env, observation)
         distribution, memory = self.distribution_step(env, params, inputs, memory)
@@ -335,17 +335,18 @@ def check_agent(agent: Agent, env: Environment, place: str = "agent") -> None:
     """Check that an agent can be built and fits an environment.
 
     Raises:
-        ConfigError: it cannot, or does not. The message begins with the place.
+        ConfigError: it cannot be built, or does not fit. The message begins with the place.
     """
     for name in ("actor", "critic"):
         network = getattr(agent, name)
         problem = network and network.problem()
         if problem:
             raise ConfigError(f"{place}.{name}.{problem}")
-    count, found = env.action_size, jnp.size(agent.log_std)
-    if found not in (1, count):
+    count = jnp.size(agent.log_std)
+    if count not in (1, env.action_size):
         raise ConfigError(
-            f"{place}.log_std: expected one number or {count}, one for each action, found {found}"
+            f"{place}.log_std: expected one number or {env.action_size}, one for each action, "
+            f"found {count}"
         )
     wanted = dict.fromkeys(agent.networks, 1) | {"actor": num_outputs(env)}
     try:

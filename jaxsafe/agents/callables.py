@@ -22,13 +22,13 @@ from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.schema.user_modules import import_modules
 
 CONTROLLER = "controller/"
-"""Prefix of the name of a classical controller, where the directory of a run may be given too."""
+"""Prefix of the name of a classical controller, in options that also take a run directory."""
 
 _FUNCTION = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
 
 class Chosen(NamedTuple):
-    """Actions in the place of a distribution over actions."""
+    """Actions that stand in the place of a distribution over actions."""
 
     action: Array
 
@@ -59,13 +59,13 @@ class CallableAgent(ForeignAgent):
 
 
 def is_callable(run: str) -> bool:
-    """Return whether a `run` names a controller or a function of a module, and no file."""
+    """Return whether a `run` is a controller or a function of a module, and not a file."""
     named = run.startswith(CONTROLLER) or _FUNCTION.fullmatch(run)
     return bool(named) and not Path(run).exists()
 
 
 def draws(run: str) -> bool:
-    """Return whether a `run` is a function that may draw its actions, as one of a module may."""
+    """Return whether a `run` is a function of a module, which may draw its actions at random."""
     return is_callable(run) and not run.startswith(CONTROLLER)
 
 
@@ -83,20 +83,20 @@ def read_callable(run: str, env: Environment) -> ForeignPolicy:
     found = find_law(run, env) if run.startswith(CONTROLLER) else _from_module(run)
     function = found.policy(env) if isinstance(found, ControlLaw) else found
     if isinstance(found, ControlLaw):
-        # What is not observed is told before anything is compiled.
+        # Tracing reports a missing observation before anything is compiled.
         observation = jax.ShapeDtypeStruct((env.observation_size,), env.dt.dtype)
         jax.eval_shape(function, jax.random.key(0), observation)
-    # One leaf, because the policies of several seeds are mapped over their parameters.
+    # There is one leaf, because policies are mapped over the seed axis of their parameters.
     return ForeignPolicy(env, CallableAgent(function), {"none": jnp.zeros(())})
 
 
 def find_law(run: str, env: Environment) -> ControlLaw:
-    """Return the control law of a name, with the numbers of the environment's task.
+    """Return the control law with a name. It has the numbers of the environment's task.
 
     Args:
         run: `controller/NAME` or the name alone.
-        env: where it will act. If it is not that of a registered task, all laws are known, with
-            their defaults.
+        env: where it will act. If its task is not registered or has no controllers, all laws are
+            known, with their defaults.
 
     Raises:
         ConfigError: there is no such controller.
@@ -116,10 +116,13 @@ def find_law(run: str, env: Environment) -> ControlLaw:
 
 
 def _from_module(run: str) -> Any:
+    """Return the function, `RecurrentPolicy` or `ControlLaw` that `MODULE:NAME` names."""
     module, _, name = run.partition(":")
     import_modules([module], "run")
-    found = getattr(importlib.import_module(module), name, None)
-    if not (callable(found) or isinstance(found, RecurrentPolicy | ControlLaw)):
-        what = "nothing" if found is None else show(found)
-        raise ConfigError(f"run: {run}: expected a function policy(key, observation), found {what}")
-    return found
+    policy = getattr(importlib.import_module(module), name, None)
+    if not (callable(policy) or isinstance(policy, RecurrentPolicy | ControlLaw)):
+        found = "nothing" if policy is None else show(policy)
+        raise ConfigError(
+            f"run: {run}: expected a function policy(key, observation), found {found}"
+        )
+    return policy

@@ -52,8 +52,8 @@ class PlainFeatures(Features, type="none"):
 class DockingFeatures(Features, type="docking"):
     """The observation, the direction p/(‖p‖ + 0.01) and log(‖p‖ + 0.005) of its position p.
 
-    The target is 0.005 wide in units of p. A plain perceptron resolves that late or never. The
-    environment must observe a position.
+    The target is 0.005 wide in units of p, which a plain perceptron learns to resolve late or
+    never. The environment must observe a position.
     """
 
     def __call__(
@@ -74,8 +74,8 @@ class ApproachFeatures(Features, type="approach"):
 
     - v/limit.
     - p·v/limit, the part of v/limit along the way to the chief.
-    - What is left of v/limit across p.
-    - ‖v‖/limit. It is 1 at the limit.
+    - The remaining part of v/limit, which is across p.
+    - ‖v‖/limit, which is 1 at the limit.
 
     The environment must observe position, velocity, speed and speed limit.
     """
@@ -111,7 +111,7 @@ class ApproachFeatures(Features, type="approach"):
 class RejoinFeatures(Features, type="rejoin"):
     """The observation, the way to the rejoin point, the relative velocity and the miss distance.
 
-    All vectors are turned from the wingman's body frame into its level frame. There left is left
+    All vectors are turned from the wingman's body frame into its level frame, in which left is left
     however the wingman rolls. With p the direction of the lead and w its velocity relative to the
     wingman, the features are:
 
@@ -126,8 +126,8 @@ class RejoinFeatures(Features, type="rejoin"):
     - The part of p across w. It is 0 on a collision course.
     - That part times the observed distance. This is the miss distance if neither aircraft
       manoeuvres, unless the observed distance is clipped.
-    - Two numbers near 1 on a collision course: how directly w opposes p, times a bell curve of the
-      part of p across w or of the miss distance.
+    - Two numbers that are near 1 on a collision course. One is how directly w opposes p, times a
+      bell curve of the part of p across w. The other has the bell curve of the miss distance.
 
     The environment must observe the magnitudes and directions of the positions of lead and rejoin
     point and of both velocities, and in space also flight path angle and roll.
@@ -137,12 +137,11 @@ class RejoinFeatures(Features, type="rejoin"):
         self, env: Environment, observation: Float[Array, "*batch o"]
     ) -> Float[Array, "*batch i"]:
         distance, bearing = _magnitude_and_direction(env, observation, "lead_position")
-        far, towards = _magnitude_and_direction(env, observation, "rejoin_position")
-        (speed, along), (own_speed, own) = (
-            _magnitude_and_direction(env, observation, f"{name}_velocity")
-            for name in ("lead", "wingman")
-        )
-        way, relative = far * towards, speed * along - own_speed * own
+        way_length, way_direction = _magnitude_and_direction(env, observation, "rejoin_position")
+        speed, heading = _magnitude_and_direction(env, observation, "lead_velocity")
+        own_speed, own_heading = _magnitude_and_direction(env, observation, "wingman_velocity")
+        way = way_length * way_direction
+        relative = speed * heading - own_speed * own_heading
         course = relative / (_norm(relative) + 0.01)
         closing = jnp.sum(bearing * course, axis=-1, keepdims=True)
         across = bearing - closing * course
@@ -161,7 +160,7 @@ class RejoinFeatures(Features, type="rejoin"):
         return jnp.concatenate([observation, *aim, closing, 4.0 * across, miss, *danger], axis=-1)
 
 
-# One program has the same roundings whether its surroundings are compiled or not.
+# A program of its own rounds alike whether its surroundings are compiled or not.
 @jax.jit
 def _norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch 1"]:
     return safe_norm(vector)[..., None]
@@ -175,10 +174,8 @@ def _magnitude_and_direction(
     The direction there is R_y(γ)·R_x(φ) times the direction in the body frame, where γ is the
     flight path angle and φ the roll.
     """
-    magnitude, direction = (
-        _elements(env, observation, f"{name}.magnitude", "rejoin"),
-        _vector(env, observation, name, "rejoin"),
-    )
+    magnitude = _elements(env, observation, f"{name}.magnitude", "rejoin")
+    direction = _vector(env, observation, name, "rejoin")
     if "roll" in env.observation_names:
         pitch, roll = (
             _scale(env, angle) * _elements(env, observation, angle, "rejoin")[..., 0]
@@ -191,7 +188,7 @@ def _magnitude_and_direction(
 
 def _scale(env: Environment, name: str) -> Number:
     """Return the number by which the environment divided an observation."""
-    return next(one.scale for one in env.observation if one.name == name)
+    return next(item.scale for item in env.observation if item.name == name)
 
 
 def _vector(
@@ -224,7 +221,7 @@ def _elements(
             f"agent.features: {features!r} needs an observation called {name!r}; choose none"
         )
     part = name.partition(".")[0]
-    if any(one.name == part and one.offset is not None for one in env.observation):
+    if any(item.name == part and item.offset is not None for item in env.observation):
         raise ConfigError(
             f"agent.features: {features!r} needs the observation {part!r} without an offset;"
             " choose none"

@@ -1,8 +1,9 @@
 """Policies that were trained elsewhere: an ONNX graph, or layers in an .npz.
 
-They take the paper's observation. A continuous policy returns the action in [−1, 1]. A discrete
-policy returns the logits of each actuator's choices, one actuator after the other. For mixed
-actions it returns, one actuator after the other, the element of the action or the logits.
+They take the paper's observation. A policy with continuous actions returns the action in [−1, 1].
+One with discrete actions returns the logits of each actuator's choices, one actuator after the
+other. One with mixed actions returns, in the order of the actuators, an element of the action or
+the logits.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {
 }
 """The functions that may stand between the layers of an .npz, by name."""
 
-MAX_NAMES = 200
-"""Most letters that a message repeats of the names in a file."""
+MAX_NAME_LETTERS = 200
+"""How many letters of the names in a file a message repeats."""
 
 
 class Choice(Protocol):
-    """What is known of the actions of a policy: their mode."""
+    """A distribution over actions of which only the mode is known."""
 
     def mode(self) -> Array:
         """Return the actions."""
@@ -60,10 +61,10 @@ class ForeignAgent:
 
     def distribution(self, env: Environment, params: Params, inputs: Array) -> Choice:
         """Return a distribution for one observation or a batch. Only its mode means something."""
-        out = jnp.vectorize(lambda one: self.network(params, one), signature="(o)->(a)")(inputs)
+        network = jnp.vectorize(lambda x: self.network(params, x), signature="(o)->(a)")
         return action_distribution(
             env.num_action_points,
-            out,
+            network(inputs),
             log_std=jnp.zeros(env.action_size),
             choose=lambda logits, _, points: Categorical(logits=logits, points=points),
         )
@@ -156,9 +157,10 @@ def _read_layers(
         count = len(archive.names) // 2
         expected = {f"{kind}_{i}" for i in range(count) for kind in ("kernel", "bias")}
         if not count or set(archive.names) != expected or count > MAX_LAYERS:
-            found = ", ".join(sorted(archive.names))[:MAX_NAMES] or "nothing"
+            found = ", ".join(sorted(archive.names))[:MAX_NAME_LETTERS] or "nothing"
             raise ConfigError(f"{path}: expected kernel_0, bias_0, kernel_1, …, found {found}")
-        network, shapes = _network(count, activation), {}
+        network = _network(count, activation)
+        shapes = {}
         for name in archive.names:
             shape, dtype = archive.describe(name)
             if dtype.kind not in "fiu" or len(shape) != (2 if name.startswith("kernel") else 1):

@@ -1,7 +1,7 @@
 """Networks of the agent as parts, built in Flax.
 
 A subclass of `Network` with a `type` is chosen by `agent.actor=TYPE`, in YAML as on the command
-line. Flax is imported with the first network that is built, so that `import jaxsafe` does without.
+line. Flax is imported when the first network is built, so that `import jaxsafe` does not need it.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ Activation = Literal["tanh", "relu", "elu", "gelu", "silu"]
 class Network(Component):
     """Base of the networks of actor and critic.
 
-    A network says which Flax module it is. `module` is the only method that it needs.
+    A network defines its Flax module. `module` is the only method that it must have.
     """
 
     recurrent: ClassVar[bool] = False
@@ -78,8 +78,8 @@ class Network(Component):
         Args:
             key: a PRNG key.
             normal: a source of standard normal numbers, which may be used instead of the key. All
-                numbers that the networks of an agent take from it come from one draw. A program
-                compiles sooner so, because each draw compiles to a loop of its own.
+                numbers that the networks of an agent take from it come from one draw. This makes
+                a program compile sooner, because each draw compiles to a loop of its own.
             module: what `module` returned.
             *inputs: arguments with which the module can be called.
         """
@@ -145,7 +145,7 @@ def orthogonal_params(key: Key, normal: Normal, module: Any, *inputs: Array) -> 
     `output_gain` in the last layer. Scales of normalisations start at 1.
 
     Args:
-        key: a PRNG key, which decides nothing.
+        key: a PRNG key, which is needed for the shapes only. It decides no number.
         normal: the source of all random numbers.
         module: a module whose last layer is called `output` and whose cell is called `cell`.
         *inputs: arguments with which the module can be called.
@@ -163,7 +163,7 @@ def orthogonal_params(key: Key, normal: Normal, module: Any, *inputs: Array) -> 
 
 
 def from_one_draw(key: Key, build: Callable[[Normal], Params]) -> Params:
-    """Return `build(normal)`, where all that `normal` returns are parts of one draw.
+    """Return `build(normal)`. All that `normal` returns are parts of one random draw.
 
     Args:
         key: a PRNG key.
@@ -220,8 +220,8 @@ def _orthogonal(normal: Float[Array, "m n"]) -> Float[Array, "m n"]:
     It is uniform over all such matrices: the Q of a QR decomposition, with the signs of diag R.
 
     Matrices are decomposed one at a time even under `vmap`. On a CPU the QR of many matrices waits
-    in a thread of XLA's pool for other threads of that pool. As many of these at once as there are
-    cores would wait forever (jaxlib 0.10).
+    in a thread of XLA's pool for other threads of that pool. If as many run at once as there are
+    cores, they wait forever (jaxlib 0.10).
     """
     q, r = jnp.linalg.qr(normal if normal.shape[0] >= normal.shape[1] else normal.T)
     q = q * jnp.sign(jnp.diagonal(r))[None]

@@ -1,6 +1,6 @@
 """ONNX graphs as functions, evaluated operator by operator.
 
-The operators are those of which networks of other libraries are made.
+The operators are those that the networks of other libraries are made of.
 """
 # pyright: reportMissingImports=false
 
@@ -28,12 +28,15 @@ An operator of another domain may have the name of one of ONNX's and mean someth
 """
 
 MIN_OPSET = 7
-"""The oldest opset that is read. Before it, an attribute matched the shapes of operands."""
+"""The oldest opset that is read. Older opsets match the shapes of operands by an attribute."""
 
-MAX_NODES, MAX_SIZE = 10_000, 2**26
-"""Most operators of a graph, and most numbers of an array that an operator makes.
+MAX_NODES = 10_000
+"""Most operators of a graph. Without a bound a small file could ask for any amount of work."""
 
-Without these bounds a small file could ask for any amount of work and memory.
+MAX_SIZE = 2**26
+"""Most numbers of an array that an operator makes.
+
+Without a bound a small file could ask for any amount of memory.
 """
 
 
@@ -53,7 +56,7 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
         model = onnx.load(path)
         onnx.checker.check_model(model)
         nodes = [_node(path, node) for node in model.graph.node]
-        weights = {one.name: numpy_helper.to_array(one) for one in model.graph.initializer}
+        weights = {array.name: numpy_helper.to_array(array) for array in model.graph.initializer}
         constants = {
             outputs[0]: _constant(path, attributes)
             for kind, _, outputs, attributes in nodes
@@ -72,7 +75,7 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
             raise ConfigError(
                 f"{path}: opset: expected {MIN_OPSET} to {newest}, found {opset.version}"
             )
-    inputs = [one for one in graph.input if one.name not in weights]
+    inputs = [declared for declared in graph.input if declared.name not in weights]
     if len(inputs) != 1 or len(graph.output) != 1:
         raise ConfigError(
             f"{path}: expected one input and one output, "
@@ -130,7 +133,7 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
 
 
 def _node(path: Path, node: Any) -> tuple[str, list[str], list[str], dict[str, Any]]:
-    """Return kind, inputs, outputs and attributes of an operator.
+    """Return the kind, inputs, outputs and attributes of an operator.
 
     Raises:
         ConfigError: the operator or one of its attributes is not known here.
@@ -140,7 +143,7 @@ def _node(path: Path, node: Any) -> tuple[str, list[str], list[str], dict[str, A
     kind = node.op_type
     if kind not in (*_OPERATORS, "Constant", "Split") or node.domain not in DOMAINS:
         raise ConfigError(f"{path}: the operator {kind} is not known here")
-    attributes = {one.name: helper.get_attribute_value(one) for one in node.attribute}
+    attributes = {item.name: helper.get_attribute_value(item) for item in node.attribute}
     for name, value in attributes.items():
         if name not in _ATTRIBUTES.get(kind, "").split() and value != 0:
             raise ConfigError(
@@ -177,13 +180,14 @@ def _constant(path: Path, attributes: Mapping[str, Any]) -> np.ndarray:
 
 def _split(x: list[Any], a: Mapping[str, Any], count: int) -> list[Array]:
     """Cut an array into parts of given sizes, or into `count` equal parts."""
-    axis, given = a.get("axis", 0), x[1] if len(x) > 1 and x[1] is not None else a.get("split")
-    whole = x[0].shape[axis]
-    part = -(-whole // count)  # where the parts cannot be equal, the last one is smaller
-    equal = [min(part, max(0, whole - i * part)) for i in range(count)]
+    axis = a.get("axis", 0)
+    given = x[1] if len(x) > 1 and x[1] is not None else a.get("split")
+    length = x[0].shape[axis]
+    part = -(-length // count)  # if the parts cannot be equal, the last ones are smaller
+    equal = [min(part, max(0, length - i * part)) for i in range(count)]
     sizes = equal if given is None else [int(size) for size in given]
-    if len(sizes) != count or min(sizes) < 0 or sum(sizes) != whole:
-        raise TypeError(f"Split has sizes {sizes} for {count} outputs of an axis of {whole}")
+    if len(sizes) != count or min(sizes) < 0 or sum(sizes) != length:
+        raise TypeError(f"Split has sizes {sizes} for {count} outputs of an axis of {length}")
     return jnp.split(x[0], np.cumsum(sizes)[:-1], axis=axis)
 
 
@@ -195,27 +199,29 @@ def _mod(x: list[Any], a: Mapping[str, Any]) -> Array:
     """
     if a.get("fmod", 0):
         return jnp.fmod(*x)
-    if any(jnp.issubdtype(jnp.result_type(one), jnp.floating) for one in x):
+    if any(jnp.issubdtype(jnp.result_type(operand), jnp.floating) for operand in x):
         raise TypeError("Mod of floats needs the attribute fmod=1")
     return jnp.mod(*x)
 
 
 def _divide(x: list[Any], a: Mapping[str, Any]) -> Array:
     """Return a quotient. A quotient of integers is rounded towards 0."""
-    if all(jnp.issubdtype(jnp.result_type(one), jnp.integer) for one in x):
+    if all(jnp.issubdtype(jnp.result_type(operand), jnp.integer) for operand in x):
         return jnp.sign(x[0]) * jnp.sign(x[1]) * (jnp.abs(x[0]) // jnp.abs(x[1]))
     return jnp.divide(*x)
 
 
 def _cast(x: list[Any], a: Mapping[str, Any]) -> Array:
-    known = {1: jnp.float32, 6: jnp.int32, 7: jnp.int32, 9: bool, 11: jnp.float32}
-    if a["to"] not in known:
+    # The numbers are those of onnx.TensorProto: float, int32, int64, bool and double.
+    types = {1: jnp.float32, 6: jnp.int32, 7: jnp.int32, 9: bool, 11: jnp.float32}
+    if a["to"] not in types:
         raise TypeError(f"Cast to type {a['to']} is not known here")
-    return x[0].astype(known[a["to"]])
+    return x[0].astype(types[a["to"]])
 
 
 def _gemm(x: list[Any], a: Mapping[str, Any]) -> Array:
-    left, right = (x[0].T if a.get("transA") else x[0]), (x[1].T if a.get("transB") else x[1])
+    left = x[0].T if a.get("transA") else x[0]
+    right = x[1].T if a.get("transB") else x[1]
     product = a.get("alpha", 1.0) * (left @ right)
     return product if len(x) < 3 else product + a.get("beta", 1.0) * x[2]
 
@@ -225,8 +231,8 @@ def _slice(x: list[Any], a: Mapping[str, Any]) -> Array:
     axes = x[3] if len(x) > 3 else a.get("axes", range(len(begin)))
     steps = x[4] if len(x) > 4 else [1] * len(begin)
     index = [slice(None)] * x[0].ndim
-    for one, *bounds in zip(axes, begin, end, steps, strict=True):
-        index[int(one)] = slice(*map(int, bounds))
+    for axis, *bounds in zip(axes, begin, end, steps, strict=True):
+        index[int(axis)] = slice(*map(int, bounds))
     return x[0][tuple(index)]
 
 

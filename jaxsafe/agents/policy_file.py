@@ -1,7 +1,7 @@
 """Policies as small .npz files.
 
 A file holds arrays and one JSON string. It is read without pickle, so a stranger's file is only
-data. The policies in `jaxsafe/pretrained/` come with the package and have the names of their tasks.
+data. The policies in `jaxsafe/pretrained/` come with the package. They are named after their tasks.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ from jaxsafe.storage.files import parse_json, write_bytes
 from jaxsafe.storage.forms import COUNT, TEXT, check
 
 FORMAT = "jaxsafe policy 2"
-"""What a header says of the form of the file."""
+"""The format of the file, as its header names it."""
 
 OLD_FORMAT = "jaxsafe policy 1"
-"""Form of files whose agents have perceptrons, all of the same size, with numbered layers."""
+"""An older format. All networks are perceptrons of one size, and their layers have numbers."""
 
 
 def save_policy(
@@ -46,14 +46,14 @@ def save_policy(
 ) -> None:
     """Write a policy file.
 
-    It holds the weights, the agent's structure, and the complete environment they belong to.
+    The file holds the weights, the agent's structure, and the complete environment of the agent.
 
     Args:
         path: the file.
         env: the environment.
         agent: the agent.
         params: its parameters.
-        about: what else the header says, see `SavedPolicy.about`.
+        about: further entries of the header, see `SavedPolicy.about`.
     """
     arrays = {
         jax.tree_util.keystr(key, simple=True, separator="/"): np.asarray(leaf)
@@ -71,10 +71,10 @@ def save_policy(
 
 
 _ABOUT = {"env": TEXT, "preset": TEXT, "seed": COUNT, "step": COUNT}
-"""The form of what else a header may say."""
+"""The form of the further entries that a header may have."""
 
 PRETRAINED = "pretrained/"
-"""Prefix of the name of a pretrained policy, where the directory of a run may be given as well."""
+"""Prefix of the name of a pretrained policy, in options that also take a run directory."""
 
 _PRETRAINED = Path(__file__).resolve().parent.parent / "pretrained"
 
@@ -99,13 +99,13 @@ def read_policy(path: str | os.PathLike) -> SavedPolicy:
         path, "not a policy file (.npz without pickles, as in <run>/policy/)"
     ) as archive:
         header = parse_json(str(archive.read("header")), infinite=True)
-    form = header.pop("format", None) if isinstance(header, dict) else None
-    if form not in (FORMAT, OLD_FORMAT):
+    file_format = header.pop("format", None) if isinstance(header, dict) else None
+    if file_format not in (FORMAT, OLD_FORMAT):
         raise ConfigError(f"{path}: not a policy file: expected format {FORMAT!r}")
     from jaxsafe.config import build
 
     agent_data = header.pop("agent", None)
-    if form == OLD_FORMAT:
+    if file_format == OLD_FORMAT:
         agent_data = with_networks(agent_data)
     with imports_allowed(False):
         env_data = header.pop("environment", None)
@@ -117,12 +117,15 @@ def read_policy(path: str | os.PathLike) -> SavedPolicy:
     check_agent(agent, env, f"{path}: agent")
     like = jax.eval_shape(lambda key: agent.init(key, env), jax.random.key(0))
     with open_archive(path, "not a policy file, or a damaged one") as archive:
-        params = _fill(like, archive, str(path), numbered=form == OLD_FORMAT)
+        params = _fill(like, archive, str(path), numbered=file_format == OLD_FORMAT)
     return SavedPolicy(env.named(header.get("env", "")), agent, params, header)
 
 
 def with_networks(agent: Any) -> Any:
-    """Return an agent as data, from what versions wrote in which all agents had perceptrons."""
+    """Return the data of an agent with its networks as parts.
+
+    The versions in which every network was a perceptron wrote the sizes of its layers only.
+    """
     if not isinstance(agent, dict) or "hidden" not in agent:
         return agent
     rest = {name: value for name, value in agent.items() if name != "hidden"}
@@ -154,7 +157,7 @@ def load_policy(
             controller.
         deterministic: whether to act by the mode of the distribution over actions. The key then
             means nothing.
-        env: the environment that a classical controller shall fly. Other policies know theirs.
+        env: the environment that a classical controller shall fly. Other policies know their own.
 
     Raises:
         ConfigError: there is no such policy, or the file holds something else.
@@ -210,7 +213,7 @@ def _fill(like: Any, archive: Archive, path: str, numbered: bool) -> Any:
         numbered: whether the layers of the networks have numbers instead of names.
 
     Raises:
-        ConfigError: an array is missing, or is not one of numbers of the right shape.
+        ConfigError: an array is missing, has another shape, or does not hold floats.
     """
 
     def pick(key: Any, leaf: jax.ShapeDtypeStruct) -> jax.Array:
@@ -221,9 +224,9 @@ def _fill(like: Any, archive: Archive, path: str, numbered: bool) -> Any:
         name = "/".join(keys)
         shape, dtype = archive.describe(name) if name in archive.names else (None, None)
         if dtype is None or shape != leaf.shape or dtype.kind != "f":
-            what = "nothing" if dtype is None else f"{dtype} of shape {shape}"
+            found = "nothing" if dtype is None else f"{dtype} of shape {shape}"
             raise ConfigError(
-                f"{path}: {name}: expected numbers of shape {leaf.shape}, found {what}"
+                f"{path}: {name}: expected numbers of shape {leaf.shape}, found {found}"
             )
         return jnp.asarray(archive.read(name), leaf.dtype)
 

@@ -1,7 +1,7 @@
-"""Policies as functions that know what they are for.
+"""Trained policies as functions that know what they are for.
 
-They print what they observe and do, refuse another observation in one line, and return actions
-within the bounds of the actuators.
+They print what they observe and do, refuse observations of another size in one line, and return
+actions within the bounds of the actuators.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class _Trained(Described):
         deterministic: bool,
         about: dict[str, Any],
     ) -> None:
-        # A recurrent policy is frozen.
+        # A recurrent policy is a frozen dataclass, which refuses ordinary assignments.
         values = {"env": env, "agent": agent, "deterministic": deterministic, "about": about}
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -51,7 +51,7 @@ class _Trained(Described):
             action, memory = agent.act(env, params, key, observation, deterministic, memory)
             return _within_bounds(env, action), memory
 
-        # It is compiled, or each call would work out the inputs of the networks again.
+        # Without compilation each call would work out anew how the networks' inputs are computed.
         object.__setattr__(self, "_act", jax.jit(act))
 
     @property
@@ -91,9 +91,9 @@ class _Trained(Described):
         sizes = [f"{name} {getattr(actor, name)}" for name in fields(type(actor))]
         yield "network", ", ".join([actor.type_name or type(actor).__name__, *sizes])
         yield "features", str(self.agent.features.type_name or type(self.agent.features).__name__)
-        known = [f"{name} {self.about[name]}" for name in ("preset", "seed") if name in self.about]
+        origin = [f"{name} {self.about[name]}" for name in ("preset", "seed") if name in self.about]
         steps = [f"{self.about['step']:,} steps"] if "step" in self.about else []
-        yield "trained", ", ".join([*known, *steps])
+        yield "trained", ", ".join([*origin, *steps])
 
 
 class TrainedPolicy(_Trained):
@@ -124,8 +124,8 @@ class TrainedRecurrentPolicy(_Trained, RecurrentPolicy):
     `policy.memory` is the memory at the start of an episode.
     """
 
-    def __init__(self, **known: Any) -> None:
-        super().__init__(**known)
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
 
         def act(key: Key, observation: Array, memory: Memory) -> tuple[Array, Memory]:
             return self._act(key, self._checked(observation), memory)
@@ -154,7 +154,7 @@ def trained_policy(
 
 
 def _within_bounds(env: Environment, action: Array) -> Array:
-    """Return actions of floats as the controller itself clips them."""
+    """Return continuous actions clipped as the controller clips them, and others unchanged."""
     if not isinstance(env.agent_platform.controller, Continuous):
         return action
     low, high = (jnp.asarray(bound, action.dtype) for bound in action_bounds(env))

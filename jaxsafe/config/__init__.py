@@ -36,7 +36,7 @@ __all__ = [
 def build(env: Environment) -> Environment:
     """Return a declared environment ready for use.
 
-    Its numbers become arrays, and its parts are checked. A tied number becomes what it follows.
+    Its numbers become arrays, and its parts are checked. A tied number is set to what it follows.
 
     Raises:
         ConfigError: one line that names the part that does not fit and what is allowed.
@@ -47,9 +47,9 @@ def build(env: Environment) -> Environment:
 def load(source: str | os.PathLike) -> Environment:
     """Read an environment from a YAML file, or from the YAML text that `dump` returns.
 
-    The modules listed under `imports` are imported first. So the file can name the components that
-    these modules define. What stands under `recipe` and `recipes` is left to `load_recipe_name` and
-    `load_recipes`.
+    The modules listed under `imports` are imported first, so that the file can name the components
+    that they define. The entries `recipe` and `recipes` are not read here but by `load_recipe_name`
+    and `load_recipes`.
 
     Args:
         source: the path of a file, or a text of more than one line.
@@ -72,9 +72,8 @@ def load_filter(path: str | os.PathLike) -> RTA:
     """Read a run time assurance filter from a YAML file.
 
     Args:
-        path: a file with an environment, whose filter is taken, or with what stands under `rta` in
-            an environment. A file with a filter alone may begin with `imports`, as one with an
-            environment may.
+        path: a file with an environment, whose filter is taken, or a file with only what stands
+            under `rta` in an environment. Both kinds of file may begin with `imports`.
 
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.
@@ -88,21 +87,21 @@ def load_filter(path: str | os.PathLike) -> RTA:
     if not isinstance(data, dict) or "platforms" not in data:
         return to_component(data, RTA, f"{path}: rta")
     data = _without_recipes(data)
-    found = build(to_component(data, Environment, f"{path}: environment")).rta
-    if found is None:
+    rta = build(to_component(data, Environment, f"{path}: environment")).rta
+    if rta is None:
         raise ConfigError(f"rta: {path} is an environment without a filter; rta=none is for none")
-    return found
+    return rta
 
 
 def load_recipes(path: str | os.PathLike) -> dict[str, dict[str, Any]]:
-    """Read the recipes that a YAML file has for the training in its environment.
+    """Read the recipes that a YAML file has for training in its environment.
 
     Args:
         path: a file with an environment, whose recipes stand under `recipes`, or with recipes
             alone.
 
     Returns:
-        The options of each recipe by its name. There are none in an environment without `recipes`.
+        The options of each recipe by its name. It is empty for an environment without `recipes`.
 
     Raises:
         ConfigError: the file cannot be read, or its recipes are no mappings.
@@ -111,22 +110,23 @@ def load_recipes(path: str | os.PathLike) -> dict[str, dict[str, Any]]:
 
     data = yaml12.read(path)
     alone = isinstance(data, Mapping) and not {"platforms", "recipe", "recipes"} & set(data)
-    found = data if alone else data.get("recipes", {}) if isinstance(data, Mapping) else data
-    if not isinstance(found, Mapping) or not all(
-        options is None or isinstance(options, Mapping) for options in found.values()
+    recipes = data if alone else data.get("recipes", {}) if isinstance(data, Mapping) else data
+    if not isinstance(recipes, Mapping) or not all(
+        options is None or isinstance(options, Mapping) for options in recipes.values()
     ):
         raise ConfigError(
-            f"{path}: recipes: expected names, each with options of a training, found {show(found)}"
+            f"{path}: recipes: expected names, each with options of a training, "
+            f"found {show(recipes)}"
         )
-    return {str(name): dict(options or {}) for name, options in found.items()}
+    return {str(name): dict(options or {}) for name, options in recipes.items()}
 
 
 def load_recipe_name(path: str | os.PathLike) -> str | None:
-    """Read the task or file whose recipes are those of a YAML file with an environment.
+    """Read which task's or file's recipes are used for the environment in a YAML file.
 
     Returns:
-        What stands under `recipe`. A file is given as seen from the current directory. None if the
-        file names nothing.
+        The entry `recipe`, or None if there is none. The path of a file leads there from the
+        current directory.
 
     Raises:
         ConfigError: the file cannot be read, it names no text, or it has recipes of its own too.
@@ -173,7 +173,7 @@ def from_data(data: Any, place: str) -> Environment:
 
     Args:
         data: the plain data.
-        place: the place of the data, with which messages of errors begin.
+        place: the place of the data, with which error messages begin.
 
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.

@@ -18,17 +18,17 @@ from jaxsafe.schema.errors import ConfigError, show
 PATHS = ("env", "out", "run", "runs", "resume", "policies", "recipe", "like")
 """Options that are paths.
 
-They are taken as typed, so `out=2024.10` is no number and `out="my run #3"` has no comment.
+They are taken as typed, so that `out=2024.10` is no number and `out="my run #3"` has no comment.
 """
 
 TEXT = "a name or a path"
-"""What an option takes that is text, in words."""
+"""What an option takes whose value is text, as error messages write it."""
 
 MAX_COUNT = 2**31 - 1
 """Largest whole number, unless an option says otherwise. The programs count in 32 bits."""
 
 MAX_SEED = 2**32 - 1
-"""Largest seed. Keys of random numbers are made of its lowest 32 bits."""
+"""Largest seed. PRNG keys are made of the lowest 32 bits of a seed."""
 
 _GROUPED = re.compile(r"[-+]?[0-9]{1,3}(?:_[0-9]{3})+")
 """A whole number whose digits are in groups, such as 100_000."""
@@ -37,7 +37,7 @@ _DASHED = re.compile(r"--?([A-Za-z][^=]*)(?:=(.*))?", re.DOTALL)
 """An option as other programs take it, such as `--seeds=10` or `--seeds`."""
 
 _OPENINGS = ("[", "log(", "uniform(")
-"""What a list begins with that has its brackets, and an interval to draw from."""
+"""How values begin that need no brackets: lists that have them, and intervals to draw from."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,8 +53,8 @@ class Arguments:
 
         Args:
             argv: the words.
-            lists: the options that take a list, or `PREFIX.` for all whose names begin with it. The
-                brackets of a list may be left out, as in `run=a,b`.
+            lists: the options that take a list. `PREFIX.` stands for all options whose names begin
+                with it. The brackets of a list may be left out, as in `run=a,b`.
 
         Raises:
             ConfigError: a word is not `key=value`, or a key stands twice.
@@ -88,7 +88,7 @@ class Arguments:
         """Take out an option that is a name or a path. Return None if it was not given.
 
         Raises:
-            ConfigError: as `text`.
+            ConfigError: the value is not text; see `text`.
         """
         return text(self.options.pop(key), key) if key in self.options else None
 
@@ -145,7 +145,7 @@ def flag(value: Any, key: str) -> bool:
 
 
 def _value(typed: str, key: str) -> Any:
-    """Return a value that is no path. 100_000, which is text in YAML, is a number in it."""
+    """Return a value that is no path. Unlike in YAML, 100_000 is a number and not text."""
     return _ungrouped(yaml12.parse(typed, key), key)
 
 
@@ -166,10 +166,10 @@ def _path(typed: str, key: str) -> Any:
 def _from_home(path: Any, key: str) -> Any:
     """Return a path, or each path of a list, with the home directory in place of its `~`.
 
-    A shell leaves the `~` of `out=~/x` alone.
+    A shell does not replace the `~` of `out=~/x`, because the word does not begin with it.
     """
     if isinstance(path, list):
-        return [_from_home(one, key) for one in path]
+        return [_from_home(item, key) for item in path]
     if not isinstance(path, str) or not path.startswith("~"):
         return path
     expanded = os.path.expanduser(path)

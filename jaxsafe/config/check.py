@@ -51,18 +51,19 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
     Args:
         env: the environment.
         before: an environment that has passed, if there is one. If `env` differs from it in numbers
-            only, `env` is not traced again. Its filter is still asked whether it suits the numbers.
+            only, `env` is not traced again. Its filter is still checked, because it may not suit
+            the new numbers.
 
     Raises:
         ConfigError: one line that names the part that does not fit and what it may refer to.
     """
     names = {section: [part.name for part in getattr(env, section)] for section in _SECTIONS}
-    for section, found in names.items():
-        _once(section, found)
-    _once("outcomes", env.outcomes)
+    for section, part_names in names.items():
+        _check_names(section, part_names)
+    _check_names("outcomes", env.outcomes)
     names["outcomes"] = list(env.outcomes[1:])
     names["places"] = names["platforms"] + names["regions"]
-    _reference("agent", env.agent, names["platforms"])
+    _check_reference("agent", env.agent, names["platforms"])
     for section in _SECTIONS:
         for index, part in enumerate(getattr(env, section)):
             earlier = names[section][:index]
@@ -79,10 +80,10 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
                 elif section == "regions" and refers.section == "places":
                     known = names["platforms"] + earlier
                     ordered = name in names["regions"]
-                _reference(place, name, known, " listed before it" if ordered else "")
+                _check_reference(place, name, known, " listed before it" if ordered else "")
     for place, refers, name in references(env.rta, "rta") if env.rta else ():
         if refers.section != "parameters":
-            _reference(place, name, names[refers.section])
+            _check_reference(place, name, names[refers.section])
     _check_problems(env)
     for platform in env.platforms:
         _check_platform(platform, is_agent=platform.name == env.agent)
@@ -95,7 +96,7 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
     _check_model(env)
     if before is None or _shapes(env) != _shapes(before):
         _check_computable(*_shapes(env), jnp.result_type(float))
-    # What a filter proves depends on the numbers, so the filter is asked in either case.
+    # What a filter can prove depends on the numbers, so the filter is checked in either case.
     _check_suited(env)
     return env
 
@@ -110,9 +111,9 @@ def _check_problems(env: Environment) -> None:
 
 
 def _problems(component: Component, place: str) -> Iterator[tuple[str, str]]:
-    """Yield what a component and those inside it say is wrong with themselves, each with its place.
+    """Yield the place and the problem of each component, this one or inside it, that has a problem.
 
-    Nothing is yielded for a component with traced numbers, because they cannot be judged.
+    A component with traced numbers is passed over, because they cannot be judged.
     """
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(component)):
         return
@@ -135,7 +136,15 @@ def _problems(component: Component, place: str) -> Iterator[tuple[str, str]]:
         yield place, problem
 
 
-def _reference(place: str, name: str, known: Iterable[str], which: str = "") -> None:
+def _check_reference(place: str, name: str, known: Iterable[str], which: str = "") -> None:
+    """Refuse a name that refers to nothing.
+
+    Args:
+        place: where the name stands.
+        name: the name.
+        known: the names of all parts to which it may refer.
+        which: words for the message that say which parts these are.
+    """
     known = list(known)
     if name not in known:
         raise ConfigError(
@@ -144,7 +153,8 @@ def _reference(place: str, name: str, known: Iterable[str], which: str = "") -> 
         )
 
 
-def _once(place: str, names: Sequence[str]) -> None:
+def _check_names(place: str, names: Sequence[str]) -> None:
+    """Refuse too many names, a name that stands twice, and one that is empty or has a dot."""
     if len(names) > MAX_PARTS:
         raise ConfigError(f"{place}: expected at most {MAX_PARTS:,} parts, found {len(names):,}")
     for name, count in Counter(names).items():
@@ -166,7 +176,7 @@ def _check_space(env: Environment) -> None:
 
 
 def _misfits(env: Environment, component: Component, place: str) -> Iterator[tuple[str, str]]:
-    """Yield what of a component and of those inside it does not fit, each with its place."""
+    """Yield the place and the fault of each field, here or further inside, that does not fit."""
     for name in fields(type(component)):
         value = getattr(component, name)
         for inner in value if isinstance(value, tuple) else (value,):
@@ -178,9 +188,10 @@ def _misfits(env: Environment, component: Component, place: str) -> Iterator[tup
 
 
 def _check_platform(platform: Platform, is_agent: bool) -> None:
-    place, controller = f"platforms.{platform.name}", platform.controller
+    place = f"platforms.{platform.name}"
+    controller = platform.controller
     parts = "actuators" if controller.takes_actions else "commands"
-    _once(f"{place}.controller.{parts}", controller.names)
+    _check_names(f"{place}.controller.{parts}", controller.names)
     for name in controller.names:
         if name not in platform.inputs:
             raise ConfigError(
@@ -196,21 +207,21 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
             f"{place}.controller ({controller.type_name}): only the agent takes actions; "
             "choose from scripted, uncontrolled"
         )
-    _once(f"{place}.start", platform.random_fields)
+    _check_names(f"{place}.start", platform.random_fields)
     rest = vars(platform.rest())
     for initializer in platform.start:
-        here = f"{place}.start.{initializer.name}"
+        start_place = f"{place}.start.{initializer.name}"
         for name in initializer.draws:
             if name not in rest:
                 which = "" if name == initializer.name else f"{name}: "
                 raise ConfigError(
-                    f"{here}: {which}no such state field; choose from {nearest(name, rest)}"
+                    f"{start_place}: {which}no such state field; choose from {nearest(name, rest)}"
                 )
         if getattr(initializer, "direction", None) is not None:
-            drawn = initializer.direction.dimension  # type: ignore[attr-defined]
-            if (drawn,) != rest[initializer.name].shape:
+            count = initializer.direction.dimension  # type: ignore[attr-defined]
+            if (count,) != rest[initializer.name].shape:
                 raise ConfigError(
-                    f"{here}.direction: draws {drawn} numbers, "
+                    f"{start_place}.direction: draws {count} numbers, "
                     f"the platform has {platform.dimension} dimensions; "
                     "give a polar range in space, none in the plane, no azimuth on a line"
                 )
@@ -219,7 +230,8 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
 def _check_randomized(env: Environment) -> None:
     """Check the numbers that are drawn at random.
 
-    Every path must lead to one number, and every number of its interval must be allowed there.
+    Every path must lead to one number, and the numbers of its interval must be allowed there. Both
+    bounds are tried, and 0 if it lies between them.
     """
     leaves: dict[int, str] = {}
     for path, interval in env.randomize.items():
@@ -256,12 +268,12 @@ def _check_randomized(env: Environment) -> None:
 
 
 def _as_one_number(value: Any, field: Any, place: str) -> Any:
-    """Convert a value for `set_path`, of a field that holds one number or a mapping of such."""
+    """Convert a value for `set_path`. The field must hold one number, or a mapping to numbers."""
     return to_value(one_number(value, field, place), field, place)
 
 
 def _check_model(env: Environment) -> None:
-    """Check that a filter's own numbers are each allowed in the place of one of the environment."""
+    """Check that each number of `rta.model` may replace a number of the environment."""
     for path, value in env.rta.model.items() if env.rta else ():
         if isinstance(value, Tracer):
             continue
@@ -279,9 +291,9 @@ def _check_model(env: Environment) -> None:
 
 
 def _shapes(env: Environment) -> tuple[Any, tuple]:
-    """Return all that decides whether an environment can be traced.
+    """Return all that decides whether an environment can be traced: its structure and its shapes.
 
-    Ties matter only where a number is random.
+    Ties are part of it only if numbers are random.
     """
     leaves, structure = jax.tree.flatten(env if env.randomize else env.replace(tied={}))
     return structure, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
@@ -305,7 +317,7 @@ def _check_computable(structure: Any, shapes: tuple, precision: Any) -> None:
 
 
 def _check_kinds(env: Environment) -> None:
-    """Check that a status is a truth value where one is asked for, and a number where one is."""
+    """Check that parts which need a boolean status refer to one, and likewise for numbers."""
 
     def statuses(env: Environment) -> Mapping[str, Any]:
         platforms = {platform.name: platform.rest() for platform in env.platforms}
@@ -313,7 +325,7 @@ def _check_kinds(env: Environment) -> None:
 
     try:
         found = jax.eval_shape(statuses, env)
-    # The error is reported with its place when the whole environment is traced.
+    # The error is reported later with its place, when a reset and a step are traced.
     except Exception:
         return
     for section in _SECTIONS:
@@ -330,10 +342,7 @@ def _check_kinds(env: Environment) -> None:
 
 
 def _check_tracing(env: Environment) -> None:
-    """Trace one reset and one step.
-
-    So what does not fit together is reported here, with its place.
-    """
+    """Trace one reset and one step, and report what does not fit together with its place."""
 
     def episode(env: Environment) -> Any:
         start, first = reset(env, jax.random.key(0))
@@ -352,7 +361,8 @@ def _check_tracing(env: Environment) -> None:
         raise ConfigError(
             f"{place}: cannot be computed: {summarise_error(error, modules(env))}"
         ) from error
-    memory, later = vars(begin[0].memory), vars(after[0].memory)
+    memory = vars(begin[0].memory)
+    later = vars(after[0].memory)
     for section in ("status", "reward", "observation"):
         for name, first in memory[section].items():
             if jax.tree.structure(first) != jax.tree.structure(later[section][name]):
@@ -377,9 +387,8 @@ def _check_tracing(env: Environment) -> None:
 def _check_suited(env: Environment) -> None:
     """Reject a filter that reports a fault at every one of eight sampled starts.
 
-    It judges them by the numbers that it predicts with, those of `rta.model`.
-
-    An environment with traced numbers passes, because they cannot be judged.
+    The filter judges the starts by the numbers that it predicts with, which are those of
+    `rta.model`. An environment with traced numbers passes, because they cannot be judged.
     """
     if env.rta is None or any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(env)):
         return
@@ -387,9 +396,9 @@ def _check_suited(env: Environment) -> None:
     with jax.ensure_compile_time_eval():
         if not _can_report(*_shapes(env), jnp.result_type(float)):
             return
-        found = _faults_of_starts(env, jax.random.split(jax.random.key(0), 8))
-        for fault, everywhere in found.items():
-            if everywhere.all():
+        faults = _faults_of_starts(env, jax.random.split(jax.random.key(0), 8))
+        for fault, present in faults.items():
+            if present.all():
                 raise ConfigError(fault if fault.startswith("rta.") else f"rta: {fault}")
 
 
@@ -409,6 +418,7 @@ def _can_report(structure: Any, shapes: tuple, precision: Any) -> bool:
 
 
 def _faults(env: Environment, key: jax.Array) -> Mapping[str, jax.Array]:
+    """Return whether the filter has each of the faults that it knows, at a random start."""
     assert env.rta is not None
     start, _ = reset(env.replace(rta=None, randomize=_without_filter(env.randomize)), key)
     return env.rta.unsuited(modelled(env), start.sim)

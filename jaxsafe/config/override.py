@@ -22,17 +22,18 @@ def override(env: Environment, changes: Mapping[str, Any], place: str = "") -> E
     `jax.vmap(lambda w: f(override(env, {"reward.delta_v.scale": w})))(weights)`, and `jax.grad` of
     the same function is a gradient with respect to a parameter.
 
-    Numbers that `env.tied` lists follow the changes. One that is itself changed follows no longer,
-    and a warning says so.
+    Numbers that `env.tied` lists follow the changes. A tied number that is itself changed follows
+    no longer, and a warning says so.
 
     Args:
         env: the environment.
         changes: new values by path. A path consists of field names and of the names of parts in a
-            list. It may begin with the name of a platform. Where a list of parts stands, a list of
-            names keeps those parts in that order: `{"observation": ["position", "velocity"]}`. A
-            path that ends in `type` replaces a part by one of another type, which keeps the fields
-            that both have: `{"deputy.type": "two_body", "deputy.eccentricity": 0.1}`.
-        place: what stands before the paths in messages of errors, such as `env` on a command line.
+            list. It may begin with the name of a platform. The new value of a list of parts may be
+            a list of names, which keeps these parts in this order:
+            `{"observation": ["position", "velocity"]}`. A path that ends in `type` replaces a part
+            by one of another type, which keeps the fields that both types have:
+            `{"deputy.type": "two_body", "deputy.eccentricity": 0.1}`.
+        place: what stands before the paths in error messages, such as `env` on a command line.
 
     Raises:
         ConfigError: a path leads nowhere, or a value has the wrong type, shape or range.

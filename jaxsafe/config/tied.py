@@ -1,7 +1,7 @@
 """Numbers of an environment that follow other numbers of it: `Environment.tied`.
 
-What is changed or drawn at random moves the numbers that follow it. A number that is itself changed
-or drawn follows no longer.
+When a number is changed or drawn at random, the numbers that follow it change too. A tied number
+that is itself changed or drawn at random follows no longer.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jaxsafe.schema.ties import follow_one, in_order, plain_paths, target
 def settle(env: Environment) -> Environment:
     """Return an environment in which every tied number is what it follows.
 
-    A file may have another number. That it becomes what it follows is told in one line.
+    A file may give another number. It is replaced, and a warning says so.
 
     Raises:
         ConfigError: numbers follow one another in a circle, or one would be out of its range.
@@ -35,7 +35,7 @@ def settle(env: Environment) -> Environment:
         tie = env.tied[path]
         number = _number(env, path)
         source = _number(env, tie.to)
-        # A path that leads nowhere is told by `check_ties`.
+        # A path that leads nowhere is reported by `check_ties`.
         if number is None or source is None or _equal(number, target(env, tie)):
             continue
         env = follow_one(env, path, tie, to_value)
@@ -51,13 +51,13 @@ def settle(env: Environment) -> Environment:
 def carry(before: Environment, after: Environment, changed: Iterable[str]) -> Environment:
     """Return a changed environment in which tied numbers have followed the changes.
 
-    A number that was changed itself, or is random now, is tied no longer. One line tells so. A tie
-    whose number or whose source is no longer there goes without a word.
+    A tied number that was itself changed, or that is random now, is tied no longer, and a warning
+    says so. If either number of a tie is gone, the tie is removed without a warning.
 
     Args:
         before: the environment before the changes.
         after: the environment with the changes.
-        changed: the paths of the changes.
+        changed: the paths that were changed.
 
     Raises:
         ConfigError: numbers follow one another in a circle, or one would be out of its range.
@@ -73,24 +73,26 @@ def carry(before: Environment, after: Environment, changed: Iterable[str]) -> En
             del ties[path]
         elif path in random or path in given or _differs(before, after, path):
             del ties[path]
-            what = "random" if path in random else "set apart"
+            reason = "random" if path in random else "set apart"
             warnings.warn(
-                f"{path} is {what}: it followed {tie.rule}, and does so no longer",
+                f"{path} is {reason}: it followed {tie.rule}, and does so no longer",
                 ConfigWarning,
                 stacklevel=3,
             )
         elif number is None or source is None:
-            continue  # `check_ties` tells that the path leads nowhere
+            continue  # `check_ties` reports that the path leads nowhere
         elif before.tied.get(path) != tie or _differs(before, after, tie.to):
             after = follow_one(after, path, tie, to_value)
     return after if len(ties) == len(after.tied) else after.replace(tied=ties)
 
 
 def check_ties(env: Environment) -> None:
-    """Check that every tie is between two numbers of the environment, the first one not random.
+    """Check that every tie is between two numbers of the environment.
+
+    The number that follows must not be random itself.
 
     Raises:
-        ConfigError: one is not. The message names it.
+        ConfigError: a tie is not allowed. The message names it.
     """
     random = plain_paths(env, env.randomize)
     for path, tie in env.tied.items():
@@ -113,9 +115,13 @@ def check_ties(env: Environment) -> None:
 
 
 def one_number(value: Any, field: Field, place: str) -> Any:
-    """Return a value of a field that holds one number or a mapping of such. Refuse other fields."""
-    one = field.unit.length in (None, ANY) if field.unit else isinstance(value, dict)
-    if not one:
+    """Return the value unchanged if the field holds one number or a mapping to numbers.
+
+    Raises:
+        ConfigError: the field holds something else.
+    """
+    holds_one = field.unit.length in (None, ANY) if field.unit else isinstance(value, dict)
+    if not holds_one:
         raise ConfigError(
             f"{place}: expected the path of one number, found that of {expects(field)}"
         )
@@ -133,7 +139,7 @@ def _number(env: Environment, path: str) -> Any:
 
 
 def _differs(before: Environment, after: Environment, path: str) -> bool:
-    """Return whether the number at a path is another one than before."""
+    """Return whether the number at a path has changed."""
     old = _number(before, path)
     new = _number(after, path)
     if old is new:
@@ -142,8 +148,9 @@ def _differs(before: Environment, after: Environment, path: str) -> bool:
 
 
 def _equal(number: Any, other: Any) -> bool:
-    """Return whether two numbers are equal but for rounding. Traced numbers are not."""
+    """Return whether two numbers are equal but for rounding. Traced numbers never are."""
     if isinstance(number, Tracer) or isinstance(other, Tracer):
         return False
-    first, second = float(np.asarray(number)), float(np.asarray(other))
+    first = float(np.asarray(number))
+    second = float(np.asarray(other))
     return first == second or abs(first - second) <= 1e-6 * abs(second)

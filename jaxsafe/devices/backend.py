@@ -1,4 +1,4 @@
-"""What programs do otherwise on an accelerator, where fewer kernels are faster."""
+"""Loops and vectors with fewer kernels, which are faster on an accelerator."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ def accelerated() -> bool:
     """Return whether this process computes on a GPU or another accelerator.
 
     A CPU runs a loop at little cost and gains from what it skips. An accelerator spends a
-    microsecond or more on every kernel and waits for the host wherever a program branches. So it
-    gains from few kernels, even if they compute more.
+    microsecond or more on every kernel, and waits for the host wherever a program branches. So it
+    gains from having few kernels, even if they compute more.
     """
     return jax.default_backend() != "cpu"
 
@@ -25,8 +25,8 @@ def scan_packed(
 ) -> tuple[Any, Any]:
     """Return what `jax.lax.scan` returns, and write the outputs with fewer kernels.
 
-    `jax.lax.scan` has a kernel for each array that a step returns, which writes it into the stack.
-    Here arrays of the same shape and type are stacked together.
+    In `jax.lax.scan` each array that a step returns is written into its stack by a kernel of its
+    own. Here arrays of the same shape and type are written together.
     """
     shapes = jax.eval_shape(lambda: function(start, jax.tree.map(lambda x: x[0], xs))[1])
     leaves, structure = jax.tree.flatten(shapes)
@@ -50,8 +50,8 @@ def scan_packed(
 def packing(tree: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
     """Return a function that makes one vector of a tree shaped like this one, and its inverse.
 
-    An operation on all parameters is one kernel for the vector, but a kernel for each array of the
-    tree. On a CPU both functions return their argument.
+    An operation on the vector is one kernel. On the tree it would be a kernel for each array. On a
+    CPU both functions return their argument.
     """
     if not accelerated():
         return (lambda tree: tree), (lambda tree: tree)

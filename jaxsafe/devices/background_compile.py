@@ -12,7 +12,7 @@ from typing import Any
 import jax
 
 NUM_THREADS = 4
-"""How many programs are compiled at a time, as many as a training has.
+"""How many programs are compiled at a time. A training has as many.
 
 The compiler does little in parallel by itself.
 """

@@ -9,7 +9,7 @@ from pathlib import Path
 def enable_compilation_cache() -> None:
     """Keep compiled programs between runs, so that the second start is quick.
 
-    The place that the user chose for them stays, and so does the choice to keep none.
+    A directory that the user has set is kept, and so is the user's choice to have no cache.
     """
     import jax
 
@@ -18,7 +18,7 @@ def enable_compilation_cache() -> None:
             base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
             (base / "jaxsafe").mkdir(parents=True, exist_ok=True)
         except (OSError, RuntimeError):
-            return  # a home that is missing or cannot be written costs time and nothing else
+            return  # without a home directory that can be written, starts only take longer
         jax.config.update("jax_compilation_cache_dir", str(base / "jaxsafe"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

@@ -1,4 +1,7 @@
-"""Memory that a training needs and finds: one that does not fit is refused before it starts."""
+"""The memory that a training needs and the memory that is free.
+
+A training that does not fit is refused before it starts.
+"""
 
 from __future__ import annotations
 
@@ -25,20 +28,20 @@ COMPILE_BYTES = 1450 * 2**20
 """Bytes that each process takes while the programs of a training are compiled.
 
 Resident memory rose by 1.12 GB for docking2d, 1.29 GB with its filter, and 1.41 GB for rejoin3d.
-Not covered: it rose by 1.86 GB for rejoin3d with 16,384 environments, and by 2.01 GB with its
-filter.
+The largest trainings are not covered. With 16,384 environments, it rose by 1.86 GB for rejoin3d and
+by 2.01 GB with its filter.
 """
 
 RUN_BYTES = 320 * 2**20
 """Bytes that each process takes besides the buffers of the update.
 
-They are for code, small programs of evaluations, logs and figures. Resident memory rose by 250 MB
-for docking2d after the update had been compiled.
+They are for code, the small programs of evaluations, logs and figures. Resident memory rose by
+250 MB for docking2d after the update had been compiled.
 """
 
 
 class ControlGroupFiles(NamedTuple):
-    """Where control groups are, and which of their files say what they leave of the memory."""
+    """Where control groups are, and which of their files say how much memory they leave."""
 
     root: str
     limit: str  # file with the limit [bytes]
@@ -88,19 +91,19 @@ def footprint(compiled: jax.stages.Compiled) -> int:
 def require(needed: int, devices: int, options: str, once: int = 0) -> None:
     """Refuse a training that does not fit into memory.
 
-    If it does not fit in one process, all processes refuse it. CPU devices of all processes on a
-    machine share its memory.
+    If it does not fit in one process, all processes refuse it. The CPU devices of all processes on
+    a machine share its memory.
 
     Args:
         needed: bytes on each device.
         devices: number of devices of this process that take part.
         options: names of the options that decide how much is needed.
         once: bytes that this process takes once, whatever the number of devices: `COMPILE_BYTES` or
-            `RUN_BYTES`. They are in the memory of the machine, so an accelerator does not need to
-            have them.
+            `RUN_BYTES`. They are in the memory of the machine, so they do not count on an
+            accelerator.
 
     Raises:
-        ConfigError: the devices do not have as much memory left.
+        ConfigError: the training needs more memory than is free.
     """
     free = available()
     total = needed
@@ -119,8 +122,8 @@ def require(needed: int, devices: int, options: str, once: int = 0) -> None:
 def available() -> int | None:
     """Return the bytes that are free, or None if that is not known.
 
-    For an accelerator it is the memory of one device. Otherwise it is what is free on this machine
-    within the limits of container and process.
+    On an accelerator they are the free bytes of one device. Otherwise they are the free bytes of
+    this machine within the limits of container and process.
     """
     device = jax.local_devices()[0]
     if device.platform != "cpu":
@@ -129,7 +132,7 @@ def available() -> int | None:
             return None
         return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
     known = [free for free in (_machine(), _container(), _process()) if free is not None]
-    return min(known) if known else None
+    return min(known, default=None)
 
 
 def _machine() -> int | None:
@@ -154,7 +157,7 @@ def _process() -> int | None:
 def _container() -> int | None:
     """Return the bytes that the control groups of this process leave it, of version 1 or 2.
 
-    It is the least of what its own group and the groups around that one leave.
+    It is the least of what its own group and the groups around it leave.
     """
     known = []
     for line in _lines("/proc/self/cgroup"):
@@ -171,7 +174,10 @@ def _container() -> int | None:
 
 
 def _group(path: Path, files: ControlGroupFiles) -> int | None:
-    """Return what is left of the limit of a group. A cache that can be dropped counts as free."""
+    """Return the bytes that the limit of a group leaves, or None if it has no limit.
+
+    A cache that can be dropped counts as free.
+    """
     limit = "".join(_lines(str(path / files.limit))).strip()
     used = "".join(_lines(str(path / files.used))).strip()
     if not (limit.isdigit() and used.isdigit()):
@@ -191,5 +197,5 @@ def _lines(path: str) -> list[str]:
 
 
 def _keys_as_words(tree: Any) -> Any:
-    """Return a tree with PRNG keys replaced by the words of which they consist."""
+    """Return the tree with each PRNG key replaced by the words that it consists of."""
     return jax.tree.map(lambda x: jax.random.key_data(x) if is_key(x) else x, tree)

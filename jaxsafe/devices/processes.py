@@ -30,10 +30,10 @@ except ImportError:  # Windows
     fcntl = None
 
 MAX_MESSAGE_BYTES = 4096
-"""Size of what process 0 sends to the others: a path or an error's text. Longer ones are cut."""
+"""Size of a message from process 0 to the others: a path or an error's text. Longer text is cut."""
 
 MAX_REASON_LETTERS = 200
-"""How much of the first line of a library's error is repeated in ours."""
+"""How much of the first line of a library's error is repeated in a ConfigError."""
 
 _LOST_PROCESS = re.compile("gloo|nccl|heartbeat|coordination|unavailable|deadline", re.IGNORECASE)
 """Words in the errors that collectives raise when another process has ended."""
@@ -42,10 +42,11 @@ _LOST_PROCESS = re.compile("gloo|nccl|heartbeat|coordination|unavailable|deadlin
 def join() -> None:
     """Find the other processes.
 
-    They are found by the environment of Slurm, Open MPI or another launcher that JAX knows.
+    They are found by the environment variables of Slurm, Open MPI or another launcher that JAX
+    knows.
 
     Raises:
-        ConfigError: there is no such launcher, or not all processes came.
+        ConfigError: there is no such launcher, or some process did not join.
     """
     try:
         jax.distributed.initialize()
@@ -116,7 +117,7 @@ def count_on_this_machine() -> int:
 def gather(x: Any) -> np.ndarray:
     """Return an array on the host of every process, wherever its parts are.
 
-    PRNG keys become the words of which they consist.
+    PRNG keys become the words that they consist of.
     """
     if is_key(x):
         x = jax.random.key_data(x)
@@ -131,8 +132,8 @@ def gather(x: Any) -> np.ndarray:
 def own_files(run: Path) -> Iterator[Path]:
     """Give each process a directory for the files of a run.
 
-    Process 0 gets the run directory itself, which it alone writes. Every other process gets a copy
-    of its logs to go on from, and prints nothing.
+    Process 0 gets the run directory itself and is the only one that writes there. Every other
+    process gets a copy of the run's logs to go on from, and prints nothing.
 
     Raises:
         ConfigError: another command already writes this run. It is raised in every process.
@@ -157,7 +158,7 @@ def own_files(run: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _locked(run: Path) -> Iterator[str]:
-    """Hold a lock on a run, where the system has locks. The lock goes with the process.
+    """Hold a lock on a run, if the system has locks. The lock ends with the process.
 
     Yields:
         An empty text, because `from_leader` takes a text.
@@ -174,14 +175,15 @@ def _locked(run: Path) -> Iterator[str]:
             raise ConfigError(
                 f"{run}: another command is at work on this run; wait for its end, or stop it"
             ) from None
-        except OSError:  # a file system without locks, or no such run, which is reported elsewhere
+        # The file system has no locks, or there is no such run, which is reported elsewhere.
+        except OSError:
             pass
         yield ""
 
 
 @contextlib.contextmanager
 def reporting_lost_process(advice: str) -> Iterator[None]:
-    """Turn an error that comes from the loss of another process into a ConfigError.
+    """Turn an error that is caused by the loss of another process into a ConfigError.
 
     Args:
         advice: what the user can do, for the message.

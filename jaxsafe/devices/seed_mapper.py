@@ -37,9 +37,9 @@ def claim_cores() -> None:
 
     Call this before JAX touches its devices. Flags that the user has set stay.
 
-    LLVM's expensive passes take longer to compile and gave no faster program on a CPU. Where JAX
-    has a plugin for an accelerator they stay, because without them an update of PPO took 13 %
-    longer on a GPU.
+    LLVM's expensive passes are switched off, because they take time to compile and gave no faster
+    program on a CPU. They stay on if JAX has a plugin for an accelerator, because without them an
+    update of PPO took 13 % longer on a GPU.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     defaults = {
@@ -63,7 +63,7 @@ def usable_cores() -> int:
 def accelerator_installed() -> bool:
     """Return whether JAX may find an accelerator here.
 
-    JAX itself is not asked, because it would set up its devices.
+    JAX itself is not asked, because it would set up its devices to answer.
     """
     only_cpu = os.environ.get("JAX_PLATFORMS") == "cpu"
     return not only_cpu and importlib.util.find_spec("jax_plugins") is not None
@@ -82,8 +82,8 @@ class SeedMapper:
 
         Args:
             num_seeds: number of seeds.
-            shares: numbers of devices that may share a seed. The largest one is taken that leaves
-                devices for all seeds.
+            shares: numbers of devices that may share a seed. The largest number that leaves devices
+                for all seeds is taken.
 
         Raises:
             ConfigError: there are too few devices, or too few seeds for all processes.
@@ -105,18 +105,18 @@ class SeedMapper:
         out_specs: Any = SPLIT_BY_SEED,
         as_pair: bool = False,
     ) -> Any:
-        """Return a jittable `(shared, seeds)` that maps `function(shared, seed)` over all seeds.
+        """Return a jitted function of `(shared, seeds)` that maps `function` over all seeds.
 
         The arrays of `seeds` and of the result have a leading axis of `padded` seeds.
 
         Args:
-            function: what to do for one seed.
+            function: what to do for one seed: `function(shared, seed)`.
             in_specs: how the arrays of `seeds` are sharded: `SPLIT_BY_SEED`, `SPLIT_BY_ENV`, or a
-                tree of both that stands for theirs.
+                tree of both whose leaves stand for parts of the tree `seeds`.
             out_specs: how the arrays that the function returns are sharded.
-            as_pair: whether a device with only one seed maps it twice. This is for what is cheap
-                and may be fused with its surroundings. The compiler makes no loop for one seed, and
-                without a loop the starts of oriented docking differed in the last bit.
+            as_pair: whether a device with only one seed maps it twice. This is for cheap functions
+                that may be fused with their surroundings. The compiler makes no loop for one seed,
+                and without a loop the starts of oriented docking differed in the last bit.
         """
 
         def map_shard(shared: Any, seeds: Any) -> Any:
@@ -146,7 +146,7 @@ class SeedMapper:
         """Distribute arrays over the devices as `map` takes them.
 
         Args:
-            tree: arrays [num_seeds] or [padded], which every process has whole.
+            tree: arrays [num_seeds] or [padded]. Every process has them whole.
             specs: how they are sharded, as `in_specs` of `map`.
         """
 
@@ -157,7 +157,7 @@ class SeedMapper:
         return jax.tree.map(place_part, specs, tree)
 
     def like(self, shapes: Any, specs: Any = SPLIT_BY_SEED) -> Any:
-        """Return shapes with shardings, to compile what `map` returns before there are arrays.
+        """Return shapes with shardings, with which what `map` returns can be compiled ahead.
 
         Args:
             shapes: shapes of arrays [padded].
@@ -184,13 +184,13 @@ class SeedMapper:
     def gather(self, tree: Any) -> Any:
         """Return the arrays on the host of every process, without the padding.
 
-        PRNG keys become the words of which they consist.
+        PRNG keys become the words that they consist of.
         """
         return jax.tree.map(lambda x: processes.gather(x)[: self.num_seeds], tree)
 
 
 def _device_groups(num_seeds: int, shares: Sequence[int]) -> list[list[Any]]:
-    """Return at most `num_seeds` groups of devices. The devices of a group take a seed together.
+    """Return at most `num_seeds` groups of devices. The devices of a group share a seed.
 
     The devices of a group belong to one process, unless that would leave a process out.
 
@@ -242,7 +242,8 @@ def _distribute(x: Any, sharding: NamedSharding) -> jax.Array:
 def isolated(function: Callable[..., Any]) -> Callable[..., Any]:
     """Keep the compiler from fusing a seed's program with its surroundings.
 
-    Its bits then do not depend on them. The first two arguments are arrays, further ones static.
+    Then the bits of its results do not depend on the surroundings. The first two arguments of the
+    function are arrays, further ones are static.
     """
 
     def alone(shared: Any, seed: Any, *static: Any) -> Any:

@@ -1,8 +1,8 @@
-"""A batch that several devices share: the part of one device, and what it needs of the others.
+"""A batch that several devices share: the part of one device, and what it needs from the others.
 
 Every device draws the random numbers of the whole batch and keeps those of its part. So the number
 of devices changes only the order of sums. All of this happens inside `jax.shard_map`. With one
-device every method returns its argument as it is.
+device, methods that take arrays return them as they are.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Shard:
     def join(self, tree: Tree, axis: int = 0) -> Tree:
         """Return the parts of all devices, joined along an axis.
 
-        Arrays of the same type go in one exchange, because each exchange takes its time, however
+        Arrays of the same type are exchanged together, because an exchange takes some time however
         little it moves.
 
         Args:

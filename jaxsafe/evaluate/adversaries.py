@@ -33,7 +33,7 @@ def uniform(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
 
 
 def bang_bang(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Return a control with every actuator at one of its bounds, at random."""
+    """Return a control with every actuator at one of its two bounds, chosen at random."""
     return _random_bounds(env, key)
 
 
@@ -50,7 +50,7 @@ def greedy(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
 
 
 def inward(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Return a control towards the other platform: pursuit, ramming from behind."""
+    """Return a control towards the other platform. It pursues, and rams from behind."""
     return _towards(env, sim, _to_target(env, sim), key)
 
 
@@ -60,9 +60,9 @@ def outward(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
 
 
 def sideways(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Return a control across the velocity. It bends the path, and at first the speed stays.
+    """Return a control across the velocity. It bends the path and at first keeps the speed.
 
-    On a line nothing is across the velocity, and the control is random.
+    On a line no direction is across the velocity, and the control is random.
     """
     velocity = sim.platforms[env.agent].velocity
     if velocity.size == 1:
@@ -120,10 +120,10 @@ def there_and_back(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
 
 
 def drain(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
-    """Return the control that a filter certifies with the least h on the way.
+    """Return, of the controls that a filter certifies, the one with the least h on the way.
 
-    Controls with every actuator at a bound or in the middle are compared. Without a filter that
-    certifies, it is the control with the least h after the step.
+    Controls with every actuator at a bound or in the middle are compared. If no filter certifies
+    controls, the one with the least h after the step is returned.
     """
     low, high = bounds(env)
     shares = jnp.array(list(itertools.product((0.0, 0.5, 1.0), repeat=low.shape[0])))

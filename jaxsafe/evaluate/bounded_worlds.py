@@ -16,13 +16,13 @@ def world_at(env: Environment, level: float, searched: bool = False) -> Environm
     """Return an environment whose uncertainty is `level` times the bound of its filter.
 
     The disturbance and the errors of navigation have the worst direction in every step. The true
-    mass is below the mass that the filter knows. The thrust is turned by the whole angle. A delay
-    is that of the bound at every level.
+    mass is below the mass that the filter knows. The thrust is turned by the whole angle. The delay
+    is the same at every level.
 
     Args:
         env: the environment, with a filter that has a `bound`.
         level: multiple of the bound. At 1 the filter promises safety.
-        searched: whether the disturbance is a `chosen` one, for a search.
+        searched: whether the disturbance is of type `chosen`, so that a search can choose it.
 
     Raises:
         ConfigError: the filter has no bound, or the world does not fit the environment.

@@ -30,12 +30,11 @@ A longer episode is given up, and its outcome is then `running`.
 MAX_STEPS = 1_000_000
 """Longest episode in an environment with a timeout.
 
-A longer episode is given up. A timeout may be so late that it means none.
+A longer episode is given up. A timeout may be so late that it never ends an episode.
 """
 
-
 Carry = tuple[Array, State, Array, Any, Episode]
-"""Steps so far, states, observations, memory of the policy, and sums over the episodes."""
+"""Number of steps so far, states, observations, memory of the policy, sums over the episodes."""
 
 
 def run_episodes(
@@ -43,8 +42,8 @@ def run_episodes(
 ) -> Episode:
     """Run one episode in each of `num_episodes` environments.
 
-    They run until all episodes have ended, or are given up after `max_steps`. Starts depend on the
-    key only, so that policies are compared from the same starts.
+    They run until all episodes have ended or `max_steps` is reached. Starts depend on the key only,
+    so that policies are compared from the same starts.
 
     Returns:
         Sums over each episode. Every field has the shape [num_episodes].
@@ -75,7 +74,7 @@ def run_episodes(
 
 
 class Position(NamedTuple):
-    """Position in a recording of several episodes, from which its next steps begin."""
+    """Position in a recording of several episodes, at which its next steps begin."""
 
     num_steps: Int[Array, ""]
     state: State
@@ -115,13 +114,13 @@ def record_steps(
     Args:
         env: the environment.
         policy: the policy.
-        key: the key that `begin_recording` had.
+        key: the key with which `begin_recording` was called.
         position: the position after the last step so far.
         num_steps: the number of steps to run.
 
     Returns:
         The position after these steps, and the states and time steps [num_steps, num_episodes].
-        What follows the end of an episode means nothing.
+        Steps after the end of an episode mean nothing.
     """
     _, key_act = jax.random.split(key)
 
@@ -147,7 +146,7 @@ def record_steps(
 def max_steps(env: Environment) -> int:
     """Return the number of steps after which an episode that has not ended is given up.
 
-    It does not depend on the limit of a timeout, which may have any value and ends episodes itself.
+    It does not depend on the limit of a timeout, which ends episodes itself and may have any value.
     """
     has_timeout = any(isinstance(condition, Timeout) for condition in env.terminal)
     return MAX_STEPS if has_timeout else MAX_STEPS_WITHOUT_TIMEOUT

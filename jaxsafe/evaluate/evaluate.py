@@ -23,15 +23,15 @@ def evaluate(
 
     Args:
         env: the environment.
-        policy: `policy(key, observation)` returns an action for each of a batch of observations,
-            as what `jaxsafe.load_policy` returns does. It may be a `RecurrentPolicy`.
+        policy: `policy(key, observation)` returns an action for each of a batch of observations, as
+            the policies of `jaxsafe.load_policy` do. It may be a `RecurrentPolicy`.
         key: a typed PRNG key. It decides starts and noise. None stands for `jax.random.key(0)`.
         num_episodes: how many episodes run side by side.
-        episodes: another name of `num_episodes`, as the command calls it.
+        episodes: another name of `num_episodes`, which the command uses.
 
     Returns:
-        By name: rates as fractions in [0, 1], lengths in steps, Δv in the unit of the task. None
-        where the environment does not measure a quantity or it is not finite.
+        The metrics by name: rates as fractions in [0, 1], lengths in steps, Δv in the unit of the
+        task. A metric is None if the environment does not measure it or it is not finite.
 
     Raises:
         ConfigError: the number of episodes is not a whole number of at least 1, or the policy

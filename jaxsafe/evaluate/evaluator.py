@@ -26,20 +26,20 @@ The noise of a batch is drawn together, so this number is part of the results.
 MIN_RECORDED_EPISODES = 10
 """Least number of episodes that are recorded at a time.
 
-So one compiled program serves the evaluations during and after training.
+It lets one compiled program serve the evaluations during and after training.
 """
 
 RECORDED_STEPS_PER_CALL = 256
 """Number of steps that are recorded at a time.
 
-So the size of a recording follows from the length of its episodes, not from any limit.
+A recording grows by this number until its episodes have ended, so it is only as long as they are.
 """
 
 MAX_RECORDED_STEPS = 25_000
-"""Length of a recording at which it ends, even if its episode has not ended.
+"""Most steps of a recording. It ends there, even if its episode has not ended.
 
-Longer logs and figures would take GiB. Every task at a tenth of its time step is still recorded
-whole.
+Longer logs and figures would take GiB. Episodes of every task are still recorded whole at a tenth
+of its time step.
 """
 
 EVALUATION_SEED = 0
@@ -71,7 +71,7 @@ class Evaluator:
     """Runs whole batches of episodes for every seed, with programs that are compiled once."""
 
     def __init__(self, mapper: SeedMapper, env: Environment, agent: Acting) -> None:
-        """Prepare to evaluate policies of `agent` in `env`, the seeds being mapped by `mapper`."""
+        """Prepare to evaluate policies of `agent` in `env`. `mapper` maps over their seeds."""
         self.mapper = mapper
         self.env = env
         self.agent = agent
@@ -83,7 +83,7 @@ class Evaluator:
         """Compile the programs while other work goes on. A second call does nothing.
 
         Args:
-            params: the parameters that `run` takes, or what `SeedMapper.like` says of them.
+            params: the parameters that `run` takes, or their shapes from `SeedMapper.like`.
         """
         if isinstance(self._run, CompiledInBackground):
             return
@@ -139,7 +139,7 @@ class Evaluator:
     ) -> Iterator[tuple[State, TimeStep]]:
         """Yield states and time steps, each [steps + 1], of the episodes that `record` describes.
 
-        At most `MAX_RECORDED_STEPS` steps of each episode are yielded.
+        At most `MAX_RECORDED_STEPS` steps of each episode are recorded.
         """
         num_batches = -(-num_episodes // EPISODES_PER_BATCH)
         for batch, key in enumerate(batch_keys(seed, num_batches)):
@@ -161,7 +161,7 @@ class Evaluator:
 
         Args:
             params: the parameters of one seed's policy.
-            number: which of the episodes.
+            number: the index of the episode.
             seed: the seed of the evaluation.
             deterministic: whether the policy takes the mode of its actions.
         """
@@ -179,7 +179,7 @@ class Evaluator:
     def _episodes(
         self, params: Params, key: Key, deterministic: Any, chosen: Sequence[int], size: int
     ) -> Iterator[tuple[State, TimeStep]]:
-        """Yield chosen episodes of a batch of some size, each up to its end."""
+        """Yield chosen episodes of a batch of `size` episodes, each up to its end."""
         begin, go_on = self._recorder(size)
         position, first = begin(params, key)
         pieces = {i: [jax.tree.map(lambda x, i=i: np.asarray(x)[i : i + 1], first)] for i in chosen}
@@ -190,9 +190,11 @@ class Evaluator:
             recorded = jax.tree.map(np.asarray, recorded)
             ends = {i: np.flatnonzero(recorded[1].done[:, i]) for i in running}
             for i in running:
-                size = ends[i][0] + 1 if ends[i].size else RECORDED_STEPS_PER_CALL
-                size = min(size, limit - before)
-                pieces[i].append(jax.tree.map(lambda x, i=i, n=size: x[:n, i].copy(), recorded))
+                num_steps = ends[i][0] + 1 if ends[i].size else RECORDED_STEPS_PER_CALL
+                num_steps = min(num_steps, limit - before)
+                pieces[i].append(
+                    jax.tree.map(lambda x, i=i, n=num_steps: x[:n, i].copy(), recorded)
+                )
             running = [i for i in running if not ends[i].size]
             if not running:
                 break
@@ -208,7 +210,7 @@ class Evaluator:
         return *self._shared, *self.mapper.replicate((key, deterministic))
 
     def _recorder(self, num_episodes: int) -> Recorder:
-        """Return the recorder of a number of episodes. It is compiled once."""
+        """Return the functions that record this number of episodes. They are compiled once."""
         if num_episodes not in self._recorders:
 
             def begin(params: Params, key: Key) -> Any:

@@ -1,8 +1,9 @@
-"""Runs of adversaries against an environment, with or without a filter, and what is counted.
+"""Runs of adversaries against an environment, with or without a filter, and counts of violations.
 
-Violations are counted at the samples. They are also counted inside the steps: the platforms are
-moved to `INSTANTS_PER_STEP` instants of each step with the control held, and separations are
-checked between two instants as well. A margin or a state that is not a number is a violation.
+Violations are counted at the ends of the steps. They are also counted inside the steps: the
+platforms are moved to `INSTANTS_PER_STEP` instants of each step with the control held, and
+separations are checked between two instants as well. A margin or a state that is not a number is a
+violation.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ _SUMMED = (*_EVENTS, "steps", "ended", "correction", "unsafe_starts")
 _LOWEST = ("lowest", "lowest_inside")
 
 Counts = dict[str, Float[Array, " n"]]
-"""Sums over the steps, and lowest margins, of each environment of a batch."""
+"""Sums over the steps and lowest margins, for each environment of a batch."""
 
 
 def attack(env: Environment, name: str, num_steps: int, num_envs: int, key: Key) -> dict[str, Any]:
@@ -72,10 +73,11 @@ def attack(env: Environment, name: str, num_steps: int, num_envs: int, key: Key)
 
     Args:
         env: the environment, with or without run time assurance.
-        name: one of `adversaries.ADVERSARIES`, or `search`. The search starts from random starts
-            and minimises the smallest h on the way against the filter. It is the cross-entropy
-            method on sequences of `SEARCH_CONTROLS` controls, each held for `SEARCH_HOLD_STEPS`
-            steps. Disturbances of type `chosen` are searched together with the controls.
+        name: one of `adversaries.ADVERSARIES`, or `search`. The search begins at random starts and
+            minimises the smallest h on the way, against the filter if there is one. It is the
+            cross-entropy method on sequences of `SEARCH_CONTROLS` controls, each held for
+            `SEARCH_HOLD_STEPS` steps. Disturbances of type `chosen` are searched together with the
+            controls.
         num_steps: the number of steps in each environment. `longest_episode` gives whole episodes.
             The search divides all steps into its sequences.
         num_envs: the number of environments that run side by side.
@@ -83,11 +85,11 @@ def attack(env: Environment, name: str, num_steps: int, num_envs: int, key: Key)
 
     Returns:
         Plain numbers: steps, episodes, violations, worst margins, interventions, mean correction
-        and unsafe starts. Episodes are those that ended. If none has ended in some environment, the
-        first part of one episode in each environment counts instead. If nothing was violated, the
-        share of episodes with a violation is below `violation_bound` with 95 % confidence, by the
-        rule of three. The bound is None after a violation. It is also None for the search, whose
-        episodes do not depend on chance alone.
+        and unsafe starts. Only episodes that ended count. But if some environment has no such
+        episode, each environment counts as one unfinished episode instead. If nothing was violated,
+        the share of episodes with a violation is below `violation_bound` with 95 % confidence, by
+        the rule of three. The bound is None after a violation. It is also None for the search,
+        whose episodes do not depend on chance alone.
     """
     physical = _with_physical_actions(env)
     if name == SEARCH:
@@ -129,8 +131,9 @@ def attack(env: Environment, name: str, num_steps: int, num_envs: int, key: Key)
 def longest_episode(env: Environment) -> int:
     """Return the number of steps after which every episode has ended by its time limit.
 
-    A time limit or a length of a step that is random counts with its worst value. The number is at
-    most `MAX_COUNT`, also where the time limit is so large that it stands for none.
+    A random time limit counts with its largest value, and a random length of a step with its
+    smallest. The number is at most `MAX_COUNT`, even if the time limit is so large that it stands
+    for none.
 
     Raises:
         ConfigError: the task has no time limit.
@@ -210,7 +213,11 @@ def _search(env: Environment, num_starts: int, key: Key) -> Counts:
     def improve(
         carry: tuple[Array, Array], key: Key, state: State
     ) -> tuple[tuple[Array, Array], Counts]:
-        """Draw a population about a mean and return mean and spread of its best sequences."""
+        """Run a population that is drawn about a mean.
+
+        Returns:
+            The mean and the spread of the best sequences, and the counts of all.
+        """
         mean, spread = carry
         population = mean + spread * jax.random.normal(key, (SEARCH_POPULATION, *mean.shape))
         shares = jnp.clip(population, -1.0, 1.0)
@@ -219,7 +226,7 @@ def _search(env: Environment, num_starts: int, key: Key) -> Counts:
         held = jnp.repeat(jnp.moveaxis(controls, 0, 1), SEARCH_HOLD_STEPS, axis=0)
         counts = run(state, held)
         best = population[jnp.argsort(counts["lowest_inside"])[:SEARCH_ELITE]]
-        # The spread keeps a least value, so that the search does not stop at what it has found.
+        # The spread is never 0, so that the search does not stop at what it has found.
         return (jnp.mean(best, axis=0), jnp.std(best, axis=0) + 0.05), counts
 
     def search_from_start(key: Key) -> Counts:
@@ -240,7 +247,7 @@ def _search(env: Environment, num_starts: int, key: Key) -> Counts:
 
 
 def _with_push(state: State, name: str, push: Float[Array, "n d"]) -> State:
-    """Return states in which a chosen disturbance is what it shall be in the next step."""
+    """Return states in which a chosen disturbance has the value `push` for the next step."""
     uncertainty = {**state.memory.uncertainty, name: push}
     return state.replace(memory=state.memory.replace(uncertainty=uncertainty))
 
@@ -300,7 +307,7 @@ def _inside(
     Args:
         env: the environment, with the numbers of this episode.
         before: the simulation before the step.
-        memory: what the parts of `uncertainty` remember in that step.
+        memory: the memories of the parts of `uncertainty` in that step.
         control: the control that the plant receives, shape (m,).
     """
     before = before.replace(regions={}, status={})
@@ -321,7 +328,7 @@ def _inside(
 def within_step(env: Environment, before: Sim, control: Float[Array, " m"], share: Number) -> Sim:
     """Return the simulation after a share of a step.
 
-    All controls are those of the whole step.
+    All controls have the values that they have for the whole step.
 
     Args:
         env: the environment.
@@ -365,7 +372,11 @@ def _add(counts: Counts, facts: Counts) -> Counts:
 
 
 def _unsafe(first: TimeStep) -> Array:
-    """Return which starts are outside the safe set, as far as is known."""
+    """Return which starts are outside the safe set.
+
+    With a filter these are the starts that it does not certify, and otherwise those that violate a
+    constraint.
+    """
     if first.info.rta is not None:
         return ~first.info.rta.certified
     return ~(jnp.min(jnp.stack(list(first.info.margins.values())), axis=0) >= 0.0)
@@ -374,7 +385,7 @@ def _unsafe(first: TimeStep) -> Array:
 def _with_physical_actions(env: Environment) -> Environment:
     """Return the environment with the agent's actions in physical units, one for every step.
 
-    An adversary that acts on every step can do all that one can whose action is held.
+    An adversary that acts on every step can do all that one with held actions can do.
     """
     physical = {"rescale": False, "post_activation": "clip", "discrete": False}
     actuators = tuple(actuator.replace(**physical) for actuator in env.actuators)

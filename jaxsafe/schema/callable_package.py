@@ -10,19 +10,18 @@ from typing import Any
 
 
 def make_callable(package: str, function: str, **names: str) -> None:
-    """Let calls of a package call a function, which is imported with the first one.
+    """Let calls of a package call a function, which is imported at the first call.
 
     Args:
-        package: the name of the package.
-        function: the module of the function, which has the name of the package's last part.
+        package: the dotted name of the package. Its last part is the name of the function.
+        function: the module that defines the function.
         names: further attributes of the package, each with the module that defines it.
     """
 
     class CallablePackage(ModuleType):
+        # With this name `inspect` and `jax.jit` see the arguments of the function.
         @property
-        def __wrapped__(
-            self,
-        ) -> Callable[..., Any]:  # so that `inspect` and `jax.jit` see its arguments
+        def __wrapped__(self) -> Callable[..., Any]:
             return getattr(importlib.import_module(function), package.rpartition(".")[2])
 
         def __call__(self, *arguments: Any, **keywords: Any) -> Any:

@@ -42,9 +42,9 @@ class Unit:
 class Range:
     """The closed or half-open interval in which a number must lie, and the magnitudes it may have.
 
-    The interval says which numbers have a meaning; `nonzero` takes 0 out of it. `smallest` and
+    The interval says which numbers have a meaning, and `nonzero` takes 0 out of it. `smallest` and
     `largest` say which magnitudes, apart from 0, single precision can compute with. A number must
-    be finite. Only a limit may be allowed to be `infinite`, and then infinity means no limit.
+    be finite. Only a limit may be allowed to be `infinite`, and infinity then means no limit.
     """
 
     low: float = -float("inf")
@@ -102,7 +102,7 @@ class Refers:
 
     @property
     def where(self) -> str:
-        """Where the part is listed, in words."""
+        """The section in which the part is listed, as messages write it."""
         return f"`{self.section}`"
 
 
@@ -150,32 +150,35 @@ class Component:
 
     @classmethod
     def prepared(cls, entries: dict[str, Any], place: str) -> dict[str, Any]:
-        """Return the fields for what a user wrote, for instance read from a file that it names.
+        """Return the values of fields that the entries of a user stand for.
+
+        A subclass may, for instance, read them from a file that an entry names.
 
         Args:
-            entries: what stands in a configuration file, by name.
-            place: the place for messages of errors.
+            entries: the entries in a configuration file, by name.
+            place: the place with which error messages begin.
         """
         return entries
 
     def problem(self) -> str | None:
         """Return what is wrong with the fields taken together, or None if nothing is.
 
-        It is called when a user's values enter.
+        It is called when values come from a user.
         """
         return None
 
     def misfits(self, env: Any) -> dict[str, str]:
-        """Return what of the fields does not fit the other parts of an environment.
+        """Return which fields do not fit the other parts of an environment.
 
-        It is called once, when the environment is built and the names that its parts refer to are
-        there. It looks at names, types and shapes, because numbers may be traced.
+        It is called once, when the environment is built and every name that its parts refer to is
+        known to exist. It looks at names, types and shapes only, because numbers may be traced.
 
         Args:
             env: the environment to which the component belongs.
 
         Returns:
-            What is wrong, in words, by the name of the field; `""` stands for the whole component.
+            What is wrong, in words, by the name of the field. The name `""` stands for the whole
+            component.
         """
         return {}
 
@@ -219,9 +222,8 @@ def normalise(value: Any) -> Any:
     Python floats and arrays then compile alike. Intervals and vectors written as tuples become
     arrays too. The dtype is the default float: float32, or float64 in x64.
 
-    Mappings are sorted by name, as every JAX transformation leaves them. What a component computes
-    from a mapping must not depend on the order in which a user wrote it, because the number would
-    be another one under jit.
+    Mappings are sorted by name, because every JAX transformation sorts them. If they kept the order
+    in which a user wrote them, a component could compute another number under jit than without it.
     """
     if isinstance(value, Component):
         changes = {}
@@ -247,7 +249,7 @@ def _as_array(value: Any) -> Any:
 def _refuse_taken(type_name: str, cls: type[Component]) -> None:
     """Refuse a type name that another class of the same kind already has.
 
-    The same class defined again (a notebook's cell) replaces the first.
+    A class that is defined again, as by a notebook's cell, replaces its first definition.
     """
     kinds = [
         base

@@ -1,6 +1,6 @@
-"""Conversion of plain data to components and back, led by the annotations of their fields.
+"""Conversion of plain data to components and back, by the annotations of their fields.
 
-Every fault is one line that names its place.
+Every fault is reported in one line that names its place.
 """
 
 from __future__ import annotations
@@ -37,7 +37,10 @@ from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.schema.user_modules import import_modules
 
 DIRECTORY: ContextVar[Path] = ContextVar("DIRECTORY", default=Path())
-"""The directory at which paths in a configuration begin: that of its file while it is read."""
+"""The directory from which the relative paths in a configuration lead.
+
+While a file is read, this is the directory of the file.
+"""
 
 _SHAPES = {
     None: "a number",
@@ -63,8 +66,8 @@ def to_component(data: Any, base: type[Kind], place: str) -> Kind:
     """
     if isinstance(data, base):
         return normalise(data)
-    known = choices(base)
-    if isinstance(data, str) and known and (":" in data or data in known):
+    options = choices(base)
+    if isinstance(data, str) and options and (":" in data or data in options):
         data = {"type": data}
     if not isinstance(data, Mapping):
         raise _no_mapping(data, base, place)
@@ -83,7 +86,7 @@ def to_component(data: Any, base: type[Kind], place: str) -> Kind:
     values = {
         name: to_value(value, table[name], join(place, name)) for name, value in entries.items()
     }
-    return normalise(cls(**values))  # defaults are numbers of Python
+    return normalise(cls(**values))  # defaults are still Python numbers
 
 
 def to_value(value: Any, field: Field, place: str) -> Any:
@@ -122,9 +125,9 @@ def expects(field: Field) -> str:
     core = bare(field.hint)
     if typing.get_origin(core) is Literal:
         return "one of " + ", ".join(map(str, typing.get_args(core)))
-    words = {str: "a name", int: "a whole number", bool: "true or false", float: "a number"}
+    by_type = {str: "a name", int: "a whole number", bool: "true or false", float: "a number"}
     mapping = is_component(core) or is_mapping(core)
-    expected = words.get(core, "a mapping" if mapping else "a list")
+    expected = by_type.get(core, "a mapping" if mapping else "a list")
     return f"{expected} {field.range}" if field.range else expected
 
 
@@ -150,14 +153,14 @@ def choose_class(entries: dict, base: type[Kind], place: str) -> tuple[type[Kind
 def _no_mapping(data: Any, base: type[Component], place: str) -> ConfigError:
     """Return the error of a part that is no mapping.
 
-    Where names of types alone are enough, because no type has a field without a default, the error
-    tells these names.
+    If the name of a type alone would do, because all fields of all types have defaults, the error
+    lists the names.
     """
     options = choices(base)
-    enough = options and not any(
+    name_suffices = options and not any(
         field.required for option in options.values() for field in fields(option).values()
     )
-    if isinstance(data, str) and enough:
+    if isinstance(data, str) and name_suffices:
         return ConfigError(f"{place}: found {show(data)}; choose from {nearest(data, options)}")
     return ConfigError(
         f"{place or 'environment'}: expected a mapping of fields, found {_show(data)}"
@@ -185,8 +188,8 @@ def _to_structure(value: Any, hint: Any, field: Field, place: str) -> Any:
 
     Args:
         value: the value.
-        hint: the annotation of the value: that of the field, or of an item where the field is a
-            list.
+        hint: the annotation of the value. It is that of the field, or that of an item if the field
+            is a list.
         field: the field, for error messages.
         place: where the value stands.
     """
@@ -212,7 +215,7 @@ def _to_structure(value: Any, hint: Any, field: Field, place: str) -> Any:
     if hint is int and isinstance(value, float) and value.is_integer():
         value = int(value)
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        with contextlib.suppress(OverflowError):  # what no float holds is refused below
+        with contextlib.suppress(OverflowError):  # a number too large for a float is refused below
             value = float(value)
     if not isinstance(value, hint) or (hint in (int, float) and isinstance(value, bool)):
         raise ConfigError(f"{place}: expected {expects(field)}, found {_show(value)}")
@@ -250,9 +253,9 @@ def _to_mapping(value: Any, item_hint: Any, place: str) -> dict[str, Any]:
 
 
 def _to_array(value: Any, field: Field, place: str) -> jax.Array:
-    """Return a number, or several, as an array of the default float.
+    """Return a number or a list of numbers as an array of the default float.
 
-    Of a traced value only the shape is checked.
+    A traced value is checked for its shape only.
     """
     length = field.unit.length if field.unit else None
     wrong = ConfigError(f"{place}: expected {expects(field)}, found {_show(value)}")
@@ -310,7 +313,7 @@ def is_component(hint: Any) -> bool:
 
 
 def is_mapping(hint: Any) -> bool:
-    """Return whether an annotation is `Mapping[…]` or alike."""
+    """Return whether an annotation is `Mapping[…]` or one of its subclasses."""
     origin = typing.get_origin(hint)
     return isinstance(origin, type) and issubclass(origin, Mapping)
 

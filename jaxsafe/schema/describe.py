@@ -1,6 +1,6 @@
 """Short texts of values, and tables of them for `repr` and for notebooks.
 
-What is described may be traced, or be shapes without numbers.
+The values may be traced, or they may be shapes without numbers.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ Rows = Iterable[tuple[str, str]]
 def brief(value: Any) -> str:
     """Return a short text of a value.
 
-    It has the numbers of a small array. Of another array, and of one whose numbers are not known
-    here, it has type and shape.
+    A number or a short vector is shown by its numbers. Any other array is shown by its type and
+    shape, and so is one whose numbers are not known here.
     """
     shape = getattr(value, "shape", None)
     dtype = getattr(value, "dtype", None)
@@ -41,16 +41,16 @@ def brief(value: Any) -> str:
         return _number(value)
     if shape is None or dtype is None:
         return show(value)
-    unknown = f"{dtype}[{','.join(map(str, shape))}]"
+    type_and_shape = f"{dtype}[{','.join(map(str, shape))}]"
     if isinstance(value, Tracer) or len(shape) > 1 or math.prod(shape) > MAX_NUMBERS:
-        return unknown
+        return type_and_shape
     try:
         numbers = np.asarray(value)
-    # The array may be a shape, keys, donated, or on another host.
+    # The value may be a shape or PRNG keys, or its array may be donated or on another host.
     except (RuntimeError, TypeError, ValueError):
-        return unknown
+        return type_and_shape
     if numbers.dtype == object:
-        return unknown
+        return type_and_shape
     if not shape:
         return _number(numbers.item())
     return f"({', '.join(map(_number, numbers.tolist()))})"
@@ -68,17 +68,17 @@ def unbroken(text: str) -> str:
 
 
 def text_table(heading: str, rows: Rows) -> str:
-    """Return a heading and below it a line for each label. Long lines are wrapped."""
+    """Return a heading with a line for each label below it. Long lines are wrapped."""
     rows = list(rows)
     width = max((len(label) for label, _ in rows), default=0)
     lines = [heading]
     for label, text in rows:
-        begin = f"  {label:{width}}  "
+        labelled = f"  {label:{width}}  "
         lines += textwrap.wrap(
             text or "none",
             WIDTH,
-            initial_indent=begin,
-            subsequent_indent=" " * len(begin),
+            initial_indent=labelled,
+            subsequent_indent=" " * len(labelled),
             break_long_words=False,
             break_on_hyphens=False,
         )
@@ -86,7 +86,7 @@ def text_table(heading: str, rows: Rows) -> str:
 
 
 def html_table(heading: str, rows: Rows) -> str:
-    """Return the same as a table in HTML, which notebooks show."""
+    """Return a heading and a table with a row for each label, in HTML for notebooks."""
     left = 'style="text-align: left"'
     lines = []
     for label, text in rows:
@@ -96,14 +96,14 @@ def html_table(heading: str, rows: Rows) -> str:
 
 
 class Described:
-    """Base of what prints itself as a heading and some rows."""
+    """Base of the classes that print themselves as a heading and rows."""
 
     def _heading(self) -> str:
         """Return the first line."""
         return type(self).__name__
 
     def _rows(self) -> Rows:
-        """Return a label and a text for each line below it."""
+        """Return a label and a text for each line below the heading."""
         return ()
 
     def __repr__(self) -> str:

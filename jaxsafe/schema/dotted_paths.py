@@ -1,8 +1,8 @@
 """Dotted paths into components, such as `reward.delta_v.scale` or `deputy.mass`.
 
-A path walks through field names and the names of the parts in a list, for instance
-`deputy.controller.actuators.thrust_x.low`. At the start it may also name a part of the component's
-`shorthand` field, which in an environment is a platform.
+A path consists of the names of fields and of parts in a list, for instance
+`deputy.controller.actuators.thrust_x.low`. It may also begin with the name of a part in the
+component's `shorthand` field. In an environment these parts are the platforms.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def as_given(value: Any, field: Field, place: str) -> Any:
 def get_path(component: Any, path: str) -> Any:
     """Return the value at a dotted path, which must lead somewhere.
 
-    Where the path leads to a list of named parts, their names are returned. `set_path` takes such a
+    If the path leads to a list of named parts, their names are returned. `set_path` takes such a
     list of names.
     """
     value = component
@@ -55,15 +55,15 @@ def set_path(
 ) -> Any:
     """Return the component with the value at one dotted path replaced.
 
-    Where the path leads to a list of named parts, a list of names picks parts in the new order. A
-    text with commas stands for a list where a list is.
+    If the path leads to a list of named parts, a list of names keeps the parts with these names, in
+    this order. A text with commas is read as a list if the field holds or takes a list.
 
     Args:
         component: the component.
         path: the path, which begins at the component.
         value: the new value.
         convert: the function that checks and converts the value.
-        place: what stands before the path in messages of errors.
+        place: what stands before the path in error messages.
 
     Raises:
         ConfigError: the path leads nowhere, or `convert` refuses the value.
@@ -91,12 +91,12 @@ def _set(
     if shorthand and head not in table and head in names:
         return component.replace(**{shorthand: _set_item(parts, path, value, convert, place)})
     if head not in table:
-        known = ", ".join([*table, *names])
         meant = _meant(component, path, [*table, *names], shorthand)
-        # A path to elsewhere is shown whole.
+        # A path that leads into another part is shown whole.
         hint = f". Did you mean {join(place, meant) if '.' in meant else meant!r}?" if meant else ""
         raise ConfigError(
-            f"{join(place, head)}: unknown field {show(head)}; choose from {known}{hint}"
+            f"{join(place, head)}: unknown field {show(head)}; "
+            f"choose from {', '.join([*table, *names])}{hint}"
         )
     field_place = join(place, head)
     content = getattr(component, head)
@@ -125,12 +125,12 @@ def _set(
 
 
 def _by_path(field: Field) -> bool:
-    """Return whether a field is a mapping of which the names are dotted paths, as `randomize`."""
+    """Return whether a field is a mapping whose keys are dotted paths, such as `randomize`."""
     return any(refers.section == "parameters" for refers in _item_references(field.hint))
 
 
 def _set_item(items: tuple, path: list[str], value: Any, convert: Convert, place: str) -> tuple:
-    """Return the items with one value replaced. Its path begins with the name of an item."""
+    """Return the items with one value replaced. The path begins with the name of an item."""
     index = index_of(items, path[0], place)
     item_place = join(place, path[0])
     if len(path) == 1:
@@ -144,9 +144,9 @@ def _set_item(items: tuple, path: list[str], value: Any, convert: Convert, place
 def _meant(
     component: Component, path: Sequence[str], known: Sequence[str], shorthand: str | None
 ) -> str | None:
-    """Return the path that a user probably meant by one that leads nowhere, if there is one.
+    """Return the path that a user probably meant by one that leads nowhere, or None.
 
-    It ends as the given path does, or in a name that is abbreviated by it or spelt alike.
+    It ends like the given path, or in a name that the given path abbreviates or misspells.
 
     Args:
         component: the component at which the path begins.
@@ -168,14 +168,14 @@ def _meant(
 
 
 def _paths(component: Component, shorthand: str | None = None) -> Iterator[str]:
-    """Yield the path of every field of a component and of what is in it."""
+    """Yield the path of every field of a component and of the components inside it."""
     for name in fields(type(component)):
         value = getattr(component, name)
         yield name
         if isinstance(value, Component):
             yield from (join(name, path) for path in _paths(value))
         if isinstance(value, Mapping):
-            # A name with a dot, as `randomize` has, can be no part of a path.
+            # A key with a dot, as `randomize` has, cannot be one name of a path.
             yield from (join(name, str(key)) for key in value if "." not in str(key))
         for index, part in enumerate(value if isinstance(value, tuple) else ()):
             if isinstance(part, Component):
@@ -185,7 +185,7 @@ def _paths(component: Component, shorthand: str | None = None) -> Iterator[str]:
 
 
 def _abbreviates(short: str, name: str) -> bool:
-    """Return whether a text stands for a name, as `lr` and `learn` do for `learning_rate`."""
+    """Return whether a text abbreviates a name, as `lr` and `learn` do `learning_rate`."""
     if len(short) > 2 and name.startswith(short):
         return True
     pieces = short.split("_") if "_" in short else [*short]
@@ -194,7 +194,9 @@ def _abbreviates(short: str, name: str) -> bool:
 
 
 def as_list(value: Any, content: Any, field: Field, place: str) -> Any:
-    """Return the list for which a text with commas stands where a list is or may be.
+    """Return the list that a text with commas stands for, and any other value unchanged.
+
+    Such a text stands for a list only if the field holds a list or takes one.
 
     Args:
         value: the value for a field.
@@ -224,7 +226,7 @@ def _pick(items: tuple, names: Sequence[str], place: str) -> tuple:
 
 
 def index_of(items: tuple, name: str, place: str) -> int:
-    """Return the index of the item with a name, or of the item that the name counts.
+    """Return the index of the item with a name. The name of a nameless item is its index.
 
     Raises:
         ConfigError: there is no such item.
@@ -269,8 +271,8 @@ def _marked_items(hint: Any, value: Any) -> list[tuple[Refers, Any]]:
 def _item_references(hint: Any) -> list[Refers]:
     """Return what the items of a tuple or the keys of a mapping refer to.
 
-    They are those of an annotation `tuple[Annotated[str, Refers(…)], …]` or
-    `Mapping[Annotated[str, Refers(…)], …]`.
+    The annotation is `tuple[Annotated[str, Refers(…)], …]` or
+    `Mapping[Annotated[str, Refers(…)], …]`. For any other there is nothing to return.
     """
     item = next(iter(typing.get_args(hint)), None)
     marks = typing.get_args(item)[1:] if typing.get_origin(item) is Annotated else ()

@@ -37,7 +37,7 @@ class ConfigWarning(UserWarning):
 def show(value: object, most: int = 60) -> str:
     """Return what `repr` returns, in one line and cut to `most` letters.
 
-    A value may be very large, so nothing of it is looked at beyond those letters.
+    A value may be very large, so no more of it is read than these letters need.
     """
     text = ""
     for piece in _pieces(value, most):
@@ -83,7 +83,10 @@ def nearest(found: object, allowed: Iterable[object]) -> str:
 
 @contextmanager
 def part(*path: str) -> Iterator[None]:
-    """Add a note to an error: the part of an environment it comes from. Runs only while tracing."""
+    """Add a note to every error inside that names the part of an environment it comes from.
+
+    A compiled program does not contain it, because it runs only while the program is traced.
+    """
     try:
         yield
     except Exception as error:
@@ -92,7 +95,7 @@ def part(*path: str) -> Iterator[None]:
 
 
 def summarise_error(error: BaseException, modules: Collection[str] = ()) -> str:
-    """Return kind and first line of an error, and where in the user's own code it arose.
+    """Return type and first line of an error, and where in the user's own code it arose.
 
     Args:
         error: the error as it was caught.

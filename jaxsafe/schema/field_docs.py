@@ -1,6 +1,6 @@
 """The texts that explain a component and its fields.
 
-That of a field is the string below it in the source of its class, which Sphinx shows too.
+The text of a field is the string below it in the source of its class, which Sphinx shows too.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ def summary(cls: type[Component]) -> str:
 
 @functools.cache
 def field_docs(cls: type[Component]) -> dict[str, str]:
-    """Return the explanation of each field that has one, by name, also of inherited fields.
+    """Return the text of each field that has one, by name, also of inherited fields.
 
-    Where Python cannot find the source of a class, the fields of that class have none.
+    If Python cannot find the source of a class, the fields of that class have no texts.
     """
     inherited = [field_docs(base) for base in cls.__bases__ if issubclass(base, Component)]
     docs = {name: text for texts in inherited for name, text in texts.items()}

@@ -33,9 +33,9 @@ def json_schema(cls: type[Component]) -> Schema:
 
 
 def options_schema(cls: type[Component]) -> Schema:
-    """Return the schema of options: a part of the fields of a component, nested or by dotted path.
+    """Return the schema of options: some fields of a component, nested or by dotted path.
 
-    Of parts that are chosen by their type nothing is checked.
+    A part that is chosen by its type is not checked.
     """
     docs = field_docs(cls)
     properties = {}
@@ -87,7 +87,7 @@ def _value(hint: Any, entry: Field, definitions: dict[str, Schema]) -> Schema:
     Args:
         hint: the annotation of the value.
         entry: the field.
-        definitions: the schemas of components so far, by name. New ones are added.
+        definitions: the schemas of components so far, by name. New ones are added to it.
     """
     core = bare(hint)
     if entry.unit:
@@ -143,7 +143,7 @@ def _reference(base: type[Component], definitions: dict[str, Schema]) -> Schema:
     name = f"{_name(base)}_types"
     if name not in definitions:
         definitions[name] = {}  # a type may have parts of the same kind
-        enough = [
+        name_suffices = [
             kind
             for kind, option in options.items()
             if not any(entry.required for entry in fields(option).values())
@@ -153,7 +153,9 @@ def _reference(base: type[Component], definitions: dict[str, Schema]) -> Schema:
             "required": ["type"],
             "properties": {"type": {"anyOf": [*map(_constant, options.values()), USER_TYPE]}},
             "if": {"type": "string"},
-            "then": {"anyOf": [{"enum": enough}, USER_TYPE] if enough else [USER_TYPE]},
+            "then": {
+                "anyOf": [{"enum": name_suffices}, USER_TYPE] if name_suffices else [USER_TYPE]
+            },
             "allOf": [
                 {
                     "if": {
@@ -170,7 +172,7 @@ def _reference(base: type[Component], definitions: dict[str, Schema]) -> Schema:
 
 
 def _constant(cls: type[Component]) -> Schema:
-    """Return the schema of the name of a type, with its first paragraph."""
+    """Return the schema of the name of a type, described by the type's first paragraph."""
     return {"const": cls.type_name, "description": summary(cls)}
 
 
@@ -188,7 +190,7 @@ def _name(cls: type[Component]) -> str:
 
 
 def _is_json(value: Any) -> bool:
-    """Return whether JSON has a word for a value: it has none for infinity."""
+    """Return whether JSON can express a value. It has no word for infinity and NaN."""
     if isinstance(value, dict):
         return all(map(_is_json, value.values()))
     if isinstance(value, list):

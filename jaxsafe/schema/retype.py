@@ -11,30 +11,32 @@ from jaxsafe.schema.convert import bare, choose_class, is_component, to_componen
 from jaxsafe.schema.dotted_paths import are_names, as_list, index_of, join, set_path
 
 TYPE = "type"
-"""What a path ends in that leads to the type of a part."""
+"""Last name of a path that leads to the type of a part."""
 
 
 def set_paths(component: Kind, changes: Mapping[str, Any], place: str = "") -> Kind:
     """Return the component with the values at some dotted paths replaced.
 
-    A path that ends in `.type` changes the type of a part. A whole part that is given comes before
-    its type, and the type before the part's other fields, whatever their order is.
+    A path that ends in `.type` changes the type of a part. Changes may stand in any order: a
+    whole part is set before its type, and the type before the part's other fields.
 
     Args:
         component: the component.
         changes: new values by dotted path, which are checked and converted.
-        place: what stands before the paths in messages of errors.
+        place: what stands before the paths in error messages.
 
     Raises:
         ConfigError: a path leads nowhere, a value is wrong, or a part cannot have a type.
     """
     parents = [path.removesuffix(TYPE) for path in changes if path.endswith(f".{TYPE}")]
-    whole = [path for path in changes if any(parent.startswith(f"{path}.") for parent in parents)]
-    for path in whole:
+    whole_parts = [
+        path for path in changes if any(parent.startswith(f"{path}.") for parent in parents)
+    ]
+    for path in whole_parts:
         component = set_path(component, path, changes[path], to_value, place)
-    left = {path: value for path, value in changes.items() if path not in whole}
-    component, left = _change_types(component, left, place)
-    for path, value in left.items():
+    remaining = {path: value for path, value in changes.items() if path not in whole_parts}
+    component, remaining = _change_types(component, remaining, place)
+    for path, value in remaining.items():
         component = set_path(component, path, value, to_value, place)
     return component
 
@@ -42,45 +44,44 @@ def set_paths(component: Kind, changes: Mapping[str, Any], place: str = "") -> K
 def _change_types(
     component: Kind, changes: Mapping[str, Any], place: str
 ) -> tuple[Kind, dict[str, Any]]:
-    """Return a component whose parts have the types of some changes, and the changes that are left.
+    """Apply the changes of types. Return the component, and the changes that remain.
 
-    A part of another type keeps the fields that both types have. The changes must give it the
-    fields that it needs besides. Their order does not matter.
+    A part with a new type keeps the fields that both types have. The changes must give the other
+    fields that the new type requires. Their order does not matter.
 
     Args:
         component: the component.
         changes: new values by dotted path. Paths to types end in `.type`.
-        place: what stands before the paths in messages of errors.
-
+        place: what stands before the paths in error messages.
     """
-    left = dict(changes)
+    remaining = dict(changes)
     typed = [path for path in changes if path.endswith(f".{TYPE}")]
     for path in sorted(typed, key=lambda path: path.count(".")):
         names = _names(component, path)[:-1]
-        standing = _standing(component, names)
-        if standing is None:
+        part_and_base = _part_and_base(component, names)
+        if part_and_base is None:
             continue
-        part, base = standing
-        kind = left.pop(path)
-        here = join(place, path.removesuffix(f".{TYPE}"))
-        new_fields = fields(choose_class({TYPE: kind}, base, here)[0])
+        part, base = part_and_base
+        kind = remaining.pop(path)
+        part_place = join(place, path.removesuffix(f".{TYPE}"))
+        new_fields = fields(choose_class({TYPE: kind}, base, part_place)[0])
         old_fields = {} if part is None else fields(type(part))
         entries = {name: getattr(part, name) for name in old_fields if name in new_fields}
-        for other in [other for other in left if _names(component, other)[:-1] == names]:
+        for other in [other for other in remaining if _names(component, other)[:-1] == names]:
             name = other.rpartition(".")[2]
             field = new_fields.get(name)
-            if field is None or are_names(entries.get(name), left[other]):
+            if field is None or are_names(entries.get(name), remaining[other]):
                 continue
             if field.required or name in entries:
-                value = as_list(left.pop(other), entries.get(name), field, join(place, other))
+                value = as_list(remaining.pop(other), entries.get(name), field, join(place, other))
                 entries[name] = value
-        changed = normalise(to_component({TYPE: kind, **entries}, base, here))
+        changed = normalise(to_component({TYPE: kind, **entries}, base, part_place))
         component = _put(component, names, changed)
-    return component, left
+    return component, remaining
 
 
 def _names(component: Component, path: Any) -> list[str]:
-    """Return the names of a path, which begins with a field of the component."""
+    """Return the names of a path, with the component's `shorthand` field where it is left out."""
     names = str(path).split(".")
     shorthand = component.shorthand
     if shorthand and names[0] not in fields(type(component)):
@@ -88,12 +89,12 @@ def _names(component: Component, path: Any) -> list[str]:
     return names
 
 
-def _standing(
+def _part_and_base(
     component: Component, names: Sequence[str]
 ) -> tuple[Component | None, type[Component]] | None:
-    """Return the part at a path and the base of what may stand there.
+    """Return the part at a path, and the base class of the parts that may stand there.
 
-    None is returned where the path leads nowhere, or where parts have no types.
+    None is returned if the path leads nowhere, or if the parts there have no types.
     """
     value: Any = component
     base: Any = None
@@ -114,7 +115,7 @@ def _standing(
 
 
 def _put(component: Any, names: Sequence[str], part: Component) -> Any:
-    """Return the component, or the list of parts, with another part at a path that leads to one."""
+    """Return the component, or the list of parts, with the part at a path replaced."""
     if not names:
         return part
     name, *rest = names

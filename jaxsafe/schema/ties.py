@@ -18,7 +18,7 @@ from jaxsafe.schema.errors import ConfigError
 
 
 class Tie(Component):
-    """What a number follows: it is `times` the number at the dotted path `to`."""
+    """The rule of a number that follows another: it is `times` the number at the path `to`."""
 
     to: str
     times: Annotated[float, Range(nonzero=True)] = 1.0
@@ -30,35 +30,35 @@ class Tie(Component):
 
 
 Ties = Mapping[str, Tie]
-"""What each number follows, by its dotted path."""
+"""The rule of each number that follows another, by its dotted path."""
 
 
 def in_order(ties: Ties) -> list[str]:
-    """Return the paths of the numbers that follow others, each behind the one that it follows.
+    """Return the paths of the numbers that follow others, each after the one that it follows.
 
     Raises:
         ConfigError: numbers follow one another in a circle.
     """
     ordered: list[str] = []
-    left = list(ties)
-    while left:
-        ready = [path for path in left if ties[path].to not in left]
+    remaining = list(ties)
+    while remaining:
+        ready = [path for path in remaining if ties[path].to not in remaining]
         if not ready:
             raise ConfigError(
-                f"tied: {', '.join(left)}: they follow one another in a circle; take one out"
+                f"tied: {', '.join(remaining)}: they follow one another in a circle; take one out"
             )
         ordered += ready
-        left = [path for path in left if path not in ready]
+        remaining = [path for path in remaining if path not in ready]
     return ordered
 
 
 def follow(component: Kind, ties: Ties, moved: Iterable[str], convert: Convert = as_given) -> Kind:
-    """Return the component with the numbers that follow others moved after them.
+    """Return the component with every number updated that follows a changed number.
 
     Args:
-        component: the component, in which some numbers have moved.
-        ties: what follows what.
-        moved: the paths of the numbers that have moved.
+        component: the component, in which some numbers have changed.
+        ties: the rules of the numbers that follow others.
+        moved: the paths of the numbers that have changed.
         convert: the function that checks the new numbers.
 
     Raises:
@@ -73,7 +73,7 @@ def follow(component: Kind, ties: Ties, moved: Iterable[str], convert: Convert =
 
 
 def follow_one(component: Kind, path: str, tie: Tie, convert: Convert = as_given) -> Kind:
-    """Return the component with one number set to what it follows.
+    """Return the component with one number set to what its tie asks for.
 
     Raises:
         ConfigError: `convert` refuses the number.
@@ -92,5 +92,5 @@ def target(component: Component, tie: Tie) -> Any:
 
 
 def plain_paths(component: Component, paths: Iterable[str]) -> list[str]:
-    """Return paths without the field that may be left out at their beginning."""
+    """Return the paths without a leading `shorthand` field of the component."""
     return [path.removeprefix(f"{component.shorthand}.") for path in paths]

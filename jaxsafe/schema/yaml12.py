@@ -22,7 +22,7 @@ from yaml.constructor import ConstructorError
 from jaxsafe.schema.errors import ConfigError, show
 
 MAX_LETTERS = 2**20
-"""The longest text that is read. PyYAML takes about ten seconds to read as much.
+"""The longest text that is read. PyYAML takes about ten seconds for a text of this length.
 
 The text of an environment has some 10,000 letters.
 """
@@ -138,7 +138,7 @@ def _construct_scalar(loader: _Loader, node: yaml.Node) -> Any:
 
 
 def _construct_text(loader: _Loader, node: yaml.ScalarNode) -> str:
-    """Read a text and refuse control characters and half characters.
+    """Read a text. Refuse control characters and surrogates, which are halves of characters.
 
     An escape can write such characters, but no file name or terminal takes them.
     """

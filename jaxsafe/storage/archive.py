@@ -1,4 +1,4 @@
-"""Arrays in .npz files that come from strangers.
+"""Arrays in .npz files that may come from strangers.
 
 No array is read before its name, type and size are known, and nothing in the file is run.
 """
@@ -20,7 +20,7 @@ from jaxsafe.schema.errors import ConfigError
 MAX_ARRAY_BYTES = 2**28
 """The largest size of an array: 256 MiB, or 67 million weights.
 
-There is a limit because a few compressed bytes can claim to be terabytes.
+There is a limit because a few compressed bytes can stand for terabytes.
 """
 
 _HEADER_READERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -53,7 +53,7 @@ class Archive:
                 raise ValueError(f"{name} is no array of at most {MAX_ARRAY_BYTES} bytes")
             content = member.read(size)
             if len(content) != size or member.read(1):  # reading to the end compares the checksum
-                raise ValueError(f"{name} has not the size that it claims")
+                raise ValueError(f"{name} does not have the size that it claims")
         return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran_order else "C")
 
 

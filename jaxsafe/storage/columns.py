@@ -1,4 +1,4 @@
-"""Rows of a log as columns, for whoever reads them in Python."""
+"""Rows of a log as columns, for reading them in Python."""
 
 from __future__ import annotations
 

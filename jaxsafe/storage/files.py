@@ -42,7 +42,7 @@ def write_json(path: Path, value: Any) -> None:
 
 @contextlib.contextmanager
 def _naming_file(path: Path) -> Iterator[None]:
-    """Add the name of the file to an error of writing, which lacks it."""
+    """Add the name of the file to an error that is raised while it is written."""
     try:
         yield
     except OSError as error:
@@ -102,7 +102,7 @@ def read_rows(path: Path, form: Any = ANYTHING) -> list[dict[str, Any]]:
     A last line that a kill cut short is not a row.
 
     Raises:
-        ConfigError: another line is broken, or a row has not this form.
+        ConfigError: another line is broken, or a row does not have this form.
     """
     if not path.exists():
         return []
@@ -135,7 +135,7 @@ def keep_rows(
         form: the form of a row.
 
     Raises:
-        ConfigError: a line is broken, or a row has not this form; see `read_rows`.
+        ConfigError: a line is broken, or a row does not have this form; see `read_rows`.
     """
     rows = [row for row in read_rows(path, form) if keep(row)]
     if path.exists():
@@ -144,7 +144,7 @@ def keep_rows(
 
 
 def sync(path: Path) -> None:
-    """Wait until the disk has what was written to a file."""
+    """Wait until everything that was written to a file is on the disk."""
     with open(path, "ab") as file:
         os.fsync(file.fileno())
 
@@ -167,7 +167,7 @@ def read_csv(path: Path, form: Any = ANYTHING) -> list[dict[str, Any]]:
     A text that is a number becomes a number, and an empty one becomes None.
 
     Raises:
-        ConfigError: the file cannot be read, or a row has not this form.
+        ConfigError: the file cannot be read, or a row does not have this form.
     """
     try:
         text = path.read_text(encoding="utf-8")

@@ -3,8 +3,8 @@
 A damaged or edited file is refused with one line before it is used.
 
 A form is a `Kind` (the form of one value), a list `[form]`, or a mapping from names to forms. A
-mapping lists the keys that must be there. `OTHERS: form` gives the form of all further keys, and
-without it they are not looked at.
+mapping lists the keys that must be there. `OTHERS: form` gives the form of all further keys, which
+are not checked without it.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 from jaxsafe.schema.errors import ConfigError, show
 
 OTHERS = ...
-"""Key that stands in a mapping for every key that the mapping does not name."""
+"""The key that stands for every key that a mapping does not name."""
 
 MAX_DEPTH = 24
-"""How many lists and mappings inside each other a file may have. Ours need less than half."""
+"""How many lists and mappings may stand inside each other. jaxsafe's files need less than half."""
 
 INTEGER_LIMIT = 2**63
 """Whole numbers in a file must be smaller, because larger ones fit into no array."""
@@ -76,7 +76,8 @@ def check(value: Any, form: Any, place: str) -> None:
     """Check that a value has a form.
 
     Raises:
-        ConfigError: it has not. The message names the place, what was found and what is expected.
+        ConfigError: the value does not have it. The message names the place, what was found and
+            what is expected.
     """
     problem = _find_problem(value, form)
     if problem is not None:

@@ -55,17 +55,17 @@ def processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
         properties[name.strip()] = value.strip()
     if "model name" not in properties:
         return platform.processor()
-    words = [properties["model name"]]
+    parts = [properties["model name"]]
     for name, label in (("cpu family", "family"), ("model", "model")):
         if name in properties:
-            words.append(f"{label} {properties[name]}")
-    return ", ".join(words)
+            parts.append(f"{label} {properties[name]}")
+    return ", ".join(parts)
 
 
 def commit() -> str | None:
     """Return the commit of the checkout this runs in, or None outside one.
 
-    The commit is marked if code or recipes differ from it. Policy files may differ.
+    The commit is marked if code or recipes differ from it. A change of policy files does not count.
     """
     git = shutil.which("git")
     if git is None:
@@ -74,7 +74,7 @@ def commit() -> str | None:
     in_package = [git, "-C", str(package)]
     is_tracked = [*in_package, "ls-files", "--error-unmatch", "types.py"]
     if subprocess.run(is_tracked, capture_output=True, check=False).returncode:
-        return None  # installed somewhere inside another repository
+        return None  # the package is installed somewhere inside another repository
 
     def output(*words: str) -> str:
         command = [*in_package, *words]
