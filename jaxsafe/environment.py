@@ -401,19 +401,21 @@ def reset_to(
         ConfigError: a platform, field or parameter is unknown, or a random one is missing or has
             another shape, or the key is missing.
     """
-    arguments = {"platforms": start, "parameters": {} if parameters is None else parameters}
-    for label, argument in arguments.items():
+    parameters = {} if parameters is None else parameters
+    for label, argument in {"platforms": start, "parameters": parameters}.items():
         if not isinstance(argument, Mapping):
             raise ConfigError(f"reset_to: expected {label} by name, found {show(argument)}")
-    parameters = _chosen_parameters(env, parameters or {})
+    parameters = _chosen_parameters(env, parameters)
     env = drawn(env, parameters)
-    names = {platform.name: platform for platform in env.platforms}
+    names = [platform.name for platform in env.platforms]
     for name in start:
         if name not in names:
             raise ConfigError(
                 f"reset_to: unknown platform {show(name)}; choose from {nearest(name, names)}"
             )
-    platforms = {name: platform.place(start.get(name, {})) for name, platform in names.items()}
+    platforms = {
+        platform.name: platform.place(start.get(platform.name, {})) for platform in env.platforms
+    }
     sim = empty_sim(env).replace(platforms=platforms)
     random = random_parts(env)
     if random and key is None:

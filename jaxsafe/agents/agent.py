@@ -326,9 +326,14 @@ class Agent(Component):
             return self._apply(name, env, params, inputs)
         if sequences is None:
             raise ConfigError(f"agent: {name} remembers, and so it needs sequences of steps")
-        step = partial(self._apply, name, env, params)
-        memory, done = sequences.memory[name], sequences.done
-        return unroll(step, memory, network.memory(), inputs, done)[1]
+        _, outputs = unroll(
+            partial(self._apply, name, env, params),
+            memory=sequences.memory[name],
+            first_memory=network.memory(),
+            inputs=inputs,
+            done=sequences.done,
+        )
+        return outputs
 
 
 def check_agent(agent: Agent, env: Environment, place: str = "agent") -> None:

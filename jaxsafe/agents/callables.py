@@ -80,9 +80,9 @@ def read_callable(run: str, env: Environment) -> ForeignPolicy:
     Raises:
         ConfigError: there is no such controller or function, or it does not fit the environment.
     """
-    found = find_law(run, env) if run.startswith(CONTROLLER) else _from_module(run)
-    function = found.policy(env) if isinstance(found, ControlLaw) else found
-    if isinstance(found, ControlLaw):
+    function = find_law(run, env) if run.startswith(CONTROLLER) else _from_module(run)
+    if isinstance(function, ControlLaw):
+        function = function.policy(env)
         # Tracing reports a missing observation before anything is compiled.
         observation = jax.ShapeDtypeStruct((env.observation_size,), env.dt.dtype)
         jax.eval_shape(function, jax.random.key(0), observation)

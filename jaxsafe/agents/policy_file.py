@@ -187,9 +187,10 @@ def find_policy(policy: str | os.PathLike) -> Path:
     Raises:
         ConfigError: there is no such policy.
     """
-    path, known = Path(policy), {file.stem: file for file in sorted(_PRETRAINED.glob("*.npz"))}
+    path = Path(policy)
     if path.suffix == ".npz":
         return path
+    known = {file.stem: file for file in sorted(_PRETRAINED.glob("*.npz"))}
     if not known:
         raise ConfigError(
             f"policy: no policies in {_PRETRAINED}; install the package unpacked, as pip does"

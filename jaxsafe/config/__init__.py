@@ -110,7 +110,7 @@ def load_recipes(path: str | os.PathLike) -> dict[str, dict[str, Any]]:
 
     data = yaml12.read(path)
     alone = isinstance(data, Mapping) and not {"platforms", "recipe", "recipes"} & set(data)
-    recipes = data if alone else data.get("recipes", {}) if isinstance(data, Mapping) else data
+    recipes = data.get("recipes", {}) if isinstance(data, Mapping) and not alone else data
     if not isinstance(recipes, Mapping) or not all(
         options is None or isinstance(options, Mapping) for options in recipes.values()
     ):

@@ -313,8 +313,9 @@ def given_up(env: Environment, kinds: Mapping[str, Episode]) -> dict[str, Any]:
 def metrics_per_seed(env: Environment, episodes: Episode) -> dict[str, list[float | None]]:
     """Return every metric of Section 5 for each seed, from sums of shape [seeds, episodes]."""
     num_seeds = np.asarray(episodes.outcome).shape[0]
-    of_seeds = [jax.tree.map(lambda x, i=i: x[i], episodes) for i in range(num_seeds)]
-    metrics = [metrics_in(env, of_seed) for of_seed in of_seeds]
+    metrics = [
+        metrics_in(env, jax.tree.map(lambda x, i=i: x[i], episodes)) for i in range(num_seeds)
+    ]
     return {name: [of_seed[name] for of_seed in metrics] for name in METRICS}
 
 
@@ -322,8 +323,11 @@ def _step_row(env: Environment, state: Any, timestep: Any, t: int) -> dict[str, 
     """Return step t of an episode as a row for a log."""
     info = timestep.info
     rta = {} if info.rta is None else {"intervening": info.intervening, **vars(info.rta)}
-    pick = lambda tree: {name: _plain(value[t]) for name, value in tree.items()}  # noqa: E731
     sim = state.sim
+
+    def pick(arrays: Mapping[str, Any]) -> dict[str, Any]:
+        return {name: _plain(array[t]) for name, array in arrays.items()}
+
     return {
         "t": _plain(sim.time[t]),
         "platforms": {name: pick(vars(platform)) for name, platform in sim.platforms.items()},

@@ -80,9 +80,9 @@ def _change_types(
     return component, remaining
 
 
-def _names(component: Component, path: Any) -> list[str]:
+def _names(component: Component, path: str) -> list[str]:
     """Return the names of a path, with the component's `shorthand` field where it is left out."""
-    names = str(path).split(".")
+    names = path.split(".")
     shorthand = component.shorthand
     if shorthand and names[0] not in fields(type(component)):
         return [shorthand, *names]
