@@ -56,7 +56,7 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
         model = onnx.load(path)
         onnx.checker.check_model(model)
         nodes = [_node(path, node) for node in model.graph.node]
-        weights = {array.name: numpy_helper.to_array(array) for array in model.graph.initializer}
+        initializers = {item.name: numpy_helper.to_array(item) for item in model.graph.initializer}
         constants = {
             outputs[0]: _constant(path, attributes)
             for kind, _, outputs, attributes in nodes
@@ -75,7 +75,7 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
             raise ConfigError(
                 f"{path}: opset: expected {MIN_OPSET} to {newest}, found {opset.version}"
             )
-    inputs = [declared for declared in graph.input if declared.name not in weights]
+    inputs = [declared for declared in graph.input if declared.name not in initializers]
     if len(inputs) != 1 or len(graph.output) != 1:
         raise ConfigError(
             f"{path}: expected one input and one output, "
@@ -91,19 +91,14 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
     sizes = [axis.dim_value for axis in declared.type.tensor_type.shape.dim]
     if len(nodes) > MAX_NODES:
         raise ConfigError(f"{path}: expected at most {MAX_NODES:,} operators, found {len(nodes):,}")
-    for name, value in {**weights, **constants}.items():
-        if value.dtype.kind not in "iub" and not jnp.issubdtype(value.dtype, jnp.floating):
-            raise ConfigError(f"{path}: {name}: expected real numbers, found {value.dtype}")
+    arrays = {**initializers, **constants}
+    for name, array in arrays.items():
+        if array.dtype.kind not in "iub" and not jnp.issubdtype(array.dtype, jnp.floating):
+            raise ConfigError(f"{path}: {name}: expected real numbers, found {array.dtype}")
     # Integers give shapes and axes, so they must be known while tracing. The other arrays are the
     # weights.
-    whole = {
-        name: value for name, value in {**weights, **constants}.items() if value.dtype.kind in "iu"
-    }
-    floats = {
-        name: value
-        for name, value in {**weights, **constants}.items()
-        if value.dtype.kind not in "iu"
-    }
+    integers = {name: array for name, array in arrays.items() if array.dtype.kind in "iu"}
+    weights = {name: array for name, array in arrays.items() if name not in integers}
 
     def network(weights: Mapping[str, Array], observation: Array) -> Array:
         if any(size > 1 for size in sizes[:-1]) or (
@@ -111,7 +106,7 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
         ):
             raise TypeError(f"its input is declared as {sizes}")
         values: dict[str, Any] = {
-            **whole,
+            **integers,
             **weights,
             declared.name: observation.reshape((1,) * (len(sizes) - 1) + (-1,)),
         }
@@ -129,7 +124,7 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
             values |= dict(zip(outputs, results, strict=True))
         return values[graph.output[0].name].ravel()
 
-    return network, floats
+    return network, weights
 
 
 def _node(path: Path, node: Any) -> tuple[str, list[str], list[str], dict[str, Any]]:
