@@ -760,13 +760,9 @@ def _diverged(env: Environment, sim: Sim) -> Bool[Array, ""]:
     ]
     numbers = [*positions, *filter(_is_float, jax.tree.leaves(sim.platforms[env.agent]))]
     finite = jnp.isfinite(jnp.concatenate([jnp.ravel(number) for number in numbers]))
-    judged = [sim.status[name] for name in _judging_statuses(env)]
-    return ~jnp.all(finite) | _any(jnp.isnan(value) for value in judged if _is_float(value))
-
-
-def _judging_statuses(env: Environment) -> list[str]:
-    """Return the names of the statuses to which terminal conditions and constraints refer."""
-    return list(dict.fromkeys(status_names((*env.terminal, *env.constraints))))
+    judging = dict.fromkeys(status_names((*env.terminal, *env.constraints)))
+    values = [sim.status[name] for name in judging]
+    return ~jnp.all(finite) | _any(jnp.isnan(value) for value in values if _is_float(value))
 
 
 def _is_float(value: Array) -> bool:
