@@ -103,22 +103,21 @@ def _set(
     if not rest:
         value = as_list(value, content, table[head], field_place)
         if are_names(content, value):
-            return component.replace(**{head: _pick(content, value, field_place)})
+            picked = tuple(content[index_of(content, name, field_place)] for name in value)
+            return component.replace(**{head: picked})
         return component.replace(**{head: convert(value, table[head], field_place)})
     if isinstance(content, Component):
         return component.replace(**{head: _set(content, rest, value, convert, field_place)})
     if isinstance(content, tuple):
         return component.replace(**{head: _set_item(content, rest, value, convert, field_place)})
-    if isinstance(content, Mapping) and _by_path(table[head]):
-        entries = {**content, ".".join(rest): value}
-        return component.replace(**{head: convert(entries, table[head], field_place)})
-    if isinstance(content, Mapping) and len(rest) == 1:
-        if rest[0] not in content:
+    by_path = isinstance(content, Mapping) and _by_path(table[head])
+    if by_path or (isinstance(content, Mapping) and len(rest) == 1):
+        key = ".".join(rest)
+        if not by_path and key not in content:
             raise ConfigError(
-                f"{field_place}: unknown name {show(rest[0])}; "
-                f"choose from {nearest(rest[0], content)}"
+                f"{field_place}: unknown name {show(key)}; choose from {nearest(key, content)}"
             )
-        entries = {**content, rest[0]: value}
+        entries = {**content, key: value}
         return component.replace(**{head: convert(entries, table[head], field_place)})
     reason = " because it is not set" if content is None else ""
     raise ConfigError(f"{join(field_place, rest[0])}: {field_place} has no fields{reason}")
@@ -219,10 +218,6 @@ def are_names(content: Any, value: Any) -> bool:
     )
     listed = isinstance(value, (list, tuple)) and value
     return bool(named and listed and all(isinstance(name, str) for name in value))
-
-
-def _pick(items: tuple, names: Sequence[str], place: str) -> tuple:
-    return tuple(items[index_of(items, name, place)] for name in names)
 
 
 def index_of(items: tuple, name: str, place: str) -> int:
