@@ -80,10 +80,7 @@ def load_filter(path: str | os.PathLike) -> RTA:
     """
     from jaxsafe.schema import yaml12
 
-    data = yaml12.read(path)
-    if isinstance(data, dict) and "imports" in data:
-        data = dict(data)
-        import_modules(data.pop("imports"), f"{path}: rta")
+    data = _imported(yaml12.read(path), f"{path}: rta")
     if not isinstance(data, dict) or "platforms" not in data:
         return to_component(data, RTA, f"{path}: rta")
     data = _without_recipes(data)
@@ -178,7 +175,12 @@ def from_data(data: Any, place: str) -> Environment:
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.
     """
-    if isinstance(data, dict) and "imports" in data:
-        data = dict(data)
-        import_modules(data.pop("imports"), place)
-    return build(to_component(data, Environment, place))
+    return build(to_component(_imported(data, place), Environment, place))
+
+
+def _imported(data: Any, place: str) -> Any:
+    """Import the modules that `imports` lists, and return the data without this entry."""
+    if not isinstance(data, dict) or "imports" not in data:
+        return data
+    import_modules(data["imports"], place)
+    return {name: value for name, value in data.items() if name != "imports"}
