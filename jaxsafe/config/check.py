@@ -102,38 +102,43 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
 
 
 def _check_problems(env: Environment) -> None:
+    """Check each component by its own `problem`.
+
+    A part with traced numbers is passed over, because they cannot be judged.
+    """
+    filters = [(env.rta, "rta")] if env.rta else []
+    for part, place in (*_parts(env), *filters):
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(part)):
+            continue
+        for component, component_place in _with_inner(part, place):
+            try:
+                # Inside a trace, comparisons of constants would be traced too.
+                with jax.ensure_compile_time_eval():
+                    problem = component.problem()
+            except ConfigError:
+                raise
+            except Exception as error:
+                reason = summarise_error(error, modules(component))
+                raise ConfigError(f"{component_place}: cannot be checked: {reason}") from error
+            if problem:
+                raise ConfigError(f"{component_place}: {problem}")
+
+
+def _parts(env: Environment) -> Iterator[tuple[Component, str]]:
+    """Yield every part of every section, with its place."""
     for section in _SECTIONS:
         for part in getattr(env, section):
-            for place, problem in _problems(part, f"{section}.{part.name}"):
-                raise ConfigError(f"{place}: {problem}")
-    for place, problem in _problems(env.rta, "rta") if env.rta else ():
-        raise ConfigError(f"{place}: {problem}")
+            yield part, f"{section}.{part.name}"
 
 
-def _problems(component: Component, place: str) -> Iterator[tuple[str, str]]:
-    """Yield the place and the problem of each component, this one or inside it, that has a problem.
-
-    A component with traced numbers is passed over, because they cannot be judged.
-    """
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(component)):
-        return
+def _with_inner(component: Component, place: str) -> Iterator[tuple[Component, str]]:
+    """Yield the components inside a component and then itself, each with its place."""
     for name in fields(type(component)):
         value = getattr(component, name)
         for inner in value if isinstance(value, tuple) else (value,):
             if isinstance(inner, Component):
-                yield from _problems(inner, join(join(place, name), getattr(inner, "name", "")))
-    # Inside a trace, comparisons of constants would be traced too.
-    with jax.ensure_compile_time_eval():
-        try:
-            problem = component.problem()
-        except ConfigError:
-            raise
-        except Exception as error:
-            raise ConfigError(
-                f"{place}: cannot be checked: {summarise_error(error, modules(component))}"
-            ) from error
-    if problem:
-        yield place, problem
+                yield from _with_inner(inner, join(join(place, name), getattr(inner, "name", "")))
+    yield component, place
 
 
 def _check_reference(place: str, name: str, known: Iterable[str], which: str = "") -> None:
@@ -165,26 +170,15 @@ def _check_names(place: str, names: Sequence[str]) -> None:
 
 
 def _check_space(env: Environment) -> None:
+    """Check that all platforms have the same dimension, and that the other parts fit them."""
     dimensions = {platform.name: platform.dimension for platform in env.platforms}
     if len(set(dimensions.values())) > 1:
         found = ", ".join(f"{name} {dimension}" for name, dimension in dimensions.items())
         raise ConfigError(f"platforms: expected the same dimension for all, found {found}")
-    for section in _SECTIONS:
-        for part in getattr(env, section):
-            for place, misfit in _misfits(env, part, f"{section}.{part.name}"):
-                raise ConfigError(f"{place}: {misfit}")
-
-
-def _misfits(env: Environment, component: Component, place: str) -> Iterator[tuple[str, str]]:
-    """Yield the place and the fault of each field, here or further inside, that does not fit."""
-    for name in fields(type(component)):
-        value = getattr(component, name)
-        for inner in value if isinstance(value, tuple) else (value,):
-            if isinstance(inner, Component):
-                inner_place = join(join(place, name), getattr(inner, "name", ""))
-                yield from _misfits(env, inner, inner_place)
-    for name, misfit in component.misfits(env).items():
-        yield join(place, name), misfit
+    for part, place in _parts(env):
+        for component, component_place in _with_inner(part, place):
+            for name, misfit in component.misfits(env).items():
+                raise ConfigError(f"{join(component_place, name)}: {misfit}")
 
 
 def _check_platform(platform: Platform, is_agent: bool) -> None:
@@ -324,21 +318,19 @@ def _check_kinds(env: Environment) -> None:
         return judge(env, empty_sim(env).replace(platforms=platforms)).status
 
     try:
-        found = jax.eval_shape(statuses, env)
+        shapes = jax.eval_shape(statuses, env)
     # The error is reported later with its place, when a reset and a step are traced.
     except Exception:
         return
-    for section in _SECTIONS:
-        for part in getattr(env, section):
-            for place, refers, name in references(part, f"{section}.{part.name}"):
-                if refers.section == "status" and refers.boolean not in (
-                    None,
-                    found[name].dtype == bool,
-                ):
-                    wanted = "true or false" if refers.boolean else "a number"
-                    raise ConfigError(
-                        f"{place}: expected a status that is {wanted}, found {name!r}, which is not"
-                    )
+    for part, part_place in _parts(env):
+        for place, refers, name in references(part, part_place):
+            if refers.section != "status" or refers.boolean is None:
+                continue
+            if refers.boolean != (shapes[name].dtype == bool):
+                wanted = "true or false" if refers.boolean else "a number"
+                raise ConfigError(
+                    f"{place}: expected a status that is {wanted}, found {name!r}, which is not"
+                )
 
 
 def _check_tracing(env: Environment) -> None:
