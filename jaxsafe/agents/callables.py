@@ -103,16 +103,15 @@ def find_law(run: str, env: Environment) -> ControlLaw:
     """
     name = run.removeprefix(CONTROLLER)
     task = registered(env.task)
-    known: dict[str, Callable[[], ControlLaw]] = dict(task.controllers if task else {})
-    if not known:
-        known.update(choices(ControlLaw))
-    if name not in known:
+    laws: dict[str, Callable[[], ControlLaw]] = dict(task.controllers if task else {})
+    if not laws:
+        laws.update(choices(ControlLaw))
+    if name not in laws:
         whose = env.task or "this environment"
         raise ConfigError(
-            f"controller: {whose} has no controller {show(name)}; "
-            f"choose from {nearest(name, known)}"
+            f"controller: {whose} has no controller {show(name)}; choose from {nearest(name, laws)}"
         )
-    return known[name]()
+    return laws[name]()
 
 
 def _from_module(run: str) -> Any:

@@ -141,7 +141,12 @@ def split_outputs(
 
 
 Distribution = Gaussian | Categorical | Joint
-"""A distribution over actions."""
+"""A distribution over actions.
+
+`mode()` returns the most probable actions, and `sample(key)` draws actions. With a `shard` it draws
+those of one device. `log_prob(action)` is the logarithm of the probability of an action, or of its
+density where it is continuous. `entropy()` is in nats.
+"""
 
 
 def action_distribution(

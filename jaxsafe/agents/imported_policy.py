@@ -124,19 +124,19 @@ def _check(path: Path, env: Environment, network: Network, weights: Mapping[str,
     wanted = num_outputs(env)
     observation = jax.ShapeDtypeStruct((env.observation_size,), jnp.float32)
     try:
-        found = jax.eval_shape(network, weights, observation)
+        outputs = jax.eval_shape(network, weights, observation)
     except Exception as error:  # JAX and the operators of a graph raise many kinds of errors
         reason = str(error).partition("\n")[0]
         raise ConfigError(
             f"{path}: does not take an observation of {env.observation_size} numbers: {reason}"
         ) from None
-    if found.shape != (wanted,):
+    if outputs.shape != (wanted,):
         raise ConfigError(
             f"{path}: expected {wanted} outputs ({', '.join(env.action_names)}), "
-            f"found shape {found.shape}"
+            f"found shape {outputs.shape}"
         )
-    if not jnp.issubdtype(found.dtype, jnp.floating):
-        raise ConfigError(f"{path}: expected outputs that are real numbers, found {found.dtype}")
+    if not jnp.issubdtype(outputs.dtype, jnp.floating):
+        raise ConfigError(f"{path}: expected outputs that are real numbers, found {outputs.dtype}")
 
 
 def _read_layers(

@@ -190,18 +190,18 @@ def find_policy(policy: str | os.PathLike) -> Path:
     path = Path(policy)
     if path.suffix == ".npz":
         return path
-    known = {file.stem: file for file in sorted(_PRETRAINED.glob("*.npz"))}
-    if not known:
+    pretrained = {file.stem: file for file in sorted(_PRETRAINED.glob("*.npz"))}
+    if not pretrained:
         raise ConfigError(
             f"policy: no policies in {_PRETRAINED}; install the package unpacked, as pip does"
         )
     name = str(policy).removeprefix(PRETRAINED)
-    if name not in known:
+    if name not in pretrained:
         raise ConfigError(
             f"policy: {str(policy)!r} is no .npz file and not pretrained; "
-            f"choose from {nearest(name, known)}"
+            f"choose from {nearest(name, pretrained)}"
         )
-    return known[name]
+    return pretrained[name]
 
 
 def _fill(like: Any, archive: Archive, path: str, numbered: bool) -> Any:

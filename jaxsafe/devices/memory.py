@@ -131,8 +131,8 @@ def available() -> int | None:
         if "bytes_limit" not in stats:
             return None
         return stats["bytes_limit"] - stats.get("bytes_in_use", 0)
-    known = [free for free in (_machine(), _container(), _process()) if free is not None]
-    return min(known, default=None)
+    limits = [free for free in (_machine(), _container(), _process()) if free is not None]
+    return min(limits, default=None)
 
 
 def _machine() -> int | None:
@@ -159,7 +159,7 @@ def _container() -> int | None:
 
     It is the least of what its own group and the groups around it leave.
     """
-    known = []
+    limits = []
     for line in _lines("/proc/self/cgroup"):
         _, controllers, path = line.split(":", 2)
         if controllers not in CONTROL_GROUPS:
@@ -169,8 +169,8 @@ def _container() -> int | None:
         for group in (own, *own.parents):  # a container's file system may show only the root
             free = _group(Path(files.root) / group, files)
             if free is not None:
-                known.append(free)
-    return min(known, default=None)
+                limits.append(free)
+    return min(limits, default=None)
 
 
 def _group(path: Path, files: ControlGroupFiles) -> int | None:

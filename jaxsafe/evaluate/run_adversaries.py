@@ -160,10 +160,10 @@ def _follow(env: Environment, name: str, num_steps: int, num_envs: int, key: Key
         key_act, key_reset = jax.random.split(key)
         keys = jax.random.split(key_act, num_envs)
         controls = jax.vmap(act)(state, keys)
-        after, done, facts = _step(env, state, controls)
+        after, done, step_counts = _step(env, state, controls)
         fresh, first = reset_batch(env, key_reset, num_envs)
-        facts["unsafe_starts"] = done & _unsafe(first)
-        return (jax.vmap(replace_ended)(done, fresh, after), _add(counts, facts)), None
+        step_counts["unsafe_starts"] = done & _unsafe(first)
+        return (jax.vmap(replace_ended)(done, fresh, after), _add(counts, step_counts)), None
 
     key_start, key_run = jax.random.split(key)
     state, first = reset_batch(env, key_start, num_envs)
@@ -196,10 +196,10 @@ def _search(env: Environment, num_starts: int, key: Key) -> Counts:
             control, *pushes = jnp.split(control, splits, axis=-1)
             for item, push in zip(chosen, pushes, strict=True):
                 state = _with_push(state, item.name, item.bound * push)
-            after, done, facts = _step(env, state, control)
+            after, done, step_counts = _step(env, state, control)
             counted = {
                 name: jnp.where(running, value, jnp.inf if name in _LOWEST else 0.0)
-                for name, value in facts.items()
+                for name, value in step_counts.items()
             }
             return (after, running & ~done, _add(counts, counted)), None
 
@@ -279,7 +279,7 @@ def _step(
     finite = jax.vmap(_finite)(after)
     lowest = jnp.where(jnp.isnan(lowest), -jnp.inf, lowest)
     inside = jnp.where(jnp.isnan(inside), -jnp.inf, inside)
-    facts = {
+    values = {
         "steps": zero + 1.0,
         "violating": ~(lowest >= 0.0) | ~finite,
         "violating_inside": ~(inside >= 0.0) | ~finite,
@@ -292,7 +292,7 @@ def _step(
         "lowest": lowest,
         "lowest_inside": inside,
     }
-    return after, timestep.done, {name: value.astype(jnp.float32) for name, value in facts.items()}
+    return after, timestep.done, {name: value.astype(jnp.float32) for name, value in values.items()}
 
 
 def _remembering(env: Environment, state: State) -> Sim:
@@ -363,10 +363,10 @@ def _empty_counts(num_envs: int) -> Counts:
     return counts | {name: jnp.full(num_envs, jnp.inf) for name in _LOWEST}
 
 
-def _add(counts: Counts, facts: Counts) -> Counts:
-    """Return the counts with those of one more step."""
+def _add(counts: Counts, more: Counts) -> Counts:
+    """Return the counts with those of one more step added."""
     return {
-        name: jnp.minimum(value, facts[name]) if name in _LOWEST else value + facts[name]
+        name: jnp.minimum(value, more[name]) if name in _LOWEST else value + more[name]
         for name, value in counts.items()
     }
 

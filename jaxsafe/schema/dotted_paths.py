@@ -141,7 +141,7 @@ def _set_item(items: tuple, path: list[str], value: Any, convert: Convert, place
 
 
 def _meant(
-    component: Component, path: Sequence[str], known: Sequence[str], shorthand: str | None
+    component: Component, path: Sequence[str], first_names: Sequence[str], shorthand: str | None
 ) -> str | None:
     """Return the path that a user probably meant by one that leads nowhere, or None.
 
@@ -150,7 +150,7 @@ def _meant(
     Args:
         component: the component at which the path begins.
         path: the path. Its first name is no field of the component.
-        known: names with which a path may begin.
+        first_names: names with which a path may begin.
         shorthand: the field of the component whose parts may stand at the beginning of a path.
     """
     ends = {}  # the shortest path to each name
@@ -159,8 +159,8 @@ def _meant(
             return other
         ends.setdefault(other.rpartition(".")[2], other)
     if len(path) > 1:
-        return next(iter(difflib.get_close_matches(path[0], known, n=1, cutoff=0.5)), None)
-    ends |= {name: name for name in known}
+        return next(iter(difflib.get_close_matches(path[0], first_names, n=1, cutoff=0.5)), None)
+    ends |= {name: name for name in first_names}
     short = [other for name, other in ends.items() if _abbreviates(path[0], name)]
     alike = [ends[name] for name in difflib.get_close_matches(path[0], ends, n=1, cutoff=0.5)]
     return next(iter([*short, *alike]), None)
@@ -187,9 +187,9 @@ def _abbreviates(short: str, name: str) -> bool:
     """Return whether a text abbreviates a name, as `lr` and `learn` do `learning_rate`."""
     if len(short) > 2 and name.startswith(short):
         return True
-    pieces = short.split("_") if "_" in short else [*short]
+    starts = short.split("_") if "_" in short else [*short]
     words = name.split("_")
-    return len(pieces) == len(words) > 1 and all(map(str.startswith, words, pieces))
+    return len(starts) == len(words) > 1 and all(map(str.startswith, words, starts))
 
 
 def as_list(value: Any, content: Any, field: Field, place: str) -> Any:
