@@ -277,7 +277,7 @@ def fly(
         if ends.size:
             break
     states, timesteps = jax.tree.map(lambda *x: np.concatenate(x), *pieces)
-    return Flight(env, states, timesteps, np.concatenate(actions))
+    return Flight(env, states=states, timesteps=timesteps, actions=np.concatenate(actions))
 
 
 @partial(jax.jit, static_argnames="policy")

@@ -111,7 +111,13 @@ class MLP(Network, type="mlp"):
     def module(self, num_outputs: int, output_gain: float) -> linen.Module:
         from jaxsafe.agents.flax_modules import Perceptron
 
-        return Perceptron(self.hidden, self.activation, self.layer_norm, num_outputs, output_gain)
+        return Perceptron(
+            hidden=self.hidden,
+            activation=self.activation,
+            layer_norm=self.layer_norm,
+            num_outputs=num_outputs,
+            output_gain=output_gain,
+        )
 
     def init(self, key: Key, normal: Normal, module: Any, *inputs: Array) -> Params:
         return orthogonal_params(key, normal, module, *inputs)
@@ -129,7 +135,12 @@ class GRU(Network, type="gru"):
     def module(self, num_outputs: int, output_gain: float) -> linen.Module:
         from jaxsafe.agents.flax_modules import Recurrent
 
-        return Recurrent(self.hidden, self.units, num_outputs, output_gain)
+        return Recurrent(
+            hidden=self.hidden,
+            units=self.units,
+            num_outputs=num_outputs,
+            output_gain=output_gain,
+        )
 
     def init(self, key: Key, normal: Normal, module: Any, *inputs: Array) -> Params:
         return orthogonal_params(key, normal, module, *inputs)

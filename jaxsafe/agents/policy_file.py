@@ -118,7 +118,8 @@ def read_policy(path: str | os.PathLike) -> SavedPolicy:
     like = jax.eval_shape(lambda key: agent.init(key, env), jax.random.key(0))
     with open_archive(path, "not a policy file, or a damaged one") as archive:
         params = _fill(like, archive, str(path), numbered=file_format == OLD_FORMAT)
-    return SavedPolicy(env.named(header.get("env", "")), agent, params, header)
+    env = env.named(header.get("env", ""))
+    return SavedPolicy(env=env, agent=agent, params=params, about=header)
 
 
 def with_networks(agent: Any) -> Any:

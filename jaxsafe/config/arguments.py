@@ -166,7 +166,7 @@ def _path(typed: str, key: str) -> Any:
 def _from_home(path: Any, key: str) -> Any:
     """Return a path, or each path of a list, with the home directory in place of its `~`.
 
-    A shell does not replace the `~` of `out=~/x`, because the word does not begin with it.
+    Not every shell replaces the `~` of `out=~/x`, because the word does not begin with it.
     """
     if isinstance(path, list):
         return [_from_home(item, key) for item in path]
