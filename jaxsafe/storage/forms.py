@@ -27,6 +27,9 @@ INTEGER_LIMIT = 2**63
 MAX_SHARE = 1 + 1e-9
 """The largest share. It exceeds 1 a little because averages are rounded."""
 
+_ABSENT = object()
+"""Stands for the value of a key that is not there."""
+
 
 class Kind(NamedTuple):
     """The form of one value."""
@@ -84,9 +87,6 @@ def check(value: Any, form: Any, place: str) -> None:
         shown = "nothing" if problem.found is _ABSENT else show(problem.found)
         label = f"{place}: {'.'.join(problem.path)}" if problem.path else place
         raise ConfigError(f"{label}: expected {problem.expected}, found {shown}")
-
-
-_ABSENT = object()
 
 
 class _Problem(NamedTuple):
