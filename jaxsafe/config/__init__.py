@@ -119,11 +119,11 @@ def load_recipes(path: str | os.PathLike) -> dict[str, dict[str, Any]]:
 
 
 def load_recipe_name(path: str | os.PathLike) -> str | None:
-    """Read which task's or file's recipes are used for the environment in a YAML file.
+    """Read the name of the task or file whose recipes a YAML file with an environment uses.
 
     Returns:
-        The entry `recipe`, or None if there is none. The path of a file leads there from the
-        current directory.
+        The entry `recipe`, or None if there is none. A path in it begins at the directory of the
+        YAML file. It is returned so that it can be opened from the current directory.
 
     Raises:
         ConfigError: the file cannot be read, it names no text, or it has recipes of its own too.

@@ -37,7 +37,7 @@ _DASHED = re.compile(r"--?([A-Za-z][^=]*)(?:=(.*))?", re.DOTALL)
 """An option as other programs take it, such as `--seeds=10` or `--seeds`."""
 
 _OPENINGS = ("[", "log(", "uniform(")
-"""How values begin that need no brackets: lists that have them, and intervals to draw from."""
+"""How values begin that get no brackets: lists that have their own, and intervals to draw from."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -37,7 +37,7 @@ from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.schema.user_modules import import_modules
 
 DIRECTORY: ContextVar[Path] = ContextVar("DIRECTORY", default=Path())
-"""The directory from which the relative paths in a configuration lead.
+"""The directory that relative paths in a configuration start from.
 
 While a file is read, this is the directory of the file.
 """
