@@ -1,7 +1,7 @@
 """New starts for the environments of a batch whose episodes ended.
 
-The cost follows the number of these environments. An environment's index is its place on the axis
-of the batch.
+On a CPU the cost grows with the number of these environments. The index of an environment is its
+place on the axis of the batch.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ In a smaller batch they are drawn for all environments if any needs one.
 """
 
 RESETS_PER_ROUND = 1 / 128
-"""Share of a large batch that gets its starts at a time. On most steps one round is enough."""
+"""Share of a large batch that gets its starts in one round. On most steps one round is enough."""
 
 MIN_RESETS_PER_ROUND = 16
-"""The least number of environments that get their starts at a time."""
+"""The least number of environments that get their starts in one round."""
 
 FLAGS_PER_WORD = 32
 """Number of environments whose flags share a word."""
@@ -46,8 +46,8 @@ def renew(
 ) -> Tree:
     """Return a batch in which some environments are replaced by new starts.
 
-    Drawing a start costs many times a step. In a small batch most steps end no episode, in a large
-    batch most steps end a few.
+    To draw a start costs many times as much as a step. In a small batch most steps end no episode.
+    In a large batch most steps end a few.
 
     An accelerator draws a start for every environment, and the draws become part of the kernels of
     the step. A step of docking3d is 23 kernels that way. With a branch and a loop, which wait for
@@ -55,8 +55,9 @@ def renew(
 
     Args:
         where: which environments to replace.
-        draw: `draw(parameters, indices)` returns starts. What it closes over has no derivative.
-        parameters: what the starts depend on. It has a derivative.
+        draw: `draw(parameters, indices)` returns starts. Derivatives do not see what it closes
+            over.
+        parameters: what the starts depend on. Derivatives see it.
         old: the batch.
         axis: the axis of the environments in all leaves, the first or the last.
     """
@@ -87,7 +88,7 @@ def choose(where: Array, fresh: Tree, old: Tree, axis: Literal[0, -1] = 0) -> Tr
 def _renew_by_definition(
     draw: Draw[Tree], axis: Literal[0, -1], where: Array, parameters: Any, old: Tree
 ) -> Tree:
-    """Draw a start for every environment, and keep those that are needed."""
+    """Draw a start for every environment, and use those that are needed."""
     return choose(where, draw(parameters, jnp.arange(where.shape[0])), old, axis)
 
 
@@ -97,16 +98,16 @@ def _renew_in_rounds(
 ) -> Tree:
     """Draw starts for a share of the batch at a time, until all that need one have theirs."""
     size = where.shape[0]
-    number = max(MIN_RESETS_PER_ROUND, int(size * RESETS_PER_ROUND))
+    per_round = max(MIN_RESETS_PER_ROUND, int(size * RESETS_PER_ROUND))
     flags = _pack(where)
 
     def renew_round(index: Array | int, batch: Tree) -> Tree:
-        indices = _indices(flags, index * number + jnp.arange(number), size)
+        indices = _indices(flags, index * per_round + jnp.arange(per_round), size)
         place = indices if axis == 0 else (..., indices)
         starts = draw(parameters, indices)
         return jax.tree.map(lambda x, new: x.at[place].set(new, mode="drop"), batch, starts)
 
-    num_rounds = (flags.ends[-1] + number - 1) // number
+    num_rounds = (flags.ends[-1] + per_round - 1) // per_round
     once = renew_round(0, old)  # outside the loop, because a loop copies all that it carries
     return jax.lax.cond(
         num_rounds > 1,
@@ -124,7 +125,7 @@ def _(draw: Draw[Tree], axis: Literal[0, -1], primals: tuple, tangents: tuple) -
 class Flags(NamedTuple):
     """The flags of all environments, `FLAGS_PER_WORD` to a word.
 
-    Bit *b* of word *w* is the flag of environment *w* + *b* × words.
+    Bit *b* of word *w* is the flag of environment *w* + *b* × (number of words).
     """
 
     words: UInt32[Array, " words"]
@@ -134,7 +135,7 @@ class Flags(NamedTuple):
 def _pack(where: Bool[Array, " n"]) -> Flags:
     """Pack flags into words by laying one half of them over the other, again and again.
 
-    This vectorises. A sum over bits, or `jnp.nonzero`, is a loop of scalars on a CPU.
+    These operations vectorise. On a CPU a sum over bits, or `jnp.nonzero`, is a loop of scalars.
     """
     padded = jnp.pad(where, (0, -where.shape[0] % FLAGS_PER_WORD))
     words = padded.reshape(FLAGS_PER_WORD, -1).astype(jnp.uint32)
@@ -149,13 +150,13 @@ def _pack(where: Bool[Array, " n"]) -> Flags:
 
 
 def _indices(flags: Flags, rank: Int[Array, " k"], size: int) -> Int[Array, " k"]:
-    """Return the indices of environments whose flag is set, by their rank among these.
+    """Return the indices of environments whose flag is set, given their ranks among these.
 
     Args:
         flags: the flags of the batch.
         rank: 0 for the first environment whose flag is set, 1 for the second, and so on.
-        size: size of the batch. It is returned for ranks beyond the last, and is no environment's
-            index.
+        size: size of the batch. It is returned for ranks beyond the last, because it is the index
+            of no environment.
     """
     num_words = flags.ends.shape[0]
     word = jnp.searchsorted(flags.ends, rank, side="right", method="scan_unrolled")

@@ -3,8 +3,8 @@
 `accumulate` follows one episode step by step, and `summarise` turns finished episodes into metrics.
 
 Two of them differ from the paper. `episode_cost`, the number of violating steps of an episode, is
-what constrained RL calls cost. The safety violation rate is the share of tests with a violation;
-the paper defines it as the share *without* one and calls lower better.
+what constrained RL calls cost. The safety violation rate is the share of tests with a violation.
+The paper defines it as the share *without* one, and yet calls lower better.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ Rates and their averages are rounded.
 """
 
 MIN_STEPS = 1e-9
-"""Steps are at least this where something is divided by them: without any step the result is 0."""
+"""The least number of steps by which a sum is divided, so that the result without steps is 0."""
 
 NUM_RESAMPLES = 2000
 """Number of bootstrap samples."""
@@ -148,7 +148,9 @@ def full_controls(env: Environment) -> tuple[float, ...]:
 
     It is `()` if the agent's controller lists no actuators.
     """
-    return tuple(max(abs(float(one.low)), abs(float(one.high))) for one in env.actuators)
+    return tuple(
+        max(abs(float(actuator.low)), abs(float(actuator.high))) for actuator in env.actuators
+    )
 
 
 def metrics_in(env: Environment, episodes: Episode) -> dict[str, float | None]:
@@ -169,7 +171,7 @@ def summarise(
 ) -> dict[str, float | None]:
     """Return the metrics over a set of finished episodes.
 
-    What the environment does not measure is None, never 0.
+    A metric that the environment does not measure is None, never 0.
 
     Args:
         episodes: sums of the episodes, each field of shape (episodes,).
@@ -177,10 +179,10 @@ def summarise(
             `env.success_indices`. A negative index and an empty list mean that there is none.
         has_delta_v: whether the environment has the status `delta_v`, from which control usage
             comes.
-        has_rta: whether there was run time assurance, whose interventions are counted.
-        has_delta_v_l1: whether the environment has the status `delta_v_l1`. None means that it has
-            it if it has `delta_v`.
-        has_constraints: whether the environment has safety constraints, whose violations are
+        has_rta: whether there was run time assurance. Then its interventions are counted.
+        has_delta_v_l1: whether the environment has the status `delta_v_l1`. None means that it does
+            if it has `delta_v`.
+        has_constraints: whether the environment has safety constraints. Then their violations are
             counted.
         full_controls: the largest magnitude of each control. Empty means that it is not known.
 
@@ -323,7 +325,7 @@ def with_interval(value: float, interval: Sequence[float] | None, form: str) -> 
     Args:
         value: the number.
         interval: its lowest and highest value, or None.
-        form: a format for numbers, such as `.1f`, with which the text is `0.5 [0.4, 0.6]`.
+        form: a format for numbers. With `.1f` the text is, for instance, `0.5 [0.4, 0.6]`.
     """
     if interval is None:
         return format(value, form)

@@ -57,14 +57,14 @@ def first_memory(policy: Policy | RecurrentPolicy, num_envs: int | None = None) 
 def act(
     policy: Policy | RecurrentPolicy, key: Key, observation: Array, memory: Any
 ) -> tuple[Array, Any]:
-    """Return the action of a policy, and its memory after it."""
+    """Return the action of a policy, and the memory of the policy after it."""
     if isinstance(policy, RecurrentPolicy):
         return policy.act(key, observation, memory)
     return policy(key, observation), memory
 
 
 class RolloutState(Record):
-    """Where a rollout has got to, which is where the next one goes on.
+    """The end of a rollout, from which another rollout can go on.
 
     With a batch of environments every array has a leading axis of that size.
     """
@@ -136,9 +136,9 @@ def rollout(
         the `RolloutState` after the last step, and the transitions, stacked alike.
 
     Raises:
-        ConfigError: `num_steps` or `num_envs` is no number of steps or environments, `record` is
-            unknown, `start` is something else or of another batch, or the actions have another
-            shape.
+        ConfigError: `num_steps` or `num_envs` is not a whole number or is too small, `record` is
+            unknown, `start` is not a `RolloutState` or has a batch of another size, or the actions
+            have another shape.
     """
     require_count("rollout: num_steps", num_steps, least=0)
     if num_envs is not None:
@@ -186,9 +186,8 @@ def rollout(
     state, observation, memory = carry
     if num_envs is not None:
         state, observation = _move_batch((state, observation), -1, 0)
-    return RolloutState(state=state, observation=observation, memory=memory), _transition(
-        *moved, *acted
-    )
+    end = RolloutState(state=state, observation=observation, memory=memory)
+    return end, _transition(*moved, *acted)
 
 
 def _transition(
@@ -214,49 +213,50 @@ def _move_batch(tree: Any, source: int, destination: int) -> Any:
 
 
 def _num_envs(start: Any, num_envs: int | None) -> int | None:
-    """Return the number of environments of the start of a rollout, None without a batch axis.
+    """Return the number of environments in the start of a rollout, None without a batch axis.
 
     Raises:
-        ConfigError: it is no such start, or `num_envs` is another number.
+        ConfigError: `start` is not a `RolloutState`, or `num_envs` is another number.
     """
     if not isinstance(start, RolloutState):
         raise ConfigError(
             "rollout: start: expected the RolloutState that an earlier rollout returned, "
             f"found {show(start)}"
         )
-    found = start.observation.shape[0] if jnp.ndim(start.observation) > 1 else None
-    if num_envs not in (None, found):
+    batch_size = start.observation.shape[0] if jnp.ndim(start.observation) > 1 else None
+    if num_envs not in (None, batch_size):
         raise ConfigError(
-            f"rollout: num_envs: expected {found or 'nothing'} as in start, found {num_envs}"
+            f"rollout: num_envs: expected {batch_size or 'nothing'} as in start, found {num_envs}"
         )
-    return found
+    return batch_size
 
 
 def require_batch(env: Environment, action: Array, num_envs: int) -> None:
-    """Refuse actions that are not one for each observation of a batch.
+    """Refuse what is not one action for each observation of a batch.
 
     Raises:
-        ConfigError: they have another shape.
+        ConfigError: the shape of `action` is not (num_envs, env.action_size).
     """
-    found, wanted = jnp.shape(action), (num_envs, env.action_size)
-    if found != wanted:
+    shape = jnp.shape(action)
+    expected = (num_envs, env.action_size)
+    if shape != expected:
         names = ", ".join(env.action_names)
         advice = (
             "; for a policy of one observation, write jax.vmap around it"
-            if found == wanted[1:]
+            if shape == expected[1:]
             else ""
         )
         raise ConfigError(
-            f"policy: expected actions of shape {wanted}, one ({names}) for each of "
-            f"{num_envs} observations, found {found}{advice}"
+            f"policy: expected actions of shape {expected}, one ({names}) for each of "
+            f"{num_envs} observations, found {shape}{advice}"
         )
 
 
 def require_hashable(policy: Policy | RecurrentPolicy) -> None:
-    """Refuse a policy for which no program can be compiled once and kept.
+    """Refuse a policy that has no hash, because its compiled program could not be kept.
 
     Raises:
-        ConfigError: it has no hash, as modules of arrays such as those of Equinox have none.
+        ConfigError: the policy has no hash. Equinox modules with arrays have none.
     """
     try:
         hash(policy)
@@ -269,9 +269,17 @@ def require_hashable(policy: Policy | RecurrentPolicy) -> None:
 
 
 def require_count(place: str, value: Any, least: int) -> None:
-    """Refuse what is not a whole number or is too small. `place` begins the message.
+    """Refuse a number of steps, environments or episodes that is not a whole number ≥ `least`.
 
-    XLA would say so in many lines, or run no environment at all.
+    Without this check XLA would say so in many lines, or run no environment at all.
+
+    Args:
+        place: where the number was given. The message begins with it.
+        value: the number.
+        least: the smallest number that is allowed.
+
+    Raises:
+        ConfigError: the number is not a whole number, or is too small.
     """
     try:
         enough = operator.index(value) >= least
@@ -293,17 +301,17 @@ def step_or_reset(
         key: a typed PRNG key for the start.
 
     Returns:
-        The next state with the observation to act on, and the time step that was taken, with the
-        observation to which it led.
+        The next state with the observation to act on, and the time step that was taken, which
+        holds the observation that the step led to.
     """
     state, timestep = step(env, state, action)
     return restarted(env, state, timestep, key), timestep
 
 
 def restarted(env: Environment, state: State, timestep: TimeStep, key: Key) -> tuple[State, Array]:
-    """Return the state and the observation to go on from after a time step.
+    """Return the state and the observation from which to go on after a time step.
 
-    They are those of a fresh start where the time step ended the episode.
+    Where the time step ended the episode, they are those of a fresh start.
     """
     fresh_state, fresh = reset(env, key)
     return choose(timestep.done, (fresh_state, fresh.observation), (state, timestep.observation))
@@ -381,9 +389,9 @@ def cut_short(
     env: Environment, state: State, timestep: TimeStep, max_episode_steps: Array | float
 ) -> TimeStep:
     """Return the time step, truncated if its episode runs on after `max_episode_steps` actions."""
-    number = jnp.result_type(float)
-    steps = state.num_steps.astype(number)
+    dtype = jnp.result_type(float)
+    actions = state.num_steps.astype(dtype)
     if env.decision_period > 1:
-        steps = steps / env.decision_period
-    cut = ~timestep.done & (steps >= jnp.asarray(max_episode_steps, number))
+        actions = actions / env.decision_period
+    cut = ~timestep.done & (actions >= jnp.asarray(max_episode_steps, dtype))
     return timestep.replace(truncated=timestep.truncated | cut)

@@ -1,4 +1,4 @@
-"""The map of the house: the records that flow through one step, and the units of parameters.
+"""The records that flow through one step, and the types of parameters with their units and ranges.
 
 Shapes are those of one environment. `jax.vmap` adds leading axes. `d` is the dimension of space, 1
 to 3.
@@ -23,7 +23,7 @@ Key = Array
 """A typed PRNG key, as made by `jax.random.key`."""
 
 Number = Any
-"""An array. Until the environment is built, a float or a tuple of floats."""
+"""An array in an environment that is built. Before that, a float or a tuple of floats."""
 
 MAX_DISTANCE = 1e12
 """The largest distance [m or ft].
@@ -41,7 +41,7 @@ Extent = Range(0.0, open_low=True, smallest=1e-6, largest=MAX_DISTANCE)
 """Range of a distance by which something is divided."""
 
 Place = Range(largest=MAX_DISTANCE)
-"""Range of a coordinate or another number of a start, on either side of 0."""
+"""Range of a coordinate, or of another number of a start, which may be negative."""
 
 Control = Range(largest=1e9)
 """Range of a control in physical units."""
@@ -65,10 +65,11 @@ Seconds = Annotated[Number, Unit("s"), Positive]
 
 @dataclasses.dataclass(frozen=True)
 class RefersInDetail(Refers):
-    """Mark of a name for which a region also tells how it moves, or how far away its boundary is.
+    """Mark of a name that asks a region for more than its position and content.
 
-    Regions that nothing names in this way do without, see `RegionState`. The section `places` is
-    that of the platforms and that of the regions.
+    A region named in this way also computes how it moves, or how far away its boundary is. Other
+    regions leave that out, see `RegionState`. The section `places` stands for `platforms` and
+    `regions` together.
     """
 
     @property
@@ -78,11 +79,11 @@ class RefersInDetail(Refers):
 
 PlatformName = Annotated[str, Refers("platforms")]
 RegionName = Annotated[str, Refers("regions")]
-"""Name of a region, of which position and content are needed."""
+"""Name of a region whose position and content are needed."""
 ShapeName = Annotated[str, RefersInDetail("regions")]
-"""Name of a region, of which the distances of platforms to its boundary are needed too."""
+"""Name of a region for which the distances of platforms to its boundary are needed too."""
 PlaceName = Annotated[str, RefersInDetail("places")]
-"""Name of a platform or of a region, of which position, velocity and orientation are needed."""
+"""Name of a platform or region whose position, velocity and orientation are needed."""
 StatusName = Annotated[str, Refers("status", boolean=False)]
 """Name of a numeric status."""
 FlagName = Annotated[str, Refers("status", boolean=True)]
@@ -114,21 +115,21 @@ class Record(Described):
         return _lines(self, "")
 
 
-def _lines(record: Record, place: str) -> Iterator[tuple[str, str]]:
-    """Yield a path and a text for each field of a record that is not empty.
+def _lines(record: Record, prefix: str) -> Iterator[tuple[str, str]]:
+    """Yield the path and the text of each field of a record, without fields that have no text.
 
-    The fields of a record of records or mappings follow one by one.
+    A field that is itself a record of records or mappings yields its own fields one by one.
     """
     for name, value in vars(record).items():
-        path = f"{place}{name}"
+        path = f"{prefix}{name}"
         if isinstance(value, Record) and any(map(_is_tree, vars(value).values())):
             yield from _lines(value, f"{path}.")
             continue
         parts = {path: value}
         if isinstance(value, Mapping) and any(map(_is_tree, value.values())):
             parts = {f"{path}.{key}": item for key, item in value.items()}
-        texts = {where: _in_one_line(part) for where, part in parts.items()}
-        yield from ((where, text) for where, text in texts.items() if text)
+        texts = {part_path: _in_one_line(part) for part_path, part in parts.items()}
+        yield from ((part_path, text) for part_path, text in texts.items() if text)
 
 
 def _is_tree(value: Any) -> bool:
@@ -136,7 +137,7 @@ def _is_tree(value: Any) -> bool:
 
 
 def _in_one_line(value: Any) -> str:
-    """Return the text of a leaf, or of a tree with names before its leaves. `()` has no text."""
+    """Return a leaf as text, or a tree with a name before each leaf. The text of `()` is empty."""
     if isinstance(value, Record):
         symbols = units(type(value))
         return _named({name: (x, symbols.get(name, "")) for name, x in vars(value).items()})
@@ -148,9 +149,9 @@ def _in_one_line(value: Any) -> str:
 
 
 def _named(values: Mapping[str, tuple[Any, str]]) -> str:
-    """Return values with their names and units, without those that have no text.
+    """Return values as text with their names and units, without those that have no text.
 
-    Neighbours that are shown by the same type and shape share it.
+    Neighbours that are shown by the same type and shape share this text.
     """
     texts = {
         name: f"{_in_one_line(value)} {unit}".strip() for name, (value, unit) in values.items()
@@ -173,17 +174,21 @@ def place(sim: Sim, name: str) -> Any:
 def is_key(x: Any) -> bool:
     """Return whether this is a typed PRNG key, an array of keys, or the shape of either.
 
-    Files and hosts hold the words of which keys consist.
+    Such keys need care, because files and other processes receive only the words of a key.
     """
     return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
 
 
 def units(record: type[Record]) -> dict[str, str]:
-    """Return the unit of each field of a platform's state that has one, from its annotation."""
+    """Return the units of the fields of a platform's state, by name.
+
+    They stand in the annotations. A field without a unit is left out.
+    """
     symbols = {}
     try:
         hints = typing.get_type_hints(record, include_extras=True)
-    except NameError:  # a class of a function, whose names Python does not find
+    except NameError:
+        # The class is defined inside a function, so Python cannot look up its annotations.
         return symbols
     for name, hint in hints.items():
         marks = [mark for mark in typing.get_args(hint)[1:] if isinstance(mark, Unit)]
@@ -218,8 +223,9 @@ class Sim(Record):
     time: Float[Array, ""]  # s since the start of the episode
     platforms: Mapping[str, Any]  # by name, each the state record of its kind of platform
     regions: Mapping[str, RegionState]  # by name
-    status: Mapping[str, Array]  # by name; while statuses are computed only the earlier ones
-    # By outcome name, all but `running`. At most one is True; but see `Terminal.apart`.
+    status: Mapping[str, Array]  # by name; while statuses are computed, only the earlier ones
+    # By outcome name, all but `running`. At most one is True, unless one stands apart, see
+    # `Terminal.apart`.
     ended: Mapping[str, Bool[Array, ""]]
     # Whether run time assurance changed the control of the step that led here.
     intervening: Bool[Array, ""]
@@ -231,7 +237,8 @@ class Sim(Record):
     # What each of the agent's actuators with a lag or a rate limit gives now, in physical units, by
     # name. Empty if all act at once.
     actuators: Mapping[str, Float[Array, ""]] = dataclasses.field(default_factory=dict)
-    # In a prediction what statuses remember on which safety constraints rest, by name; else empty.
+    # In a filter's prediction, what those statuses remember on which safety constraints rest, by
+    # name. Else it is empty.
     remembered: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -245,9 +252,9 @@ class Memory(Record):
     reward: Mapping[str, Any]
     observation: Mapping[str, Any]
     rta: Any  # what run time assurance remembers
-    # What the parts of `env.uncertainty` remember, by name, and the readings under way of sensors
-    # that make errors, by the name of the observation. Both are empty in a world without errors.
+    # What the parts of `env.uncertainty` remember, by name.
     uncertainty: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    # Readings under way of the sensors that make errors, by the name of the observation.
     sensors: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -268,19 +275,19 @@ class State(Record):
 class RTAInfo(Record):
     """What run time assurance did on a step.
 
-    Of the several steps of a `decision_period` it is the worst: the largest correction, the
-    smallest margin, and whether all were feasible and certified. The backup controller is that of
-    the last step, and the constraint that of the last change.
+    With a `decision_period` the filter acts several times, and the numbers are the worst of these
+    steps: the largest correction, the smallest margin, and whether all were feasible and certified.
+    The backup controller is that of the last step, and the constraint that of the last change.
     """
 
     correction: Float[Array, ""]  # ‖u_act − u_des‖, physical units
     feasible: Bool[Array, ""]  # whether some control met the filter's constraints
     certified: Bool[Array, ""]  # whether the control that acts is known to be safe
-    # Smallest h after the step as predicted. For separations also on the way.
+    # Smallest h that is predicted after the step, and for separations also within the step.
     predicted_margin: Float[Array, ""]
     backup_index: Int[Array, ""]  # index of the backup controller in reserve
-    # Index into `env.rta.constraints` of the constraint for which the control was changed, −1 where
-    # it was not.
+    # Index into `env.rta.constraints` of the constraint for which the control was changed, or −1 if
+    # it was not changed.
     constraint: Int[Array, ""] = dataclasses.field(
         default_factory=lambda: jnp.full((), -1, jnp.int32)
     )

@@ -1,4 +1,4 @@
-"""Control laws for docking: along the speed limit, LQR, MPC, and thrust along one axis."""
+"""Control laws for docking: PD along the speed limit, LQR, MPC, and thrust along one body axis."""
 
 from __future__ import annotations
 
@@ -43,7 +43,8 @@ class PD(ControlLaw, type="pd"):
 
     The desired velocity w points at the origin. Its size is ‖r‖ times `approach`, and at most
     `share` of the speed limit ν₀ + ν₁‖r‖, Eqs. (14), (17). The thrust m (w − v)/`response` is
-    proportional to the error of the velocity. Where w is not cut, that is a PD law in position.
+    proportional to the error of the velocity. Where the speed limit does not cut w, this is a PD
+    law in position.
 
     The numbers are chosen by hand: `share` leaves room for the lag behind the falling limit, and
     `approach` makes the last metre slower than the limit.
@@ -58,8 +59,9 @@ class PD(ControlLaw, type="pd"):
 
     def control(self, env: Environment, design: Any, sim: Sim) -> Float[Array, " m"]:
         state = sim.platforms[env.agent]
-        wanted = _towards_origin(env, state.position, self.share, self.approach)
-        return env.agent_platform.mass * (wanted - state.velocity) / self.response  # type: ignore[attr-defined]
+        mass = env.agent_platform.mass  # type: ignore[attr-defined]
+        desired = _towards_origin(env, state.position, self.share, self.approach)
+        return mass * (desired - state.velocity) / self.response
 
 
 class LQR(ControlLaw, type="lqr"):
@@ -94,14 +96,15 @@ class MPC(ControlLaw, type="mpc"):
     """Model predictive control of a point mass under the speed limit and the bounds of its thrust.
 
     Every step it plans `horizon` thrusts, each held for `hold` steps, and gives the first. The plan
-    minimises Σ xᵀQx + uᵀRu + the cost of an LQR for ever after, for the linear plant, with Q and R
-    as in `LQR`. After every thrust ‖v‖ ≤ `share` · (ν₀ + ν₁ e·r), where e is the present direction
-    of the position r. This is a second-order cone, and lies within the speed limit, because
-    e·r ≤ ‖r‖. From farther away than `reach` the cost is that from `reach`, because more rounds
-    would be needed for a larger one.
+    minimises Σ xᵀQx + uᵀRu for the linear plant, with Q and R as in `LQR`. To this sum is added the
+    cost of an LQR that goes on from the end of the plan for ever. After every thrust
+    ‖v‖ ≤ `share` · (ν₀ + ν₁ e·r), where e is the present direction of the position r. This is a
+    second-order cone. It lies within the speed limit, because e·r ≤ ‖r‖. In the cost a position
+    farther away than `reach` counts as one at `reach`, because a larger one would need more rounds.
 
-    The plan is found by `iterations` rounds of ADMM (Boyd et al. 2011), as in OSQP and SCS: one
-    product with a matrix that `design` has inverted, and projections onto the box and the cones.
+    The plan is found by `iterations` rounds of ADMM (Boyd et al. 2011), as in OSQP and SCS. A round
+    is one product with a matrix that `design` has inverted, and projections onto the box of the
+    thrusts and the cones of the speeds.
     """
 
     position: Annotated[Length, Positive] = 5.0
@@ -118,11 +121,14 @@ class MPC(ControlLaw, type="mpc"):
         return _point_mass(env, self)
 
     def design(self, env: Environment) -> Mapping[str, Array]:
-        """Return the matrices of the plan, in thrusts as shares of the largest one.
+        """Return the matrices of the plan. Its thrusts u are shares of the largest one.
 
-        `gradient` is that of the cost, and `offset` the constrained quantities of a plan without
-        thrust, both per state x. `rows` are the constrained quantities per plan: all velocities as
-        multiples of a speed limit, all positions times ν₁ likewise. `step` is (H + ρ (I + GᵀG))⁻¹.
+        With the Hessian H of the cost and the penalty ρ of ADMM they are:
+
+        - `gradient`: its product with the state x is 1/ρ times the gradient of the cost at u = 0.
+        - `rows` G and `offset`: G u plus `offset` times x are the constrained quantities of the
+          plan. They are all positions times ν₁ and all velocities, both divided by `_unit`.
+        - `step`: ρ (H + ρ (I + GᵀG))⁻¹.
         """
         a, b = linear_model(env)
         size = b.shape[1]
@@ -154,13 +160,13 @@ class MPC(ControlLaw, type="mpc"):
         gram = np.eye(count * size) + rows.T @ rows
         penalty = float(self.penalty) * np.trace(hessian) / np.trace(gram)
         step = np.linalg.inv(hessian + penalty * gram)
-        found = {
+        matrices = {
             "step": penalty * step,
             "gradient": gradient / penalty,
             "rows": rows,
             "offset": offset,
         }
-        return {name: jnp.asarray(value, env.dt.dtype) for name, value in found.items()}
+        return {name: jnp.asarray(matrix, env.dt.dtype) for name, matrix in matrices.items()}
 
     def _unit(self, limit: VelocityLimit) -> Number:
         """Return the speed [m/s] that counts as 1: ν₀, or the limit at `position` if that is 0."""
@@ -180,10 +186,10 @@ class MPC(ControlLaw, type="mpc"):
         unit = self._unit(limit)
         floor = (limit.floor - limit.slope * limit.constant_to) / unit
 
-        def allowed(plan: Array, moved: Array) -> tuple[Array, Array]:
-            """Return the nearest plan within the box, and the nearest states in the cones."""
+        def project(plan: Array, motion: Array) -> tuple[Array, Array]:
+            """Return the nearest plan within the box, and the nearest motion within the cones."""
             plan = jnp.clip(plan.reshape(-1, size), low / largest, high / largest).ravel()
-            position, velocity = jnp.split(moved.reshape(-1, 2 * size), 2, axis=1)
+            position, velocity = jnp.split(motion.reshape(-1, 2 * size), 2, axis=1)
             height = position @ outwards
             speed, change = _into_cone(safe_norm(velocity), floor + height, self.share)
             velocity = velocity * (speed / jnp.maximum(safe_norm(velocity), 1e-9))[:, None]
@@ -191,15 +197,17 @@ class MPC(ControlLaw, type="mpc"):
             return plan, jnp.concatenate([position, velocity], axis=1).ravel()
 
         def improve(carry: tuple[Array, ...], _: Any) -> tuple[tuple[Array, ...], None]:
-            plan, moved, plan_error, moved_error = carry
-            aim = plan - plan_error + design["rows"].T @ (moved - offset - moved_error)
-            free = design["step"] @ (aim - gradient)
-            reached = design["rows"] @ free + offset
-            plan, moved = allowed(free + plan_error, reached + moved_error)
-            return (plan, moved, plan_error + free - plan, moved_error + reached - moved), None
+            plan, motion, plan_error, motion_error = carry
+            aim = plan - plan_error + design["rows"].T @ (motion - offset - motion_error)
+            free_plan = design["step"] @ (aim - gradient)
+            free_motion = design["rows"] @ free_plan + offset
+            plan, motion = project(free_plan + plan_error, free_motion + motion_error)
+            plan_error = plan_error + free_plan - plan
+            motion_error = motion_error + free_motion - motion
+            return (plan, motion, plan_error, motion_error), None
 
-        none = jnp.zeros_like(gradient)
-        start = (*allowed(none, offset), none, jnp.zeros_like(offset))
+        no_thrust = jnp.zeros_like(gradient)
+        start = (*project(no_thrust, offset), no_thrust, jnp.zeros_like(offset))
         (plan, *_), _ = jax.lax.scan(improve, start, None, self.iterations)
         return largest * plan[:size]
 
@@ -215,16 +223,18 @@ def _into_cone(radius: Array, height: Array, slope: Number) -> tuple[Array, Arra
 
 
 class Align(ControlLaw, type="align"):
-    """A turn of the thrust axis towards the wanted acceleration, and thrust along it.
+    """A turn of the body axis towards the desired acceleration, and thrust along it.
 
-    For a spacecraft that thrusts along its body. With the desired velocity w of `PD` the wanted
-    acceleration is (w − v)/`response` + ẇ − a, where a is the acceleration without thrust. So the
-    axis points along the falling limit once the velocity is right, and does not follow noise.
+    The law is for a spacecraft that thrusts along its body. With the desired velocity w of `PD` the
+    desired acceleration is (w − v)/`response` + ẇ − a, where a is the acceleration without thrust.
+    So the axis points along the falling limit once the velocity is right, and does not follow
+    noise.
 
-    Let e be the angle from the nearer end of the body axis to it, and α the bound of the wheel. The
-    attitude follows the rate sign(e) min(√(1.6 α abs(e)), abs(e)/`settle`). The thrust is the
-    wanted one along the axis while abs(e) ≤ `aligned`, and else 0: thrust across the wanted
-    acceleration would turn it away as fast as the body follows.
+    Let e be the angle from the nearer end of the body axis to the desired acceleration, and α the
+    largest angular acceleration. The attitude follows the rate sign(e) min(√(1.6 α abs(e)),
+    abs(e)/`settle`). While abs(e) ≤ `aligned`, the thrust gives the part of the desired
+    acceleration along the axis, and else it is 0. Thrust across the desired acceleration would turn
+    that away as fast as the body follows.
     """
 
     share: Share = 0.9
@@ -245,35 +255,38 @@ class Align(ControlLaw, type="align"):
         state = sim.platforms[env.agent]
         plant = cast(OrientedSpacecraft, env.agent_platform)
 
-        def wanted(position: Array) -> Array:
+        def desired(position: Array) -> Array:
             return _towards_origin(env, position, self.share, self.approach)
 
-        velocity, changing = jax.jvp(wanted, (state.position,), (state.velocity,))
+        velocity, velocity_rate = jax.jvp(desired, (state.position,), (state.velocity,))
         drift = plant.derivative(state, {}).velocity
-        aim = (velocity - state.velocity) / self.response + changing - drift
-        error = wrap(jnp.arctan2(aim[1], aim[0]) - state.attitude, -jnp.pi / 2, jnp.pi)
+        push = (velocity - state.velocity) / self.response + velocity_rate - drift
+        error = wrap(jnp.arctan2(push[1], push[0]) - state.attitude, -jnp.pi / 2, jnp.pi)
         fastest = jnp.sqrt(1.6 * bounds(env)[1][1] * jnp.abs(error))
         rate = jnp.sign(error) * jnp.minimum(fastest, jnp.abs(error) / self.settle)
         turn = (rate - state.attitude_rate) / env.dt
-        thrust = plant.mass * jnp.sum(aim * direction(state.attitude))
+        thrust = plant.mass * jnp.sum(push * direction(state.attitude))
         thrust = jnp.where(jnp.abs(error) <= self.aligned, thrust, 0.0)
         controls = {"thrust": thrust, "attitude_acceleration": turn}
         return jnp.stack([controls[name] for name in env.action_names])
 
 
 def linear_model(env: Environment) -> tuple[np.ndarray, np.ndarray]:
-    """Return A and B of x' = A x + B u, the step of a linear point mass, with x = (r, v)."""
+    """Return A and B of x' = A x + B u, the step of a linear point mass, with x = (r, v).
+
+    Their shapes are (2m, 2m) and (2m, m) for m thrusts.
+    """
     plant = env.agent_platform
     names = env.action_names
     size = len(names)
 
-    def after(x: Array, u: Array) -> Array:
+    def step(x: Array, u: Array) -> Array:
         state = plant.rest().replace(position=x[:size], velocity=x[size:])
-        later = plant.step(state, dict(zip(names, u, strict=True)), env.dt)
-        return jnp.concatenate([later.position, later.velocity])
+        after = plant.step(state, dict(zip(names, u, strict=True)), env.dt)
+        return jnp.concatenate([after.position, after.velocity])
 
-    zeros = jnp.zeros(2 * size, env.dt.dtype), jnp.zeros(size, env.dt.dtype)
-    a, b = jax.jacfwd(after, argnums=(0, 1))(*zeros)
+    origin = (jnp.zeros(2 * size, env.dt.dtype), jnp.zeros(size, env.dt.dtype))
+    a, b = jax.jacfwd(step, argnums=(0, 1))(*origin)
     return np.asarray(a, np.float64), np.asarray(b, np.float64)
 
 
@@ -283,10 +296,10 @@ def speed_limit(env: Environment) -> VelocityLimit:
     Raises:
         ConfigError: there is none.
     """
-    found = [status for status in env.status if isinstance(status, VelocityLimit)]
-    if not found:
+    limits = [status for status in env.status if isinstance(status, VelocityLimit)]
+    if not limits:
         raise ConfigError("controller: needs a status of type velocity_limit, found none")
-    return found[0]
+    return limits[0]
 
 
 def _towards_origin(
@@ -317,4 +330,5 @@ def _point_mass(env: Environment, law: ControlLaw) -> Needs:
 
 
 def _bryson(largest: list[Any]) -> np.ndarray:
+    """Return the diagonal weights of quantities, given the largest acceptable value of each."""
     return np.diag(1.0 / np.array([float(value) for value in largest]) ** 2)

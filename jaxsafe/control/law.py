@@ -19,8 +19,8 @@ from jaxsafe.types import Key, Sim, State
 class ControlLaw(Component):
     """Base of control laws.
 
-    A subclass writes `control`. What a law computes once for an environment, such as its gains, is
-    what `design` returns.
+    A subclass writes `control`. If a law computes something once for an environment, such as its
+    gains, the subclass also writes `design`, which returns it.
     """
 
     def needs(self, env: Environment) -> Needs:
@@ -32,7 +32,7 @@ class ControlLaw(Component):
         return ()
 
     def design(self, env: Environment) -> Any:
-        """Return a tree of arrays that `control` needs. The numbers of `env` must be known."""
+        """Return a tree of arrays that `control` needs. The numbers of `env` must not be traced."""
         return ()
 
     def control(self, env: Environment, design: Any, sim: Sim) -> Float[Array, " m"]:
@@ -58,8 +58,9 @@ class LawPolicy(Described):
     """A control law as a policy: `policy(key, observation)` returns an action.
 
     Observations may have leading batch axes, and the actions then have them too. A law draws
-    nothing, so the key means nothing. `policy.control(sim)` is the law in physical units, of the
-    whole state, and `policy.action(state)` the action for it.
+    nothing, so the key is not used. From the whole state, whatever is observed,
+    `policy.control(sim)` returns the control in physical units and `policy.action(state)` the
+    action.
     """
 
     def __init__(self, env: Environment, law: ControlLaw) -> None:
@@ -75,14 +76,15 @@ class LawPolicy(Described):
             ConfigError: the observation lacks what the law needs, or has another size.
         """
         require_observed(self.env, self.needs, self.law.type_name or type(self.law).__name__)
-        size, found = self.env.observation_size, jnp.shape(observation)
-        if not found or found[-1] != size:
+        size = self.env.observation_size
+        shape = jnp.shape(observation)
+        if not shape or shape[-1] != size:
             raise ConfigError(
-                f"observation: expected {size} numbers on the last axis, found shape {found}"
+                f"observation: expected {size} numbers on the last axis, found shape {shape}"
             )
 
-        def act(one: Float[Array, " o"]) -> Array:
-            return self._action_of(observed_sim(self.env, one))
+        def act(single: Float[Array, " o"]) -> Array:
+            return self._action_of(observed_sim(self.env, single))
 
         return jnp.vectorize(act, signature="(o)->(a)")(jnp.asarray(observation))
 
@@ -108,11 +110,11 @@ class LawPolicy(Described):
 
 
 def action_of(env: Environment, control: Float[Array, " m"]) -> Array:
-    """Return the action that gives a control within its bounds, or the nearest choice to it.
+    """Return the action that gives a control. A discrete action is the choice nearest to it.
 
     Args:
         env: the environment.
-        control: the control in physical units and action order, shape (m,).
+        control: the control in physical units and action order, within its bounds, shape (m,).
     """
     points = env.num_action_points or (0,) * env.action_size
     elements = []

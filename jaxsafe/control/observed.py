@@ -1,4 +1,4 @@
-"""The state that an observation shows."""
+"""From an observation to the state that it shows, for control laws."""
 
 from __future__ import annotations
 
@@ -25,22 +25,26 @@ VECTORS = ("position", "velocity")
 class Quantity(NamedTuple):
     """A quantity that an observation shows."""
 
-    of: str
-    what: str
-    relative_to: str | None
+    of: str  # name of a platform or region
+    what: str  # name of the quantity, such as `position`
+    relative_to: str | None  # name of the platform or region from which it is seen
 
 
 def observed_sim(env: Environment, observation: Float[Array, " o"]) -> Sim:
     """Return the simulation that an observation shows.
 
-    What is not observed is as in `rest`. If only relative positions are observed, the agent is at
-    the origin, and if its heading is not observed, it is 0. So the world is shifted and turned
-    about the vertical, and a control law returns the same control. What an observation clips stays
-    clipped.
+    A quantity that is not observed has its value in `rest`. If only relative positions are
+    observed, the agent is therefore at the origin. If its heading is not observed, the heading is
+    0. So the world is shifted and turned about the vertical, and a control law returns the same
+    control. What an observation clips stays clipped.
 
     Args:
         env: the environment.
         observation: one observation, shape (o,).
+
+    Returns:
+        A simulation with platforms, and with those regions whose position is observed relative to
+        the agent. Its time is 0, and statuses are empty.
     """
     seen = _seen(env, observation)
     states = {
@@ -83,7 +87,7 @@ def require_observed(env: Environment, needs: Needs, law: str) -> None:
 
     Args:
         env: the environment.
-        needs: what the law must see.
+        needs: what the law must see, pairs of a platform or region and a quantity of it.
         law: the name of the law, for the message.
 
     Raises:
@@ -104,7 +108,7 @@ def require_observed(env: Environment, needs: Needs, law: str) -> None:
 def _seen(env: Environment, observation: Array) -> list[tuple[Observation, Quantity, Array]]:
     """Return each observation that shows the state, with its vector in physical units."""
     labels = [name.partition(".")[0] for name in env.observation_names]
-    found = []
+    seen = []
     for item in env.observation:
         quantity = _quantity(item)
         if quantity is None:
@@ -114,11 +118,12 @@ def _seen(env: Environment, observation: Array) -> list[tuple[Observation, Quant
         value = value if item.offset is None else value + item.offset
         if getattr(item, "form", "rectangular") == "magnorm":
             value = value[0] * value[1:]
-        found.append((item, quantity, value))
-    return found
+        seen.append((item, quantity, value))
+    return seen
 
 
 def _quantity(item: Observation) -> Quantity | None:
+    """Return the quantity that an observation shows, or None if it is not one of the state."""
     if isinstance(item, Observe):
         return Quantity(item.of, item.what, item.relative_to)
     if isinstance(item, ObserveRegion):
@@ -146,19 +151,22 @@ def _observed_numbers(
 
 def _between(vectors: Mapping[Quantity, Array], of: str, to: str) -> Array | None:
     """Return the position of one platform relative to another, if it is observed."""
-    found = vectors.get(Quantity(of, "position", to))
-    if found is not None:
-        return found
+    position = vectors.get(Quantity(of, "position", to))
+    if position is not None:
+        return position
     opposite = vectors.get(Quantity(to, "position", of))
     return None if opposite is None else -opposite
 
 
 def _own_position(env: Environment, vectors: Mapping[Quantity, Array]) -> Array:
-    """Return the agent's position: the observed one, or that relative to a platform at 0."""
-    found = vectors.get(Quantity(env.agent, "position", None))
-    at_origin = [platform.name for platform in env.platforms if type(platform) is Anchor]
-    apart = [_between(vectors, of=env.agent, to=name) for name in at_origin]
+    """Return the agent's position: the observed one, or that relative to an anchor at the origin.
+
+    If neither is observed, it is the position in `rest`.
+    """
+    observed = vectors.get(Quantity(env.agent, "position", None))
+    anchors = [platform.name for platform in env.platforms if type(platform) is Anchor]
+    apart = [_between(vectors, of=env.agent, to=name) for name in anchors]
     return next(
-        (position for position in [found, *apart] if position is not None),
+        (position for position in [observed, *apart] if position is not None),
         env.agent_platform.rest().position,
     )

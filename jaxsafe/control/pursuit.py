@@ -30,16 +30,18 @@ from jaxsafe.types import (
 class Pursuit(ControlLaw, type="pursuit"):
     """Pursuit of a region that moves with a lead, and then formation hold.
 
-    The desired velocity is the lead's, plus d times `gain` and at most `closing`, where d is the
-    way to the region's centre. So the error decays like exp(−`gain` t) once it is small, and far
-    away the agent closes in at a constant speed, on a course near that of the lead. In the plane
-    the agent takes the desired heading and speed as fast as its bounds allow.
+    The desired velocity is the lead's plus `gain` times d, where d is the way to the region's
+    centre. The second part is at most `closing`. So the error decays like exp(−`gain` t) once it is
+    small. Far away the agent closes in at a constant speed, on a course near that of the lead. In
+    the plane the agent takes the desired heading and speed as fast as its bounds allow.
 
     In space it banks for the turn e/`response`, where e is the error of the heading, and takes the
-    desired flight path angle. The lead is flown around at `clearance`.
+    desired flight path angle. It flies around the lead at the distance `clearance`: towards it the
+    speed is at most `yielding` times the distance that is left.
 
     The numbers are chosen by hand. The paper observes no distance beyond 1000 ft, and 1000 ft times
-    `gain` is `closing`, so the observation gives the control of the whole state.
+    `gain` is `closing`. So the law returns the same control from the observation as from the whole
+    state.
     """
 
     lead: PlatformName = "lead"
@@ -59,10 +61,10 @@ class Pursuit(ControlLaw, type="pursuit"):
             )
         regions = [region.name for region in env.regions]
         others = [other.name for other in env.platforms if other.name != env.agent]
-        for name, known in ((self.region, regions), (self.lead, others)):
-            if name not in known:
-                found = ", ".join(known) or "none"
-                raise ConfigError(f"controller: pursuit follows {name!r}; there is {found}")
+        for name, names in ((self.region, regions), (self.lead, others)):
+            if name not in names:
+                existing = ", ".join(names) or "none"
+                raise ConfigError(f"controller: pursuit follows {name!r}; there is {existing}")
         angles = ("roll", "flight_path_angle") if isinstance(plant, Dubins3D) else ()
         own = [(env.agent, what) for what in ("velocity", *angles)]
         return [
@@ -78,14 +80,14 @@ class Pursuit(ControlLaw, type="pursuit"):
         lead = sim.platforms[self.lead]
         change = self.gain * way
         change *= jnp.minimum(1.0, self.closing / jnp.maximum(safe_norm(change), 1e-6))
-        wanted = lead.velocity + self._around(change, lead.position - own.position)
-        course = jnp.arctan2(wanted[1], wanted[0])
+        desired = lead.velocity + self._around(change, lead.position - own.position)
+        course = jnp.arctan2(desired[1], desired[0])
         error = wrap(course - own.heading, -jnp.pi, 2.0 * jnp.pi)
-        controls = {"acceleration": (safe_norm(wanted) - own.speed) / env.dt}
+        controls = {"acceleration": (safe_norm(desired) - own.speed) / env.dt}
         if isinstance(plant, Dubins3D):
             lowest, highest = plant.roll_limits
             bank = arctan(own.speed * error / (self.response * plant.gravity))
-            climb = jnp.arctan2(-wanted[2], safe_norm(wanted[:2]))
+            climb = jnp.arctan2(-desired[2], safe_norm(desired[:2]))
             controls["roll_rate"] = (jnp.clip(bank, lowest, highest) - own.roll) / env.dt
             controls["flight_path_angle_rate"] = (climb - own.flight_path_angle) / env.dt
         else:
@@ -95,10 +97,10 @@ class Pursuit(ControlLaw, type="pursuit"):
     def _around(
         self, change: Float[Array, " d"], to_lead: Float[Array, " d"]
     ) -> Float[Array, " d"]:
-        """Return a velocity relative to the lead that leads around it, if `change` is towards it.
+        """Return `change`, a velocity relative to the lead, turned aside if it leads into the lead.
 
-        The speed towards the lead is at most `yielding` · (distance − `clearance`), and what is
-        taken from it goes across.
+        The speed towards the lead is at most `yielding` · (distance − `clearance`). Where that cuts
+        it, the speed across grows instead, so that the whole speed stays the same.
         """
         distance = safe_norm(to_lead)
         towards = to_lead / jnp.maximum(distance, 1e-6)

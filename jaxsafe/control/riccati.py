@@ -13,11 +13,18 @@ MAX_DOUBLINGS = 60
 def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
     """Return the stabilising P of P = AᵀPA − AᵀPB (R + BᵀPB)⁻¹ BᵀPA + Q.
 
-    It is computed by the structure-preserving doubling algorithm (Chu, Fan, Lin and Wang 2004),
-    whose k-th iterate is the cost of 2ᵏ steps.
+    P is computed by the structure-preserving doubling algorithm (Chu, Fan, Lin and Wang 2004). Its
+    k-th iterate is the cost of 2ᵏ steps.
+
+    Args:
+        a: A of the plant x' = A x + B u, shape (n, n).
+        b: B of the plant, shape (n, m).
+        q: Q, the weights of the state, shape (n, n).
+        r: R, the weights of the control, shape (m, m).
 
     Raises:
-        ConfigError: the iteration does not converge, as for a plant that cannot be stabilised.
+        ConfigError: the iteration does not converge, for instance because the plant cannot be
+            stabilised.
     """
     identity = np.eye(len(a))
     g = b @ np.linalg.solve(r, b.T)
@@ -38,6 +45,12 @@ def riccati(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.nd
 
 
 def lqr_gain(a: np.ndarray, b: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Return K = (R + BᵀPB)⁻¹ BᵀPA, with which u = −K x minimises Σ xᵀQx + uᵀRu."""
+    """Return K = (R + BᵀPB)⁻¹ BᵀPA, shape (m, n), with which u = −K x minimises Σ xᵀQx + uᵀRu.
+
+    The arguments are those of `riccati`.
+
+    Raises:
+        ConfigError: the Riccati equation has no solution.
+    """
     p = riccati(a, b, q, r)
     return np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)

@@ -1,7 +1,7 @@
 """The tasks by name, and `make`, which returns the environment of a task.
 
-The two domains, `rejoin` and `docking`, have a file each. The tasks of a domain are at the end of
-its file. `task` has the record of a task and the call that registers one.
+The two domains, `rejoin` and `docking`, have a module each. The tasks of a domain are at the end of
+its module. The module `task` has the record of a task and the function that registers one.
 """
 
 from __future__ import annotations
@@ -97,16 +97,14 @@ def make(
     """
     if not isinstance(task, (str, os.PathLike)):
         raise ConfigError(f"env: expected the name of a task or a .yaml file, found {show(task)}")
-    for option, kinds, value in (
+    for option, expected_type, value in (
         ("overrides", Mapping, overrides),
         ("randomize", Mapping, randomize),
         ("actions", str, actions),
     ):
-        if value is not None and not isinstance(value, kinds):
-            raise ConfigError(
-                f"{option}: expected {'paths with values' if kinds is Mapping else 'a name'}, "
-                f"found {show(value)}"
-            )
+        if value is not None and not isinstance(value, expected_type):
+            expected = "paths with values" if expected_type is Mapping else "a name"
+            raise ConfigError(f"{option}: expected {expected}, found {show(value)}")
     name = os.fspath(task)
     return adapt(
         unchanged(name),
@@ -120,7 +118,7 @@ def make(
 
 
 def unchanged(task: str) -> Environment:
-    """Return the environment of a task as it is declared, or the one that a YAML file has.
+    """Return the environment of a task as it is declared, or the environment in a YAML file.
 
     Raises:
         ConfigError: there is no such task, or the file has no environment.
@@ -150,7 +148,7 @@ def adapt(
         variant: the variant of the task, as for `make`, but None changes nothing.
         randomize: the intervals of random numbers by dotted path.
         rta: run time assurance, as for `make`.
-        place: what stands before the paths of the overrides in messages of errors, such as `env`.
+        place: what error messages put before the paths of the overrides, such as `env`.
 
     Raises:
         ConfigError: one line that names the place, what was found and what is allowed.
@@ -166,7 +164,7 @@ def adapt(
 
 
 def _variant_values(name: str, variant: str) -> dict[str, Any]:
-    """Return the values of a variant, by dotted path, in everything in which the variants differ.
+    """Return the values of a variant, for every dotted path at which the variants differ.
 
     Args:
         name: the name of a task, which may begin with its module.
@@ -191,6 +189,11 @@ def _variant_values(name: str, variant: str) -> dict[str, Any]:
 
 
 def _filter(name: str, rta: str | RTA) -> RTA | None:
+    """Return the filter that the option `rta` of `make` stands for. None is no filter.
+
+    Raises:
+        ConfigError: there is no such preset, or the file has no filter.
+    """
     if isinstance(rta, RTA):
         return rta
     if isinstance(rta, str) and rta.endswith((".yaml", ".yml")):
@@ -198,9 +201,9 @@ def _filter(name: str, rta: str | RTA) -> RTA | None:
     task = registered(name)
     presets = {"none": lambda: None, **(task.filters if task else {})}
     if not isinstance(rta, str) or rta not in presets:
-        known = [*presets, "FILE.yaml"]
+        choices = [*presets, "FILE.yaml"]
         raise ConfigError(
-            f"rta: {name} has no preset {show(rta)}; choose from {nearest(rta, known)}"
+            f"rta: {name} has no preset {show(rta)}; choose from {nearest(rta, choices)}"
         )
     return presets[rta]()
 

@@ -1,6 +1,7 @@
 """Spacecraft docking: fly the deputy to within 0.5 m of the chief and keep to the speed limit.
 
-Sections 3 and 4, Tables 4, 6, 8 and 10 of the paper. Lengths in m, speeds in m/s, forces in N.
+Sections 3 and 4, Tables 4, 6, 8 and 10 of the paper. Lengths are in m, speeds in m/s and forces in
+N.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ DOCKING_TIES: Ties = {
     "deputy.start.velocity.slope": Tie(to="status.velocity_limit.slope"),
     "reward.success.time_scale": Tie(to="terminal.timeout.limit"),  # t_max of Table 8
 }
-"""Numbers that follow others. A start is within the speed limit."""
+"""Numbers that follow others. So a start is within the speed limit, whatever the limit is."""
 
 ORBIT_TIES: Ties = {
     **DOCKING_TIES,
@@ -170,7 +171,7 @@ def docking_region(dimension: Literal[1, 2, 3]) -> Region:
 
 
 def docking_status() -> tuple[Status, ...]:
-    """Return distance, region, speed and its limit, and the Δv of the step."""
+    """Return the distance, whether the deputy is docking, its speed and the limit, and the Δv."""
     return (
         Distance(name="docking_distance", of="deputy", to="chief"),
         InRegion(name="in_docking", of="deputy", region="docking_region"),
@@ -192,7 +193,7 @@ def docking_constraints() -> tuple[Constraint, ...]:
 
 
 def docking_terminal(timeout: float) -> tuple[Terminal, ...]:
-    """Return the terminal conditions of Table 10, but for the bound that ends with its reward."""
+    """Return the terminal conditions of Table 10, without the one that is a bound of the reward."""
     return (
         Docked(
             name="success",
@@ -236,7 +237,7 @@ def docking_reward(timeout: float) -> tuple[Reward, ...]:
 
 
 def speed_observation() -> tuple[Observation, ...]:
-    """Return the last two rows of each part of Table 6."""
+    """Return the last two rows of each part of Table 6: the speed and its limit."""
     return (
         ObserveStatus(name="speed", status="speed"),
         ObserveStatus(name="velocity_limit", status="velocity_limit"),
@@ -264,8 +265,8 @@ RELEASED_ORIENTED: Mapping[str, Any] = RELEASED | {
 LIMIT_MARGIN = 2.5e-4
 """Margin of the filters below the speed limit at samples [m/s].
 
-It makes the limit hold inside a step as well: near the chief the distance dips below its values at
-the samples by up to half the way of a step.
+It makes the limit hold inside a step as well. Near the chief the distance falls below its values at
+the samples, by up to half the way of a step.
 """
 
 BRAKE: dict[str, Any] = {
@@ -281,14 +282,14 @@ The proof is in docs/safety/proofs.md.
 SMALL_BOUND = UncertaintyBound(
     process=0.001, mass=0.02, misalignment=0.02, position=0.1, velocity=0.001
 )
-"""What the preset `robust` makes up for, unless it is told otherwise.
+"""The bound of the preset `robust`, unless another one is given.
 
-A push of 1 mm/s in a step, 2 % of the mass, 0.02 rad of the thrust, and a measured state that is
-wrong by 10 cm and 1 mm/s.
+It allows for a push of 1 mm/s in a step, an error of 2 % of the mass, a thrust that is off by 0.02
+rad, and a measured state that is wrong by 10 cm and 1 mm/s.
 """
 
 STOP: dict[str, Any] = {**BRAKE, "horizon": 16, "terminal": Slow(speed=0.19)}
-"""Filters that predict braking until there is hardly any speed, as if nothing was known of it."""
+"""Filters that predict braking until hardly any speed is left, as if there were no proof for it."""
 
 TURN: dict[str, Any] = {
     "constraints": ("velocity_limit",),
@@ -304,7 +305,7 @@ _ALPHA = Polynomial(linear=0.05, cubic=0.1)
 
 
 def _explicit_asif(backup: AlignAndBrake | Brake) -> ExplicitASIF:
-    """Return the paper's continuous-time filter, whose solution acts unchecked: for comparison."""
+    """Return the paper's continuous-time filter for comparison. Its solution acts unchecked."""
     return ExplicitASIF(
         constraints=("velocity_limit",),
         backups=(backup,),

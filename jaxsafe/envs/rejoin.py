@@ -1,6 +1,7 @@
 """Aircraft rejoin: fly the wingman to the rejoin point of the lead and stay there for 20 s.
 
-Sections 3 and 4, Tables 3, 5, 7 and 9 of the paper. Lengths in ft, speeds in ft/s, angles in rad.
+Sections 3 and 4, Tables 3, 5, 7 and 9 of the paper. Lengths are in ft, speeds in ft/s and angles in
+rad.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ REJOIN_TIES: Ties = {
 """Numbers that follow others."""
 
 REJOIN_POINT = Aspect(distance=500.0, angle=jnp.pi / 3)
-"""Eq. (6): behind the lead, 60° from its tail [ft]."""
+"""Eq. (6): 500 ft from the lead, 60° from its tail."""
 
 LEAD_DISTANCES = (5000.0, 10_000.0)
 """Distance of the wingman from the lead at the start [ft], Table 3."""
@@ -152,7 +153,7 @@ def rejoin3d() -> Environment:
 
 
 def rejoin_status() -> tuple[Status, ...]:
-    """Return the distances to the lead and to the rejoin region, and the time spent in it."""
+    """Return whether the wingman is in the rejoin region and since when, and its distances."""
     return (
         InRegion(name="in_rejoin", of="wingman", region="rejoin_region"),
         TimeHeld(name="rejoin_time", status="in_rejoin"),
@@ -194,7 +195,7 @@ def rejoin_reward(timeout: float) -> tuple[Reward, ...]:
 
 
 def rejoin_observation(dimension: int) -> tuple[Observation, ...]:
-    """Return the rows of Table 5: magnitudes and directions, seen from the wingman."""
+    """Return the vectors of Table 5, as magnitudes and directions seen from the wingman."""
     lengths = (1000.0, *(1.0,) * dimension)
     speeds = (400.0, *(1.0,) * dimension)
     seen = {"frame": "wingman", "form": "magnorm", "clip": (-1.0, 1.0)}
@@ -237,11 +238,11 @@ RELEASED_3D: Mapping[str, Any] = RELEASED | {
     "wingman.controller.actuators.roll_rate.high": 0.09,
     "wingman.controller.actuators": ["flight_path_angle_rate", "roll_rate", "acceleration"],
 }
-"""The ailerons of the released code drive γ, its elevator φ."""
+"""The same in space. In the released code the ailerons drive γ, and the elevator drives φ."""
 
 MATCH_2D: dict[str, Any] = {
     "constraints": ("collision",),
-    "margin": 1.0,  # [ft] by which prediction and plant may differ in float32
+    "margin": 1.0,  # [ft], by which the prediction and the plant may differ in float32
     "backups": tuple(
         MatchVelocity(name=turn, lead="lead", clearance=101.0, turn=turn)
         for turn in ("left", "right")
@@ -249,7 +250,7 @@ MATCH_2D: dict[str, Any] = {
     "horizon": 40,
     "terminal": VelocityMatched(of="wingman", to="lead", tolerance=1.0, clearance=101.0),
 }
-"""Filters that keep a way out open: turn left or right until the wingman flies as the lead does."""
+"""Filters that keep a way out open: a left or right turn until the wingman flies as the lead."""
 
 ROBUST_2D: dict[str, Any] = MATCH_2D | {
     "backups": tuple(
@@ -260,7 +261,7 @@ ROBUST_2D: dict[str, Any] = MATCH_2D | {
     "terminal": VelocityMatched(of="wingman", to="lead", tolerance=10.0, clearance=107.0),
     "bound": UncertaintyBound(process=1.0),  # [ft/s²]
 }
-"""Filters that keep a way out open within a bound. The distances suffice for the largest one."""
+"""The same within an uncertainty bound. The distances suffice for the largest one allowed."""
 
 MATCH_3D: dict[str, Any] = {
     "constraints": ("collision",),
@@ -280,7 +281,7 @@ MATCH_3D: dict[str, Any] = {
         lag=1.0,
     ),
 }
-"""Filters in space, which may also climb or dive."""
+"""Filters that keep a way out open in space, where a turn may also climb or dive."""
 
 ROBUST_3D: dict[str, Any] = MATCH_3D | {
     "backups": tuple(
@@ -300,14 +301,14 @@ ROBUST_3D: dict[str, Any] = MATCH_3D | {
     "terminal": VelocityMatched(of="wingman", to="lead", tolerance=0.75, clearance=204.0),
     "bound": UncertaintyBound(process=0.3),  # [ft/s²]
 }
-"""Filters that keep a way out open within a bound. In space turning takes longer."""
+"""The same within an uncertainty bound. In space turning takes longer."""
 
 _ALPHA = Polynomial(linear=0.2)
 """Strengthening function of the filters from the literature, Eq. (3)."""
 
 
 def _explicit_asif(backup: MatchVelocity) -> ExplicitASIF:
-    """Return the paper's continuous-time filter, whose solution acts unchecked: for comparison."""
+    """Return the paper's continuous-time filter for comparison. Its solution acts unchecked."""
     return ExplicitASIF(
         constraints=("collision",),
         backups=(backup,),

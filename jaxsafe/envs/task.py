@@ -1,4 +1,4 @@
-"""The record of all that is known of a task, and the tasks by name.
+"""The record that describes a task, and the tasks by name.
 
 A package adds a task of its own with one call:
 
@@ -31,7 +31,7 @@ Controllers = Mapping[str, Callable[[], ControlLaw]]
 """Classical controllers by the name that follows `controller/`."""
 
 TASKS: dict[str, Task] = {}
-"""Every registered task by its name, but for the starters."""
+"""Every registered task by its name, except the starters."""
 
 STARTERS: dict[str, Task] = {}
 """Small tasks to begin with, by name. They are not part of the benchmark, nor of `env=all`."""
@@ -41,7 +41,7 @@ _NAME = re.compile(r"[A-Za-z]\w*")
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Task:
-    """All that is known of a task."""
+    """A task: its environment, and what the commands offer for it."""
 
     name: str
     environment: Callable[[], Environment]
@@ -49,15 +49,15 @@ class Task:
     released: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     """What `variant="released"` changes, by dotted path: the semantics of the released code."""
     filters: Filters = dataclasses.field(default_factory=dict)
-    """What `rta=…` knows by name."""
+    """The presets of `rta=…`."""
     controllers: Controllers = dataclasses.field(default_factory=dict)
-    """What `run=controller/…` knows by name."""
+    """The controllers of `run=controller/…`."""
     gymnasium_id: str | None = None
     """The id for `gymnasium.make`, for instance `my_package/Hover-v0`."""
     recipe: str | Path | None = None
     """The file of training recipes by preset, or of an environment that has such `recipes`. A
-    relative path is one in the package's `configs/`.
-    Without a file there is only the preset `observation_only`, the options' defaults."""
+    relative path begins at the package's `configs/`. Without a file there is only the preset
+    `observation_only`, which has the defaults of the options."""
     paper_steps: int | None = None
     """Table 2 of the paper: environment steps to 80 % success in training."""
     starter: bool = False
@@ -67,19 +67,20 @@ class Task:
 def register(task: Task) -> None:
     """Make a task known by its name, and to Gymnasium by its id.
 
-    The same task defined again replaces the first, as happens when a notebook's cell runs twice.
+    A task that is defined again in the same module replaces the first one, as happens when the cell
+    of a notebook runs twice.
 
     Raises:
-        ConfigError: the name is not a plain word, or the name or the id is that of another task.
+        ConfigError: the name is not a plain word, or another task has the name or the id.
     """
     if not _NAME.fullmatch(task.name) or task.name == "all":
         raise ConfigError(
             f"task {show(task.name)}: expected a name of letters, digits and _, other than all"
         )
-    known = registered(task.name)
-    if known and known.environment.__module__ != task.environment.__module__:
+    existing = registered(task.name)
+    if existing and existing.environment.__module__ != task.environment.__module__:
         raise ConfigError(
-            f"task {task.name!r}: taken by {known.environment.__module__}; choose another name"
+            f"task {task.name!r}: taken by {existing.environment.__module__}; choose another name"
         )
     if task.gymnasium_id:
         _register_id(task.gymnasium_id, task.name)
@@ -88,8 +89,8 @@ def register(task: Task) -> None:
 
 def registered(name: str) -> Task | None:
     """Return the task of a name, or None if there is none. The name may begin with its module."""
-    task = name.rpartition(":")[2]
-    return TASKS.get(task) or STARTERS.get(task)
+    short = name.rpartition(":")[2]
+    return TASKS.get(short) or STARTERS.get(short)
 
 
 def find_task(name: str, place: str = "env", others: Sequence[str] = ()) -> Task:
@@ -97,26 +98,26 @@ def find_task(name: str, place: str = "env", others: Sequence[str] = ()) -> Task
 
     Args:
         name: the name.
-        place: where the name stands. Messages of errors begin with it.
-        others: what may stand there besides tasks and files, for the message of an error.
+        place: where the name was given. Error messages begin with it.
+        others: what may be given besides tasks and files, for error messages.
 
     Raises:
         ConfigError: the module cannot be imported, or there is no such task.
     """
-    module, _, task = name.rpartition(":")
+    module, _, short = name.rpartition(":")
     if module:
         import_modules([module], place)
-    known = registered(task)
-    if known is None:
+    task = registered(short)
+    if task is None:
         raise ConfigError(
-            f"{place}: unknown task {show(task)} and not a .yaml file; "
-            f"choose from {nearest(task, [*TASKS, *STARTERS, *others])}"
+            f"{place}: unknown task {show(short)} and not a .yaml file; "
+            f"choose from {nearest(short, [*TASKS, *STARTERS, *others])}"
         )
-    return known
+    return task
 
 
 def default_filter(name: str) -> str | None:
-    """Return `default` if `rta=default` means something for a task; None if not, or for a file."""
+    """Return `default` if a task has a recommended filter, else None. It is None for a file too."""
     if is_file(name):
         return None
     return "default" if "default" in find_task(name).filters else None
@@ -128,7 +129,7 @@ def is_file(name: str) -> bool:
 
 
 def short_name(name: str) -> str:
-    """Return the name without its module, of a task, or without folder and ending, of a file."""
+    """Return the name of a task without its module, or that of a file without folder and ending."""
     return Path(name.rpartition(":")[2]).stem
 
 
@@ -141,15 +142,15 @@ def user_module(name: str) -> str | None:
 
 
 def _register_id(gymnasium_id: str, task: str) -> None:
-    """Tell Gymnasium of a task; its environment loads when one is made.
+    """Register a task with Gymnasium, which imports the adapter when an environment is made.
 
-    No `max_episode_steps`: tasks end by themselves, and a second clock would truncate what they
-    terminate.
+    No `max_episode_steps` is given. Tasks end by themselves, and a second clock would truncate what
+    they terminate.
     """
-    known = registration.registry.get(gymnasium_id)
-    if known is not None and known.kwargs.get("task") != task:
+    existing = registration.registry.get(gymnasium_id)
+    if existing is not None and existing.kwargs.get("task") != task:
         raise ConfigError(f"task {task!r}: Gymnasium has another environment called {gymnasium_id}")
-    if known is None:
+    if existing is None:
         registration.register(
             gymnasium_id,
             entry_point="jaxsafe.adapters.gymnasium:GymEnv",

@@ -41,7 +41,7 @@ class Constraint(Component):
     """A signed margin h, which is safe where h ≥ 0, and a limit.
 
     The severity of a violation is −h as a share of the limit. The optional fields say how filters
-    treat this constraint. Where they are left out, what the filter says counts.
+    treat this constraint. A field that is left out has the value that the filter has for it.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Constraint(Component):
     between: ClassVar[bool] = False
     """Whether h can fall far below 0 between two safe instants.
 
-    If so, filters bound h also between the instants, with `Status.on_the_way`.
+    If so, filters also bound h between the instants, with `Status.on_the_way`.
     """
 
     def margin(self, sim: Sim) -> Float[Array, ""]:
@@ -70,7 +70,7 @@ class Constraint(Component):
         raise NotImplementedError
 
     def margin_between(self, now: Sim, on_the_way: Sim) -> Float[Array, ""]:
-        """Return the h of a predicted step, a lower bound if `between`.
+        """Return the h of a predicted step. If `between`, it is a lower bound over the whole step.
 
         Args:
             now: the simulation after the step.
@@ -109,7 +109,7 @@ class Separation(Constraint, type="separation"):
 class LowerLimit(Constraint, type="lower_limit"):
     """The margin h = status − minimum.
 
-    A filter bounds it between two samples where the status is a distance, or falls with one.
+    A filter bounds it between two samples if the status is a distance or falls with a distance.
     """
 
     between: ClassVar[bool] = True
@@ -124,7 +124,7 @@ class LowerLimit(Constraint, type="lower_limit"):
         return self.scale
 
     def margin_between(self, now: Sim, on_the_way: Sim) -> Float[Array, ""]:
-        # A status that grows where a distance falls is no lower bound on the way.
+        # For a status that grows when a distance falls, the margin on the way is no lower bound.
         return jnp.minimum(self.margin(now), self.margin(on_the_way))
 
 
@@ -178,8 +178,8 @@ class ConeConstraint(Constraint, type="cone"):
     """The margin between an angle and the half angle of a cone [rad].
 
     The angle is that between the `axis` of the cone and the direction to a target. `keep` says
-    whether the target must stay inside the cone, as a docking port in a camera's view, or outside,
-    as the sun. A filter keeps it at samples.
+    whether the target must stay inside the cone, such as a docking port in a camera's view, or
+    outside, such as the sun. A filter keeps it at samples.
     """
 
     axis: Vector

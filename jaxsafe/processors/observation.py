@@ -39,7 +39,6 @@ Shift = Annotated[Number, Unit("as observed", length=ANY), Range(largest=MAX_DIS
 Clip = Annotated[Number, Unit("1", length=2), Range(infinite=True)]
 """Lowest and highest value of an observation after scaling."""
 
-
 Deviation = Annotated[Number, Unit("as observed", length=ANY), Range(0.0, largest=MAX_DISTANCE)]
 """One standard deviation for all elements of an observation, or one for each."""
 
@@ -52,8 +51,8 @@ class Observation(Processor):
     is the standard deviation standardise it. Each is one number for all elements or one for each.
 
     A sensor adds its `bias` and normal `noise` of a standard deviation in physical units. With the
-    probability `dropout` it gives all elements of the last reading again. What it gives arrives
-    `delay` actions late; the first reading of an episode arrives at once.
+    probability `dropout` it gives all elements of the last reading again. A reading arrives `delay`
+    actions late, but the first one of an episode arrives at once.
     """
 
     scale: Scale = 1.0
@@ -96,7 +95,11 @@ class Observation(Processor):
         Args:
             measured: the true vector.
             readings: the readings under way before, or None at the start of an episode.
-            key: a key for this sensor and this instant, not used by a sensor that draws nothing.
+            key: a key for this sensor and this instant. A sensor that draws nothing does not use
+                it.
+
+        Raises:
+            ValueError: `bias` or `noise` has another number of elements than the vector.
         """
         self._check_lengths(measured, ("bias", "noise"))
         reading = measured if self.bias is None else measured + self.bias
@@ -115,7 +118,11 @@ class Observation(Processor):
         return readings[0], readings
 
     def _check_lengths(self, measured: Float[Array, " k"], names: tuple[str, ...]) -> None:
-        """Check that fields have one number, or one for each element of the measured vector."""
+        """Check that fields have one number, or one for each element of the measured vector.
+
+        Raises:
+            ValueError: a field has another number of elements.
+        """
         for name in names:
             value = getattr(self, name)
             if value is not None and jnp.shape(value) not in ((), measured.shape):
@@ -202,7 +209,7 @@ class ObserveVector(VectorObservation, type="observe_vector"):
 
 
 class ObserveOrientation(Observation, type="observe_orientation"):
-    """The orientation of a platform or region, which does not jump.
+    """The orientation of a platform or region, in numbers that do not jump.
 
     In the plane it is [cos θ, sin θ] of the angle θ of the body's x axis. In space it is the first
     two columns of the rotation matrix, which are the body's x and y axes; the z axis follows from
@@ -250,7 +257,7 @@ class ObserveTime(Observation, type="observe_time"):
 
 
 class ObserveAngle(Observation, type="observe_angle"):
-    """An angle θ of a platform's state, given as [cos θ, sin θ], which does not jump at ±π."""
+    """An angle θ of a platform's state, as [cos θ, sin θ]. These two do not jump at ±π."""
 
     of: PlatformName
     what: str
@@ -275,12 +282,11 @@ class ObserveStatus(Observation, type="observe_status"):
 
 
 def _not_observable(env: Environment, what: str, *platforms: str) -> dict[str, str]:
-    """Return what is wrong with a quantity that one of some platforms does not have."""
+    """Return what is wrong with a quantity, if one of the platforms does not have it."""
     for name in platforms:
         known = env.platform(name).quantities()
         if what not in known:
-            found = f"{name} has no quantity {what!r}; choose from {nearest(what, known)}"
-            return {"what": found}
+            return {"what": f"{name} has no quantity {what!r}; choose from {nearest(what, known)}"}
     return {}
 
 

@@ -1,4 +1,4 @@
-"""The processor state machine of Fig. 11.
+"""The base of statuses, rewards and observations: the processor state machine of Fig. 11.
 
 A processor has a memory. `increment` moves it once a step, and `process` only reads it.
 """
@@ -41,7 +41,7 @@ class Processor(Component):
 
     @property
     def remembers(self) -> bool:
-        """Whether it has a memory."""
+        """Whether the processor has a memory."""
         return type(self).init is not Processor.init
 
     def init(self, sim: Sim) -> Any:

@@ -62,7 +62,7 @@ class DriftDistance(Status, type="drift_distance"):
     duration: Seconds
     samples: Annotated[int, Range(1, largest=1000)] = 60
     mean_motion: MeanMotion = MEAN_MOTION
-    """That of the platform."""
+    """Mean motion n of the orbit, the same as that of the platform `of`."""
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
         places, _ = self._drift(sim)
@@ -73,8 +73,9 @@ class DriftDistance(Status, type="drift_distance"):
         first, first_speeds = self._drift(before)
         last, last_speeds = self._drift(sim)
         interval = self._interval
-        # At each instant of the drift, how near its place comes while the state moves from one end
-        # of the step to the other, and how far it gets in half an interval before and after.
+        # `nearest` is how near the places of the drift come while the state moves from one end of
+        # the step to the other. `reach` is how far the drift gets in half an interval, so it covers
+        # the time between two of its instants.
         reach = jnp.maximum(first_speeds, last_speeds) * interval / 2.0
         nearest = jnp.min(jax.vmap(closest_approach)(first, last) - reach)
         acceleration = jnp.maximum(self._acceleration(before), self._acceleration(sim))
@@ -97,7 +98,7 @@ class DriftDistance(Status, type="drift_distance"):
         return places - sim.platforms[self.to].position, safe_norm(velocities)
 
     def _acceleration(self, sim: Sim) -> Float[Array, ""]:
-        """Return the largest acceleration [m/s²] of the drift, which is an ellipse that moves."""
+        """Return the largest acceleration [m/s²] of the drift, whose path is a moving ellipse."""
         own = sim.platforms[self.of]
         n = self.mean_motion
         r = own.position

@@ -26,7 +26,7 @@ from jaxsafe.types import (
 )
 
 Pay = Annotated[Number, Unit("1"), Range(largest=1e12)]
-"""A part of a reward, so limited that squares of its sums over episodes are finite in float32."""
+"""A part of a reward. Its range keeps squares of its sums over episodes finite in float32."""
 
 PerMetrePerSecond = Annotated[Number, Unit("s/m"), Range(largest=1e12)]
 """A part of a reward for each metre per second."""
@@ -59,9 +59,9 @@ class ConditionalReward(Reward):
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
         amount = self.amount(sim)
-        return (
-            amount if self.condition is None else jnp.where(sim.status[self.condition], amount, 0)
-        )
+        if self.condition is None:
+            return amount
+        return jnp.where(sim.status[self.condition], amount, 0)
 
 
 class ConstantReward(ConditionalReward, type="constant"):
@@ -74,7 +74,7 @@ class ConstantReward(ConditionalReward, type="constant"):
 
 
 class Proportional(ConditionalReward, type="proportional"):
-    """The term offset + scale·status, of any status that is a number."""
+    """The term offset + scale·status for a status that is a number."""
 
     status: StatusName
     scale: Pay
@@ -229,7 +229,7 @@ class DeltaVCost(Reward, type="delta_v"):
 class Intervention(Reward, type="intervention"):
     """A constant on every step on which run time assurance changed the control.
 
-    A policy pays it for leaning on run time assurance.
+    With a negative `scale` a policy pays for leaning on run time assurance.
     """
 
     scale: Pay = -0.01

@@ -1,4 +1,4 @@
-"""Statuses: named facts about the simulated world, numbers or truth values.
+"""Statuses: named facts about the simulated world, each a number or a truth value.
 
 They are computed in order, so a later status may use an earlier one.
 """
@@ -48,7 +48,7 @@ class Status(Processor):
     per_step: ClassVar[bool] = False
     """Whether the value belongs to the last step and not to the instant after it.
 
-    `info` has the sum of such values over the steps of a `decision_period`.
+    With a `decision_period`, `info` has the sum of such values over its steps.
     """
 
     def on_the_way(self, env: Environment, before: Sim, sim: Sim) -> Any:
@@ -274,7 +274,7 @@ class ControlStatus(Status):
 class ControlComponent(ControlStatus, type="control"):
     """One control of the last step, in its physical unit.
 
-    `element` is its place in `env.action_names`, which begins with 0.
+    `element` is its index in `env.action_names`. The first one is 0.
     """
 
     element: Annotated[int, Range(0, largest=1000)]
@@ -290,7 +290,7 @@ class ControlComponent(ControlStatus, type="control"):
 
 
 class ControlNorm(ControlStatus):
-    """Base of statuses of the size of a control.
+    """Base of statuses that measure the size of a control.
 
     Each control is divided by its `scale`, which is one number for all or one for each. The size is
     the Euclidean norm `l2`, or the sum of magnitudes `l1`.
@@ -370,7 +370,7 @@ class Accumulator(Status, type="accumulator"):
     """Sum of a status over the steps of the episode, such as the Δv that is used up.
 
     With `per_second` the status is a rate, and each step adds status·Δt. A truth value counts as 1
-    or 0. The sample at reset adds nothing. Filters predict how the sum goes on.
+    or 0. The sample at reset adds nothing. Filters predict the sum too.
     """
 
     status: AnyStatusName
@@ -453,8 +453,8 @@ class Not(Status, type="not"):
 
 
 def on_itself(env: Environment, of: str, region: str) -> dict[str, str]:
-    """Return what is wrong with a platform to which a region cannot be related, if it is."""
-    if all((one.name, one.on) != (region, of) for one in env.regions):
+    """Return what is wrong if a region is carried by the very platform that it is related to."""
+    if all((other.name, other.on) != (region, of) for other in env.regions):
         return {}
     return {"of": f"region {region!r} is on {of!r} itself; choose another"}
 
@@ -464,6 +464,6 @@ def _apart(sim: Sim, of: str, to: str) -> Float[Array, " d"]:
 
 
 def _nearest(env: Environment, before: Sim, sim: Sim, of: str, to: str) -> Float[Array, ""]:
-    """Return a lower bound of the distance of two platforms or regions on the way to `sim`."""
+    """Return a lower bound of the distance of two platforms or regions within the step to `sim`."""
     bends = bend(env, before, sim, of) + bend(env, before, sim, to)
     return closest_approach(_apart(before, of, to), _apart(sim, of, to)) - bends

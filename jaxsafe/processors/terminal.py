@@ -23,11 +23,11 @@ class Terminal(Component):
     """A condition that ends the episode with the outcome it is named after.
 
     `ends` says what the end means for learning. After `terminated` nothing follows. In the paper a
-    timeout is a failure of this kind too. After `truncated` the episode is merely cut, and the
-    value of its last state still counts.
+    timeout is a failure of this kind too. With `truncated` the episode is merely cut, and the value
+    of its last state still counts.
 
-    A condition that stands `apart` neither hides the conditions after it nor is hidden by those
-    before it. So its reward and that of another condition may fall on one step.
+    A condition that stands `apart` does not hide the conditions after it, and those before it do
+    not hide it. So its reward and that of another condition may fall on one step.
     """
 
     name: str
@@ -127,7 +127,7 @@ class Held(Terminal, type="held"):
 
 
 class Holds(Terminal, type="holds"):
-    """A boolean status is true: any flag, for instance that the agent is in a keep-out zone."""
+    """A boolean status is true, for instance the status whether the agent is in a keep-out zone."""
 
     status: FlagName
 

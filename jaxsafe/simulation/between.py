@@ -1,8 +1,8 @@
 """Bounds of distances on the way between two samples.
 
 A filter knows the world at the beginning and at the end of a step. What happens within the step is
-bounded: platforms leave the straight line by no more than `Platform.bend`, and what carries a
-region is taken to turn at a constant rate.
+bounded. Platforms leave the straight line by no more than `Platform.bend`. The carrier of a region
+is assumed to turn at a constant rate.
 """
 
 from __future__ import annotations
@@ -36,7 +36,10 @@ def bend(env: Environment, before: Sim, sim: Sim, name: str) -> Float[Array, ""]
     carried = bend(env, before, sim, region.on)
     if region.offset is None or not region.offset.turns:
         return carried
-    levers = [one.regions[name].position - place(one, region.on).position for one in (before, sim)]
+    levers = [
+        instant.regions[name].position - place(instant, region.on).position
+        for instant in (before, sim)
+    ]
     return carried + 0.15 * safe_norm(levers[1] - levers[0]) * _turn(before, sim, region.on)
 
 
@@ -62,32 +65,32 @@ def regions_on_the_way(env: Environment, before: Sim, sim: Sim) -> Mapping[str, 
 def _signed_distance_bounds(
     env: Environment, region: Region, before: Sim, sim: Sim, of: str
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the least and the largest signed distance of a platform to a region on the way.
+    """Return bounds of the signed distance of a platform to a region on the way, low and high.
 
-    Seen from axes that turn by φ, a straight line of a length L between points no farther than R
-    is bent: its second derivative by the share of the step is at most 2φL + φ²R, so it leaves its
-    chord by no more than an eighth of that.
+    Seen from axes that turn by φ in the step, a straight line is bent. Let its length be L, and let
+    its points be no farther away than R. Then its second derivative with respect to the share of
+    the step is at most 2φL + φ²R, and so it leaves its chord by no more than an eighth of that.
     """
     offsets = []
-    lengths = []
+    global_offsets = []
     turn = jnp.zeros_like(sim.time)
-    for one in (before, sim):
-        offset = one.platforms[of].position - one.regions[region.name].position
-        axes = None if region.on is None else region.axes(place(one, region.on))
-        lengths.append(offset)
+    for instant in (before, sim):
+        offset = instant.platforms[of].position - instant.regions[region.name].position
+        axes = None if region.on is None else region.axes(place(instant, region.on))
+        global_offsets.append(offset)
         offsets.append(offset if axes is None else to_body(axes, offset))
     slack = bend(env, before, sim, of) + bend(env, before, sim, region.name)
     if region.on is not None and region.axes(place(sim, region.on)) is not None:
         turn = _turn(before, sim, region.on)
-        way = safe_norm(lengths[1] - lengths[0])
-        farthest = jnp.maximum(safe_norm(lengths[0]), safe_norm(lengths[1]))
+        way = safe_norm(global_offsets[1] - global_offsets[0])
+        farthest = jnp.maximum(safe_norm(global_offsets[0]), safe_norm(global_offsets[1]))
         slack = slack + (2.0 * turn * way + turn**2 * farthest) / 8.0
     low = region.nearest(offsets[0], offsets[1]) - slack
     return low, region.farthest(offsets[0], offsets[1]) + slack
 
 
 def _turn(before: Sim, sim: Sim, name: str) -> Float[Array, ""]:
-    """Return by how much a platform or region has turned [rad]."""
+    """Return the angle by which a platform or region has turned [rad]."""
     return turn_between(place(before, name).orientation, place(sim, name).orientation)
 
 

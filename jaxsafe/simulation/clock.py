@@ -1,7 +1,7 @@
 """Comparison of times that are whole numbers of time steps.
 
-50 steps of 0.3 s take 15 s, although the float of 50 × 0.3 is not equal to 15. Times are therefore
-compared with a tolerance.
+50 steps of 0.3 s take 15 s, although in float32 the product 50 × 0.3 is not equal to 15. Times are
+therefore compared with a tolerance.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Controllers: the way from the agent's action to named controls in physical units.
 
-They are described in Section 4 "Platforms" and in the appendix "Environment Platforms". Between a
-controller and the dynamics, controls are named and never positional. Actions are positional, in the
-order in which the actuators are listed.
+The paper describes them in Section 4 "Platforms" and in the appendix "Environment Platforms".
+Between a controller and the dynamics, controls have names and no order. Actions have the order in
+which the actuators are listed.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ Controls = Mapping[str, Float[Array, ""]]
 """Controls in physical units, by name."""
 
 MAX_TANH = 0.999
-"""Largest tanh of an action that stands for a given control.
+"""Largest tanh of an action that `Actuator.to_continuous` returns.
 
-The action of a limit itself would be infinite, and no policy could learn from it.
+The action for a limit itself would be infinite, and no policy could learn from it.
 """
 
 
@@ -44,9 +44,10 @@ class Actuator(Component):
     Continuous actions in [−1, 1] are clipped and mapped affinely to [low, high]. With
     `post_activation: tanh` actions may be any numbers, and their hyperbolic tangent is mapped. With
     `zero_centred` the map is piecewise linear, so that 0 stays 0. Without `rescale` actions are
-    physical already and are only clipped. Discrete actions choose one of `points` values, spaced
-    equally from low to high, both included. `discrete` says that the controller `mixed` takes
-    discrete actions here.
+    physical already and are only clipped.
+
+    Discrete actions choose one of `points` values, spaced equally from low to high, both included.
+    With `discrete` the controller `mixed` takes discrete actions for this actuator.
 
     An actuator acts at once, unless it has a `time_constant` τ of a first-order lag or a
     `rate_limit` R. Then its value x follows the control u by ẋ = (u − x)/τ, no faster than R, and
@@ -67,7 +68,7 @@ class Actuator(Component):
 
     @property
     def at_once(self) -> bool:
-        """Whether the plant receives the control itself: neither a lag nor a rate limit."""
+        """Whether the plant receives the control itself, without a lag or a rate limit."""
         return self.time_constant is None and self.rate_limit is None
 
     def follow(
@@ -85,15 +86,13 @@ class Actuator(Component):
     def problem(self) -> str | None:
         if self.post_activation == "tanh" and not self.rescale:
             return "post_activation: tanh gives shares of the limits, so leave rescale on"
-        return (
-            None
-            if self.low <= self.high
-            else f"expected low ≤ high, found {self.low:g} and {self.high:g}"
-        )
+        if self.low <= self.high:
+            return None
+        return f"expected low ≤ high, found {self.low:g} and {self.high:g}"
 
     @property
     def action_range(self) -> tuple[Number, Number]:
-        """The lowest and the highest continuous action that makes a difference."""
+        """The lowest and the highest continuous action. Actions beyond them make no difference."""
         if not self.rescale:
             return self.low, self.high
         return (-jnp.inf, jnp.inf) if self.post_activation == "tanh" else (-1.0, 1.0)
@@ -110,7 +109,7 @@ class Actuator(Component):
     def to_continuous(self, control: Float[Array, ""]) -> Float[Array, ""]:
         """Return the action that gives a physical control within the limits.
 
-        With tanh, a control at a limit has the action of one that is `MAX_TANH` of the way there.
+        With tanh, a control at a limit has the action of a control `MAX_TANH` of the way there.
         """
         if not self.rescale:
             return control
@@ -120,7 +119,7 @@ class Actuator(Component):
         return share
 
     def _share(self, control: Float[Array, ""]) -> Float[Array, ""]:
-        """Return where in the limits a control is, from −1 to 1."""
+        """Return where between the limits a control is, from −1 to 1."""
         if self.zero_centred:
             bound = jnp.where(control < 0.0, -self.low, self.high)
             return control / jnp.where(bound > 0.0, bound, 1.0)
@@ -140,7 +139,7 @@ class Controller(Component):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the controls that it gives. Those of an agent are in the order of the action."""
+        """Names of the controls that the controller gives, for an agent in the action's order."""
         return ()
 
     @property
@@ -162,7 +161,7 @@ class Controller(Component):
 
 
 class Uncontrolled(Controller, type="uncontrolled"):
-    """No control: all are 0, as for the chief or for an aircraft that flies on as it started."""
+    """No control: all are 0, as for the chief, or for an aircraft that flies on as it started."""
 
     def control(self, action: Array, sim: Sim) -> Controls:
         return {}
@@ -184,11 +183,11 @@ class Continuous(AgentController, type="continuous"):
 
     def problem(self) -> str | None:
         discrete = [actuator.name for actuator in self.actuators if actuator.discrete]
+        if not discrete:
+            return None
         return (
             f"expected continuous actuators, found {discrete[0]!r} with discrete: true;"
             " choose type mixed"
-            if discrete
-            else None
         )
 
     def control(self, action: Float[Array, " actuators"], sim: Sim) -> Controls:
@@ -224,7 +223,7 @@ class Discrete(AgentController, type="discrete"):
 
 
 class Mixed(Continuous, type="mixed"):
-    """Controller of an agent with continuous and discrete actions, as each actuator says itself.
+    """Controller of an agent with continuous and discrete actions, as each actuator asks for.
 
     The action has shape (actuators,) and is a vector of floats. An actuator with `discrete: true`
     takes the index of a point, which is rounded to a whole number and clipped to 0 … points − 1.

@@ -32,9 +32,8 @@ class SpacecraftState(Record):
 
     position: Annotated[Float[Array, " d"], Unit("m")]  # r
     velocity: Annotated[Float[Array, " d"], Unit("m/s")]  # v
-    delta_v: Annotated[
-        Float[Array, " d"], Unit("m/s")
-    ]  # F Δt / m, the velocity change by the thrust of the last step
+    # F Δt / m, the velocity change by the thrust of the last step.
+    delta_v: Annotated[Float[Array, " d"], Unit("m/s")]
 
     @property
     def heading(self) -> Float[Array, ""]:
@@ -141,8 +140,8 @@ def cwh_flow(
     """Return position and velocity after a time t under constant thrust, solving Eqs. (12), (16).
 
     With τ = nt and the entire functions s₁ = sin τ/τ, c₂ = (1 − cos τ)/τ² and s₃ = (τ − sin τ)/τ³,
-    every coefficient is a product without cancellation. So float32 keeps its precision at τ =
-    0.001, and n = 0 gives the double integrator.
+    every coefficient is a product without cancellation. So float32 keeps its precision at
+    τ = 0.001, and n = 0 gives the double integrator.
 
     Args:
         r: position [m], shape (d,), d = 2 or 3.

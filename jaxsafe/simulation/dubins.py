@@ -205,16 +205,16 @@ class Dubins3D(Platform, type="dubins3d"):
     def step(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Dubins3DState:
         """Return the state after `dt` seconds.
 
-        It is a quadrature over the pieces of the step within which no limit is reached. The error
-        of the position is below 1e-3 ft for a step of 1 s, and mostly 1e-5 ft.
+        The position is a quadrature over the pieces of the step in which no limit is reached. Its
+        error is below 1e-3 ft for a step of 1 s, and mostly 1e-5 ft.
         """
         ramps = self._ramps(state, controls, dt)
         stops = [time_to_limit(*quantity, dt) for quantity in ramps if quantity[1] is not None]
         spans = pieces(stops, dt)
 
-        # A loop keeps what it computed for one piece. In four copies of its body XLA would compute
-        # that again for each use. On a GPU, copies took half as long again with a million
-        # environments and less time with fewer.
+        # A loop keeps what it has computed for a piece. In four copies of the loop's body XLA would
+        # compute that again for each use. On a GPU the copies took half as long again with a
+        # million environments, and less time with fewer environments.
         still = jnp.zeros_like(state.heading)
         start = (state.heading, still, still, still)
         one_piece = lambda carry, span: (self._fly(ramps, carry, span), None)  # noqa: E731
@@ -232,7 +232,7 @@ class Dubins3D(Platform, type="dubins3d"):
     def _ramps(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Ramps:
         """Return the ramps of roll, flight path angle and speed.
 
-        A rate without a control is None.
+        A quantity that no control moves has the rate None.
         """
         ramps = [
             (state.roll, self._roll_rate(state, controls, dt), self.roll_limits),
@@ -254,8 +254,8 @@ class Dubins3D(Platform, type="dubins3d"):
 
         Args:
             ramps: roll, flight path angle and speed, as ramps from the beginning of the step.
-            before: heading, and displacement along x, y and z, before the piece.
-            span: begin and length of the piece [s].
+            before: the heading, and the displacement along x, y and z, before the piece.
+            span: the beginning and the length of the piece [s].
         """
         heading, *moved = before
         begin, length = span
@@ -279,6 +279,7 @@ class Dubins3D(Platform, type="dubins3d"):
         heading: Array,
         moved: Sequence[Array],
     ) -> Dubins3DState:
+        """Return the state after the step, given its heading and its displacement."""
         roll, gamma, speed = (ramp(*quantity, dt) for quantity in ramps)
         return Dubins3DState(
             position=state.position + jnp.stack(moved),
@@ -303,7 +304,7 @@ class Dubins3D(Platform, type="dubins3d"):
     def derivative(self, state: Dubins3DState, controls: Controls) -> Dubins3DState:
         """Return the right-hand side of Eq. (9), which holds within the limits.
 
-        A commanded heading rate is the rate of the turn, and the bank stays as it is.
+        If a `heading_rate` is given, the heading changes at this rate, and the bank stays as it is.
         """
         acceleration = _control(controls, "acceleration", like=state.speed)
         gamma_rate = _control(controls, "flight_path_angle_rate", like=state.speed)
@@ -326,9 +327,9 @@ class Dubins3D(Platform, type="dubins3d"):
     def bend(self, before: Dubins3DState, after: Dubins3DState, dt: Seconds) -> Float[Array, ""]:
         """Return how far the path may leave the straight line from `before` to `after`.
 
-        To the bound for any platform this adds one for the acceleration a across the velocity,
-        which changes with the roll. However a gets from its first value to its last, the path
-        leaves the path of the mean acceleration by ‖Δa‖Δt²/54 at most.
+        This adds to the bound for any platform. The acceleration a across the velocity changes with
+        the roll. However a gets from its first value to its last, the path leaves the one of the
+        mean acceleration by ‖Δa‖Δt²/54 at most.
         """
         across = [
             self.gravity * jnp.tan(state.roll) * jnp.cos(state.flight_path_angle)
@@ -337,10 +338,11 @@ class Dubins3D(Platform, type="dubins3d"):
         return super().bend(before, after, dt) + jnp.abs(across[1] - across[0]) * dt**2 / 54.0
 
     def _turn_rate(self, bank: tuple[Array, Array], speed: Array) -> Array:
-        """Return the heading rate ψ̇ = g/v tan φ by one division, given (sin φ, cos φ)."""
+        """Return the heading rate ψ̇ = g/v tan φ, given (sin φ, cos φ), with only one division."""
         return self.gravity * bank[0] / (speed * bank[1])
 
     def _roll_rate(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Any:
+        """Return the roll rate, which a `heading_rate` replaces, or None if there is neither."""
         if "heading_rate" not in controls:
             return controls.get("roll_rate")
         return (arctan(controls["heading_rate"] * state.speed / self.gravity) - state.roll) / dt
@@ -349,7 +351,8 @@ class Dubins3D(Platform, type="dubins3d"):
 def _turn(before: Float[Array, " d"], after: Float[Array, " d"]) -> Float[Array, ""]:
     """Return the angle from one velocity to another in the horizontal plane [rad]."""
     across = before[0] * after[1] - before[1] * after[0]
-    return jnp.arctan2(across, before[0] * after[0] + before[1] * after[1])
+    along = before[0] * after[0] + before[1] * after[1]
+    return jnp.arctan2(across, along)
 
 
 def _control(controls: Controls, name: str, like: Array) -> Array:
@@ -378,8 +381,8 @@ def weighted_sum(weights: Sequence[float], values: Sequence[Array]) -> Any:
 def _arc(heading: Any, speed: Any, turn: Any, acceleration: Any, t: Any) -> Float[Array, " 2"]:
     """Return the displacement ∫₀ᵗ (v + aτ) (cos(ψ + ωτ), sin(ψ + ωτ)) dτ.
 
-    It is computed along and across the heading at half time. With h = ωt/2 the part along it is t
-    (v + at/2) sin h/h and the part across it is a t² (sin h/h − cos h)/(2h).
+    It is computed along and across the heading at half time. With h = ωt/2 the part along it is
+    t (v + at/2) sin h/h, and the part across it is a t² (sin h/h − cos h)/(2h).
 
     Args:
         heading: ψ at the beginning [rad].

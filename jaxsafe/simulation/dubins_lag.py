@@ -43,7 +43,6 @@ Lag = Annotated[Number, Unit("s"), Range(0.0, open_low=True, smallest=1e-3, larg
 Substeps = Annotated[int, Range(1, largest=1000)]
 """Number of parts into which a step is divided."""
 
-
 Command = tuple[Array, Array, Number]
 """A rate, the command that it follows, and the time constant of its lag."""
 
@@ -124,8 +123,8 @@ class LaggedDubins2D(Dubins2D, type="dubins2d_lag"):
     def bend(self, before: Any, after: Any, dt: Seconds) -> Float[Array, ""]:
         """Return how far the path may leave the straight line from `before` to `after`.
 
-        To the bound for any platform this adds ‖Δa‖Δt²/54 for what the acceleration may change, as
-        for `dubins3d`. The acceleration is v̇ along and v ψ̇ across the velocity.
+        This adds ‖Δa‖Δt²/54 to the bound for any platform, as `dubins3d` does, where Δa is what the
+        acceleration may change. The acceleration is v̇ along and v ψ̇ across the velocity.
         """
         along = jnp.abs(before.acceleration) + jnp.abs(after.acceleration)
         across = _change_of_product(
@@ -243,8 +242,9 @@ class LaggedDubins3D(Dubins3D, type="dubins3d_lag"):
     def bend(self, before: Any, after: Any, dt: Seconds) -> Float[Array, ""]:
         """Return how far the path may leave the straight line from `before` to `after`.
 
-        To the bound for any platform this adds ‖Δa‖Δt²/54 for what the acceleration may change. It
-        is v̇ along the velocity, v γ̇ across it upwards, and g tan φ cos γ across it sideways.
+        This adds ‖Δa‖Δt²/54 to the bound for any platform, where Δa is what the acceleration may
+        change. The acceleration is v̇ along the velocity, v γ̇ across it upwards, and g tan φ cos γ
+        across it sideways.
         """
         along = jnp.abs(before.acceleration) + jnp.abs(after.acceleration)
         rates = [state.flight_path_angle_rate for state in (before, after)]
@@ -290,6 +290,7 @@ def _command(controls: Controls, name: str, time_constant: Number, rate: Array) 
 
 
 def _slope(command: Command) -> Array:
+    """Return the rate at which a rate with a lag changes."""
     rate, target, time_constant = command
     return (target - rate) / time_constant
 

@@ -11,18 +11,14 @@ from jaxtyping import Array, Float
 
 from jaxsafe.schema.component import Unit
 from jaxsafe.simulation.trig import sin_cos
-from jaxsafe.types import (
-    Number,
-    Place,
-    Reach,
-)
+from jaxsafe.types import Number, Place, Reach
 
 
 def safe_norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
     """Return the Euclidean norm ‖v‖, whose gradient at v = 0 is 0 instead of NaN.
 
     The function uses two `where`. The root must not see 0 even in the branch that is not taken,
-    because `where` multiplies that branch's infinite derivative by zero.
+    because `where` would multiply the infinite derivative of that branch by zero.
     """
     squared = jnp.sum(vector * vector, axis=-1)
     zero = squared == 0.0  # false for NaN, so that NaN stays NaN
@@ -129,14 +125,14 @@ def turn_between(before: Float[Array, "d d"], after: Float[Array, "d d"]) -> Flo
 def angle_between(first: Float[Array, " d"], second: Float[Array, " d"]) -> Float[Array, ""]:
     """Return the angle between two vectors [rad], from 0 to π.
 
-    It is 0 if one of the two is 0, which has no direction. Its gradient is finite everywhere.
+    It is 0 if one of the vectors is 0 and so has no direction. Its gradient is finite everywhere.
     """
     first = mag_norm(first)[1:]
     second = mag_norm(second)[1:]
-    known = jnp.any(first != 0.0) & jnp.any(second != 0.0)
+    defined = jnp.any(first != 0.0) & jnp.any(second != 0.0)
     cosine = jnp.sum(first * second)
     sine = safe_norm(second - cosine * first)
-    return jnp.arctan2(jnp.where(known, sine, 0.0), jnp.where(known, cosine, 1.0))
+    return jnp.arctan2(jnp.where(defined, sine, 0.0), jnp.where(defined, cosine, 1.0))
 
 
 Coordinates = Annotated[Number, Unit("m or ft", length=0), Place]
@@ -155,7 +151,7 @@ def no_direction(vector: Float[Array, " d"], name: str) -> str | None:
 
 
 def wrong_size(env: Any, **vectors: Float[Array, " d"]) -> dict[str, str]:
-    """Return by name what is wrong with vectors of another size than the space."""
+    """Return what is wrong with vectors that have not one number for each dimension, by name."""
     space = env.agent_platform.dimension
     return {
         name: f"expected {space} numbers, found {vector.size}"

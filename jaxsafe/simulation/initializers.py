@@ -1,8 +1,8 @@
 """Random starts: each initializer draws a field of a platform's state, or several together.
 
-They are described in Section 4 "Initialization" and in Tables 3 and 4. Initializers run in the
-order in which they are listed, platform after platform. So a later one may refer to a field that is
-drawn earlier or to an earlier platform.
+The paper describes them in Section 4 "Initialization" and in Tables 3 and 4. Initializers run in
+the order in which they are listed, platform after platform. So a later one may refer to a field
+that was drawn earlier, or to an earlier platform.
 """
 
 from __future__ import annotations
@@ -45,22 +45,22 @@ Shares = Annotated[Number, Unit("1", length=2), Range(0.0, largest=1e3)]
 
 
 class Initializer(Component):
-    """Base of initializers. Each draws the state field that it is named after, or several."""
+    """Base of initializers. Each draws the state field after which it is named, or several."""
 
     name: str
 
     @property
     def draws(self) -> tuple[str, ...]:
-        """Names of the state fields that it draws."""
+        """Names of the state fields that the initializer draws."""
         return (self.name,)
 
     def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Array | dict[str, Array]:
-        """Return a value of the field, or values by field if it draws several.
+        """Return a value of the field, or values by field if the initializer draws several.
 
         Args:
             key: a typed PRNG key.
-            drawn: this platform's fields that are drawn so far, by name.
-            sim: the simulation with the platforms that are placed so far.
+            drawn: the fields of this platform that were drawn before, by name.
+            sim: the simulation with the platforms that were placed before.
         """
         raise NotImplementedError
 
@@ -133,7 +133,7 @@ class Uniform(Initializer, type="uniform"):
 class Normal(Initializer, type="normal"):
     """A value drawn from a normal distribution, independently in each component.
 
-    With bounds the distribution is truncated: what lies outside is not drawn.
+    With bounds the distribution is truncated: values outside are never drawn.
     """
 
     mean: Annotated[Number, Unit("physical", length=ANY), Place]
@@ -182,7 +182,7 @@ class Cases(Initializer, type="cases"):
         default_factory=dict
     )
     file: str | None = None
-    """A CSV file with the values, whose first row is their names. Its path begins at the YAML file.
+    """A CSV file with the values. Its first row has their names. Its path begins at the YAML file.
     It is read once, and `jaxsafe config` prints the values."""
 
     @classmethod
@@ -235,12 +235,13 @@ def read_cases(path: Any, place: str = "cases") -> dict[str, list[float]]:
     """Read the `values` of `Cases` from a CSV file. Its first row has their names.
 
     Args:
-        path: the path, which begins at the directory of the configuration file that is being read,
+        path: the path. It begins at the directory of the configuration file that is being read, or
             else at the working directory.
-        place: the place for messages of errors.
+        place: what error messages begin with.
 
     Raises:
-        ConfigError: the file cannot be read, or a row has no number for each name.
+        ConfigError: the file cannot be read, a name stands twice in the first row, or another row
+            does not have a number for each name.
     """
     if not isinstance(path, str | os.PathLike):
         raise ConfigError(f"{place}: file: expected the path of a CSV file, found {show(path)}")

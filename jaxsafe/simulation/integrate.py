@@ -33,12 +33,11 @@ PARTIAL_WEIGHTS = np.linalg.solve(
 ).T.tolist()
 """Weights of the integrals from 0 to each Gauss-Legendre node, one list per node."""
 
-
 AHEAD = (0.0, 1 / 2, 1 / 2, 1.0)
-"""How far ahead the stages of the classical Runge-Kutta method are, in lengths of a step."""
+"""Times of the stages of the classical Runge-Kutta method, in lengths of a step."""
 
 STAGE_WEIGHTS = (1 / 6, 1 / 3, 1 / 3, 1 / 6)
-"""Weights of these stages."""
+"""Weights of the stages of the classical Runge-Kutta method."""
 
 
 def ramp(x: Number, rate: Number | None, limits: Float[Array, " 2"], t: Number) -> Any:
@@ -75,10 +74,10 @@ def time_to_limit(x: Number, rate: Number, limits: Float[Array, " 2"], dt: Numbe
 
 
 def lagged(x: Number, target: Number, time_constant: Number, t: Number) -> Any:
-    """Return what follows a target with a first-order lag, τẋ = target − x, after a time t.
+    """Return the value at time t of what follows a target with first-order lag, τẋ = target − x.
 
     Args:
-        x: its value at time 0.
+        x: the value at time 0.
         target: the constant target.
         time_constant: τ [s].
         t: time [s].
@@ -94,10 +93,11 @@ def lagged_integral(x: Number, target: Number, time_constant: Number, t: Number)
 def lag_within_rate(
     x: Number, target: Number, time_constant: Number | None, rate_limit: Number | None, dt: Number
 ) -> tuple[Any, Any]:
-    """Return mean and end of a step in which a value follows a target, ẋ = clip((u − x)/τ, ±R).
+    """Return the mean over a step of a value that follows a target, and the value at its end.
 
-    The solution is exact: a ramp as long as the rate R limits it, and an exponential afterwards.
-    Without a time constant τ the ramp leads to the target, where the value then rests.
+    The value x follows the target u by ẋ = clip((u − x)/τ, ±R). The solution is exact: a ramp as
+    long as R limits the rate, and an exponential afterwards. Without a time constant τ the ramp
+    leads to the target, where the value then rests.
 
     Args:
         x: the value at the beginning.
@@ -107,19 +107,20 @@ def lag_within_rate(
         dt: length of the step [s].
     """
     total = jnp.zeros_like(dt)
-    left = dt
+    remaining = dt
     if rate_limit is not None:
         gap = target - x
-        followed = 0.0 if time_constant is None else rate_limit * time_constant
-        ramped = jnp.clip(jnp.abs(gap) - followed, 0.0, rate_limit * dt)
+        # Within this distance of the target the lag alone is slower than the rate limit.
+        lag_distance = 0.0 if time_constant is None else rate_limit * time_constant
+        ramped = jnp.clip(jnp.abs(gap) - lag_distance, 0.0, rate_limit * dt)
         time = ramped / rate_limit
         total = time * (x + 0.5 * jnp.sign(gap) * ramped)
         x = jnp.where(ramped >= jnp.abs(gap), target, x + jnp.sign(gap) * ramped)
-        left = dt - time
+        remaining = dt - time
     if time_constant is None:
-        return (total + left * x) / dt, x
-    total = total + lagged_integral(x, target, time_constant, left)
-    return total / dt, lagged(x, target, time_constant, left)
+        return (total + remaining * x) / dt, x
+    total = total + lagged_integral(x, target, time_constant, remaining)
+    return total / dt, lagged(x, target, time_constant, remaining)
 
 
 def turning_time(rate: Number, target: Number, time_constant: Number) -> Any:
@@ -149,8 +150,8 @@ def lagged_ramp(
 ) -> Any:
     """Return a state whose rate follows a target with a first-order lag, and which has limits.
 
-    At a limit the state rests until its rate turns inwards. The rate changes its sign once at
-    most. So what the state would exceed a limit by is known, and the solution is exact.
+    At a limit the state rests until its rate turns inwards. The rate changes its sign once at most.
+    So it is known by how much the state would exceed a limit, and the solution is exact.
 
     Args:
         x: the state at time 0, within the limits.
@@ -182,7 +183,8 @@ def runge_kutta(
         state: the state at time 0, a tree of numbers.
         dt: length of the step [s].
         substeps: the number of Runge-Kutta steps.
-        limit: brings a state back into its limits. It is applied after each of these steps.
+        limit: returns a state brought back into its limits. It is applied after each of these
+            steps.
     """
     h = dt / substeps
     split, join = _in_scalars(state)
@@ -212,7 +214,7 @@ def runge_kutta(
 
 
 def _in_scalars(tree: T) -> tuple[Callable[[T], list[Array]], Callable[[list[Array]], T]]:
-    """Return functions from trees like this one to the list of their numbers, and back."""
+    """Return two functions: from a tree like this one to a list of its numbers, and back."""
     leaves, structure = jax.tree.flatten(tree)
     shapes = [jnp.shape(leaf) for leaf in leaves]
     ends = np.cumsum([math.prod(shape) for shape in shapes])
@@ -231,22 +233,21 @@ def _in_scalars(tree: T) -> tuple[Callable[[T], list[Array]], Callable[[list[Arr
 
 
 def pieces(stops: Sequence[Any], dt: Number) -> tuple[Float[Array, " s"], Float[Array, " s"]]:
-    """Return begin and length [s] of the pieces of a step, each of shape (len(stops) + 1,).
+    """Return the beginning and length [s] of the pieces of a step, each of shape (len(stops) + 1,).
 
     Args:
         stops: times [s] at which one piece ends and the next one begins, in any order.
         dt: length of the step [s].
     """
     bounds = [jnp.zeros_like(dt), *ascending(stops), dt]
-    return jnp.stack(bounds[:-1]), jnp.stack(
-        [end - begin for begin, end in itertools.pairwise(bounds)]
-    )
+    lengths = [end - begin for begin, end in itertools.pairwise(bounds)]
+    return jnp.stack(bounds[:-1]), jnp.stack(lengths)
 
 
 def ascending(values: Sequence[Any]) -> list[Any]:
     """Return the values in ascending order.
 
-    They are sorted by exchanges, which under `vmap` is several times cheaper than a sort in every
+    They are sorted by exchanges. Under `vmap` this is several times cheaper than a sort in every
     environment.
     """
     values = list(values)
@@ -269,8 +270,8 @@ def sine_ratios(tau: Number) -> tuple[Any, Any, Any]:
 def _sine_remainder(tau: Number) -> Any:
     """Return (τ − sin τ)/τ³.
 
-    It is a series where |τ| < 1. There the derivative of a quotient would lose its digits, also
-    that of `jnp.sinc`.
+    Where |τ| < 1 it is a series, because the derivative of a quotient would lose its digits there.
+    So does the derivative of `jnp.sinc`.
     """
     small = jnp.abs(tau) < 1.0
     squared = jnp.where(small, tau, 0.0) ** 2

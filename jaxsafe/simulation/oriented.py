@@ -25,12 +25,10 @@ class OrientedState(Record):
 
     position: Annotated[Float[Array, " 2"], Unit("m")]  # r
     velocity: Annotated[Float[Array, " 2"], Unit("m/s")]  # v
-    delta_v: Annotated[
-        Float[Array, " 1"], Unit("m/s")
-    ]  # F Δt / m, the velocity change by the thrust of the last step
-    attitude: Annotated[
-        Float[Array, ""], Unit("rad")
-    ]  # θ from the x axis to the body's x axis, in [−π, π)
+    # F Δt / m, the velocity change by the thrust of the last step.
+    delta_v: Annotated[Float[Array, " 1"], Unit("m/s")]
+    # θ from the x axis to the body's x axis, in [−π, π).
+    attitude: Annotated[Float[Array, ""], Unit("rad")]
     attitude_rate: Annotated[Float[Array, ""], Unit("rad/s")]  # θ̇
 
     @property
@@ -56,10 +54,7 @@ class OrientedSpacecraft(Platform, type="oriented_spacecraft"):
     mean_motion: MeanMotion = MEAN_MOTION
     attitude_rate_limits: Annotated[
         Number, Unit("rad/s", length=2), Range(largest=1e6, infinite=True)
-    ] = (
-        -RATE_LIMIT,
-        RATE_LIMIT,
-    )
+    ] = (-RATE_LIMIT, RATE_LIMIT)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -82,8 +77,8 @@ class OrientedSpacecraft(Platform, type="oriented_spacecraft"):
     def step(self, state: OrientedState, controls: Controls, dt: Seconds) -> OrientedState:
         """Return the state after `dt` seconds.
 
-        The motion without thrust is the exact flow of Eq. (12). To it the step adds the responses
-        to the turning thrust: the thrust is a sum of impulses at the nodes of a quadrature, and the
+        The motion without thrust is the exact flow of Eq. (12). The step adds the response to the
+        turning thrust to it: the thrust is a sum of impulses at the nodes of a quadrature, and the
         flow carries each impulse to the end of the step.
         """
         limits = self.attitude_rate_limits

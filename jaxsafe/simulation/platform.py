@@ -41,7 +41,7 @@ class Platform(Component):
         return tuple(name for initializer in self.start for name in initializer.draws)
 
     def rest(self) -> Any:
-        """Return the state record before any initializer ran: at the origin, at rest."""
+        """Return the state record before any initializer has run: at the origin, at rest."""
         raise NotImplementedError
 
     def quantities(self) -> tuple[str, ...]:
@@ -49,8 +49,8 @@ class Platform(Component):
         state = self.rest()
         derived = [
             name
-            for kind in reversed(type(state).__mro__)
-            for name, value in vars(kind).items()
+            for base in reversed(type(state).__mro__)
+            for name, value in vars(base).items()
             if isinstance(value, property)
         ]
         return tuple(name for name in (*vars(state), *derived) if name not in ("orientation",))
@@ -72,15 +72,13 @@ class Platform(Component):
     def step_within_limits(self, state: Any, controls: Controls, dt: Seconds) -> Any:
         """Return the state after `dt` seconds, as `step` does, for a step that reaches no limit.
 
-        The caller promises that no state reaches a limit before the end of the step. So the result
+        The caller promises that nothing reaches a limit before the end of the step. So the result
         may be cheaper to compute.
         """
         return self.step(state, controls, dt)
 
     def held(self, state: Any, controls: Controls, dt: Seconds) -> Controls:
-        """Return controls for a part of a step.
-
-        They act in that part as the given controls act in the whole step.
+        """Return the controls that act in a part of a step as the given ones do in the whole step.
 
         Args:
             state: the state record before the step.
@@ -92,9 +90,9 @@ class Platform(Component):
     def bend(self, before: Any, after: Any, dt: Seconds) -> Float[Array, ""]:
         """Return how far the path may leave the straight line from `before` to `after`.
 
-        These are the states before and after a step of `dt` seconds. At a constant acceleration it
-        leaves the line by ‖Δv‖Δt/8. If the acceleration stops within the step, at a limit, it is up
-        to 32/27 of that.
+        These are the states before and after a step of `dt` seconds. At a constant acceleration the
+        path leaves the line by ‖Δv‖Δt/8. If the acceleration stops within the step, at a limit, the
+        path leaves it by up to 32/27 of that.
         """
         return 0.15 * safe_norm(after.velocity - before.velocity) * dt  # 0.15 ≥ 1/8 · 32/27 = 0.148
 
@@ -113,7 +111,7 @@ class Platform(Component):
         """Return the state after a step in which a disturbance acted besides the controls.
 
         Args:
-            state: the state record after the step without it.
+            state: the state record after the step without the disturbance.
             acceleration: a disturbing acceleration a, which adds aΔt to the velocity and aΔt²/2 to
                 the position, shape (d,).
             wind: a velocity w that adds wΔt to the position, shape (d,).
@@ -131,7 +129,7 @@ class Platform(Component):
         raise NotImplementedError
 
     def reset(self, key: Key, sim: Sim) -> Any:
-        """Draw a random start, given the platforms that are placed so far.
+        """Draw a random start, given the platforms that were placed before.
 
         Raises:
             ConfigError: an initializer draws a value of another shape than its field has.
@@ -146,9 +144,9 @@ class Platform(Component):
                 drawn[name] = value
                 expected = getattr(rest, name).shape
                 if value.shape != expected:
-                    which = "" if name == initializer.name else f"{name}: "
+                    field = "" if name == initializer.name else f"{name}: "
                     raise ConfigError(
-                        f"platforms.{self.name}.start.{initializer.name}: {which}expected shape"
+                        f"platforms.{self.name}.start.{initializer.name}: {field}expected shape"
                         f" {expected}, found {value.shape}"
                     )
         return self.settle(rest.replace(**drawn))
@@ -195,9 +193,8 @@ def placed(name: str, value: Any, like: Array) -> Array:
         ConfigError: the value has another shape or is not finite numbers.
     """
     try:
-        with np.errstate(
-            over="ignore"
-        ):  # a number beyond the largest float32 becomes infinite and is refused below
+        # A number beyond the largest float32 becomes infinite here, and is refused below.
+        with np.errstate(over="ignore"):
             array = jnp.asarray(value, like.dtype)
     except (TypeError, ValueError, OverflowError):
         raise ConfigError(f"reset_to: {name}: expected numbers, found {show(value)}") from None

@@ -114,7 +114,7 @@ class PointMassAircraft(Dubins3D, type="point_mass_aircraft"):
     def bend(self, before: Dubins3DState, after: Dubins3DState, dt: Seconds) -> Float[Array, ""]:
         """Return how far the path may leave the straight line from `before` to `after`.
 
-        To the bound for any platform this adds ‖Δa‖Δt²/54 for the lift, which turns with the bank.
+        This adds ‖Δa‖Δt²/54 to the bound for any platform, because the lift turns with the bank.
         """
         lift = self.gravity * jnp.max(jnp.abs(self.load_factor_limits))
         change = lift * jnp.abs(after.roll - before.roll)
@@ -131,10 +131,11 @@ class PointMassAircraft(Dubins3D, type="point_mass_aircraft"):
         )
 
     def _resting(self, state: Dubins3DState, rates: Dubins3DState) -> Dubins3DState:
-        """Return the rates without those that lead out of a limit at which the state is."""
+        """Return the rates with 0 in place of those that lead beyond a limit that is reached."""
         resting = {}
         for name, (low, high) in self._limits().items():
-            value, rate = getattr(state, name), getattr(rates, name)
+            value = getattr(state, name)
+            rate = getattr(rates, name)
             outwards = ((value >= high) & (rate > 0.0)) | ((value <= low) & (rate < 0.0))
             resting[name] = jnp.where(outwards, 0.0, rate)
         return rates.replace(**resting)

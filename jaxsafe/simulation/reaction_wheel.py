@@ -30,7 +30,7 @@ class ReactionWheelSpacecraft(OrientedSpacecraft, type="reaction_wheel_spacecraf
     speed for the rest of the step, and so does the body. I_zz θ̇ + D ψ never changes.
 
     Instead of the wheel's acceleration it may be given that of the body, `attitude_acceleration` θ̈
-    [rad/s²], as `oriented_spacecraft`. The wheel then turns by −I_zz θ̈/D.
+    [rad/s²], as for `oriented_spacecraft`. The wheel's acceleration is then −I_zz θ̈/D.
 
     The inertias are those of the 6U CubeSat of the published code, whose wheel turns at 576 rad/s
     at most.
@@ -71,7 +71,7 @@ class ReactionWheelSpacecraft(OrientedSpacecraft, type="reaction_wheel_spacecraf
 
     @property
     def _ratio(self) -> Number:
-        """I_zz/D, by how much faster than the body the wheel turns."""
+        """I_zz/D: the wheel turns that many times faster than the body."""
         return self.inertia / self.wheel_inertia
 
     def _turning(self, controls: Controls) -> Controls:

@@ -80,7 +80,7 @@ class BodyDisplacement(Offset, type="body_displacement"):
 
     def vector(self, platform: Any) -> Float[Array, " d"]:
         if self.by.shape != platform.position.shape:
-            return self.by  # of a wrong size, which `Region.place` reports
+            return self.by  # `Region.place` reports the wrong size
         return to_global(platform.orientation, self.by)
 
 
@@ -104,7 +104,7 @@ class Region(Component):
         """Return whether a point is inside.
 
         Args:
-            offset: of the point from the centre, in the region's axes, shape (d,).
+            offset: the point relative to the centre, in the region's axes, shape (d,).
         """
         raise NotImplementedError
 
@@ -112,10 +112,10 @@ class Region(Component):
         """Return the distance of a point to the boundary, negative inside.
 
         It changes by no more than the point moves. Its absolute value may be less than the true
-        distance, and then the docstring of the region says where.
+        distance. Then the docstring of the region says where.
 
         Args:
-            offset: of the point from the centre, in the region's axes, shape (d,).
+            offset: the point relative to the centre, in the region's axes, shape (d,).
         """
         raise NotImplementedError(f"a {self.type_name} knows no distance to its boundary")
 
@@ -222,9 +222,10 @@ The bound is off by at most a sixteenth of the length of the line.
 def _distance_on_line(
     region: Region, before: Float[Array, " d"], after: Float[Array, " d"], side: float
 ) -> Float[Array, ""]:
-    """Return a bound of the signed distance on a straight line: an upper one for `side` 1, else −1.
+    """Return a bound of the signed distance on a straight line.
 
-    Between two samples the distance leaves their mean by no more than half the way between them.
+    It is an upper bound if `side` is 1, and a lower bound if it is −1. Between two samples the
+    distance differs from their mean by no more than half the way between them.
     """
     shares = jnp.linspace(0.0, 1.0, LINE_SAMPLES + 1, dtype=before.dtype)
     offsets = [before + share * (after - before) for share in shares]
@@ -263,7 +264,7 @@ class Turned(Region):
 
     convex: ClassVar[bool] = True
     turns: bool = False
-    """Whether the region's axes turn with what carries it. Else they are those of the world."""
+    """Whether the region's axes turn with what carries it. Else they are the global axes."""
 
     def axes(self, carrier: Any) -> Float[Array, "d d"] | None:
         return carrier.orientation if self.turns and carrier is not None else None
@@ -305,7 +306,7 @@ class Box(Turned, type="box"):
 
 
 class HalfSpace(Turned, type="half_space"):
-    """All points on one side of a plane through the centre: that to which `towards` points."""
+    """All points on one side of a plane through the centre, the side to which `towards` points."""
 
     towards: Heading
 
@@ -328,8 +329,8 @@ class HalfSpace(Turned, type="half_space"):
 class Cone(Turned, type="cone"):
     """All points whose direction from the centre is within `half_angle` of the vector `towards`.
 
-    The centre is the tip. With a `length` the cone ends that far along `towards`; outside, behind
-    its end, the distance may then be less than the true one.
+    The centre is the tip. With a `length` the cone ends that far along `towards`. Outside, beyond
+    this end, the distance may then be less than the true one.
     """
 
     dimensions: ClassVar[tuple[int, ...]] = (2, 3)

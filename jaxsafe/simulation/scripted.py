@@ -28,7 +28,7 @@ class Command(Component):
         raise NotImplementedError
 
     def extremes(self) -> tuple[Number, Number]:
-        """Return the smallest and the largest control at any time, infinite if not known."""
+        """Return the smallest and the largest control at any time. They are infinite if unknown."""
         return -jnp.inf, jnp.inf
 
 

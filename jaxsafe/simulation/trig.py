@@ -1,6 +1,6 @@
 """Sine and cosine together, arctangent, and wrapped angles.
 
-In float32 on a CPU they are several times cheaper than XLA's own functions.
+In float32 on a CPU these functions are several times cheaper than XLA's own.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ _ARCTANGENT_COEFFICIENTS = (
 _traced_once = functools.partial(jax.jit, inline=True)
 """Decorator that traces a function once per shape and type.
 
-A program calls the functions below hundreds of times. Tracing each call afresh took two thirds of
-the time that the program was traced.
+A program calls the functions below hundreds of times. To trace each call afresh took two thirds of
+the time in which the program was traced.
 """
 
 
@@ -69,7 +69,7 @@ def _sin_cos(x: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*
 
 
 def _sine_of_rest(x: Array, quarters: Array) -> Array:
-    """Return the sine of x − `quarters` · π/2, whose angle is a quarter turn at most."""
+    """Return the sine of x − `quarters` · π/2, an angle of at most a quarter turn."""
     r = (
         (x - quarters * _HALF_PI_PARTS[0]) - quarters * _HALF_PI_PARTS[1]
     ) - quarters * _HALF_PI_PARTS[2]

@@ -38,7 +38,7 @@ EARTH = 3.986004418e14
 
 
 class TwoBodyState(SpacecraftState):
-    """State of a spacecraft relative to a chief on an elliptic orbit, and the chief's place."""
+    """State of a spacecraft relative to a chief on an elliptic orbit, and the chief's anomaly."""
 
     true_anomaly: Annotated[Float[Array, ""], Unit("rad")]  # ν of the chief, in [−π, π)
 
@@ -105,6 +105,7 @@ class TwoBody(Spacecraft, type="two_body"):
         )
 
     def _frame(self, true_anomaly: Float[Array, ""]) -> Frame:
+        """Return the motion of the chief at a true anomaly [rad]."""
         sine, cosine = sin_cos(true_anomaly)
         w = 1.0 + self.eccentricity * cosine
         pull = self._base_rate**2 * w**3

@@ -4,8 +4,8 @@ The frame is Hill's frame of the chief, as in `two_body`. It turns with the chie
 orbit: at the rate ω_z about the angular momentum and at ω_x about the radius. The state of the
 chief is its osculating orbit: the eccentricity vector (e cos ω, e sin ω) from the ascending node,
 the inclination i, the argument of latitude θ, and the relative change η of the angular momentum
-h = h₀ (1 + η). They follow from Gauss's equations, driven by the acceleration of J2 along the
-radius, the track and the normal. With f = 3/2 J2 μ Rₑ²/R⁴ it is
+h = h₀ (1 + η). They follow Gauss's equations, driven by the acceleration of J2. Along the radius,
+the track and the normal this acceleration is, with f = 3/2 J2 μ Rₑ²/R⁴,
 
     f_r = −f (1 − 3 sin²i sin²θ),  f_t = −f sin²i sin 2θ,  f_n = −f sin 2i sin θ.
 

@@ -1,8 +1,8 @@
 """How the world differs from its model: disturbances, faults, delays and errors of navigation.
 
 The parts stand in the section `uncertainty` of an environment. No filter knows of them. A filter
-predicts with the model, which is the environment without this section, and from the state that
-navigation tells.
+predicts with the model, which is the environment without this section, and from the state that is
+measured.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ class Uncertainty(Component):
 
     A part has a memory, which holds what acts now. `init` makes it at the start of an episode, and
     `increment` moves it once a step, after the filter and before the world moves. The other methods
-    only read it. A part writes those that it needs.
+    only read it. A subclass writes the methods that it needs.
     """
 
     many_kinds: ClassVar[bool] = True
     draws: ClassVar[bool] = False
-    """Whether it draws random numbers."""
+    """Whether the part draws random numbers."""
 
     name: str
 
@@ -60,8 +60,8 @@ class Uncertainty(Component):
             sim: the simulation before the step.
             key: a key for this part and this step.
             memory: the memory of the step before.
-            control: the control of this step in physical units and action order, as the parts
-                before this one leave it.
+            control: the control of this step in physical units and action order, as changed by the
+                parts before this one.
         """
         return memory
 
@@ -85,9 +85,9 @@ class Uncertainty(Component):
 class Disturbance(Uncertainty):
     """Base of disturbances of a platform's motion.
 
-    As an `acceleration` [m/s² or ft/s²] a disturbance a is held over a step on top of the plant's
-    own motion: the velocity changes by aΔt and the position by aΔt²/2. As a `wind` w [m/s or ft/s]
-    it moves the position by wΔt.
+    A disturbance of the kind `acceleration`, a [m/s² or ft/s²], is held over a step and adds to the
+    plant's own motion: aΔt to the velocity and aΔt²/2 to the position. A disturbance of the kind
+    `wind`, w [m/s or ft/s], adds wΔt to the position.
     """
 
     on: PlatformName
@@ -196,8 +196,8 @@ class Gusts(Disturbance, type="gusts"):
 class ChosenDisturbance(Disturbance, type="chosen"):
     """A disturbance that is chosen from outside, for adversaries and for scripts of one's own.
 
-    It acts as its memory `state.memory.uncertainty[name]` says, cut to the length `bound`, and is 0
-    until something is written there.
+    It is the vector in its memory, `state.memory.uncertainty[name]`, cut to the length `bound`. It
+    is 0 until something is written there.
     """
 
     bound: Size
@@ -226,7 +226,7 @@ class ActuatorFault(Uncertainty):
 
 
 class WeakActuator(ActuatorFault, type="weak"):
-    """An actuator that gives the `share` of what it is given, less than 1 or more."""
+    """An actuator that gives its control times `share`, which may be less than 1 or more."""
 
     share: Annotated[Number, Unit("1"), Range(0.0, largest=1e3)]
 
@@ -235,7 +235,7 @@ class WeakActuator(ActuatorFault, type="weak"):
 
 
 class StuckActuator(ActuatorFault, type="stuck"):
-    """An actuator that gives the control `at`, whatever it is given, from the time `since` on."""
+    """An actuator that gives `at` from the time `since` on, whatever its control is."""
 
     at: Bound = 0.0
     since: Annotated[Number, Unit("s"), Range(0.0, largest=1e9)] = 0.0
@@ -245,7 +245,7 @@ class StuckActuator(ActuatorFault, type="stuck"):
 
 
 class MisalignedThrusters(Uncertainty, type="misaligned"):
-    """Two or three thrusters, one for each axis of a platform, that are turned together by `angle`.
+    """Two or three thrusters, one for each axis of a platform, all turned by the same `angle`.
 
     In the plane the thrust is turned anticlockwise. In space it is turned about `axis`.
     """
@@ -305,7 +305,7 @@ class ActionDelay(Uncertainty, type="delay"):
 
 
 class StateError(Uncertainty):
-    """Base of errors of what is known of a platform, as filters and observations see it.
+    """Base of errors in the state of a platform, as filters and observations see it.
 
     The memory is the error of the field `what` of the platform's state, or of its velocity.
     Statuses, rewards and the end of an episode follow the true state.
@@ -329,7 +329,7 @@ class StateError(Uncertainty):
     def measured(self, env: Environment, sim: Sim, memory: Any) -> Sim:
         state = sim.platforms[self.of]
         wrong = self.true(sim) + memory
-        if self.what == "velocity":  # of an aircraft it is no field of the state
+        if self.what == "velocity":  # which is not a field of the state of an aircraft
             state = env.platform(self.of).with_velocity(state, wrong)
         else:
             state = state.replace(**{self.what: wrong})
@@ -375,13 +375,13 @@ def in_unit_ball(key: Key, like: Float[Array, " d"]) -> Float[Array, " d"]:
 
 
 def no_longer(vector: Float[Array, " d"], bound: Number) -> Float[Array, " d"]:
-    """Return a vector, cut to a length."""
+    """Return a vector, shortened to the length `bound` if it is longer."""
     length = safe_norm(vector)
     return vector * jnp.where(length > bound, bound / jnp.where(length > 0.0, length, 1.0), 1.0)
 
 
 def _no_actuators(env: Environment, field: str, names: tuple[str, ...]) -> dict[str, str]:
-    """Return what is wrong with names of actuators that the agent does not have."""
+    """Return what is wrong with names of actuators, if the agent lacks one of them."""
     known = [actuator.name for actuator in env.actuators]
     for name in names:
         if name not in known:

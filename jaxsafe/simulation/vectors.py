@@ -25,10 +25,10 @@ class Vector(Component):
 
 
 class PlaceVector(Vector):
-    """Base of vectors that a platform or region has, as seen from another one if it is named."""
+    """Base of vectors that a platform or region has, relative to another one if it is named."""
 
     quantity: ClassVar[str]
-    """The name of the vector in the state of a platform or region."""
+    """The field of the state of a platform or region that holds the vector."""
     of: PlaceName
     relative_to: PlaceName | None = None
 
@@ -42,7 +42,7 @@ class PlaceVector(Vector):
 class Position(PlaceVector, type="position"):
     """The position of a platform or of a region's centre.
 
-    With `relative_to` it is the way there from that platform or centre.
+    With `relative_to` it is the position relative to that platform or centre.
     """
 
     quantity: ClassVar[str] = "position"
