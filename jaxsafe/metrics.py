@@ -20,23 +20,6 @@ from jaxtyping import Array, Float, Int
 from jaxsafe.environment import Environment
 from jaxsafe.types import Record, TimeStep
 
-METRICS = (
-    "average_return",
-    "episode_length",
-    "success_rate",
-    "control_usage",
-    "control_usage_l1",
-    "control_effort",
-    "safety_violation_rate",
-    "episode_safety_violation_rate",
-    "episode_cost",
-    "episode_violation_severity_mean",
-    "episode_violation_severity_max",
-    "mean_reward",
-    "intervention_rate",
-)
-"""The names that `summarise` returns."""
-
 SAFETY_METRICS = (
     "safety_violation_rate",
     "episode_safety_violation_rate",
@@ -45,6 +28,19 @@ SAFETY_METRICS = (
     "episode_violation_severity_max",
 )
 """The metrics that only an environment with safety constraints has."""
+
+METRICS = (
+    "average_return",
+    "episode_length",
+    "success_rate",
+    "control_usage",
+    "control_usage_l1",
+    "control_effort",
+    *SAFETY_METRICS,
+    "mean_reward",
+    "intervention_rate",
+)
+"""The names that `summarise` returns."""
 
 ENOUGH_EPISODES = 20
 """Training episodes that a seed must finish before its success rate counts in Table 2."""
