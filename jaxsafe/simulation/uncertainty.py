@@ -28,10 +28,6 @@ Size = Annotated[Number, Unit("physical"), Range(0.0, largest=1e9)]
 """Size of a random vector, in the unit of what it is added to."""
 
 
-Platforms = Mapping[str, Any]
-"""The states of all platforms, by name."""
-
-
 class Uncertainty(Component):
     """Base of all ways in which the world differs from its model.
 
