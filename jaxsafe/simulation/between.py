@@ -30,7 +30,7 @@ def bend(env: Environment, before: Sim, sim: Sim, name: str) -> Float[Array, ""]
     if name in sim.platforms:
         duration = sim.time - before.time
         return env.platform(name).bend(before.platforms[name], sim.platforms[name], duration)
-    region = _region(env, name)
+    region = next(region for region in env.regions if region.name == name)
     if region.on is None:
         return jnp.zeros_like(sim.time)
     carried = bend(env, before, sim, region.on)
@@ -73,7 +73,6 @@ def _signed_distance_bounds(
     """
     offsets = []
     global_offsets = []
-    turn = jnp.zeros_like(sim.time)
     for instant in (before, sim):
         offset = instant.platforms[of].position - instant.regions[region.name].position
         axes = None if region.on is None else region.axes(place(instant, region.on))
@@ -92,7 +91,3 @@ def _signed_distance_bounds(
 def _turn(before: Sim, sim: Sim, name: str) -> Float[Array, ""]:
     """Return the angle by which a platform or region has turned [rad]."""
     return turn_between(place(before, name).orientation, place(sim, name).orientation)
-
-
-def _region(env: Environment, name: str) -> Region:
-    return next(region for region in env.regions if region.name == name)
