@@ -128,10 +128,6 @@ class Dubins2D(Platform, type="dubins2d"):
             speed=final_speed,
         )
 
-    @property
-    def can_be_pushed(self) -> bool:
-        return True
-
     def with_velocity(self, state: Dubins2DState, velocity: Float[Array, " 2"]) -> Dubins2DState:
         return state.replace(
             heading=state.heading + _turn(state.velocity, velocity),
@@ -288,10 +284,6 @@ class Dubins3D(Platform, type="dubins3d"):
             flight_path_angle=gamma,
             roll=roll,
         )
-
-    @property
-    def can_be_pushed(self) -> bool:
-        return True
 
     def with_velocity(self, state: Dubins3DState, velocity: Float[Array, " 3"]) -> Dubins3DState:
         climb = jnp.arctan2(-velocity[2], safe_norm(velocity[:2]))

@@ -53,7 +53,7 @@ class Platform(Component):
             for name, value in vars(base).items()
             if isinstance(value, property)
         ]
-        return tuple(name for name in (*vars(state), *derived) if name not in ("orientation",))
+        return tuple(name for name in (*vars(state), *derived) if name != "orientation")
 
     def settle(self, state: Any) -> Any:
         """Return a start as `step` would leave it, for instance with its angles wrapped."""
@@ -98,8 +98,9 @@ class Platform(Component):
 
     @property
     def can_be_pushed(self) -> bool:
-        """Whether `pushed` is defined."""
-        return "velocity" in vars(self.rest())
+        """Whether `pushed` is defined: the velocity is a field of the state or can be set."""
+        sets_velocity = type(self).with_velocity is not Platform.with_velocity
+        return sets_velocity or "velocity" in vars(self.rest())
 
     def pushed(
         self,
