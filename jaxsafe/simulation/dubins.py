@@ -225,6 +225,14 @@ class Dubins3D(Platform, type="dubins3d"):
         heading, *moved = self._fly(ramps, (state.heading, 0.0, 0.0, 0.0), (jnp.zeros_like(dt), dt))
         return self._arrived(state, ramps, dt, heading=heading, moved=moved)
 
+    def _limits(self) -> dict[str, Any]:
+        """Return the limits of the state fields that have some, by name."""
+        return {
+            "speed": self.speed_limits,
+            "flight_path_angle": self.flight_path_angle_limits,
+            "roll": self.roll_limits,
+        }
+
     def _ramps(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Ramps:
         """Return the ramps of roll, flight path angle and speed.
 

@@ -276,13 +276,6 @@ class LaggedDubins3D(Dubins3D, type="dubins3d_lag"):
             "speed": _command(controls, "acceleration", self.acceleration_lag, state.acceleration),
         }
 
-    def _limits(self) -> dict[str, Any]:
-        return {
-            "roll": self.roll_limits,
-            "flight_path_angle": self.flight_path_angle_limits,
-            "speed": self.speed_limits,
-        }
-
 
 def _command(controls: Controls, name: str, time_constant: Number, rate: Array) -> Command:
     """Return a rate, the command that it follows, and the time constant of its lag."""

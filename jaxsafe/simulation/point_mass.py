@@ -139,10 +139,3 @@ class PointMassAircraft(Dubins3D, type="point_mass_aircraft"):
             outwards = ((value >= high) & (rate > 0.0)) | ((value <= low) & (rate < 0.0))
             resting[name] = jnp.where(outwards, 0.0, rate)
         return rates.replace(**resting)
-
-    def _limits(self) -> dict[str, Float[Array, " 2"]]:
-        return {
-            "speed": self.speed_limits,
-            "flight_path_angle": self.flight_path_angle_limits,
-            "roll": self.roll_limits,
-        }
