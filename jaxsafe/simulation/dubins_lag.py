@@ -101,10 +101,7 @@ class LaggedDubins2D(Dubins2D, type="dubins2d_lag"):
             acceleration=lagged(*push, dt),
         )
 
-    def step_within_limits(
-        self, state: Any, controls: Controls, dt: Seconds
-    ) -> LaggedDubins2DState:
-        return self.step(state, controls, dt)
+    step_within_limits = Platform.step_within_limits  # not the shortcut of `Dubins2D`
 
     def derivative(self, state: Any, controls: Controls) -> LaggedDubins2DState:
         """Return the right-hand side, which holds within the limits."""
@@ -220,10 +217,7 @@ class LaggedDubins3D(Dubins3D, type="dubins3d_lag"):
             acceleration=lagged(*rates["speed"], dt),
         )
 
-    def step_within_limits(
-        self, state: Any, controls: Controls, dt: Seconds
-    ) -> LaggedDubins3DState:
-        return self.step(state, controls, dt)
+    step_within_limits = Platform.step_within_limits  # not the shortcut of `Dubins3D`
 
     def derivative(self, state: Any, controls: Controls) -> LaggedDubins3DState:
         """Return the right-hand side, which holds within the limits."""
@@ -248,11 +242,12 @@ class LaggedDubins3D(Dubins3D, type="dubins3d_lag"):
         """
         along = jnp.abs(before.acceleration) + jnp.abs(after.acceleration)
         rates = [state.flight_path_angle_rate for state in (before, after)]
+        largest_rate = jnp.abs(rates[0]) + jnp.abs(rates[1])
         upwards = _change_of_product(
             factor=self.speed_limits[1],
             factor_change=along * dt,
-            rate=jnp.abs(rates[0]) + jnp.abs(rates[1]),
-            rate_change=jnp.abs(rates[0]) + jnp.abs(rates[1]),
+            rate=largest_rate,
+            rate_change=largest_rate,
         )
         rolled = (jnp.abs(before.roll_rate) + jnp.abs(after.roll_rate)) * dt
         bank = jnp.minimum(

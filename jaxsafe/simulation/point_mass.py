@@ -76,10 +76,7 @@ class PointMassAircraft(Dubins3D, type="point_mass_aircraft"):
             limit=self._within,
         )
 
-    def step_within_limits(
-        self, state: Dubins3DState, controls: Controls, dt: Seconds
-    ) -> Dubins3DState:
-        return self.step(state, controls, dt)
+    step_within_limits = Platform.step_within_limits  # not the shortcut of `Dubins3D`
 
     def derivative(self, state: Dubins3DState, controls: Controls) -> Dubins3DState:
         """Return the right-hand side of the equations, which hold within the limits."""
@@ -108,8 +105,7 @@ class PointMassAircraft(Dubins3D, type="point_mass_aircraft"):
             roll=jnp.asarray(controls.get("roll_rate", 0.0), speed.dtype),
         )
 
-    def held(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Controls:
-        return controls
+    held = Platform.held  # a commanded heading rate is not among the inputs
 
     def bend(self, before: Dubins3DState, after: Dubins3DState, dt: Seconds) -> Float[Array, ""]:
         """Return how far the path may leave the straight line from `before` to `after`.
