@@ -211,9 +211,11 @@ class Dubins3D(Platform, type="dubins3d"):
         # A loop keeps what it has computed for a piece. In four copies of the loop's body XLA would
         # compute that again for each use. On a GPU the copies took half as long again with a
         # million environments, and less time with fewer environments.
+        def one_piece(carry: tuple[Any, ...], span: tuple[Array, Array]) -> tuple[Any, None]:
+            return self._fly(ramps, carry, span), None
+
         still = jnp.zeros_like(state.heading)
         start = (state.heading, still, still, still)
-        one_piece = lambda carry, span: (self._fly(ramps, carry, span), None)  # noqa: E731
         (heading, *moved), _ = jax.lax.scan(one_piece, start, spans)
         return self._arrived(state, ramps, dt, heading=heading, moved=moved)
 
