@@ -84,7 +84,7 @@ class LawPolicy(Described):
             )
 
         def act(single: Float[Array, " o"]) -> Array:
-            return self._action_of(observed_sim(self.env, single))
+            return action_of(self.env, self.control(observed_sim(self.env, single)))
 
         return jnp.vectorize(act, signature="(o)->(a)")(jnp.asarray(observation))
 
@@ -95,10 +95,7 @@ class LawPolicy(Described):
 
     def action(self, state: State) -> Array:
         """Return the action for a state, as `reset` and `step` return it."""
-        return self._action_of(state.sim)
-
-    def _action_of(self, sim: Sim) -> Array:
-        return action_of(self.env, self.control(sim))
+        return action_of(self.env, self.control(state.sim))
 
     def _heading(self) -> str:
         return f"Control law {self.law.type_name or type(self.law).__name__}"
