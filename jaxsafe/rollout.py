@@ -154,11 +154,11 @@ def rollout(
         carry = (start.state, start.observation, start.memory)
         if num_envs is not None:
             carry = (*_move_batch((start.state, start.observation), 0, -1), start.memory)
-    elif num_envs is None:
-        state, timestep = reset(env, key_start)
-        carry = (state, timestep.observation, start_memory)
     else:
-        state, timestep = reset_batch(env, key_start, num_envs, axis=-1)
+        if num_envs is None:
+            state, timestep = reset(env, key_start)
+        else:
+            state, timestep = reset_batch(env, key_start, num_envs, axis=-1)
         carry = (state, timestep.observation, start_memory)
 
     def one_step(carry: tuple[State, Array, Any], key: Key) -> tuple[Any, Any]:
@@ -328,6 +328,9 @@ def reset_batch(
         num_envs: number of environments in the whole batch.
         shard: the part of the batch that this device has. Only its starts are returned.
         axis: the axis of the environments in all leaves, the first or the last.
+
+    Returns:
+        What `reset` returns, for each environment.
     """
     size = num_envs // shard.count
     return _starts(env, key, shard.first(size) + jnp.arange(size), axis)

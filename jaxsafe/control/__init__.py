@@ -1,7 +1,7 @@
 """Classical controllers: control laws that fly a task without learning.
 
-A law sees the whole state, or what an observation shows of it. `jaxsafe.load_policy` returns one as
-a policy, and `run=controller/NAME` flies it.
+A law sees the whole state, or what an observation shows of it. `jaxsafe.load_policy` returns a law
+as a policy, and `run=controller/NAME` flies it.
 """
 
 from jaxsafe.control.docking import LQR, MPC, PD, Align

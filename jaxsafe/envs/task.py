@@ -134,7 +134,7 @@ def short_name(name: str) -> str:
 
 
 def user_module(name: str) -> str | None:
-    """Return the module of a user's task; None for a task of this package or a file."""
+    """Return the module of a user's task. It is None for a task of this package and for a file."""
     task = registered(name)
     if task is None or task.environment.__module__.partition(".")[0] == "jaxsafe":
         return None

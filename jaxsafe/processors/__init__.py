@@ -1,6 +1,6 @@
-"""The meaning of the state, as in Figs. 8, 10 and 11 of the paper.
+"""What the state means: statuses, safety constraints, ends, rewards and observations.
 
-These are statuses, safety constraints, ends of an episode, rewards and observations.
+Figs. 8, 10 and 11 of the paper show these parts.
 """
 
 from jaxsafe.processors.constraint import (

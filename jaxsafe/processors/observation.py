@@ -212,7 +212,7 @@ class ObserveOrientation(Observation, type="observe_orientation"):
     """The orientation of a platform or region, in numbers that do not jump.
 
     In the plane it is [cos θ, sin θ] of the angle θ of the body's x axis. In space it is the first
-    two columns of the rotation matrix, which are the body's x and y axes; the z axis follows from
+    two columns of the rotation matrix, which are the body's x and y axes. The z axis follows from
     them. With `frame` the axes are seen from the body frame of that platform or region.
     """
 
@@ -284,9 +284,10 @@ class ObserveStatus(Observation, type="observe_status"):
 def _not_observable(env: Environment, what: str, *platforms: str) -> dict[str, str]:
     """Return what is wrong with a quantity, if one of the platforms does not have it."""
     for name in platforms:
-        known = env.platform(name).quantities()
-        if what not in known:
-            return {"what": f"{name} has no quantity {what!r}; choose from {nearest(what, known)}"}
+        quantities = env.platform(name).quantities()
+        if what not in quantities:
+            choices = nearest(what, quantities)
+            return {"what": f"{name} has no quantity {what!r}; choose from {choices}"}
     return {}
 
 

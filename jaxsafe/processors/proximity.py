@@ -110,7 +110,8 @@ class DriftDistance(Status, type="drift_distance"):
     def _bend(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, ""]:
         """Return how far a place of the drift may leave its chord while the state moves a step."""
         plant = env.platform(self.of)
-        first, last = before.platforms[self.of], sim.platforms[self.of]
+        first = before.platforms[self.of]
+        last = sim.platforms[self.of]
         dt = sim.time - before.time
         n = jnp.abs(self.mean_motion)
         change = safe_norm(last.velocity - first.velocity)

@@ -252,9 +252,10 @@ class VectorComponent(Status, type="component"):
         return vector["xyz".index(self.axis)]
 
     def misfits(self, env: Environment) -> dict[str, str]:
-        known = "xyz"[: env.agent_platform.dimension]
-        fits = self.axis in known
-        return {} if fits else {"axis": f"found {self.axis!r}; choose from {', '.join(known)}"}
+        axes = "xyz"[: env.agent_platform.dimension]
+        if self.axis in axes:
+            return {}
+        return {"axis": f"found {self.axis!r}; choose from {', '.join(axes)}"}
 
 
 class ControlStatus(Status):
@@ -285,8 +286,8 @@ class ControlComponent(ControlStatus, type="control"):
     def misfits(self, env: Environment) -> dict[str, str]:
         if self.element < env.action_size:
             return {}
-        known = ", ".join(f"{i} ({name})" for i, name in enumerate(env.action_names))
-        return {"element": f"found {self.element}; choose from {known}"}
+        elements = ", ".join(f"{i} ({name})" for i, name in enumerate(env.action_names))
+        return {"element": f"found {self.element}; choose from {elements}"}
 
 
 class ControlNorm(ControlStatus):

@@ -260,8 +260,8 @@ def read_cases(path: Any, place: str = "cases") -> dict[str, list[float]]:
             for name, text in zip(names, row, strict=True):
                 columns[name].append(float(text))
         except ValueError:
-            found = f"row {number}: expected {len(names)} numbers, found {show(row)}"
-            raise ConfigError(f"{place}: {full_path}: {found}") from None
+            problem = f"row {number}: expected {len(names)} numbers, found {show(row)}"
+            raise ConfigError(f"{place}: {full_path}: {problem}") from None
     return columns
 
 

@@ -314,8 +314,8 @@ class StateError(Uncertainty):
         rest = env.platform(self.of).rest()
         fields = [name for name in {**vars(rest), "velocity": None} if name != "orientation"]
         if self.what not in fields:
-            found = f"{self.of} has no {self.what!r} in its state"
-            return {"what": f"{found}; choose from {nearest(self.what, fields)}"}
+            choices = nearest(self.what, fields)
+            return {"what": f"{self.of} has no {self.what!r} in its state; choose from {choices}"}
         return {}
 
     def true(self, sim: Sim) -> Array:
@@ -378,9 +378,9 @@ def no_longer(vector: Float[Array, " d"], bound: Number) -> Float[Array, " d"]:
 
 def _no_actuators(env: Environment, field: str, names: tuple[str, ...]) -> dict[str, str]:
     """Return what is wrong with names of actuators, if the agent lacks one of them."""
-    known = [actuator.name for actuator in env.actuators]
+    actuators = [actuator.name for actuator in env.actuators]
     for name in names:
-        if name not in known:
-            found = f"{env.agent} has no actuator {name!r}"
-            return {field: f"{found}; choose from {nearest(name, known) or 'none'}"}
+        if name not in actuators:
+            choices = nearest(name, actuators) or "none"
+            return {field: f"{env.agent} has no actuator {name!r}; choose from {choices}"}
     return {}
