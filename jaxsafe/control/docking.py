@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsafe.control.law import ControlLaw
+from jaxsafe.control.law import ControlLaw, wrong_controls
 from jaxsafe.control.observed import Needs
 from jaxsafe.control.riccati import lqr_gain, riccati
 from jaxsafe.environment import Environment
@@ -249,6 +249,9 @@ class Align(ControlLaw, type="align"):
                 f"controller: align flies an oriented_spacecraft; {env.agent} is a "
                 f"{env.agent_platform.type_name}"
             )
+        controls = ("thrust", "attitude_acceleration")
+        if sorted(env.action_names) != sorted(controls):
+            raise wrong_controls(env, self, controls)
         return [(env.agent, what) for what in ("position", "velocity", "attitude", "attitude_rate")]
 
     def control(self, env: Environment, design: Any, sim: Sim) -> Float[Array, " 2"]:
@@ -262,7 +265,9 @@ class Align(ControlLaw, type="align"):
         drift = plant.derivative(state, {}).velocity
         push = (velocity - state.velocity) / self.response + velocity_rate - drift
         error = wrap(jnp.arctan2(push[1], push[0]) - state.attitude, -jnp.pi / 2, jnp.pi)
-        fastest = jnp.sqrt(1.6 * bounds(env)[1][1] * jnp.abs(error))
+        _, high = bounds(env)
+        largest_turn = high[env.action_names.index("attitude_acceleration")]
+        fastest = jnp.sqrt(1.6 * largest_turn * jnp.abs(error))
         rate = jnp.sign(error) * jnp.minimum(fastest, jnp.abs(error) / self.settle)
         turn = (rate - state.attitude_rate) / env.dt
         thrust = plant.mass * jnp.sum(push * direction(state.attitude))
@@ -322,10 +327,7 @@ def _point_mass(env: Environment, law: ControlLaw) -> Needs:
     plant = env.agent_platform
     axes = tuple(f"thrust_{axis}" for axis in "xyz"[: plant.dimension])
     if env.action_names != axes:
-        raise ConfigError(
-            f"controller: {law.type_name} gives {', '.join(axes)}; "
-            f"{env.agent} takes {', '.join(env.action_names)}"
-        )
+        raise wrong_controls(env, law, axes)
     return [(env.agent, "position"), (env.agent, "velocity")]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax.numpy as jnp
@@ -104,6 +105,14 @@ class LawPolicy(Described):
         yield "action", action_text(self.env)
         for name in fields(type(self.law)):
             yield name, brief(getattr(self.law, name))
+
+
+def wrong_controls(env: Environment, law: ControlLaw, given: Sequence[str]) -> ConfigError:
+    """Return the error for an agent that takes other controls than the law gives."""
+    return ConfigError(
+        f"controller: {law.type_name} gives {', '.join(given)}; "
+        f"{env.agent} takes {', '.join(env.action_names)}"
+    )
 
 
 def action_of(env: Environment, control: Float[Array, " m"]) -> Array:

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.control.law import ControlLaw
+from jaxsafe.control.law import ControlLaw, wrong_controls
 from jaxsafe.control.observed import Needs
 from jaxsafe.environment import Environment
 from jaxsafe.schema.component import Range, Unit
@@ -59,13 +59,18 @@ class Pursuit(ControlLaw, type="pursuit"):
                 f"controller: pursuit flies dubins2d and dubins3d; {env.agent} is a "
                 f"{plant.type_name}"
             )
+        in_space = isinstance(plant, Dubins3D)
+        turns = ("roll_rate", "flight_path_angle_rate") if in_space else ("heading_rate",)
+        controls = (*turns, "acceleration")
+        if not {*env.action_names} <= {*controls}:
+            raise wrong_controls(env, self, controls)
         regions = [region.name for region in env.regions]
         others = [other.name for other in env.platforms if other.name != env.agent]
         for name, names in ((self.region, regions), (self.lead, others)):
             if name not in names:
                 existing = ", ".join(names) or "none"
                 raise ConfigError(f"controller: pursuit follows {name!r}; there is {existing}")
-        angles = ("roll", "flight_path_angle") if isinstance(plant, Dubins3D) else ()
+        angles = ("roll", "flight_path_angle") if in_space else ()
         own = [(env.agent, what) for what in ("velocity", *angles)]
         return [
             *own,

@@ -12,7 +12,7 @@ import scipy.optimize
 import jaxsafe
 from jaxsafe.commands.evaluate import main
 from jaxsafe.commands.export import main as export
-from jaxsafe.control import LQR, MPC, PD, ControlLaw, Pursuit, observed_sim
+from jaxsafe.control import LQR, MPC, PD, Align, ControlLaw, Pursuit, observed_sim
 from jaxsafe.control.docking import linear_model
 from jaxsafe.control.riccati import lqr_gain, riccati
 from jaxsafe.envs import STARTERS, TASKS
@@ -234,6 +234,17 @@ def test_pursuit_goes_around_the_lead() -> None:
     assert flights["around"].margins["collision"].min() > 50.0
 
 
+def test_align_flies_actuators_in_any_order() -> None:
+    names = ["thrust", "attitude_acceleration"]
+    controls = []
+    for order in (names, names[::-1]):
+        env = jaxsafe.make("docking2d_oriented", {"deputy.controller.actuators": order})
+        state, _ = jaxsafe.reset(env, jax.random.key(0))
+        control = Align().policy(env).control(state.sim)
+        controls.append([float(control[order.index(name)]) for name in names])
+    assert controls[0] == controls[1]
+
+
 def test_a_controller_says_what_it_is_and_what_it_lacks() -> None:
     env = jaxsafe.make("docking2d")
     text = repr(jaxsafe.load_policy("controller/pd", env=env))
@@ -253,6 +264,20 @@ def test_a_controller_says_what_it_is_and_what_it_lacks() -> None:
         (
             lambda: Pursuit(lead="deputy").policy(jaxsafe.make("rejoin2d")),
             "controller: pursuit follows 'deputy'; there is lead",
+        ),
+        (
+            lambda: Align().policy(
+                jaxsafe.make("docking2d_oriented", {"deputy.controller.actuators": ["thrust"]})
+            ),
+            "controller: align gives thrust, attitude_acceleration; deputy takes thrust",
+        ),
+        (
+            lambda: Pursuit().policy(
+                jaxsafe.make(
+                    "rejoin3d", {"wingman.controller.actuators.roll_rate.name": "heading_rate"}
+                )
+            ),
+            "controller: pursuit gives roll_rate, flight_path_angle_rate, acceleration; wingman",
         ),
         (
             lambda: PD().policy(env)(None, jnp.zeros(5)),
