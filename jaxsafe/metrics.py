@@ -287,9 +287,7 @@ def over_seeds(per_seed: list[float | None]) -> dict[str, Any]:
     }
 
 
-def stratified_iqm(
-    scores: Sequence[Sequence[float]], resamples: int = NUM_RESAMPLES
-) -> dict[str, Any]:
+def stratified_iqm(scores: Sequence[Sequence[float]]) -> dict[str, Any]:
     """Return the interquartile mean over all runs of all tasks, with its 95 % bootstrap interval.
 
     The interquartile mean is the mean of the middle half of all scores. The bootstrap is
@@ -298,14 +296,13 @@ def stratified_iqm(
 
     Args:
         scores: for each task, a sequence of the scores of its runs.
-        resamples: number of bootstrap samples.
     """
     from scipy.stats import trim_mean
 
     generator = np.random.default_rng(0)
     tasks = [np.asarray(task_scores, float) for task_scores in scores]
     drawn = [
-        task_scores[generator.integers(len(task_scores), size=(resamples, len(task_scores)))]
+        task_scores[generator.integers(len(task_scores), size=(NUM_RESAMPLES, len(task_scores)))]
         for task_scores in tasks
     ]
     interval = None
@@ -329,16 +326,15 @@ def with_interval(value: float, interval: Sequence[float] | None, form: str) -> 
     return f"{value:{form}} [{low:{form}}, {high:{form}}]"
 
 
-def bootstrap_interval(values: np.ndarray, resamples: int = NUM_RESAMPLES) -> np.ndarray:
+def bootstrap_interval(values: np.ndarray) -> np.ndarray:
     """Return the 95 % percentile-bootstrap interval of the mean over the last axis.
 
     Args:
         values: shape (rows, seeds).
-        resamples: number of bootstrap samples.
 
     Returns:
         The lowest and the highest value of each row, shape (2, rows).
     """
     num_seeds = values.shape[-1]
-    draws = np.random.default_rng(0).integers(num_seeds, size=(resamples, num_seeds))
+    draws = np.random.default_rng(0).integers(num_seeds, size=(NUM_RESAMPLES, num_seeds))
     return np.percentile(values[:, draws].mean(axis=-1), [2.5, 97.5], axis=-1)
