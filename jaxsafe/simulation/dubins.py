@@ -201,8 +201,8 @@ class Dubins3D(Platform, type="dubins3d"):
     def step(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Dubins3DState:
         """Return the state after `dt` seconds.
 
-        The position is a quadrature over the pieces of the step in which no limit is reached. Its
-        error is below 1e-3 ft for a step of 1 s, and mostly 1e-5 ft.
+        Heading and position are quadratures over the pieces of the step in which no limit is
+        reached. The error of the position is below 1e-3 ft for a step of 1 s, and mostly 1e-5 ft.
         """
         ramps = self._ramps(state, controls, dt)
         stops = [time_to_limit(*quantity, dt) for quantity in ramps if quantity[1] is not None]
@@ -329,9 +329,9 @@ class Dubins3D(Platform, type="dubins3d"):
     def bend(self, before: Dubins3DState, after: Dubins3DState, dt: Seconds) -> Float[Array, ""]:
         """Return how far the path may leave the straight line from `before` to `after`.
 
-        This adds to the bound for any platform. The acceleration a across the velocity changes with
-        the roll. However a gets from its first value to its last, the path leaves the one of the
-        mean acceleration by ‖Δa‖Δt²/54 at most.
+        The bound for any platform is enlarged, because the acceleration a across the velocity
+        changes with the roll. However a gets from its first value to its last, the path leaves that
+        of the mean acceleration by ‖Δa‖Δt²/54 at most.
         """
         across = [
             self.gravity * jnp.tan(state.roll) * jnp.cos(state.flight_path_angle)
@@ -344,7 +344,7 @@ class Dubins3D(Platform, type="dubins3d"):
         return self.gravity * bank[0] / (speed * bank[1])
 
     def _roll_rate(self, state: Dubins3DState, controls: Controls, dt: Seconds) -> Any:
-        """Return the roll rate, which a `heading_rate` replaces, or None if there is neither."""
+        """Return the roll rate, which follows from a `heading_rate` if one is given, or None."""
         if "heading_rate" not in controls:
             return controls.get("roll_rate")
         return (arctan(controls["heading_rate"] * state.speed / self.gravity) - state.roll) / dt
