@@ -55,9 +55,9 @@ def renew(
 
     Args:
         where: which environments to replace.
-        draw: `draw(parameters, indices)` returns starts. Derivatives do not see what it closes
-            over.
-        parameters: what the starts depend on. Derivatives see it.
+        draw: `draw(parameters, indices)` returns starts. Derivatives do not pass through what it
+            closes over.
+        parameters: what the starts depend on. Derivatives pass through it.
         old: the batch.
         axis: the axis of the environments in all leaves, the first or the last.
     """

@@ -179,9 +179,7 @@ def _variant_values(name: str, variant: str) -> dict[str, Any]:
         )
     task = TASKS.get(name.rpartition(":")[2])
     if task is None:
-        raise ConfigError(
-            f"variant: {name} says itself what it is; a variant is for {', '.join(TASKS)}"
-        )
+        raise ConfigError(f"variant: {name} has no variants; a variant is for {', '.join(TASKS)}")
     if variant == "released":
         return dict(task.released)
     paper = task.environment()

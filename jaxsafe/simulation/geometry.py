@@ -151,7 +151,7 @@ def no_direction(vector: Float[Array, " d"], name: str) -> str | None:
 
 
 def wrong_size(env: Any, **vectors: Float[Array, " d"]) -> dict[str, str]:
-    """Return what is wrong with vectors that have not one number for each dimension, by name."""
+    """Return what is wrong with each vector that lacks one number per dimension, by its name."""
     space = env.agent_platform.dimension
     return {
         name: f"expected {space} numbers, found {vector.size}"

@@ -91,7 +91,7 @@ class Region(Component):
     """
 
     dimensions: ClassVar[tuple[int, ...]] = (1, 2, 3)
-    """Dimensions of space in which the region is what its name says."""
+    """Dimensions of space in which a region of this type can be."""
     convex: ClassVar[bool] = False
     """Whether the region is convex. The distance on a line is then largest at an end."""
     name: str

@@ -582,9 +582,7 @@ def test_a_variant_is_for_a_task_by_name(env: Environment, tmp_path: Path) -> No
     path.write_text(dump(env))
     for variant in ("paper", "released"):
         message = fault(lambda variant=variant: jaxsafe.make(path, variant=variant))
-        assert message.startswith(
-            f"variant: {path} says itself what it is; a variant is for rejoin2d"
-        )
+        assert message.startswith(f"variant: {path} has no variants; a variant is for rejoin2d")
     assert "Did you mean 'released'?" in fault(lambda: jaxsafe.make(path, variant="releasd"))  # type: ignore[arg-type]
 
 
