@@ -100,7 +100,7 @@ class MPC(ControlLaw, type="mpc"):
     cost of an LQR that goes on from the end of the plan for ever. After every thrust
     ‖v‖ ≤ `share` · (ν₀ + ν₁ e·r), where e is the present direction of the position r. This is a
     second-order cone. It lies within the speed limit, because e·r ≤ ‖r‖. In the cost a position
-    farther away than `reach` counts as one at `reach`, because a larger one would need more rounds.
+    farther away than `reach` counts as one at `reach`. Larger costs would need more rounds.
 
     The plan is found by `iterations` rounds of ADMM (Boyd et al. 2011), as in OSQP and SCS. A round
     is one product with a matrix that `design` has inverted, and projections onto the box of the
