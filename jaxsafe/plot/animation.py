@@ -1,7 +1,7 @@
 """An episode of any environment as a film, or as pictures while it goes on.
 
 It shows where the agent is, what its thrusters do, how far it is from the other platform, and how
-safe.
+safe it is.
 """
 
 from __future__ import annotations
@@ -81,7 +81,10 @@ MIN_DISTANCE = 1e-3
 """Smallest distance on the logarithmic axis."""
 
 MIN_ROOM = 0.05
-"""Smallest room beyond the values at an axis, in its unit or as a share of a power of ten."""
+"""Smallest gap between the values and the ends of an axis.
+
+It is in the unit of the axis, or on a logarithmic axis in powers of ten.
+"""
 
 ARROW = 0.4
 """Length of the arrow of full thrust, as a share of half the width of the map."""
@@ -117,10 +120,10 @@ def require_ffmpeg() -> str:
     Raises:
         ConfigError: there is none.
     """
-    found = shutil.which("ffmpeg")
-    if found is None:
+    ffmpeg = shutil.which("ffmpeg")
+    if ffmpeg is None:
         raise ConfigError("render: mp4 needs the program ffmpeg, which is not on the PATH; use gif")
-    return found
+    return ffmpeg
 
 
 def _gif(frames: Iterator[np.ndarray]) -> bytes:
@@ -147,25 +150,28 @@ def _mp4(frames: Iterator[np.ndarray]) -> bytes:
     images += images[-1:] * (LAST_FRAME_MS // FRAME_MS)
     height, width, _ = images[0].shape
     source = f"-f rawvideo -pix_fmt rgb24 -s {width}x{height} -r {1000 / FRAME_MS:.6g} -i -"
-    # A fragmented file can be written to a pipe, which cannot go back.
+    # Only a fragmented file can be written to a pipe, because ffmpeg cannot go back in a pipe.
     target = "-pix_fmt yuv420p -movflags frag_keyframe+empty_moov -f mp4 -"
-    words = [require_ffmpeg(), "-v", "error", *source.split(), *target.split()]
-    run = subprocess.run(words, input=b"".join(map(bytes, images)), capture_output=True)
+    command = [require_ffmpeg(), "-v", "error", *source.split(), *target.split()]
+    run = subprocess.run(command, input=b"".join(map(bytes, images)), capture_output=True)
     if run.returncode:
-        told = run.stderr.decode(errors="replace").strip().splitlines() or ["no message"]
-        raise ConfigError(f"render: ffmpeg failed: {told[-1]}")
+        lines = run.stderr.decode(errors="replace").strip().splitlines() or ["no message"]
+        raise ConfigError(f"render: ffmpeg failed: {lines[-1]}")
     return run.stdout
 
 
 class Moment(NamedTuple):
-    """What a picture shows of one step. Vectors are relative to the platform looked from."""
+    """What a picture shows of one step.
 
-    time: float
-    places: Mapping[str, np.ndarray]  # of platforms and regions
-    directions: Mapping[str, np.ndarray]  # in which platforms point, or else move
+    Vectors are relative to the platform that the scene is seen from.
+    """
+
+    time: float  # [s]
+    places: Mapping[str, np.ndarray]  # the position of each platform and region
+    directions: Mapping[str, np.ndarray]  # where each platform points, or else moves
     thrust: np.ndarray | None  # as a share of the largest thrust
-    distance: float  # of the agent
-    margins: Mapping[str, float]
+    distance: float  # from the agent to the platform that the scene is seen from
+    margins: Mapping[str, float]  # h of each constraint
     outcome: str
 
 
@@ -251,8 +257,8 @@ class Scene:
         """
         origin, turn = self._frame(sim)
         directions = {name: in_plane(_direction(state)) for name, state in sim.platforms.items()}
-        named = {**sim.regions, **sim.platforms}
-        places = {name: turn @ (_place(one) - origin) for name, one in named.items()}
+        states = {**sim.regions, **sim.platforms}
+        places = {name: turn @ (_place(state) - origin) for name, state in states.items()}
         distance = float(np.linalg.norm(places[self.env.agent]))
         ended = [name for name, flag in sim.ended.items() if flag]
         self.moments.append(
@@ -291,7 +297,7 @@ class Scene:
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
     def _frame(self, sim: Sim) -> tuple[np.ndarray, np.ndarray]:
-        """Return the place that all is seen from, and the rotation into its axes."""
+        """Return the position that all is seen from, and the rotation into its axes."""
         dimension = 3 if self._spatial else 2
         if self._origin is None:
             return np.zeros(dimension), np.eye(dimension)
@@ -305,7 +311,7 @@ class Scene:
     def _thrust(self, control: np.ndarray, direction: np.ndarray) -> np.ndarray | None:
         """Return the thrust as a share of the largest one, or None if the agent has no thruster."""
         thrust = np.zeros(len(direction))
-        known = False
+        has_thruster = False
         for actuator, value in zip(self.env.actuators, control, strict=True):
             axis = {"thrust_x": 0, "thrust_y": 1, "thrust_z": 2}.get(actuator.name)
             largest = max(abs(float(actuator.low)), abs(float(actuator.high))) or 1.0
@@ -313,8 +319,8 @@ class Scene:
                 thrust = thrust + direction * value / largest
             elif axis is not None and axis < len(thrust):
                 thrust[axis] += value / largest
-            known |= actuator.name == "thrust" or axis is not None
-        return thrust if known else None
+            has_thruster |= actuator.name == "thrust" or axis is not None
+        return thrust if has_thruster else None
 
     @styled
     def _set_up(self) -> None:
@@ -381,8 +387,8 @@ class Scene:
         unit = length_unit(self.env)
         above, below = self.curves
         origin = plain(self._origin)
-        what = "distance" if self._origin is None else f"distance to\nthe {origin}"
-        above.set(yscale="log", ylabel=labelled(what, unit))
+        quantity = "distance" if self._origin is None else f"distance to\nthe {origin}"
+        above.set(yscale="log", ylabel=labelled(quantity, unit))
         above.tick_params(labelbottom=False)
         below.set(xlabel="time [s]")
         below.axhline(0.0, color="black", linewidth=0.8)
@@ -433,7 +439,7 @@ class Scene:
         return max([*finite, 1e-6])
 
     def _draw_background(self, now: Moment) -> None:
-        """Set the axes and everything that depends on them only."""
+        """Set the axes and everything that depends only on them."""
         labels = frame_labels(self._origin if self._turned else None, length_unit(self.env))
         set_frame(self.map, range(3 if self._spatial else 2), labels, self._reach)
         if self._spatial:
@@ -456,7 +462,7 @@ class Scene:
         self._unsafe.set(y=low, height=-low)
 
     def _move(self, past: Sequence[Moment]) -> None:
-        """Put everything that moves to where it is after a step."""
+        """Put everything that moves to where it is after the last of these steps."""
         now = past[-1]
         for name, (trail, nose, dot) in self._trails.items():
             path = np.stack([moment.places[name] for moment in past])

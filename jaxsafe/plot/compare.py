@@ -121,8 +121,8 @@ def compare_curves(
         entries[-1].set_label(plain(mark[0]))
     entries += curve_entries(every_row, every_evaluation, ("black", "black"))
     add_legend(figure, spare, entries)
-    what = ": mean and 95 % interval over seeds" if averaged else ""
-    figure.suptitle(fitted(f"{plain(title)}{what}", figure))
+    suffix = ": mean and 95 % interval over seeds" if averaged else ""
+    figure.suptitle(fitted(f"{plain(title)}{suffix}", figure))
     return figure
 
 

@@ -87,9 +87,9 @@ Rows = Sequence[Mapping[str, Any]]
 class Axis:
     """The horizontal axis of training curves."""
 
-    column: str
+    column: str  # the column of the progress log
     label: str
-    unit: float  # what one unit of the axis is in units of the column
+    unit: float  # the value of the column that is 1 on the axis
 
     @classmethod
     def of(cls, x: str, rows: Rows) -> Self:
@@ -146,8 +146,8 @@ class Curve:
             look: the look of the lines.
         """
         if not self.has_mean:
-            for place, (values, sure) in enumerate(zip(self.values.T, self.sure.T, strict=True)):
-                colour = colours[place % len(colours)]
+            for index, (values, sure) in enumerate(zip(self.values.T, self.sure.T, strict=True)):
+                colour = colours[index % len(colours)]
                 _draw_line(panel, self.at, values, sure, color=colour, **look)
             return
         _draw_line(
@@ -279,7 +279,7 @@ def shown_curves(rows: Rows, panels: Sequence[str] = ()) -> list[tuple[str, str,
     Raises:
         ConfigError: a column of `panels` has no values.
     """
-    known = [
+    available = [
         curve
         for curve in CURVES
         if any(
@@ -288,8 +288,8 @@ def shown_curves(rows: Rows, panels: Sequence[str] = ()) -> list[tuple[str, str,
         )
     ]
     if not panels:
-        return known
-    by_name = {curve[0]: curve for curve in known}
+        return available
+    by_name = {curve[0]: curve for curve in available}
     for name in panels:
         if name not in by_name:
             choices = ", ".join(by_name) or "none, because no episode has ended yet"
@@ -298,7 +298,7 @@ def shown_curves(rows: Rows, panels: Sequence[str] = ()) -> list[tuple[str, str,
 
 
 def without_diverged(rows: Rows) -> tuple[Rows, str]:
-    """Return the rows of the seeds that have not diverged and words that say which are left out.
+    """Return the rows of the seeds that have not diverged, and a text that names the others.
 
     If every seed has diverged, all rows are returned. Their curves end where the seeds diverged.
     """
@@ -408,16 +408,16 @@ def curve_table(
     steps = sorted({row["step"] for row in rows})
     kept = np.linspace(0, len(steps) - 1, min(most, len(steps))).astype(int)
     steps = sorted({steps[i] for i in kept})
-    seeds = {seed: place for place, seed in enumerate(sorted({row["seed"] for row in rows}))}
-    index = {step: i for i, step in enumerate(steps)}
+    seed_index = {seed: i for i, seed in enumerate(sorted({row["seed"] for row in rows}))}
+    point_index = {step: i for i, step in enumerate(steps)}
     at = np.zeros(len(steps))
-    values = np.full((len(steps), len(seeds)), np.nan)
+    values = np.full((len(steps), len(seed_index)), np.nan)
     for row in rows:
-        if row["step"] in index:
-            point = index[row["step"]]
+        if row["step"] in point_index:
+            point = point_index[row["step"]]
             at[point] = row[column]
             value = row.get(name)
-            values[point, seeds[row["seed"]]] = np.nan if value is None else value
+            values[point, seed_index[row["seed"]]] = np.nan if value is None else value
     return at, values
 
 

@@ -1,7 +1,6 @@
-"""Figures of logged episodes of a run.
+"""Figures of logged episodes: trajectories (Fig. 18), and speed against distance (Fig. 19).
 
-They are trajectories (Fig. 18), and speed and distance (Fig. 19). What run time assurance altered
-is drawn by `jaxsafe.plot.interventions`.
+`jaxsafe.plot.interventions` draws what run time assurance altered.
 """
 
 from __future__ import annotations
@@ -36,13 +35,15 @@ LAST_COLOUR = 0.85
 """Part of the colour map that is used. Its end is too light on white."""
 
 CLOSE_UP = 3.0
-"""Half the width of a close-up of the smallest region, in distances to the region's far end."""
+"""Half the width of a close-up, as a multiple of the distance to the far end of its region."""
 
 PANEL_WIDTH = 3.2
 """Width of a panel of trajectories in inches, if the width of the figure is left open."""
 
 COLOUR_BAR_WIDTH = 0.9
 """Width of the colour bar with its label in inches."""
+
+SUBTITLE = "deterministic episodes of the first seed"
 
 Rows = list[dict[str, Any]]
 """Rows of an episode in a log, one per step."""
@@ -92,7 +93,7 @@ def trajectories(
     regions = [region for region in regions if region.name in logged]
     origin = np.array([row["platforms"][first]["position"] for row in last], float)
     if not alone and np.ptp(origin, axis=0).any():
-        # A region that stays in place has no one place on a map that moves.
+        # The map moves, so a region that stays in place has no fixed position on it.
         regions = [region for region in regions if region.on is not None]
     places = [np.nan_to_num(_relative_path(last[-1:], region.name)[0]) for region in regions]
     sizes = [
@@ -155,13 +156,17 @@ def trajectories(
     if handles:
         figure.legend(handles, names, loc="outside lower center", ncols=len(names))
     _colour_bar(figure, colours, panels)
-    what = "deterministic episodes of the first seed"
-    figure.suptitle(fitted(f"{plain(title)}\n{what}", figure))
+    figure.suptitle(fitted(f"{plain(title)}\n{SUBTITLE}", figure))
     return figure
 
 
 def _within(path: np.ndarray, half: float) -> np.ndarray:
-    """Return a path with a gap where it is outside of the box. Axes in space do not clip."""
+    """Return a path with a gap where it leaves the box, because axes in space do not clip.
+
+    Args:
+        path: the path, shape (points, 3).
+        half: half the width of the box.
+    """
     return np.where((np.abs(path) <= half).all(axis=1, keepdims=True), path, np.nan)
 
 
@@ -200,7 +205,7 @@ def speed_distance(episodes: Episodes, title: str, width: float | None = None) -
             fastest = max(fastest, np.nanmax(speed))
     line = np.concatenate(limits, axis=1)
     reach = 1.2 * max(starts) or 1.0
-    line = line[:, line[0] <= reach]  # the path of an early policy may lead far away
+    line = line[:, line[0] <= reach]  # the path of an early policy may lead farther away
     line = line[:, np.argsort(line[0])]
     panel.plot(line[0], line[1], color="black", linestyle=":", linewidth=1.6, label="speed limit")
     panel.set(xlabel="distance to the chief [m]", ylabel="speed [m/s]")
@@ -208,8 +213,7 @@ def speed_distance(episodes: Episodes, title: str, width: float | None = None) -
     panel.set(xlim=(0, reach), ylim=(0, top))
     panel.legend(loc="best")
     _colour_bar(figure, colours, panel)
-    what = "deterministic episodes of the first seed"
-    figure.suptitle(fitted(f"{plain(title)}\n{what}", figure))
+    figure.suptitle(fitted(f"{plain(title)}\n{SUBTITLE}", figure))
     return figure
 
 
@@ -221,8 +225,8 @@ def _agent(rows: list[dict[str, Any]]) -> str:
 def _relative_path(rows: list[dict[str, Any]], of: str) -> np.ndarray:
     """Return the positions of a platform or region relative to the first platform, (steps, d).
 
-    They are turned by the heading of the first platform if it has one. If there is only one
-    platform they are not changed.
+    If the first platform has a heading, x is along it. If there is only one platform, the positions
+    are not changed.
     """
     first = next(iter(rows[0]["platforms"]))
     places = [{**row.get("regions", {}), **row["platforms"]} for row in rows]

@@ -97,13 +97,13 @@ def _origin_moves(env: Environment, states: State) -> bool:
 
 
 def _heads(env: Environment, states: State) -> str | None:
-    """Return the platform along whose heading x is, or None."""
+    """Return the name of the platform along whose heading x is, or None."""
     origin = _origin(env)
     return origin if origin and "heading" in vars(states.sim.platforms[origin]) else None
 
 
 def _relative_path(env: Environment, states: State, of: str) -> np.ndarray:
-    """Return the positions of a platform or region as seen from the first other platform."""
+    """Return the positions of a platform or region as seen from `_origin`, shape (steps, d)."""
     sim = states.sim
     place = sim.platforms[of] if of in sim.platforms else sim.regions[of]
     path = in_plane(np.array(place.position, float))
@@ -126,7 +126,7 @@ def _draw_path(panel: Any, view: tuple[int, ...], env: Environment, states: Stat
     forbidden = kept_out(env)
     for region in env.regions:
         if region.on is None and _origin_moves(env, states):
-            continue  # it has no one place on a map that moves
+            continue  # it has no fixed position on a map that moves
         place = np.nan_to_num(_relative_path(env, states, region.name)[-1])
         if spatial:
             region_surface(panel, region, place, region.name in forbidden)

@@ -54,9 +54,9 @@ def most_altered(episodes: Sequence[tuple[int, Rows]]) -> Rows:
 def interventions(rows: Rows, env: Environment, title: str, width: float | None = None) -> Figure:
     """Return a figure of one episode over time in s.
 
-    It has a panel for each control, desired and actual, and a panel for h of each constraint. Steps
-    on which the filter altered the control are shaded. The predicted margin is drawn beside h if
-    the filter keeps one constraint, else in a panel of its own.
+    Each control has a panel of the desired and the actual control. Each constraint has a panel of
+    its h. Steps on which the filter altered the control are shaded. The predicted margin is drawn
+    beside h if the filter keeps one constraint, else in a panel of its own.
 
     Args:
         rows: an episode of `episodes.jsonl`, from its start. Row k holds the control of the step
@@ -115,8 +115,8 @@ def interventions(rows: Rows, env: Environment, title: str, width: float | None 
     figure.align_ylabels(list(panels))
     share = altered.mean() if len(altered) else 0.0
     outcome = plain(rows[-1]["outcome"])
-    what = f"altered on {100.0 * share:.0f} % of the steps, ended with {outcome}"
-    figure.suptitle(fitted(f"{plain(title)}\n{what}", figure))
+    subtitle = f"altered on {100.0 * share:.0f} % of the steps, ended with {outcome}"
+    figure.suptitle(fitted(f"{plain(title)}\n{subtitle}", figure))
     return figure
 
 
@@ -159,7 +159,7 @@ def _intervening(rows: Rows) -> np.ndarray:
 
 
 def _column(rows: Rows, *path: str) -> np.ndarray:
-    """Return the number at a path in every row. A null becomes NaN and leaves a gap."""
+    """Return the number at a path in every row, shape (rows,). A null is NaN and leaves a gap."""
     values: list[Any] = list(rows)
     for name in path:
         values = [value[name] for value in values]

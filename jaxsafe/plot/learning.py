@@ -70,8 +70,8 @@ def learning_curves(rows: Rows, x: str, title: str, width: float | None = None) 
             panel.set_ylim(max(WORST_SHOWN, panel.get_ylim()[0]), 1.05)
     figure.supxlabel(axis.label, fontsize="medium")
     several = len({row["seed"] for row in rows}) > 1
-    what = "median and range of the seeds" if several else "one seed"
-    figure.suptitle(fitted(f"{plain(title)}\neach update, {what}{left_out}", figure))
+    shown_seeds = "median and range of the seeds" if several else "one seed"
+    figure.suptitle(fitted(f"{plain(title)}\neach update, {shown_seeds}{left_out}", figure))
     return figure
 
 

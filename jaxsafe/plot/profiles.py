@@ -38,9 +38,9 @@ def performance_profiles(panels: Mapping[str, Scores], title: str, width: float 
     looks = dict(zip(labels, cycle(LINE_STYLES), strict=False))
     banded = False
     for panel, (quantity, scores) in zip(places, panels.items(), strict=True):
-        every = np.concatenate([np.asarray(values, float) for values in scores.values()])
-        room = 0.02 * np.ptp(every) or 0.02 * abs(float(every[0])) or 1.0
-        at = np.linspace(every.min() - room, every.max() + room, NUM_SCORES)
+        pooled = np.concatenate([np.asarray(values, float) for values in scores.values()])
+        room = 0.02 * np.ptp(pooled) or 0.02 * abs(float(pooled[0])) or 1.0
+        at = np.linspace(pooled.min() - room, pooled.max() + room, NUM_SCORES)
         for label, values in scores.items():
             line, colour = looks[label]
             above = 100.0 * (np.asarray(values, float) > at[:, None])
@@ -60,6 +60,7 @@ def performance_profiles(panels: Mapping[str, Scores], title: str, width: float 
         for label, (line, colour) in looks.items()
     ]
     add_legend(figure, spare, entries)
-    what = "95 % interval over seeds" if banded else "every seed"
-    figure.suptitle(fitted(f"{plain(title)}\nperformance profiles after training, {what}", figure))
+    spread = "95 % interval over seeds" if banded else "every seed"
+    subtitle = f"performance profiles after training, {spread}"
+    figure.suptitle(fitted(f"{plain(title)}\n{subtitle}", figure))
     return figure

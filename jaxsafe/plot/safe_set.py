@@ -3,8 +3,8 @@
 The command is `python -m jaxsafe.plot.safe_set env=rejoin2d`.
 
 H(x) is the smallest h on the way of the best backup controller from x. Without a horizon it is h(x)
-itself. A state is certified where H(x) reaches the margin that the filter keeps. For docking the
-planes are distance against speed, and for rejoin they are the surroundings of the lead.
+itself. A state is certified where H(x) reaches the margin that the filter keeps. A plane for
+docking shows distance against speed, and a plane for rejoin shows the surroundings of the lead.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ def planes(env: Environment) -> Planes:
         and isinstance(others[0], type(agent))
     ):
         return _rejoin(agent, others[0])
-    found = ", ".join(map(_type_name, env.platforms))
-    raise ConfigError(f"env: expected two spacecraft or two aircraft of one kind, found {found}")
+    types = ", ".join(map(_type_name, env.platforms))
+    raise ConfigError(f"env: expected two spacecraft or two aircraft of one kind, found {types}")
 
 
 def survey(env: Environment, start: Start, x: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -105,8 +105,8 @@ def survey(env: Environment, start: Start, x: Any, y: Any) -> tuple[np.ndarray, 
         y: values along the second axis, shape (m,).
 
     Returns:
-        H and the smallest h, each of shape (m, n). H is the highest one of all backup controllers.
-        It is −∞ where each of them ends outside of the terminal set.
+        H and the smallest h of all constraints, each of shape (m, n). H is that of the best backup
+        controller. It is −∞ where every backup controller ends outside of the terminal set.
     """
 
     def states(env: Environment, x: Any, y: Any) -> Sim:
@@ -120,7 +120,7 @@ def survey(env: Environment, start: Start, x: Any, y: Any) -> tuple[np.ndarray, 
 def _assess(env: Environment, sims: Sim) -> tuple[Float[Array, "m n"], Float[Array, "m n"]]:
     """Return H and h of a grid of states.
 
-    It is a program of its own, so that all panels share it.
+    This is a program of its own, so that all panels share it.
     """
 
     def assess_state(sim: Sim) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -134,7 +134,7 @@ def _assess(env: Environment, sims: Sim) -> tuple[Float[Array, "m n"], Float[Arr
 def place(env: Environment, start: Mapping[str, Mapping[str, Any]]) -> Sim:
     """Return the simulation with the given fields. All other fields are those at rest.
 
-    Numbers of the environment that are random keep their present values.
+    Random numbers of the environment keep their present values.
 
     Args:
         env: the environment.
@@ -166,9 +166,9 @@ def draw(
         ConfigError: the environment has no filter that certifies, or no planes are known for it.
     """
     if not isinstance(env.rta, CertifiedRTA) or not env.rta.backups:
-        found = "none" if env.rta is None else _type_name(env.rta)
+        rta = "none" if env.rta is None else _type_name(env.rta)
         raise ConfigError(
-            f"rta: expected a filter that certifies states, for instance default, found {found}"
+            f"rta: expected a filter that certifies states, for instance default, found {rta}"
         )
     plane = planes(env)
     left, right = x or plane.x_ends
@@ -210,8 +210,8 @@ def draw(
 def _docking(agent: Any, chief: Any) -> Planes:
     """Return planes of distance against speed, for three directions of flight.
 
-    If the thrust turns with the body, they are for three attitudes instead. On a line there are two
-    directions.
+    On a line there are only two directions. If the thrust turns with the body, the planes are for
+    three attitudes instead.
     """
     x, *across = np.eye(agent.dimension)
 

@@ -72,13 +72,13 @@ FORBIDDEN: dict[str, Any] = {
 """Look of a region to stay out of. The hatch tells it from a goal without its colour."""
 
 NICE = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)
-"""Round numbers, up to a power of ten."""
+"""Round numbers from 1 to 10. Others are a power of ten times one of these."""
 
 ZOOM = 0.78
 """Size of a view in space. Larger ones have no room for their labels."""
 
 SPACE_LABEL_PAD = 8.0
-"""Distance of a label from its axis in space, in points. Numbers of five digits fit between."""
+"""Distance of a label from its axis in space, in points. Numbers of five digits fit into it."""
 
 CHARACTERS_PER_INCH = 13
 """Number of characters of a title that fit into an inch."""
@@ -164,9 +164,9 @@ def region_patch(
 ) -> Any:
     """Return a patch of a region around the origin, seen from above or from the side.
 
-    Seen from the side, a region with a height is a rectangle. A region to stay out of is hatched. A
-    box, and in the plane a cone or a half-space, is drawn where its axes are those of the map, and
-    else only its centre.
+    Seen from the side, a region with a height is a rectangle. A region to stay out of is hatched.
+    If the axes of a box are those of the map, its outline is drawn. The same holds for a cone and a
+    half-space in the plane. Otherwise only their centre is drawn.
 
     Args:
         region: the region.
@@ -214,7 +214,7 @@ class Ball(NamedTuple):
 def region_surface(panel: Any, region: Any, centre: np.ndarray, forbidden: bool = False) -> Any:
     """Draw and return the surface of a region in space: a ball, an upright cylinder or a box.
 
-    Of another region, or a box that turns, only the centre is drawn.
+    Only the centre of any other region, and of a box that turns, is drawn.
 
     Args:
         panel: axes in space.
@@ -232,7 +232,7 @@ def region_surface(panel: Any, region: Any, centre: np.ndarray, forbidden: bool 
         up = radius * np.sin(np.pi * rise)
     surface = [across * np.cos(turn), across * np.sin(turn), up * np.ones_like(turn)]
     if isinstance(region, Box) and not region.turns:
-        # A ball that is blown up until it touches the sides of a cube.
+        # A box is a ball that is blown up until it touches the sides of a cube.
         ball = [np.cos(np.pi * rise) * np.cos(turn), np.cos(np.pi * rise) * np.sin(turn)]
         ball = np.stack([*ball, np.sin(np.pi * rise)])
         surface = ball / np.abs(ball).max(axis=0) * np.reshape(region.size, (3, 1, 1)) / 2.0

@@ -29,18 +29,18 @@ def sweep_curves(path: Path, curves: Sequence[tuple[str, dict[str, Any]]]) -> Pa
     panel = figure.subplots()
     axis = Axis.of("steps", [{"step": max(curve["steps"])} for _, curve in curves])
     num_named = min(len(curves), MAX_NAMED_SETTINGS)
-    for place, (label, curve) in reversed(list(enumerate(curves))):
+    for rank, (label, curve) in reversed(list(enumerate(curves))):
         steps = np.array(curve["steps"])
         success = 100.0 * np.mean(np.array(curve["success_rate"], float), axis=0)
-        named = place < MAX_NAMED_SETTINGS
-        colour = colormaps["viridis"](0.85 * place / max(num_named - 1, 1)) if named else GREY
+        named = rank < MAX_NAMED_SETTINGS
+        colour = colormaps["viridis"](0.85 * rank / max(num_named - 1, 1)) if named else GREY
         panel.plot(
             steps / axis.unit,
             success,
             color=colour,
             linewidth=1.6 if named else 0.6,
             label=plain(label) if named else None,
-            zorder=-place,
+            zorder=-rank,
         )
     name, quantity, _ = CURVES[0]
     set_axes(panel, axis, quantity=quantity, name=name)
