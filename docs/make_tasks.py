@@ -18,8 +18,8 @@ import numpy as np
 
 import jaxsafe
 from jaxsafe.commands.catalogue import number
+from jaxsafe.environment import control_unit, length_unit
 from jaxsafe.envs import TASKS
-from jaxsafe.plot.style import control_unit, length_unit
 from jaxsafe.processors.observation import Observation, Observe, ObserveAngle, ObserveRegion
 from jaxsafe.schema.component import Component, fields
 from jaxsafe.simulation.platform import Platform

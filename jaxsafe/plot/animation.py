@@ -22,7 +22,7 @@ from matplotlib.patches import Circle, Patch
 from matplotlib.ticker import NullFormatter
 from PIL import Image
 
-from jaxsafe.environment import Environment
+from jaxsafe.environment import Environment, length_unit
 from jaxsafe.plot.style import (
     AMBER,
     BLUE,
@@ -38,7 +38,6 @@ from jaxsafe.plot.style import (
     keep_away_distances,
     kept_out,
     labelled,
-    length_unit,
     margin_unit,
     nice,
     plain,

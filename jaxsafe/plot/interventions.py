@@ -8,29 +8,25 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from jaxsafe.environment import Environment, control_unit, length_unit
 from jaxsafe.plot.style import (
     BLUE,
     GREEN,
     GREY,
     ORANGE,
     NotebookFigure,
-    control_unit,
     fitted,
     labelled,
-    length_unit,
     margin_unit,
     plain,
     styled,
 )
-
-if TYPE_CHECKING:
-    from jaxsafe.environment import Environment
 
 SHADE = "#F0E442"
 """Colour of altered steps, from the palette of `jaxsafe.plot.style`."""

@@ -23,14 +23,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxsafe.environment import Environment, reset_to
+from jaxsafe.environment import Environment, length_unit, reset_to
 from jaxsafe.plot.style import (
     GREY,
     ORANGE,
     SKY,
     fitted,
     labelled,
-    length_unit,
     margin_unit,
     plain,
     styled,

@@ -6,7 +6,7 @@ import io
 import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
@@ -14,17 +14,13 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle
 from matplotlib.ticker import FixedLocator, MaxNLocator
 
-from jaxsafe.environment import control_unit as control_unit
-from jaxsafe.environment import length_unit as length_unit
+from jaxsafe.environment import Environment
 from jaxsafe.processors.constraint import ConeConstraint, KeepIn, KeepOut, Separation, SpeedLimit
 from jaxsafe.processors.status import Distance
 from jaxsafe.schema.dotted_paths import references
 from jaxsafe.schema.errors import ConfigError, printable
 from jaxsafe.simulation.regions import Box, Cone, HalfSpace
 from jaxsafe.storage.files import write_bytes
-
-if TYPE_CHECKING:
-    from jaxsafe.environment import Environment
 
 FAR = 1e6
 """How far a region without an end is drawn, in the unit of lengths. No map shows as much."""

@@ -11,12 +11,12 @@ from typing import Any, Literal
 
 from matplotlib.figure import Figure
 
-from jaxsafe.environment import Environment, filter_name
+from jaxsafe.environment import Environment, filter_name, length_unit
 from jaxsafe.plot.curves import AXES, evaluation_rows, training_curves
 from jaxsafe.plot.figures import Episodes, Rows, speed_distance, trajectories
 from jaxsafe.plot.interventions import interventions, most_altered
 from jaxsafe.plot.learning import learning_curves
-from jaxsafe.plot.style import keep_away_distances, kept_out, length_unit, save, to_bytes
+from jaxsafe.plot.style import keep_away_distances, kept_out, save, to_bytes
 from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.storage.files import read_rows
 from jaxsafe.storage.forms import (

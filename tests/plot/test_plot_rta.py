@@ -13,9 +13,9 @@ from matplotlib.image import imread
 import jaxsafe
 from jaxsafe.commands import safe_set as command
 from jaxsafe.config import describe
+from jaxsafe.environment import control_unit
 from jaxsafe.plot import safe_set
 from jaxsafe.plot.interventions import interventions, most_altered
-from jaxsafe.plot.style import control_unit
 from jaxsafe.rta.cascade import Cascade, Stage
 from jaxsafe.runs.figures import draw_all
 from jaxsafe.schema import yaml12
