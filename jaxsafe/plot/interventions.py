@@ -7,7 +7,6 @@ safe the episode stayed.
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxsafe.environment import Environment, control_unit, length_unit
+from jaxsafe.plot.figures import Episodes, Rows
 from jaxsafe.plot.style import (
     BLUE,
     GREEN,
@@ -31,11 +31,8 @@ from jaxsafe.plot.style import (
 SHADE = "#F0E442"
 """Colour of altered steps, from the palette of `jaxsafe.plot.style`."""
 
-Rows = list[dict[str, Any]]
-"""Rows of an episode in a log, one per step."""
 
-
-def most_altered(episodes: Sequence[tuple[int, Rows]]) -> Rows:
+def most_altered(episodes: Episodes) -> Rows:
     """Return the episode with the most interventions among those of the last training step.
 
     Args:
