@@ -1,6 +1,6 @@
 """Export of policies to other tools.
 
-A policy becomes ONNX or StableHLO. For verifiers there is the closed loop with its safety property.
+A policy becomes an ONNX or StableHLO file. Verifiers get the closed loop and its safety property.
 """
 
 from jaxsafe.export.functions import Exported, action, closed_loop, control, network

@@ -23,6 +23,7 @@ from jaxsafe.types import State, TimeStep
 from jaxsafe.uncertain import random_parts
 
 Function = Callable[[Float[Array, "batch i"]], Float[Array, "batch o"]]
+"""A function of a batch of vectors."""
 
 
 class Exported(NamedTuple):
@@ -39,6 +40,9 @@ def network(saved: SavedPolicy) -> Exported:
     It is a function from the features that the actor sees to the means of its actions. If actions
     are discrete, it returns their logits. If they are mixed, it returns the means of the continuous
     ones and then the logits of the others.
+
+    Raises:
+        ConfigError: the policy remembers.
     """
     _require_no_memory(saved)
     observation = jax.ShapeDtypeStruct((saved.env.observation_size,), jnp.float32)
@@ -75,6 +79,9 @@ def action(saved: SavedPolicy | ForeignPolicy) -> Exported:
 
     The action is the mode of the policy's distribution. Computing the features is part of the
     function.
+
+    Raises:
+        ConfigError: the policy remembers.
     """
     _require_no_memory(saved)
 
@@ -89,33 +96,40 @@ def control(saved: SavedPolicy | ForeignPolicy) -> Exported:
     """Return the function from a start to the control that acts first, in physical units.
 
     The start is the state in which an episode begins, with the elements of `state_names`.
+
+    Raises:
+        ConfigError: the policy remembers, or the environment is random in every step.
     """
     _require_nothing_random(saved.env)
     act = action(saved).function
 
-    def one(start: Array) -> Array:
+    def first_control(start: Array) -> Array:
         env = saved.env.replace(decision_period=1)
         state, timestep = reset_to(env, _placed(env, start))
         _, following = step(env, state, _as_action(env, act(timestep.observation)))
         return following.info.control_actual
 
-    return Exported(jax.vmap(one), state_names(saved.env), saved.env.action_names)
+    return Exported(jax.vmap(first_control), state_names(saved.env), saved.env.action_names)
 
 
 def closed_loop(saved: SavedPolicy | ForeignPolicy, steps: int, unrolled: bool = False) -> Exported:
     """Return the function from a start to every safety margin h on the way.
 
-    The margins are those at the start and the smallest of each step. The way is safe if all are
-    ≥ 0.
+    The margins are those at the start and the smallest of each step. The way is safe if all of them
+    are ≥ 0.
 
     Args:
         saved: the policy.
         steps: number of steps.
-        unrolled: whether the function has no loop. An ONNX graph needs it so. XLA would take
-            minutes to compile it.
+        unrolled: whether the function has no loop. An ONNX graph must not have one. XLA would take
+            minutes to compile a function without a loop.
+
+    Raises:
+        ConfigError: the policy remembers, or the environment is random in every step.
     """
     _require_nothing_random(saved.env)
-    act, env = action(saved).function, saved.env
+    act = action(saved).function
+    env = saved.env
     world = env.replace(decision_period=1)
 
     def margins(timestep: TimeStep) -> Array:
@@ -124,27 +138,29 @@ def closed_loop(saved: SavedPolicy | ForeignPolicy, steps: int, unrolled: bool =
     def advance(carry: tuple[State, Array], _: Any) -> tuple[tuple[State, Array], Array]:
         state, observation = carry
         action = _as_action(env, act(observation))
-        found = []
+        within_step = []
         for _ in range(env.decision_period):
             state, timestep = step(world, state, action)
             observation = timestep.observation
-            found.append(margins(timestep))
-        return (state, observation), functools.reduce(jnp.minimum, found)
+            within_step.append(margins(timestep))
+        return (state, observation), functools.reduce(jnp.minimum, within_step)
 
-    def one(start: Array) -> Array:
+    def all_margins(start: Array) -> Array:
         state, timestep = reset_to(env, _placed(env, start))
-        carry, found = (state, timestep.observation), [margins(timestep)]
+        carry = (state, timestep.observation)
+        at_start = margins(timestep)
         if not unrolled:
-            return jnp.concatenate([found[0], jax.lax.scan(advance, carry, None, steps)[1].ravel()])
+            return jnp.concatenate([at_start, jax.lax.scan(advance, carry, None, steps)[1].ravel()])
+        on_the_way = [at_start]
         for _ in range(steps):
-            carry, following = advance(carry, None)
-            found.append(following)
-        return jnp.concatenate(found)
+            carry, smallest = advance(carry, None)
+            on_the_way.append(smallest)
+        return jnp.concatenate(on_the_way)
 
     names = tuple(
         f"{constraint.name}_{t}" for t in range(steps + 1) for constraint in env.constraints
     )
-    return Exported(jax.vmap(one), state_names(env), names)
+    return Exported(jax.vmap(all_margins), state_names(env), names)
 
 
 def state_names(env: Environment) -> tuple[str, ...]:
@@ -163,13 +179,13 @@ def _fields(env: Environment) -> list[tuple[str, int]]:
 
     The number is 0 for a scalar.
     """
-    found = []
+    fields = []
     for platform in env.platforms:
         rest = platform.rest()
         for initializer in platform.start:
             shape = jnp.shape(getattr(rest, initializer.name))
-            found.append((f"{platform.name}.{initializer.name}", shape[0] if shape else 0))
-    return found
+            fields.append((f"{platform.name}.{initializer.name}", shape[0] if shape else 0))
+    return fields
 
 
 def _require_nothing_random(env: Environment) -> None:

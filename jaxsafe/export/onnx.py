@@ -1,9 +1,8 @@
 """Conversion of JAX functions to ONNX graphs.
 
-Each primitive becomes the ONNX operators that compute the same. Only the primitives of which
-policies, features and dynamics of the tasks consist are known. Any other primitive is refused by
-name. A graph has fixed shapes, opset 17 and float32, because verifiers and small runtimes
-understand these.
+Each primitive becomes the ONNX operators that compute the same. The policies, features and dynamics
+of the tasks consist of primitives that are known here. Any other primitive is refused by name. A
+graph has fixed shapes, opset 17 and float32, because verifiers and small runtimes understand these.
 """
 # pyright: reportMissingImports=false
 
@@ -71,7 +70,7 @@ _INSIDE = {
     "custom_jvp_call": "call_jaxpr",
     "custom_vjp_call": "call_jaxpr",
 }
-"""Parameters that hold the inner jaxpr of primitives that call one, by name of the primitive."""
+"""The parameter that holds the inner jaxpr, by name of the primitive that calls it."""
 
 _TYPES = {
     "float32": TensorProto.FLOAT,
@@ -129,7 +128,7 @@ def to_onnx(function: Callable[[Any], Any], shape: Sequence[int]) -> Any:
     graph.node("Identity", [output], "output")
     graph.prune("output")
     [result] = closed.out_avals
-    made = helper.make_graph(
+    graph_proto = helper.make_graph(
         graph.nodes,
         "jaxsafe",
         [helper.make_tensor_value_info("input", TensorProto.FLOAT, shape)],
@@ -137,7 +136,10 @@ def to_onnx(function: Callable[[Any], Any], shape: Sequence[int]) -> Any:
         graph.constants,
     )
     model = helper.make_model(
-        made, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jaxsafe", ir_version=8
+        graph_proto,
+        opset_imports=[helper.make_opsetid("", OPSET)],
+        producer_name="jaxsafe",
+        ir_version=8,
     )
     checker.check_model(model, full_check=True)
     return model
@@ -154,16 +156,18 @@ class _Graph:
     def node(
         self, kind: str, inputs: Sequence[str], output: str | None = None, **attributes: Any
     ) -> str:
+        """Add a node, and return the name of its output."""
         output = output or self._name()
         self.nodes.append(helper.make_node(kind, list(inputs), [output], **attributes))
         return output
 
     def constant(self, value: Any) -> str:
+        """Add a constant, and return its name."""
         array = np.asarray(value)
         return self._initializer(array.astype(_NARROW.get(array.dtype.name, array.dtype)))
 
     def integers(self, *values: int) -> str:
-        """Add integers that are not data: shapes, axes and bounds. They stay 64 bits wide."""
+        """Add shapes, axes or bounds, and return their name. Unlike data they stay 64 bits wide."""
         return self._initializer(np.array(values, np.int64))
 
     def _initializer(self, array: np.ndarray) -> str:
@@ -194,7 +198,8 @@ class _Graph:
 
     def prune(self, *outputs: str) -> None:
         """Remove nodes and constants that the outputs do not need."""
-        needed, kept = set(outputs), []
+        needed = set(outputs)
+        kept = []
         for node in reversed(self.nodes):
             if needed & set(node.output):
                 needed |= set(node.input)
@@ -207,7 +212,9 @@ class _Graph:
         return f"x{self._count}"
 
     def _equation(self, equation: Any, inputs: list[str]) -> list[str]:
-        kind, params = equation.primitive.name, equation.params
+        """Add one equation, and return the names of its results."""
+        kind = equation.primitive.name
+        params = equation.params
         if kind in _INSIDE:
             inner = params[_INSIDE[kind]]
             return self.inline(inner.jaxpr, inner.consts, inputs)
@@ -228,7 +235,7 @@ class _Graph:
         return [translate(inputs, shapes, equation.outvars[0].aval, params)]
 
     def _pieces(self, whole: str, sizes: Sequence[int], axis: int) -> list[str]:
-        """Split an array along an axis into pieces of these sizes."""
+        """Split an array along an axis into pieces of these sizes, and return their names."""
         results = [self._name() for _ in sizes]
         self.nodes.append(
             helper.make_node("Split", [whole, self.integers(*sizes)], results, axis=axis)
@@ -287,7 +294,7 @@ class _Graph:
         axis = params.get("axis", params.get("dimension", 0))
         return self.node(
             "Concat",
-            [self.node("Unsqueeze", [one, self.integers(axis)]) for one in inputs],
+            [self.node("Unsqueeze", [name, self.integers(axis)]) for name in inputs],
             axis=axis,
         )
 
@@ -308,9 +315,12 @@ class _Graph:
         )
 
     def _slice(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
-        begin, end, strides = params["start_indices"], params["limit_indices"], params["strides"]
-        bounds = (begin, end, range(len(begin)), strides or [1] * len(begin))
-        return self.node("Slice", [inputs[0], *(self.integers(*one) for one in bounds)])
+        begin = params["start_indices"]
+        end = params["limit_indices"]
+        axes = range(len(begin))
+        strides = params["strides"] or [1] * len(begin)
+        bounds = (self.integers(*values) for values in (begin, end, axes, strides))
+        return self.node("Slice", [inputs[0], *bounds])
 
     def _transpose(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
         return self.node("Transpose", inputs, perm=list(params["permutation"]))
@@ -328,7 +338,7 @@ class _Graph:
         )
 
     def _dot_general(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
-        (left, right), batch = params["dimension_numbers"][0], params["dimension_numbers"][1]
+        (left, right), batch = params["dimension_numbers"]
         if (
             any(batch)
             or tuple(left) != (len(shapes[0]) - 1,)

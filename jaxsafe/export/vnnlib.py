@@ -1,8 +1,8 @@
 """The safety of a controller as a question for verifiers, and a search for a counterexample.
 
 Verifiers of neural networks get two files. An ONNX graph holds the closed loop, from a start to
-every margin h on the way. A VNN-LIB file describes what must not happen: a start in a box from
-which some margin is negative. The search looks for such a start.
+every margin h on the way. A VNN-LIB file describes what must not happen: there is a start in a box
+from which some margin is negative. `search` looks for such a start.
 """
 
 from __future__ import annotations
@@ -30,15 +30,17 @@ class Worst(NamedTuple):
     """The smallest margin on the way, or −∞ if some margin is NaN. That is not safe either."""
 
     start: np.ndarray
+    """The start, in the order of the inputs of the closed loop."""
+
     tried: int
     """Number of starts that the search tried."""
 
 
 def write_vnnlib(path: Path, exported: Exported, box: Box) -> Path:
-    """Write the property that some output is ≤ 0 for some input in the box.
+    """Write the property that some margin is ≤ 0 for some start in the box.
 
-    If a verifier answers `unsat`, every start in the box is safe. VNN-LIB has no strict inequality.
-    So a margin of 0 counts as unsafe, although it is safe.
+    If a verifier answers `unsat`, every start in the box is safe. VNN-LIB has no strict inequality,
+    so a margin of 0 counts as unsafe, although it is safe.
 
     Args:
         path: the file.
@@ -79,7 +81,7 @@ def search(
         box: bounds of each element of a start.
         key: a PRNG key for the random starts.
         starts: number of random starts.
-        best: number of starts from which the search descends, those with the smallest margins.
+        best: number of starts from which the search descends. They have the smallest margins.
         rounds: number of steps of each descent.
     """
     low, high = (jnp.array([[bounds[i] for bounds in box]], jnp.result_type(float)) for i in (0, 1))
@@ -96,7 +98,7 @@ def search(
 
     @jax.jit
     def descend(share: jax.Array) -> tuple[jax.Array, jax.Array]:
-        def one(
+        def descend_once(
             i: int, carry: tuple[jax.Array, jax.Array, jax.Array]
         ) -> tuple[jax.Array, jax.Array, jax.Array]:
             share, worst, at = carry
@@ -107,11 +109,12 @@ def search(
             moved = jnp.clip(
                 share - 0.1 * 0.95**i * gradient / jnp.maximum(length, 1e-12), 0.0, 1.0
             )
-            found = least(moved)
-            better = found < worst
-            return moved, jnp.where(better, found, worst), jnp.where(better[:, None], moved, at)
+            margin = least(moved)
+            better = margin < worst
+            return moved, jnp.where(better, margin, worst), jnp.where(better[:, None], moved, at)
 
-        _, worst, at = jax.lax.fori_loop(0, rounds, one, (share, least(share), share))
+        begin = (share, least(share), share)
+        _, worst, at = jax.lax.fori_loop(0, rounds, descend_once, begin)
         return worst, at
 
     order = jnp.argsort(jax.jit(least)(shares))[:best]
