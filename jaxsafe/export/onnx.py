@@ -196,9 +196,9 @@ class _Graph:
             names |= dict(zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
-    def prune(self, *outputs: str) -> None:
-        """Remove nodes and constants that the outputs do not need."""
-        needed = set(outputs)
+    def prune(self, output: str) -> None:
+        """Remove nodes and constants that the output does not need."""
+        needed = {output}
         kept = []
         for node in reversed(self.nodes):
             if needed & set(node.output):
