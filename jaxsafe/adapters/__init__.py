@@ -29,7 +29,7 @@ FORKED = (
 _process: int | None = None
 """Id of the process that has made or stepped environments.
 
-A process that is forked from it does not have its threads of JAX.
+A process that is forked from it lacks its JAX threads.
 """
 
 
@@ -59,15 +59,14 @@ def environment(
             takes none.
 
     Raises:
-        ConfigError: an option is unknown, or is given for an environment that is made already. Also
-            raised as by `jaxsafe.make`, and in a process that was forked from one that has used
-            JAX.
+        ConfigError: an option is unknown, or is given for an environment that is made already, or
+            this process was forked from one that has used JAX. Also raised as by `jaxsafe.make`.
     """
     refuse_fork()
-    known = list(inspect.signature(make).parameters)[1:]
+    choices = list(inspect.signature(make).parameters)[1:]
     for option in options:
-        if option not in known:
-            raise ConfigError(f"{option}: unknown option; choose from {nearest(option, known)}")
+        if option not in choices:
+            raise ConfigError(f"{option}: unknown option; choose from {nearest(option, choices)}")
     if not isinstance(task, Environment):
         return make(task, overrides, **options)
     if options:

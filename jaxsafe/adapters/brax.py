@@ -52,7 +52,7 @@ class BraxEnv(Env):
             options: `variant`, `randomize` and `rta` of `jaxsafe.make`.
 
         Raises:
-            ConfigError: actions are discrete, or are not in [−1, 1]. Brax's agents know only
+            ConfigError: some action is discrete, or is not in [−1, 1]. Brax's agents know only
                 continuous actions in that interval. Also raised as by `jaxsafe.make`.
         """
         self.env = environment(task, overrides, options)
@@ -141,8 +141,8 @@ class Repeat(Wrapper):
 class FreshStarts(Wrapper):
     """A wrapper that draws a new start for each episode.
 
-    With Brax's own AutoResetWrapper, every episode of an environment begins where its first episode
-    began.
+    With Brax's own `AutoResetWrapper`, every episode of an environment begins where its first
+    episode began.
     """
 
     def reset(self, rng: Key) -> State:
@@ -158,10 +158,10 @@ class FreshStarts(Wrapper):
 
         def draw(taken: State) -> State:
             fresh = self.env.reset(now)
-            begun = choose(
+            pipeline_state, obs = choose(
                 taken.done, (fresh.pipeline_state, fresh.obs), (taken.pipeline_state, taken.obs)
             )
-            return taken.replace(pipeline_state=begun[0], obs=begun[1])
+            return taken.replace(pipeline_state=pipeline_state, obs=obs)
 
         following = jax.lax.cond(jnp.any(taken.done), draw, lambda taken: taken, taken)
         following.info["starts"] = keys
@@ -182,7 +182,7 @@ def wrap(
         env: the environment of one task.
         episode_length: number of steps of the task after which an episode is truncated.
         action_repeat: number of steps of the task for which each action is taken.
-        randomization_fn: must be None. It is for Brax's own physics.
+        randomization_fn: None. Brax randomizes its own physics with it.
 
     Raises:
         ConfigError: there is a `randomization_fn`, or `action_repeat` is below 1.

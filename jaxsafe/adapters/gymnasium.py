@@ -41,14 +41,14 @@ class _Chains:
     _unseeded: np.ndarray
     """Which environments begin a chain at their next start even without a seed, [num_envs].
 
-    They are those without a chain, and all of them once `np_random` has become a new generator.
+    These are the environments without a chain, and all of them after `np_random` has been set.
     """
 
     @property
     def np_random(self) -> np.random.Generator:
         """Return Gymnasium's random number generator.
 
-        Once it has been set, chains that begin without a seed take theirs from it.
+        Once it has been set, chains that begin without a seed draw their seeds from it.
         """
         return super().np_random  # type: ignore[misc]
 
@@ -66,7 +66,7 @@ class _Chains:
 
         Args:
             mask: which environments to start, [num_envs].
-            seeds: a seed for each environment of the batch, or None.
+            seeds: for each environment of the batch a seed, or None.
             placed: the chosen start of the episodes. None stands for random starts.
         """
         self._begin_chains(mask, seeds)
@@ -87,16 +87,17 @@ class _Chains:
         begin = mask & (self._unseeded | [seed is not None for seed in seeds])
         if not begin.any():
             return
-        own = [0] * len(seeds)
+        own_seeds = [0] * len(seeds)
         if any(seed is None for seed in seeds):
-            known: Any = self.np_random_seed  # type: ignore[attr-defined]
-            own = (
+            first: Any = self.np_random_seed  # type: ignore[attr-defined]
+            own_seeds = (
                 self.np_random.integers(2**32, size=len(seeds)).tolist()
-                if known == -1
-                else range(known, known + len(seeds))
+                if first == -1
+                else range(first, first + len(seeds))
             )
         self._batch.seed(
-            begin, [one if seed is None else seed for seed, one in zip(seeds, own, strict=True)]
+            begin,
+            [own if seed is None else seed for seed, own in zip(seeds, own_seeds, strict=True)],
         )
         self._unseeded &= ~begin
 
@@ -184,8 +185,11 @@ class GymEnv(_Chains, gym.Env[np.ndarray, Any]):
         """Advance one time step of the task.
 
         Args:
-            action: the action. A mixed one is a mapping from the name of each actuator to its
-                element, or the vector of these.
+            action: the action. A mixed action is a mapping from the name of each actuator to its
+                element, or the vector of the elements.
+
+        Returns:
+            The observation, the reward, `terminated`, `truncated` and `info`.
 
         Raises:
             ResetNeeded: there was no reset before.
@@ -225,6 +229,7 @@ class GymEnv(_Chains, gym.Env[np.ndarray, Any]):
             self._window.close()
 
     def _receive(self, episodes: Episodes) -> tuple[np.ndarray, float, bool, bool, dict]:
+        """Return the latest time step as `step` returns it, and show it if there is a window."""
         timestep: Any = jax.tree.map(lambda x: x[0], episodes.timestep)
         if self._frames is not None:
             self._frames.add(jax.tree.map(lambda x: x[0], episodes.state.sim), timestep.info)
@@ -299,8 +304,8 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, Any, np.ndarray]):
         """Start an episode in each environment, or in those of a mask.
 
         Args:
-            seed: the seed of environment 0, to which the others add their index; or a list with a
-                seed, or None, for each environment. None takes the next keys of the chains.
+            seed: the seed of environment 0, to which the others add their index. Or a list that has
+                a seed or None for each environment. None takes the next keys of the chains.
             options: those of `GymEnv.reset`, and `reset_mask`, a bool array [num_envs].
 
         Returns:
@@ -333,18 +338,18 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, Any, np.ndarray]):
         Raises:
             ConfigError: as `GymEnv.reset`.
         """
-        asked = self._seeds(seeds)
+        checked_seeds = self._seeds(seeds)
         groups = [
             (_checked_options(chosen, ("start", "parameters")), mask)
             for chosen, mask in _grouped(options)
         ]
         placements = [_placed(self.env, chosen) for chosen, _ in groups]
         for placed, (_, mask) in zip(placements, groups, strict=True):
-            self._start(mask, asked, placed)
+            self._start(mask, checked_seeds, placed)
         return self._begun(np.ones(self.num_envs, bool))
 
     def _begun(self, mask: np.ndarray) -> tuple[np.ndarray, dict]:
-        """Return observations and infos after environments of a mask have started episodes."""
+        """Return observations and infos after the environments of a mask have started episodes."""
         episodes = self._batch.now
         self._over = np.where(mask, False, self._over)
         self._film(mask, episodes)
@@ -379,11 +384,12 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, Any, np.ndarray]):
                 " reset them with options={'reset_mask': …}"
             )
         action = _checked_action(self.env, actions)
-        wanted = (self.num_envs, self.env.action_size)
-        if action.shape != wanted:
-            raise ConfigError(f"actions: expected shape {wanted}, found {action.shape}")
+        expected = (self.num_envs, self.env.action_size)
+        if action.shape != expected:
+            raise ConfigError(f"actions: expected shape {expected}, found {action.shape}")
         self._batch.step(action)
-        restarted, final = np.zeros_like(over), {}
+        restarted = np.zeros_like(over)
+        final = {}
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and over.any():
             # The start replaces the step that these environments have taken above.
             restarted = over
@@ -438,7 +444,7 @@ class GymVectorEnv(_Chains, VectorEnv[np.ndarray, Any, np.ndarray]):
                 "reset: seed: expected a whole number ≥ 0, or one for each environment, "
                 f"found {seed!r}"
             )
-        seeds = [_checked_seed(one) for one in seed]
+        seeds = [_checked_seed(own) for own in seed]
         if len(seeds) != self.num_envs:
             raise ConfigError(f"reset: seed: expected {self.num_envs} seeds, found {len(seeds)}")
         return seeds
@@ -588,7 +594,7 @@ def _refuse_forking_workers() -> None:
 
 
 MAX_SEED_BITS = 128
-"""The largest number of bits of a seed. The seeds that Gymnasium draws itself have as many."""
+"""The largest number of bits of a seed. Seeds that Gymnasium draws itself have that many."""
 
 
 def _checked_seed(seed: Any) -> int | None:
@@ -630,9 +636,9 @@ def _grouped(
 
     All environments without options are one group.
     """
-    groups = {id(one) if one else None: one for one in options}
-    own = np.array([id(one) if one else None for one in options], object)
-    return [(one, own == key) for key, one in groups.items()]
+    groups = {id(chosen) if chosen else None: chosen for chosen in options}
+    keys = np.array([id(chosen) if chosen else None for chosen in options], object)
+    return [(chosen, keys == key) for key, chosen in groups.items()]
 
 
 class _Placed:
@@ -651,7 +657,7 @@ class _Placed:
         self.episode = self.with_key(jax.random.key(0) if self.random else None)
 
     def with_key(self, key: Key | None) -> Episodes:
-        """Return an episode that begins there, with disturbances from a key."""
+        """Return an episode that begins there. Its disturbances are drawn from the key."""
         return Episodes(*reset_to(*self._arguments, key=key))
 
 
@@ -694,9 +700,9 @@ def _checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
     try:
         return AutoresetMode(mode)
     except ValueError:
-        known = [one.value for one in AutoresetMode]
+        choices = [member.value for member in AutoresetMode]
         raise ConfigError(
-            f"autoreset_mode: unknown mode {mode!r}; choose from {nearest(str(mode), known)}"
+            f"autoreset_mode: unknown mode {mode!r}; choose from {nearest(str(mode), choices)}"
         ) from None
 
 

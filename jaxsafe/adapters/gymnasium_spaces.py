@@ -32,7 +32,7 @@ def spaces(env: Environment) -> tuple[gym.spaces.Box, Space]:
     """Return the space of observations and the space of actions.
 
     Discrete actions have a `MultiDiscrete` space, continuous ones a `Box`. Mixed actions have a
-    `Dict` with a `Discrete` or a `Box` of shape () by the name of each actuator.
+    `Dict`, which holds a `Discrete` or a `Box` of shape () by the name of each actuator.
     """
     dtype = jnp.result_type(float)
     low, high = observation_bounds(env)
@@ -61,30 +61,30 @@ def facts(env: Environment, timestep: TimeStep) -> dict[str, Any]:
     """
     info = timestep.info
     outcomes = np.array(env.outcomes, object)
-    found = {
+    entries = {
         "cost": timestep.cost,
         "outcome": outcomes[info.outcome],
         "is_success": env.succeeded(info.outcome),
         **{name: getattr(info, name) for name in _FACTS},
     }
-    return found if info.rta is None else {**found, "rta": vars(info.rta)}
+    return entries if info.rta is None else {**entries, "rta": vars(info.rta)}
 
 
-def masked(found: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
+def masked(entries: Mapping[str, Any], mask: np.ndarray) -> dict[str, Any]:
     """Return a batch of infos in Gymnasium's form.
 
-    In that form each entry has a second one beside it, named after it with `_` in front. The second
-    one says which environments of the batch have the first.
+    In that form each entry has a mask beside it, named after it with `_` in front. The mask says
+    which environments of the batch have the entry.
 
     Args:
-        found: the entries, each [num_envs, …] or a mapping of such entries.
+        entries: the entries, each [num_envs, …] or a mapping of such entries.
         mask: which environments have them, [num_envs].
     """
     # All entries share one copy, so nobody may write to it.
     mask = mask.copy()
     mask.setflags(write=False)
     batch = {}
-    for name, value in found.items():
+    for name, value in entries.items():
         batch[name] = masked(value, mask) if isinstance(value, Mapping) else np.asarray(value)
         batch[f"_{name}"] = mask
     return batch
@@ -97,10 +97,10 @@ def of_environment(infos: Mapping[str, Any], index: int) -> dict[str, Any]:
         infos: the infos of the batch, in Gymnasium's form.
         index: the index of the environment in the batch.
     """
-    found = {}
+    info = {}
     for name, value in infos.items():
         if name.startswith("_") and name[1:] in infos:
             continue
-        one = of_environment(value, index) if isinstance(value, Mapping) else value[index]
-        found[name] = one.item() if isinstance(one, np.generic) else one
-    return found
+        entry = of_environment(value, index) if isinstance(value, Mapping) else value[index]
+        info[name] = entry.item() if isinstance(entry, np.generic) else entry
+    return info

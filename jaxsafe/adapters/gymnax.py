@@ -64,9 +64,11 @@ class GymnaxEnv:
     Its methods work under `jax.vmap` over keys and states, and over parameters.
 
     `info` holds `cost`, `is_success`, `terminated`, `truncated` and `final_observation`. The final
-    observation is the one that the step led to, before any reset. Discrete actions are one choice
-    for each actuator. Here they become one choice among all their combinations. Mixed actions are a
-    mapping from the name of each actuator to its element, or the vector of these.
+    observation is the one that the step led to, before any reset.
+
+    A discrete action of the task is a choice for each actuator. Here it is one choice among all
+    combinations of these. A mixed action is a mapping from the name of each actuator to its
+    element, or the vector of the elements.
     """
 
     def __init__(
@@ -88,7 +90,8 @@ class GymnaxEnv:
         Raises:
             ConfigError: as `jaxsafe.make`.
         """
-        self.env, self.legacy = environment(task, overrides, options), legacy
+        self.env = environment(task, overrides, options)
+        self.legacy = legacy
         self.name = str(task) if isinstance(task, str | os.PathLike) else "jaxsafe"
 
     @property
@@ -117,7 +120,7 @@ class GymnaxEnv:
     def num_actions(self) -> int:
         """Return the number of combinations of discrete actions.
 
-        If actions are continuous or mixed, it is the number of elements of one.
+        If actions are continuous or mixed, return the number of elements of an action.
         """
         return (
             math.prod(self.env.num_action_points)
@@ -128,10 +131,10 @@ class GymnaxEnv:
     def action_space(self, params: GymnaxParams | None = None) -> Any:
         """Return the space of actions.
 
-        It is `Discrete` over all combinations of discrete actions, and a `Box` of continuous ones.
-        The box is [−1, 1] for actuators that rescale, and without bounds for those that take the
-        tanh of an action. For the others it has the limits that they have in `params`. Mixed
-        actions have a `Dict` with a `Discrete` or a `Box` by the name of each actuator.
+        It is a `Discrete` over all combinations of discrete actions, and a `Box` of continuous
+        ones. The box is [−1, 1] for actuators that rescale, and without bounds for those that take
+        the tanh of an action. For the others it has the limits that they have in `params`. Mixed
+        actions have a `Dict`, which holds a `Discrete` or a `Box` by the name of each actuator.
         """
         kind = self.env.action_kind
         if kind == "discrete":
@@ -165,7 +168,7 @@ class GymnaxEnv:
 def _reset(key: Key, params: GymnaxParams) -> tuple[Array, State]:
     """Return the observation and the state of a random start.
 
-    This function and `_step` are compiled once for all environments of one structure.
+    This function and `_step` are compiled once for all environments that have the same structure.
     """
     state, timestep = reset(params.env, key)
     return timestep.observation, state

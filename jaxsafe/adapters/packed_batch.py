@@ -38,9 +38,8 @@ class Packing:
 
     The array is [words], or [words, num_envs] for a batch.
 
-    Compiled programs belong to one `Packing` object. So a process has only one of them for each
-    structure, which `packing` returns. A copy is that same object, and so is one that is read from
-    a pickle.
+    Compiled programs belong to one `Packing` object. So a process has only one object for each
+    structure, and `packing` returns it. A copy, or what is read from a pickle, is that same object.
     """
 
     def __init__(
@@ -52,11 +51,15 @@ class Packing:
             structure: the structure of the pytree.
             shapes: shape and dtype of each leaf. The shapes leave out the axis of the batch.
         """
-        self._structure, self._shapes = structure, shapes
+        self._structure = structure
+        self._shapes = shapes
+        # A block is a dtype, the range of its words, and its leaves. A leaf is its index among all
+        # leaves and the range of its words within the block.
         self._blocks: list[tuple[np.dtype, int, int, list[tuple[int, int, int]]]] = []
         end = 0
         for dtype in sorted({dtype for _, dtype in shapes}, key=str):
-            start, parts = end, []
+            start = end
+            parts = []
             for i, (shape, _) in enumerate(shapes):
                 if shapes[i][1] == dtype:
                     size = int(np.prod(shape, dtype=int))
@@ -78,7 +81,8 @@ class Packing:
 
     def pack(self, tree: Any) -> Array:
         """Return the words of a tree, [words] or [words, num_envs]."""
-        leaves, word = jax.tree.leaves(tree), _unsigned(jnp.result_type(float))
+        leaves = jax.tree.leaves(tree)
+        word = _unsigned(jnp.result_type(float))
 
         def words(leaf: Array, shape: tuple[int, ...], dtype: np.dtype) -> Array:
             bits = (
@@ -113,18 +117,25 @@ class Packing:
             return block.astype(_unsigned(dtype), copy=False).view(dtype)
 
         def leaf(part: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-            return (
-                part[0] if not shape else part.T.reshape((-1, *shape)) if len(shape) > 1 else part.T
-            )
+            if not shape:
+                return part[0]
+            return part.T.reshape((-1, *shape)) if len(shape) > 1 else part.T
 
         return self._tree(np.asarray(words), typed, leaf)
 
     def _tree(self, words: Any, typed: Any, leaf: Any) -> Any:
+        """Return the tree whose words these are.
+
+        Args:
+            words: the words, [words] or [words, num_envs].
+            typed: returns the elements of a dtype from the words of its block.
+            leaf: returns a leaf of some shape from its elements.
+        """
         leaves: list[Any] = [None] * len(self._shapes)
         for dtype, start, end, parts in self._blocks:
             block = typed(words[start:end], dtype)
-            for i, a, b in parts:
-                leaves[i] = leaf(block[a:b], self._shapes[i][0])
+            for i, first, last in parts:
+                leaves[i] = leaf(block[first:last], self._shapes[i][0])
         return jax.tree.unflatten(self._structure, leaves)
 
 
@@ -150,7 +161,7 @@ def _packing(structure: Any, shapes: tuple[tuple[tuple[int, ...], np.dtype], ...
 
 
 def _unsigned(dtype: Any) -> np.dtype:
-    """Return the unsigned integer type of the same width."""
+    """Return the unsigned integer dtype that is as wide as a dtype."""
     return np.dtype(f"u{np.dtype(dtype).itemsize}")
 
 
@@ -282,7 +293,7 @@ def advance(layout: Layout, env: Array, words: Array, action: Array, limit: floa
 
 @functools.partial(jax.jit, static_argnums=0)
 def _raw_keys(impl: str, seeds: Array) -> Array:
-    """Return the key of each seed as raw words, [num_envs, words of a key].
+    """Return the PRNG key of each seed as raw words, [num_envs, words of a key].
 
     Args:
         impl: the kind of keys, as `jax.random.key` takes it.

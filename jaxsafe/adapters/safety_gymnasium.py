@@ -1,6 +1,6 @@
-"""Environments by the convention of constrained RL.
+"""The tasks with the interface of Safety-Gymnasium, as OmniSafe uses it.
 
-A step returns six values, with the cost between reward and `terminated`.
+A step returns six values. The cost is between the reward and `terminated`.
 """
 
 from __future__ import annotations
@@ -21,8 +21,9 @@ class SafetyEnv:
     A step returns `observation, reward, cost, terminated, truncated, info`.
 
     It is one environment, or with `num_envs` a compiled batch. An environment of the batch whose
-    episode ends starts a new one in the same step. Then `infos["final_observation"]` holds the last
-    observation of the old episode, where `infos["_final_observation"]` is True.
+    episode ends starts a new one in the same step. Then `infos["_final_observation"]` is True for
+    that environment, and `infos["final_observation"]` holds the last observation of the old
+    episode.
     """
 
     def __init__(
@@ -49,15 +50,14 @@ class SafetyEnv:
         else:
             self.env = GymVectorEnv(task, num_envs, overrides, autoreset_mode="SameStep", **options)
         self.num_envs = num_envs
-        self.observation_space, self.action_space = (
-            self.env.observation_space,
-            self.env.action_space,
-        )
+        self.observation_space = self.env.observation_space
+        self.action_space = self.env.action_space
         self.single_observation_space = getattr(
             self.env, "single_observation_space", self.observation_space
         )
         self.single_action_space = getattr(self.env, "single_action_space", self.action_space)
-        self.metadata, self.render_mode = self.env.metadata, self.env.render_mode
+        self.metadata = self.env.metadata
+        self.render_mode = self.env.render_mode
 
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None

@@ -51,8 +51,8 @@ class SB3VecEnv(VecEnv):
             options: the other arguments of `GymVectorEnv`, except `autoreset_mode`.
 
         Raises:
-            ConfigError: as `jaxsafe.make`; or actions are mixed or without bounds.
-                Stable-Baselines3 knows no such actions.
+            ConfigError: as `jaxsafe.make`, or actions are mixed or without bounds, which
+                Stable-Baselines3 does not know.
         """
         self.env = GymVectorEnv(task, num_envs, overrides, autoreset_mode="SameStep", **options)
         _check_actions(self.env.env)
@@ -76,8 +76,8 @@ class SB3VecEnv(VecEnv):
         """Set the options of the next reset.
 
         Args:
-            options: options of `GymEnv.reset`: one dict for all environments, or a list with one
-                for each.
+            options: the options of `GymEnv.reset`, as one dict for all environments or as a list
+                with a dict for each.
 
         Raises:
             ConfigError: the list has another length than there are environments.
@@ -93,15 +93,15 @@ class SB3VecEnv(VecEnv):
         self._actions = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        observation, reward, terminated, truncated, facts = self.env.step(self._actions)
+        observation, reward, terminated, truncated, batch = self.env.step(self._actions)
         done = terminated | truncated
-        infos: list[dict[str, Any]] = [{"cost": cost} for cost in facts["cost"].tolist()]
-        begun = {name: value for name, value in facts.items() if name in self.reset_infos[0]}
+        infos: list[dict[str, Any]] = [{"cost": cost} for cost in batch["cost"].tolist()]
+        begun = {name: value for name, value in batch.items() if name in self.reset_infos[0]}
         for index in np.flatnonzero(done):
-            final = facts["final_info"]
+            final = batch["final_info"]
             infos[index] = {
                 "cost": final["cost"][index].item(),
-                "terminal_observation": facts["final_obs"][index],
+                "terminal_observation": batch["final_obs"][index],
                 "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
                 "is_success": bool(final["is_success"][index]),
                 "outcome": final["outcome"][index],
