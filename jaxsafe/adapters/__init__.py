@@ -15,8 +15,6 @@ import numpy as np
 
 from jaxsafe.config import override
 from jaxsafe.environment import Environment
-from jaxsafe.environment import action_bounds as action_bounds
-from jaxsafe.environment import acts_within_one as acts_within_one
 from jaxsafe.envs import make
 from jaxsafe.schema.errors import ConfigError, nearest, show
 

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from jaxsafe.adapters import action_bounds, checked_count, environment
+from jaxsafe.adapters import checked_count, environment
 from jaxsafe.autoreset import choose
-from jaxsafe.environment import Environment, reset, step
+from jaxsafe.environment import Environment, action_bounds, reset, step
 from jaxsafe.schema.errors import ConfigError, missing
 from jaxsafe.types import Key, TimeStep
 

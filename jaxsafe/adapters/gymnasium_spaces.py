@@ -9,8 +9,8 @@ import gymnasium as gym
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.adapters import action_bounds, observation_bounds
-from jaxsafe.environment import Environment
+from jaxsafe.adapters import observation_bounds
+from jaxsafe.environment import Environment, action_bounds
 from jaxsafe.types import TimeStep
 
 Space = gym.spaces.Box | gym.spaces.MultiDiscrete | gym.spaces.Dict

@@ -21,14 +21,12 @@ from jaxtyping import Array
 
 from jaxsafe.adapters import (
     MAX_COUNT,
-    action_bounds,
-    acts_within_one,
     checked_count,
     elements,
     environment,
     observation_bounds,
 )
-from jaxsafe.environment import Environment, reset, step
+from jaxsafe.environment import Environment, action_bounds, acts_within_one, reset, step
 from jaxsafe.rollout import cut_short, restarted
 from jaxsafe.schema.errors import missing
 from jaxsafe.types import Key, Record, State

@@ -12,10 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from jaxsafe.adapters import action_bounds
 from jaxsafe.adapters.gymnasium import GymVectorEnv
 from jaxsafe.adapters.gymnasium_spaces import of_environment
-from jaxsafe.environment import Environment
+from jaxsafe.environment import Environment, action_bounds
 from jaxsafe.schema.errors import ConfigError, missing
 
 try:

@@ -4,7 +4,8 @@ import sys
 
 import pytest
 
-from jaxsafe.adapters import action_bounds, observation_bounds
+from jaxsafe.adapters import observation_bounds
+from jaxsafe.environment import action_bounds
 from jaxsafe.envs import make
 from jaxsafe.schema.errors import missing
 
