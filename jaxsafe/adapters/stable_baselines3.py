@@ -7,7 +7,7 @@ PPO("MlpPolicy", SB3VecEnv("docking2d", 64))
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -115,7 +115,7 @@ class SB3VecEnv(VecEnv):
         return self.env.render()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        return [getattr(self.env, attr_name)] * len(self._chosen(indices))
+        return [getattr(self.env, attr_name)] * self._count(indices)
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         raise AttributeError(
@@ -130,11 +130,11 @@ class SB3VecEnv(VecEnv):
         )
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        return [False] * len(self._chosen(indices))
+        return [False] * self._count(indices)
 
-    def _chosen(self, indices: Any) -> list[int]:
-        found: Iterable[int] = self._get_indices(indices)
-        return list(found)
+    def _count(self, indices: Any) -> int:
+        """Return to how many environments the indices refer. None refers to all of them."""
+        return len(list(self._get_indices(indices)))
 
 
 def _check_actions(env: Environment) -> None:
