@@ -1,8 +1,8 @@
 """Measure what a GPU is worth to jaxsafe, by one command within ten minutes.
 
 Each part is a process of its own with a share of the time. The most important part comes first.
-What a part does not use goes to those after it. What there was no time for is named in the results
-and on standard error.
+Time that a part does not use goes to the parts after it. A measurement for which there was no time
+is named in the results and on standard error.
 
 - `numbers`: tests of numbers on this device: recorded steps and episodes in double precision, laws
   of the tasks, run time assurance, and a training that goes on from a checkpoint.
@@ -53,7 +53,10 @@ from jaxsafe.envs import TASKS
 HERE = Path(__file__).parent
 OUT = HERE / "results" / "accelerator.json"
 LEVEL = 0.95
+"""The success rate in training that `learning` waits for."""
+
 PEER = "gymnax:Pendulum-v1"
+"""The environment of another library that `environments` measures beside the tasks."""
 
 
 class Sizes(NamedTuple):
@@ -65,7 +68,7 @@ class Sizes(NamedTuple):
 
 
 ACCELERATOR = Sizes("1,1024,16384,262144,1048576", ppo=(2048, 32768), filters=(4096, 65536))
-"""PPO has as many environments as in `ppo.py`, and as many as an accelerator has room for."""
+"""PPO has as many environments as in `ppo.py`, and then as many as an accelerator has room for."""
 
 CPU = Sizes("1,64,1024", ppo=(64,), filters=(64,))
 
@@ -73,13 +76,13 @@ STEPS = 1000
 """Steps of each environment in one measurement, so that resets have their share."""
 
 FEWER_STEPS_FROM = 2**17
-"""With so many environments a quarter of the steps take long enough to be measured."""
+"""From so many environments on, a quarter of the steps takes long enough to be measured."""
 
 COMPILING = 0.75
-"""The share of a part's time that its programs may take to compile. Later ones are skipped."""
+"""The share of the time left in which the programs of a round must compile. Others are skipped."""
 
 GRACE = 5.0
-"""Seconds beyond its time after which a part is ended."""
+"""How many seconds a part may take beyond its time before it is killed."""
 
 TESTS = (
     "tests/envs/test_golden.py",
@@ -108,7 +111,7 @@ WORKERS = 8
 class Request(NamedTuple):
     """What a part is asked for."""
 
-    until: float  # on the monotonic clock
+    until: float  # its end, on the monotonic clock [s]
     tasks: Sequence[str]
     sizes: Sequence[int]
     seeds: int
@@ -123,11 +126,9 @@ class Request(NamedTuple):
 class Job(NamedTuple):
     """One row to be measured."""
 
-    row: dict[str, Any]
-    # Compiles on a thread. Returns the function that is measured, which takes a number to begin
-    # from.
-    prepare: Callable[[], Any]
-    measure: Callable[[Any, Request], dict[str, Any]]  # returns what a row says besides
+    row: dict[str, Any]  # what the row says about the measurement itself
+    prepare: Callable[[], Any]  # compiles on a thread, and returns a `Built`
+    measure: Callable[[Any, Request], dict[str, Any]]  # returns the numbers of the row
 
 
 def main() -> None:
@@ -181,7 +182,7 @@ def rows_of(
 ) -> Iterator[dict[str, Any]]:
     """Run a part in a process of its own and yield its rows as it prints them.
 
-    Where the part ended early, a last row says why.
+    If the part ended early, a last row says why.
     """
     asked = [f"{key}={options[key]}" for key in ("tasks", "sizes", "seeds", "repeats")]
     command = [sys.executable, __file__, f"probe={name}", f"seconds={seconds}", *asked]
@@ -201,12 +202,12 @@ def rows_of(
                     yield json.loads(line)
         overdue.cancel()
         errors.seek(0)
-        said = errors.read()
-    sys.stderr.write(said)
+        messages = errors.read()
+    sys.stderr.write(messages)
     if process.returncode == -signal.SIGKILL:
         yield {"skipped": f"{name}: the rest, out of time"}
     elif process.returncode:
-        yield {"skipped": f"{name}: the rest, exit code {process.returncode}: {said[-1500:]}"}
+        yield {"skipped": f"{name}: the rest, exit code {process.returncode}: {messages[-1500:]}"}
 
 
 def probe(options: dict[str, str], tasks: Sequence[str]) -> None:
@@ -234,7 +235,7 @@ def numbers(request: Request) -> Iterator[dict[str, Any]]:
         "-p",
         "no:benchmark",
     ]
-    # Warnings about other versions of packages are no question of numbers.
+    # Warnings about other versions of packages say nothing about numbers.
     command += [
         "-W",
         "default",
@@ -275,7 +276,7 @@ def numbers(request: Request) -> Iterator[dict[str, Any]]:
 
 
 def environments(request: Request) -> Iterator[dict[str, Any]]:
-    """Measure steps a second. Large batches of all tasks come before small ones."""
+    """Measure steps a second. Large batches of all tasks are measured before small ones."""
     import environments as peers
     import jax
 
@@ -399,7 +400,7 @@ def learning(request: Request) -> Iterator[dict[str, Any]]:
         while updates < config.num_updates and mean < LEVEL and request.left > 0.0:
             state, curves = built.call(state)
             rates = np.asarray(curves["success_rate"])[: config.seeds, -1]
-            updates = updates + 1
+            updates += 1
             mean = float(rates.mean())
             seconds = time.monotonic() - begin
             reached = [
@@ -430,7 +431,7 @@ def learning(request: Request) -> Iterator[dict[str, Any]]:
 
 
 def filters(request: Request) -> Iterator[dict[str, Any]]:
-    """Measure calls a second. The recommended filter of each task comes first."""
+    """Measure calls a second. The recommended filter of each task is measured first."""
     import jax
     import rta
 
@@ -483,14 +484,14 @@ def sizes_here() -> Sizes:
 class Built:
     """Compiled programs and how to call them.
 
-    It also has the time of compiling and the memory of the last program.
+    It also knows how long they took to compile, and how much memory the last of them needs.
     """
 
     call: Callable[[Any], Any]
     config: Any = None
 
     def __init__(self, compile_: Callable[[], Any]) -> None:
-        """Compile. `compile_` returns a program or a list of them."""
+        """Compile the programs. `compile_` returns one of them or a list."""
         begin = time.monotonic()
         built = compile_()
         self.programs = built if isinstance(built, list) else [built]
@@ -515,25 +516,31 @@ class Built:
 def measured(
     jobs: Sequence[Job], request: Request, size: int = sys.maxsize
 ) -> Iterator[dict[str, Any]]:
-    """Compile some jobs side by side, at most two a core, then measure them one after another.
+    """Measure jobs in rounds. Yield a row for each job, or why it was skipped.
 
-    The next jobs follow in the same way, so nothing is measured while something compiles. If the
-    time is too short for another round like the one before, the rest is skipped. Rows are marked if
-    they were measured although some program of their round was still compiling.
+    The jobs of a round compile side by side, at most two a core, and are then measured one after
+    another, so that nothing is measured while something compiles. If the time is too short for
+    another round as long as the longest one, the rest is skipped. A row is marked if it was
+    measured although some program of its round was still compiling.
+
+    Args:
+        jobs: the jobs in their order.
+        request: what the part is asked for.
+        size: the largest number of jobs of a round.
     """
     size = min(size, 2 * usable_cores())
     longest = 0.0
     for first in range(0, len(jobs), size):
-        turn = jobs[first : first + size]
+        jobs_now = jobs[first : first + size]
         begin = time.monotonic()
         if longest > request.left or request.left <= 0.0:
             yield from ({"skipped": f"{named(job)}: out of time"} for job in jobs[first:])
             return
-        pool = ThreadPoolExecutor(len(turn))
-        futures = [pool.submit(job.prepare) for job in turn]
+        pool = ThreadPoolExecutor(len(jobs_now))
+        futures = [pool.submit(job.prepare) for job in jobs_now]
         wait(futures, timeout=COMPILING * request.left)
         compiling = not all(future.done() for future in futures)
-        for job, future in zip(turn, futures, strict=True):
+        for job, future in zip(jobs_now, futures, strict=True):
             if not future.done():
                 yield {"skipped": f"{named(job)}: not compiled in time"}
             elif (error := future.exception()) is not None:
@@ -551,7 +558,7 @@ def measured(
 
 
 def row_of(job: Job, built: Built, request: Request) -> dict[str, Any]:
-    """Measure a job that is compiled. An error of the device ends its row, but not the others."""
+    """Measure a job that is compiled. If the device fails, only this row is skipped."""
     try:
         measurements = job.measure(built, request)
     except Exception as error:
@@ -565,12 +572,12 @@ def row_of(job: Job, built: Built, request: Request) -> dict[str, Any]:
 
 
 def named(job: Job) -> str:
-    """Return the name of a job where it is skipped."""
+    """Return what a job that is skipped is called in the results."""
     return ", ".join(f"{key} {value}" for key, value in job.row.items())
 
 
 def timed(run: Callable[[int], Any], repeats: int) -> list[float]:
-    """Return the seconds of some calls. A first call is not counted."""
+    """Return the seconds of some calls. One call before them is not counted."""
     import jax
 
     seconds = []
@@ -585,12 +592,12 @@ def largest(recipes: Path) -> str:
     """Return the name of the recipe with the most environments."""
     from jaxsafe.schema import yaml12
 
-    known = yaml12.read(recipes)
-    return max(known, key=lambda name: known[name]["ppo"]["num_envs"])
+    content = yaml12.read(recipes)
+    return max(content, key=lambda name: content[name]["ppo"]["num_envs"])
 
 
 class Part(NamedTuple):
-    """One of the script's questions and its share of the time."""
+    """A part of the measurements and its share of the time."""
 
     run: Callable[[Request], Iterator[dict[str, Any]]]
     share: float

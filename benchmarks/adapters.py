@@ -1,8 +1,9 @@
 """Measure how fast the tasks are through Gymnasium, and what each adapter costs.
 
-Adapters are compared with the pure functions, in steps a second with actions chosen beforehand:
+These are measured at some numbers of environments, in steps a second with actions chosen
+beforehand:
 
-- `GymVectorEnv` at some numbers of environments,
+- `GymVectorEnv`,
 - Gymnasium's SyncVectorEnv of the same task,
 - Gymnasium's NumPy-vectorised CartPole,
 - EnvPool's CartPole, where it is installed,
@@ -10,8 +11,8 @@ Adapters are compared with the pure functions, in steps a second with actions ch
 - `SafetyEnv`,
 - the adapters for gymnax, Brax and Stable-Baselines3, where those are installed.
 
-Compile time is measured apart. Numbers are the median of some repeats, in turns. Results are
-written to `benchmarks/results/adapters.json`, and a table is printed:
+Compile time is measured apart. Numbers are medians of some repeats, in which all take turns.
+Results are written to `benchmarks/results/adapters.json`, and a table is printed:
 
     python benchmarks/adapters.py [task=docking2d] [envs=1,64,1024,4096] [repeats=5]
 """
@@ -46,6 +47,7 @@ SECONDS = 1.0
 """About how long one measurement takes."""
 
 Step = Callable[[], Any]
+"""A function that takes one step of all environments."""
 
 
 def main() -> None:
@@ -65,7 +67,7 @@ def main() -> None:
 
 
 def peers(task: str, number: int) -> dict[str, Step]:
-    """Return, by name, a function that takes one step of all environments."""
+    """Return the step of each peer by its name."""
     env = jaxsafe.make(task)  # made once, not for each of thousands of single environments
     steps = {
         "pure functions, called from Python": pure(task, number),
@@ -112,7 +114,7 @@ def vector(env: Any) -> Step:
 
 
 def single(env: gym.Env) -> Step:
-    """Return the step of a single Gymnasium environment, which is reset where its episode ends."""
+    """Return the step of a single Gymnasium environment, which is reset when its episode ends."""
     env.reset(seed=0)
     action = env.action_space.sample()
 
@@ -175,7 +177,10 @@ def sb3_env(task: str, number: int) -> Step:
 
 
 def measure(steps: dict[str, Step], number: int, repeats: int) -> dict[str, Any]:
-    """Measure steps a second of each, in turns so that a slow moment of the machine hits all."""
+    """Measure steps a second of each peer.
+
+    The peers take turns, so that a slow moment of the machine hits all of them.
+    """
     counts = {}
     first = {}
     for name, step in steps.items():

@@ -51,9 +51,9 @@ def docking_bounds(env: jaxsafe.Environment, first: TimeStep) -> dict[str, jax.A
     """Return the least length [s] and the largest return of an episode from each start.
 
     −dr/dt is at most the speed. So the way at the speed limit ν₀ + ν₁r takes
-    log((ν₀ + ν₁r)/(ν₀ + ν₁ · radius))/ν₁, and no policy that keeps the limit is faster. The return
-    has at most the whole potential of the distance, no Δv, and a success after that time. A step
-    above the limit costs 0.01 and more, and saves less than that: 1/(0.2 · 2000) per m/s.
+    log((ν₀ + ν₁r)/(ν₀ + ν₁ · radius))/ν₁, and no policy that keeps the limit is faster. At best a
+    return holds the whole potential of the distance, no Δv, and a success after that time. A step
+    above the limit costs 0.01 or more. It saves less than that, namely 1/(0.2 · 2000) per m/s.
     """
     limit = speed_limit(env)
     last = limit.floor + limit.slope * env.regions[0].radius  # type: ignore[attr-defined]
@@ -68,12 +68,14 @@ def docking_bounds(env: jaxsafe.Environment, first: TimeStep) -> dict[str, jax.A
 def rejoin_bounds(state: State) -> dict[str, jax.Array]:
     """Return the least length [s] of an episode from each start.
 
-    The rejoin region moves at the lead's constant velocity w, and is within a ball of radius R. An
-    aircraft that turns at once and flies at 400 ft/s reaches the ball, which begins at d from it,
-    when ‖d + w t‖ = 400 t + R. Then it stays for 20 s.
+    The rejoin region moves at the lead's constant velocity w, and is within a ball of radius R. Let
+    d be the vector from the aircraft to the centre of the ball at the start. An aircraft that turns
+    at once and flies at 400 ft/s reaches the ball when ‖d + w t‖ = 400 t + R. Then it stays for
+    20 s.
     """
     sim = state.sim
-    own, lead = sim.platforms["wingman"], sim.platforms["lead"]
+    own = sim.platforms["wingman"]
+    lead = sim.platforms["lead"]
     way = sim.regions["rejoin_region"].position - own.position
     radius = 150.0 if way.shape[-1] == 2 else math.hypot(100.0, 150.0)
     fastest = SPEED_LIMITS[1]
@@ -88,8 +90,8 @@ def bounds(task: str, episodes: int) -> dict[str, float]:
     env = jaxsafe.make(task)
     key_start, _ = jax.random.split(jax.random.key(0))  # the starts of `jaxsafe.evaluate`
     state, first = jax.jit(reset_batch, static_argnums=2)(env, key_start, episodes)
-    found = rejoin_bounds(state) if "lead" in state.sim.platforms else docking_bounds(env, first)
-    return {name: float(jnp.mean(values)) for name, values in found.items()}
+    each = rejoin_bounds(state) if "lead" in state.sim.platforms else docking_bounds(env, first)
+    return {name: float(jnp.mean(values)) for name, values in each.items()}
 
 
 def measure(task: str, name: str, rta: str, episodes: int) -> dict[str, Any]:
@@ -97,12 +99,12 @@ def measure(task: str, name: str, rta: str, episodes: int) -> dict[str, Any]:
     env = jaxsafe.make(task, rta=rta)
     policy = jaxsafe.load_policy(task if name == PPO else f"controller/{name}", env=env)
     began = time.perf_counter()
-    found = jaxsafe.evaluate(env, policy, jax.random.key(0), episodes)
+    metrics = jaxsafe.evaluate(env, policy, jax.random.key(0), episodes)
     row = {
         "task": task,
         "policy": name,
         "rta": rta,
-        **{metric: found[metric] for metric in METRICS},
+        **{metric: metrics[metric] for metric in METRICS},
     }
     row["training_steps"] = policy.about["step"] if name == PPO else 0  # type: ignore[union-attr]
     row["wall_s"] = round(time.perf_counter() - began, 1)

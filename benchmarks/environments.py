@@ -1,7 +1,7 @@
 """Measure how many steps a second the five tasks take on one core, beside other libraries.
 
 Actions are random and continuous, resets are automatic, and everything is inside one compiled scan.
-Compile time is measured apart. Numbers are the median of some repeats. Each row is a process of its
+Compile time is measured apart. Numbers are medians of some repeats. Each row is a process of its
 own, pinned to one core. Peers run in Python environments that this script builds in
 `benchmarks/peers`.
 
@@ -9,7 +9,7 @@ own, pinned to one core. Peers run in Python environments that this script build
   environment at every step, and a start drawn whether it is needed or not.
 - Rows that end in `:one_action` draw actions once and take them at every step, so that the
   environment is alone in the loop.
-- `docking3d:no_reset` does so too, and goes on where an episode ended.
+- `docking3d:no_reset` also draws actions once. Where an episode ends, it goes on without a reset.
 - Peers are other and mostly smaller tasks: gymnax's CartPole and Pendulum, Brax's inverted pendulum
   (spring), and CartPole of Gymnasium (NumPy) and EnvPool (one thread). The last two get the same
   actions at every step.
@@ -46,7 +46,7 @@ OUT = Path(__file__).parent / "results" / "environments.json"
 RELEASED = (1800.0, 3000.0)
 """Steps a second of the released SafeRL code in one process, for its slowest and fastest task.
 
-The figures come from elsewhere.
+This script does not measure them.
 """
 
 NUM_STEPS = 1000
@@ -56,7 +56,7 @@ A single environment takes 200 times as many.
 """
 
 SLOW_STEPS = 2_000_000
-"""Steps of all environments together in one measurement of what is called from Python."""
+"""Steps of all environments together in one measurement of a step that is called from Python."""
 
 
 def main() -> None:
@@ -109,9 +109,9 @@ def episode_steps(
     one_action: bool = False,
     reset: bool = True,
 ) -> jax.Array:
-    """Take steps with random actions. Return a sum, so that nothing is left out.
+    """Take steps with random actions. Return the sum of rewards, costs and observations.
 
-    It is the sum of rewards, costs and of what a policy would see.
+    The compiler leaves out nothing, because the sum depends on everything.
     """
     state, timestep = reset_batch(env, key, num_envs, axis=-1)
     draw = lambda key: jax.random.uniform(key, (env.action_size, num_envs), minval=-1.0)  # noqa: E731
@@ -135,7 +135,7 @@ def episode_steps(
 
 
 def usual_way(num_envs: int, repeats: int) -> dict[str, Any]:
-    """Measure docking3d, one environment at a time, mapped."""
+    """Measure docking3d as most JAX environments are written: a `vmap` of a single environment."""
     env = jaxsafe.make("docking3d")
 
     def run(key: jax.Array, num_envs: int, num_steps: int) -> jax.Array:
@@ -160,9 +160,9 @@ def gymnax(name: str, num_envs: int, repeats: int, one_action: bool = False) -> 
 
 
 def gymnax_steps(name: str, one_action: bool = False) -> Callable[[jax.Array, int, int], jax.Array]:
-    """Return a function that steps gymnax's environment as `episode_steps` steps ours.
+    """Return a function that steps an environment of gymnax as `episode_steps` steps ours.
 
-    It takes a key and the numbers of environments and steps.
+    It takes a key, the number of environments, and the number of steps.
     """
     env, params = importlib.import_module("gymnax").make(name)
     space = env.action_space(params)
@@ -251,7 +251,7 @@ def compiled(
 
 
 def called(step: Callable[[], Any], num_envs: int, repeats: int) -> dict[str, Any]:
-    """Measure what is called from Python."""
+    """Measure a step of all environments that is called from Python."""
     num_steps = max(10, min(SLOW_STEPS // num_envs, 20_000))
     seconds = []
     for _ in range(repeats + 1):

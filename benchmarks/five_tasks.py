@@ -1,10 +1,10 @@
 """Measure how long it takes until ten seeds of all five tasks are learnt.
 
 Nothing is compiled before. One way is `python -m jaxsafe.train env=all preset=shortest_time` in a
-process of its own with an empty cache of compiled programs. The other is the same five trainings as
-five commands, one after another. A task is learnt when 95 % of the last 100 training episodes
-succeeded, on average over seeds. Table 2 of the paper counts 80 % in this way. Results are written
-to `benchmarks/results/five_tasks.json`, and a table of medians is printed:
+process of its own with an empty cache of compiled programs. The other way is the same five
+trainings as five commands, one after another. A task is learnt when 95 % of the last 100 training
+episodes succeeded, on average over seeds. Table 2 of the paper counts 80 % in the same way. Results
+are written to `benchmarks/results/five_tasks.json`, and a table of medians is printed:
 
     python benchmarks/five_tasks.py [seeds=10] [seed=0] [preset=shortest_time] [repeats=3]
 """
@@ -29,6 +29,8 @@ from jaxsafe.storage.files import read_json, read_rows
 
 OUT = Path(__file__).parent / "results" / "five_tasks.json"
 LEVEL = 0.95
+"""The success rate at which a task is learnt."""
+
 POLL = 0.1
 """Seconds between looks at the logs."""
 
@@ -51,7 +53,10 @@ def main() -> None:
 
 
 def together(asked: Sequence[str]) -> dict[str, Any]:
-    """Train all five tasks by one command. Return when the last of them is learnt."""
+    """Train all five tasks by one command.
+
+    Return the seconds until the last of them is learnt, with the rest of the row.
+    """
     with tempfile.TemporaryDirectory() as place:
         runs = {task: Path(place, "all", task) for task in TASKS}
         whole, sizes = watched(
@@ -69,7 +74,7 @@ def together(asked: Sequence[str]) -> dict[str, Any]:
 def apart(asked: Sequence[str]) -> dict[str, Any]:
     """Train each task by a command of its own.
 
-    Return the sum of the seconds until each is learnt.
+    Return the sum of the seconds until each is learnt, with the rest of the row.
     """
     with tempfile.TemporaryDirectory() as place:
         runs = {task: Path(place, task) for task in TASKS}
@@ -92,7 +97,7 @@ def watched(
 ) -> tuple[float, list[tuple[float, dict[Path, int]]]]:
     """Run a training command. Return the seconds that it takes and how its progress logs grew.
 
-    The lengths of the logs are in bytes.
+    Their growth is a list of times in s, each with the bytes of every log.
     """
     environment = {key: value for key, value in os.environ.items() if key not in CACHE} | {
         "XDG_CACHE_HOME": str(cache)
@@ -116,7 +121,11 @@ def watched(
 def when(run: Path, sizes: Sequence[tuple[float, dict[Path, int]]]) -> float | None:
     """Return the seconds from the start of the command until a task was learnt.
 
-    The log of its run then had the row with which it was learnt.
+    That is when the log of the run had the row with which the task was learnt.
+
+    Args:
+        run: the run directory of the task.
+        sizes: how the logs grew, as `watched` returns it.
     """
     log = run / "progress.jsonl"
     rows = read_rows(log)
@@ -133,7 +142,7 @@ def when(run: Path, sizes: Sequence[tuple[float, dict[Path, int]]]) -> float | N
 def evaluated(runs: dict[str, Path]) -> dict[str, Any]:
     """Return the mean success over seeds with sampled actions, and the failed seeds.
 
-    They are those of the evaluation after training.
+    Both are from the evaluation after training.
     """
     results = {task: read_json(run / "results.json") for task, run in runs.items()}
     success = {
@@ -147,7 +156,7 @@ def evaluated(runs: dict[str, Path]) -> dict[str, Any]:
 
 
 def all_known(values: Sequence[float | None]) -> list[float]:
-    """Return the values, or nothing if one of them was never reached."""
+    """Return the values, or an empty list if one of them is None."""
     known = [value for value in values if value is not None]
     return known if len(known) == len(values) else []
 

@@ -1,6 +1,6 @@
-"""Measurements in processes of their own.
+"""Measurements in processes of their own, and the words of the commands.
 
-They run on chosen cores, and with peers whose versions exclude each other.
+A process is pinned to chosen cores. Peers whose versions exclude each other have a Python each.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ CACHE = (
 )
 """Variables that decide whether JAX keeps compiled programs, and from which time and size on."""
 
-
 PEERS = {
     "gymnax": ["gymnax", "six"],
     "brax": ["brax"],
@@ -38,10 +37,10 @@ Gymnax imports six without asking for it.
 
 
 def words(**defaults: str) -> dict[str, str]:
-    """Return the options of the command, `name=value`, over their defaults.
+    """Return the options of the command, which are words `name=value`, over their defaults.
 
-    A name that has no default ends the command with one line. `probe` asks for a single
-    measurement.
+    A name that has no default ends the command with one line. Only `probe`, which asks for a single
+    measurement, needs no default.
     """
     given = {name: value for name, _, value in (word.partition("=") for word in sys.argv[1:])}
     for name in given:
@@ -53,17 +52,18 @@ def words(**defaults: str) -> dict[str, str]:
 def several(option: str, value: str, known: Iterable[str]) -> list[str]:
     """Return the names in a list with commas. An unknown name ends the command with one line."""
     names = [name for name in value.split(",") if name]
-    allowed = list(known)
+    choices = list(known)
     for name in names:
-        if name not in allowed:
-            sys.exit(f"{option}: found {name!r}; choose from {', '.join(allowed)}")
+        if name not in choices:
+            sys.exit(f"{option}: found {name!r}; choose from {', '.join(choices)}")
     return names
 
 
 def interpreter(name: str) -> str:
-    """Return Python with a peer beside jaxsafe. It is built in `benchmarks/peers` the first time.
+    """Return the path of a Python that has a peer beside jaxsafe.
 
-    For what is no peer, it is this Python.
+    It is built in `benchmarks/peers` the first time. For a name that is no peer, return the path of
+    this Python.
     """
     if name not in PEERS:
         return sys.executable
@@ -82,9 +82,9 @@ def interpreter(name: str) -> str:
 
 
 def versions(names: Iterable[str]) -> dict[str, dict[str, str]]:
-    """Return the versions in each peer's environment.
+    """Return the versions of packages in each peer's environment.
 
-    They are those of what pip installed for it, and of what that computes with.
+    The packages are those that pip installed for the peer, and those that it computes with.
     """
     ask = "import json, sys; from importlib.metadata import distributions as all; "
     ask += (
@@ -118,10 +118,15 @@ def probe(
     python: str = sys.executable,
     cache: Path | None = None,
 ) -> Any:
-    """Run a script pinned to some cores, or on all. Return what it prints last, as JSON.
+    """Run a script in a process of its own. Return the last line that it prints, read as JSON.
 
-    `request` are its words. `cache` keeps what JAX compiles, however small. Without it nothing is
-    kept.
+    Args:
+        script: the path of the script.
+        request: its words.
+        cores: the number of cores that it is pinned to. None stands for all.
+        python: the path of Python.
+        cache: a directory that keeps every program that JAX compiles, however small. Without it
+            nothing is kept.
     """
     command = [python, script, *request]
     environment = {key: value for key, value in os.environ.items() if key not in CACHE}
@@ -131,9 +136,9 @@ def probe(
     # A child inherits the cores of the thread that starts it.
     os.sched_setaffinity(0, sorted(before)[:cores])
     try:
-        ran = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
+        run = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
     finally:
         os.sched_setaffinity(0, before)
-    if ran.returncode:
-        sys.exit(f"{' '.join(request)}: {ran.stderr[-2000:]}")
-    return json.loads(ran.stdout.splitlines()[-1])
+    if run.returncode:
+        sys.exit(f"{' '.join(request)}: {run.stderr[-2000:]}")
+    return json.loads(run.stdout.splitlines()[-1])

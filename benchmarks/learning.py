@@ -5,10 +5,10 @@ Each variant trains ten seeds by the task's recipe in a process of its own:
 - as it is,
 - with its shuffle replaced by the sort of `jax.random.permutation`,
 - with the gradient of a minibatch at once instead of in chunks,
-- with every seed shared by two devices, on a CPU two cores.
+- with every seed shared by two devices, which are two cores of a CPU.
 
-All draw the same starts and noise, but rounding or order differ, so that each ends elsewhere. How
-good the policies are must not differ beyond noise. Results are written to
+All variants draw the same starts and noise. Rounding or order differ, so each ends with other
+policies. Their quality must not differ beyond noise. Results are written to
 `benchmarks/results/learning.json`, and a table is printed:
 
     python benchmarks/learning.py [tasks=docking2d,rejoin2d] [seeds=10] [seed=0]
@@ -59,7 +59,7 @@ def main() -> None:
 def trained(variant: str, asked: list[str]) -> dict[str, Any]:
     """Train a variant.
 
-    Return the steps to 80 % success, and success and length of final episodes.
+    Return the steps to 80 % success, and the success and length of the episodes after training.
     """
     from jaxsafe.commands import train as train
     from jaxsafe.devices.seed_mapper import claim_cores

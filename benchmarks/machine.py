@@ -17,7 +17,7 @@ from jaxsafe.storage.provenance import processor
 def about() -> dict[str, Any]:
     """Return commit, versions, device and the number of cores that may be used.
 
-    Ask before anything is measured.
+    Call this before measuring, so that the commit is the one whose code is measured.
     """
     return {
         "commit": _git("rev-parse", "HEAD"),

@@ -1,10 +1,10 @@
 """Measure how much memory a training takes, for each environment and for each seed.
 
-- Stated: the bytes of a state of the task, and of what a seed keeps between updates without its
+- Stated: the bytes of one environment's state, and of what a seed keeps between updates besides its
   environments.
-- Predicted: what the compiled update needs in all, by XLA. A training compares that with the memory
-  that is free before it starts. It adds what a process takes once: for compiling, for code and for
-  the programs of its evaluations (`jaxsafe/devices/memory.py`).
+- Predicted: what the compiled update needs in all, according to XLA. A training adds what a process
+  takes once: for compiling, for code and for the programs of its evaluations. Before it starts, it
+  compares the sum with the memory that is free (`jaxsafe/devices/memory.py`).
 - Measured: how far the resident memory of the process rises during two updates.
 
 Each row is a process of its own, on Linux. Results are written to `benchmarks/results/memory.json`,
@@ -72,7 +72,7 @@ def probe(task: str, num_envs: int) -> dict[str, int]:
     state = fresh(shared, mapper.keys(0))
     advance = two.lower(shared, state).compile()
     batch_bytes = memory.size((state.env_state, state.observation, state.episode))
-    # The peak begins anew here, because compiling is not what is measured.
+    # This resets the peak of the process, because compiling is not what is measured.
     Path("/proc/self/clear_refs").write_text("5")
     before = resident("VmRSS")
     jax.block_until_ready(advance(shared, state))
@@ -85,7 +85,7 @@ def probe(task: str, num_envs: int) -> dict[str, int]:
 
 
 def resident(which: str) -> int:
-    """Return the bytes of this process in memory, now or at most."""
+    """Return the bytes of this process in memory, now (`VmRSS`) or at most (`VmHWM`)."""
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     return next(1024 * int(line.split()[1]) for line in lines if line.startswith(which))
 

@@ -5,15 +5,16 @@ minibatches, actor and critic of 2 × 64 tanh, on the task's observation. rejax,
 Stable-Baselines3 take the task through `jaxsafe.adapters`. Stable-Baselines3 has its own loop and
 takes 64 × 1024.
 
-Each measurement is a process of its own, on one pinned core and on all. Peers run in environments
-that this script builds in `benchmarks/peers`, since their versions exclude each other. Compile time
-is measured apart. Numbers are the median of some repeats, in turns. Other rows are:
+Each measurement is a process of its own, on one pinned core and on all. Peers run in Python
+environments that this script builds in `benchmarks/peers`, since their versions exclude each other.
+Compile time is measured apart. Numbers are medians of some repeats, in which all take turns. Other
+rows are:
 
 - ten seeds at once against one,
 - this PPO with the sort of `jax.random.permutation` for its shuffle,
 - PPO as it is mostly written in JAX (`usual_ppo.py`),
-- `networks only`, which does nothing but take a batch through the networks, forwards and backwards,
-  and step with Adam, on one core. The rest is what this PPO spends elsewhere.
+- `networks only` on one core, which takes a batch through the networks, forwards and backwards,
+  steps with Adam, and does nothing else. What this PPO takes longer is spent elsewhere.
 
 Results are written to `benchmarks/results/ppo.json`:
 
@@ -85,9 +86,12 @@ def main() -> None:
 
 
 def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
-    """Run our PPO as `jaxsafe.train` does, with `seeds` seeds.
+    """Measure the samples a second of our PPO, as `jaxsafe.train` runs it, over all seeds.
 
-    Return the samples a second of all seeds.
+    Args:
+        task: the task.
+        seeds: number of seeds.
+        sort: whether the sort of `jax.random.permutation` replaces its shuffle.
     """
     from jaxsafe.devices.seed_mapper import claim_cores
 
@@ -110,9 +114,10 @@ def ours(task: str, seeds: int = 1, sort: bool = False) -> float:
 def our_programs(
     task: str, seeds: int, updates: int, num_envs: int = NUM_ENVS
 ) -> tuple[Any, Any, Any, Any]:
-    """Return the programs of our PPO and their arguments.
+    """Return the two programs of our PPO, the keys of the seeds, and what all seeds share.
 
-    The programs make the fresh state and some updates. Both take keys and what all seeds share.
+    The first program takes what is shared and the keys, and makes a fresh state. The second takes
+    what is shared and a state, and makes some updates.
     """
     from jaxsafe.devices.seed_mapper import SeedMapper
     from jaxsafe.train.train import programs
@@ -144,7 +149,7 @@ def settings(task: str, num_envs: int = NUM_ENVS) -> tuple[Any, Any]:
 
 
 def networks_only(task: str) -> float:
-    """Measure what the networks and Adam need of our updates.
+    """Measure the samples a second of the networks and Adam in our updates.
 
     There are no environments, no advantages and no shuffle.
     """
@@ -208,7 +213,10 @@ def usual_way(task: str) -> float:
 
 
 def usual_program(task: str, num_envs: int = NUM_ENVS) -> tuple[Callable, Callable]:
-    """Return some updates of `usual_ppo.py`, and its start, which takes a key."""
+    """Return a function that makes some updates of `usual_ppo.py`, and one that makes its start.
+
+    The first takes a carry, the second a key, of which it makes the first carry.
+    """
     import jax
     import usual_ppo
 
@@ -225,7 +233,7 @@ def usual_program(task: str, num_envs: int = NUM_ENVS) -> tuple[Callable, Callab
 
 
 def timed(run: Callable, start: Any) -> float:
-    """Return the samples a second of some updates, called for the second time."""
+    """Return the samples a second of the updates. The first call compiles and is not counted."""
     import jax
 
     jax.block_until_ready(run(start))
@@ -242,7 +250,7 @@ def rejax(task: str) -> float:
 
 
 def rejax_trainer(task: str, updates: int, num_envs: int = NUM_ENVS) -> Any:
-    """Return some updates of rejax from a key, to be compiled."""
+    """Return a function that makes some updates of rejax from a key."""
     import jax
     from rejax import PPO  # pyright: ignore[reportMissingImports]
 
@@ -267,9 +275,9 @@ def rejax_trainer(task: str, updates: int, num_envs: int = NUM_ENVS) -> Any:
 
 
 def brax(task: str) -> float:
-    """Measure Brax's PPO by what it reports itself.
+    """Return the samples a second that Brax's PPO reports itself.
 
-    Evaluations are left out, and so is the first epoch, which compiles.
+    They leave out evaluations, and the first epoch, which compiles.
     """
     from brax.training.agents.ppo import train as ppo  # pyright: ignore[reportMissingImports]
     from brax.training.agents.ppo.networks import make_ppo_networks  # pyright: ignore[reportMissingImports]

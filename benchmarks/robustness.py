@@ -1,9 +1,9 @@
 """Measure what a bound on the uncertainty costs, and what the world does to a filter without one.
 
-The filter `robust` has the bound `BOUND`, and the worlds are as bad as that or worse:
-`jaxsafe.evaluate.bounded_worlds.world_at`. In them fly the policies that come with the package, and
-an adversary that pushes towards the chief: without a filter, with the `default` filter, which has
-no bound, and with `robust`.
+The filter `robust` has the bound `BOUND`. A world at some level has uncertainty of that level times
+the bound (`jaxsafe.evaluate.bounded_worlds.world_at`). The policies that come with the package fly
+in these worlds, and so does an adversary that pushes towards the chief. They fly without a filter,
+with the `default` filter, which has no bound, and with `robust`.
 
 Results are written to `benchmarks/results/robustness.json`, the figure to
 `docs/figures_robust.png`, and the table of docs/safety/attacks.md is printed:
@@ -49,14 +49,20 @@ CHATTER_STEPS = 300
 
 
 def world(task: str, rta: str, level: float) -> Environment:
-    """Return a world at a level, in which another filter may fly, or none."""
+    """Return the world of a task at a level, with a filter or none.
+
+    Args:
+        task: the task.
+        rta: the filter, one of `FILTERS`.
+        level: the uncertainty, as a multiple of `BOUND`.
+    """
     robust = world_at(jaxsafe.make(task, {"rta.bound": BOUND}, rta="robust"), level)
     if rta == "robust":
         return robust
     if rta == "none":
         return override(robust, {"rta": None})
-    known = {} if robust.rta is None else robust.rta.model
-    model = {f"rta.model.{path}": value for path, value in known.items()}
+    numbers = {} if robust.rta is None else robust.rta.model
+    model = {f"rta.model.{path}": value for path, value in numbers.items()}
     nominal = jaxsafe.make(task, rta=rta)
     return override(robust, {"rta": nominal.rta, **model})
 
@@ -71,10 +77,10 @@ def chatter(env: Environment, policy: Any, episodes: int) -> float:
 
 
 def measure(task: str, rta: str, level: float, episodes: int) -> dict[str, Any]:
-    """Fly whole episodes and return what users ask for."""
+    """Fly whole episodes, and under attack. Return the row of the results."""
     env = world(task, rta, level)
     policy = jaxsafe.load_policy(task)
-    found = jaxsafe.evaluate(env, policy, jax.random.key(0), episodes)
+    metrics = jaxsafe.evaluate(env, policy, jax.random.key(0), episodes)
     names = (
         "success_rate",
         "control_usage",
@@ -85,7 +91,7 @@ def measure(task: str, rta: str, level: float, episodes: int) -> dict[str, Any]:
         "intervention_rate",
     )
     row = {"task": task, "rta": rta, "level": level, "episodes": episodes}
-    row |= {name: found[name] for name in names} | {"chatter": chatter(env, policy, episodes)}
+    row |= {name: metrics[name] for name in names} | {"chatter": chatter(env, policy, episodes)}
     pushed = attack(env, "inward", ATTACK_STEPS, episodes, jax.random.key(2))
     row["attacked"] = pushed["violating_steps"] / pushed["steps"]
     row["attacked_worst_margin"] = pushed["worst_margin_inside"]
@@ -95,7 +101,7 @@ def measure(task: str, rta: str, level: float, episodes: int) -> dict[str, Any]:
 
 @styled
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draw violations, success and control usage against the level, a row of panels a task."""
+    """Draw violations, success and control usage against the level, in a row of panels per task."""
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     figure = Figure(figsize=(9.6, 2.9 * len(tasks)), layout="constrained")
     panels = np.atleast_2d(figure.subplots(len(tasks), 3))

@@ -1,15 +1,15 @@
 """Measure what run time assurance costs and how much it changes.
 
-- `calls`: filter calls a second in a batch of 4096 states met on the way under random actions, in
-  float32. Compiling is measured apart, and numbers are medians.
+- `calls`: filter calls a second on a batch of 4096 states, in float32. The states are met under
+  random actions. Compiling is measured apart, and numbers are medians.
 - `qp`: the small quadratic program.
 - `change`: how often and how much each docking filter alters random actions.
 - `starts`: what becomes of starts that are not certified.
-- `training`: what a filter in the loop adds to the wall time of training, in turns with training
-  without one.
+- `training`: what a filter in the loop adds to the wall time of training. Training with it and
+  without it take turns.
 
-Where cbfpy or run-time-assurance are installed their filters run in the same invocation. Results
-are written to `benchmarks/results/rta.json`, and the tables are printed:
+Where cbfpy or run-time-assurance is installed, its filter runs in the same invocation. Results are
+written to `benchmarks/results/rta.json`, and the tables are printed:
 
     python benchmarks/rta.py [parts=calls,qp,change,starts,training] [repeats=7]
 """
@@ -59,17 +59,17 @@ def main() -> None:
     options = words(repeats="7", parts=",".join(parts))
     repeats = int(options["repeats"])
     chosen = several("parts", options["parts"], parts)
-    known = json.loads(OUT.read_text()) if OUT.exists() else {}
+    content = json.loads(OUT.read_text()) if OUT.exists() else {}
     for name in chosen:
         here = about()
         rows = parts[name](repeats)
-        known[name] = {**here, "rows": rows}
+        content[name] = {**here, "rows": rows}
         print(
             f"\n{name}\n"
             + markdown(list(rows[0]), ([_short(value) for value in row.values()] for row in rows))
         )
         OUT.parent.mkdir(exist_ok=True)
-        OUT.write_text(json.dumps(known, indent=1) + "\n")
+        OUT.write_text(json.dumps(content, indent=1) + "\n")
 
 
 def timed(run: Callable[[], Any], repeats: int) -> tuple[float, float]:
@@ -107,7 +107,7 @@ def calls(repeats: int) -> list[dict[str, Any]]:
 
 @jax.jit
 def filter_batch(env: Any, sims: Any, memories: Any, desired: Any) -> Any:
-    """Return what the filter of an environment lets act, in each of a batch of simulations."""
+    """Return what the filter of an environment returns for each of a batch of simulations."""
     return jax.vmap(functools.partial(env.rta.filter, env))(sims, memories, desired)
 
 
@@ -126,7 +126,7 @@ def met(env: jaxsafe.Environment, batch: int = BATCH) -> tuple[Any, Any, jax.Arr
     The simulations are those after 100 steps of random actions without a filter.
     """
     size = env.action_size
-    (low, high) = bounds(env)
+    low, high = bounds(env)
 
     @jax.jit
     def run(env: Any, key: jax.Array) -> Any:
@@ -221,7 +221,7 @@ def cbfpy_calls(repeats: int) -> list[dict[str, Any]]:
 
 
 def programs(repeats: int) -> list[dict[str, Any]]:
-    """Measure the small quadratic program: solutions a second, and its distance from float64."""
+    """Measure the small quadratic program: solutions a second, and the error against float64."""
     rng = np.random.default_rng(0)
     rows = []
     solve = jax.jit(jax.vmap(nearest_solution))
@@ -235,11 +235,11 @@ def programs(repeats: int) -> list[dict[str, Any]]:
         ]
         single = [array.astype(np.float32) for array in problem]
         seconds, _ = timed(lambda single=single: solve(*single), repeats)
-        found = solve(*single)
+        solution = solve(*single)
         with jax.enable_x64():
             exact = solve(*(array.astype(np.float64) for array in single))
-        both = np.asarray(found.feasible & exact.feasible)
-        error = np.abs(found.control - exact.control).max(axis=1)[both]
+        both = np.asarray(solution.feasible & exact.feasible)
+        error = np.abs(solution.control - exact.control).max(axis=1)[both]
         rows.append(
             {
                 "variables": m,
@@ -255,7 +255,7 @@ def programs(repeats: int) -> list[dict[str, Any]]:
 def changes(repeats: int) -> list[dict[str, Any]]:
     """Count how often and how much random actions are altered.
 
-    Also count what is violated all the same.
+    Also count the steps that violate a constraint all the same.
     """
     del repeats
     rows = []
@@ -278,7 +278,7 @@ def changes(repeats: int) -> list[dict[str, Any]]:
 def starts(repeats: int) -> list[dict[str, Any]]:
     """Count what becomes of the starts of oriented docking that are not certified, in 400 steps.
 
-    The second row leaves out the fastest starts.
+    The second pair of rows leaves out the fastest starts.
     """
     del repeats
     keys = jax.random.split(jax.random.key(7), 200_000)
@@ -319,7 +319,7 @@ def starts(repeats: int) -> list[dict[str, Any]]:
 
 
 def training(repeats: int) -> list[dict[str, Any]]:
-    """Measure the wall time of an update of PPO with a filter, as a share of that without."""
+    """Measure the wall time of an update of PPO with a filter, as a multiple of that without."""
     agent = normalise(Agent())
     ppo = normalise(PPO(num_envs=64, num_steps=128))
     rows = []

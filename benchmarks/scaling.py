@@ -1,20 +1,20 @@
-"""Measure what more cores and more seeds gain, and project what a thousand devices would.
+"""Measure what more cores and more seeds gain, and project what a thousand devices would gain.
 
-Each measurement is a process of its own, pinned to one core or on a power of two of them, in turns.
-Compiling is measured apart. Numbers are the median of some repeats:
+Each measurement is a process of its own, pinned to one core or to a power of two of them. All take
+turns. Compiling is measured apart. Numbers are medians of some repeats:
 
 - environment steps, 4,096 environments on each core, as in `environments.py`,
 - one seed of the PPO of `ppo.py` for each core,
 - one seed, whose environments and minibatches the cores share.
 
-The projection is for devices such as these cores. A seed on a device of its own takes what it takes
-here beside other busy cores, and nothing goes between devices. Devices that share a seed take their
-part of that. They also take what sharing was seen to add to a perfect split, once for each
-doubling.
+The projection is for devices such as these cores. A seed on a device of its own takes as long as it
+takes here beside other busy cores, and nothing goes between devices. Devices that share a seed
+divide that time among them. Sharing also adds time: here it was measured against a perfect split,
+and the projection adds it once for each doubling of the devices.
 
-The projection measures no network between machines, and small parts of a batch are less efficient
-than large ones. So for many devices a seed it is the best that can be hoped for. Results are
-written to `benchmarks/results/scaling.json`, and two tables are printed:
+The projection contains no network between machines. It also assumes that small parts of a batch are
+as efficient as large ones, which they are not. So for many devices per seed it is the best that can
+be hoped for. Results are written to `benchmarks/results/scaling.json`, and two tables are printed:
 
     python benchmarks/scaling.py [task=docking3d] [repeats=3]
 """
@@ -39,6 +39,7 @@ SHARED = (1, 8, 64)
 """Numbers of devices that share a seed, in the projection."""
 
 DEVICES = 1000
+"""Number of devices of the projection."""
 
 
 def main() -> None:

@@ -2,7 +2,7 @@
 
 The parts are import, make, trace and compile, and the first result.
 
-Every measurement is a process of its own, and numbers are the median of some. Three tables are
+Every measurement is a process of its own, and numbers are medians of some repeats. Three tables are
 printed:
 
 - The first is without a compilation cache. Its first program is a step with automatic reset in 64
@@ -14,7 +14,7 @@ printed:
   so it also pays for importing and making ours. Cold is with an empty cache of compiled programs.
   Warm is with what the process before left there. Peers run in Python environments that this script
   builds in `benchmarks/peers`.
-- The third is what that time goes into, as JAX's own events and profiler tell it.
+- The third is what that time goes into, according to JAX's own events and its profiler.
 
 Results are written to `benchmarks/results/startup.json`:
 
@@ -83,7 +83,7 @@ def main() -> None:
 
 
 def first_result(name: str, word: str, repeats: int) -> dict[str, Any]:
-    """Return what a probe measures with an empty cache, and with a full one."""
+    """Return what a probe measures with an empty cache (cold), and with a full one (warm)."""
     result: dict[str, Any] = {"name": name, "cold": [], "warm": []}
     python = interpreter(name.split()[0])
     for _ in range(repeats):
@@ -94,7 +94,7 @@ def first_result(name: str, word: str, repeats: int) -> dict[str, Any]:
 
 
 def measured(name: str, rta: str, repeats: int, python: str = sys.executable) -> dict[str, Any]:
-    """Return medians over fresh processes."""
+    """Return a row of the first table, with medians over fresh processes."""
     times = [apart(__file__, [f"probe={name},{rta}"], python=python) for _ in range(repeats)]
     return {
         "name": name,
@@ -178,9 +178,10 @@ EVENTS = {
     "lower": "/jax/core/compile/jaxpr_to_mlir_module_duration",
     "compile": "/jax/core/compile/backend_compile_duration",
 }
-"""Events by which JAX reports its stages. Each is inside the next or before it.
+"""Events by which JAX reports its stages, in their order.
 
-Reading the cache counts as compiling.
+A later stage may run inside an earlier one. Its time then counts for the later stage alone. Reading
+the cache counts as compiling.
 """
 
 REGIONS = {
@@ -188,7 +189,7 @@ REGIONS = {
     "emitters": ("FusionCompiler::Compile",),
     "LLVM": ("TaskDispatcher::dispatch",),
 }
-"""Names of XLA's profiler for the parts of compiling for a CPU.
+"""Names that XLA's profiler gives to the parts of compiling for a CPU.
 
 Their times are summed over the threads that do them side by side.
 """
@@ -241,7 +242,7 @@ def _covered(spans: list[tuple[str, float, float]]) -> float:
     total = 0.0
     until = 0.0
     for _, begin, end in sorted(spans, key=lambda span: span[1]):
-        total = total + max(0.0, end - max(begin, until))
+        total += max(0.0, end - max(begin, until))
         until = max(until, end)
     return total
 

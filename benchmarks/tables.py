@@ -1,8 +1,9 @@
 """The tables of the pages, from the results of the benchmarks and of the report.
 
 So the pages cannot drift from the results. Run `python benchmarks/tables.py` after a benchmark or a
-report. Each table replaces the one in its page that has the same first row.
-`tests/benchmarks/test_benchmarks.py` compares the committed pages with it.
+report. Each table replaces the table in its page that has the same first row.
+`tests/benchmarks/test_benchmarks.py` compares the committed pages with what this script would
+write.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ ENVIRONMENTS = {
     "gymnasium:CartPole-v1": "Gymnasium CartPole-v1, NumPy",
     "envpool:CartPole-v1": "EnvPool CartPole-v1, one thread",
 }
+"""What the pages call a row of `environments.py`, by its name there."""
 
 
 class Facts(NamedTuple):
@@ -48,7 +50,7 @@ class Facts(NamedTuple):
 
     goal: str
     never: str  # what the safety constraint forbids
-    observation: int  # number of elements
+    observation: int  # number of its elements
     actions: int  # number of actuators
 
 
@@ -75,11 +77,15 @@ PPO = {
     "brax": "Brax",
     "sb3": "Stable-Baselines3",
 }
+"""What the pages call a row of `ppo.py`, by its name there."""
+
 VARIANTS = {
     "sorting shuffle": "shuffled by sorting",
     "whole gradients": "gradients of whole minibatches",
     "two devices a seed": "two devices share each seed",
 }
+"""What the pages call a variant of `learning.py`, by its name there."""
+
 ADAPTERS = {
     "pure functions, called from Python": "pure functions, called from Python",
     "GymVectorEnv": "`GymVectorEnv`",
@@ -92,6 +98,8 @@ ADAPTERS = {
     "Gymnasium CartPole, NumPy": "Gymnasium CartPole, NumPy",
     "EnvPool CartPole": "EnvPool CartPole",
 }
+"""What the pages call a row of `adapters.py`, by its name there."""
+
 DOCKING_FIRST = sorted(TASKS, key=lambda task: task.startswith("rejoin"))
 """The tasks in the order of docs/safety."""
 
@@ -106,21 +114,24 @@ PARTS = (
     "emitters",
     "LLVM",
 )
+"""Columns of `startup_profile`."""
+
 FILTERS = {
     "cbfpy, batched": "cbfpy 0.1.0, `vmap`",
     "run-time-assurance, one at a time": "run-time-assurance 1.18.6, one call at a time",
 }
+"""What the pages call a filter of another library, by its name in `rta.py`."""
 
 
 def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table. Empty cells are as short as they can be."""
+    """Return a table in Markdown. Empty cells are as short as they can be."""
     lines = [[*heads], *rows]
     text = ["|" + "|".join(f" {cell} " if cell else " " for cell in line) + "|" for line in lines]
     return "\n".join([text[0], "|" + "---|" * len(heads), *text[1:]])
 
 
 def speed(_: Results) -> str:
-    """Return the first table of the page: what each task does a second, and seconds to learn it."""
+    """Return the table of the steps a second of each task, and the seconds to learn it."""
     results = {
         name: json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
         for name in ("environments", "accelerator")
@@ -147,7 +158,7 @@ def speed(_: Results) -> str:
 
 
 def environments(results: Results, names: Iterable[str] = tuple(ENVIRONMENTS)) -> str:
-    """Return the table of million steps a second, medians."""
+    """Return the table of medians of million steps a second."""
     rates = _steps(results)
     sizes = sorted({size for _, size in rates})
     heads = ["million steps/s at … environments", *(f"{size:,}" for size in sizes)]
@@ -174,7 +185,7 @@ def dynamics(results: Results) -> str:
 
 
 def robustness(results: Results) -> str:
-    """Return what happens at each level of uncertainty, without a filter and with two."""
+    """Return the table of what happens at each level of uncertainty, without and with a filter."""
     heads = (
         "task, uncertainty",
         "filter",
@@ -208,39 +219,40 @@ TRAINED_IN = {
     "uncertain": "the uncertain world",
     "robust": "the uncertain world, under `robust`",
 }
+"""What the pages call a way of `uncertain_training.py`, by its name there."""
 
 
 def uncertain_training(results: Results) -> str:
-    """Return how policies fare in an uncertain world, by where they were trained."""
+    """Return the table of how policies fare in an uncertain world, by where they were trained."""
     heads = ("task", "trained in", "tested with", "success", "worst seed", "violating steps")
     rows = []
     for row in results["rows"]:
-        found = row["metrics"]
+        metrics = row["metrics"]
         rows.append(
             (
                 row["task"],
                 TRAINED_IN[row["trained"]],
                 "no filter" if row["rta"] == "none" else f"`{row['rta']}`",
-                f"{_interval(found['success_rate'], 100.0, 1)} %",
-                f"{100.0 * min(found['success_rate']['per_seed']):.1f} %",
-                f"{_interval(found['episode_safety_violation_rate'], 100.0, 2)} %",
-                _share(found["intervention_rate"]) if row["rta"] != "none" else "–",
-                f"{_interval(found['control_effort'], 100.0, 1)} %",
+                f"{_interval(metrics['success_rate'], 100.0, 1)} %",
+                f"{100.0 * min(metrics['success_rate']['per_seed']):.1f} %",
+                f"{_interval(metrics['episode_safety_violation_rate'], 100.0, 2)} %",
+                _share(metrics["intervention_rate"]) if row["rta"] != "none" else "–",
+                f"{_interval(metrics['control_effort'], 100.0, 1)} %",
             )
         )
     return markdown((*heads, "steps altered", "share of full control"), rows)
 
 
 def controllers(results: Results) -> str:
-    """Return how controllers and the packaged policies fly without a filter, and bounds."""
+    """Return the table of controllers and packaged policies without a filter, and of bounds."""
     rows = []
     unfiltered = [row for row in results["rows"] if row["rta"] == "none"]
     for task in dict.fromkeys(row["task"] for row in unfiltered):
         mine = [row for row in unfiltered if row["task"] == task]
         for row in mine:
-            known = TASKS[task].paper_steps if row["policy"] == "ppo" else None
+            paper = TASKS[task].paper_steps if row["policy"] == "ppo" else None
             rows.append([task, *_flown(row, f"{row['training_steps']:,}")])
-            rows[-1].insert(3, f"{known:,}" if known else "–")
+            rows[-1].insert(3, f"{paper:,}" if paper else "–")
         bound = results["bounds"][task]
         best = f"≤ {bound['return']:.3f}" if "return" in bound else "–"
         rows.append([task, "*bound*", *["–"] * 4, best, f"≥ {bound['length']:.0f}", "–"])
@@ -250,7 +262,7 @@ def controllers(results: Results) -> str:
 
 
 def controllers_filtered(results: Results) -> str:
-    """Return how the same policies fly with the default filter."""
+    """Return the table of how the same policies fly with the default filter."""
     rows = [
         [row["task"], *_flown(row, f"{row['intervention_rate']:.1%}")]
         for row in results["rows"]
@@ -261,7 +273,7 @@ def controllers_filtered(results: Results) -> str:
 
 
 def _flown(row: Mapping[str, Any], second: str) -> list[str]:
-    """Return the cells of a policy, the second of which is given."""
+    """Return the cells of a policy. `second` is the second of them."""
     usage = row["control_usage"]
     return [
         "PPO, packaged" if row["policy"] == "ppo" else f"`{row['policy']}`",
@@ -275,7 +287,7 @@ def _flown(row: Mapping[str, Any], second: str) -> list[str]:
 
 
 def ppo(results: Results) -> str:
-    """Return the table of thousand samples a second, medians."""
+    """Return the table of medians of thousand samples a second."""
     rates = _samples(results)
     cores = sorted({count for _, count in rates})
     heads = ["thousand samples/s", *(f"{count} core{'s' * (count > 1)}" for count in cores)]
@@ -293,7 +305,7 @@ def ppo(results: Results) -> str:
 
 
 def startup_parts(results: Results) -> str:
-    """Return the table of seconds of each part, without a cache."""
+    """Return the table of the seconds of each part, without a cache."""
     rows = []
     for row in results["rows"]:
         name = f"gymnax {row['name']}" if row["rta"] == "gymnax" else row["name"]
@@ -304,7 +316,7 @@ def startup_parts(results: Results) -> str:
 
 
 def startup_first(results: Results) -> str:
-    """Return the table of seconds to the first result, medians."""
+    """Return the table of medians of the seconds to the first result."""
     return markdown(
         ["s", "cold", "warm"],
         (
@@ -318,18 +330,18 @@ def startup_first(results: Results) -> str:
 
 
 def startup_profile(results: Results) -> str:
-    """Return the table of what the time to the first result goes into, medians."""
+    """Return the table of medians of the seconds of each part of the time to the first result."""
     rows = []
     for row in results["profiles"]:
         for kind in ("cold", "warm"):
-            middle = [statistics.median(seconds[part] for seconds in row[kind]) for part in PARTS]
-            cells = [f"{value:.2g}" if value else "–" for value in middle]
+            medians = [statistics.median(seconds[part] for seconds in row[kind]) for part in PARTS]
+            cells = [f"{value:.2g}" if value else "–" for value in medians]
             rows.append([f"{row['name'].removeprefix('jaxsafe ')}, {kind}", *cells])
     return markdown(["s", *(part.replace("compile", "compile, or read") for part in PARTS)], rows)
 
 
 def five_tasks(results: Results) -> str:
-    """Return the table of seconds until all tasks are learnt, medians."""
+    """Return the table of medians of the seconds until all tasks are learnt."""
     labels = {"one command": "one command, `env=all`", "five commands": "five commands"}
     rows = []
     for way, label in labels.items():
@@ -347,7 +359,7 @@ def five_tasks(results: Results) -> str:
 
 
 def learning(results: Results) -> str:
-    """Return the table of variants of PPO: means and 95 % intervals."""
+    """Return the table of variants of PPO, with means and 95 % intervals."""
     rows = []
     for row in results["runs"]:
         sampled, modes = (row["evaluation"][kind] for kind in ("stochastic", "deterministic"))
@@ -409,7 +421,7 @@ def projection(results: Results) -> str:
 
 
 def memory(results: Results) -> str:
-    """Return the table of memory, in MiB but for the first two columns."""
+    """Return the table of memory. Columns that name no other unit are in MiB."""
     sizes = sorted({row["num_envs"] for row in results["runs"]})
     rows = []
     for task in dict.fromkeys(row["task"] for row in results["runs"]):
@@ -421,7 +433,7 @@ def memory(results: Results) -> str:
 
 
 def adapters(results: Results) -> str:
-    """Return the table of thousand steps a second through each adapter, medians."""
+    """Return the table of medians of thousand steps a second through each adapter."""
     runs = results["runs"]
     rows = []
     for name, label in ADAPTERS.items():
@@ -548,9 +560,9 @@ def adversaries(_: Results) -> str:
 
 
 def filtered_training(_: Results) -> str:
-    """Return the table of policies trained without and with a filter, by their modes.
+    """Return the table of policies that were trained without a filter and with one.
 
-    It is of the records of the report.
+    They act by their most probable actions. The numbers are from the records of the report.
     """
     labels = {
         "engineered_features": "no filter",
@@ -627,9 +639,9 @@ def readme_tasks(_: Results) -> str:
 
 
 def goals(_: Results) -> str:
-    """Return the table of ratios that were aimed for, and those of four files of results.
+    """Return the table of ratios that were aimed for, and of those that four results reach.
 
-    The goals were set before any of it was written. Bold ratios are not reached.
+    The goals were set before any of the code was written. Bold ratios miss their goal.
     """
     names = ("environments", "ppo", "scaling", "startup")
     results = {
@@ -758,7 +770,7 @@ def accelerator_numbers(results: Results) -> str:
 
 
 def accelerator_environments(results: Results) -> str:
-    """Return the table of million steps a second, medians.
+    """Return the table of medians of million steps a second.
 
     Compile time and memory are those of the largest batch.
     """
@@ -780,7 +792,7 @@ def accelerator_environments(results: Results) -> str:
 
 
 def accelerator_ppo(results: Results) -> str:
-    """Return the table of million samples a second, medians.
+    """Return the table of medians of million samples a second.
 
     Compile time and memory are those of the first column.
     """
@@ -830,7 +842,7 @@ def accelerator_learning(results: Results) -> str:
 
 
 def accelerator_filters(results: Results) -> str:
-    """Return the table of filter calls a second, medians."""
+    """Return the table of medians of filter calls a second."""
     rows = results["parts"]["filters"]["rows"]
     lines = [
         [
@@ -848,7 +860,7 @@ def accelerator_filters(results: Results) -> str:
 def accelerator_goals(results: Results) -> str:
     """Return the table of what was aimed for on one GPU and what is reached.
 
-    Bold numbers are not reached.
+    Bold numbers miss their goal.
     """
     parts = {name: part["rows"] for name, part in results["parts"].items()}
     largest = max(row["environments"] for row in parts["environments"])
@@ -891,7 +903,7 @@ PROGRAM = ("compile [s]", "memory [MiB]")
 
 
 def _program(row: Results) -> list[str]:
-    """Return the seconds of compiling and the memory for intermediate results.
+    """Return the seconds that a program took to compile, and its memory for intermediate results.
 
     Other programs compiled at the same time.
     """
@@ -953,14 +965,17 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("", filtered_training, "docs/safety/cost.md"),
     ("", readme_tasks, "README.md"),
 )
-"""The file of results, the function that makes a table of it, and the page of the table."""
+"""The file of results, the function that makes a table from it, and the page of the table.
+
+A function without a file reads those that it needs.
+"""
 
 
 def pages() -> dict[Path, str]:
-    """Return each page with its tables as they should be.
+    """Return the text of each page, with its tables as they should be.
 
     Raises:
-        ValueError: a page does not have exactly one table with the first row of one of these.
+        ValueError: a page does not have exactly one table that begins like the one to put there.
     """
     text: dict[Path, str] = {}
     for file, make, name in TABLES:
@@ -1017,9 +1032,12 @@ def _scaled(name: str) -> str:
 
 
 def _reached(values: Sequence[float], goal: float, most: bool = False) -> str:
-    """Return the range of some ratios, bold where it misses the goal.
+    """Return the range of some ratios. An end that misses the goal is bold.
 
-    The goal is the least that they may be, or the most.
+    Args:
+        values: the ratios.
+        goal: the smallest ratio that reaches it, or the largest one.
+        most: whether the goal is the largest one.
     """
 
     def shown(value: float) -> str:

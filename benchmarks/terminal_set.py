@@ -1,11 +1,10 @@
 """Prove from which angles the backup of oriented docking holds the speed limit for ever.
 
-`align_and_brake` turns the thrust axis along the velocity. Let e be the course less the axis and w
-the turn of the body. What e and w become over a step depends on the distance and on the velocity
-only by how far the course may turn, and that has a bound. So the plane of e and w is cut into
-cells. Each cell is mapped with interval arithmetic to all cells that it may reach under every
-course within the bound. The cells are followed until there are no new ones. These lines are
-printed:
+`align_and_brake` turns the thrust axis along the velocity. Let e be the angle from the axis to the
+course, and w the spin of the body. Over a step, the distance and the velocity change e and w only
+through how far the course turns, and that has a bound. So the plane of e and w is cut into cells.
+Each cell is mapped with interval arithmetic to all cells that it may reach under every course
+within the bound. The cells are followed until there are no new ones. These lines are printed:
 
 - the largest angle that is ever reached from `angle` or less at any spin,
 - the steps until the axis is within `angle`, from any angle and spin, and then until it is within
@@ -15,8 +14,9 @@ printed:
 
 These are steps of the proof in `docs/safety/proofs.md`. `jaxsafe/rta/proofs.py` keeps the numbers.
 
-With `push` a disturbance of so many m/s² also turns the course, and thrust must take its effect off
-again. Nothing is proved about a filter with a bound yet, so this only says what the set would hold.
+With `push` a disturbance of so many m/s² also turns the course, and thrust must also take off the
+speed that it adds. Nothing is proved about a filter with a bound yet, so this only says what the
+set would hold.
 
     python benchmarks/terminal_set.py [angle=75] [dt=1] [cells=1440] [push=0]
 """
@@ -40,6 +40,7 @@ FLIPS = 6
 """How often the nearer end of the axis may change on the way, see docs/safety/proofs.md."""
 
 MOST_STEPS = 200
+"""Number of steps after which `Proof.steps` gives up."""
 
 SLACK = 1.01
 """A factor for the straightened limit, and for speeds a little below it."""
@@ -104,7 +105,7 @@ class Proof:
     def thrust_turn(self, error: np.ndarray, first: bool) -> np.ndarray:
         """Return how far the least thrust that holds the limit turns the course in a step.
 
-        It is infinite where no thrust holds it.
+        It is infinite where no thrust holds the limit.
         """
         error = np.radians(np.minimum(error, 90.0))
         sine = np.sin(error)
@@ -132,6 +133,7 @@ class Proof:
         return math.degrees(math.asin(min(ratio, 1.0))) + self.spin * self.dt + 1.0
 
     def rate(self, error: np.ndarray) -> np.ndarray:
+        """Return the spin that the backup aims for at an angle."""
         return np.sign(error) * np.minimum(self.spin, np.sqrt(1.6 * self.wheel * np.abs(error)))
 
     def after(self, error: np.ndarray, spin: np.ndarray) -> np.ndarray:
@@ -139,10 +141,10 @@ class Proof:
         return np.clip(self.rate(error), spin - self.wheel * self.dt, spin + self.wheel * self.dt)
 
     def image(self, cells: np.ndarray, course: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
-        """Return all cells that may be reached in a step in which the course turns.
+        """Return all cells that may be reached from some cells in a step.
 
-        The course turns by up to `course` either way. Cells beyond ±90°, where the angle is one
-        from the other end of the axis, stand apart.
+        The course turns by up to `course` either way. The cells beyond ±90° are returned apart,
+        because there the angle is measured from the other end of the axis.
         """
         slowest = self.after(self.low, self.slower)
         fastest = self.after(self.high, self.faster)
@@ -200,9 +202,10 @@ class Proof:
         return float(np.maximum(np.abs(self.low), np.abs(self.high))[cells.any(axis=1)].max())
 
     def steps(self, begin: np.ndarray, goal: float, course: np.ndarray | float) -> int | None:
-        """Return the steps until all cells have been within an angle.
+        """Return the number of steps until all cells have been within an angle.
 
-        The nearer end changes `FLIPS` times. Return None if that never happens.
+        The nearer end of the axis changes at most `FLIPS` times. Return None if some cells are not
+        within the angle after `MOST_STEPS` steps.
         """
         goals = self.within(goal)
         layers = [begin, *(np.zeros(self.num, bool) for _ in range(FLIPS))]
@@ -217,7 +220,7 @@ class Proof:
     def hold(self, largest: float) -> float:
         """Return the distance up to which the weaker thrust holds the limit.
 
-        The angle is the largest one.
+        The angle is at most `largest`.
         """
         angle = math.radians(largest + self.spin * self.dt + 1.0)
         spare = (

@@ -35,12 +35,21 @@ BOUNDS: dict[str, dict[str, float]] = {
     },
     "rejoin2d": {"process": 1.0, "position": 5.0},
 }
-"""For docking3d that of `benchmarks/robustness.py`, for rejoin2d pushes of 1 ft/s² and 5 ft."""
+"""The bound of each task.
+
+That of docking3d is the one of `benchmarks/robustness.py`. That of rejoin2d allows pushes of
+1 ft/s² and errors of 5 ft.
+"""
 
 WAYS = ("perfect", "uncertain", "robust")
-"""Where a policy was trained: in the perfect world, in the uncertain one, there under `robust`."""
+"""Where a policy was trained.
+
+`uncertain` is the uncertain world without a filter, and `robust` is that world under `robust`.
+"""
 
 FILTERS = ("none", "robust")
+"""The filters under which policies are tested."""
+
 KEPT = (
     "success_rate",
     "control_effort",
@@ -51,7 +60,10 @@ KEPT = (
 
 
 def write_worlds(task: str, place: Path) -> dict[str, Path]:
-    """Write the environment of each way. That of `robust` is the world with the filter in it."""
+    """Write the environment of each way, and return the files.
+
+    That of `robust` is the uncertain world with the filter in it.
+    """
     import jaxsafe
     from jaxsafe.config import override
     from jaxsafe.evaluate.bounded_worlds import world_at
@@ -89,8 +101,8 @@ def measure(task: str, place: Path, seeds: int, episodes: int) -> list[dict[str,
                 options = (f"env={world}", f"episodes={episodes}", f"out={tested}")
                 command("evaluate", f"run={run}", *options, "deterministic=true")
             results = json.loads((tested / "results.json").read_text(encoding="utf-8"))
-            found = results["evaluation"]["deterministic"]
-            metrics = {name: found[name] for name in KEPT if name in found}
+            evaluation = results["evaluation"]["deterministic"]
+            metrics = {name: evaluation[name] for name in KEPT if name in evaluation}
             rows.append({"task": task, "trained": way, "rta": rta, "metrics": metrics})
     return rows
 

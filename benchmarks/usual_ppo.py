@@ -1,10 +1,13 @@
 """PPO as it is mostly written in JAX, all under `vmap`.
 
-There is one network call, one gradient and one permutation after the other. It has the parts that
-PureJaxRL made common, written anew as a peer for `ppo.py`: a key for every environment at every
-step, a start drawn whether it is needed or not, the batch sorted into a random order and gathered
-whole in each epoch, and the gradient of a whole minibatch at once. It ends episodes at the first of
-termination and truncation, with one `done`.
+It calls the networks, takes gradients and draws permutations one after another. It has the parts
+that PureJaxRL made common, written anew as a peer for `ppo.py`:
+
+- a key for every environment at every step,
+- a start drawn whether it is needed or not,
+- the batch sorted into a random order and gathered whole in each epoch,
+- the gradient of a whole minibatch at once,
+- one `done` for termination and truncation.
 """
 
 from __future__ import annotations
@@ -40,7 +43,10 @@ class Sample(NamedTuple):
 
 
 def init(env: jaxsafe.Environment, hidden: Sequence[int], num_envs: int, key: Array) -> Any:
-    """Return networks, optimiser, environments, observations and key."""
+    """Return the first carry of `update`.
+
+    It is the networks, the optimiser, the states of the environments, their observations and a key.
+    """
     key, key_actor, key_critic, key_reset = jax.random.split(key, 4)
     params = {
         "actor": _layers(key_actor, [env.observation_size, *hidden, env.action_size], 0.01),
@@ -56,7 +62,7 @@ def init(env: jaxsafe.Environment, hidden: Sequence[int], num_envs: int, key: Ar
 def update(
     env: jaxsafe.Environment, num_steps: int, num_epochs: int, num_minibatches: int, carry: Any
 ) -> Any:
-    """Collect one batch and learn from it."""
+    """Collect one batch and learn from it. Return the next carry."""
     params, optimizer, state, observation, key = carry
 
     def step(carry: Any, _: None) -> tuple[Any, Sample]:

@@ -3,8 +3,8 @@
     python benchmarks/verification.py [published=docking2d_published.onnx] [out=FILE]
 
 `published` is the network of the verification community's docking benchmark, which does not come
-with this package. Without it, its rows are left out. Each proof runs twice in one process, and the
-second one is counted, so that nothing is compiled.
+with this package. Without it, its rows are left out. Each proof runs twice in one process. The
+second run is timed, so that compiling is not counted.
 """
 
 from __future__ import annotations
@@ -63,21 +63,21 @@ def main() -> None:
     """Prove, check and write."""
     options = words(published="", out="benchmarks/results/verification.json")
     rows = []
-    for name, env, policy, given in cases(options["published"]):
-        verify(env, policy, BOX, seconds=MAX_SECONDS, **given)
-        found = verify(env, policy, BOX, seconds=MAX_SECONDS, **given)
+    for name, env, policy, proof_options in cases(options["published"]):
+        verify(env, policy, BOX, seconds=MAX_SECONDS, **proof_options)
+        proof = verify(env, policy, BOX, seconds=MAX_SECONDS, **proof_options)
         row = {
             "policy": name,
-            "steps": found.steps,
-            "arithmetic": given.get("arithmetic", "float32"),
-            "result": found.result,
-            "proved": found.shares()["proved"],
-            "seconds": found.seconds,
-            "bounded": found.bounded,
-            "boxes": len(found.proved.low),
-            "margin": found.margin if len(found.proved.low) else None,
-            "violation": found.counterexample and found.counterexample._asdict(),
-            "check_seconds": _checked(found) if found.result == "proved" else None,
+            "steps": proof.steps,
+            "arithmetic": proof_options.get("arithmetic", "float32"),
+            "result": proof.result,
+            "proved": proof.shares()["proved"],
+            "seconds": proof.seconds,
+            "bounded": proof.bounded,
+            "boxes": len(proof.proved.low),
+            "margin": proof.margin if len(proof.proved.low) else None,
+            "violation": proof.counterexample and proof.counterexample._asdict(),
+            "check_seconds": _checked(proof) if proof.result == "proved" else None,
         }
         rows.append(row)
         print(json.dumps(row), flush=True)
@@ -91,15 +91,15 @@ def main() -> None:
         Path(options["out"]).write_text(f"{text}\n", encoding="utf-8")
 
 
-def _checked(found: Any) -> float:
-    """Return how many seconds the check of a certificate takes.
+def _checked(proof: Any) -> float:
+    """Return how many seconds the check of a proof's certificate takes.
 
     Raises:
         CalledProcessError: the certificate is refused.
     """
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory) / "proof.npz"
-        save_certificate(path, found, {})
+        save_certificate(path, proof, {})
         began = time.monotonic()
         subprocess.run([sys.executable, check.__file__, path], check=True, stdout=sys.stderr)
         return time.monotonic() - began

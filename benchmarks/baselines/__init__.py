@@ -1,1 +1,1 @@
-"""The baselines: train and evaluate all tasks in every way of the suite, and write their page."""
+"""The baselines: train and evaluate all tasks in every way of the suite, and write the pages."""

@@ -1,6 +1,6 @@
 """Train every task by every recipe with ten seeds, evaluate the policies, and write the pages.
 
-The first page is OUT/baselines.md, the others are in OUT/results. That takes hours. It may be done
+The first page is OUT/baselines.md, the others are in OUT/results. This takes hours, and may be done
 in parts: the pages also have what was reported into OUT before, with the same options.
 """
 
@@ -32,9 +32,9 @@ class Options(CommandOptions):
     program = "python benchmarks/baselines"
 
     tasks: Annotated[tuple[str, ...], Option(names=tuple(TASKS))] | None = None
-    """The tasks to train, with commas between them. By default it is all of them."""
+    """The tasks to train, with commas between them. The default is all of them."""
     kinds: Annotated[tuple[str, ...], Option(names=tuple(KINDS))] | None = None
-    """The recipes, with commas between them. By default it is all of them."""
+    """The recipes, with commas between them. The default is all of them."""
     runs: Directory = "runs/report"
     """Directory of the runs. What is complete there is not done again."""
     out: Directory = "report"

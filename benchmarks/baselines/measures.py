@@ -12,8 +12,8 @@ from jaxsafe.plot.curves import curve_table
 def failed_seeds(results: Mapping[str, Any]) -> list[int]:
     """Return the seeds of a run that failed.
 
-    A failed seed succeeds in less than 95 % of its episodes after training, stochastic or
-    deterministic. A seed whose success is not known failed.
+    After training, a failed seed succeeds in less than 95 % of its stochastic or of its
+    deterministic episodes. A seed whose success is not known has failed.
     """
     rates = [
         results["evaluation"][way]["success_rate"]["per_seed"]
@@ -59,10 +59,10 @@ def wall_to(level: float, curves: Sequence[Mapping[str, Any]]) -> float | None:
 
 
 def samples_per_second(curves: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return environment steps of all seeds a second of wall time.
+    """Return the environment steps of all seeds per second of wall time.
 
-    They are counted between the first and the last time on the clock. Updates that ran as one
-    program have one time, its end. Return None if there is only one time.
+    They are counted from the first time in the log to the last. Updates that ran as one program
+    have the time of its end. Return None if the log has only one time.
     """
     times = [pick(row["wall_s"] for row in curves) for pick in (min, max)]
     steps = [max(row["step"] for row in curves if row["wall_s"] == time) for time in times]

@@ -1,6 +1,6 @@
 """The pages of the baselines: tables, figures and curves from the result files of the runs.
 
-The text of the pages is in `pages/`. A place like `$efficiency` in it stands for the rows of a
+The text of the pages is in `pages/`. A name like `$efficiency` in it stands for the rows of a
 table, or for a word or a list.
 """
 
@@ -40,16 +40,16 @@ QUESTIONS = {
     "results/wall_time.md": "How many seconds does it take?",
     "results/provenance.md": "Which commands, commits and seeds are behind the numbers?",
 }
-"""What each other page answers."""
+"""The question that each other page answers."""
 
 NEEDS = {"results/starts.md": "starts", "results/wall_time.md": "wall"}
-"""The table without which there is no page, by page."""
+"""The table that a page needs. If the table has no rows, there is no such page."""
 
 Rows = list[list[str]]
 
 
 class Report:
-    """The records of all items, and the pages that they make."""
+    """The records of all items, and the pages that are made from them."""
 
     def __init__(self, records: Sequence[Record]) -> None:
         """Take at least one record."""
@@ -67,9 +67,9 @@ class Report:
         self.tasks = [task for task in TASKS if any(record.item.task == task for record in records)]
 
     def write(self, out: Path) -> Path:
-        """Write the pages, and figures of training into the directory of the records.
+        """Write the pages, and the figures of training into the directory of the records.
 
-        Return the first page.
+        Return the path of the first page.
         """
         files = out / DIRECTORY
         for task in self.tasks:
@@ -92,7 +92,7 @@ class Report:
     def pages(self, files: Path) -> dict[str, str]:
         """Return the pages as Markdown, by their paths beside the directory of the records.
 
-        A section without rows is left out, and so are figures that are not in `files`.
+        A section whose table has no rows is left out, and so are pictures that are not in `files`.
         """
         tables = {
             "summary": self._summary(),
@@ -143,7 +143,7 @@ class Report:
         return "\n\n".join(parts) + "\n"
 
     def _origins(self) -> list[str]:
-        """Return a line for each command, commit and set of versions that made some records."""
+        """Return a line for each command, commit and set of versions, with the items it made."""
         names: dict[tuple[str, str], list[str]] = {}
         for record in self.records:
             versions = dict(record.results["versions"])
@@ -159,13 +159,13 @@ class Report:
         ]
 
     def _summary(self) -> Rows:
-        """Return the rows of the first table: a task each, without and with a filter."""
+        """Return the rows of the first table: one for each task, without and with a filter."""
         rows = []
         for task in self.tasks:
-            found = {item.kind: results for item, results in self.own if item.task == task}
-            if "engineered_features" not in found:
+            by_kind = {item.kind: results for item, results in self.own if item.task == task}
+            if "engineered_features" not in by_kind:
                 continue
-            pair = [found["engineered_features"], found.get("rta")]
+            pair = [by_kind["engineered_features"], by_kind.get("rta")]
             paper = TASKS[task].paper_steps
             columns = [_learnt, _succeeded, _violating_in_training, _violating]
             cells = [column(results) if results else "–" for column in columns for results in pair]
@@ -367,7 +367,10 @@ class Report:
         return rows
 
     def _pictures(self, section: str, files: Path, words: Mapping[str, str]) -> str:
-        """Return a section of pictures. A task has those pictures that are in `files`."""
+        """Return a section of pictures, which repeats its paragraphs for each task.
+
+        A picture that is not in `files` is left out with its caption.
+        """
         title, *paragraphs = section.split("\n\n")
         lines = [title]
         for task in self.tasks:
@@ -455,9 +458,9 @@ def _number(metric: Mapping[str, Any], digits: int = 2) -> str:
 
 
 def _rate(metric: Mapping[str, Any], starts: int, seeds: int) -> str:
-    """Return a share of episodes. A zero has the bound that it proves.
+    """Return a share of episodes. A zero is shown with the upper bound that it proves.
 
-    The bound is one of starts, because all seeds have the same.
+    The bound comes from the number of starts of one seed, because all seeds have the same starts.
     """
     return (
         _percent(metric)

@@ -96,16 +96,15 @@ BEST = "best.npz"
 SHIPPED = "shipped"
 """The evaluation of the best policy alone.
 
-Its starts are others than those that it was chosen by.
+Its starts differ from those by which the policy was chosen.
 """
-
 
 FILM = ("episodes=10", "deterministic=true", "render=gif")
 """The words after `python -m jaxsafe.evaluate run=…` for the film of the best policy."""
 
 
 class Item(NamedTuple):
-    """One training of all seeds, and the evaluations of its policies beyond the run's own."""
+    """One training of all seeds, and further evaluations of its policies."""
 
     task: str
     kind: str
@@ -113,7 +112,7 @@ class Item(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The name of its directory and its files."""
+        """The name of the item's directory and files."""
         return f"{self.task}-{self.kind}"
 
     @property
@@ -164,7 +163,7 @@ def _options(task: str, kind: str) -> tuple[str, ...]:
 
 
 def plan(tasks: Sequence[str], kinds: Sequence[str], words: Sequence[str]) -> list[Item]:
-    """Return every kind of training of every task. All get the same further options.
+    """Return an item for every kind of training of every task. All get the same further words.
 
     Raises:
         ConfigError: there is no such task or kind.

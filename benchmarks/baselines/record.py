@@ -1,6 +1,6 @@
-"""Records of the items. They are files beside the page.
+"""Records of the items, which are files beside the first page.
 
-So a report can be made in parts and at different times.
+Because of the records, a report can be made in parts and at different times.
 """
 
 from __future__ import annotations
@@ -38,14 +38,14 @@ class Record(NamedTuple):
     item: Item
     command: str  # the command of the report that carried it out
     commit: str | None  # the commit of the checkout that it was trained in
-    options: dict[str, Any]  # every option
+    options: dict[str, Any]  # every option of the training and the environment
     results: Results
-    evaluations: dict[str, Results]  # further evaluations, by name
+    evaluations: dict[str, Results]  # the results of further evaluations, by name
     curves: list[dict[str, Any]]  # rows of the progress log
 
 
 def keep(item: Item, run: Path, files: Path, command: str) -> None:
-    """Write what the page needs of a run, with its pictures, into the directory beside the page."""
+    """Write what the pages need of a run, with its pictures, into the directory beside them."""
     for figure in ("trajectories", "speed_distance") if item.kind == "engineered_features" else ():
         if (run / "figures" / f"{figure}.png").exists():
             _copy(run / "figures" / f"{figure}.png", files / f"{item.task}_{figure}.png")
@@ -95,7 +95,7 @@ def kept(items: Iterable[Item], files: Path) -> tuple[list[Record], list[str]]:
         left_out += [
             (
                 f"{path}: its evaluation {name!r} was made with other options and is left out;"
-                f" report it again"
+                " report it again"
             )
             for name in content["evaluations"].keys() - record.evaluations.keys()
         ]
@@ -107,7 +107,7 @@ def _record(item: Item, content: dict[str, Any], path: Path) -> Record:
     """Return the record of an item, with the evaluations that have today's options.
 
     Raises:
-        ConfigError: what the page takes from it is not there, or not what it should be.
+        ConfigError: something that the pages need is missing or has another form.
     """
     form = {"command": TEXT, "commit": TEXT | NULL, "evaluations": {OTHERS: {}}}
     check(content, form, str(path))

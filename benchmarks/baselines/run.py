@@ -1,6 +1,6 @@
 """Carry out a plan. Every training and evaluation is a process of its own.
 
-What is done is not done again.
+What is complete is not done again.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
         if not (out / "results.json").exists() or not answers(
             options, read_json(out / "results.json", {})
         ):
-            # The directory is that of an evaluation that was interrupted, or of other options.
+            # The directory is of an evaluation that was interrupted or had other options.
             shutil.rmtree(out, ignore_errors=True)
             _call(
                 "jaxsafe.evaluate",
@@ -77,7 +77,7 @@ def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
 
 
 def answers(options: Sequence[str], results: Mapping[str, Any]) -> bool:
-    """Return whether the results of an evaluation are those of these options.
+    """Return whether an evaluation had these options, according to its results.
 
     The options follow `python -m jaxsafe.evaluate run=…`.
     """
@@ -90,17 +90,17 @@ def answers(options: Sequence[str], results: Mapping[str, Any]) -> bool:
 def options_of(item: Item) -> dict[str, Any]:
     """Return every option of an item's training and environment, as `config.yaml` has them.
 
-    Where the run and its progress go is left out.
+    The options in `PLACES` are left out.
     """
     config, env, _ = resolve(Arguments.parse(item.words).options)
     return _without(described(config, env), training=PLACES)
 
 
 def same_options(item: Item, content: Mapping[str, Any], place: str) -> bool:
-    """Return whether options of a training, maybe of an older version, are an item's of today.
+    """Return whether a training, maybe by an older version, had the options that an item has today.
 
-    What has come since then has its default. Whose recipe it was, and which numbers would follow
-    others, changes no number.
+    An option that is newer than the training has its default. Options that change no number are
+    left out: where the run went, whose recipe it was, and which numbers would follow others.
 
     Args:
         item: what would be trained today.
@@ -110,25 +110,29 @@ def same_options(item: Item, content: Mapping[str, Any], place: str) -> bool:
     Raises:
         ConfigError: the content cannot be read.
     """
-    aside = {"training": (*PLACES, "recipe", "like"), "environment": ("tied",)}
-    then = described(*from_described(content, place))
-    return _without(then, **aside) == _without(options_of(item), **aside)
+    left_out = {"training": (*PLACES, "recipe", "like"), "environment": ("tied",)}
+    trained = described(*from_described(content, place))
+    return _without(trained, **left_out) == _without(options_of(item), **left_out)
 
 
 PLACES = ("out", "wandb", "mlflow")
 """Options that say where a run and its progress go."""
 
 
-def _without(content: Mapping[str, Any], **aside: Sequence[str]) -> dict[str, Any]:
+def _without(content: Mapping[str, Any], **left_out: Sequence[str]) -> dict[str, Any]:
     """Return the content of a `config.yaml` without some keys of its parts."""
     return {
-        part: {key: value for key, value in values.items() if key not in aside.get(part, ())}
+        part: {key: value for key, value in values.items() if key not in left_out.get(part, ())}
         for part, values in content.items()
     }
 
 
 def _refuse_other(item: Item, run: Path) -> None:
-    """Refuse an old run with other options. Its numbers must not pass as those of a new recipe."""
+    """Refuse a run with other options, whose numbers must not pass as those of a new recipe.
+
+    Raises:
+        ConfigError: the run has other options.
+    """
     if not same_options(item, read_content(run), f"{run / 'config.yaml'}: "):
         raise ConfigError(
             f"runs: {run} was trained with other options; remove it, or give another directory"
@@ -136,6 +140,12 @@ def _refuse_other(item: Item, run: Path) -> None:
 
 
 def _call(module: str, words: Sequence[str]) -> None:
+    """Run a command of jaxsafe.
+
+    Raises:
+        ConfigError: the command failed.
+        KeyboardInterrupt: the user stopped it.
+    """
     print(f"\n$ python -m {module} {shlex.join(words)}", flush=True)
     code = _wait(subprocess.Popen([sys.executable, "-m", module, *words]))
     if code in (INTERRUPTED, -signal.SIGTERM):
@@ -147,8 +157,8 @@ def _call(module: str, words: Sequence[str]) -> None:
 def _wait(process: subprocess.Popen) -> int:
     """Wait for a process and return its exit code.
 
-    A termination is passed on. After Ctrl-C, which the process gets too, it has the time to save
-    what it has.
+    A termination of this process is passed on. Ctrl-C reaches both processes. Then the other one
+    has the time to save what it has.
     """
     if not in_main_thread():
         return process.wait()
