@@ -2,7 +2,7 @@
 
     pip install '.[brax]' && python examples/brax_docking2d.py [ppo | sac | apg]
 
-APG differentiates the reward through the spacecraft's dynamics. Brax's settings are a start and are
+APG differentiates the reward through the spacecraft's dynamics. The settings are a start and are
 not tuned.
 """
 
@@ -28,10 +28,10 @@ def train(algorithm: str, scale: float = 1.0) -> dict[str, Any]:
 
     def progress(step: int, metrics: dict[str, Any]) -> None:
         seen.append(metrics)
-        facts = {
+        shown = {
             name: float(metrics[f"eval/episode_{name}"]) for name in ("reward", "success", "cost")
         }
-        print(f"{step:>10,}", *(f"{name} {value:.2f}" for name, value in facts.items()), flush=True)
+        print(f"{step:>10,}", *(f"{name} {value:.2f}" for name, value in shown.items()), flush=True)
 
     common = {
         "wrap_env_fn": wrap,

@@ -1,4 +1,4 @@
-"""The policy of the package docks in a batch of Gymnasium's environments.
+"""The packaged policy docks in a batch of Gymnasium's environments.
 
 It flies with run time assurance or without.
 
@@ -34,7 +34,7 @@ def fly(rta: str = "none", num_envs: int = 64) -> dict[str, float]:
             np.asarray(policy(key_now, observation))
         )
         done = terminated | truncated
-        # An environment that starts anew tells of its last step in `final_info`.
+        # Where an episode has ended, `info` is that of the next one, and `final_info` of the last.
         ended = info.get("final_info", info)
         success |= running & done & ended["is_success"]
         violated |= running & (np.where(done, ended["cost"], info["cost"]) > 0)

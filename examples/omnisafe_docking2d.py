@@ -18,7 +18,7 @@ import torch
 
 from jaxsafe.adapters.safety_gymnasium import SafetyEnv
 
-# OmniSafe imports it for its own tasks.
+# OmniSafe imports Safety-Gymnasium for tasks of its own, which are not used here.
 sys.modules.setdefault("safety_gymnasium", types.ModuleType("safety_gymnasium"))
 import omnisafe  # noqa: E402
 from omnisafe.envs.core import CMDP, env_register  # noqa: E402
@@ -46,7 +46,7 @@ class Docking(CMDP):
 
     @property
     def max_episode_steps(self) -> int:
-        """The limit of the task itself."""
+        """Number of steps after which the task itself ends an episode."""
         return 2001
 
     def step(self, action: torch.Tensor) -> tuple:
@@ -64,11 +64,11 @@ class Docking(CMDP):
         return self._tensor(observation), info
 
     def set_seed(self, seed: int) -> None:
-        """Begin the chains of keys."""
+        """Start every environment from a seed."""
         self.reset(seed=seed)
 
     def render(self) -> Any:
-        """Return nothing without a render mode."""
+        """Return a picture, or None without a render mode."""
         return self._env.render()
 
     def close(self) -> None:
@@ -79,10 +79,10 @@ class Docking(CMDP):
 
 
 def train(steps: int = 1_000_000, cost_limit: float = 25.0) -> Any:
-    """Train PPO-Lagrangian under a budget of violating steps an episode.
+    """Train PPO-Lagrangian under a budget of violating steps per episode.
 
-    Batches and rates suit the task. OmniSafe starts all environments anew in each epoch. With 8
-    environments its 16,384 steps hold an episode of 2,001.
+    Batches and rates suit the task. OmniSafe starts all environments anew in each epoch. So each of
+    the 8 environments takes 2,048 steps of the 16,384, which hold a whole episode of 2,001 steps.
     """
     rate = {"lr": 2e-3}
     agent = omnisafe.Agent(

@@ -2,7 +2,7 @@
 
     pip install '.[gymnax]' rejax && python examples/rejax_docking2d.py
 
-rejax 0.1.3 needs gymnax 0.0.9, and distrax a nightly TensorFlow Probability:
+rejax 0.1.3 needs gymnax 0.0.9, and its distrax needs a nightly TensorFlow Probability:
 
     pip install gymnax==0.0.9 six --pre tfp-nightly
 """
@@ -18,7 +18,10 @@ NUM_SEEDS = 4
 
 
 def train(steps: int = 500_000) -> tuple[jax.Array, jax.Array]:
-    """Return length and return of the evaluations, (seeds, evaluations, episodes)."""
+    """Train, and return length and return of the evaluations.
+
+    Both have the shape (seeds, evaluations, episodes).
+    """
     env = GymnaxEnv("docking2d", legacy=True)
     ppo = PPO.create(
         env=env,

@@ -1,7 +1,7 @@
 """Filters for a simulator of your own: a vehicle in the plane that must not hit an obstacle.
 
-The simulator is NumPy and knows nothing of jaxsafe. A policy flies straight at the obstacle, bare
-and with each of two filters.
+The simulator is NumPy and knows nothing of jaxsafe. A policy flies straight at the obstacle,
+without a filter and with each of two filters.
 
     pip install . && python examples/rta_own_simulator.py
 """
@@ -55,7 +55,7 @@ def brake(x):
 
 @jax.jit
 def by_asif(x, u):
-    """Return the nearest control under two barrier rows, and what happened."""
+    """Return the control that is nearest to u under two barriers, and what happened."""
     alpha = Polynomial(linear=0.5).of
     constraints = [
         Barrier(h=clearance, degree=2, alpha=alpha, priority=1),
@@ -66,7 +66,7 @@ def by_asif(x, u):
 
 @jax.jit
 def by_simplex(x, u):
-    """Return the control, or that of the brake, and what happened."""
+    """Return u or the control of the brake, and what happened."""
     constraints = [Barrier(h=clearance, margin=0.05), Barrier(h=speed_left, margin=0.01)]
     return filter_by_simplex(
         plant,
@@ -82,7 +82,9 @@ def by_simplex(x, u):
 def fly(filter_control=None):
     """Fly for 20 s and return the smallest clearance, the highest speed and the share altered."""
     x = np.array([-8.0, 0.3, 0.0, 0.0])
-    nearest, fastest, altered = np.inf, 0.0, 0
+    nearest = np.inf
+    fastest = 0.0
+    altered = 0
     for _ in range(200):
         u = np.clip(-x[:2] + [3.0, 0.0], -1.0, 1.0)
         if filter_control:

@@ -19,9 +19,9 @@ from jaxsafe.adapters.stable_baselines3 import SB3VecEnv
 
 
 class GrowingHorizon(BaseCallback):
-    """A horizon 1/(1 − gamma) that grows by a factor.
+    """A horizon 1/(1 − gamma) that grows by a factor over the training.
 
-    A short horizon finds the chief. A long one then finds the quick way.
+    With a short horizon the agent finds the chief. With a longer one it then finds the quick way.
     """
 
     def __init__(self, factor: float, steps: int) -> None:
@@ -61,7 +61,13 @@ def train(steps: int = 1_000_000, seed: int = 0) -> PPO:
 
 
 def success_rate(model: PPO, deterministic: bool, episodes: int = 100) -> float:
-    """Return the success rate from other starts, with sampled actions or with the modes."""
+    """Return the success rate from other starts than those of the training.
+
+    Args:
+        model: the trained model.
+        deterministic: whether it acts by the modes of its distributions. Else it samples.
+        episodes: number of episodes, each in an environment of its own.
+    """
     env = SB3VecEnv("docking2d", episodes)
     env.seed(1000)
     observation = env.reset()
