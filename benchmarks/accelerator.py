@@ -46,8 +46,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from isolated import several, words
-from machine import usable_cores
 
+from jaxsafe.devices.seed_mapper import usable_cores
 from jaxsafe.envs import TASKS
 
 HERE = Path(__file__).parent

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import subprocess
 from importlib.metadata import version
@@ -11,6 +10,7 @@ from typing import Any
 
 import jax
 
+from jaxsafe.devices.seed_mapper import usable_cores
 from jaxsafe.storage.provenance import processor
 
 
@@ -31,11 +31,6 @@ def about() -> dict[str, Any]:
         "processor": processor(),
         "cores": usable_cores(),
     }
-
-
-def usable_cores() -> int:
-    """Return how many cores this process may run on."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _git(*words: str) -> str:

@@ -55,7 +55,9 @@ def main() -> None:
         print(json.dumps(PROBES[options["probe"]](task)))
         return
     import tables
-    from machine import about, usable_cores
+    from machine import about
+
+    from jaxsafe.devices.seed_mapper import usable_cores
 
     here = about()
     peers = several("peers", options["peers"], PEERS)

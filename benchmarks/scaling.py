@@ -51,7 +51,9 @@ def main() -> None:
         print(PROBES[options["probe"]](task))
         return
     import tables
-    from machine import about, usable_cores
+    from machine import about
+
+    from jaxsafe.devices.seed_mapper import usable_cores
 
     here = about()
     cores = 1 << (usable_cores().bit_length() - 1)
