@@ -77,29 +77,30 @@ def main() -> None:
     """Measure, write the results and print the table."""
     options = words(envs="4096", names=",".join(MODELS), repeats="5", steps=str(NUM_STEPS))
     names = several("names", options["names"], MODELS)
-    request = [f"{name}={options[name]}" for name in ("envs", "repeats", "steps")]
+    sizes = {name: int(options[name]) for name in ("envs", "repeats", "steps")}
     if "probe" in options:
-        print(json.dumps(measure(options["probe"], *(int(word.split("=")[1]) for word in request))))
+        print(json.dumps(measure(options["probe"], **sizes)))
         return
     import tables
     from machine import about
 
     here = about()
+    request = [f"{name}={size}" for name, size in sizes.items()]
     runs = []
     for name in names:
         rate = probe(__file__, [f"probe={name}", *request], 1)
         runs.append({"model": name, "task": MODELS[name][0], **rate})
         print(f"{name}: {rate['steps_per_s']:,.0f}", file=sys.stderr)
-    content = {**here, "pinned_to": 1, "num_envs": int(options["envs"]), "runs": runs}
+    content = {**here, "pinned_to": 1, "num_envs": sizes["envs"], "runs": runs}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
     print(tables.dynamics(content))
 
 
-def measure(name: str, num_envs: int, repeats: int, num_steps: int) -> dict[str, Any]:
-    """Measure one model."""
+def measure(name: str, envs: int, repeats: int, steps: int) -> dict[str, Any]:
+    """Measure one model with some environments, in repeats of some steps."""
     task, changes = MODELS[name]
     run = functools.partial(episode_steps, jaxsafe.make(task, changes))
-    return compiled(run, num_envs, repeats, num_steps)
+    return compiled(run, envs, repeats, steps)
 
 
 if __name__ == "__main__":
