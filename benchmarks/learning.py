@@ -61,7 +61,7 @@ def trained(variant: str, asked: list[str]) -> dict[str, Any]:
 
     Return the steps to 80 % success, and the success and length of the episodes after training.
     """
-    from jaxsafe.commands import train as train
+    from jaxsafe.commands import train
     from jaxsafe.devices.seed_mapper import claim_cores
     from jaxsafe.train import ppo
 
