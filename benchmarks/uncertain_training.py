@@ -23,23 +23,14 @@ from pathlib import Path
 from typing import Any
 
 from isolated import several, words
+from robustness import BOUND
 
 OUT = Path(__file__).parent / "results" / "uncertain_training.json"
 BOUNDS: dict[str, dict[str, float]] = {
-    "docking3d": {
-        "process": 0.01,
-        "mass": 0.05,
-        "misalignment": 0.05,
-        "position": 1.0,
-        "velocity": 0.01,
-    },
+    "docking3d": BOUND,
     "rejoin2d": {"process": 1.0, "position": 5.0},
 }
-"""The bound of each task.
-
-That of docking3d is the one of `benchmarks/robustness.py`. That of rejoin2d allows pushes of
-1 ft/s² and errors of 5 ft.
-"""
+"""The bound of each task. That of rejoin2d allows pushes of 1 ft/s² and errors of 5 ft."""
 
 WAYS = ("perfect", "uncertain", "robust")
 """Where a policy was trained.
