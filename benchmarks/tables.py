@@ -8,7 +8,6 @@ write.
 
 from __future__ import annotations
 
-import json
 import re
 import statistics
 import sys
@@ -20,7 +19,7 @@ from baselines.plan import WITHOUT_RTA
 
 from jaxsafe.envs import TASKS
 from jaxsafe.metrics import with_interval
-from jaxsafe.storage.files import write_text
+from jaxsafe.storage.files import read_json, write_text
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -133,8 +132,7 @@ def markdown(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 def speed(_: Results) -> str:
     """Return the table of the steps a second of each task, and the seconds to learn it."""
     results = {
-        name: json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
-        for name in ("environments", "accelerator")
+        name: read_json(RESULTS / f"{name}.json") for name in ("environments", "accelerator")
     }
     core = _steps(results["environments"])
     rows = results["accelerator"]["parts"]["environments"]["rows"]
@@ -517,7 +515,7 @@ def attacks(_: Results) -> str:
     """Return the table of what all adversaries together achieved against each task's filter."""
     rows = []
     for task in DOCKING_FIRST:
-        results = json.loads((RESULTS / "falsify" / f"{task}.json").read_text(encoding="utf-8"))
+        results = read_json(RESULTS / "falsify" / f"{task}.json")
         policies = results["policies"]
         violating = [row["violating_steps"] + row["violating_steps_inside"] for row in policies]
         rows.append(
@@ -537,7 +535,7 @@ def adversaries(_: Results) -> str:
     """Return the table of what each adversary achieved against each task's filter."""
     rows = []
     for task in DOCKING_FIRST:
-        results = json.loads((RESULTS / "falsify" / f"{task}.json").read_text(encoding="utf-8"))
+        results = read_json(RESULTS / "falsify" / f"{task}.json")
         for row in results["policies"]:
             rows.append(
                 [
@@ -644,9 +642,7 @@ def goals(_: Results) -> str:
     The goals were set before any of the code was written. Bold ratios miss their goal.
     """
     names = ("environments", "ppo", "scaling", "startup")
-    results = {
-        name: json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")) for name in names
-    }
+    results = {name: read_json(RESULTS / f"{name}.json") for name in names}
     steps = _steps(results["environments"])
     samples = _samples(results["ppo"])
     scaled = _rates(results["scaling"])
@@ -980,7 +976,7 @@ def pages() -> dict[Path, str]:
     text: dict[Path, str] = {}
     for file, make, name in TABLES:
         page = ROOT / name
-        results = json.loads((RESULTS / f"{file}.json").read_text(encoding="utf-8")) if file else {}
+        results = read_json(RESULTS / f"{file}.json") if file else {}
         table = make(results)
         head = table.partition("\n")[0]
         before = text.get(page) or page.read_text(encoding="utf-8")
@@ -1004,7 +1000,7 @@ def main() -> None:
 
 
 def _record(task: str, kind: str) -> Results:
-    return json.loads((BASELINES / f"{task}-{kind}.json").read_text(encoding="utf-8"))
+    return read_json(BASELINES / f"{task}-{kind}.json")
 
 
 def _steps(results: Results) -> dict[tuple[str, int], float]:
