@@ -60,7 +60,6 @@ def main() -> None:
     results = [
         {"envs": number, **measure(peers(task, number), number, repeats)} for number in numbers
     ]
-    OUT.parent.mkdir(exist_ok=True)
     content = {**here, "gymnasium": gym.__version__, "task": task, "runs": results}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
     print(tables.adapters(content))

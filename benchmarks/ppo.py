@@ -81,7 +81,6 @@ def main() -> None:
         {"peer": name, "cores": count, "samples_per_s": rates}
         for (name, count), rates in rates_of.items()
     ]
-    OUT.parent.mkdir(exist_ok=True)
     content = {**here, "peers": versions(python), "task": task, "repeats": repeats, "runs": rows}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
     print(tables.ppo(content))

@@ -68,7 +68,6 @@ def main() -> None:
             f"\n{name}\n"
             + markdown(list(rows[0]), ([_short(value) for value in row.values()] for row in rows))
         )
-        OUT.parent.mkdir(exist_ok=True)
         OUT.write_text(json.dumps(content, indent=1) + "\n")
 
 
