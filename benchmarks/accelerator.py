@@ -223,24 +223,9 @@ def probe(options: dict[str, str], tasks: Sequence[str]) -> None:
 
 def numbers(request: Request) -> Iterator[dict[str, Any]]:
     """Run the tests. Yield a row for each that did not pass, and one with all counts."""
-    command = [
-        sys.executable,
-        "-m",
-        "pytest",
-        "-v",
-        "--tb=short",
-        "-rN",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "no:benchmark",
-    ]
-    # Warnings about other versions of packages say nothing about numbers.
-    command += [
-        "-W",
-        "default",
-        *TESTS,
-    ]
+    # With `-W default` warnings about other versions of packages are no errors.
+    options = "-v --tb=short -rN -p no:cacheprovider -p no:benchmark -W default"
+    command = [sys.executable, "-m", "pytest", *options.split(), *TESTS]
     workers = min(WORKERS, usable_cores())
     if workers > 2 and importlib.util.find_spec("xdist"):
         command += [f"-n{workers}", f"--maxprocesses={workers}"]
