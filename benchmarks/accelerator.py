@@ -184,8 +184,8 @@ def rows_of(
 
     If the part ended early, a last row says why.
     """
-    asked = [f"{key}={options[key]}" for key in ("tasks", "sizes", "seeds", "repeats")]
-    command = [sys.executable, __file__, f"probe={name}", f"seconds={seconds}", *asked]
+    arguments = [f"{key}={options[key]}" for key in ("tasks", "sizes", "seeds", "repeats")]
+    command = [sys.executable, __file__, f"probe={name}", f"seconds={seconds}", *arguments]
     with tempfile.TemporaryFile("w+") as errors:
         with subprocess.Popen(
             command,

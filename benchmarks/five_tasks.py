@@ -42,17 +42,17 @@ def main() -> None:
     from machine import about
 
     here = about()
-    asked = [f"{name}={options[name]}" for name in ("preset", "seeds", "seed")]
+    arguments = [f"{name}={options[name]}" for name in ("preset", "seeds", "seed")]
     runs = []
     for _ in range(int(options["repeats"])):
-        runs.append({"one command": together(asked), "five commands": apart(asked)})
+        runs.append({"one command": together(arguments), "five commands": apart(arguments)})
         print(json.dumps(runs[-1]), file=sys.stderr)
-    content = {**here, "words": asked, "level": LEVEL, "unit": "s", "runs": runs}
+    content = {**here, "words": arguments, "level": LEVEL, "unit": "s", "runs": runs}
     OUT.write_text(json.dumps(content, indent=1) + "\n")
     print(tables.five_tasks(content))
 
 
-def together(asked: Sequence[str]) -> dict[str, Any]:
+def together(arguments: Sequence[str]) -> dict[str, Any]:
     """Train all five tasks by one command.
 
     Return the seconds until the last of them is learnt, with the rest of the row.
@@ -60,7 +60,7 @@ def together(asked: Sequence[str]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as place:
         runs = {task: Path(place, "all", task) for task in TASKS}
         whole, sizes = watched(
-            ["env=all", *asked, f"out={place}/all"], runs.values(), Path(place, "cache")
+            ["env=all", *arguments, f"out={place}/all"], runs.values(), Path(place, "cache")
         )
         at = [when(run, sizes) for run in runs.values()]
         return {
@@ -71,7 +71,7 @@ def together(asked: Sequence[str]) -> dict[str, Any]:
         }
 
 
-def apart(asked: Sequence[str]) -> dict[str, Any]:
+def apart(arguments: Sequence[str]) -> dict[str, Any]:
     """Train each task by a command of its own.
 
     Return the sum of the seconds until each is learnt, with the rest of the row.
@@ -80,7 +80,7 @@ def apart(asked: Sequence[str]) -> dict[str, Any]:
         runs = {task: Path(place, task) for task in TASKS}
         cache = Path(place, "cache")
         whole = sum(
-            watched([f"env={task}", *asked, f"out={run}"], [run], cache)[0]
+            watched([f"env={task}", *arguments, f"out={run}"], [run], cache)[0]
             for task, run in runs.items()
         )
         at = [wall_to(LEVEL, read_rows(run / "progress.jsonl")) for run in runs.values()]
@@ -93,7 +93,7 @@ def apart(asked: Sequence[str]) -> dict[str, Any]:
 
 
 def watched(
-    asked: Sequence[str], runs: Iterable[Path], cache: Path
+    arguments: Sequence[str], runs: Iterable[Path], cache: Path
 ) -> tuple[float, list[tuple[float, dict[Path, int]]]]:
     """Run a training command. Return the seconds that it takes and how its progress logs grew.
 
@@ -106,7 +106,9 @@ def watched(
     began = time.monotonic()
     sizes = []
     process = subprocess.Popen(
-        [sys.executable, "-m", "jaxsafe.train", *asked], env=environment, stdout=subprocess.DEVNULL
+        [sys.executable, "-m", "jaxsafe.train", *arguments],
+        env=environment,
+        stdout=subprocess.DEVNULL,
     )
     while process.poll() is None:
         sizes.append(
@@ -114,7 +116,7 @@ def watched(
         )
         time.sleep(POLL)
     if process.returncode:
-        sys.exit(f"{' '.join(asked)}: the training did not end")
+        sys.exit(f"{' '.join(arguments)}: the training did not end")
     return time.monotonic() - began, sizes
 
 

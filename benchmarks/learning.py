@@ -56,7 +56,7 @@ def main() -> None:
     print(tables.learning(content))
 
 
-def trained(variant: str, asked: list[str]) -> dict[str, Any]:
+def trained(variant: str, arguments: list[str]) -> dict[str, Any]:
     """Train a variant.
 
     Return the steps to 80 % success, and the success and length of the episodes after training.
@@ -73,9 +73,9 @@ def trained(variant: str, asked: list[str]) -> dict[str, Any]:
     if variant == "whole gradients":
         ppo.CHUNK = 1 << 30
     if variant == "two devices a seed":
-        asked = [*asked, "devices_per_seed=2"]
+        arguments = [*arguments, "devices_per_seed=2"]
     with tempfile.TemporaryDirectory() as place:
-        if train.main([*asked, f"out={place}/run"]):
+        if train.main([*arguments, f"out={place}/run"]):
             sys.exit("the training did not end")
         results = json.loads((Path(place) / "run" / "results.json").read_text(encoding="utf-8"))
     keep = ("success_rate", "episode_length")

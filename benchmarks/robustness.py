@@ -113,9 +113,9 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     for task, line in zip(tasks, panels, strict=True):
         for (name, (label, unit)), panel in zip(quantities.items(), line, strict=True):
             for rta in FILTERS:
-                mine = [row for row in rows if (row["task"], row["rta"]) == (task, rta)]
-                levels = [row["level"] for row in mine]
-                values = [unit * row[name] for row in mine]
+                of_filter = [row for row in rows if (row["task"], row["rta"]) == (task, rta)]
+                levels = [row["level"] for row in of_filter]
+                values = [unit * row[name] for row in of_filter]
                 panel.plot(levels, values, marker="o", markersize=3, label=rta)
             panel.axvline(1.0, color=GREY, linewidth=0.8, linestyle=":")
             panel.set_xlabel("uncertainty, as a multiple of the bound")

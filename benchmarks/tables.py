@@ -246,8 +246,8 @@ def controllers(results: Results) -> str:
     rows = []
     unfiltered = [row for row in results["rows"] if row["rta"] == "none"]
     for task in dict.fromkeys(row["task"] for row in unfiltered):
-        mine = [row for row in unfiltered if row["task"] == task]
-        for row in mine:
+        of_task = [row for row in unfiltered if row["task"] == task]
+        for row in of_task:
             paper = TASKS[task].paper_steps if row["policy"] == "ppo" else None
             rows.append([task, *_flown(row, f"{row['training_steps']:,}")])
             rows[-1].insert(3, f"{paper:,}" if paper else "–")
@@ -423,9 +423,9 @@ def memory(results: Results) -> str:
     sizes = sorted({row["num_envs"] for row in results["runs"]})
     rows = []
     for task in dict.fromkeys(row["task"] for row in results["runs"]):
-        mine = [row for row in results["runs"] if row["task"] == task]
-        cells = [f"{row['predicted'] / 2**20:.0f} / {row['measured'] / 2**20:.0f}" for row in mine]
-        rows.append([task, f"{mine[0]['lane']:,} B", f"{mine[0]['seed'] / 1024:.0f} KiB", *cells])
+        own = [row for row in results["runs"] if row["task"] == task]
+        cells = [f"{row['predicted'] / 2**20:.0f} / {row['measured'] / 2**20:.0f}" for row in own]
+        rows.append([task, f"{own[0]['lane']:,} B", f"{own[0]['seed'] / 1024:.0f} KiB", *cells])
     heads = ["predicted / measured", "an environment", "a seed without them"]
     return markdown([*heads, *(f"{size:,} × {results['num_steps']}" for size in sizes)], rows)
 
@@ -796,12 +796,12 @@ def accelerator_ppo(results: Results) -> str:
     columns = [*dict.fromkeys((row["environments"], row["seeds"]) for row in rows)]
     lines = []
     for peer in dict.fromkeys(row["peer"] for row in rows):
-        mine = {(row["environments"], row["seeds"]): row for row in rows if row["peer"] == peer}
+        of_peer = {(row["environments"], row["seeds"]): row for row in rows if row["peer"] == peer}
         cells = [
-            _three(mine[column]["samples_per_s"] / 1e6) if column in mine else "–"
+            _three(of_peer[column]["samples_per_s"] / 1e6) if column in of_peer else "–"
             for column in columns
         ]
-        lines.append([peer, *cells, *_program(next(iter(mine.values())))])
+        lines.append([peer, *cells, *_program(next(iter(of_peer.values())))])
     heads = [f"{seeds} seed{'s' * (seeds > 1)} × {size:,}" for size, seeds in columns]
     return markdown(
         ["million samples/s on the accelerator, seeds × environments", *heads, *PROGRAM], lines

@@ -186,16 +186,16 @@ class Proof:
         begin = self.within(self.angle)
         aligned = self.within(self.aligned)
         first = self.course(first=True)
-        known = begin | np.logical_or(*self.image(begin & ~aligned, first))
-        fresh = known & ~aligned
+        reachable = begin | np.logical_or(*self.image(begin & ~aligned, first))
+        fresh = reachable & ~aligned
         later = self.course(first=False)
         while fresh.any():
             if not np.isfinite(later[np.nonzero(fresh)[0]]).all():
                 return None
             reached = np.logical_or(*self.image(fresh, later))
-            fresh = reached & ~known
-            known |= reached
-        return known
+            fresh = reached & ~reachable
+            reachable |= reached
+        return reachable
 
     def largest(self, cells: np.ndarray) -> float:
         """Return the largest angle of some cells."""
@@ -232,16 +232,16 @@ class Proof:
 
     def lines(self) -> list[str]:
         """Return what was proved, in words."""
-        known = self.closure()
+        reachable = self.closure()
         swing = self.swing()
-        if known is None or swing > self.angle:
+        if reachable is None or swing > self.angle:
             return [f"not proved: from {self.angle:g}° the angle may escape (swing {swing:.1f}°)"]
-        largest = self.largest(known)
+        largest = self.largest(reachable)
         every = np.ones(self.num, bool)
         drift = self.gravity(LOW_SHARE)
         later = self.course(first=False)
         turned = self.steps(every, self.angle, drift)
-        within = self.steps(known, self.aligned, later)
+        within = self.steps(reachable, self.aligned, later)
         return [
             (
                 f"dt {self.dt:g} s, margin {self.margin:g} m/s, wheel {self.wheel:g}°/s², spin"

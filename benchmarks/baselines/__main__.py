@@ -58,7 +58,8 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.train.host.options import resolve
 
     options = Options.parse(argv)
-    out, runs = Path(options.out), Path(options.runs)
+    out = Path(options.out)
+    runs = Path(options.runs)
     rest = [word for word in argv if word.partition("=")[0] in options.training]
     rest = rest if "seeds" in options.training else [f"seeds={SEEDS}", *rest]
     items = plan(options.tasks or [*TASKS], options.kinds or [*KINDS], rest)

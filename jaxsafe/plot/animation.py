@@ -303,7 +303,8 @@ class Scene:
         platform = sim.platforms[self._origin]
         turn = np.eye(dimension)
         if self._turned:
-            cosine, sine = np.cos(platform.heading), np.sin(platform.heading)
+            cosine = np.cos(platform.heading)
+            sine = np.sin(platform.heading)
             turn[:2, :2] = [[cosine, sine], [-sine, cosine]]
         return _place(platform), turn
 
