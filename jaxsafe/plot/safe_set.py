@@ -23,7 +23,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from jaxsafe.environment import Environment, length_unit, reset_to
+from jaxsafe.environment import Environment, filter_name, length_unit, reset_to
 from jaxsafe.plot.style import (
     GREY,
     ORANGE,
@@ -90,7 +90,7 @@ def planes(env: Environment) -> Planes:
         and isinstance(others[0], type(agent))
     ):
         return _rejoin(agent, others[0])
-    types = ", ".join(map(_type_name, env.platforms))
+    types = ", ".join(part.type_name or type(part).__name__ for part in env.platforms)
     raise ConfigError(f"env: expected two spacecraft or two aircraft of one kind, found {types}")
 
 
@@ -165,9 +165,9 @@ def draw(
         ConfigError: the environment has no filter that certifies, or no planes are known for it.
     """
     if not isinstance(env.rta, CertifiedRTA) or not env.rta.backups:
-        rta = "none" if env.rta is None else _type_name(env.rta)
         raise ConfigError(
-            f"rta: expected a filter that certifies states, for instance default, found {rta}"
+            "rta: expected a filter that certifies states, for instance default,"
+            f" found {filter_name(env)}"
         )
     plane = planes(env)
     left, right = x or plane.x_ends
@@ -278,10 +278,6 @@ def _rejoin(agent: Any, lead: Any) -> Planes:
         spatial=True,
         note=speeds,
     )
-
-
-def _type_name(component: Any) -> str:
-    return component.type_name or type(component).__name__
 
 
 def _unit(env: Environment) -> str | None:
