@@ -1,6 +1,8 @@
 """The tasks as environments of Brax, for its PPO, SAC and APG.
 
-ppo.train(BraxEnv("docking2d"), wrap_env_fn=wrap, …)
+A trainer of Brax takes an environment together with `wrap`::
+
+    ppo.train(BraxEnv("docking2d"), wrap_env_fn=wrap, …)
 """
 # pyright: reportMissingImports=false
 
@@ -182,7 +184,7 @@ def wrap(
         env: the environment of one task.
         episode_length: number of steps of the task after which an episode is truncated.
         action_repeat: number of steps of the task for which each action is taken.
-        randomization_fn: None. Brax randomizes its own physics with it.
+        randomization_fn: must be None, because it is for Brax's own physics.
 
     Raises:
         ConfigError: there is a `randomization_fn`, or `action_repeat` is below 1.

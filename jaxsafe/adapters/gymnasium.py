@@ -1,5 +1,7 @@
 """Gymnasium environments, one at a time or as a batch in one compiled step.
 
+Gymnasium makes them by their ids::
+
     gymnasium.make("jaxsafe/Docking3D-v0", rta="default")
     gymnasium.make_vec("jaxsafe/Docking3D-v0", num_envs=64, autoreset_mode="SameStep")
 

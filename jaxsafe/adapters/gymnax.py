@@ -1,10 +1,10 @@
 """The tasks as environments of gymnax.
 
 They have `reset(key, params)` and `step(key, state, action, params)`. A step that ends an episode
-also starts the next one.
+also starts the next one. What a step returns depends on the version of gymnax::
 
-env = GymnaxEnv("docking2d")                  # gymnax ≥ 1.0: a step returns six values
-env = GymnaxEnv("docking2d", legacy=True)     # gymnax 0.0.9, rejax, PureJaxRL: five, one `done`
+    env = GymnaxEnv("docking2d")               # gymnax ≥ 1.0: six values
+    env = GymnaxEnv("docking2d", legacy=True)  # gymnax 0.0.9, rejax, PureJaxRL: five, one `done`
 """
 # pyright: reportMissingImports=false
 

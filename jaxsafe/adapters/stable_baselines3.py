@@ -1,6 +1,8 @@
 """The compiled batch of environments with the interface of Stable-Baselines3.
 
-PPO("MlpPolicy", SB3VecEnv("docking2d", 64))
+An algorithm of that library takes it as its environment::
+
+    PPO("MlpPolicy", SB3VecEnv("docking2d", 64))
 """
 # pyright: reportMissingImports=false
 
