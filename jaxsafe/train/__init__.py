@@ -1,4 +1,4 @@
-"""Training.
+"""Training with PPO: one seed as a pure function, or a whole run in a directory.
 
 `jaxsafe.train(env, agent, hyperparameters, key, num_updates)` trains one seed as a pure function,
 see `jaxsafe.train.train.train`. `jaxsafe.train("docking2d", seeds=10)` does what
@@ -10,7 +10,7 @@ from jaxsafe.schema.callable_package import make_callable
 
 make_callable(
     __name__,
-    # As for `__main__.py`, what trains a whole run stands on a higher floor.
+    # As in `__main__.py`, the code that trains a whole run stands on a higher floor.
     "jaxsafe.runs.training",
     Agent="jaxsafe.agents.agent",
     PPO="jaxsafe.train.ppo",

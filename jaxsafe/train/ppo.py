@@ -1,12 +1,12 @@
 """Proximal policy optimisation of one seed, a pure function from training state to training state.
 
-With an agent that has a critic of the cost it is PPO-Lagrangian (Ray, Achiam and Amodei 2019). It
+If the agent has a critic of the cost, this is PPO-Lagrangian (Ray, Achiam and Amodei 2019), which
 maximises rewards less a multiplier times costs. The multiplier grows while the episodes cost more
 than `cost_limit`.
 
 `update` reads like the algorithm: collect a batch, estimate advantages, improve the networks over
 some epochs. Seeds, devices and files are the caller's business. Hyperparameters that are numbers
-are leaves, and sizes are structure.
+are leaves of the pytree, and sizes are part of its structure.
 """
 
 from __future__ import annotations
@@ -90,14 +90,14 @@ class PPO(Component):
     complete_episodes: bool = False
     """Whether to learn from whole episodes only, as in the paper's docking training.
 
-    Every update then starts all environments afresh. An episode counts if it would have ended
-    within `num_steps` however long it had lasted, so `num_steps` must be at least the longest one.
-    What follows it in its environment is not learnt from.
+    Every update then starts all environments afresh. An episode counts if even the longest one,
+    begun at the same step, would have ended within `num_steps`. So `num_steps` must be at least the
+    length of the longest episode. The steps after the last episode that counts are not learnt from.
     """
     num_epochs: Annotated[int, Range(1, largest=10_000)] = 10
     """Number of times that an update goes through its samples."""
     num_minibatches: Annotated[int, Range(1, largest=MAX_COUNT)] = 2
-    """Number of parts of the samples of an update. Each part gives one step of the optimiser."""
+    """Number of parts of the samples of an update, one for each step of the optimiser."""
     learning_rate: Annotated[Dimensionless, Positive] = 3e-3
     """Learning rate at the beginning of the training."""
     final_learning_rate: Annotated[Dimensionless, Range(0.0)] = 3e-4
@@ -111,9 +111,9 @@ class PPO(Component):
     gae_lambda: Annotated[Dimensionless, Share] = 1.0
     """Decay λ of generalised advantage estimation."""
     clip: Annotated[Dimensionless, Positive] = 0.2
-    """Bound on how far the ratio of new to old probabilities counts away from 1."""
+    """Largest distance from 1 up to which the ratio of new to old probabilities counts."""
     noise_decay: Annotated[Dimensionless, Range(0.0, largest=20.0)] = 0.0
-    """How far log_std falls by the end, besides what is learnt."""
+    """How far log_std falls until the end of the training, in addition to what is learnt."""
     value_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.5
     """Weight of the critic's loss."""
     entropy_coefficient: Annotated[Dimensionless, Range(0.0)] = 0.0
@@ -121,9 +121,12 @@ class PPO(Component):
     max_grad_norm: Annotated[Dimensionless, Positive] = 0.5
     """Largest norm of a gradient. A longer gradient is scaled down to it."""
     averaging: Annotated[Dimensionless, Share] = 0.0
-    """Share of the training over which the networks that are kept are averaged."""
+    """Share of the training over which networks are averaged. The averages are what is kept."""
     learns_from: Literal["desired", "actual"] = "desired"
-    """The control to learn from where run time assurance changed it: the agent's, or what acted."""
+    """The control to learn from where run time assurance changed it.
+
+    `desired` is the control that the agent chose, and `actual` is the one that acted.
+    """
     cost_limit: Annotated[Dimensionless, Positive] = 25.0
     """Number of violating steps that an episode may have, with PPO-Lagrangian.
 
@@ -151,9 +154,9 @@ class PPO(Component):
 
         Each device has the same number of environments and of samples of a minibatch.
         """
-        most = math.gcd(self.num_envs, self.rows(agent) // self.num_minibatches)
-        small = [count for count in range(1, math.isqrt(most) + 1) if most % count == 0]
-        return sorted({*small, *(most // count for count in small)})
+        largest = math.gcd(self.num_envs, self.rows(agent) // self.num_minibatches)
+        small = [count for count in range(1, math.isqrt(largest) + 1) if largest % count == 0]
+        return sorted({*small, *(largest // count for count in small)})
 
 
 class TrainState(Record):
@@ -165,7 +168,7 @@ class TrainState(Record):
     observation: Float[Array, "num_envs o"]
     episode: Episode  # sums of the running episodes, [num_envs]
     memory: Mapping[str, Memory]
-    """What each network remembers of the running episodes, [num_envs, …]. `()` for most."""
+    """What each network remembers of the running episodes, [num_envs, …], or `()` for nothing."""
     window: Window  # the latest finished episodes
     key: Key
     """Key of the whole run. Update i uses fold_in(key, i)."""
@@ -181,7 +184,7 @@ class Transition(NamedTuple):
 
     inputs: Float[Array, "t n i"]  # what the actor saw
     totals: Mapping[str, Float[Array, "t n"]]
-    """What each reward term had summed to before the step, if the critic sees it."""
+    """The sum of each reward term before the step, if the critic sees it."""
     action: Array
     log_prob: Float[Array, "t n"]
     reward: Float[Array, "t n"]
@@ -208,7 +211,7 @@ class Batch(NamedTuple):
     weight: Any = ()
     """The weight of each sample, with `complete_episodes`. The mean over the whole batch is 1."""
     sequences: Sequences | None = None
-    """What recurrent networks need to know of sequences. Samples are sequences then, [n, t, …]."""
+    """Memories and ends of episodes, if a network is recurrent. Samples are sequences [n, t, …]."""
 
 
 def over_devices(whole: Any, split: Any) -> TrainState:
@@ -216,8 +219,8 @@ def over_devices(whole: Any, split: Any) -> TrainState:
 
     Args:
         whole: the value of fields that all devices of a seed have whole.
-        split: the value of fields with an axis of environments. Devices that share the environments
-            of a seed have the entries of their own ones.
+        split: the value of fields with an axis of environments. Each device that shares the
+            environments of a seed has the entries of its own environments.
     """
     names = {field.name for field in dataclasses.fields(TrainState)}
     by_environment = {"env_state", "observation", "episode", "memory"}
@@ -324,14 +327,15 @@ def update(
 
 
 def check_complete_episodes(env: Environment, ppo: PPO) -> None:
-    """Check that `num_steps` are enough for a whole episode, where only such episodes are used.
+    """Check that `num_steps` are enough for a whole episode, if only whole episodes are used.
 
     Raises:
-        ConfigError: they are not, or the episodes have no longest length.
+        ConfigError: they are not enough, or the length of an episode has no limit.
     """
     if not ppo.complete_episodes:
         return
     longest = _longest(env, ppo)
+    # Inside `jax.jit` the number is not known.
     if isinstance(longest, Tracer) or longest <= ppo.num_steps:
         return
     if longest_episode(env) is None and longest == PPO.max_episode_steps:
@@ -347,9 +351,9 @@ def check_complete_episodes(env: Environment, ppo: PPO) -> None:
 
 def _longest(env: Environment, ppo: PPO) -> Array:
     """Return the number of steps after which every episode of the training has ended."""
-    limit = longest_episode(env)
-    most = jnp.asarray(ppo.max_episode_steps)
-    return most if limit is None else jnp.minimum(limit, most)
+    time_limit = longest_episode(env)
+    truncation = jnp.asarray(ppo.max_episode_steps)
+    return truncation if time_limit is None else jnp.minimum(time_limit, truncation)
 
 
 def _start_afresh(
@@ -441,7 +445,7 @@ def dual_ascent(ppo: PPO, multiplier: Array, window: Window, done: Array) -> Arr
 
 
 def learning_rate(ppo: PPO, progress: Array | float) -> Array:
-    """Return the step size after a share of the training, `progress`."""
+    """Return the learning rate after the share `progress` of the training."""
     first, last = jnp.asarray(ppo.learning_rate), jnp.asarray(ppo.final_learning_rate)
     if ppo.learning_rate_decay == "exponential":
         return first * (last / first) ** progress
@@ -449,10 +453,10 @@ def learning_rate(ppo: PPO, progress: Array | float) -> Array:
 
 
 def discount(ppo: PPO, progress: Array | float) -> Array:
-    """Return the discount factor γ after a share of the training, `progress`.
+    """Return the discount factor γ after the share `progress` of the training.
 
-    Its horizon 1/(1 − γ) grows exponentially by `horizon_growth`. A short horizon finds the way
-    early. A long one then finds the quick way.
+    Its horizon 1/(1 − γ) grows exponentially by `horizon_growth`. With a short horizon the policy
+    soon finds a way to succeed. With a long one it then finds a quick way.
     """
     return 1.0 - (1.0 - jnp.asarray(ppo.gamma)) / jnp.asarray(ppo.horizon_growth) ** progress
 
@@ -524,7 +528,7 @@ def collect(
 def _acted(env: Environment, action: Array, timestep: TimeStep) -> Array:
     """Return the actions to learn from.
 
-    Where run time assurance intervened, they are those that give the control that acted.
+    Where run time assurance intervened, they are the actions that give the actual control.
     """
     controller: Any = env.agent_platform.controller
     acted = jax.vmap(controller.action)(timestep.info.control_actual)
@@ -540,7 +544,7 @@ def gae(
     gamma: Array,
     lam: Array,
 ) -> Array:
-    """Return generalised advantage estimates along the leading axis.
+    """Return generalised advantage estimates along the leading axis (Schulman et al. 2016).
 
     δ_t = r_t + γ V(s_{t+1})(1 − terminated_t) − V(s_t),  A_t = δ_t + γλ(1 − done_t) A_{t+1}
 
@@ -585,7 +589,7 @@ def learn(
         agent: the agent.
         ppo: the hyperparameters.
         step_size: the learning rate.
-        state: the state. It holds the parameters and the optimizer's state before.
+        state: the state. It holds the parameters and the optimizer's state before the first step.
         batch: the samples of all devices of the seed.
         key: a PRNG key.
         shard: the part of every minibatch that this device takes.
@@ -644,14 +648,15 @@ def loss(
 ) -> tuple[Array, Diagnostics]:
     """Return the clipped surrogate loss + value error − entropy bonus, averaged over the batch.
 
-    Samples count by their weights, if they have any. The second value has the terms of the loss,
-    and how far the policy is from the one that collected the batch.
+    This is minus the objective of PPO (Schulman et al. 2017). Samples count by their weights, if
+    they have any. The second value has the terms of the loss, and how far the policy is from the
+    one that collected the batch.
     """
     mean = partial(_mean, weight=batch.weight)
     policy = agent.distribution(env, params, batch.inputs, batch.sequences)
     log_ratio = policy.log_prob(batch.action) - batch.log_prob
     bounded = jax.lax.stop_gradient(jnp.minimum(log_ratio, MAX_LOG_RATIO))
-    # The second term is 0 and has the derivative.
+    # The term in brackets is 0 and has the derivative.
     ratio = jnp.exp(bounded + (log_ratio - jax.lax.stop_gradient(log_ratio)))
     clipped = jnp.clip(ratio, 1.0 - ppo.clip, 1.0 + ppo.clip)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
@@ -660,7 +665,7 @@ def loss(
     value_error = 0.5 * (value - batch.value_target) ** 2
     entropy = policy.entropy()
     outside = jnp.abs(ratio - 1.0) > ppo.clip
-    # Without the barrier XLA fuses the gradient otherwise, and the last bits of a training change.
+    # Without the barrier XLA fuses the gradient in another way, which changes the last bits.
     alone = jax.lax.optimization_barrier(jax.lax.stop_gradient(policy))
     terms = {
         "policy_loss": -mean(surrogate),
@@ -758,7 +763,7 @@ def _judge(
     next_seen: Float[Array, "t n c"],
     done: Bool[Array, "t n"],
 ) -> tuple[Float[Array, "t n"], Float[Array, "t n"], Memory]:
-    """Return what a critic says of each state, and of the state after it before any reset.
+    """Return the output of a critic for each state, and for its successor before any reset.
 
     Args:
         agent: the agent.
@@ -766,7 +771,7 @@ def _judge(
         name: the critic, `critic` or `cost_critic`.
         memory: what the critic remembers before the first step, [num_envs, …].
         seen: what the critic sees of each state.
-        next_seen: what it sees of the state after it.
+        next_seen: what the critic sees of the successor of each state.
         done: whether the episode ended with the step.
 
     Returns:
@@ -780,7 +785,7 @@ def _judge(
     def step(memory: Memory, inputs: tuple[Array, Array]) -> tuple[Memory, tuple[Array, Array]]:
         now, following = inputs
         value, memory = agent.critic_step(name, params, now, memory)
-        # What the critic sees of the next state before a reset is not what it goes on from.
+        # This memory is dropped, because the critic goes on from the state after any reset.
         next_value, _ = agent.critic_step(name, params, following, memory)
         return memory, (value, next_value)
 
@@ -793,7 +798,7 @@ def _judge(
 def _in_chunks(
     critic: Callable[[Array], Array], seen: Float[Array, "t n c"]
 ) -> Float[Array, "t n"]:
-    """Return what a critic says of each sample. On a CPU it sees `CHUNK` samples at a time."""
+    """Return the output of a critic for each sample. On a CPU it sees `CHUNK` samples at a time."""
     t, n, size = seen.shape
     parts = _num_chunks(t * n)
     return (
@@ -804,7 +809,7 @@ def _in_chunks(
 
 
 def _num_chunks(samples: int) -> int:
-    """Return in how many parts this number of samples goes through the networks."""
+    """Return the number of parts in which this many samples go through the networks."""
     return 1 if accelerated() or samples % CHUNK else max(1, samples // CHUNK)
 
 

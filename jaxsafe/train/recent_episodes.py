@@ -39,8 +39,8 @@ def empty_window(like: Episode) -> Window:
         like: episodes whose fields have the dtypes of the window.
     """
     episodes = jax.tree.map(lambda x: jnp.zeros(SIZE, x.dtype), like)
-    none = jnp.zeros((), jnp.int32)
-    return Window(episodes, none, none, none)
+    zero = jnp.zeros((), jnp.int32)
+    return Window(episodes, zero, zero, zero)
 
 
 def push(
@@ -57,8 +57,8 @@ def push(
         done: whether the episode ended with the step. Episodes that have not ended by the last step
             still run.
         counts: which steps are part of an episode that counts. The others are left out of the
-            window and of the number of episodes, and what they cost is added up. Episodes do not go
-            on after the last step then. None stands for all.
+            window and of the number of episodes, but their cost is added. No episode goes on after
+            the last step then. None means that all steps count and that episodes go on.
     """
     finished = (done if counts is None else done & counts).ravel()
     order = jnp.cumsum(finished, dtype=jnp.int32) - 1
@@ -94,11 +94,10 @@ def latest_cost(window: Window, number: int = 25) -> Array:
         window: the window.
         number: how many episodes to average, at most `SIZE`.
     """
-    known = jnp.minimum(window.count, number)
+    available = jnp.minimum(window.count, number)
     age = (window.count - 1 - jnp.arange(SIZE)) % SIZE
-    return jnp.sum(jnp.where(age < known, window.episodes.violating_steps, 0)) / jnp.maximum(
-        known, 1
-    )
+    cost = jnp.sum(jnp.where(age < available, window.episodes.violating_steps, 0))
+    return cost / jnp.maximum(available, 1)
 
 
 def means(
@@ -106,15 +105,15 @@ def means(
 ) -> dict[str, Array]:
     """Return averages over the episodes in the window, by column of the progress log.
 
-    They are 0 while the window is empty. A share is an average of shares: every episode counts
-    alike, however long it is. The rates of `metrics.summarise` are other numbers under other names.
-    In them every step counts alike.
+    They are 0 while the window is empty. A share of steps is averaged over episodes, each of which
+    counts alike, however long it is. The rates of `metrics.summarise` are other numbers with other
+    names, because in them every step counts alike.
 
     Args:
         window: the window.
         outcomes: names of the outcomes, as `env.outcomes`. The first one means that the episode
             still runs.
-        successes: names of those that count as success.
+        successes: names of the outcomes that count as success.
     """
     filled = (jnp.arange(SIZE, dtype=window.count.dtype) < window.count).astype(
         jnp.result_type(float)

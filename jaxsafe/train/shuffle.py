@@ -20,16 +20,16 @@ def shuffle(key: Key, size: int) -> Int[Array, " size"]:
     """Return a pseudo-random permutation of 0 … size − 1, by the swap-or-not construction.
 
     Each round pairs every x with (k − x) mod size for a random k, and swaps the pair if a hash of
-    it says so. A round maps the range onto itself, so the rounds together are a permutation. No
-    element needs to know of another. See Hoang, Morris and Rogaway, "An enciphering scheme based on
-    a card shuffle", CRYPTO 2012.
+    it says so. A round maps the range onto itself, so the rounds together are a permutation. Each
+    element is computed on its own. See Hoang, Morris and Rogaway, "An enciphering scheme based on a
+    card shuffle", CRYPTO 2012.
 
     Args:
         key: a PRNG key.
         size: any number below 2³¹.
     """
     offsets, salts = jax.random.bits(key, (2 * ROUNDS,), jnp.uint32).reshape(2, ROUNDS)
-    # Some offsets are likelier than others, by less than size/2³².
+    # The modulo makes some offsets likelier than others, by less than size/2³².
     offsets = (offsets % size).astype(jnp.int32)
 
     def swap_or_not(order: Array, round_: tuple[Array, Array]) -> tuple[Array, None]:

@@ -1,6 +1,6 @@
 """Training as pure functions.
 
-`train` trains one seed. `programs` returns what trains all seeds on their devices.
+`train` trains one seed. `programs` returns the programs that train all seeds on their devices.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from jaxsafe.types import Key
 
 STATE = ppo.over_devices(SPLIT_BY_SEED, SPLIT_BY_ENV)
 """Sharding of the training states of all seeds."""
-
 
 Curves = dict[str, jax.Array]
 """Curves of a training, [updates] each, by column of the progress log.
@@ -66,8 +65,8 @@ def train(
         key: a typed PRNG key.
         num_updates: how many batches of `hyperparameters.batch_size` steps are collected and learnt
             from. It is a static number. Schedules run over that many updates.
-        callback: a function that is called on the host after every `every` updates, for logs or a
-            stop of one's own.
+        callback: a function that is called on the host after every `every` updates, for instance to
+            write logs or to stop the training.
         every: number of updates between two calls. None stands for a fiftieth of the training.
         params: parameters to start from, such as `state.average` of another training. None stands
             for fresh ones.
@@ -96,7 +95,7 @@ def train(
 
 
 def programs(mapper: SeedMapper, length: int, limit: int) -> tuple[Any, Any]:
-    """Return the programs of a training of all seeds, to be called or lowered.
+    """Return the two programs that train all seeds, to be called or lowered.
 
     Args:
         mapper: the mapper of the seeds.
@@ -105,7 +104,7 @@ def programs(mapper: SeedMapper, length: int, limit: int) -> tuple[Any, Any]:
 
     Returns:
         `(shared, keys) -> state` for `begin`, and `(shared, state) -> (state, curves)` for `chunk`.
-        There `shared` is `(env, agent, hyper)`, and the other arrays have a leading axis of seeds.
+        `shared` is `(env, agent, hyper)`, and the other arrays have a leading axis of seeds.
     """
 
     def advance(shared: tuple, state: TrainState) -> tuple[TrainState, dict[str, jax.Array]]:
@@ -132,7 +131,7 @@ def chunk(
 ) -> tuple[TrainState, dict[str, jax.Array]]:
     """Train one seed for `length` updates, or for fewer at the end of the run.
 
-    The updates of a seed that has diverged are counted. Otherwise it is left as it is.
+    A seed that has diverged is left as it is, except that its updates are counted.
 
     Args:
         shared: `(env, agent, hyper)`.
@@ -151,7 +150,7 @@ def chunk(
         state = state.replace(num_updates=jnp.minimum(state.num_updates + 1, limit))
         return state, ppo.no_diagnostics(agent)
 
-    def one(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
+    def one_update(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
         going = (state.num_updates < limit) & ~ppo.diverged(state)
         state, diagnostics = jax.lax.cond(
             going, lambda s: ppo.update(env, agent, hyper, limit, s, shard), leave, state
@@ -167,9 +166,9 @@ def chunk(
         means = recent_episodes.means(state.window, env.outcomes, env.successes)
         return state, {**counts, **means, **diagnostics}
 
-    return jax.lax.scan(one, state, None, length=length)
+    return jax.lax.scan(one_update, state, None, length=length)
 
 
-# Made once: every call of `isolated` is a new function, which JAX would compile again.
+# Every call of `isolated` returns a new function, which JAX would compile again.
 _begin = jax.jit(isolated(begin))
 _chunk = jax.jit(isolated(chunk), static_argnums=(2, 3))

@@ -1,8 +1,8 @@
 """Checkpoints with orbax.
 
-The directory of a step appears whole or not at all. So a kill leaves the checkpoint before. That
-holds even where a checkpoint takes the place of one of the same step. The old one is moved aside,
-and is removed only when the new one is there.
+The directory of a step appears whole or not at all, so a kill spoils no checkpoint. This holds even
+if the checkpoint of a step is written again. The old one is moved aside, and is removed only when
+the new one is there.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from jaxsafe.types import is_key
 
 logging.getLogger("absl").setLevel(logging.ERROR)
 
-
 QUIET_S = 0.5
 """The threads of a failed read or write count as ended after this time without complaints [s]."""
 
@@ -40,16 +39,16 @@ SETTLE_S = 10.0
 """Longest time to wait for the threads of a failed read or write to end [s]."""
 
 MAX_REASON = 120
-"""Most letters that a message repeats of an error of orbax or tensorstore."""
+"""Largest number of characters of an error of orbax or tensorstore that a message repeats."""
 
-PRECISION, DIGEST = "precision", "sha256"
-"""Names of the facts that are added to those of a checkpoint.
+PRECISION = "precision"
+"""Name of the fact, added to those of a checkpoint, that is the type of its numbers."""
 
-They are the type of its numbers, and the digest of all else in it.
-"""
+DIGEST = "sha256"
+"""Name of the fact, added to those of a checkpoint, that is the digest of all else in it."""
 
 ASIDE = ".before"
-"""End of the name of a checkpoint while the one that takes its place is written."""
+"""Suffix of the name of a checkpoint while the one that replaces it is written."""
 
 
 class Checkpoints:
@@ -89,8 +88,8 @@ class Checkpoints:
 
         Args:
             step: environment steps of each seed.
-            state: a pytree of arrays on the host. PRNG keys are given as their words.
-            facts: some data of JSON.
+            state: a pytree of arrays on the host. PRNG keys are given as their key data.
+            facts: facts about the checkpoint, which JSON can hold.
 
         Raises:
             ConfigError: there is no room for it, or it cannot be written for another reason.
@@ -98,7 +97,8 @@ class Checkpoints:
         ocp = self._ocp
         facts = {**facts, PRECISION: jnp.result_type(float).name}
         facts[DIGEST] = _digest(state, facts)
-        place, before = self.directory / str(step), self.directory / f"{step}{ASIDE}"
+        place = self.directory / str(step)
+        before = self.directory / f"{step}{ASIDE}"
         if step in self.steps:
             if processes.leads():
                 place.rename(before)
@@ -132,15 +132,15 @@ class Checkpoints:
             )
 
     def _recover(self) -> None:
-        """Take back what was not finished. One process does this, and the others wait."""
+        """Undo the writes that were not finished. One process does this, and the others wait."""
         if processes.leads():
             self._take_back()
         processes.wait_for_all("taken back")
 
     def _take_back(self) -> None:
-        """Put a checkpoint back if its successor of the same step was never completely written.
+        """Put a checkpoint back if the one that replaces it was never completely written.
 
-        What is left of the successor is removed.
+        The incomplete one is removed.
         """
         for part in self.directory.glob("*.orbax-checkpoint-tmp*"):
             shutil.rmtree(part, ignore_errors=True)
@@ -168,18 +168,15 @@ class Checkpoints:
         Args:
             step: environment steps of each seed.
             like: shapes of the arrays, in the structure that the result has.
-            newer: arrays that are 0 where the checkpoint lacks them, by the last part of their
-                names.
+            newer: the last parts of the names of arrays that are 0 if the checkpoint lacks them.
 
         Raises:
             ConfigError: there is no checkpoint at this step, or it is broken, damaged or of another
                 run.
         """
-        facts, place, now = (
-            self.facts(step),
-            self.directory / str(step),
-            jnp.result_type(float).name,
-        )
+        facts = self.facts(step)
+        place = self.directory / str(step)
+        now = jnp.result_type(float).name
         if facts.get(PRECISION, now) != now:
             raise ConfigError(
                 f"{place}: checkpoint was written in {facts[PRECISION]}, "
@@ -190,14 +187,14 @@ class Checkpoints:
         state = (
             self._read_older(step, abstract, absent) if absent else self._read_all(step, abstract)
         )
-        for (path, found), wanted in zip(
+        for (path, array), expected in zip(
             jax.tree_util.tree_leaves_with_path(state), jax.tree.leaves(abstract), strict=True
         ):
-            if found.shape != wanted.shape:
+            if array.shape != expected.shape:
                 name = jax.tree_util.keystr(path, simple=True, separator="/")
                 raise ConfigError(
                     f"{place}: checkpoint is of another run: "
-                    f"{name} has shape {found.shape}, expected {wanted.shape}"
+                    f"{name} has shape {array.shape}, expected {expected.shape}"
                 )
         digest = facts.pop(DIGEST, None)
         if (digest is not None or PRECISION in facts) and digest != _digest(state, facts, absent):
@@ -207,7 +204,7 @@ class Checkpoints:
         return jax.tree.map(_as, state, like)
 
     def _has(self, step: int, name: str) -> bool:
-        """Return whether a checkpoint has an array of a name, as far as its index can be read."""
+        """Return whether a checkpoint has an array of this name, or its index cannot be read."""
         try:
             text = (self.directory / str(step) / "state" / "_METADATA").read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError):
@@ -218,11 +215,11 @@ class Checkpoints:
         return self._read(step, state=self._ocp.args.StandardRestore(abstract))["state"]
 
     def _read_older(self, step: int, abstract: Any, absent: Collection[str]) -> Any:
-        """Read the arrays of a checkpoint that lacks some. Those are 0."""
+        """Read the arrays of a checkpoint that lacks some of them. The absent ones are 0."""
         tree = _without(self._ocp.tree.serialize_tree(abstract, keep_empty_nodes=True), absent)
-        how = self._ocp.args.PyTreeRestore(item=tree, partial_restore=True)
-        # Orbax writes nothing any more where it has read in this way, so another reader does.
-        read = Checkpoints(self.directory.parent)._read(step, state=how)["state"]
+        partial = self._ocp.args.PyTreeRestore(item=tree, partial_restore=True)
+        # A manager of orbax that has read in this way no longer writes, so another one reads.
+        read = Checkpoints(self.directory.parent)._read(step, state=partial)["state"]
 
         def pick(path: Any, leaf: np.ndarray) -> Any:
             names = _names(path)
@@ -249,7 +246,7 @@ class Checkpoints:
                 lines = [line for line in str(error).splitlines() if line.strip()]
                 reason = (lines or [type(error).__name__])[0][:MAX_REASON]
             # This stands outside the except clause, because the error keeps the failed tasks alive,
-            # and they complain when they go.
+            # which complain when they end.
             if reason:
                 _ignore_late_complaints()
                 _settle(complaints)
@@ -296,9 +293,10 @@ def _ignore_late_complaints() -> None:
 
 def _settle(complaints: io.StringIO) -> None:
     """Wait until the threads of a failed read or write have ended, then free what they leave."""
-    end, said = time.monotonic() + SETTLE_S, -1
-    while time.monotonic() < end and said != complaints.tell():
-        said = complaints.tell()
+    end = time.monotonic() + SETTLE_S
+    length = -1
+    while time.monotonic() < end and length != complaints.tell():
+        length = complaints.tell()
         time.sleep(QUIET_S)
     gc.collect()
 
@@ -319,19 +317,19 @@ def _digest(state: Any, facts: dict[str, Any], absent: Collection[str] = ()) -> 
 
     Arrays whose names end in one of `absent` are left out.
     """
-    found = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     for path, leaf in jax.tree_util.tree_leaves_with_path(state):
         if absent and _names(path)[-1] in absent:
             continue
         array = np.asarray(leaf)
-        found.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}".encode())
-        found.update(array.tobytes())
-    return found.hexdigest()
+        digest.update(f"{jax.tree_util.keystr(path)} {array.dtype} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
 
 
 def _empty(shape: Any) -> np.ndarray:
-    words = jax.eval_shape(jax.random.key_data, shape) if is_key(shape) else shape
-    return np.empty(words.shape, words.dtype)
+    data = jax.eval_shape(jax.random.key_data, shape) if is_key(shape) else shape
+    return np.empty(data.shape, data.dtype)
 
 
 def _as(x: Any, shape: Any) -> Any:

@@ -27,11 +27,11 @@ SPECIAL = str.maketrans(
         "^": r"\textasciicircum{}",
     }
 )
-"""What LaTeX needs in place of characters that mean something to it."""
+"""Replacements of the characters that have a meaning in LaTeX."""
 
 
 def csv_rows(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return a row for each run: what it is, and means with the ends of their 95 % intervals.
+    """Return a row for each run: what it is, and means with the bounds of their 95 % intervals.
 
     Args:
         runs: the results of each run by its label.
@@ -46,9 +46,9 @@ def csv_rows(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
             **_columns("training_cost", results["training_cost"]),
             **{
                 name: value
-                for kind, found in results["evaluation"].items()
+                for kind, metrics in results["evaluation"].items()
                 for metric in METRICS
-                for name, value in _columns(f"{kind}/{metric}", found[metric]).items()
+                for name, value in _columns(f"{kind}/{metric}", metrics[metric]).items()
             },
         }
         for label, results in runs.items()
@@ -56,7 +56,7 @@ def csv_rows(runs: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def latex(runs: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a LaTeX table, which needs the package booktabs. Intervals are those of 95 %.
+    """Return a LaTeX table with 95 % intervals. It needs the package booktabs.
 
     Args:
         runs: the results of each run by its label.
@@ -104,7 +104,7 @@ def latex(runs: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def _columns(name: str, metric: Mapping[str, Any]) -> dict[str, float | None]:
-    """Return the mean of a metric and the ends of its interval, by column."""
+    """Return the mean of a metric and the bounds of its interval, by column."""
     low, high = metric["ci95"] or (None, None)
     return {f"{name}/mean": metric["mean"], f"{name}/low": low, f"{name}/high": high}
 

@@ -1,7 +1,7 @@
-"""What a run tells while it goes on.
+"""The progress of a run while it goes on.
 
-It writes progress rows to files and to the sinks that the user asks for, and shows a bar or plain
-lines on the terminal.
+Rows of numbers go to files and to the sinks that the user asks for. The terminal shows a progress
+bar or plain lines.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def check_order(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         path: the file, for the message.
 
     Raises:
-        ConfigError: they do not.
+        ConfigError: a row has other columns or stands in the wrong place.
     """
     seeds = [row["seed"] for row in rows if row["step"] == rows[0]["step"]]
     for index, row in enumerate(rows):
@@ -80,13 +80,13 @@ def check_order(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def headline(*runs: Mapping[str, Any]) -> str:
-    """Return in short what a run is, for the title of a table or a figure.
+    """Return a short description of a run, for the title of a table or a figure.
 
     Args:
-        *runs: the facts about the run that its results hold. Of several runs, only what they share
-            is told.
+        *runs: the facts about the run that its results hold. If there are several runs, the
+            description has only what they have in common.
     """
-    told = [
+    descriptions = [
         [
             str(facts["env"]),
             f"preset {facts['preset']}",
@@ -98,7 +98,7 @@ def headline(*runs: Mapping[str, Any]) -> str:
         for facts in runs
     ]
     return ", ".join(
-        words[0] for words in zip(*told, strict=True) if words[0] and len({*words}) == 1
+        parts[0] for parts in zip(*descriptions, strict=True) if parts[0] and len({*parts}) == 1
     )
 
 
@@ -106,7 +106,7 @@ class ProgressLog:
     """`progress.jsonl` and `progress.csv`, with a row for every update of every seed."""
 
     def __init__(self, run: Path, resume_step: int, expected: int) -> None:
-        """Open the logs, and cut them back to the step from which the run goes on.
+        """Open the logs, and remove the rows after the step from which the run goes on.
 
         Args:
             run: the run directory.
@@ -177,7 +177,7 @@ class ProgressLog:
 
 
 def _numbers(row: Mapping[str, Any]) -> dict[str, float]:
-    """Return the numbers of a row that are known, by column."""
+    """Return the known numbers of a row, by column."""
     others = ("seed", "step", "diverged")
     return {name: value for name, value in row.items() if name not in others and value is not None}
 
@@ -245,7 +245,7 @@ def columns(env: Environment) -> list[str]:
 
 
 class Display:
-    """A live bar on a terminal and in a notebook. Elsewhere a plain line at every tenth."""
+    """A progress bar on a terminal or in a notebook, elsewhere a plain line at every tenth."""
 
     def __init__(self, steps: int, done: int, shown: bool = True) -> None:
         """Show progress towards `steps` environment steps of each seed.
@@ -274,7 +274,7 @@ class Display:
             self._bar.set_postfix_str("compiling")
 
     def start(self) -> None:
-        """Begin to count time. What came before does not count for the rate of training."""
+        """Begin to count time. The time before does not count for the rate of training."""
         self._begin = self._done, time.monotonic()
         if self._bar is not None:
             self._bar.unpause()
@@ -282,18 +282,18 @@ class Display:
     def show(self, step: int, rows: list[dict[str, Any]]) -> None:
         """Show the state after `step` steps, given the latest row of each seed."""
         means = {name: _mean([row[name] for row in rows]) for name in ("success_rate", "return")}
-        facts = (
+        summary = (
             f"success {_text(means['success_rate'], '.1%')}, return {_text(means['return'], '.2f')}"
         )
         if diverged := sum(row["diverged"] for row in rows):
-            facts += f", {diverged} of {len(rows)} seeds diverged and left out"
+            summary += f", {diverged} of {len(rows)} seeds diverged and left out"
         if self._bar is not None:
-            self._bar.set_postfix_str(facts, refresh=False)
+            self._bar.set_postfix_str(summary, refresh=False)
             self._bar.update(step - self._done)
         elif self._shown and step * 10 // self._steps > self._done * 10 // self._steps:
             first, begin = self._begin
             left = (time.monotonic() - begin) * (self._steps - step) / max(step - first, 1)
-            print(f"{step:>10,} of {self._steps:,} steps, {facts}, {left:.0f} s left", flush=True)
+            print(f"{step:>10,} of {self._steps:,} steps, {summary}, {left:.0f} s left", flush=True)
         self._done = step
 
     def tell(self, text: str) -> None:

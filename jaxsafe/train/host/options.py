@@ -30,9 +30,9 @@ Count = Annotated[int, Range(1, largest=MAX_COUNT)]
 """A number of devices or episodes."""
 
 Steps = Annotated[int, Range(1, largest=10**15)]
-"""A number of environment steps. Users raise an interval of steps to mean never.
+"""A number of environment steps. For an interval of steps, a huge number means never.
 
-Double precision counts as far as the largest one.
+Double precision represents even the largest one exactly.
 """
 
 RENAMED = {
@@ -51,11 +51,13 @@ RENAMED = {
 """Today's names of values by option and earlier name. Commands and old runs may use both."""
 
 NO_RECIPE = "none"
-"""What a recipe is called that leaves all options at their defaults."""
+"""Name of the recipe that leaves all options at their defaults."""
 
 MAX_SEEDS = 100_000
-WORTHWHILE = 128
-"""Least number of samples of a minibatch for each device that shares a seed.
+"""Largest number of seeds of a run."""
+
+MIN_SAMPLES_PER_DEVICE = 128
+"""Smallest number of samples of a minibatch for each device that shares a seed.
 
 Fewer samples take less time than exchanging their gradients.
 """
@@ -72,10 +74,10 @@ class TrainConfig(Component):
     recipe: str | None = None
     """The task or the file whose recipe is taken, or none for the options' own defaults.
 
-    By default it is that of the task, or what the file of an environment names or has.
+    By default it is the recipe of the task, or the one that an environment's file has or names.
     """
     like: str | None = None
-    """The run whose environment and options are taken, but for those that are given here.
+    """The run whose environment and options are taken. Options that are given here replace its own.
 
     For instance like=runs/docking3d ppo.gamma=0.98 trains it once more with another number.
     """
@@ -90,7 +92,7 @@ class TrainConfig(Component):
     devices_per_seed: Count | None = None
     """Number of devices that share the environments of a seed.
 
-    By default as many as there are share them, while each has work.
+    By default they are shared by all devices that there are, as long as each has enough work.
     """
     steps: Steps = 500_000
     """Number of environment steps of each seed."""
@@ -107,10 +109,10 @@ class TrainConfig(Component):
     """How training treats interventions of run time assurance.
 
     `punishment` adds a reward term for them, and `corrected_action` learns from the control that
-    acted. By default it is `punishment`, where there is a filter.
+    acted. By default it is `punishment` if there is a filter.
     """
     start_from: str | None = None
-    """The run directory, policy file or `pretrained/TASK` whose networks are trained on.
+    """The run directory, policy file or `pretrained/TASK` whose networks are trained further.
 
     It is also written `from=`, for instance from=runs/docking3d. None stands for fresh networks.
     """
@@ -125,7 +127,7 @@ class TrainConfig(Component):
     checkpoint_every: Steps | None = None
     """Number of steps between two checkpoints. By default it is a tenth of the run."""
     log_every: Steps = 100
-    """One of so many evaluation episodes is logged step by step.
+    """One of this many evaluation episodes is logged step by step.
 
     Some episodes are logged before the first evaluation too.
     """
@@ -169,7 +171,7 @@ class TrainConfig(Component):
         return [
             count
             for count in self.ppo.shares(self.agent)
-            if count == 1 or minibatch >= count * WORTHWHILE
+            if count == 1 or minibatch >= count * MIN_SAMPLES_PER_DEVICE
         ]
 
     def every(self, steps: int | None) -> int:
@@ -232,13 +234,13 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         if isinstance(arguments.options.get(sink), bool):
             arguments.options[sink] = "jaxsafe" if arguments.options[sink] else None
     if "rta_training" in arguments.options:
-        told = arguments.options["rta_training"]
-        arguments.options["rta_training"] = current_name("rta_training", told)
+        value = arguments.options["rta_training"]
+        arguments.options["rta_training"] = current_name("rta_training", value)
     base = None if like is None else _base(text(like, "like"), arguments.options)
     config = base.config if base else TrainConfig()
-    # This comes first, so that a misspelt option is told before a slow start.
+    # This comes first, so that a misspelt option is reported before anything slow begins.
     config = set_paths(config, arguments.options)
-    env, told = _environment(task, config, base, arguments.options)
+    env, rta_training = _environment(task, config, base, arguments.options)
     env = override(env, overrides, place="env")
     require_success(env)
     name = base.name if base and task is None else str(task)
@@ -247,8 +249,8 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     else:
         config, chosen = _with_recipe(name, arguments.options)
     config = set_paths(config, {**arguments.options, **chosen})
-    config = config.replace(rta_training=told)
-    if told == "corrected_action":
+    config = config.replace(rta_training=rta_training)
+    if rta_training == "corrected_action":
         config = set_path(config, "ppo.learns_from", "actual", to_value)
     config = _with_algorithm(config, arguments.options)
     _check_rta(config, env)
@@ -301,7 +303,7 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
 def _environment(
     task: str | None, config: TrainConfig, base: Base | None, given: Mapping[str, Any]
 ) -> tuple[Environment, str | None]:
-    """Return the environment of a training without overrides, and how interventions are treated.
+    """Return the environment of a training before overrides, and how interventions are treated.
 
     Args:
         task: a task or a file. None stands for the environment of another run.
@@ -311,26 +313,26 @@ def _environment(
     """
     if task is None:
         assert base is not None
-        kinds = {name: given.get(name) for name in ("actions", "variant", "rta")}
-        env = adapt(base.env, base.name, place="", **kinds)
+        changes = {name: given.get(name) for name in ("actions", "variant", "rta")}
+        env = adapt(base.env, base.name, place="", **changes)
     else:
         env = make(task, actions=config.actions, variant=config.variant, rta=config.rta)
-    told = config.rta_training
+    rta_training = config.rta_training
     if base and env.rta is None:
-        told = given.get("rta_training")
-    elif told is None and env.rta is not None:
-        told = "punishment"
+        rta_training = given.get("rta_training")
+    elif rta_training is None and env.rta is not None:
+        rta_training = "punishment"
     punished = any(isinstance(term, Intervention) for term in env.reward)
-    if base and base.config.rta_training == "punishment" and told != "punishment":
+    if base and base.config.rta_training == "punishment" and rta_training != "punishment":
         others = [term for term in env.reward if not isinstance(term, Intervention)]
         env = env.replace(reward=tuple(others))
-    elif told == "punishment" and not punished:
+    elif rta_training == "punishment" and not punished:
         env = env.replace(reward=(*env.reward, normalise(Intervention(name="intervention"))))
-    return env, told
+    return env, rta_training
 
 
 def _with_recipe(task: str, given: Mapping[str, Any]) -> tuple[TrainConfig, dict[str, Any]]:
-    """Return the defaults with the values of a recipe in their place, and which recipe it is.
+    """Return the configuration of a recipe, and the options that say which recipe it is.
 
     Args:
         task: a task or a file.
@@ -355,14 +357,14 @@ class Base(NamedTuple):
 def _base(run: str, given: Mapping[str, Any]) -> Base:
     """Return what a training takes from another run.
 
-    What followed from options of that run is at its default, because these options may change.
+    Values that follow from other options are at their defaults, because these options may change.
 
     Args:
         run: the run directory.
         given: the options that the user gave.
 
     Raises:
-        ConfigError: there is no such run, its configuration cannot be read, or there is an option
+        ConfigError: there is no such run, its configuration cannot be read, or an option is given
             that the run decides.
     """
     from jaxsafe.train.host import run_directory  # it imports this module
@@ -371,21 +373,21 @@ def _base(run: str, given: Mapping[str, Any]) -> Base:
         if name in given:
             raise ConfigError(f"{name}: the options are those of {run}; leave out {name} or like")
     config, env, name = run_directory.read(Path(run), "like")
-    plain = TrainConfig()
-    kept = config.algorithm == given.get("algorithm", config.algorithm)
+    defaults = TrainConfig()
+    same_algorithm = config.algorithm == given.get("algorithm", config.algorithm)
     config = config.replace(
         out=None,
-        cost_limit=config.cost_limit if kept else None,
-        agent=config.agent.replace(cost_critic=plain.agent.cost_critic),
-        ppo=config.ppo.replace(cost_limit=plain.ppo.cost_limit),
+        cost_limit=config.cost_limit if same_algorithm else None,
+        agent=config.agent.replace(cost_critic=defaults.agent.cost_critic),
+        ppo=config.ppo.replace(cost_limit=defaults.ppo.cost_limit),
     )
     if config.rta_training == "corrected_action":
-        config = config.replace(ppo=config.ppo.replace(learns_from=plain.ppo.learns_from))
+        config = config.replace(ppo=config.ppo.replace(learns_from=defaults.ppo.learns_from))
     return Base(config, env, name)
 
 
 def _inherit_agent(arguments: Arguments, source: str) -> None:
-    """Add the options of the agent that a training has from what it starts from.
+    """Add the options of the agent of the run or policy from which a training starts.
 
     Raises:
         ConfigError: there is no such run or policy, or the user asks for another agent.
@@ -402,7 +404,7 @@ def _inherit_agent(arguments: Arguments, source: str) -> None:
 
 
 def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfig:
-    """Return the configuration with what follows from its algorithm.
+    """Return the configuration with the values that follow from its algorithm.
 
     Args:
         config: the configuration.
@@ -434,11 +436,10 @@ def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfi
             "ppo.gamma: expected less than 1 with algorithm=ppo_lagrangian, "
             f"found {float(config.ppo.gamma)}"
         )
-    agent, ppo = (
-        config.agent.replace(cost_critic=True),
-        config.ppo.replace(cost_limit=config.cost_limit),
+    return config.replace(
+        agent=config.agent.replace(cost_critic=True),
+        ppo=config.ppo.replace(cost_limit=config.cost_limit),
     )
-    return config.replace(agent=agent, ppo=ppo)
 
 
 def _check_rta(config: TrainConfig, env: Environment) -> None:
@@ -457,26 +458,26 @@ def _check_rta(config: TrainConfig, env: Environment) -> None:
 def recipe(task: str, preset: str | None, source: str | None = None) -> dict[str, Any]:
     """Return settings by dotted path from a recipe, with the recipe's source and its preset.
 
-    Where there is no recipe, there is only the preset `observation_only`.
+    Without a recipe there is only the preset `observation_only`.
 
     Args:
         task: the name of the task, or the file of an environment.
         preset: a preset of the recipe. None stands for the first one.
-        source: whose recipe it is, as for `find_recipes`.
+        source: the task or the file whose recipe is taken, as for `find_recipes`.
 
     Raises:
         ConfigError: there is no such task or file, or the recipe does not have the preset.
     """
-    found = find_recipes(task, source)
-    known = found.presets or {"observation_only": {}}
-    name = next(iter(known)) if preset is None else preset
-    if name not in known and RENAMED["preset"].get(name) in known:
+    available = find_recipes(task, source)
+    presets = available.presets or {"observation_only": {}}
+    name = next(iter(presets)) if preset is None else preset
+    if name not in presets and RENAMED["preset"].get(name) in presets:
         name = current_name("preset", name)
-    if name not in known:
+    if name not in presets:
         raise ConfigError(
-            f"preset: unknown preset {show(name)}; choose from {nearest(name, known)}"
+            f"preset: unknown preset {show(name)}; choose from {nearest(name, presets)}"
         )
-    return {"recipe": found.source, "preset": name, **flatten(known[name] or {})}
+    return {"recipe": available.source, "preset": name, **flatten(presets[name] or {})}
 
 
 class Recipes(NamedTuple):
@@ -495,7 +496,7 @@ def find_recipes(task: str, source: str | None = None) -> Recipes:
     Args:
         task: the name of the task, or the file of an environment.
         source: the task or the file whose recipes are taken, or `none`. None stands for the task
-            itself, and where that is a file, for what the file has or names.
+            itself. A file stands for the recipes that it has or names.
 
     Raises:
         ConfigError: there is no such task or file, or files name one another.
@@ -537,7 +538,7 @@ def recipe_options() -> set[str]:
 
 
 def current_name(option: str, value: Any) -> Any:
-    """Return today's name of the value of an option, and warn if it is another one."""
+    """Return today's name of a value of an option, and warn if an earlier name is given."""
     name = RENAMED[option].get(value, value) if isinstance(value, str) else value
     if name != value:
         warnings.warn(f"{option}: {value} is now called {name}", ConfigWarning, stacklevel=2)

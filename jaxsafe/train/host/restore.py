@@ -34,7 +34,7 @@ def structure(env: Environment, config: TrainConfig) -> dict[str, Any]:
     """
 
     def seeds(keys: jax.Array) -> ppo.TrainState:
-        return jax.vmap(lambda one: ppo.init(env, config.agent, config.ppo, one))(keys)
+        return jax.vmap(lambda key: ppo.init(env, config.agent, config.ppo, key))(keys)
 
     state = jax.eval_shape(seeds, jax.random.split(jax.random.key(0), config.seeds))
     return {
@@ -49,7 +49,7 @@ def structure(env: Environment, config: TrainConfig) -> dict[str, Any]:
 NEWER = ("control_desired", "control_actual")
 """Arrays that older checkpoints lack, by the last part of their names.
 
-They are 0 then. No part of an older environment looks at them.
+They are 0 then, because no part of an older environment looks at them.
 """
 
 MAY_CHANGE = (
@@ -67,7 +67,7 @@ MAY_CHANGE = (
 )
 """Options that may differ from those of a checkpoint.
 
-They say how long to train, on which devices, where the run is, when to look at the training, and
+They say how long to train, on which devices, where the run is, when it is evaluated and saved, and
 where its progress goes.
 """
 
@@ -100,7 +100,8 @@ def restore(
     Raises:
         ConfigError: it cannot be read, or another environment or configuration made it.
     """
-    facts, place = checkpoints.facts(step), f"{checkpoints.directory / str(step)}: facts"
+    facts = checkpoints.facts(step)
+    place = f"{checkpoints.directory / str(step)}: facts"
     check(facts, {"updates": COUNT, "wall_s": AMOUNT, "compile_s": AMOUNT}, place)
     if "made_from" in facts:
         own = made_from(env, config)
@@ -121,9 +122,9 @@ def restore(
 
 
 def _as_of_today(before: Any) -> Any:
-    """Return what a checkpoint was made from as this version describes it.
+    """Return what a checkpoint was made from, as this version describes it.
 
-    So a field that is newer than the checkpoint has its default in it.
+    A field that is newer than the checkpoint has its default.
     """
     try:
         config, env = run_directory.from_described(before, "")
@@ -144,44 +145,45 @@ def _difference(before: Any, now: Any, place: str = "") -> tuple[str, Any, Any]:
         pairs = [(f"[{index}]", *pair) for index, pair in enumerate(zip(before, now, strict=True))]
     else:
         return ("", None, None) if before == now else (place, show(before), show(now))
-    for name, one, other in pairs:
-        found = _difference(one, other, f"{place}.{name}" if place else name)
-        if found[0]:
-            return found
+    for name, *values in pairs:
+        difference = _difference(*values, f"{place}.{name}" if place else name)
+        if difference[0]:
+            return difference
     return "", None, None
 
 
 def start_params(mapper: SeedMapper, config: TrainConfig, env: Environment) -> Params:
     """Return the networks of every seed at the start of a training that does not start afresh.
 
-    The i-th seed starts with the i-th policy of the run that it starts from. Where there are fewer
-    policies than seeds, they are taken from the first again.
+    The i-th seed starts with the i-th policy of the run that it starts from. If there are fewer
+    policies than seeds, they are taken again from the first one on.
 
     Raises:
         ConfigError: there is no such run or policy, or its networks have other shapes.
     """
     source = str(config.start_from)
     if is_single(source):
-        found = jax.tree.map(lambda x: np.asarray(x)[None], read_policy(find_policy(source)).params)
+        params = read_policy(find_policy(source)).params
+        stacked = jax.tree.map(lambda x: np.asarray(x)[None], params)
     else:
         before, own_env, _ = run_directory.read(Path(source), "from")
         seeds = SeedMapper(before.seeds)
-        found = seeds.gather(load_params(seeds, Path(source), before, own_env, "last")[0])
+        stacked = seeds.gather(load_params(seeds, Path(source), before, own_env, "last")[0])
     like = structure(env, config)["state"].average
-    policies = jax.tree.leaves(found)[0].shape[0]
+    policies = jax.tree.leaves(stacked)[0].shape[0]
 
     def pick(path: Any, leaf: jax.ShapeDtypeStruct) -> np.ndarray:
-        stacked = found
+        part = stacked
         for entry in path:
-            stacked = stacked.get(entry.key, {}) if isinstance(stacked, dict) else {}
-        shape = np.shape(stacked)[1:] if not isinstance(stacked, dict) else "nothing"
+            part = part.get(entry.key, {}) if isinstance(part, dict) else {}
+        shape = np.shape(part)[1:] if not isinstance(part, dict) else "nothing"
         if shape != leaf.shape[1:]:
             name = jax.tree_util.keystr(path, simple=True, separator="/")
             raise ConfigError(
                 f"from: {name}: expected numbers of shape {leaf.shape[1:]}, found {shape}; "
                 f"{source} observes or does something else"
             )
-        return np.asarray(stacked)[np.arange(config.seeds) % policies]
+        return np.asarray(part)[np.arange(config.seeds) % policies]
 
     return mapper.place(jax.tree_util.tree_map_with_path(pick, like))
 
@@ -213,6 +215,5 @@ def load_params(
             f"checkpoint: found {show(which)}; choose from {nearest(which, choices)}"
         ) from None
     content, _ = restore(checkpoints, step, env, config)
-    return mapper.place(
-        content["best"]["params"] if which == "best" else content["state"].average
-    ), step
+    params = content["best"]["params"] if which == "best" else content["state"].average
+    return mapper.place(params), step

@@ -114,12 +114,12 @@ def evaluation(
     Args:
         env: the environment.
         episodes: the episodes of all seeds, by kind of evaluation.
-        left_out: places of seeds in the batch whose values are None and in no average.
+        left_out: indices of seeds that no average includes. Their values are None.
     """
-    each = {kind: metrics_per_seed(env, one) for kind, one in episodes.items()}
+    per_seed = {kind: metrics_per_seed(env, sums) for kind, sums in episodes.items()}
     return {
         kind: {name: over_sound_seeds(values, left_out) for name, values in metrics.items()}
-        for kind, metrics in each.items()
+        for kind, metrics in per_seed.items()
     }
 
 
@@ -128,10 +128,10 @@ def over_sound_seeds(per_seed: Sequence[float | None], left_out: Collection[int]
 
     Args:
         per_seed: the values of all seeds.
-        left_out: places of the seeds to leave out. Their values are None among those of all seeds.
+        left_out: indices of the seeds to leave out. Their values in `per_seed` become None.
     """
-    shown = [None if place in left_out else value for place, value in enumerate(per_seed)]
-    sound = [value for place, value in enumerate(per_seed) if place not in left_out]
+    shown = [None if index in left_out else value for index, value in enumerate(per_seed)]
+    sound = [value for index, value in enumerate(per_seed) if index not in left_out]
     return {**over_seeds(sound or [None]), "per_seed": shown}
 
 
@@ -141,39 +141,35 @@ def diverged_seeds(steps: Mapping[int, int | None]) -> dict[str, Any]:
     Args:
         steps: for each of these seeds the step by which it had diverged, if that is known.
     """
-    found = [{"seed": seed, "step": step} for seed, step in sorted(steps.items())]
-    return {"diverged": found} if found else {}
+    entries = [{"seed": seed, "step": step} for seed, step in sorted(steps.items())]
+    return {"diverged": entries} if entries else {}
 
 
 def table(results: dict[str, Any], path: Path) -> str:
     """Return the results as text.
 
-    A column for each kind of evaluation has mean and 95 % interval over seeds.
+    Each kind of evaluation has a column with means and 95 % intervals over seeds.
 
     Args:
         results: the results.
         path: the file that holds them.
     """
-    found = results["evaluation"]
+    evaluations = results["evaluation"]
     lines = [f"{headline(results)}, {results['steps']:,} steps each", ""]
     sound = results["seeds"] - len(results.get("diverged", ()))
-    rows = [["mean [95 % interval] over seeds" if sound >= ENOUGH_SEEDS else "", *found]]
+    rows = [["mean [95 % interval] over seeds" if sound >= ENOUGH_SEEDS else "", *evaluations]]
     for name, label, unit in _ROWS:
-        if all(one.get(name, {}).get("mean") is not None for one in found.values()):
-            rows.append([label, *(_cell(one[name], unit) for one in found.values())])
-    rows.append(
-        [
-            "worst seed, success rate",
-            *(percent(least([one["success_rate"]]), 1) for one in found.values()),
-        ]
-    )
+        if all(metrics.get(name, {}).get("mean") is not None for metrics in evaluations.values()):
+            rows.append([label, *(_cell(metrics[name], unit) for metrics in evaluations.values())])
+    worst = [least([metrics["success_rate"]]) for metrics in evaluations.values()]
+    rows.append(["worst seed, success rate", *(percent(rate, 1) for rate in worst)])
     lines += [*columns(rows), *told_diverged(results), *told_violations(results)]
     if "given_up" in results:
         counts, limit = results["given_up"], results["given_up"]["after_steps"]
-        told = ", ".join(f"{counts[kind]:,} {kind}" for kind in found)
+        listed = ", ".join(f"{counts[kind]:,} {kind}" for kind in evaluations)
         lines.append(
             f"episodes still running after {limit:,} steps, "
-            f"given up and counted as failures: {told}"
+            f"given up and counted as failures: {listed}"
         )
     if "interaction_efficiency" in results:
         steps = results["interaction_efficiency"]["timesteps"]
@@ -248,7 +244,7 @@ def _metric(seeds: int, kind: Kind) -> dict[str, Any]:
 
 
 def summary(runs: Mapping[str, Path]) -> str:
-    """Return a line for each of several runs, given their directories by name.
+    """Return a table of several runs, given their directories by name, with a line for each.
 
     A line has the success after training, and the violating steps during and after it.
 
@@ -272,19 +268,17 @@ def summary(runs: Mapping[str, Path]) -> str:
     diverged: list[str] = []
     for name, run in runs.items():
         results = read_results(run / "results.json")
-        found = [results["evaluation"][kind] for kind in ("stochastic", "deterministic")]
-        success = [one["success_rate"] for one in found]
-        reached, cost = (
-            results["interaction_efficiency"]["timesteps"],
-            found[0]["episode_cost"]["mean"],
-        )
+        evaluations = [results["evaluation"][kind] for kind in ("stochastic", "deterministic")]
+        success = [metrics["success_rate"] for metrics in evaluations]
+        reached = results["interaction_efficiency"]["timesteps"]
+        cost = evaluations[0]["episode_cost"]["mean"]
         diverged += [f"{name}: {line}" for line in told_diverged(results)]
         rows.append(
             (
                 name,
                 f"{results['steps']:,}",
                 f"{reached:,}" if reached else "never",
-                *(percent(one["mean"], 2) for one in success),
+                *(percent(rate["mean"], 2) for rate in success),
                 percent(least(success), 1),
                 known(cost, ".2f"),
                 known(results["training_cost"]["mean"], ",.0f"),
@@ -306,7 +300,8 @@ def told_diverged(results: Mapping[str, Any]) -> list[str]:
     if not diverged:
         return []
     steps = ", ".join(
-        f"{one['seed']}" + (f" by step {one['step']:,}" if one["step"] else "") for one in diverged
+        f"{entry['seed']}" + (f" by step {entry['step']:,}" if entry["step"] else "")
+        for entry in diverged
     )
     return [f"DIVERGED, and left out of the averages: seed{'s' * (len(diverged) > 1)} {steps}"]
 
@@ -316,8 +311,8 @@ def told_violations(results: Mapping[str, Any]) -> list[str]:
 
     Return no line if the environment has no safety constraints.
     """
-    found = results["evaluation"]
-    rates = {kind: one["episode_safety_violation_rate"]["mean"] for kind, one in found.items()}
+    kinds = results["evaluation"].items()
+    rates = {kind: metrics["episode_safety_violation_rate"]["mean"] for kind, metrics in kinds}
     if any(rate is None for rate in rates.values()):
         return []
     rta = results.get("rta", "none")
@@ -328,18 +323,18 @@ def told_violations(results: Mapping[str, Any]) -> list[str]:
         line += f"{share:.2f} % while training ({cost:,.0f} per seed); after it "
     line += ", ".join(f"{100.0 * rate:.2f} % {kind}" for kind, rate in rates.items())
     lines = ["", line]
-    episodes = {kind: one["safety_violation_rate"]["mean"] for kind, one in found.items()}
+    episodes = {kind: metrics["safety_violation_rate"]["mean"] for kind, metrics in kinds}
     if episodes.get("stochastic", 0.0) > episodes.get("deterministic", 0.0):
         lines += [
-            "stochastic actions are sampled, as in training. Their noise now and then carries a",
-            "policy that flies along a limit across it. So many episodes have a violation, of few",
-            "steps. deterministic actions are the most probable ones.",
+            "Stochastic actions are sampled, as in training. Now and then their noise carries a",
+            "policy that flies along a limit across it, so more episodes have a violation, though",
+            "of few steps. Deterministic actions are the most probable ones.",
         ]
     return lines
 
 
 def least(metrics: Sequence[Mapping[str, Any]]) -> float | None:
-    """Return the smallest value of any seed in several metrics, or None if none is known."""
+    """Return the smallest known value of any seed in several metrics, or None if there is none."""
     return min(
         (value for metric in metrics for value in metric["per_seed"] if value is not None),
         default=None,

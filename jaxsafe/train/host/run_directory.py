@@ -40,7 +40,7 @@ def create(config: TrainConfig, env: Environment, name: str) -> Path:
     path = make(config.out, Path("runs"), name)
     content = {"env": name, **described(config, env), "commit": commit(), "versions": versions()}
     environment = content["environment"]
-    # Where the run is read, the module of a task registers it. So its filters are known by name.
+    # When the run is read, the module of a task registers it, so its filters are known by name.
     module = user_module(name)
     imports = {*environment.get("imports", []), *modules(config), *([module] if module else [])}
     if imports:
@@ -79,7 +79,7 @@ def runs(path: Path) -> list[Path]:
 
     The tasks come first, in their order. Other runs follow by name.
     """
-    inside = sorted(found.parent for found in path.glob("*/config.yaml"))
+    inside = sorted(file.parent for file in path.glob("*/config.yaml"))
     if (path / "config.yaml").is_file() or not inside:
         return [path]
     order = [*TASKS]
@@ -95,7 +95,7 @@ def make(out: str | None, parent: Path, name: str) -> Path:
 
     Args:
         out: the directory that the user asks for. None stands for the next free one.
-        parent: where to look for the next free one.
+        parent: the directory in which to make the next free one.
         name: the name of the next free one. It gets a number if it is taken.
 
     Raises:
@@ -137,7 +137,7 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
     """
     if not (path / "config.yaml").is_file():
         beside = (
-            [str(found.parent) for found in path.parent.glob("*/config.yaml")]
+            [str(file.parent) for file in path.parent.glob("*/config.yaml")]
             if path.parent.is_dir()
             else []
         )
@@ -145,21 +145,21 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
         raise ConfigError(
             f"{option}: no run in {str(path)!r} (a directory with config.yaml){choice}"
         )
-    content, place = read_content(path), f"{path / 'config.yaml'}: "
-    config, env = from_described(content, place)
+    content = read_content(path)
+    config, env = from_described(content, f"{path / 'config.yaml'}: ")
     name = str(content["env"])
     return config, env.named(name), name
 
 
 def from_described(content: Mapping[str, Any], place: str) -> tuple[TrainConfig, Environment]:
-    """Return the configuration and the environment of the data that `described` returns.
+    """Return the configuration and the environment from data that `described` returned.
 
-    The data may be older. Options that had other names then are understood, and what is new since
-    then has its default.
+    An earlier version may have written the data. Options that it called otherwise are understood,
+    and options that it lacked have their defaults.
 
     Args:
         content: the data.
-        place: what stands before places in messages of errors.
+        place: what stands before the places in error messages.
 
     Raises:
         ConfigError: the data cannot be read.
@@ -177,16 +177,16 @@ def from_described(content: Mapping[str, Any], place: str) -> tuple[TrainConfig,
 
 
 def extend(runs: Sequence[Path], steps: Any) -> None:
-    """Let runs train for more steps, also those that have ended. Schedules run over the new number.
+    """Let runs train for more steps, even if they have ended. Schedules run over the new number.
 
-    The results of a run that has ended are kept beside those to come, as `results_STEPS.json`.
+    The results of a run that has ended are kept as `results_STEPS.json`.
 
     Args:
         runs: the run directories.
         steps: the new number of environment steps of each seed.
 
     Raises:
-        ConfigError: it is not more than a run has now, or a directory holds no run.
+        ConfigError: the number is not larger than that of a run now, or a directory holds no run.
     """
     configs = {run: read(run, "resume")[0] for run in runs}
     longer = {run: set_path(config, "steps", steps, to_value) for run, config in configs.items()}
@@ -204,10 +204,10 @@ def extend(runs: Sequence[Path], steps: Any) -> None:
 def discard_unused(path: Path) -> None:
     """Remove the directory of a run if nothing was written to it since it was made.
 
-    What failed before it began is no run.
+    A training that failed before it began leaves no run.
     """
     if all(
-        found.is_dir() or found.name in ("config.yaml", "sweep.yaml") for found in path.rglob("*")
+        entry.is_dir() or entry.name in ("config.yaml", "sweep.yaml") for entry in path.rglob("*")
     ):
         shutil.rmtree(path, ignore_errors=True)
 

@@ -1,6 +1,6 @@
-"""The session: compiled chunks of updates, and between them logs, evaluations and checkpoints.
+"""A session of a run: compiled chunks of updates, and logs, evaluations, checkpoints between them.
 
-All that decides the numbers is a function of the configuration and of the state in the checkpoint.
+The numbers are functions of the configuration and of the state in the checkpoint alone.
 Chunks begin at the same updates however often a run is interrupted. So a resumed run ends bit for
 bit where the uninterrupted one ends, if it has as many processor cores or accelerators as before.
 """
@@ -83,7 +83,11 @@ class Training:
             clock: a clock that begins with what was spent on the run before.
             checkpoints: the run directory that holds the checkpoints, if it is another one.
         """
-        self.config, self.env, self.name, self.run, self.clock = config, env, name, run, clock
+        self.config = config
+        self.env = env
+        self.name = name
+        self.run = run
+        self.clock = clock
         self.mapper = SeedMapper(config.seeds, config.shares)
         self.shared = self.mapper.replicate((env, config.agent, config.ppo))
         intervals = (config.every(config.eval_every), config.every(config.checkpoint_every))
@@ -155,10 +159,11 @@ class Training:
                 self._record(1, final=False)
         display.start()
         with self.clock, _StopRequest() as stop:
-            # All hosts agree on this, because a signal may come to one of them at any time.
+            # All processes agree on this, because a signal may reach only one of them.
             stopping = False
             while self.updates < self.config.num_updates and not stopping:
-                before, (self.state, curves) = self.updates, self.advance(self.shared, self.state)
+                before = self.updates
+                self.state, curves = self.advance(self.shared, self.state)
                 self.updates = min(before + self.chunk, self.config.num_updates)
                 self._write_progress(curves, self.updates - before, display)
                 if self.updates < self.config.num_updates and self._due(
@@ -196,24 +201,25 @@ class Training:
         """
         self._evaluate()
         self._save()
-        found = {}
+        episodes = {}
         for kind in KINDS:
-            found[kind] = self._run_episodes(
+            episodes[kind] = self._run_episodes(
                 kind, self.config.episodes, self.state.average, self.step, final=True
             )
         self._record(self.config.episodes, final=True)
-        return found
+        return episodes
 
     def _begin(self) -> None:
         """Make the state, fresh or restored, while all programs are compiled side by side."""
         content = structure(self.env, self.config)
-        each = (
+        state_bytes = (
             memory.size(content) // self.config.seeds * self.mapper.padded // self.mapper.mesh.size
         )
         memory.require(
-            each, self.mapper.num_local_devices, memory.MEMORY_OPTIONS, memory.COMPILE_BYTES
+            state_bytes, self.mapper.num_local_devices, memory.MEMORY_OPTIONS, memory.COMPILE_BYTES
         )
-        begin, keys = time.monotonic(), self.mapper.keys(self.config.seed)
+        begin = time.monotonic()
+        keys = self.mapper.keys(self.config.seed)
         fresh, advance = programs(self.mapper, self.chunk, self.config.num_updates)
         like = self.mapper.like(jax.eval_shape(fresh, self.shared, keys), STATE)
         # The program that takes longest to compile comes first.
@@ -257,7 +263,7 @@ class Training:
             for step in steps
             if done[step] == step // self.config.ppo.batch_size * self.config.seeds
         ]
-        # If the log covers no checkpoint, it is refused when it is opened.
+        # A log that covers no checkpoint is refused later, when it is opened.
         newest = max(covered, default=steps[-1])
         if newest != steps[-1]:
             print(
@@ -265,11 +271,10 @@ class Training:
                 f"going on from {newest:,}"
             )
         content, facts = restore(self.checkpoints, newest, self.env, self.config)
-        self.state, self.best = (
-            self.mapper.place(content["state"], STATE),
-            self.mapper.place(content["best"]),
-        )
-        self.updates, self.compile_s = facts["updates"], facts["compile_s"]
+        self.state = self.mapper.place(content["state"], STATE)
+        self.best = self.mapper.place(content["best"])
+        self.updates = facts["updates"]
+        self.compile_s = facts["compile_s"]
         self.clock.spent += facts["wall_s"]
 
     def _keep_copies(self) -> None:
@@ -294,11 +299,13 @@ class Training:
         Raises:
             ConfigError: it does not fit.
         """
-        begin, compiled = time.monotonic(), self.advance.compiled()
+        begin = time.monotonic()
+        compiled = self.advance.compiled()
         self.compile_s += time.monotonic() - begin
-        has = memory.size(self.state) // self.mapper.mesh.size  # the state is in memory already
+        # The state is in memory already.
+        state_bytes = memory.size(self.state) // self.mapper.mesh.size
         memory.require(
-            memory.footprint(compiled) - has,
+            memory.footprint(compiled) - state_bytes,
             self.mapper.num_local_devices,
             memory.MEMORY_OPTIONS,
             memory.RUN_BYTES,
@@ -319,15 +326,16 @@ class Training:
     def _early_due(self) -> bool:
         """Return whether to log an episode that shows early learning.
 
-        That is after 0, 1, 2, 4, … chunks of updates, if evaluations come later.
+        This is after 0, 1, 2, 4, … chunks of updates, if evaluations come later.
         """
-        chunks, first = self.updates // self.chunk, self.config.every(self.config.eval_every)
+        chunks = self.updates // self.chunk
+        first = self.config.every(self.config.eval_every)
         return self.updates < first < self.config.num_updates and chunks & (chunks - 1) == 0
 
     def _known(self, row: dict[str, Any]) -> bool:
-        """Return whether a row of the evaluations is kept.
+        """Return whether to keep a row of the logs of evaluations.
 
-        It is kept if training, as it goes on from here, will not write it again.
+        A row is kept if the training, which goes on from here, will not write it again.
         """
         return self.updates > 0 and row["step"] <= self.step and row["step"] < self.num_steps
 
@@ -346,7 +354,7 @@ class Training:
         display.show(self.step, rows[-self.config.seeds :])
 
     def _find_diverged(self, rows: list[dict[str, Any]]) -> list[int]:
-        """Note the seeds that have diverged by rows of the progress log. Return the new ones."""
+        """Note the seeds that rows of the progress log call diverged, and return the new ones."""
         before = set(self.diverged)
         for row in rows:
             if row.get("diverged"):
@@ -371,7 +379,7 @@ class Training:
         return bool((self.mapper.gather(self.best["success"]) >= 0.0).any())
 
     def _keep_best(self, params: Any, step: int) -> None:
-        """Evaluate parameters of a step, and keep those of each seed that succeed most."""
+        """Evaluate the parameters of a step, and keep those of each seed that succeed most."""
         count = self.config.eval_episodes
         episodes = self._run_episodes("deterministic", count, params=params, step=step)
         rate = np.mean(self.env.succeeded(np.asarray(episodes.outcome)), axis=1)
@@ -413,7 +421,7 @@ class Training:
 
     def _save(self) -> None:
         for log in self.run.glob("*.jsonl"):
-            # A checkpoint outlives a loss of power, so the rows before it must outlive it too.
+            # A checkpoint survives a loss of power, so the rows before it must survive it too.
             sync(log)
         facts = {
             "updates": self.updates,
@@ -428,7 +436,7 @@ class Training:
 
 @jax.jit
 def _keep_best(best: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
-    """Return for each seed the parameters that succeeded more often, and the later ones if equal.
+    """Return the parameters of each seed that succeeded more often, or the later ones if equal.
 
     Parameters that are not finite are never taken.
     """
@@ -440,7 +448,7 @@ def _keep_best(best: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
 class _StopRequest:
     """A context that turns the first Ctrl-C or termination into a flag.
 
-    So the run stops between chunks. The second signal acts as usual. Signals come to the main
+    So the run can stop between chunks. A second signal acts as usual. Signals come to the main
     thread, and a training in another thread leaves them alone.
     """
 

@@ -62,7 +62,7 @@ class TensorBoard:
 class WandB:
     """A run of Weights & Biases. Without a network, `WANDB_MODE=offline` keeps it in `<run>/wandb`.
 
-    When a run is resumed, steps that Weights & Biases has already are ignored there. Their values
+    When a run is resumed, Weights & Biases ignores the steps that it already has. Their values
     would be equal.
     """
 
@@ -86,9 +86,9 @@ class WandB:
 
 
 class MLflow:
-    """A run of MLflow, where `MLFLOW_TRACKING_URI` says.
+    """A run of MLflow on the server or in the directory that `MLFLOW_TRACKING_URI` names.
 
-    When a run is resumed, values may come twice. They are equal.
+    When a run is resumed, values may be logged twice. They are equal then.
     """
 
     def __init__(self, experiment: str, run: Path, options: Mapping[str, Any]) -> None:
@@ -99,11 +99,11 @@ class MLflow:
 
         def new_run() -> str:
             known = self._client.get_experiment_by_name(experiment)
-            place = known.experiment_id if known else self._client.create_experiment(experiment)
-            number = self._client.create_run(place, run_name=run.name).info.run_id
+            number = known.experiment_id if known else self._client.create_experiment(experiment)
+            run_id = self._client.create_run(number, run_name=run.name).info.run_id
             params = [self._entities.Param(name, str(value)) for name, value in options.items()]
-            self._client.log_batch(number, params=params)
-            return number
+            self._client.log_batch(run_id, params=params)
+            return run_id
 
         self._id = _kept_id(run / "mlflow_id", new_run)
         self._client.update_run(self._id, status="RUNNING")
@@ -191,7 +191,7 @@ def _in_one_line(sink: str) -> Iterator[None]:
 
 
 def _kept_id(file: Path, make: Callable[[], str]) -> str:
-    """Return the id that a service knows the run by. The run directory keeps it for `resume`."""
+    """Return the id by which a service knows the run. The run directory keeps it for `resume`."""
     if not file.exists():
         write_text(file, make())
     return file.read_text(encoding="utf-8")

@@ -1,4 +1,4 @@
-"""What a training starts from: the agent of a run or of a policy file."""
+"""The agent of the run or of the policy file that a training starts from."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxsafe.schema.user_modules import import_modules
 from jaxsafe.train.host.run_config import read_content
 
 OPTIONS = ("actor", "critic", "features", "critic_sees_totals", "cost_critic")
-"""Options of the agent that decide which parameters it has and what they mean."""
+"""Options of the agent that decide which parameters it has, and what these mean."""
 
 
 def agent_options(source: str) -> dict[str, Any]:
