@@ -22,7 +22,7 @@ SUBCOMMANDS = {
     "config types": "list the types of parts, or explain some",
     "config schema": "write a JSON schema, from which editors complete files",
 }
-"""What the commands of two words do. The module of `config types` is `config_types`."""
+"""What the commands of two words do. The module of `config types` is `config_types.py`."""
 
 HELP = ("help", "-h", "--help")
 """Words that ask for the help text."""

@@ -1,6 +1,6 @@
-"""All types of which an environment, a filter and an agent are made.
+"""All types that an environment, a filter and an agent are made of.
 
-`jaxsafe config types` prints them, and the page of the site has the same.
+`jaxsafe config types` prints them, and a page of the site lists them.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from jaxsafe.train.ppo import PPO
 
 
 class Section(NamedTuple):
-    """Types that stand in the same place."""
+    """Types that can stand in the same field."""
 
     heading: str
     bases: tuple[type[Component], ...]
@@ -71,11 +71,11 @@ SECTIONS = {
     "agent": Section("Agents", (Agent, Features, Network)),
     "ppo": Section("PPO", (PPO,)),
 }
-"""The sections, most of them by the name of the field where their types stand."""
+"""The sections. Most have the name of the field in which their types stand."""
 
 
 class Entry(NamedTuple):
-    """What is known of a type."""
+    """The description of a type."""
 
     name: str
     paragraphs: list[str]
@@ -84,34 +84,34 @@ class Entry(NamedTuple):
 
 
 def find(name: str) -> list[type[Component]]:
-    """Return the types of a section, or those of a name.
+    """Return the types of the section of this name, or else the types of this name.
 
     Raises:
-        ConfigError: there is neither.
+        ConfigError: neither a section nor a type has this name.
     """
     # `region` means the section `regions`.
-    sections = {section.rstrip("s"): found for section, found in SECTIONS.items()}
+    sections = {key.rstrip("s"): section for key, section in SECTIONS.items()}
     if name.rstrip("s") in sections:
         return types_of(sections[name.rstrip("s")], with_users=True)
-    known = [cls for section in SECTIONS.values() for cls in types_of(section, with_users=True)]
-    found = [cls for cls in dict.fromkeys(known) if title(cls) == name]
-    if not found:
-        near = difflib.get_close_matches(name, [*SECTIONS, *map(title, known)], n=3, cutoff=0.6)
+    types = [cls for section in SECTIONS.values() for cls in types_of(section, with_users=True)]
+    matches = [cls for cls in dict.fromkeys(types) if title(cls) == name]
+    if not matches:
+        near = difflib.get_close_matches(name, [*SECTIONS, *map(title, types)], n=3, cutoff=0.6)
         hint = f". Did you mean {' or '.join(map(repr, dict.fromkeys(near)))}?" if near else ""
         raise ConfigError(
             f"types: nothing is called {show(name)}; choose from the types and from the sections "
             f"{', '.join(SECTIONS)}{hint}"
         )
-    return found
+    return matches
 
 
 def types_of(section: Section, with_users: bool = False) -> list[type[Component]]:
-    """Return the types of a section, and on demand those that a user has defined."""
+    """Return the types of a section, with those that a user has defined if `with_users` is true."""
     return [cls for base in section.bases for cls in _classes(base, with_users)]
 
 
 def describe(cls: type[Component], with_users: bool = False) -> Entry:
-    """Return what is known of a type."""
+    """Return the description of a type."""
     docs = field_docs(cls)
     rows = [
         Row(
@@ -127,14 +127,14 @@ def describe(cls: type[Component], with_users: bool = False) -> Entry:
 
 
 def title(cls: type[Component]) -> str:
-    """Return what YAML calls a type, or what the catalogue calls one that YAML has no name for."""
+    """Return the name of a type in YAML, or a name for a type that has none there."""
     return cls.type_name or cls.__name__.lower()
 
 
 def number(value: Any) -> str:
-    """Return a number, or a list of them, as one reads it.
+    """Return a number, or a list of numbers, as readable text.
 
-    Fractions of π are written as such where they are exact in float32.
+    A fraction of π is written as such if it is exact in float32.
     """
     if np.ndim(value):
         return "[" + ", ".join(map(number, value)) + "]"
@@ -153,13 +153,14 @@ def number(value: Any) -> str:
 
 
 def _classes(base: type[Component], with_users: bool) -> list[type[Component]]:
-    found = choices(base).values()
-    own = [cls for cls in found if with_users or cls.__module__.startswith("jaxsafe.")]
-    return own or [base]
+    """Return the types that can stand for a base, or the base itself if there are none."""
+    types = choices(base).values()
+    shown = [cls for cls in types if with_users or cls.__module__.startswith("jaxsafe.")]
+    return shown or [base]
 
 
 def _takes(field: Field, with_users: bool) -> str:
-    """Return what a field takes: which types, a name of which section, or as errors say it."""
+    """Return what a field takes: some types, a name from a section, or what its errors say."""
     core = bare(field.hint)
     inner = typing.get_args(core)
     base = inner[0] if typing.get_origin(core) is tuple and inner else core

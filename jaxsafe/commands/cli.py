@@ -36,8 +36,8 @@ def run(
 ) -> None:
     """Run a command and leave with its exit code.
 
-    Output that nobody reads any more is no error. Output that could not be written is an error.
-    That error is reported when the work is done.
+    Output that nobody reads any more is no error. Output that could not be written is one, which is
+    reported when the work is done.
 
     Args:
         main: the command. It takes the words of the command line and returns its exit code, or None
@@ -45,7 +45,7 @@ def run(
         options: the options of the command, for the help text.
         leave: a function that ends the process after an error or Ctrl-C. In all other cases
             `sys.exit` ends it.
-        alone: whether the command does something without a word.
+        alone: whether the command does something if it is called without any word.
     """
     argv = sys.argv[1:]
     with lasting_streams() as stdout:
@@ -60,7 +60,7 @@ def run(
 
 
 def _explain(options: type[CommandOptions], argv: Sequence[str]) -> int:
-    """Print the help text. A command line without a word is an error, which it explains."""
+    """Print the help text. It also explains a command line without any word, which is an error."""
     given = options.arguments([word for word in argv if word not in HELP])
     print(help_text(options, given), file=sys.stdout if argv else sys.stderr)
     return 0 if argv else 2

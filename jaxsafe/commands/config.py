@@ -1,7 +1,7 @@
 """Print a complete environment as YAML on standard output.
 
-A file with this text can be changed, and given to any command as env=FILE.yaml. It names the recipe
-of the task, so `jaxsafe train FILE.yaml` trains as the task is trained.
+The text can be kept in a file, changed, and given to any command as env=FILE.yaml. It names the
+recipe of the task, so `jaxsafe train FILE.yaml` trains as the task is trained.
 """
 
 from __future__ import annotations
@@ -35,18 +35,18 @@ def main(argv: Sequence[str]) -> int:
         data = {"recipe": name, **data}
     if own:
         data["recipes"] = own
-    # Whoever reads the file takes it to be UTF-8, so output in another encoding is only ASCII.
+    # The reader of the file assumes UTF-8, so output in another encoding has only ASCII.
     utf8 = codecs.lookup(sys.stdout.encoding).name == "utf-8"
     print(yaml12.write(data, ascii_only=not utf8), end="")
     return 0
 
 
 def _recipes(env: str, in_full: bool) -> tuple[str | None, Mapping[str, Any]]:
-    """Return the task or file that decides how a printed environment is trained, and recipes.
+    """Return the task or file whose recipe a printed environment names, and recipes to print.
 
     Args:
         env: a task or a file.
-        in_full: whether to return recipes in place of the name of a task or a file.
+        in_full: whether to return recipes instead of the name of a task or a file.
     """
     from jaxsafe.config import load_recipe_name, load_recipes
     from jaxsafe.envs import find_task, is_file

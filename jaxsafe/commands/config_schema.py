@@ -1,4 +1,4 @@
-"""Write a JSON schema of the files of environments, from which editors complete and check them.
+"""Write a JSON schema, with which editors complete and check the files of environments.
 
 An editor with a YAML language server reads it where a file begins with the line
 # yaml-language-server: $schema=jaxsafe.schema.json

@@ -1,7 +1,7 @@
-"""Print the types of which an environment, a filter and an agent are made.
+"""Print the types that an environment, a filter and an agent are made of.
 
-The first word is a section, such as reward, or a type, such as distance_change, whose fields are
-then printed. Without a word all sections are listed with their types.
+The first word is a section, such as reward, or a type, such as distance_change. The fields of these
+types are printed. Without a word all sections are listed with their types.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxsafe.schema.field_docs import summary
 from jaxsafe.schema.user_modules import import_modules
 
 Modules = Annotated[tuple[str, ...], Option(takes="names of modules")]
-"""Modules of a user."""
+"""Modules that a user has written."""
 
 
 class Options(CommandOptions):

@@ -29,7 +29,7 @@ class EnvironmentOptions(CommandOptions):
     rta: str | None = None
     """Run time assurance: none, default, another preset of the task, or a file.
 
-    The file has a filter, or an environment whose filter is taken. By default it is what the
+    The file holds a filter, or an environment whose filter is taken. By default it is what the
     environment says.
     """
     overrides: Overrides
@@ -60,5 +60,5 @@ class TaskOptions(EnvironmentOptions):
     """A task, such as docking3d, or the file of an environment, such as mine.yaml."""
 
     def filter_or_default(self) -> str | None:
-        """Return the option `rta`. By default it is that of `default_filter`."""
+        """Return the option `rta`, or what `default_filter` returns if it is not given."""
         return self.rta or default_filter(self.env)

@@ -47,7 +47,7 @@ class Options(PolicyOptions):
     render: Literal["gif", "mp4"] | None = None
     """Make a film of an episode. An mp4 needs ffmpeg on the PATH."""
     film: Literal["first", "failing", "violating", "worst"] = "first"
-    """The episode to film: the first, or the first that fails or violates, or the worst by return.
+    """The episode to film: the first, the first that fails or violates, or the worst by return.
 
     If there is no such episode, the first is filmed.
     """
@@ -88,13 +88,15 @@ def main(argv: Sequence[str]) -> int:
         require_ffmpeg()
     subject = load_foreign(options) if foreign else load(options.run, options.checkpoint)
     if options.film_seed is not None:
-        first, last = subject.facts["seed"], subject.facts["seed"] + subject.facts["seeds"] - 1
+        first = subject.facts["seed"]
+        last = first + subject.facts["seeds"] - 1
         if not first <= options.film_seed <= last:
-            found = f"found {options.film_seed}"
-            raise ConfigError(f"film_seed: expected a seed from {first} to {last}, {found}")
+            raise ConfigError(
+                f"film_seed: expected a seed from {first} to {last}, found {options.film_seed}"
+            )
     env = subject.env if foreign else options.change(subject.env, subject.name)
-    if told := differences(subject.env, env):
-        print(told)
+    if difference := differences(subject.env, env):
+        print(difference)
     request: dict[str, Any] = {
         "run": options.run,
         "episodes": options.episodes,

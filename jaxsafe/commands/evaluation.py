@@ -68,13 +68,14 @@ def evaluate(
         film: the film to make of each kind of evaluation, or None.
 
     Returns:
-        The path of `results.json`, its content, and lines that tell of the films.
+        The path of `results.json`, its content, and lines about the films.
 
     Raises:
         ConfigError: `out` holds something, or no outcome of the environment counts as a success.
     """
     require_success(env)
-    episodes, seed = request["episodes"], request["evaluation_seed"]
+    episodes = request["episodes"]
+    seed = request["evaluation_seed"]
     path = run_directory.make(
         out,
         subject.place,
@@ -91,8 +92,8 @@ def evaluate(
         raise
     first = subject.facts["seed"]
     left_out = _not_finite(subject)
-    for kind, one in sums.items():
-        rows = episode_rows(env, one, first, step=subject.facts["steps"], kind=kind, final=True)
+    for kind, of_kind in sums.items():
+        rows = episode_rows(env, of_kind, first, step=subject.facts["steps"], kind=kind, final=True)
         append_rows(
             path / "eval.jsonl", (row for row in rows if row["seed"] - first not in left_out)
         )
@@ -103,25 +104,25 @@ def evaluate(
         "versions": versions(),
         "evaluation": evaluation(env, sums, left_out),
     }
-    results |= given_up(env, sums) | diverged_seeds({first + place: None for place in left_out})
+    results |= given_up(env, sums) | diverged_seeds({first + index: None for index in left_out})
     write_json(path / "results.json", results)
-    told = []
+    lines = []
     if film is not None:
-        for kind, one in sums.items():
-            told += _render(subject, evaluator, one, seed, kind, film, path)
-    return path / "results.json", results, told
+        for kind, of_kind in sums.items():
+            lines += _render(subject, evaluator, of_kind, seed, kind, film, path)
+    return path / "results.json", results, lines
 
 
 def _not_finite(subject: Subject) -> list[int]:
-    """Return the indices of the policies that have a parameter that is not finite.
+    """Return the indices of the policies with parameters that are not finite.
 
     A training that diverged leaves such policies.
     """
     leaves = jax.tree.leaves(subject.mapper.gather(subject.params))
     return [
-        place
-        for place in range(subject.facts["seeds"])
-        if not all(np.isfinite(leaf[place]).all() for leaf in leaves)
+        index
+        for index in range(subject.facts["seeds"])
+        if not all(np.isfinite(leaf[index]).all() for leaf in leaves)
     ]
 
 
@@ -134,7 +135,7 @@ def _render(
     film: Film,
     path: Path,
 ) -> list[str]:
-    """Make a film of an episode of one policy, and return lines that tell its path.
+    """Make a film of an episode of one policy, and return lines with its path.
 
     Args:
         subject: the policies.
@@ -153,11 +154,11 @@ def _render(
     own = jax.tree.map(lambda x: np.asarray(x)[index], sums)
     number = film.choose(own, env)
     whose = f"seed {first + index}, {kind}"
-    told = []
+    lines = []
     if number is None:
-        told.append(f"film: no {film.which} episode of {whose}; the first one is shown")
+        lines.append(f"film: no {film.which} episode of {whose}; the first one is shown")
     params = jax.tree.map(lambda x: x[index], subject.mapper.gather(subject.params))
     episode = evaluator.episode(params, number or 0, seed, kind == "deterministic")
     title = f"{subject.name}, {whose}, episode {number or 0}"
     file = animate(env, episode, path / f"episode_{kind}.{film.form}", title)
-    return [*told, f"film of {whose}, episode {number or 0}: {file}"]
+    return [*lines, f"film of {whose}, episode {number or 0}: {file}"]

@@ -32,8 +32,8 @@ These are the starts of the verification community's closed-loop docking propert
 MAX_STEPS = 2000
 """Largest number of steps of the closed loop.
 
-A docking episode has as many. Each step adds about 350 operators and takes 3 MiB while they are
-made.
+A docking episode has at most as many. Each step adds about 350 operators, which take 3 MiB while
+they are made.
 """
 
 MAX_BOUND = 1e18
@@ -150,10 +150,10 @@ def main(argv: Sequence[str]) -> int:
             raise missing(error, "flatbuffers", "export") from None
         target = Path(out or f"{stem}.stablehlo")
         shape = jax.export.symbolic_shape(f"batch, {len(exported.inputs)}")
-        made = jax.export.export(jax.jit(exported.function))(
+        artefact = jax.export.export(jax.jit(exported.function))(
             jax.ShapeDtypeStruct(shape, jnp.float32)
         )
-        write_bytes(target, bytes(made.serialize()))
+        write_bytes(target, bytes(artefact.serialize()))
     else:
         from jaxsafe.export.onnx import write_onnx
 
@@ -175,7 +175,8 @@ def single_policy(options: SingleOptions) -> tuple[SavedPolicy | ForeignPolicy, 
     from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
     from jaxsafe.train.host import run_directory
 
-    run, seed = options.run, options.seed
+    run = options.run
+    seed = options.seed
     foreign = options.is_foreign()
     single = is_single(run)
     if foreign or single:
@@ -183,7 +184,7 @@ def single_policy(options: SingleOptions) -> tuple[SavedPolicy | ForeignPolicy, 
     if foreign:
         return options.read_foreign(), f"{Path(run).stem}_{options.task}"
     if not single:
-        # Reading the run imports the modules of which a user's environment is made.
+        # Reading the run imports the modules that a user's environment is made of.
         run_directory.read(Path(run), "run")
         stems = [
             file.stem.removeprefix("seed_") for file in (Path(run) / "policy").glob("seed_*.npz")
@@ -201,14 +202,14 @@ def single_policy(options: SingleOptions) -> tuple[SavedPolicy | ForeignPolicy, 
     path = find_policy(run) if single else Path(run) / "policy" / f"seed_{seed}.npz"
     saved = read_policy(path)
     env = options.change(saved.env, str(saved.about.get("env", path.stem)))
-    if told := differences(saved.env, env):
-        print(told)
+    if difference := differences(saved.env, env):
+        print(difference)
     return saved._replace(env=env), path.stem if single else f"{Path(run).name}_{path.stem}"
 
 
 @contextmanager
 def _with_advice(env: Environment) -> Iterator[None]:
-    """Add to an error how to leave out the filter of the environment.
+    """Add to an error the advice to leave out the filter of the environment, if there is one.
 
     Most filters have no counterpart in ONNX.
     """
@@ -225,7 +226,7 @@ def _with_advice(env: Environment) -> Iterator[None]:
 def _require_finite(run: str, saved: SavedPolicy | ForeignPolicy) -> None:
     """Refuse a policy that was left by a training that diverged.
 
-    An infinite constant in a network from elsewhere may be a bound, so only NaN is refused there.
+    In a network from elsewhere an infinite constant may be a bound, so only NaN is refused there.
     """
     import jax
     import numpy as np
@@ -252,8 +253,8 @@ def _vnnlib(
     """Write the graph and the property, and print what a search for a counterexample finds.
 
     Args:
-        unrolled: the closed loop without a loop in its graph, to be written.
-        looped: the same closed loop with a loop, to be searched.
+        unrolled: the closed loop with one step after another in its graph, to be written.
+        looped: the same closed loop with a loop in its graph, to be searched.
         given: intervals of starts from the command line, by name.
         path: the path of the property. The graph gets the same name with the suffix `.onnx`.
         about: facts about the policy, for the graph.
@@ -275,13 +276,13 @@ def _vnnlib(
     start = ", ".join(
         f"{name} {value:.4g}" for name, value in zip(looped.inputs, worst.start, strict=True)
     )
-    found = (
+    verdict = (
         f"no counterexample among {worst.tried:,} starts, which proves nothing"
         if worst.margin >= 0.0
         else "violated"
     )
     margin = "not a number" if worst.margin == -math.inf else f"{worst.margin:.4g}"
-    print(f"least margin {margin} from {start}: {found}")
+    print(f"least margin {margin} from {start}: {verdict}")
     return 0
 
 
@@ -298,7 +299,8 @@ def _box(names: Sequence[str], given: Mapping[str, object]) -> list[tuple[float,
     Raises:
         ConfigError: an element has no proper interval, or an interval belongs to no element.
     """
-    bounds, used = {**BOX, **given}, set()
+    bounds = {**BOX, **given}
+    used = set()
     box = []
     for name in names:
         parts = name.split(".")
@@ -319,12 +321,12 @@ def _box(names: Sequence[str], given: Mapping[str, object]) -> list[tuple[float,
 
 
 def _is_interval(value: Any) -> TypeGuard[Sequence[float]]:
-    numbers = (
+    is_pair = (
         isinstance(value, (list, tuple))
         and len(value) == 2
-        and all(isinstance(one, (int, float)) for one in value)
+        and all(isinstance(bound, (int, float)) for bound in value)
     )
-    return numbers and -MAX_BOUND <= value[0] <= value[1] <= MAX_BOUND
+    return is_pair and -MAX_BOUND <= value[0] <= value[1] <= MAX_BOUND
 
 
 def command() -> None:

@@ -30,9 +30,9 @@ from jaxsafe.storage import provenance
 from jaxsafe.storage.files import write_text
 
 MOST_STEPS = 1_000_000
-"""Largest number of steps of each adversary where `steps` is not given.
+"""Largest number of steps of each adversary if `steps` is not given.
 
-Episodes that are longer than this allows are cut.
+Episodes that would need more steps are cut.
 """
 
 POLICIES = (*ADVERSARIES, SEARCH)
@@ -67,7 +67,7 @@ class Options(TaskOptions):
         Annotated[tuple[float, ...], Range(0.0, high=1e6), Option(takes="numbers from 0 to 1e6")]
         | None
     ) = None
-    """Multiples of the filter's bound, with commas between them. Each is a world to attack in.
+    """Multiples of the filter's bound, with commas between them. Each gives a world to attack in.
 
     The disturbance has the worst direction in every step, and so have the errors of navigation. The
     search chooses the disturbance together with the controls.
@@ -75,7 +75,7 @@ class Options(TaskOptions):
     seed: Seed = 0
     """Seed of the starts and of the adversaries."""
     out: File | None = None
-    """A .json file for the numbers."""
+    """A .json file to write the numbers to."""
 
 
 def report(rows: Sequence[dict[str, Any]]) -> str:

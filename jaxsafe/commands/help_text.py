@@ -18,14 +18,14 @@ from jaxsafe.schema.convert import bare, expects, to_data
 from jaxsafe.schema.field_docs import field_docs
 
 WIDTH = 100
-"""Number of letters of a line."""
+"""Number of characters of a line."""
 
 REST = "Options of every command."
 """Title of the options that are in no group."""
 
 
 class Row(NamedTuple):
-    """All that is known of an option, or of a field of a part."""
+    """The description of an option, or of a field of a part."""
 
     name: str
     takes: str
@@ -37,7 +37,7 @@ class Row(NamedTuple):
 
 
 def help_text(cls: type[CommandOptions], given: Mapping[str, Any]) -> str:
-    """Return the usage, what the command does, and every option with all that is known of it.
+    """Return the usage of a command, what it does, and a description of every option.
 
     Args:
         cls: the options of the command.
@@ -67,8 +67,8 @@ def row_lines(row: Row, width: int, indent: int) -> Iterator[str]:
     """Yield the lines about an option or a field.
 
     Args:
-        row: what is known of it.
-        width: number of letters for the name.
+        row: the description of the option or field.
+        width: number of characters for the name.
         indent: number of spaces before the name.
     """
     takes = f"{row.takes} (default {row.default})" if row.default else row.takes
@@ -79,7 +79,7 @@ def row_lines(row: Row, width: int, indent: int) -> Iterator[str]:
 
 
 def grouped(cls: type[CommandOptions], options: Iterable[Row]) -> dict[str, list[Row]]:
-    """Return the options of a command by the title of their group. Options of no group are last."""
+    """Return the options of a command by the title of their group, those without a group last."""
     left = {entry.name: entry for entry in options}
     groups: dict[str, list[Row]] = {}
     for title, patterns in cls.groups.items():
@@ -89,11 +89,11 @@ def grouped(cls: type[CommandOptions], options: Iterable[Row]) -> dict[str, list
 
 
 def entries(cls: type[Component], start: str = "") -> Iterator[Row]:
-    """Yield each option.
+    """Yield the description of each option.
 
     Args:
         cls: the options of a command, or a component of which every field is an option.
-        start: what stands before the names of the fields.
+        start: the prefix of the names of the fields.
     """
     docs = field_docs(cls)
     table = options_of(cls) if issubclass(cls, CommandOptions) else fields(cls)
@@ -114,7 +114,7 @@ def entries(cls: type[Component], start: str = "") -> Iterator[Row]:
 
 
 def wrapped(text: str, indent: int) -> list[str]:
-    """Return a text in lines. Its paragraphs become one, as they are short."""
+    """Return a text as lines. Its paragraphs become one, because they are short."""
     space = " " * indent
     words = " ".join(inspect.cleandoc(text).split())
     return textwrap.wrap(
@@ -139,7 +139,7 @@ def shown(value: Any) -> str:
 
 
 def _words(cls: type[CommandOptions]) -> Iterator[str]:
-    """Yield the words of the usage line, an example of each option that has one."""
+    """Yield the words of the usage line: one example of each option that has examples."""
     for field in options_of(cls).values():
         for word in option(field).examples[:1]:
             yield word.partition("=")[2] if option(field).first else word

@@ -1,7 +1,7 @@
 """The options of a command: one class that the parser and the help text are made from.
 
-A new option is one line of such a class, and below it the text that explains it. The annotation
-says what the option takes. For instance:
+A new option is one line of such a class, with the text that explains it below. The annotation says
+what the option takes. For instance:
 
     episodes: Annotated[int, Range(1, largest=MAX_COUNT)] = 1000
 """
@@ -24,12 +24,12 @@ Count = Annotated[int, Range(1, largest=arguments.MAX_COUNT)]
 """A number of episodes, steps or environments."""
 
 Seed = Annotated[int, Range(0, largest=arguments.MAX_SEED)]
-"""A seed of random numbers. A larger one would give the same numbers as a smaller one."""
+"""A seed of random numbers. Larger seeds would give the same numbers as smaller ones."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Option:
-    """Mark of an option that says what its type leaves open."""
+    """A mark of an option, which says what the type of the option leaves open."""
 
     first: bool = False
     """Whether the first word of a command line may be the value alone, as `docking3d` for `env`."""
@@ -41,7 +41,7 @@ class Option:
     """The names to choose from."""
 
     kind: str = ""
-    """What the names are names of, for the error about an unknown one."""
+    """What the names stand for, for the error about an unknown name."""
 
     takes: str = ""
     """What the option takes in words, where its type does not say it."""
@@ -50,10 +50,10 @@ class Option:
     """An older name, which is accepted too."""
 
     prefix: str | None = None
-    """What the names of several options begin with.
+    """The beginning that the names of several options share.
 
-    The field gets all of them, by the rest of their names. The empty prefix fits all names, so a
-    field with it stands last and gets the options that no other field takes.
+    The field gets all these options, by the rest of their names. The empty prefix fits all names,
+    so a field with it stands last and gets the options that no other field takes.
     """
 
     placeholder: str = ""
@@ -149,13 +149,13 @@ class CommandOptions(Component):
 
     @classmethod
     def defaults(cls, given: Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
-        """Return what the help text says of defaults that depend on other options.
+        """Return the defaults that depend on other options, for the help text.
 
         Args:
-            given: the options beside the word that asks for the help text.
+            given: the options that were given together with the word that asks for help.
 
         Returns:
-            These defaults by the name of the option, and a sentence about where they come from.
+            The defaults by the name of the option, and a sentence about where they come from.
 
         Raises:
             ConfigError: one of the other options is wrong.
@@ -191,12 +191,15 @@ class CommandOptions(Component):
 
 
 def option(field: Field) -> Option:
-    """Return the mark of an option. One without a mark has an empty one."""
+    """Return the mark of an option, or an empty mark if it has none."""
     return next((mark for mark in marks(field.hint) if isinstance(mark, Option)), Option())
 
 
 def options_of(cls: type[CommandOptions]) -> dict[str, Field]:
-    """Return the fields that are options: those which must be given, the command's own, others."""
+    """Return the fields that are options, by name.
+
+    Required options come first, then the others of the command, then those of its base classes.
+    """
     table = fields(cls)
     names = [name for base in cls.__mro__ for name in inspect.get_annotations(base)]
     ordered = [table[name] for name in dict.fromkeys(names) if name in table and name != "given"]
@@ -205,7 +208,7 @@ def options_of(cls: type[CommandOptions]) -> dict[str, Field]:
 
 
 def shown_name(field: Field) -> str:
-    """Return the name of an option. That of several with a prefix has a placeholder in it."""
+    """Return the name of an option, or the prefix and the placeholder of several options."""
     mark = option(field)
     return field.name if mark.prefix is None else f"{mark.prefix}{mark.placeholder}"
 
@@ -265,9 +268,9 @@ def _interval(value: Any, field: Field, key: str) -> tuple[float, float]:
 
 def _numbers(value: Any, field: Field, key: str) -> tuple[float, ...]:
     items = value if isinstance(value, list) else [value]
-    known = all(isinstance(item, int | float) and not isinstance(item, bool) for item in items)
+    numbers = all(isinstance(item, int | float) and not isinstance(item, bool) for item in items)
     limits = field.range or Range()
-    if not items or not known or not all(item in limits for item in items):
+    if not items or not numbers or not all(item in limits for item in items):
         raise ConfigError(f"{key}: expected {option(field).takes}, found {show(value)}")
     return tuple(map(float, items))
 

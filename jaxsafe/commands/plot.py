@@ -1,8 +1,8 @@
 """Draw the paper's figures of a run from its log files, into RUN/figures.
 
 With several runs of one task, draw their curves in one figure and their performance profiles in
-another, and print a table of their results. Beside the figures the table is written as CSV and
-LaTeX, with 95 % intervals.
+another, and print a table of their results. The table is also written as CSV and LaTeX, with 95 %
+intervals.
 """
 
 from __future__ import annotations
@@ -28,8 +28,10 @@ PANELS = (
 """The columns of the progress log that have a panel. `jaxsafe.plot.curves` has their labels."""
 
 MIN_WIDTH = 2.0
+"""Smallest width of a figure in inches."""
+
 MAX_WIDTH = 40.0
-"""Smallest and largest width of a figure in inches. A page is about 7 inches wide."""
+"""Largest width of a figure in inches. A page is about 7 inches wide."""
 
 
 class Options(CommandOptions):
@@ -55,7 +57,7 @@ class Options(CommandOptions):
     format: Annotated[Literal["png", "pdf", "svg"], Option(kind="format")] = "png"
     """The format of the figures."""
     out: File | None = None
-    """File of the figure of several runs, by default comparison.png. Its ending says its format.
+    """The file of the figure of several runs, by default comparison.png. Its suffix is its format.
 
     The figures of a single run are in its directory.
     """
@@ -96,11 +98,11 @@ def _expand(options: Options) -> tuple[list[Path], bool]:
             paths.append(Path(typed))
             continue
         several = True
-        found = [Path(name) for name in sorted(glob.glob(typed))]
-        found = [path for path in found if (path / "config.yaml").exists()]
-        if not found:
+        matches = [Path(name) for name in sorted(glob.glob(typed))]
+        matches = [path for path in matches if (path / "config.yaml").exists()]
+        if not matches:
             raise ConfigError(f"run: no run fits {typed!r}")
-        paths += found
+        paths += matches
     return paths, several
 
 
@@ -173,9 +175,9 @@ def _compare(runs: Sequence[Path], options: Options, width: float | None) -> lis
         "return τ": _scores(results, "average_return", 1.0),
     }
     written = [save(figure, out)]
-    known = {quantity: values for quantity, values in scores.items() if values}
-    if known:
-        profiles = performance_profiles(known, title, width)
+    scores = {quantity: values for quantity, values in scores.items() if values}
+    if scores:
+        profiles = performance_profiles(scores, title, width)
         written.append(save(profiles, out.with_name(f"{out.stem}_profiles{out.suffix}")))
     write_csv(out.with_suffix(".csv"), csv_rows(results))
     write_text(out.with_suffix(".tex"), latex(results))
@@ -187,7 +189,7 @@ def _labelled(runs: Sequence[Path], labels: Sequence[str]) -> dict[str, Path]:
     """Return the run directories by their labels, which are their names unless others are given.
 
     Raises:
-        ConfigError: there are not several runs of different labels.
+        ConfigError: there is only one run, or two runs have the same label.
     """
     shown = ", ".join(map(str, runs))
     if labels and len(labels) != len(runs):
@@ -206,7 +208,7 @@ def _out(options: Options) -> Path:
     """Return the path of the figure of several runs.
 
     Raises:
-        ConfigError: its ending and `format` contradict each other.
+        ConfigError: its suffix and `format` contradict each other.
     """
     out = Path(options.out or f"comparison.{options.format}")
     if "format" in options.given and out.suffix not in ("", f".{options.format}"):
@@ -220,18 +222,15 @@ def _out(options: Options) -> Path:
 def _scores(
     results: Mapping[str, Mapping[str, Any]], metric: str, factor: float
 ) -> dict[str, list[float]]:
-    """Return a metric of the stochastic evaluation of every seed, by the label of the run."""
-    return {
-        name: known
-        for name, one in results.items()
-        if (
-            known := [
-                factor * value
-                for value in one["evaluation"]["stochastic"][metric]["per_seed"]
-                if value is not None
-            ]
-        )
-    }
+    """Return a metric of the stochastic evaluation of each seed, by the label of the run.
+
+    Runs in which no seed has a value are left out.
+    """
+    scores: dict[str, list[float]] = {}
+    for name, run in results.items():
+        per_seed = run["evaluation"]["stochastic"][metric]["per_seed"]
+        scores[name] = [factor * value for value in per_seed if value is not None]
+    return {name: values for name, values in scores.items() if values}
 
 
 def command() -> None:

@@ -1,4 +1,4 @@
-"""Policies to evaluate: those of all seeds of a run, or the one in a policy file."""
+"""Policies to evaluate: those of all seeds of a run, or the one of a policy file."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ class Subject(NamedTuple):
 def load_foreign(options: PolicyOptions) -> Subject:
     """Return a policy that was trained elsewhere or not at all, to act in a task.
 
-    Which files can be read stands in `jaxsafe.agents.imported_policy`, and which names are known in
-    `jaxsafe.agents.callables`.
+    `jaxsafe.agents.imported_policy` says which files can be read, and `jaxsafe.agents.callables`
+    says which names are known.
 
     Args:
         options: the options of the command, which name the policy and the task.
@@ -59,10 +59,11 @@ def load_foreign(options: PolicyOptions) -> Subject:
     Raises:
         ConfigError: there is no such task, or the policy does not fit it.
     """
-    policy, mapper = options.read_foreign(), SeedMapper(1)
+    policy = options.read_foreign()
+    mapper = SeedMapper(1)
     params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], policy.params))
     path = Path(options.run)
-    about = {
+    own_facts = {
         "env": options.task,
         "preset": path.name,
         "algorithm": "not trained" if is_callable(options.run) else "unknown",
@@ -76,7 +77,7 @@ def load_foreign(options: PolicyOptions) -> Subject:
         agent=policy.agent,
         mapper=mapper,
         params=params,
-        facts=about,
+        facts=own_facts,
         place=Path("evaluations") / path.stem.replace(":", "_"),
     )
 
@@ -102,24 +103,37 @@ def load(run: str, checkpoint: str | None) -> Subject:
     config, env, name = run_directory.read(Path(run), "run")
     mapper = SeedMapper(config.seeds)
     params, step = load_params(mapper, Path(run), config, env, checkpoint or "last")
-    found = {**facts(config, env, name), "steps": step}
-    return Subject(name, env, config.agent, mapper, params, found, Path(run) / "evaluations")
+    return Subject(
+        name=name,
+        env=env,
+        agent=config.agent,
+        mapper=mapper,
+        params=params,
+        facts={**facts(config, env, name), "steps": step},
+        place=Path(run) / "evaluations",
+    )
 
 
 def _of_file(path: Path) -> Subject:
-    saved, mapper = read_policy(path), SeedMapper(1)
+    saved = read_policy(path)
+    mapper = SeedMapper(1)
     params = mapper.place(jax.tree.map(lambda x: np.asarray(x)[None], saved.params))
     about = {"env": path.stem, "preset": "unknown", "seed": 0, "step": 0} | saved.about
     # No algorithm but PPO-Lagrangian has a critic of the cost.
     algorithm = "ppo_lagrangian" if saved.agent.cost_critic else "ppo"
-    found = {"env": about["env"], "preset": about["preset"], "algorithm": algorithm, "seeds": 1}
-    found |= {"seed": about["seed"], "steps": about["step"]}
     return Subject(
-        str(about["env"]),
-        saved.env,
-        saved.agent,
-        mapper,
-        params,
-        found,
-        Path("evaluations") / path.stem,
+        name=str(about["env"]),
+        env=saved.env,
+        agent=saved.agent,
+        mapper=mapper,
+        params=params,
+        facts={
+            "env": about["env"],
+            "preset": about["preset"],
+            "algorithm": algorithm,
+            "seeds": 1,
+            "seed": about["seed"],
+            "steps": about["step"],
+        },
+        place=Path("evaluations") / path.stem,
     )

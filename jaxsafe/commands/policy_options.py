@@ -39,7 +39,7 @@ class PolicyOptions(EnvironmentOptions):
     By default the policy acts where it was trained.
     """
     activation: Annotated[str, Option(names=tuple(ACTIVATIONS))] = "tanh"
-    """The function between the layers of an .npz from elsewhere."""
+    """The activation function between the layers of an .npz from elsewhere."""
 
     @property
     def changes(self) -> dict[str, Any]:
@@ -122,31 +122,33 @@ class PolicyOptions(EnvironmentOptions):
 def differences(trained: Environment, env: Environment) -> str:
     """Return a line about observations and actuators that are defined otherwise than in training.
 
-    Such a part has the same name in both environments. The line is empty if there is no such part.
+    Such a part has the same name in both environments. Without such a part the line is empty.
 
     Args:
         trained: the environment in which a policy was trained.
         env: the environment in which the policy acts.
     """
-    found = []
+    different = []
     pairs = {
         "observation": (trained.observation, env.observation),
         "actuator": (trained.actuators, env.actuators),
     }
     for what, (before, after) in pairs.items():
-        known = {part.name: to_data(part) for part in before}
-        found += [f"{what} {part.name}" for part in after if to_data(part) != known.get(part.name)]
-    return f"defined otherwise than in training: {', '.join(found)}" if found else ""
+        trained_as = {part.name: to_data(part) for part in before}
+        for part in after:
+            if to_data(part) != trained_as.get(part.name):
+                different.append(f"{what} {part.name}")
+    return f"defined otherwise than in training: {', '.join(different)}" if different else ""
 
 
 def _names(path: str) -> set[str]:
-    """Return the names of the entries of an archive. There are none if there is no archive.
+    """Return the names of the entries of an archive, or no names if there is no archive.
 
     The entries are not read.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             return set(archive.namelist())
-    # Whatever is wrong with the file, reading it later tells more.
+    # If something is wrong with the file, the error is better when the file is read later.
     except Exception:
         return set()

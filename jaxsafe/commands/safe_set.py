@@ -1,6 +1,6 @@
 """Draw at which states a filter of run time assurance certifies.
 
-For docking the axes are distance and speed. For rejoin they are the surroundings of the lead.
+For docking the axes are distance and speed. For rejoin they are positions relative to the lead.
 """
 
 from __future__ import annotations

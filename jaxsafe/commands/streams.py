@@ -1,8 +1,9 @@
-"""Standard output and standard error of a command. Whatever happens to them, the work goes on.
+"""Standard output and standard error of a command, which goes on whatever happens to them.
 
-Letters that an encoding lacks are replaced. Control characters are spelt out, because they may come
-with a stranger's file and would act on the terminal. A stream that is closed leads nowhere. So does
-a stream that can take no more, because the reader of a pipe has gone or the disk is full.
+Characters that an encoding lacks are replaced. Control characters are spelt out, because a
+stranger's file may contain them and they would act on the terminal. What is written to a closed
+stream is discarded. The same holds for a stream that takes no more, because the reader of a pipe
+has gone or the disk is full.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class LastingStream:
         except OSError as error:
             self.error = error
             nowhere = os.open(os.devnull, os.O_WRONLY)
-            # The text in the buffer, libraries and child processes use the file descriptor.
+            # The buffered text, libraries and child processes still use the file descriptor.
             os.dup2(nowhere, self._stream.fileno())
             os.close(nowhere)
 
@@ -61,7 +62,7 @@ def lasting_streams() -> Iterator[LastingStream]:
         The lasting standard output.
     """
     before = sys.stdout, sys.stderr
-    # A file that gets the number of a closed stream would receive what libraries print there.
+    # If a file got the number of a closed stream, it would receive what libraries print there.
     while (number := os.open(os.devnull, os.O_RDWR)) <= 2:
         pass
     os.close(number)

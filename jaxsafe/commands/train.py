@@ -70,7 +70,10 @@ class Options(CommandOptions):
     overrides: Overrides
     """Change one field of the environment, for instance env.reward.delta_v.scale=-0.02."""
     resume: Directory | None = None
-    """The run to go on with. Beside it stand only distributed, and steps to train it for longer."""
+    """The run to go on with.
+
+    Only distributed may be given with it, and steps to train the run for longer.
+    """
     distributed: bool = False
     """Whether this is one of several processes that srun or mpirun started."""
     training: Annotated[Mapping[str, Any], Option(prefix="", component=TrainConfig)]
@@ -127,8 +130,8 @@ def main(argv: Sequence[str]) -> int:
                 unfinished = [run for run in runs if not is_complete(run)]
                 finished = train_all(unfinished, path, BEGAN)
             except Exception as error:
-                # With several processes, the error may be the loss of another one. The run can go
-                # on after that.
+                # With several processes, the error may be the loss of another process. The run can
+                # be resumed after that, so it is kept.
                 alone = jax.process_count() == 1
                 if (
                     resume is None

@@ -1,7 +1,7 @@
 """Train many settings of the options of a training as one program, and rank them.
 
-Several options of a sweep make a grid of all combinations, or samples=N draws some of them. A sweep
-that was stopped goes on with resume=DIR, which stands alone.
+If several options are swept, all combinations are trained, or samples=N draws some of them. A sweep
+that was stopped goes on with resume=DIR, without any other option.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Options(CommandOptions):
 
     groups: ClassVar = {
         "What is trained.": ("env", "sweep.OPTION", "samples", "draw", "OPTION"),
-        "How the settings are ranked, and where all is kept.": (
+        "How the settings are ranked, and where everything is kept.": (
             "rank",
             "episodes",
             "out",
@@ -49,7 +49,7 @@ class Options(CommandOptions):
     ]
     """Values of an option of `jaxsafe train`, or of env.PATH.
 
-    From an interval of numbers values are drawn, which needs samples=N.
+    Values are drawn from an interval of numbers, which needs samples=N.
     """
     samples: Annotated[int, Range(1, largest=MAX_SETTINGS)] | None = None
     """Number of settings to draw. By default all combinations are trained."""
@@ -80,7 +80,8 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.tune import results
     from jaxsafe.tune.batched_training import train_all
 
-    options, path = Options.parse(argv), None
+    options = Options.parse(argv)
+    path = None
     resume = options.resume
     if resume is not None:
         options.refuse_others("resume")
@@ -88,23 +89,23 @@ def main(argv: Sequence[str]) -> int:
         options = Options.read(results.read_request(path).options)
     arguments = Arguments({"episodes": options.episodes, **options.without(*OWN)})
     sweep = pop_sweep(arguments)
-    found = settings(arguments, sweep, options.samples, options.draw)
+    points = settings(arguments, sweep, options.samples, options.draw)
     if path is None:
-        path = results.create(options.out, options.without(), found[0])
+        path = results.create(options.out, options.without(), points[0])
     else:
-        results.refuse_other(path, found[0])
-    rows = results.read(path, found)
-    left = [i for i in range(len(found)) if i not in rows]
+        results.refuse_other(path, points[0])
+    rows = results.read(path, points)
+    left = [i for i in range(len(points)) if i not in rows]
     print(
-        f"{len(found)} settings × {found[0].config.seeds} seeds, "
-        f"{len(alike(found, left))} to compile, in {path}",
+        f"{len(points)} settings × {points[0].config.seeds} seeds, "
+        f"{len(alike(points, left))} to compile, in {path}",
         flush=True,
     )
-    total = sum(found[i].config.num_updates for i in left)
+    total = sum(points[i].config.num_updates for i in left)
     try:
         # `disable=None` draws no bar where there is no terminal.
         with tqdm(total=total, unit=" updates", disable=None) as bar:
-            for done in train_all(found, left, bar.update):
+            for done in train_all(points, left, bar.update):
                 results.add(path, done)
                 rows |= done
                 tqdm.write("\n".join(results.line(i, row, list(sweep)) for i, row in done.items()))
@@ -114,7 +115,7 @@ def main(argv: Sequence[str]) -> int:
         raise
     except KeyboardInterrupt:
         print(
-            f"stopped with {len(rows)} of {len(found)} settings; "
+            f"stopped with {len(rows)} of {len(points)} settings; "
             f"go on with: python -m jaxsafe.tune resume={path}"
         )
         return cli.INTERRUPTED

@@ -28,9 +28,10 @@ MAX_STEPS = 2000
 """Largest number of steps. A docking episode has as many."""
 
 EXIT_CODES = {"proved": 0, "refuted": 1, "open": 3}
+"""The exit code of each result of a proof."""
 
 BETWEEN_LINES = 2.0
-"""Seconds between two lines about the progress."""
+"""Smallest time between two lines about the progress [s]."""
 
 
 class Options(SingleOptions):
@@ -58,9 +59,12 @@ class Options(SingleOptions):
     arithmetic: Literal["float32", "real"] = "float32"
     """The arithmetic of the loop: single precision as it runs, or real numbers."""
     minutes: Annotated[int, Range(1, largest=100_000)] | None = None
-    """When to stop. What is left is open then. By default there is no limit."""
+    """Number of minutes after which to stop. By default there is no limit.
+
+    The boxes that are left then are open.
+    """
     boxes: Count = 100_000
-    """How many boxes to bound at most."""
+    """Largest number of boxes to bound."""
     everything: bool = False
     """Whether to go on after a violation, for a map of the whole box."""
     resume: File | None = None
@@ -77,12 +81,12 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.verify.verify import verify
 
     options = Options.parse(argv)
-    known = load_certificate(options.resume) if options.resume else None
+    earlier = load_certificate(options.resume) if options.resume else None
     saved, stem = single_policy(options)
     out = Path(options.out or f"{stem}_{options.property}.npz")
     if out.suffix != ".npz":
         raise ConfigError(f"out: expected NAME.npz, found {out}")
-    found = verify(
+    verification = verify(
         saved.env,
         saved.agent.policy(saved.env, saved.params, True),
         {**BOX, **options.box},
@@ -91,47 +95,49 @@ def main(argv: Sequence[str]) -> int:
         seconds=math.inf if options.minutes is None else 60.0 * options.minutes,
         max_boxes=options.boxes,
         everything=options.everything,
-        resume=known,
+        resume=earlier,
         progress=_Progress(),
     )
-    save_certificate(out, found, {"policy": stem, "jaxsafe": versions()["jaxsafe"]})
-    print(f"{_line(found)}\n{found.result}: {_reason(found)}\nwritten to {out}")
-    if found.result == "open":
+    save_certificate(out, verification, {"policy": stem, "jaxsafe": versions()["jaxsafe"]})
+    result = verification.result
+    print(f"{_line(verification)}\n{result}: {_reason(verification)}\nwritten to {out}")
+    if result == "open":
         print(f"go on with the same options and resume={out}")
-    return EXIT_CODES[found.result]
+    return EXIT_CODES[result]
 
 
 class _Progress:
-    """Prints what is known from time to time."""
+    """Prints a line about the verification from time to time."""
 
     def __init__(self) -> None:
         self.last = time.monotonic()
 
-    def __call__(self, known: Verification) -> None:
+    def __call__(self, verification: Verification) -> None:
         if time.monotonic() - self.last < BETWEEN_LINES:
             return
         self.last = time.monotonic()
-        rest = known.shares()["open"]
-        left = f", about {known.seconds * rest / (1.0 - rest):.0f} s left" if rest < 1.0 else ""
-        print(f"{_line(known)}{left}", flush=True)
+        rest = verification.shares()["open"]
+        seconds = verification.seconds * rest / (1.0 - rest) if rest < 1.0 else None
+        left = "" if seconds is None else f", about {seconds:.0f} s left"
+        print(f"{_line(verification)}{left}", flush=True)
 
 
-def _line(known: Verification) -> str:
-    shares = ", ".join(f"{share:.2%} {name}" for name, share in known.shares().items())
-    return f"{shares} after {known.bounded:,} boxes and {known.seconds:.1f} s"
+def _line(verification: Verification) -> str:
+    shares = ", ".join(f"{share:.2%} {name}" for name, share in verification.shares().items())
+    return f"{shares} after {verification.bounded:,} boxes and {verification.seconds:.1f} s"
 
 
-def _reason(found: Verification) -> str:
-    violation = found.counterexample
+def _reason(verification: Verification) -> str:
+    violation = verification.counterexample
     if violation is not None:
         start = json.dumps(violation.start)
         return f"margin {violation.margin:.4g} after {violation.step} steps from reset_to {start}"
-    if found.result == "open":
-        return f"{len(found.open.low):,} boxes are left"
-    count = len(found.proved.low)
+    if verification.result == "open":
+        return f"{len(verification.open.low):,} boxes are left"
+    count = len(verification.proved.low)
     return (
-        f"h ≥ {found.margin:.3g} m/s on all ways of {found.steps} steps from {count:,} boxes, "
-        "between samples too"
+        f"h ≥ {verification.margin:.3g} m/s on all ways of {verification.steps} steps "
+        f"from {count:,} boxes, between samples too"
     )
 
 

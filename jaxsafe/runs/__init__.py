@@ -1,6 +1,6 @@
-"""Runs: training all seeds of a task in a directory, and all that is kept there.
+"""Runs: the training of all seeds of a task in a directory, and everything that is kept there.
 
-The commands call what is here, and so does `jaxsafe.train` with the name of a task.
+The commands use this package, and so does `jaxsafe.train` with the name of a task.
 """
 
 from jaxsafe.runs.run import Run, open_run

@@ -58,26 +58,26 @@ def draw_all(
         run: the run directory.
         x: the horizontal axis of training curves: steps, or wall time.
         form: the format of the figures: png, pdf or svg.
-        panels: the columns of the progress log that the training curves show. Without any, they
-            show all.
+        panels: the columns of the progress log that the training curves show. If there are none,
+            they show all.
         width: the width of each figure in inches.
 
     Returns:
         The paths of the figures.
 
     Raises:
-        ConfigError: the run has no progress log, or no values of a column of `panels`.
+        ConfigError: the run has no progress log, or the log has no values of a column of `panels`.
     """
     figures = draw(run, x, panels, width)
-    place = run / "figures"
+    directory = run / "figures"
     # If there are no figures yet, all of them appear at once or none does.
-    new = place if place.exists() else place.with_name("figures.part")
+    new = directory if directory.exists() else directory.with_name("figures.part")
     # A command that was killed may have left this directory.
-    shutil.rmtree(place.with_name("figures.part"), ignore_errors=True)
+    shutil.rmtree(directory.with_name("figures.part"), ignore_errors=True)
     paths = [save(figure, new / f"{name}.{form}") for name, figure in figures.items()]
-    if new != place:
-        new.rename(place)
-    return [place / path.name for path in paths]
+    if new != directory:
+        new.rename(directory)
+    return [directory / path.name for path in paths]
 
 
 def draw(
@@ -88,13 +88,13 @@ def draw(
     Args:
         run: the run directory.
         x: the horizontal axis of training curves: `steps` or `wall`.
-        panels: the columns of the progress log that the training curves show. Without any, they
-            show all.
+        panels: the columns of the progress log that the training curves show. If there are none,
+            they show all.
         width: the width of each figure in inches.
 
     Raises:
-        ConfigError: `x` is something else, or the run has no progress log, or no values of a column
-            of `panels`.
+        ConfigError: `x` is something else, or the run has no progress log, or the log has no values
+            of a column of `panels`.
     """
     if x not in AXES:
         raise ConfigError(f"x: unknown axis {show(x)}; choose from {nearest(x, AXES)}")
@@ -163,9 +163,9 @@ def evaluations(run: Path, progress: Sequence[Mapping[str, Any]]) -> list[dict[s
     }
     log = read_rows(run / "eval.jsonl", form)
     optional = ("delta_v", "violating_steps", "interventions")
-    known = {name: NUMBER_OR_NULL for name in optional if any(name in row for row in log)}
+    logged = {name: NUMBER_OR_NULL for name in optional if any(name in row for row in log)}
     for number, row in enumerate(log, start=1):
-        check(row, known, f"{run / 'eval.jsonl'}, row {number}")
+        check(row, logged, f"{run / 'eval.jsonl'}, row {number}")
     return evaluation_rows(log, progress)
 
 
@@ -187,9 +187,9 @@ def _episodes(
     """
     grouped: dict[tuple[int, bool, int], Rows] = {}
     rows = read_rows(path)
-    wanted = form(rows) if form else ANYTHING
+    row_form = form(rows) if form else ANYTHING
     for number, row in enumerate(rows, start=1):
-        check(row, wanted, f"{path}, row {number}")
+        check(row, row_form, f"{path}, row {number}")
         row["platforms"] = {name: row["platforms"][name] for name in names}
         grouped.setdefault((row["step"], row["final"], row["episode"]), []).append(row)
     ended = {step for step, final, _ in grouped if final}
@@ -201,7 +201,7 @@ def _episodes(
 def _row_form(env: Environment, names: Sequence[str], rows: Rows) -> dict[str, Any]:
     """Return what a row of an episode log must look like.
 
-    Older logs lack some fields. Such a field is required of all rows if one row has it.
+    Older logs lack some fields. If one row has such a field, all rows must have it.
 
     Args:
         env: the environment of the run.
@@ -209,7 +209,7 @@ def _row_form(env: Environment, names: Sequence[str], rows: Rows) -> dict[str, A
         rows: all rows of the log.
     """
     sizes = {platform.name: platform.dimension for platform in env.platforms}
-    place = {"position": numbers(max(sizes.values()))}
+    position = {"position": numbers(max(sizes.values()))}
     headed = any(
         "heading" in vars(platform.rest())
         for platform in env.platforms
@@ -220,20 +220,20 @@ def _row_form(env: Environment, names: Sequence[str], rows: Rows) -> dict[str, A
         "final": FLAG,
         "episode": COUNT,
         "platforms": {
-            name: place | ({"heading": NUMBER_OR_NULL} if headed and name == names[0] else {})
+            name: position | ({"heading": NUMBER_OR_NULL} if headed and name == names[0] else {})
             for name in names
         },
         "status": {},
     }
-    known = {key for row in rows for key in row}
+    keys = {key for row in rows for key in row}
     shown = {"docking_distance", "speed", "velocity_limit"}
     if any(
         isinstance(row.get("status"), Mapping) and shown <= row["status"].keys() for row in rows
     ):
         form["status"] = dict.fromkeys(sorted(shown), NUMBER_OR_NULL)
-    if "regions" in known:
-        form["regions"] = {OTHERS: place}
-    if "rta" in known:
+    if "regions" in keys:
+        form["regions"] = {OTHERS: position}
+    if "rta" in keys:
         actuators = dict.fromkeys(env.action_names, NUMBER_OR_NULL)
         form |= {
             "t": NUMBER,

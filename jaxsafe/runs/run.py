@@ -63,8 +63,8 @@ class Run(Described):
     def progress(self) -> Any:
         """The progress log, with a row for each update of each seed.
 
-        It is a pandas `DataFrame`. Where pandas is not installed it is a dict of NumPy arrays by
-        column. What is not known yet is NaN.
+        It is a pandas `DataFrame`, or a dict of NumPy arrays by column if pandas is not installed.
+        Values that are not known yet are NaN.
         """
         from jaxsafe.train.host.log import read_progress
 
@@ -74,8 +74,8 @@ class Run(Described):
     def episodes(self) -> Any:
         """The evaluation episodes that were logged, with a row for each of their steps.
 
-        It has the form of `progress`. The columns `step`, `final` and `episode` say which episode a
-        row is of. Others have names such as `platforms.deputy.position.x`.
+        It has the form of `progress`. The columns `step`, `final` and `episode` say to which
+        episode a row belongs. Others have names such as `platforms.deputy.position.x`.
         """
         from jaxsafe.storage.files import read_rows
 
@@ -102,7 +102,7 @@ class Run(Described):
                 sampled, as in training.
 
         Raises:
-            ConfigError: there is no such seed or checkpoint, or training diverged.
+            ConfigError: there is no such seed or checkpoint, or the training of the seed diverged.
         """
         import jax
         import numpy as np
@@ -113,8 +113,7 @@ class Run(Described):
 
         seed = self.config.seed if seed is None else seed
         if seed not in self.seeds:
-            found = show(seed)
-            raise ConfigError(f"seed: expected one of {_span(self.seeds)}, found {found}")
+            raise ConfigError(f"seed: expected one of {_span(self.seeds)}, found {show(seed)}")
         mapper = SeedMapper(self.config.seeds)
         which = checkpoint if isinstance(checkpoint, str) else show(checkpoint)
         params, step = load_params(mapper, self.path, self.config, self.env, which)
@@ -128,7 +127,7 @@ class Run(Described):
     def plot(self, x: Literal["steps", "wall"] = "steps") -> Figures:
         """Return the figures of the run by name, which a notebook shows one below the other.
 
-        Each is a matplotlib `Figure`. The run directory has them as files in `figures/`.
+        Each is a matplotlib `Figure`. The run directory holds their files in `figures/`.
 
         Args:
             x: the horizontal axis of training curves: steps, or wall time.
@@ -146,6 +145,10 @@ class Run(Described):
         Args:
             steps: the new number of environment steps of each seed.
             progress: whether to show how far the training is.
+
+        Raises:
+            ConfigError: `steps` is not larger than it is now.
+            KeyboardInterrupt: the user stopped the training, which is kept.
         """
         from jaxsafe.runs.training import train_run
 
@@ -165,19 +168,19 @@ class Run(Described):
 
         results = self.results
         kinds = results["evaluation"]
-        rates = [one["success_rate"] for one in kinds.values()]
+        rates = [metrics["success_rate"] for metrics in kinds.values()]
 
-        def each(name: str, form: str) -> str:
-            means = {kind: known(one[name]["mean"], form) for kind, one in kinds.items()}
-            return ", ".join(f"{mean} {kind}" for kind, mean in means.items())
+        def means(name: str, form: str) -> str:
+            texts = {kind: known(metrics[name]["mean"], form) for kind, metrics in kinds.items()}
+            return ", ".join(f"{text} {kind}" for kind, text in texts.items())
 
         reached = results["interaction_efficiency"]["timesteps"]
         yield "task", f"{self.task}, preset {self.config.preset}, {self.config.algorithm}"
         yield "seeds", f"{_span(self.seeds)}, {results['steps']:,} steps each"
         yield "filter", results.get("rta", "unknown")
-        yield "success", f"{each('success_rate', '.1%')}, worst seed {percent(least(rates), 1)}"
+        yield "success", f"{means('success_rate', '.1%')}, worst seed {percent(least(rates), 1)}"
         yield "80 % success", f"after {reached:,} steps" if reached else "not reached in training"
-        yield "return", each("average_return", ".2f")
+        yield "return", means("average_return", ".2f")
         for line in told_violations(results)[1:2]:
             yield "violating steps", line.partition(": ")[2]
         yield "time", f"{results['wall_s']:.1f} s, {results['compile_s']:.1f} s of it compiling"

@@ -1,4 +1,4 @@
-"""Training runs one after another: each trains, is evaluated, and gets its figures.
+"""The training of runs, one after another, with their evaluation and their figures.
 
 `jaxsafe.train` calls `train`.
 """
@@ -66,13 +66,12 @@ def train(
 ) -> tuple[TrainState, Curves]: ...
 
 
-@functools.wraps(
-    function.train
-)  # so that `inspect` and `jax.jit` see the arguments of the function
+# `inspect` and `jax.jit` shall see the arguments of the pure function.
+@functools.wraps(function.train)
 def train(*arguments: Any, **options: Any) -> Any:
-    """Train a run, given a name, or do what `jaxsafe.train.train.train` does, given an environment.
+    """Train a run if a name is given, or one seed if an environment is given.
 
-    See `train_run` for the first, which takes the options of the command.
+    A name and options go to `train_run`, and an environment goes to `jaxsafe.train.train.train`.
     """
     env = arguments[0] if arguments else options.get("env")
     if {"resume", "like"} & set(options) or isinstance(env, str | os.PathLike):
@@ -100,8 +99,8 @@ def train_run(
     Args:
         env: a task, the file of an environment, or `MODULE:TASK`. It may be left out with the
             option `like`.
-        resume: the directory of a run to go on with. Beside it stands only `steps`, to train it for
-            longer.
+        resume: the directory of a run to go on with. Only `steps` may be given beside it, to train
+            the run for longer.
         progress: whether to show how far the training is.
         **options: the options of the command by name, such as `seeds=10`, `steps=200_000` and
             `out="runs/mine"`. Those with a dot are written `**{"ppo.gamma": 0.98}`.
@@ -125,7 +124,7 @@ def train_run(
     if progress:
         _tell_idle_cores(path)
     try:
-        finished = train_all([path], path, began, told=False, progress=progress)
+        finished = train_all([path], path, began, verbose=False, progress=progress)
     except Exception:
         if resume is None:
             run_directory.discard_unused(path)
@@ -169,13 +168,13 @@ def _extend(path: Path, options: Mapping[str, Any]) -> None:
     run_directory.read(path, "resume")
     for name in options:
         if name != "steps":
-            raise ConfigError(f"{name}: the run has its options; beside resume stands only steps")
+            raise ConfigError(f"{name}: the run has its options; only steps is given with resume")
     if options.get("steps") is not None:
         run_directory.extend([path], options["steps"])
 
 
 def _tell_idle_cores(path: Path) -> None:
-    """Say so if the seeds of a run cannot share the cores, because JAX was in use before."""
+    """Print a line if the seeds of a run cannot share the cores, because JAX was in use before."""
     cores = usable_cores()
     seeds = run_directory.read(path, "run")[0].seeds
     alone = jax.default_backend() == "cpu" and jax.local_device_count() == 1
@@ -200,18 +199,18 @@ def is_complete(run: Path) -> bool:
 
 
 def train_all(
-    runs: Sequence[Path], path: Path, began: float, *, told: bool = True, progress: bool = True
+    runs: Sequence[Path], path: Path, began: float, *, verbose: bool = True, progress: bool = True
 ) -> bool:
     """Train runs one after another, then evaluate all of them.
 
-    The programs of a run are compiled while the run before it trains, because compiling alone
+    The programs of a run are compiled while the run before it trains, because compiling on its own
     leaves cores idle.
 
     Args:
         runs: the directories of the runs.
         path: the directory from which the user can resume all of them.
         began: the time [s] of `time.monotonic` at which the clock of the first run starts.
-        told: whether to print what a run is and what came of it.
+        verbose: whether to print what each run is, its results and the paths of its figures.
         progress: whether to show how far a training is.
 
     Returns:
@@ -222,7 +221,7 @@ def train_all(
         for run, following in zip_longest(runs, runs[1:]):
             training = upcoming or _open(run, files, began)
             config = training.config
-            if told:
+            if verbose:
                 seeds = f"{config.seeds} {'seed' if config.seeds == 1 else 'seeds'}"
                 print(
                     f"{training.name}: {seeds} × {training.num_steps:,} steps, "
@@ -233,7 +232,7 @@ def train_all(
             if upcoming:
                 upcoming.prepare()
             if not training.train(progress):
-                call = f"python -m jaxsafe.train resume={path}" if told else go_on(path)
+                call = f"python -m jaxsafe.train resume={path}" if verbose else go_on(path)
                 print(f"stopped at step {training.step:,}; go on with: {call}")
                 return False
             trained.append((run, training))
@@ -244,20 +243,20 @@ def train_all(
 
         for run, training in trained:
             results = finish(training)
-            if told:
+            if verbose:
                 print(table(results, run / "results.json"))
             figures = draw_all(training.run)
-            if told:
+            if verbose:
                 print("figures: " + ", ".join(map(str, figures)))
     return True
 
 
 def recipe_text(config: TrainConfig) -> str:
-    """Say which options a training began with: those of a run, or a preset of a recipe."""
+    """Return a text that says whether a training has the options of a run or of a recipe."""
     if config.like is not None:
         return f"like {config.like}"
-    known = config.recipe not in (None, NO_RECIPE)
-    return f"recipe {config.recipe}, preset {config.preset}" if known else f"preset {config.preset}"
+    preset = f"preset {config.preset}"
+    return preset if config.recipe in (None, NO_RECIPE) else f"recipe {config.recipe}, {preset}"
 
 
 def go_on(path: Path) -> str:
@@ -266,7 +265,7 @@ def go_on(path: Path) -> str:
 
 
 def _open(run: Path, files: ExitStack, began: float) -> Training:
-    """Return what is left of a run to train.
+    """Return the training of a run, to be prepared and to go on from the newest checkpoint.
 
     Args:
         run: the run directory.

@@ -1,6 +1,6 @@
 """Training of many settings at once.
 
-Here a training is that of one seed with one setting. All trainings run the same compiled program.
+Here a training is one seed with one setting. All trainings run the same compiled program.
 """
 
 from __future__ import annotations
@@ -41,23 +41,23 @@ Between two pieces Ctrl-C takes effect and the progress bar moves. Neither waits
 
 
 def train_all(
-    found: Sequence[Setting], chosen: Sequence[int], tick: Callable[[int], object]
+    settings: Sequence[Setting], chosen: Sequence[int], tick: Callable[[int], object]
 ) -> Iterator[dict[int, dict[str, Any]]]:
     """Train and evaluate the chosen settings, some at a time.
 
     Args:
-        found: all settings of a sweep.
+        settings: all settings of a sweep.
         chosen: indices of the settings to train.
         tick: called with the number of updates finished since the last call, summed over settings.
 
     Yields:
         The results of the settings that were trained together, by index.
     """
-    for group in alike(found, chosen):
-        batch = BatchedTraining(found[group[0]], len(group))
+    for group in alike(settings, chosen):
+        batch = BatchedTraining(settings[group[0]], len(group))
         for first in range(0, len(group), batch.at_once):
             some = group[first : first + batch.at_once]
-            yield dict(zip(some, batch.run([found[i] for i in some], tick), strict=True))
+            yield dict(zip(some, batch.run([settings[i] for i in some], tick), strict=True))
 
 
 class BatchedTraining:
@@ -73,15 +73,17 @@ class BatchedTraining:
             like: one of the settings. The others differ from it in numbers only.
             count: number of settings.
         """
-        self.like, self.seeds, devices = like, like.config.seeds, jax.devices()
+        self.like = like
+        self.seeds = like.config.seeds
+        devices = jax.devices()
         on_cpu = devices[0].platform == "cpu"
         self.at_once = (
             min(count, math.lcm(self.seeds, len(devices)) // self.seeds) if on_cpu else count
         )
         self.mapper = SeedMapper(self.at_once * self.seeds)
         self.length = -(-like.config.num_updates // CHUNKS)
-        self._init = self.mapper.map(lambda _, one: begin(*one))
-        # Compiled when the first trainings are known.
+        self._init = self.mapper.map(lambda _, training: begin(*training))
+        # It is compiled when the first trainings are known.
         self._advance: Any = None
         self._evaluate = self.mapper.map(_one_evaluation)
 
@@ -101,19 +103,22 @@ class BatchedTraining:
         )
         self._advance = self._advance or self._fitting(trainings, keys)
         state = self._init((), (trainings, keys))
-        curves = []
+        pieces = []
         for first in range(0, self.like.config.num_updates, self.length):
             count = min(self.length, self.like.config.num_updates - first)
             state, rows = self._advance((), (trainings, state))
-            curves.append(self.mapper.gather({name: rows[name][:, :count] for name in CURVES}))
+            pieces.append(self.mapper.gather({name: rows[name][:, :count] for name in CURVES}))
             tick(count * len(some))
-        curve = {name: np.concatenate([one[name] for one in curves], axis=1) for name in curves[0]}
+        curve = {name: np.concatenate([piece[name] for piece in pieces], axis=1) for name in CURVES}
         sums = {
             kind: self._episodes(trainings, state.average, kind == "deterministic")
             for kind in KINDS
         }
-        split = lambda table: table.reshape(self.at_once, self.seeds, *table.shape[1:])[: len(some)]  # noqa: E731
-        curve, sums = jax.tree.map(split, (curve, sums))
+
+        def by_setting(x: np.ndarray) -> np.ndarray:
+            return x.reshape(self.at_once, self.seeds, *x.shape[1:])[: len(some)]
+
+        curve, sums = jax.tree.map(by_setting, (curve, sums))
         return [
             self._result(setting, *jax.tree.map(lambda x, i=i: x[i], (curve, sums)))
             for i, setting in enumerate(some)
@@ -127,8 +132,8 @@ class BatchedTraining:
             keys: a PRNG key for each training.
 
         Raises:
-            ConfigError: the state or the program needs more memory than there is. This is found
-                out before the state is allocated.
+            ConfigError: the state or the program needs more memory than there is. The state has
+                not been allocated then.
         """
         like = self.mapper.like(jax.eval_shape(self._init, (), (trainings, keys)))
         state = memory.size(like) // self.mapper.mesh.size
@@ -144,8 +149,8 @@ class BatchedTraining:
         )
         return compiled
 
-    def _one_chunk(self, _: tuple, one: tuple[Any, Any]) -> tuple[Any, dict[str, jax.Array]]:
-        return chunk(*one, self.length, self.like.config.num_updates)
+    def _one_chunk(self, _: tuple, training: tuple[Any, Any]) -> tuple[Any, dict[str, jax.Array]]:
+        return chunk(*training, self.length, self.like.config.num_updates)
 
     def _episodes(self, trainings: Any, params: Any, deterministic: bool) -> Episode:
         """Return the evaluation episodes of every training. Each field is [trainings, episodes].
@@ -176,19 +181,19 @@ class BatchedTraining:
         diverged = curve["diverged"]
         # A seed that has diverged succeeds no more.
         success = np.where(diverged, 0.0, curve["success_rate"]).T
-        episodes = curve["count"].T
+        counts = curve["count"].T
         last = np.where(diverged, np.nan, curve["return"])[:, -1]
         left_out = np.flatnonzero(diverged[:, -1]).tolist()
         evaluation = {
             kind: metrics_per_seed(setting.env, episodes) for kind, episodes in sums.items()
         }
-        for metric in (values for metrics in evaluation.values() for values in metrics.values()):
-            for place in left_out:
-                metric[place] = None
+        for values in (values for metrics in evaluation.values() for values in metrics.values()):
+            for index in left_out:
+                values[index] = None
         return {
             **setting.changes,
             "steps": int(steps[-1]),
-            "interaction_efficiency": interaction_efficiency(steps, success, episodes),
+            "interaction_efficiency": interaction_efficiency(steps, success, counts),
             "training_success": success[-1].tolist(),
             "training_return": last.tolist(),
             "evaluation": evaluation,
@@ -200,6 +205,7 @@ class BatchedTraining:
         }
 
 
-def _one_evaluation(shared: tuple, one: tuple[Any, Any]) -> Episode:
-    (key, deterministic), ((env, agent, _), params) = shared, one
+def _one_evaluation(shared: tuple, training: tuple[Any, Any]) -> Episode:
+    key, deterministic = shared
+    (env, agent, _), params = training
     return run_episodes(env, agent.policy(env, params, deterministic), key, EPISODES_PER_BATCH)

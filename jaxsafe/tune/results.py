@@ -23,13 +23,13 @@ from jaxsafe.tune.settings import Setting
 Rows = dict[int, dict[str, Any]]
 """The results of settings, by the index of the setting in the sweep."""
 
-SHOWN = 20
+MAX_ROWS = 20
 """The largest number of settings in the printed table."""
 
-NONE = {"80 % after": "never"}
-"""What a column of the table shows where there is no value. Other columns show a dash."""
+NO_VALUE = {"80 % after": "never"}
+"""What a column of the table shows if there is no value. Other columns show a dash."""
 
-LONGEST = 36
+MAX_LABEL = 36
 """The largest number of characters of a setting's values in the legend of the figure.
 
 If they are longer, the legend has only the number of the setting.
@@ -60,7 +60,7 @@ def create(out: str | None, request: Mapping[str, Any], first: Setting) -> Path:
 
 
 def read_request(path: Path) -> Arguments:
-    """Return the options of a sweep that was begun.
+    """Return the options with which a sweep was begun.
 
     Args:
         path: the directory of the sweep.
@@ -77,7 +77,7 @@ def read_request(path: Path) -> Arguments:
 
 
 def refuse_other(path: Path, first: Setting) -> None:
-    """Refuse to resume a sweep after its recipe or environment has changed.
+    """Refuse to resume a sweep if its recipe or environment has changed.
 
     Results of another recipe or environment must not stand in one table with those there are.
 
@@ -102,25 +102,26 @@ def _content(path: Path) -> dict[str, Any]:
     return content
 
 
-def read(path: Path, found: Sequence[Setting]) -> Rows:
+def read(path: Path, settings: Sequence[Setting]) -> Rows:
     """Return the results so far. A last line that was cut short by a kill is removed from the file.
 
     Args:
         path: the directory of the sweep.
-        found: the settings of the sweep.
+        settings: the settings of the sweep.
 
     Raises:
         ConfigError: a line is broken, or does not belong to one of these settings.
     """
-    file, rows = path / "settings.jsonl", {}
+    file = path / "settings.jsonl"
+    rows: Rows = {}
     for number, row in enumerate(keep_rows(file, lambda _: True, {"setting": COUNT}), start=1):
         index, place = row.pop("setting"), f"{file}, row {number}"
-        if index >= len(found) or index in rows:
+        if index >= len(settings) or index in rows:
             raise ConfigError(
-                f"{place}: setting: expected one of the {len(found)} settings, each once,"
+                f"{place}: setting: expected one of the {len(settings)} settings, each once,"
                 f" found {index}"
             )
-        check(row, _form(found[index]), place)
+        check(row, _form(settings[index]), place)
         check(
             row.get("diverged", []), [{"seed": COUNT, "step": COUNT | NULL}], f"{place}: diverged"
         )
@@ -129,7 +130,7 @@ def read(path: Path, found: Sequence[Setting]) -> Rows:
             {"after_steps": COUNT, OTHERS: COUNT},
             f"{place}: given_up",
         )
-        for name, value in found[index].changes.items():
+        for name, value in settings[index].changes.items():
             if row.get(name) != json.loads(json.dumps(value)):
                 raise ConfigError(
                     f"{place}: {name}: expected {show(value)} in setting {index},"
@@ -140,7 +141,7 @@ def read(path: Path, found: Sequence[Setting]) -> Rows:
 
 
 def _form(setting: Setting) -> dict[str, Any]:
-    """Return the form that the results of a setting must have. It has only what is read of them."""
+    """Return the form that the results of a setting must have, as far as they are read."""
     seeds, updates = setting.config.seeds, setting.config.num_updates
     rate, curve = numbers(seeds, SHARE | NULL), numbers(updates, SHARE | NULL)
     metrics = {
@@ -193,22 +194,22 @@ def finish(path: Path, rows: Rows, swept: Sequence[str], rank: str) -> str:
 
     order = sorted(rows, key=lambda index: (_key(rows[index], rank), index))
     flat = [{"setting": index, **_flat(rows[index], swept)} for index in order]
-    # Settings of which a seed has diverged have other columns.
-    names = dict.fromkeys(name for one in flat for name in one)
-    flat = [{name: one.get(name) for name in names} for one in flat]
+    # A setting with a seed that has diverged has more columns than others.
+    names = dict.fromkeys(name for cells in flat for name in cells)
+    flat = [{name: cells.get(name) for name in names} for cells in flat]
     write_json(
         path / "results.json",
         {"rank": rank, "settings": [{"setting": i, **rows[i]} for i in order]},
     )
     write_csv(path / "results.csv", flat)
     figure = sweep_curves(path, [(_label(i, rows[i], swept), rows[i]["curve"]) for i in order])
-    lines = _table(flat[:SHOWN])
-    if len(flat) > SHOWN:
-        lines.append(f"… and {len(flat) - SHOWN} more")
+    lines = _table(flat[:MAX_ROWS])
+    if len(flat) > MAX_ROWS:
+        lines.append(f"… and {len(flat) - MAX_ROWS} more")
     lines += [
         f"setting {index}: {_given_up(rows[index])}" for index in order if "given_up" in rows[index]
     ]
-    lines += [f"setting {index}: {told}" for index in order for told in told_diverged(rows[index])]
+    lines += [f"setting {index}: {text}" for index in order for text in told_diverged(rows[index])]
     return "\n".join([*lines, f"results in {path / 'results.csv'}, figure {figure}"])
 
 
@@ -222,13 +223,13 @@ def line(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
     """
     facts = _flat(row, swept)
     values = ", ".join(f"{name} {facts[name]}" for name in swept)
-    reached = _cell(facts["80 % after"], NONE["80 % after"])
+    reached = _cell(facts["80 % after"], NO_VALUE["80 % after"])
     after = f"80 % after {reached}, then {percent(facts['stochastic'], 1)}"
     return f"setting {index}: {values}: {'; '.join([after, *told_diverged(row)])}"
 
 
 def _given_up(row: dict[str, Any]) -> str:
-    """Say how many evaluation episodes of a setting had not ended."""
+    """Return a text about the evaluation episodes of a setting that had not ended."""
     counts = dict(row["given_up"])
     steps = counts.pop("after_steps")
     return (
@@ -240,42 +241,42 @@ def _given_up(row: dict[str, Any]) -> str:
 def _key(row: dict[str, Any], rank: str) -> tuple[float, ...]:
     """Return the key by which settings are sorted. Small is good.
 
-    Settings of which no seed diverged come first, then those with the fewest. Among equals the
-    chosen quantity decides, and then the other quantities.
+    Settings come in the order of the number of their seeds that diverged. Among equals the chosen
+    quantity decides, and then the other quantities.
 
     Args:
         row: the results of the setting.
         rank: the chosen quantity: `steps`, `success` or `deterministic`.
     """
     steps = row["interaction_efficiency"]["timesteps"] or float("inf")
-    success, deterministic = (
+    stochastic, deterministic = (
         -(_mean(row, kind, "success_rate") or 0.0) for kind in ("stochastic", "deterministic")
     )
     area = -float(np.mean(np.nan_to_num(np.array(row["curve"]["success_rate"], float))))
     quantities = {
-        "steps": (steps, area, success),
-        "success": (success, deterministic, steps),
-        "deterministic": (deterministic, success, steps),
+        "steps": (steps, area, stochastic),
+        "success": (stochastic, deterministic, steps),
+        "deterministic": (deterministic, stochastic, steps),
     }
     return len(row.get("diverged", ())), *quantities[rank]
 
 
 def _flat(row: dict[str, Any], swept: Sequence[str]) -> dict[str, Any]:
     """Return the cells of a setting in the table, by column."""
-    each = row["interaction_efficiency"]["per_seed"]
-    known = _known(row, "stochastic", "success_rate")
+    reached = row["interaction_efficiency"]["per_seed"]
+    rates = _known(row, "stochastic", "success_rate")
     return {
         **{
             name: json.dumps(row[name]) if isinstance(row[name], (list, dict)) else row[name]
             for name in swept
         },
         "80 % after": row["interaction_efficiency"]["timesteps"],
-        "seeds at 80 %": f"{sum(step is not None for step in each)}/{len(each)}",
+        "seeds at 80 %": f"{sum(step is not None for step in reached)}/{len(reached)}",
         "training": round(
             float(np.mean(np.nan_to_num(np.array(row["training_success"], float)))), 4
         ),
         "stochastic": _mean(row, "stochastic", "success_rate", 4),
-        "worst": None if not known else round(min(known), 4),
+        "worst": round(min(rates), 4) if rates else None,
         "deterministic": _mean(row, "deterministic", "success_rate", 4),
         "length": _mean(row, "deterministic", "episode_length", 1),
         **(
@@ -301,8 +302,8 @@ def _mean(row: dict[str, Any], kind: str, metric: str, digits: int | None = None
         metric: the name of the metric.
         digits: number of decimals to which the average is rounded. None does not round.
     """
-    known = _known(row, kind, metric)
-    mean = float(np.mean(known)) if known else None
+    values = _known(row, kind, metric)
+    mean = float(np.mean(values)) if values else None
     return mean if mean is None or digits is None else round(mean, digits)
 
 
@@ -313,11 +314,11 @@ def _known(row: dict[str, Any], kind: str, metric: str) -> list[float]:
 def _label(index: int, row: dict[str, Any], swept: Sequence[str]) -> str:
     """Return the entry of a setting in the legend: its number, and its values where they fit."""
     values = ", ".join(f"{'.'.join(name.split('.')[-2:])} {row[name]}" for name in swept)
-    return f"{index}: {values}" if len(values) <= LONGEST else f"setting {index}"
+    return f"{index}: {values}" if len(values) <= MAX_LABEL else f"setting {index}"
 
 
 def _table(rows: Sequence[dict[str, Any]]) -> list[str]:
-    cells = ([_cell(value, NONE.get(name, "–")) for name, value in row.items()] for row in rows)
+    cells = ([_cell(value, NO_VALUE.get(name, "–")) for name, value in row.items()] for row in rows)
     return columns([[*rows[0]], *cells])
 
 

@@ -21,7 +21,7 @@ from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.train.host.options import TrainConfig, resolve
 
 PREFIX = "sweep."
-"""What stands on the command line before the name of an option that is swept."""
+"""Prefix of the name of an option that is swept, on the command line."""
 
 COMMON = ("env", "seeds", "seed", "episodes", "out", "preset", "recipe", "like")
 """Options that all settings of a sweep share."""
@@ -33,7 +33,7 @@ Each setting is a training. Checking this many takes half a minute before the fi
 """
 
 MANY_SETTINGS = 500
-"""Number of settings from which on the user is told that they are being checked."""
+"""Number of settings from which the user is told that they are being checked."""
 
 _RANGE = re.compile(r"(log|uniform)\(\s*([^,\s]+)\s*,\s*([^,\s]+)\s*\)")
 
@@ -125,35 +125,36 @@ def settings(
         points = [[_draw(values, generator) for values in sweep.values()] for _ in range(samples)]
     if len(points) >= MANY_SETTINGS:
         print(f"checking {len(points):,} settings", flush=True)
-    found = []
+    result = []
     for point in points:
         changes = dict(zip(sweep, point, strict=True))
         config, env, _ = resolve({**arguments.options, **changes})
-        found.append(Setting(changes, config, env))
-    return found
+        result.append(Setting(changes, config, env))
+    return result
 
 
-def alike(found: Sequence[Setting], chosen: Sequence[int]) -> list[list[int]]:
+def alike(every: Sequence[Setting], chosen: Sequence[int]) -> list[list[int]]:
     """Return the chosen indices in groups, each of which is compiled once.
 
     The settings of a group differ in numbers only.
 
     Args:
-        found: all settings of the sweep.
+        every: all settings of the sweep.
         chosen: indices of settings.
     """
     groups: dict[Any, list[int]] = {}
     for index in chosen:
-        leaves, structure = jax.tree.flatten(parameters(found[index]))
+        setting = every[index]
+        leaves, structure = jax.tree.flatten(parameters(setting))
         shapes = tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-        groups.setdefault((structure, shapes, found[index].config.num_updates), []).append(index)
+        groups.setdefault((structure, shapes, setting.config.num_updates), []).append(index)
     return list(groups.values())
 
 
 def parameters(setting: Setting) -> tuple[Any, Any, Any]:
     """Return environment, agent and hyperparameters of a setting.
 
-    They are all that a training is made from, except its seed.
+    A training is made from these and its seed.
     """
     return setting.env, setting.config.agent, setting.config.ppo
 

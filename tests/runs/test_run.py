@@ -165,7 +165,7 @@ def test_a_wrong_call_is_refused_in_one_line(
 
 
 def test_a_run_that_is_resumed_keeps_its_options(whole: Path) -> None:
-    with pytest.raises(ConfigError, match="seeds: the run has its options; beside resume stands"):
+    with pytest.raises(ConfigError, match="seeds: the run has its options; only steps is given"):
         jaxsafe.train(resume=whole, seeds=4)  # type: ignore[call-overload]
     assert jaxsafe.train(resume=whole).path == whole
     with pytest.raises(ConfigError, match=r"env: .*whole is a run; resume=.* goes on with it"):

@@ -29,7 +29,7 @@ def test_the_table_tells_violating_steps_while_training_and_after(results: dict)
         "violating steps without a filter: 10.00 % while training (128 per seed); "
         "after it 2.00 % stochastic, 0.00 % deterministic"
     ) in told
-    assert "stochastic actions are sampled, as in training." in told
+    assert "Stochastic actions are sampled, as in training." in told
     set_violations(results, stochastic=0.0, training=0.0)
     told = table(results | {"rta": "discrete_asif"}, Path("x"))
     assert "violating steps with the filter discrete_asif: 0.00 % while training" in told
