@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 from baselines.plan import WITHOUT_RTA
 
 from jaxsafe.envs import TASKS
+from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
 from jaxsafe.metrics import with_interval
 from jaxsafe.storage.files import read_json, write_text
 
@@ -360,7 +361,7 @@ def learning(results: Results) -> str:
     """Return the table of variants of PPO, with means and 95 % intervals."""
     rows = []
     for row in results["runs"]:
-        sampled, modes = (row["evaluation"][kind] for kind in ("stochastic", "deterministic"))
+        sampled, modes = (row["evaluation"][kind] for kind in EVALUATION_KINDS)
         worst = min(sampled["success_rate"]["per_seed"] + modes["success_rate"]["per_seed"])
         first = row["variant"] not in VARIANTS
         rows.append(

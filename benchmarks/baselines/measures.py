@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
 from jaxsafe.metrics import ENOUGH_EPISODES, interaction_efficiency
 from jaxsafe.plot.curves import curve_table
 
@@ -15,10 +16,7 @@ def failed_seeds(results: Mapping[str, Any]) -> list[int]:
     After training, a failed seed succeeds in less than 95 % of its stochastic or of its
     deterministic episodes. A seed whose success is not known has failed.
     """
-    rates = [
-        results["evaluation"][way]["success_rate"]["per_seed"]
-        for way in ("stochastic", "deterministic")
-    ]
+    rates = [results["evaluation"][kind]["success_rate"]["per_seed"] for kind in EVALUATION_KINDS]
     pairs = enumerate(zip(*rates, strict=True), start=results["seed"])
     return [seed for seed, pair in pairs if any(rate is None or rate < 0.95 for rate in pair)]
 

@@ -17,6 +17,7 @@ from baselines.measures import failed_seeds, finished, samples_per_second, steps
 from baselines.plan import CERTIFIED_STARTS, FILM, KINDS, SHIPPED, WITH_RTA, WITHOUT_RTA, best_seed
 from baselines.record import Record
 from jaxsafe.envs import TASKS
+from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
 from jaxsafe.metrics import ENOUGH_EPISODES, stratified_iqm, with_interval
 from jaxsafe.plot.compare import compare_curves, seed_curves
 from jaxsafe.plot.style import save
@@ -223,7 +224,7 @@ class Report:
         rows = []
         for item, results in self.own:
             evaluation = results["evaluation"]
-            rates = [evaluation[way]["success_rate"] for way in ("stochastic", "deterministic")]
+            rates = [evaluation[way]["success_rate"] for way in EVALUATION_KINDS]
             rows.append(
                 [
                     item.task,
@@ -356,7 +357,7 @@ class Report:
     def _together(self) -> Rows:
         rows = []
         for kind in self.kinds:
-            for way in ("stochastic", "deterministic"):
+            for way in EVALUATION_KINDS:
                 scores = [
                     results["evaluation"][way]["success_rate"]["per_seed"]
                     for item, results in self.own
@@ -432,7 +433,7 @@ def _violating(results: Mapping[str, Any]) -> str:
 def _both(results: Mapping[str, Any], name: str) -> str:
     """Return a share in percent, with sampled actions and with the most probable ones."""
     metrics = results["evaluation"]
-    shares = [metrics[actions][name]["mean"] for actions in ("stochastic", "deterministic")]
+    shares = [metrics[actions][name]["mean"] for actions in EVALUATION_KINDS]
     return " / ".join("–" if share is None else f"{100 * share:.2f}" for share in shares)
 
 

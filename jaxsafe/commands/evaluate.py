@@ -15,13 +15,6 @@ from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores
 from jaxsafe.schema.errors import ConfigError
 
-KINDS = {
-    None: ("stochastic", "deterministic"),
-    True: ("deterministic",),
-    False: ("stochastic",),
-}
-"""Kinds of evaluation, by the option `deterministic`."""
-
 
 class Options(PolicyOptions):
     """The options of `jaxsafe evaluate`."""
@@ -64,6 +57,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.agents.callables import draws
     from jaxsafe.commands.evaluation import Film, evaluate
     from jaxsafe.commands.policies import load, load_foreign
+    from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
     from jaxsafe.train.host.results import table
 
     options = Options.parse(argv)
@@ -75,8 +69,8 @@ def main(argv: Sequence[str]) -> int:
             "deterministic: expected true or nothing, found False; "
             "a policy from elsewhere acts by its mode"
         )
-    chosen = options.deterministic
-    kinds = KINDS[True if foreign and chosen is None else chosen]
+    deterministic = True if foreign and options.deterministic is None else options.deterministic
+    kinds = [kind for kind in EVALUATION_KINDS if deterministic in (None, kind == "deterministic")]
     film = None
     if options.render is None:
         options.refuse_beside(["film", "film_seed"], "without render=gif or render=mp4")

@@ -48,7 +48,7 @@ EVALUATION_SEED = 0
 `python -m jaxsafe.evaluate seed=…` chooses others.
 """
 
-KINDS = ("stochastic", "deterministic")
+EVALUATION_KINDS = ("stochastic", "deterministic")
 """Kinds of evaluation: a policy draws its actions, or takes the mode of their distribution."""
 
 

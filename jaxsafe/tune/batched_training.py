@@ -18,8 +18,8 @@ from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.evaluate.evaluator import (
     EPISODES_PER_BATCH,
+    EVALUATION_KINDS,
     EVALUATION_SEED,
-    KINDS,
     given_up,
     in_batches,
     metrics_per_seed,
@@ -112,7 +112,7 @@ class BatchedTraining:
         curve = {name: np.concatenate([piece[name] for piece in pieces], axis=1) for name in CURVES}
         sums = {
             kind: self._episodes(trainings, state.average, kind == "deterministic")
-            for kind in KINDS
+            for kind in EVALUATION_KINDS
         }
 
         def by_setting(x: np.ndarray) -> np.ndarray:

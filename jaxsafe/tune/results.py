@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxsafe.config.arguments import Arguments
+from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.storage.files import append_rows, keep_rows, write_csv, write_json, write_text
@@ -155,7 +156,7 @@ def _form(setting: Setting) -> dict[str, Any]:
             "per_seed": numbers(seeds, COUNT | NULL),
         },
         "training_success": rate,
-        "evaluation": {"stochastic": metrics, "deterministic": metrics},
+        "evaluation": dict.fromkeys(EVALUATION_KINDS, metrics),
         "curve": {
             "steps": numbers(updates, COUNT),
             "success_rate": Kind(
@@ -250,7 +251,7 @@ def _key(row: dict[str, Any], rank: str) -> tuple[float, ...]:
     """
     steps = row["interaction_efficiency"]["timesteps"] or float("inf")
     stochastic, deterministic = (
-        -(_mean(row, kind, "success_rate") or 0.0) for kind in ("stochastic", "deterministic")
+        -(_mean(row, kind, "success_rate") or 0.0) for kind in EVALUATION_KINDS
     )
     area = -float(np.mean(np.nan_to_num(np.array(row["curve"]["success_rate"], float))))
     quantities = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
 from jaxsafe.metrics import with_interval
 
 METRICS = (
@@ -72,7 +73,7 @@ def latex(runs: Mapping[str, Mapping[str, Any]]) -> str:
     )
     rows = []
     for label, results in runs.items():
-        drawn, mode = (results["evaluation"][kind] for kind in ("stochastic", "deterministic"))
+        drawn, mode = (results["evaluation"][kind] for kind in EVALUATION_KINDS)
         reached = results["interaction_efficiency"]["timesteps"]
         rows.append(
             (

@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxsafe.agents.policy_file import save_policy
 from jaxsafe.environment import Environment, filter_name
-from jaxsafe.evaluate.evaluator import KINDS, given_up, metrics_per_seed
+from jaxsafe.evaluate.evaluator import EVALUATION_KINDS, given_up, metrics_per_seed
 from jaxsafe.metrics import ENOUGH_SEEDS, Episode, interaction_efficiency, over_seeds, with_interval
 from jaxsafe.storage.files import read_json, write_json
 from jaxsafe.storage.forms import (
@@ -221,7 +221,7 @@ def check_results(results: Any, place: str, training: bool) -> None:
             check(metrics.get(name), _metric(seeds, values), f"{place}: evaluation.{kind}.{name}")
     if training:
         form = {
-            "evaluation": {kind: {} for kind in KINDS},
+            "evaluation": {kind: {} for kind in EVALUATION_KINDS},
             "wall_s": AMOUNT,
             "compile_s": AMOUNT,
             "interaction_efficiency": {
@@ -255,8 +255,7 @@ def summary(runs: Mapping[str, Path]) -> str:
         "",
         "steps",
         "80 % after",
-        "stochastic",
-        "deterministic",
+        *EVALUATION_KINDS,
         "worst seed",
         "cost/episode",
         "cost of training",
@@ -268,7 +267,7 @@ def summary(runs: Mapping[str, Path]) -> str:
     diverged: list[str] = []
     for name, run in runs.items():
         results = read_results(run / "results.json")
-        evaluations = [results["evaluation"][kind] for kind in ("stochastic", "deterministic")]
+        evaluations = [results["evaluation"][kind] for kind in EVALUATION_KINDS]
         success = [metrics["success_rate"] for metrics in evaluations]
         reached = results["interaction_efficiency"]["timesteps"]
         cost = evaluations[0]["episode_cost"]["mean"]

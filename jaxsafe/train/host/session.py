@@ -25,7 +25,7 @@ from jaxsafe.devices.background_compile import CompiledInBackground, without_col
 from jaxsafe.devices.processes import in_main_thread
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
-from jaxsafe.evaluate.evaluator import EVALUATION_SEED, KINDS, Evaluator, episode_rows
+from jaxsafe.evaluate.evaluator import EVALUATION_KINDS, EVALUATION_SEED, Evaluator, episode_rows
 from jaxsafe.metrics import Episode
 from jaxsafe.schema.convert import to_data
 from jaxsafe.storage.files import append_rows, keep_rows, sync
@@ -202,7 +202,7 @@ class Training:
         self._evaluate()
         self._save()
         episodes = {}
-        for kind in KINDS:
+        for kind in EVALUATION_KINDS:
             episodes[kind] = self._run_episodes(
                 kind, self.config.episodes, self.state.average, self.step, final=True
             )
