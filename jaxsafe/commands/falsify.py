@@ -78,34 +78,40 @@ class Options(TaskOptions):
     """A .json file to write the numbers to."""
 
 
-def report(rows: Sequence[dict[str, Any]]) -> str:
-    """Return a table of what the adversaries achieved.
+HEADING = (
+    f"{'policy':12} {'steps':>10} {'violating':>10} {'inside':>8} "
+    f"{'worst h':>10} {'inside':>10} {'altered':>8} {'‖Δu‖':>8}"
+)
+"""The first line of the table of what the adversaries achieved."""
 
-    Args:
-        rows: the result of `attack` for each adversary.
-    """
-    lines = [
-        f"{'policy':12} {'steps':>10} {'violating':>10} {'inside':>8} "
-        f"{'worst h':>10} {'inside':>10} {'altered':>8} {'‖Δu‖':>8}"
-    ]
-    lines += [
+
+def line(row: dict[str, Any]) -> str:
+    """Return the line of the table for one adversary, given the result of `attack`."""
+    return (
         f"{row['policy']:12} {row['steps']:>10,} {row['violating_steps']:>10,} "
         f"{row['violating_steps_inside']:>8,} {_number(row['worst_margin']):>10} "
         f"{_number(row['worst_margin_inside']):>10} {row['intervention_rate']:>8.2%} "
         f"{row['mean_correction']:>8.3g}"
-        for row in rows
-    ]
+    )
+
+
+def confidence(rows: Sequence[dict[str, Any]]) -> str:
+    """Return a bound on the share of episodes with a violation, as text. It is empty without one.
+
+    Args:
+        rows: the result of `attack` for each adversary.
+    """
     bounded = [row for row in rows if row["violation_bound"] is not None]
-    if bounded:
-        share = max(row["violation_bound"] for row in bounded)
-        cut = "" if all(row["whole_episodes"] for row in bounded) else ", which were cut off,"
-        clean = sum(not violated(row) for row in rows)
-        lines.append(
-            f"{clean} of {len(rows)} without a violation: "
-            f"against each random one less than a share of {share:.1g} "
-            f"of the episodes{cut} has one, with 95 % confidence"
-        )
-    return "\n".join(lines)
+    if not bounded:
+        return ""
+    share = max(row["violation_bound"] for row in bounded)
+    cut = "" if all(row["whole_episodes"] for row in bounded) else ", which were cut off,"
+    clean = sum(not violated(row) for row in rows)
+    return (
+        f"{clean} of {len(rows)} without a violation: "
+        f"against each random one less than a share of {share:.1g} "
+        f"of the episodes{cut} has one, with 95 % confidence"
+    )
 
 
 def violated(row: dict[str, Any]) -> bool:
@@ -149,18 +155,17 @@ def main(argv: Sequence[str]) -> int:
             world = env if level is None else world_at(env, level, searched=name == SEARCH)
             row = attack(world, name, length, options.num_envs, jax.random.key(options.seed))
             of_level.append(row if level is None else {"level": level, **row})
-            if level is not None and len(of_level) == 1:
-                print(f"{level:g} times the bound")
-            first, *lines = report(of_level[-1:]).splitlines()
-            print(f"{first}\n{lines[0]}" if len(of_level) == 1 else lines[0], flush=True)
+            if len(of_level) == 1:
+                print(HEADING if level is None else f"{level:g} times the bound\n{HEADING}")
+            print(line(row), flush=True)
             # The file is written after each adversary, so that nothing is lost if the run is
             # stopped.
             if options.out:
                 content = {**facts, "policies": [*rows, *of_level]}
                 text = json.dumps(content, indent=1, ensure_ascii=False)
                 write_text(Path(options.out), f"{text}\n")
-        if report(of_level).splitlines()[-1].endswith("confidence"):
-            print(report(of_level).splitlines()[-1])
+        if bound := confidence(of_level):
+            print(bound)
         rows += of_level
     if options.out:
         print(f"written to {options.out}")
