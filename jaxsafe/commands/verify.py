@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from jaxsafe.commands import cli
-from jaxsafe.commands.export import BOX, SingleOptions, single_policy
+from jaxsafe.commands.export import BOX, MAX_STEPS, SingleOptions, single_policy
 from jaxsafe.commands.options import Count, File, Option
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.schema.component import Range
@@ -23,9 +23,6 @@ from jaxsafe.schema.errors import ConfigError
 
 if TYPE_CHECKING:
     from jaxsafe.verify.verify import Verification
-
-MAX_STEPS = 2000
-"""Largest number of steps. A docking episode has as many."""
 
 EXIT_CODES = {"proved": 0, "refuted": 1, "open": 3}
 """The exit code of each result of a proof."""
