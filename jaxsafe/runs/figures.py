@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from matplotlib.figure import Figure
 
-from jaxsafe.environment import Environment, filter_name, length_unit
+from jaxsafe.environment import Environment, length_unit
 from jaxsafe.plot.curves import AXES, evaluation_rows, training_curves
 from jaxsafe.plot.figures import Episodes, Rows, speed_distance, trajectories
 from jaxsafe.plot.interventions import interventions, most_altered
@@ -32,6 +32,7 @@ from jaxsafe.storage.forms import (
 )
 from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.log import headline, read_progress
+from jaxsafe.train.host.results import facts
 
 
 class Figures(dict[str, Figure]):
@@ -100,13 +101,8 @@ def draw(
         raise ConfigError(f"x: unknown axis {show(x)}; choose from {nearest(x, AXES)}")
     rows = progress(run)
     config, env, name = run_directory.read(run, "run")
-    facts = {
-        "env": name,
-        "preset": config.preset,
-        "algorithm": config.algorithm,
-        "rta": filter_name(env),
-    }
-    title = headline({**facts, "seeds": len({row["seed"] for row in rows})})
+    seeds = len({row["seed"] for row in rows})
+    title = headline({**facts(config, env, name), "seeds": seeds})
     curves = training_curves(
         rows, x, title, evaluations=evaluations(run, rows), panels=panels, width=width
     )

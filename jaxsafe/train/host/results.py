@@ -97,13 +97,14 @@ def finish(training: Training) -> dict[str, Any]:
 
 def facts(config: TrainConfig, env: Environment, name: str) -> dict[str, Any]:
     """Return what all results say about the run to which they belong."""
-    how = {
+    return {
         "env": name,
         "preset": config.preset,
         "algorithm": config.algorithm,
         "rta": filter_name(env),
+        "seeds": config.seeds,
+        "seed": config.seed,
     }
-    return {**how, "seeds": config.seeds, "seed": config.seed}
 
 
 def evaluation(
