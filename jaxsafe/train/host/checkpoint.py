@@ -119,7 +119,6 @@ class Checkpoints:
                     or type(error).__name__
                 )
             if reason:
-                _ignore_late_complaints()
                 _settle(complaints)
         if processes.leads():
             if reason:
@@ -184,9 +183,10 @@ class Checkpoints:
             )
         abstract = jax.tree.map(_empty, like)
         absent = [name for name in newer if not self._has(step, name)]
-        state = (
-            self._read_older(step, abstract, absent) if absent else self._read_all(step, abstract)
-        )
+        if absent:
+            state = self._read_older(step, abstract, absent)
+        else:
+            state = self._read(step, state=self._ocp.args.StandardRestore(abstract))["state"]
         for (path, array), expected in zip(
             jax.tree_util.tree_leaves_with_path(state), jax.tree.leaves(abstract), strict=True
         ):
@@ -210,9 +210,6 @@ class Checkpoints:
         except (OSError, UnicodeDecodeError):
             return True
         return f"'{name}'" in text
-
-    def _read_all(self, step: int, abstract: Any) -> Any:
-        return self._read(step, state=self._ocp.args.StandardRestore(abstract))["state"]
 
     def _read_older(self, step: int, abstract: Any, absent: Collection[str]) -> Any:
         """Read the arrays of a checkpoint that lacks some of them. The absent ones are 0."""
@@ -248,7 +245,6 @@ class Checkpoints:
             # This stands outside the except clause, because the error keeps the failed tasks alive,
             # which complain when they end.
             if reason:
-                _ignore_late_complaints()
                 _settle(complaints)
         if reason:
             raise ConfigError(f"{self.directory / str(step)}: checkpoint cannot be read: {reason}")
@@ -293,6 +289,7 @@ def _ignore_late_complaints() -> None:
 
 def _settle(complaints: io.StringIO) -> None:
     """Wait until the threads of a failed read or write have ended, then free what they leave."""
+    _ignore_late_complaints()
     end = time.monotonic() + SETTLE_S
     length = -1
     while time.monotonic() < end and length != complaints.tell():
