@@ -22,7 +22,8 @@ from jaxsafe.metrics import ENOUGH_EPISODES, stratified_iqm, with_interval
 from jaxsafe.plot.compare import compare_curves, seed_curves
 from jaxsafe.plot.style import save
 from jaxsafe.storage.files import write_text
-from jaxsafe.train.host.results import known, least
+from jaxsafe.storage.text_table import or_dash
+from jaxsafe.train.host.results import least
 from jaxsafe.train.recent_episodes import SIZE as WINDOW
 
 DIRECTORY = "baselines"
@@ -345,9 +346,9 @@ class Report:
                     str(best_seed(record.results)),
                     *(_share(metrics["success_rate"]["mean"]) for metrics in (drawn, mode)),
                     _share(mode["episode_safety_violation_rate"]["mean"]),
-                    known(mode["control_usage_l1"]["mean"], ".2f") if docks else "–",
+                    or_dash(mode["control_usage_l1"]["mean"], ".2f") if docks else "–",
                     *(
-                        known(mode[metric]["mean"], ".1f")
+                        or_dash(mode[metric]["mean"], ".1f")
                         for metric in ("average_return", "episode_length")
                     ),
                 ]
@@ -423,7 +424,7 @@ def _succeeded(results: Mapping[str, Any]) -> str:
 
 
 def _violating_in_training(results: Mapping[str, Any]) -> str:
-    return known(results["training_cost"]["mean"], ",.0f")
+    return or_dash(results["training_cost"]["mean"], ",.0f")
 
 
 def _violating(results: Mapping[str, Any]) -> str:

@@ -158,20 +158,15 @@ class Run(Described):
         return f"Run {self.path}"
 
     def _rows(self) -> Rows:
-        from jaxsafe.train.host.results import (
-            known,
-            least,
-            percent,
-            told_diverged,
-            told_violations,
-        )
+        from jaxsafe.storage.text_table import or_dash
+        from jaxsafe.train.host.results import least, percent, told_diverged, told_violations
 
         results = self.results
         kinds = results["evaluation"]
         rates = [metrics["success_rate"] for metrics in kinds.values()]
 
         def means(name: str, form: str) -> str:
-            texts = {kind: known(metrics[name]["mean"], form) for kind, metrics in kinds.items()}
+            texts = {kind: or_dash(metrics[name]["mean"], form) for kind, metrics in kinds.items()}
             return ", ".join(f"{text} {kind}" for kind, text in texts.items())
 
         reached = results["interaction_efficiency"]["timesteps"]

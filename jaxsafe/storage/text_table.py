@@ -18,3 +18,8 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
         cells[0] = f"{row[0]:{widths[0]}}"
         lines.append("  ".join(cells).rstrip())
     return lines
+
+
+def or_dash(value: float | None, form: str) -> str:
+    """Return a number as text in a format such as `.1f`, or a dash if it is None."""
+    return "–" if value is None else format(value, form)

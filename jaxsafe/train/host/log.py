@@ -19,6 +19,7 @@ from jaxsafe.metrics import measures
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import append_csv, append_rows, read_rows, write_csv, write_rows
 from jaxsafe.storage.forms import COUNT, FLAG, NUMBER, NUMBER_OR_NULL, OTHERS
+from jaxsafe.storage.text_table import or_dash
 from jaxsafe.train.host.sinks import Sink, reason
 from jaxsafe.train.ppo import DIAGNOSTICS
 
@@ -282,9 +283,8 @@ class Display:
     def show(self, step: int, rows: list[dict[str, Any]]) -> None:
         """Show the state after `step` steps, given the latest row of each seed."""
         means = {name: _mean([row[name] for row in rows]) for name in ("success_rate", "return")}
-        summary = (
-            f"success {_text(means['success_rate'], '.1%')}, return {_text(means['return'], '.2f')}"
-        )
+        success = or_dash(means["success_rate"], ".1%")
+        summary = f"success {success}, return {or_dash(means['return'], '.2f')}"
         if diverged := sum(row["diverged"] for row in rows):
             summary += f", {diverged} of {len(rows)} seeds diverged and left out"
         if self._bar is not None:
@@ -312,7 +312,3 @@ class Display:
 def _mean(values: list[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return sum(known) / len(known) if known else None
-
-
-def _text(value: float | None, form: str) -> str:
-    return "–" if value is None else format(value, form)

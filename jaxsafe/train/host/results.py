@@ -24,7 +24,7 @@ from jaxsafe.storage.forms import (
     numbers,
 )
 from jaxsafe.storage.provenance import versions
-from jaxsafe.storage.text_table import columns
+from jaxsafe.storage.text_table import columns, or_dash
 from jaxsafe.train.host.log import headline
 from jaxsafe.train.host.options import TrainConfig
 from jaxsafe.train.host.session import Training
@@ -280,8 +280,8 @@ def summary(runs: Mapping[str, Path]) -> str:
                 f"{reached:,}" if reached else "never",
                 *(percent(rate["mean"], 2) for rate in success),
                 percent(least(success), 1),
-                known(cost, ".2f"),
-                known(results["training_cost"]["mean"], ",.0f"),
+                or_dash(cost, ".2f"),
+                or_dash(results["training_cost"]["mean"], ",.0f"),
                 f"{results['wall_s']:.1f}",
                 # Results of older versions have neither of these.
                 str(results.get("algorithm", "–")),
@@ -343,12 +343,7 @@ def least(metrics: Sequence[Mapping[str, Any]]) -> float | None:
 
 def percent(value: float | None, digits: int) -> str:
     """Return a share as text in percent, or a dash if it is None."""
-    return known(value, f".{digits}%")
-
-
-def known(value: float | None, form: str) -> str:
-    """Return a number as text, or a dash if it is not known."""
-    return "–" if value is None else format(value, form)
+    return or_dash(value, f".{digits}%")
 
 
 def _efficiency(training: Training) -> dict[str, Any]:
