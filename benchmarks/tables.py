@@ -19,8 +19,8 @@ from baselines.plan import WITHOUT_RTA
 
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
-from jaxsafe.metrics import with_interval
 from jaxsafe.storage.files import read_json, write_text
+from jaxsafe.train.host.results import mean_text
 
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
@@ -1055,8 +1055,7 @@ def _until(steps: int | None) -> str:
 
 
 def _interval(metric: Results, factor: float, digits: int) -> str:
-    interval = metric["ci95"] and [factor * bound for bound in metric["ci95"]]
-    return with_interval(factor * metric["mean"], interval, f".{digits}f")
+    return mean_text(metric, f".{digits}f", factor)
 
 
 def _share(metric: Results) -> str:

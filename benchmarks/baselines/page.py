@@ -18,12 +18,12 @@ from baselines.plan import CERTIFIED_STARTS, FILM, KINDS, SHIPPED, WITH_RTA, WIT
 from baselines.record import Record
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
-from jaxsafe.metrics import ENOUGH_EPISODES, stratified_iqm, with_interval
+from jaxsafe.metrics import ENOUGH_EPISODES, stratified_iqm
 from jaxsafe.plot.compare import compare_curves, seed_curves
 from jaxsafe.plot.style import save
 from jaxsafe.storage.files import write_text
 from jaxsafe.storage.text_table import or_dash
-from jaxsafe.train.host.results import least
+from jaxsafe.train.host.results import least, mean_text
 from jaxsafe.train.recent_episodes import SIZE as WINDOW
 
 DIRECTORY = "baselines"
@@ -449,14 +449,13 @@ def _share(value: float | None, digits: int = 2) -> str:
 def _percent(metric: Mapping[str, Any]) -> str:
     if metric["mean"] is None:
         return "–"
-    interval = metric["ci95"] and [100.0 * bound for bound in metric["ci95"]]
-    return f"{with_interval(100.0 * metric['mean'], interval, '.2f')} %"
+    return f"{mean_text(metric, '.2f', 100.0)} %"
 
 
 def _number(metric: Mapping[str, Any], digits: int = 2) -> str:
     if metric["mean"] is None:
         return "–"
-    return with_interval(metric["mean"], metric["ci95"], f",.{digits}f")
+    return mean_text(metric, f",.{digits}f")
 
 
 def _rate(metric: Mapping[str, Any], starts: int, seeds: int) -> str:

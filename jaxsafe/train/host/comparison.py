@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
-from jaxsafe.metrics import with_interval
+from jaxsafe.train.host.results import mean_text
 
 METRICS = (
     "success_rate",
@@ -111,9 +111,4 @@ def _columns(name: str, metric: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 def _cell(metric: Mapping[str, Any], factor: float, form: str) -> str:
-    if metric["mean"] is None:
-        return "--"
-    interval: Sequence[float] | None = metric["ci95"] and [
-        factor * bound for bound in metric["ci95"]
-    ]
-    return with_interval(factor * metric["mean"], interval, form)
+    return "--" if metric["mean"] is None else mean_text(metric, form, factor)

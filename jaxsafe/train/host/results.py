@@ -346,12 +346,18 @@ def percent(value: float | None, digits: int) -> str:
     return or_dash(value, f".{digits}%")
 
 
+def mean_text(metric: Mapping[str, Any], form: str, factor: float = 1.0) -> str:
+    """Return the mean of a metric with its interval as text, both multiplied by a factor."""
+    interval = metric["ci95"] and [factor * bound for bound in metric["ci95"]]
+    return with_interval(factor * metric["mean"], interval, form)
+
+
 def _efficiency(training: Training) -> dict[str, Any]:
     steps, success = training.log.curve("success_rate")
     return interaction_efficiency(steps, success, training.log.curve("episodes")[1])
 
 
-def _cell(metric: dict[str, Any], unit: str) -> str:
-    factor, end = (100.0, " %") if unit == "%" else (1.0, "")
-    interval = metric["ci95"] and [factor * bound for bound in metric["ci95"]]
-    return with_interval(factor * metric["mean"], interval, ".2f") + end
+def _cell(metric: Mapping[str, Any], unit: str) -> str:
+    if unit == "%":
+        return f"{mean_text(metric, '.2f', 100.0)} %"
+    return mean_text(metric, ".2f")
