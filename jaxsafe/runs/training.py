@@ -232,7 +232,11 @@ def train_all(
             if upcoming:
                 upcoming.prepare()
             if not training.train(progress):
-                call = f"python -m jaxsafe.train resume={path}" if verbose else go_on(path)
+                call = (
+                    f"python -m jaxsafe.train resume={path}"
+                    if verbose
+                    else f"jaxsafe.train(resume={str(path)!r})"
+                )
                 print(f"stopped at step {training.step:,}; go on with: {call}")
                 return False
             trained.append((run, training))
@@ -257,11 +261,6 @@ def recipe_text(config: TrainConfig) -> str:
         return f"like {config.like}"
     preset = f"preset {config.preset}"
     return preset if config.recipe in (None, NO_RECIPE) else f"recipe {config.recipe}, {preset}"
-
-
-def go_on(path: Path) -> str:
-    """Return the call that goes on with a run."""
-    return f"jaxsafe.train(resume={str(path)!r})"
 
 
 def _open(run: Path, files: ExitStack, began: float) -> Training:

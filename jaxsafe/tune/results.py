@@ -280,18 +280,14 @@ def _flat(row: dict[str, Any], swept: Sequence[str]) -> dict[str, Any]:
         "worst": round(min(rates), 4) if rates else None,
         "deterministic": _mean(row, "deterministic", "success_rate", 4),
         "length": _mean(row, "deterministic", "episode_length", 1),
+        # Without safety constraints there is no such rate.
         **(
             {"violating": _mean(row, "deterministic", "episode_safety_violation_rate", 5)}
-            if _measured(row)
+            if _known(row, "deterministic", "episode_safety_violation_rate")
             else {}
         ),
         **({"diverged": len(row["diverged"])} if "diverged" in row else {}),
     }
-
-
-def _measured(row: dict[str, Any]) -> bool:
-    """Return whether violations of safety constraints were counted for some seed."""
-    return bool(_known(row, "deterministic", "episode_safety_violation_rate"))
 
 
 def _mean(row: dict[str, Any], kind: str, metric: str, digits: int | None = None) -> float | None:
