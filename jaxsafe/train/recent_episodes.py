@@ -18,6 +18,9 @@ from jaxsafe.types import Record
 SIZE = 100
 """Number of episodes in the window, as in the paper's training curves."""
 
+COST_EPISODES = 25
+"""Number of episodes that the latest cost is averaged over."""
+
 
 class Window(Record):
     """A ring of the last `SIZE` finished episodes, and counts over all episodes."""
@@ -85,16 +88,12 @@ def total_cost(window: Window) -> Array:
     return window.cost + window.running_cost
 
 
-def latest_cost(window: Window, number: int = 25) -> Array:
+def latest_cost(window: Window) -> Array:
     """Return the mean cost of the latest finished episodes, in violating steps per episode.
 
     It is 0 while there are none.
-
-    Args:
-        window: the window.
-        number: how many episodes to average, at most `SIZE`.
     """
-    available = jnp.minimum(window.count, number)
+    available = jnp.minimum(window.count, COST_EPISODES)
     age = (window.count - 1 - jnp.arange(SIZE)) % SIZE
     cost = jnp.sum(jnp.where(age < available, window.episodes.violating_steps, 0))
     return cost / jnp.maximum(available, 1)

@@ -116,5 +116,5 @@ def test_the_latest_cost_is_that_of_the_last_episodes() -> None:
         )
         window = jax.jit(push)(window, episodes, jnp.asarray(done))
         finished += costs[done].tolist()
-        assert float(latest_cost(window, 25)) == pytest.approx(np.mean(finished[-25:]))
+        assert float(latest_cost(window)) == pytest.approx(np.mean(finished[-25:]))
     assert len(finished) > 2 * SIZE
