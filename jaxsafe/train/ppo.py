@@ -446,7 +446,8 @@ def dual_ascent(ppo: PPO, multiplier: Array, window: Window, done: Array) -> Arr
 
 def learning_rate(ppo: PPO, progress: Array | float) -> Array:
     """Return the learning rate after the share `progress` of the training."""
-    first, last = jnp.asarray(ppo.learning_rate), jnp.asarray(ppo.final_learning_rate)
+    first = jnp.asarray(ppo.learning_rate)
+    last = jnp.asarray(ppo.final_learning_rate)
     if ppo.learning_rate_decay == "exponential":
         return first * (last / first) ** progress
     return first + (last - first) * progress
@@ -494,18 +495,19 @@ def collect(
         )
         if ppo.learns_from == "actual":
             action = _acted(env, action, timestep)
-        done, episode = timestep.done, accumulate(episode, timestep)
+        done = timestep.done
+        episode = accumulate(episode, timestep)
         transition = Transition(
-            inputs,
-            totals,
-            action,
-            policy.log_prob(action),
-            timestep.reward,
-            timestep.terminated,
-            done,
-            agent.inputs(env, timestep.observation),
-            episode,
-            timestep.cost if agent.cost_critic else (),
+            inputs=inputs,
+            totals=totals,
+            action=action,
+            log_prob=policy.log_prob(action),
+            reward=timestep.reward,
+            terminated=timestep.terminated,
+            done=done,
+            next_inputs=agent.inputs(env, timestep.observation),
+            episode=episode,
+            cost=timestep.cost if agent.cost_critic else (),
         )
         return (
             env_state,
@@ -516,11 +518,12 @@ def collect(
 
     scan = scan_packed if accelerated() else jax.lax.scan
     end, transitions = scan(one_step, start, jax.random.split(key, ppo.num_steps))
+    env_state, observation, episode, actor_memory = end
     state = state.replace(
-        env_state=end[0],
-        observation=end[1],
-        episode=end[2],
-        memory={**state.memory, "actor": end[3]},
+        env_state=env_state,
+        observation=observation,
+        episode=episode,
+        memory={**state.memory, "actor": actor_memory},
     )
     return state, transitions
 
@@ -561,7 +564,8 @@ def gae(
         gamma: the discount factor γ.
         lam: λ of the estimates.
     """
-    terminated, done = terminated.astype(reward.dtype), done.astype(reward.dtype)
+    terminated = terminated.astype(reward.dtype)
+    done = done.astype(reward.dtype)
     delta = reward + gamma * next_value * (1.0 - terminated) - value
 
     def backward(following: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -722,7 +726,8 @@ def _to_batch(
     value, next_value, critic_memory = judge("critic", memory["critic"])
     after = {**state.memory, "critic": critic_memory}
     advantage = gae(t.reward, value, next_value, t.terminated, t.done, gamma, ppo.gae_lambda)
-    target, cost_target = advantage + value, ()
+    target = advantage + value
+    cost_target = ()
     if agent.cost_critic:
         rate, next_rate, after["cost_critic"] = judge("cost_critic", memory["cost_critic"])
         cost_advantage = gae(
@@ -730,7 +735,15 @@ def _to_batch(
         )
         cost_target = cost_advantage + rate
         advantage -= state.multiplier * cost_advantage / (1.0 - gamma)
-    part = Batch(t.inputs, t.totals, t.action, t.log_prob, advantage, target, cost_target)
+    part = Batch(
+        inputs=t.inputs,
+        totals=t.totals,
+        action=t.action,
+        log_prob=t.log_prob,
+        advantage=advantage,
+        value_target=target,
+        cost_target=cost_target,
+    )
     if counts is not None:
         part = part._replace(weight=counts.astype(value.dtype))
     done = t.done if agent.recurrent else ()
@@ -801,11 +814,9 @@ def _in_chunks(
     """Return the output of a critic for each sample. On a CPU it sees `CHUNK` samples at a time."""
     t, n, size = seen.shape
     parts = _num_chunks(t * n)
-    return (
-        critic(seen)
-        if parts == 1
-        else jax.lax.map(critic, seen.reshape(parts, -1, size)).reshape(t, n)
-    )
+    if parts == 1:
+        return critic(seen)
+    return jax.lax.map(critic, seen.reshape(parts, -1, size)).reshape(t, n)
 
 
 def _num_chunks(samples: int) -> int:

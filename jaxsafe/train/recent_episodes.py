@@ -43,7 +43,7 @@ def empty_window(like: Episode) -> Window:
     """
     episodes = jax.tree.map(lambda x: jnp.zeros(SIZE, x.dtype), like)
     zero = jnp.zeros((), jnp.int32)
-    return Window(episodes, zero, zero, zero)
+    return Window(episodes=episodes, count=zero, cost=zero, running_cost=zero)
 
 
 def push(
@@ -77,7 +77,12 @@ def push(
     if counts is not None:
         cost = cost + running_cost
         running_cost = jnp.zeros_like(running_cost)
-    return Window(ring, window.count + order[-1] + 1, window.cost + cost, running_cost)
+    return Window(
+        episodes=ring,
+        count=window.count + order[-1] + 1,
+        cost=window.cost + cost,
+        running_cost=running_cost,
+    )
 
 
 def total_cost(window: Window) -> Array:
