@@ -821,7 +821,7 @@ def _in_chunks(
 
 def _num_chunks(samples: int) -> int:
     """Return the number of parts in which this many samples go through the networks."""
-    return 1 if accelerated() or samples % CHUNK else max(1, samples // CHUNK)
+    return 1 if accelerated() or samples % CHUNK else samples // CHUNK
 
 
 def _optimizer(ppo: PPO) -> optax.GradientTransformation:
