@@ -189,15 +189,15 @@ def single_policy(options: SingleOptions) -> tuple[SavedPolicy | ForeignPolicy, 
         stems = [
             file.stem.removeprefix("seed_") for file in (Path(run) / "policy").glob("seed_*.npz")
         ]
-        known = {int(stem) for stem in stems if stem.isdecimal()}
-        if not known:
+        seeds = {int(stem) for stem in stems if stem.isdecimal()}
+        if not seeds:
             raise ConfigError(
                 f"run: {run} has no policies yet; "
                 f"finish it with: python -m jaxsafe.train resume={run}"
             )
-        if seed not in known:
+        if seed not in seeds:
             raise ConfigError(
-                f"seed: found {seed}; choose from {', '.join(map(str, sorted(known)))}"
+                f"seed: found {seed}; choose from {', '.join(map(str, sorted(seeds)))}"
             )
     path = find_policy(run) if single else Path(run) / "policy" / f"seed_{seed}.npz"
     saved = read_policy(path)

@@ -116,9 +116,9 @@ def entries(cls: type[Component], start: str = "") -> Iterator[Row]:
 def wrapped(text: str, indent: int) -> list[str]:
     """Return a text as lines. Its paragraphs become one, because they are short."""
     space = " " * indent
-    words = " ".join(inspect.cleandoc(text).split())
+    joined = " ".join(inspect.cleandoc(text).split())
     return textwrap.wrap(
-        words,
+        joined,
         WIDTH,
         initial_indent=space,
         subsequent_indent=space,

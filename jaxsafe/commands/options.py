@@ -128,7 +128,8 @@ class CommandOptions(Component):
             ConfigError: an option is unknown or missing, or does not take its value.
         """
         table = options_of(cls)
-        rest, values = dict(given), {}
+        rest = dict(given)
+        values: dict[str, Any] = {}
         for name, field in table.items():
             mark = option(field)
             for key in (name, mark.alias) if mark.prefix is None else ():
@@ -177,7 +178,7 @@ class CommandOptions(Component):
                 raise ConfigError(f"{name}: means nothing {situation}; leave it out")
 
     def refuse_others(self, *names: str) -> None:
-        """Refuse all options but these and those of every command.
+        """Refuse all options except these and the options of every command.
 
         Raises:
             ConfigError: another option was given.
@@ -185,7 +186,7 @@ class CommandOptions(Component):
         _refuse(self.without(*names), names)
 
     def without(self, *names: str) -> dict[str, Any]:
-        """Return the options that were given, without these and those of every command."""
+        """Return the options that were given, except these and the options of every command."""
         left_out = (*names, *fields(CommandOptions))
         return {name: value for name, value in self.given.items() if name not in left_out}
 

@@ -216,7 +216,8 @@ def train_all(
     Returns:
         False if the user asked to stop, else True.
     """
-    trained, upcoming = [], None
+    trained: list[tuple[Path, Training]] = []
+    upcoming = None
     with ExitStack() as files:
         for run, following in zip_longest(runs, runs[1:]):
             training = upcoming or _open(run, files, began)

@@ -400,8 +400,8 @@ def action_std(params: Params) -> Array:
 def explained_variance(target: Array, value: Array, weight: Array | tuple = ()) -> Array:
     """Return the share of the targets' variance that the values explain.
 
-    It is 1 for a perfect critic and 0 for one that says the same of all states. Samples may have
-    weights, whose mean is 1.
+    It is 1 for a perfect critic, and 0 for a critic whose value is the same in all states. Samples
+    may have weights, whose mean is 1.
     """
     return 1.0 - _variance(target - value, weight) / _variance(target, weight)
 

@@ -109,9 +109,9 @@ def means(
 ) -> dict[str, Array]:
     """Return averages over the episodes in the window, by column of the progress log.
 
-    They are 0 while the window is empty. A share of steps is averaged over episodes, each of which
-    counts alike, however long it is. The rates of `metrics.summarise` are other numbers with other
-    names, because in them every step counts alike.
+    They are 0 while the window is empty. A share of steps is an average over episodes, and every
+    episode counts alike, however long it is. The rates of `metrics.summarise` are other numbers
+    with other names, because in them every step counts alike.
 
     Args:
         window: the window.

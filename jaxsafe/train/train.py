@@ -38,7 +38,7 @@ If it returns True the training stops.
 """
 
 CALLS = 50
-"""How often a callback is called in a training, unless `every` says otherwise."""
+"""Number of calls of a callback in a training for which `every` is not given."""
 
 
 def train(

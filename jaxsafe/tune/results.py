@@ -116,7 +116,8 @@ def read(path: Path, settings: Sequence[Setting]) -> Rows:
     file = path / "settings.jsonl"
     rows: Rows = {}
     for number, row in enumerate(keep_rows(file, lambda _: True, {"setting": COUNT}), start=1):
-        index, place = row.pop("setting"), f"{file}, row {number}"
+        index = row.pop("setting")
+        place = f"{file}, row {number}"
         if index >= len(settings) or index in rows:
             raise ConfigError(
                 f"{place}: setting: expected one of the {len(settings)} settings, each once,"

@@ -42,10 +42,10 @@ MAX_REASON = 120
 """Largest number of characters of an error of orbax or tensorstore that a message repeats."""
 
 PRECISION = "precision"
-"""Name of the fact, added to those of a checkpoint, that is the type of its numbers."""
+"""Name of a fact that `Checkpoints.save` adds: the type of the numbers in the checkpoint."""
 
 DIGEST = "sha256"
-"""Name of the fact, added to those of a checkpoint, that is the digest of all else in it."""
+"""Name of a fact that `Checkpoints.save` adds: the digest of everything else in the checkpoint."""
 
 ASIDE = ".before"
 """Suffix of the name of a checkpoint while the one that replaces it is written."""
@@ -235,10 +235,11 @@ class Checkpoints:
                 f"checkpoint: no step {show(step)} in {self.directory}; "
                 f"choose from {nearest(step, self.steps) or 'none'}"
             )
-        read, reason = {}, ""
+        content = {}
+        reason = ""
         with _silence() as complaints:
             try:
-                read = self._manager.restore(step, args=self._ocp.args.Composite(**args))
+                content = self._manager.restore(step, args=self._ocp.args.Composite(**args))
             except Exception as error:  # orbax and tensorstore raise whatever their layers raise
                 lines = [line for line in str(error).splitlines() if line.strip()]
                 reason = (lines or [type(error).__name__])[0][:MAX_REASON]
@@ -248,7 +249,7 @@ class Checkpoints:
                 _settle(complaints)
         if reason:
             raise ConfigError(f"{self.directory / str(step)}: checkpoint cannot be read: {reason}")
-        return read
+        return content
 
 
 @contextlib.contextmanager

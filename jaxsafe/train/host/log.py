@@ -131,7 +131,7 @@ class ProgressLog:
         else:
             self._csv.unlink(missing_ok=True)
         self.sinks: dict[str, Sink] = {}
-        """Where the rows go besides the files, by name."""
+        """The sinks that get the rows in addition to the files, by name."""
 
     def write(self, rows: list[dict[str, Any]]) -> None:
         """Add rows to all logs, and give them to the sinks.
@@ -310,5 +310,5 @@ class Display:
 
 
 def _mean(values: list[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return sum(known) / len(known) if known else None
+    numbers = [value for value in values if value is not None]
+    return sum(numbers) / len(numbers) if numbers else None

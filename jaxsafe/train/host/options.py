@@ -187,7 +187,7 @@ def resolve_all(options: Mapping[str, Any]) -> list[tuple[TrainConfig, Environme
     """Return what `resolve` returns. With `env=all` return it for each task.
 
     Args:
-        options: those of `python -m jaxsafe.train`, as `resolve` takes them.
+        options: the options of `python -m jaxsafe.train`, as `resolve` takes them.
 
     Raises:
         ConfigError: as `resolve`. Its message begins with the task if the same options do not fit
@@ -339,7 +339,8 @@ def _with_recipe(task: str, given: Mapping[str, Any]) -> tuple[TrainConfig, dict
         given: the options that the user gave.
     """
     settings = recipe(task, given.get("preset"), given.get("recipe"))
-    source, preset = settings["recipe"], settings["preset"]
+    source = settings["recipe"]
+    preset = settings["preset"]
     place = f"{source}: recipes.{preset}" if is_file(source) else ""
     config = set_paths(normalise(TrainConfig()), settings, place)
     return config, {"recipe": source, "preset": preset}

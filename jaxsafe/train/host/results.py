@@ -166,7 +166,8 @@ def table(results: dict[str, Any], path: Path) -> str:
     rows.append(["worst seed, success rate", *(percent(rate, 1) for rate in worst)])
     lines += [*columns(rows), *told_diverged(results), *told_violations(results)]
     if "given_up" in results:
-        counts, limit = results["given_up"], results["given_up"]["after_steps"]
+        counts = results["given_up"]
+        limit = counts["after_steps"]
         listed = ", ".join(f"{counts[kind]:,} {kind}" for kind in evaluations)
         lines.append(
             f"episodes still running after {limit:,} steps, "
@@ -292,7 +293,7 @@ def summary(runs: Mapping[str, Path]) -> str:
 
 
 def told_diverged(results: Mapping[str, Any]) -> list[str]:
-    """Return a line that names the seeds that diverged and says that no average has them.
+    """Return a line that names the seeds that diverged and says that no average includes them.
 
     Return no line if none diverged.
     """

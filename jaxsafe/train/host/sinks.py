@@ -47,7 +47,7 @@ class TensorBoard:
     """Event files in `<run>/tensorboard`."""
 
     def __init__(self, run: Path, resume_step: int) -> None:
-        """Open the files. What they hold after `resume_step` is no longer shown."""
+        """Open the files. Values after `resume_step` are no longer shown."""
         writer = library("tensorboard").SummaryWriter
         self._writer = writer(str(run / "tensorboard"), purge_step=resume_step + 1)
 
@@ -98,9 +98,9 @@ class MLflow:
         self._client = library("mlflow").MlflowClient()
 
         def new_run() -> str:
-            known = self._client.get_experiment_by_name(experiment)
-            number = known.experiment_id if known else self._client.create_experiment(experiment)
-            run_id = self._client.create_run(number, run_name=run.name).info.run_id
+            found = self._client.get_experiment_by_name(experiment)
+            group = found.experiment_id if found else self._client.create_experiment(experiment)
+            run_id = self._client.create_run(group, run_name=run.name).info.run_id
             params = [self._entities.Param(name, str(value)) for name, value in options.items()]
             self._client.log_batch(run_id, params=params)
             return run_id
