@@ -98,8 +98,10 @@ class MLflow:
         self._client = library("mlflow").MlflowClient()
 
         def new_run() -> str:
-            found = self._client.get_experiment_by_name(experiment)
-            group = found.experiment_id if found else self._client.create_experiment(experiment)
+            existing = self._client.get_experiment_by_name(experiment)
+            group = (
+                existing.experiment_id if existing else self._client.create_experiment(experiment)
+            )
             run_id = self._client.create_run(group, run_name=run.name).info.run_id
             params = [self._entities.Param(name, str(value)) for name, value in options.items()]
             self._client.log_batch(run_id, params=params)
