@@ -75,7 +75,7 @@ class Run(Described):
         """The evaluation episodes that were logged, with a row for each of their steps.
 
         It has the form of `progress`. The columns `step`, `final` and `episode` say to which
-        episode a row belongs. Others have names such as `platforms.deputy.position.x`.
+        episode a row belongs. Other columns have names such as `platforms.deputy.position.x`.
         """
         from jaxsafe.storage.files import read_rows
 

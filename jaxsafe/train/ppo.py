@@ -121,7 +121,7 @@ class PPO(Component):
     max_grad_norm: Annotated[Dimensionless, Positive] = 0.5
     """Largest norm of a gradient. A longer gradient is scaled down to it."""
     averaging: Annotated[Dimensionless, Share] = 0.0
-    """Share of the training over which networks are averaged. The averages are what is kept."""
+    """Share of the training over which networks are averaged. The average is evaluated and kept."""
     learns_from: Literal["desired", "actual"] = "desired"
     """The control to learn from where run time assurance changed it.
 

@@ -132,8 +132,8 @@ class BatchedTraining:
             keys: a PRNG key for each training.
 
         Raises:
-            ConfigError: the state or the program needs more memory than there is. The state has
-                not been allocated then.
+            ConfigError: the state or the program needs more memory than there is. This is checked
+                before the state is allocated.
         """
         like = self.mapper.like(jax.eval_shape(self._init, (), (trainings, keys)))
         state = memory.size(like) // self.mapper.mesh.size

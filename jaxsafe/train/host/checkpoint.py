@@ -204,7 +204,10 @@ class Checkpoints:
         return jax.tree.map(_as, state, like)
 
     def _has(self, step: int, name: str) -> bool:
-        """Return whether a checkpoint has an array of this name, or its index cannot be read."""
+        """Return whether a checkpoint has an array of this name.
+
+        It is True as well if the index of the checkpoint cannot be read.
+        """
         try:
             text = (self.directory / str(step) / "state" / "_METADATA").read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError):

@@ -92,7 +92,7 @@ class TrainConfig(Component):
     devices_per_seed: Count | None = None
     """Number of devices that share the environments of a seed.
 
-    By default they are shared by all devices that there are, as long as each has enough work.
+    By default all devices share the environments, as long as each has enough work.
     """
     steps: Steps = 500_000
     """Number of environment steps of each seed."""
