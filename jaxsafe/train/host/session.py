@@ -120,7 +120,7 @@ class Training:
         if processes.leads():
             self.log.sinks = self._open_sinks()
         for name in ("eval.jsonl", "episodes.jsonl"):
-            keep_rows(self.run / name, self._known, {"step": COUNT})
+            keep_rows(self.run / name, self._is_kept, {"step": COUNT})
         if not self._has_evaluated():
             keep_rows(self.run / "eval.jsonl", lambda row: False)
         self.diverged = {}
@@ -332,7 +332,7 @@ class Training:
         first = self.config.every(self.config.eval_every)
         return self.updates < first < self.config.num_updates and chunks & (chunks - 1) == 0
 
-    def _known(self, row: dict[str, Any]) -> bool:
+    def _is_kept(self, row: dict[str, Any]) -> bool:
         """Return whether to keep a row of the logs of evaluations.
 
         A row is kept if the training, which goes on from here, will not write it again.
