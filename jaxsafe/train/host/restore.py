@@ -145,8 +145,8 @@ def _difference(before: Any, now: Any, place: str = "") -> tuple[str, Any, Any]:
         pairs = [(f"[{index}]", *pair) for index, pair in enumerate(zip(before, now, strict=True))]
     else:
         return ("", None, None) if before == now else (place, show(before), show(now))
-    for name, *values in pairs:
-        difference = _difference(*values, f"{place}.{name}" if place else name)
+    for name, old, new in pairs:
+        difference = _difference(old, new, f"{place}.{name}" if place else name)
         if difference[0]:
             return difference
     return "", None, None
