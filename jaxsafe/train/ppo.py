@@ -753,10 +753,7 @@ def _to_batch(
         batch = batch._replace(weight=batch.weight / share)
     explained = explained_variance(batch.value_target, value, batch.weight)
     centred = batch.advantage - _mean(batch.advantage, batch.weight)
-    if counts is None:
-        std = batch.advantage.std()
-    else:
-        std = jnp.sqrt(_variance(batch.advantage, batch.weight))
+    std = jnp.sqrt(_variance(batch.advantage, batch.weight))
     batch = batch._replace(advantage=centred / (std + 1e-8))
     state = state.replace(memory=after)
     if not agent.recurrent:
