@@ -182,9 +182,9 @@ def _fields(env: Environment) -> list[tuple[str, int]]:
     fields = []
     for platform in env.platforms:
         rest = platform.rest()
-        for initializer in platform.start:
-            shape = jnp.shape(getattr(rest, initializer.name))
-            fields.append((f"{platform.name}.{initializer.name}", shape[0] if shape else 0))
+        for name in platform.random_fields:
+            shape = jnp.shape(getattr(rest, name))
+            fields.append((f"{platform.name}.{name}", shape[0] if shape else 0))
     return fields
 
 

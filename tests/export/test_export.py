@@ -173,6 +173,15 @@ def test_the_state_goes_in_and_the_control_comes_out() -> None:
     np.testing.assert_allclose(computed[0], timestep.info.control_actual, atol=1e-5)
 
 
+def test_a_start_that_is_drawn_as_one_case_has_the_names_of_its_fields() -> None:
+    values = {"position.x": [1.0], "position.y": [2.0], "velocity.x": [0.0], "velocity.y": [0.1]}
+    env = jaxsafe.make(
+        "docking2d", {"deputy.start": [{"type": "cases", "name": "start", "values": values}]}
+    )
+    usual = jaxsafe.make("docking2d")
+    assert functions.state_names(env) == functions.state_names(usual)
+
+
 def test_the_closed_loop_is_the_environments_own() -> None:
     policy = saved("docking2d")
     start = np.array([[80.0, -60.0, 0.1, -0.05], [70.0, 106.0, -0.28, 0.28]], np.float32)
