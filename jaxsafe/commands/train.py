@@ -44,6 +44,7 @@ class Options(CommandOptions):
             "cost_limit",
             "rta_training",
             "start_from",
+            "starts",
             "resume",
         ),
         "Evaluations, checkpoints and where everything is kept.": (

@@ -201,8 +201,10 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
             f"{place}.controller ({controller.type_name}): only the agent takes actions; "
             "choose from scripted, uncontrolled"
         )
-    _check_names(f"{place}.start", platform.random_fields)
+    first = [initializer for initializer in platform.start if not initializer.redraws]
+    _check_names(f"{place}.start", [name for initializer in first for name in initializer.draws])
     rest = vars(platform.rest())
+    drawn: set[str] = set()
     for initializer in platform.start:
         start_place = f"{place}.start.{initializer.name}"
         for name in initializer.draws:
@@ -211,6 +213,12 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
                 raise ConfigError(
                     f"{start_place}: {which}no such state field; choose from {nearest(name, rest)}"
                 )
+        undrawn = sorted({*initializer.draws} - drawn)
+        if initializer.redraws and undrawn:
+            raise ConfigError(
+                f"{start_place}: {undrawn[0]} must be drawn before it, and nothing draws it"
+            )
+        drawn |= {*initializer.draws}
         if getattr(initializer, "direction", None) is not None:
             count = initializer.direction.dimension  # type: ignore[attr-defined]
             if (count,) != rest[initializer.name].shape:

@@ -66,6 +66,7 @@ from jaxsafe.simulation.regions import (
     Sphere,
 )
 from jaxsafe.simulation.scripted import Command, Constant, Schedule, Scripted, Sinusoid
+from jaxsafe.simulation.starts_in_boxes import SometimesInBoxes
 from jaxsafe.simulation.two_body import TwoBody, TwoBodyState
 from jaxsafe.simulation.two_body_j2 import TwoBodyJ2, TwoBodyJ2State
 from jaxsafe.simulation.uncertainty import (
@@ -144,6 +145,7 @@ __all__ = [
     "Schedule",
     "Scripted",
     "Sinusoid",
+    "SometimesInBoxes",
     "Spacecraft",
     "SpacecraftState",
     "Sphere",

@@ -11,7 +11,7 @@ import csv
 import dataclasses
 import os
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -48,6 +48,8 @@ class Initializer(Component):
     """Base of initializers. Each draws the state field after which it is named, or several."""
 
     name: str
+    redraws: ClassVar[bool] = False
+    """Whether it replaces fields that other initializers have drawn before it."""
 
     @property
     def draws(self) -> tuple[str, ...]:

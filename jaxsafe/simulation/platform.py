@@ -38,7 +38,8 @@ class Platform(Component):
     @property
     def random_fields(self) -> tuple[str, ...]:
         """Names of the state fields that `start` draws."""
-        return tuple(name for initializer in self.start for name in initializer.draws)
+        names = [name for initializer in self.start for name in initializer.draws]
+        return tuple(dict.fromkeys(names))
 
     def rest(self) -> Any:
         """Return the state record before any initializer has run: at the origin, at rest."""

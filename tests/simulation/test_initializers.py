@@ -29,6 +29,7 @@ from jaxsafe.simulation.initializers import (
     Uniform,
     uniform,
 )
+from jaxsafe.simulation.starts_in_boxes import SometimesInBoxes
 from jaxsafe.types import Sim
 
 NUM_STARTS = 4000
@@ -341,6 +342,74 @@ def test_the_fields_of_a_case_are_drawn_together_and_all_cases_alike() -> None:
 )
 def test_cases_need_columns_that_fit(values: dict, fault: str) -> None:
     assert fault in (normalise(Cases(name="start", values=values)).problem() or "")
+
+
+USUAL = (
+    Uniform(name="position", low=(0.0, 0.0), high=(1.0, 1.0)),
+    Uniform(name="heading", low=-1.0, high=1.0),
+)
+CORNERS = {
+    "low": {"position.y": (10.0, 20.0), "heading": (3.0, 4.0)},
+    "high": {"position.y": (11.0, 22.0), "heading": (3.0, 5.0)},
+}
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_a_share_of_the_starts_is_in_boxes_each_as_likely(share: float) -> None:
+    mixed = normalise(SometimesInBoxes(name="boxes", share=share, **CORNERS))
+    assert set(mixed.draws) == {"position", "heading"}
+    usual_starts = [normalise(initializer) for initializer in USUAL]
+
+    def draw(key: jax.Array) -> dict[str, jax.Array]:
+        keys = jax.random.split(key, 3)
+        drawn = {x.name: x.draw(k, {}, NOWHERE) for x, k in zip(usual_starts, keys, strict=False)}
+        return mixed.draw(keys[2], drawn, NOWHERE)
+
+    drawn = jax.vmap(draw)(jax.random.split(jax.random.key(0), NUM_STARTS))
+    x, y = np.asarray(drawn["position"]).T
+    heading = np.asarray(drawn["heading"])
+    assert np.all((x >= 0.0) & (x <= 1.0))  # no box has this number
+    usual = (y <= 1.0) & (np.abs(heading) <= 1.0)
+    boxes = [(y >= 10.0) & (y <= 11.0) & (heading == 3.0), (y >= 20.0) & (heading >= 4.0)]
+    assert np.all(usual | boxes[0] | boxes[1])
+    counts = [usual.sum(), *(box.sum() for box in boxes)]
+    expected = NUM_STARTS * np.array([1.0 - share, share / 2.0, share / 2.0])
+    assert np.all(np.abs(counts - expected) <= 4.0 * np.sqrt(expected))
+    if share:
+        assert kstest((y[boxes[1]] - 20.0) / 2.0, "uniform").pvalue > LEVEL
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"low": {}}, "expected the same numbers in low and high, found none and"),
+        ({"high": {"position.y": (1.0,), "heading": (3.0,)}}, "expected lists of one length"),
+        ({"high": {"position.y": (9.0, 9.0), "heading": (3.0, 5.0)}}, "expected low ≤ high, which"),
+        (
+            {"low": {"position.a": (0.0,)}, "high": {"position.a": (1.0,)}},
+            "expected a field, or a field and x, y or z, found position.a",
+        ),
+    ],
+)
+def test_boxes_need_corners_that_fit(changes: dict, fault: str) -> None:
+    fields = {**CORNERS, **changes}
+    assert fault in (normalise(SometimesInBoxes(name="boxes", **fields)).problem() or "")
+
+
+@pytest.mark.parametrize(
+    ("column", "fault"),
+    [
+        ("position.z", r"no such axis: position\.z, and position has 2"),
+        ("heading", "start.boxes: heading: no such state field"),
+        ("delta_v", "start.boxes: delta_v must be drawn before it, and nothing draws it"),
+    ],
+)
+def test_a_box_of_a_field_that_is_not_drawn_is_refused(column: str, fault: str) -> None:
+    corners = {"low": {column: [0.0]}, "high": {column: [1.0]}}
+    boxes = SometimesInBoxes(name="boxes", **corners)
+    usual = jaxsafe.make("docking2d").agent_platform.start
+    with pytest.raises(jaxsafe.ConfigError, match=fault):
+        jaxsafe.make("docking2d", {"deputy.start": [*usual, boxes]})
 
 
 ENVIRONMENT = """\

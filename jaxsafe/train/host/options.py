@@ -22,6 +22,7 @@ from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError, ConfigWarning, nearest, show
 from jaxsafe.schema.retype import set_paths
 from jaxsafe.train.host.sinks import LIBRARIES, library
+from jaxsafe.train.host.starts import with_unproved_starts
 from jaxsafe.train.host.warm_start import agent_options
 from jaxsafe.train.ppo import MAX_COUNT, PPO, check_complete_episodes
 from jaxsafe.types import Dimensionless, Positive
@@ -116,6 +117,8 @@ class TrainConfig(Component):
 
     It is also written `from=`, for instance from=runs/docking3d. None stands for fresh networks.
     """
+    starts: str | None = None
+    """A certificate of `jaxsafe verify`. Every second start is in a box that it does not prove."""
     out: str | None = None
     """The run directory. By default it is a new directory in runs/."""
     eval_every: Steps | None = None
@@ -241,6 +244,8 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     # This comes first, so that a misspelt option is reported before anything slow begins.
     config = set_paths(config, arguments.options)
     env, rta_training = _environment(task, config, base, arguments.options)
+    if "starts" in arguments.options and config.starts is not None:
+        env = with_unproved_starts(env, config.starts)
     env = override(env, overrides, place="env")
     require_success(env)
     name = base.name if base and task is None else str(task)
