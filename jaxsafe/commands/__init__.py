@@ -11,6 +11,7 @@ COMMANDS = {
     "plot": "draw a run from its log files, or several runs in one figure",
     "tune": "train many settings as one program and rank them",
     "export": "write a policy as ONNX, StableHLO or VNN-LIB",
+    "dataset": "write steps of policies as data for offline learning",
     "config": "print an environment as YAML",
     "verify": "prove that a policy is safe from every start in a box",
     "falsify": "let adversaries try to break a filter",

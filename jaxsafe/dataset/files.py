@@ -1,0 +1,147 @@
+"""Datasets as files: an .npz with a header, or a dataset of Minari."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsafe.dataset.collect import Dataset
+from jaxsafe.environment import Environment
+from jaxsafe.schema.errors import ConfigError
+from jaxsafe.storage.archive import open_archive
+from jaxsafe.storage.files import parse_json, write_bytes
+
+FORMAT = "jaxsafe dataset 1"
+"""What a header says of the form of the file."""
+
+
+def facts(env: Environment, data: Dataset) -> dict[str, Any]:
+    """Return what a header says of the data: names, and averages over whole episodes.
+
+    Episodes that were cut at the end of the data are left out of the averages, where others are
+    left.
+    """
+    episodes = data.episodes()
+    whole = [part for part in episodes if data.terminated[part].any()] or episodes
+    costs = [data.costs[part].sum(axis=0) for part in whole]
+    return {
+        "observation_names": list(env.observation_names),
+        "action_names": list(env.action_names),
+        "constraints": [constraint.name for constraint in env.constraints],
+        "steps": len(data.reward),
+        "episodes": len(episodes),
+        "mean_return": float(np.mean([data.reward[part].sum() for part in whole])),
+        "mean_length": float(np.mean([part.stop - part.start for part in whole])),
+        "mean_costs": np.mean(costs, axis=0).tolist(),
+        "success_rate": float(np.mean([data.success[part].any() for part in whole])),
+    }
+
+
+def save_dataset(path: str | os.PathLike, data: Dataset, header: Mapping[str, Any]) -> None:
+    """Write a dataset as an .npz file: an array for each field, and `header`, a JSON text.
+
+    Args:
+        path: the file.
+        data: the steps.
+        header: what the header says besides its format, such as what `facts` returns.
+    """
+    text = json.dumps({"format": FORMAT, **header}, allow_nan=False)
+    buffer = io.BytesIO()
+    arrays: dict[str, Any] = data._asdict()
+    np.savez_compressed(buffer, header=np.array(text), **arrays)
+    write_bytes(Path(path), buffer.getvalue())
+
+
+def load_dataset(path: str | os.PathLike) -> tuple[Dataset, dict[str, Any]]:
+    """Return a dataset and its header.
+
+    Args:
+        path: a file that `save_dataset` wrote.
+
+    Raises:
+        ConfigError: the file cannot be read, or is no dataset.
+    """
+    with open_archive(path, "no dataset, or a damaged one") as archive:
+        header = parse_json(str(archive.read("header")), infinite=False)
+        if not isinstance(header, dict) or header.get("format") != FORMAT:
+            raise ConfigError(f"{path}: no dataset: expected format {FORMAT!r}")
+        return Dataset(*(archive.read(name) for name in Dataset._fields)), header
+
+
+def save_minari(
+    name: str, env: Environment, data: Dataset, header: Mapping[str, Any], gymnasium_id: str | None
+) -> None:
+    """Write a dataset into Minari's directory of datasets.
+
+    Each episode has `cost` (whether any constraint is violated), `costs` by constraint, and
+    `success` among its infos.
+
+    Args:
+        name: its name, such as `jaxsafe/docking2d/expert-v0`.
+        env: the environment.
+        data: the steps.
+        header: what the description says.
+        gymnasium_id: the id of the environment, with which Minari can make it again.
+
+    Raises:
+        ConfigError: Minari is not installed, it has such a dataset, or the name is none for it.
+    """
+    try:
+        import minari
+        from minari.data_collector import EpisodeBuffer
+    except ImportError:
+        raise ConfigError("format: minari is not installed; pip install 'minari[hdf5]'") from None
+    from jaxsafe.adapters.gymnasium_spaces import spaces
+
+    if env.action_kind == "mixed":
+        raise ConfigError("format: minari takes continuous or discrete actions; use format=npz")
+    observation_space, action_space = spaces(env)
+    buffers = []
+    for number, part in enumerate(data.episodes()):
+        costs = {
+            constraint.name: _with_first(data.costs[part, index])
+            for index, constraint in enumerate(env.constraints)
+        }
+        buffers.append(
+            EpisodeBuffer(
+                id=number,
+                observations=np.concatenate(
+                    [data.observation[part], data.next_observation[part][-1:]]
+                ),
+                actions=data.action[part],
+                rewards=data.reward[part].tolist(),
+                terminations=data.terminated[part].tolist(),
+                truncations=data.truncated[part].tolist(),
+                infos={
+                    "cost": _with_first(data.costs[part].max(axis=1, initial=0.0)),
+                    "costs": costs,
+                    "success": _with_first(data.success[part]),
+                },
+            )
+        )
+    try:
+        # Minari warns of each field of authors and links that is left out.
+        with warnings.catch_warnings(action="ignore", category=UserWarning):
+            minari.create_dataset_from_buffers(
+                dataset_id=name,
+                buffer=buffers,
+                env=gymnasium_id,
+                observation_space=observation_space,
+                action_space=action_space,
+                algorithm_name=str(header["kind"]),
+                description=json.dumps(dict(header)),
+            )
+    except (ValueError, FileExistsError) as error:
+        raise ConfigError(f"out: {name}: {str(error).splitlines()[0]}") from None
+
+
+def _with_first(values: np.ndarray) -> np.ndarray:
+    """Return values of steps with a zero for the reset, because Minari's infos begin there."""
+    return np.concatenate([np.zeros_like(values[:1]), values])

@@ -1,0 +1,162 @@
+"""Data for offline learning: every step is one that the environment took."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import minari
+import numpy as np
+import pytest
+
+import jaxsafe
+from jaxsafe.commands.dataset import main
+from jaxsafe.dataset import collect, collect_from_each, load_dataset, random_policy, save_dataset
+from jaxsafe.dataset.files import facts
+from jaxsafe.schema.errors import ConfigError
+
+SHORT = {"terminal.timeout.limit": 30.0}
+
+
+@pytest.fixture(scope="module")
+def env() -> Any:
+    return jaxsafe.make("docking2d", SHORT)
+
+
+@pytest.fixture(scope="module")
+def data(env: Any) -> Any:
+    return collect(env, random_policy(env), jax.random.key(0), 700)
+
+
+def test_steps_of_an_episode_follow_each_other(data: Any) -> None:
+    assert len(data.reward) == 700
+    assert np.all(np.abs(data.action) <= 1.0)
+    assert data.done[-1]
+    goes_on = ~data.done[:-1]
+    np.testing.assert_array_equal(
+        data.observation[1:][goes_on], data.next_observation[:-1][goes_on]
+    )
+    lengths = [part.stop - part.start for part in data.episodes()]
+    assert sum(lengths) == 700
+    assert max(lengths) == 31  # the first step with t > limit
+    assert np.any(data.observation[1:][~goes_on] != data.next_observation[:-1][~goes_on])
+
+
+def test_a_step_is_what_the_environment_does(env: Any, data: Any) -> None:
+    start = data.episodes()[1].start
+    seen = data.observation[start]
+    deputy = {"position": seen[:2] * 100.0, "velocity": seen[2:4] * 0.5}
+    state, _ = jaxsafe.reset_to(env, {"deputy": deputy})
+    for index in range(start, start + 5):
+        state, timestep = jaxsafe.step(env, state, jnp.asarray(data.action[index]))
+        np.testing.assert_allclose(timestep.observation, data.next_observation[index], atol=1e-5)
+        np.testing.assert_allclose(timestep.reward, data.reward[index], atol=1e-5)
+        assert float(timestep.cost) == data.costs[index].max()
+        np.testing.assert_allclose(timestep.info.control_actual, data.control[index], atol=1e-6)
+
+
+def test_each_of_several_policies_takes_as_many_steps(env: Any) -> None:
+    def pushing(parameters: Any) -> Any:
+        return lambda key, observation: jnp.full((len(observation), 2), parameters)
+
+    thrusts = [jnp.float32(x) for x in (-0.5, 0.0, 0.25)]
+    data = collect_from_each(env, pushing, thrusts, jax.random.key(1), 500)
+    values, counts = np.unique(data.action[:, 0], return_counts=True)
+    assert values.tolist() == [-0.5, 0.0, 0.25]
+    assert counts.tolist() == [167, 167, 166]
+    changes = np.flatnonzero(np.diff(data.action[:, 0]))
+    assert data.done[changes].all()  # no episode is of two policies
+
+
+@pytest.mark.parametrize("actions", ["discrete", "continuous"])
+def test_random_actions_are_uniform_in_their_bounds(actions: str) -> None:
+    env = jaxsafe.make("docking2d", actions=actions)
+    drawn = np.asarray(random_policy(env)(jax.random.key(0), jnp.zeros((4000, 6))))
+    if actions == "continuous":
+        assert np.abs(drawn).max() <= 1.0
+        assert np.abs(drawn.mean(axis=0)).max() < 0.04
+        return
+    points = env.num_action_points[0]
+    counts = np.bincount(drawn[:, 0], minlength=points)
+    assert len(counts) == points
+    assert counts.min() > 0.8 * 4000 / points
+
+
+def test_a_file_has_all_that_was_collected(env: Any, data: Any, tmp_path: Path) -> None:
+    path = tmp_path / "data.npz"
+    save_dataset(path, data, facts(env, data))
+    again, header = load_dataset(path)
+    for name, array in data._asdict().items():
+        np.testing.assert_array_equal(getattr(again, name), array)
+    assert header["constraints"] == ["velocity_limit"]
+    assert header["steps"] == 700
+    assert header["episodes"] == len(data.episodes())
+    whole = [part for part in data.episodes() if data.terminated[part].any()]
+    returns = [data.reward[part].sum() for part in whole]
+    assert header["mean_return"] == pytest.approx(np.mean(returns), rel=1e-5)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ConfigError, match=r"data\.npz: no dataset, or a damaged one"):
+        load_dataset(path)
+
+
+def test_the_command_writes_data_of_random_actions(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    out = tmp_path / "random.npz"
+    words = ["env=docking2d", "kind=random", "steps=300", "env.terminal.timeout.limit=20"]
+    assert main([*words, f"out={out}"]) == 0
+    assert "300 steps in " in capsys.readouterr().out
+    data, header = load_dataset(out)
+    assert header["kind"] == "random"
+    assert len(data.reward) == 300
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", ["medium", "replay"])
+def test_data_of_checkpoints_are_of_all_seeds(kind: str, whole: Path, tmp_path: Path) -> None:
+    out = tmp_path / "data.npz"
+    assert main([f"run={whole}", f"kind={kind}", "steps=400", f"out={out}"]) == 0
+    data, header = load_dataset(out)
+    assert header["steps"] == len(data.reward) == 400
+
+
+def test_minari_reads_every_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    words = ["run=pretrained/docking2d", "steps=300", "env.terminal.timeout.limit=40"]
+    words += ["format=minari", "out=jaxsafe/docking2d/test-v0", "kind=filtered"]
+    assert main(words) == 0
+    assert "written to jaxsafe/docking2d/test-v0" in capsys.readouterr().out
+    dataset = minari.load_dataset("jaxsafe/docking2d/test-v0")
+    assert dataset.total_steps == 300
+    for episode in dataset.iterate_episodes():
+        assert len(episode.observations) == len(episode.actions) + 1
+        assert len(episode.infos["costs"]["velocity_limit"]) == len(episode.observations)
+        assert episode.terminations[-1] or episode.truncations[-1]
+        assert dataset.spec.observation_space.contains(episode.observations[0])
+        assert dataset.spec.action_space.contains(episode.actions[0])
+    with pytest.raises(ConfigError, match="out: jaxsafe/docking2d/test-v0: "):
+        main(words)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["kind=random"], "env: kind=random needs a task and no run"),
+        (["kind=random", "env=docking2d", "run=pretrained/docking2d"], "needs a task and no run"),
+        (["kind=random", "env=docking2d", "deterministic=true"], "deterministic"),
+        ([], "run: missing; the policies"),
+        (["run=docking2d"], "run: docking2d is a task"),
+        (["run=pretrained/docking2d", "kind=replay"], "run: kind=replay needs the directory of a"),
+        (
+            ["run=pretrained/docking2d", "out=data.csv"],
+            r"out: expected NAME\.npz, found data\.csv",
+        ),
+        (["run=pretrained/docking2d", "kind=offline"], "kind: "),
+    ],
+)
+def test_mistakes_are_named(words: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as caught:
+        main(words)
+    assert "\n" not in str(caught.value)
