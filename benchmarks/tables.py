@@ -242,6 +242,24 @@ def uncertain_training(results: Results) -> str:
     return markdown((*heads, "steps altered", "share of full control"), rows)
 
 
+def datasets(results: Results) -> str:
+    """Return the scores of data for offline learning by where they come from."""
+    heads = ("task", "`kind`", "episodes", "return", "length", "success", "violating steps")
+    rows = [
+        (
+            row["task"],
+            f"`{row['kind']}`",
+            f"{row['episodes']:,}",
+            f"{row['mean_return']:.3f}",
+            f"{row['mean_length']:,.1f}",
+            f"{100.0 * row['success_rate']:.1f} %",
+            f"{sum(row['mean_costs']):.3f}",
+        )
+        for row in results["rows"]
+    ]
+    return markdown(heads, rows)
+
+
 def controllers(results: Results) -> str:
     """Return the table of controllers and packaged policies without a filter, and of bounds."""
     rows = []
@@ -950,6 +968,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("robustness", robustness, "docs/safety/attacks.md"),
     ("verification", verification, "docs/verification.md"),
     ("uncertain_training", uncertain_training, "docs/safety/attacks.md"),
+    ("datasets", datasets, "docs/dataset.md"),
     ("controllers", controllers, "docs/controllers.md"),
     ("controllers", controllers_filtered, "docs/controllers.md"),
     ("adapters", adapters, "docs/adapters/gymnasium.md"),
