@@ -67,9 +67,9 @@ def later_sim(env: Environment, sim: Sim, platforms: Others) -> Sim:
 
 
 def others_later(env: Environment, sim: Sim) -> Others:
-    """Return all platforms but the agent's one step later.
+    """Return the states of all platforms but the agent's one step later, by name.
 
-    No control of this step can change them.
+    The agent's control in this step cannot change them.
     """
     later = {}
     for platform in env.platforms:
@@ -103,7 +103,7 @@ def driven(
 ) -> tuple[Controls, Mapping[str, Float[Array, ""]]]:
     """Return what the agent's plant receives over a step, and what its actuators give after it.
 
-    Both are in physical units, by name. The second has the actuators with a lag or a rate limit.
+    Both are in physical units, by name. The second holds only actuators with a lag or a rate limit.
 
     Args:
         env: the environment.
@@ -122,7 +122,7 @@ def driven(
 
 
 def undirected(platform: Platform, sim: Sim) -> Controls:
-    """Return the controls, by name, of a platform that is not the agent's. No action reaches it."""
+    """Return the controls, by name, of a platform other than the agent's. No action reaches it."""
     return platform.controller.control(jnp.zeros(0), sim)
 
 
@@ -142,12 +142,16 @@ def place_regions(env: Environment, sim: Sim) -> Sim:
 
 
 def _in_detail(env: Environment) -> tuple[set[str], set[str]]:
-    """Return the regions whose motion, and those whose distances, are named by some part."""
+    """Return the names of the regions whose motion, and of those whose distance, some part uses."""
     if not env.regions:
         return set(), set()
-    named = [found for found in references(env, "") if isinstance(found[1], RefersInDetail)]
-    moving = {name for _, refers, name in named if refers.section == "places"}
-    measured = {name for _, refers, name in named if refers.section == "regions"}
+    in_detail = [
+        (refers.section, name)
+        for _, refers, name in references(env, "")
+        if isinstance(refers, RefersInDetail)
+    ]
+    moving = {name for section, name in in_detail if section == "places"}
+    measured = {name for section, name in in_detail if section == "regions"}
     return moving, measured
 
 
@@ -161,8 +165,8 @@ def update_statuses(
     Args:
         env: the environment.
         sim: the simulation, with its platforms.
-        memory: what the statuses remember from the step before, by name. Statuses that are not
-            there begin anew, as all do at the start of an episode.
+        memory: what the statuses remember from the step before, by name. Statuses that have no
+            entry begin anew, as all do at the start of an episode.
         duration: length of the step [s]. None stands for `env.dt`.
 
     Returns:
@@ -236,7 +240,8 @@ def status_names(parts: Iterable[Component]) -> Iterator[str]:
 def judge(env: Environment, sim: Sim, before: Sim | None = None) -> Sim:
     """Return the simulation with regions and statuses that follow from its platforms alone.
 
-    A status remembers what `sim.remembered` has of it, and otherwise what it does at a reset.
+    A status uses the memory that `sim.remembered` has of it. Without one it begins anew, as at a
+    reset.
 
     Args:
         env: the environment.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def begun(env: Environment, sim: Sim, key: Any) -> dict[str, Any]:
-    """Return what the parts of `uncertainty` remember at the start of an episode, by name.
+    """Return what the parts of `uncertainty` remember at the start of an episode, by name of part.
 
     Args:
         env: the environment.
@@ -55,27 +55,34 @@ def random_parts(env: Environment) -> list[str]:
 
 
 def episode_words(key: Key, stream: int) -> Any:
-    """Return the words of a key of threefry for an episode, drawn from a key of any kind.
+    """Return the two words of an episode's threefry key, drawn from a key of any kind.
 
-    A state holds words, so that all its leaves are arrays of numbers.
+    A state holds the words in place of the key, so that all its leaves are arrays of numbers.
+
+    Args:
+        key: the key of the reset.
+        stream: a number that no other draw from `key` uses.
+
+    Returns:
+        Words of shape (2,) and type uint32.
     """
     return jax.random.bits(jax.random.fold_in(key, stream), (2,), jnp.uint32)
 
 
 def step_key(words: Any, num_steps: Array) -> Any:
-    """Return the key of a step, given the words of that of the episode, or () for ()."""
+    """Return the key of a step from the words of the episode's key. From () return ()."""
     if isinstance(words, tuple):
         return words
     return jax.random.fold_in(episode_key(words), num_steps)
 
 
 def episode_key(words: Array) -> Key:
-    """Return the key that `episode_words` stand for, whatever kind of keys JAX makes."""
+    """Return the key of an episode from its words, whatever kind of key JAX makes by default."""
     return jax.random.wrap_key_data(words, impl="threefry2x32")
 
 
 def part_key(key: Any, index: int) -> Any:
-    """Return the key of a part, given that of the step, or () for ()."""
+    """Return the key of a part from the key of the step. From () return ()."""
     return key if isinstance(key, tuple) else jax.random.fold_in(key, index)
 
 
@@ -104,7 +111,14 @@ def received(
 def arriving(
     env: Environment, sim: Sim, memory: Mapping[str, Any], control: Float[Array, " m"]
 ) -> Float[Array, " m"]:
-    """Return the control that the plant receives in a step of which the memories are known."""
+    """Return the control that the plant receives in a step, given what the parts remember in it.
+
+    Args:
+        env: the environment.
+        sim: the simulation before the step.
+        memory: what the parts of `env.uncertainty` remember in the step, by name.
+        control: the control of the step, after run time assurance.
+    """
     for item in env.uncertainty:
         control = item.received(env, sim, memory[item.name], control)
     return control
@@ -113,7 +127,13 @@ def arriving(
 def disturbed(
     env: Environment, memory: Mapping[str, Any], platforms: Mapping[str, Any]
 ) -> Mapping[str, Any]:
-    """Return the platforms after a step, given those that the model predicts."""
+    """Return the platforms after a step, disturbed by the parts of `uncertainty`.
+
+    Args:
+        env: the environment.
+        memory: what the parts of `env.uncertainty` remember in the step, by name.
+        platforms: the platforms after the step as the model predicts them, by name.
+    """
     for item in env.uncertainty:
         with part("uncertainty", item.name):
             platforms = item.moved(env, memory[item.name], platforms)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class WorstDisturbance(Disturbance, type="worst"):
     """A disturbance of the size `bound` that lowers the smallest h after the step most steeply.
 
-    It knows the control of the step. Where the disturbance has no influence on h it is 0.
+    It knows the control of the step. It is 0 where a disturbance has no influence on h.
     """
 
     bound: Size
@@ -46,25 +46,26 @@ class WorstDisturbance(Disturbance, type="worst"):
 class WorstNavigationError(StateError, type="worst_navigation"):
     """An error of navigation of the size `bound` that makes the smallest h look largest.
 
-    So a filter believes to be farther from a violation than it is. The h is that of platforms that
-    have flown on for a step with their velocities, because h need not depend on a velocity itself.
+    So a filter believes that the agent is farther from a violation than it is. The h is taken after
+    all platforms have flown on for a step with their velocities, because h itself need not depend
+    on a velocity.
     """
 
     bound: Size
 
     def init(self, env: Environment, sim: Sim, key: Key) -> Any:
-        like = self.true(sim)
+        true_value = self.true(sim)
 
         def h(error: Float[Array, " k"]) -> Float[Array, ""]:
-            seen = self.measured(env, sim, error.reshape(like.shape))
+            seen = self.measured(env, sim, error.reshape(true_value.shape))
             ahead = {
                 platform.name: _drifted(platform, seen.platforms[platform.name], env.dt)
                 for platform in env.platforms
             }
             return smallest_margin(env, seen.replace(platforms=ahead, regions={}, status={}))
 
-        flat = jnp.zeros_like(jnp.ravel(like))
-        return (self.bound * steepest(h, flat)).reshape(like.shape)
+        flat = jnp.zeros_like(jnp.ravel(true_value))
+        return (self.bound * steepest(h, flat)).reshape(true_value.shape)
 
     def increment(
         self, env: Environment, sim: Sim, key: Key, memory: Any, control: Float[Array, " m"]

@@ -79,9 +79,10 @@ class DiscreteASIF(CertifiedRTA, type="discrete_asif"):
         if self.bound is None:
             return project(margin)
 
-        # What is lost depends on the control. So project with what the strongest control loses,
-        # then with what the control just found loses. A control that loses no more than it was
-        # found with replaces the one before. Of two rounds, at least one finds such a control.
+        # How much h is lost depends on the control. So the first projection allows for what the
+        # strongest control loses, and each further one for what the control before it loses. A
+        # control that loses no more than was allowed for replaces the one before. At least one of
+        # two rounds finds such a control.
         control, feasible = project(margin + self.lost(env, jnp.maximum(-low, high)))
         lost = self.lost(env, control)
         for _ in range(2):
@@ -135,9 +136,10 @@ def speed_ball(
 
 
 def linear(function: Callable[[Array], T], at: Float[Array, " m"]) -> tuple[T, T]:
-    """Return the value of a function and its derivatives, which have an axis of m in front.
+    """Return the value of a function at a point, and its derivatives by the m elements there.
 
-    Differentiation is forwards, so that nothing is stored.
+    The derivatives have an axis of length m in front. They are taken forwards, so that nothing is
+    stored.
     """
     along = functools.partial(jax.jvp, function, (at,))
     return jax.vmap(along, out_axes=(None, 0))((jnp.eye(at.shape[0], dtype=at.dtype),))
@@ -311,7 +313,7 @@ def nearest_by_priority(
     ) -> tuple[Array, Array, Array, Array]:
         """Return control, `solved`, `feasible` and the row that moves the control most.
 
-        Rows without slack of a lower priority are left out, and the others have `hard_slack`.
+        Rows without slack are left out below `least_priority`. The others have `hard_slack`.
         """
         kept = [
             index
@@ -358,24 +360,24 @@ class ImplicitASIF(CertifiedRTA, type="implicit_asif"):
     ) -> Proposal:
         low, high = bounds(env)
 
-        def least(u: Float[Array, " m"]) -> tuple[Array, Array]:
+        def predict(u: Float[Array, " m"]) -> tuple[Array, Array]:
             paths = self.follow(env, sim, advance(env, sim, u))
             return paths.values, paths.margins
 
         def improve(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], Array]:
             proposal, feasible = carry
-            (values, margins), (gains, _margin_gains) = linear(least, proposal)
+            (values, margins), (gains, _margin_gains) = linear(predict, proposal)
             best = jnp.argmax(values)
-            known = jnp.isfinite(values[best])
-            row = jnp.where(known, gains[:, best], 0.0)
+            proved = jnp.isfinite(values[best])
+            row = jnp.where(proved, gains[:, best], 0.0)
             required = self.margin_to_certify(env, proposal)
-            missing = jnp.where(known, required + self.spare - values[best], 0.0)
+            missing = jnp.where(proved, required + self.spare - values[best], 0.0)
             projected, feasible = project_box_halfspace(
                 u=desired, low=low, high=high, a=row, b=missing + jnp.sum(row * proposal)
             )
             safe = values[best] >= required
             closest = self.closest(env, margins[best])
-            return (jnp.where(safe, proposal, projected), safe | (known & feasible)), closest
+            return (jnp.where(safe, proposal, projected), safe | (proved & feasible)), closest
 
         (control, feasible), closest = jax.lax.scan(
             improve, (desired, jnp.ones((), bool)), length=self.rounds

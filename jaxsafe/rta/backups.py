@@ -239,9 +239,10 @@ class MatchVelocity(BackupController, type="match_velocity"):
         return jnp.stack([controls[name] for name in env.action_names])
 
     def _aim(self, own: Any, lead: Any, lead_after: Any) -> tuple[Array, Array, Array, Array]:
-        """Return w, its part along the lead's velocity, and the heading error.
+        """Return what the controller aims at.
 
-        The third of four values is the square of the lead's horizontal speed.
+        The four values are w [ft/s], its part along the lead's velocity [ft/s], the square of the
+        lead's horizontal speed [ft²/s²], and the heading error [rad].
         """
         away = self._away(own.position - lead.position)
         level_squared = jnp.sum(lead.velocity[:2] ** 2)
@@ -290,7 +291,7 @@ class MatchVelocity(BackupController, type="match_velocity"):
         moved = after.platforms[env.agent]
         asked = dict(zip(env.action_names, self.control(env, before, after.platforms), strict=True))
 
-        # The true control goes for another velocity than the predicted one, by so much.
+        # How far the velocities that the true and the predicted control aim at may be apart.
         reach = tube.position + bound.position
         distance = safe_norm(own.position - lead.position)
         too_close = jnp.maximum(self.clearance - (distance - reach), 0.0)
@@ -298,7 +299,7 @@ class MatchVelocity(BackupController, type="match_velocity"):
         if self.climb is not None:
             tube = cast(TubeInSpace, tube)
             plant = cast(Dubins3D, env.agent_platform)
-            # Where the agent is closer than half the clearance w turns faster than it grows.
+            # Where the agent is closer than half the clearance, w turns faster than it grows.
             apart *= jnp.maximum(too_close / jnp.maximum(distance - reach, 1.0), 1.0)
             *_, error = self._aim(own, lead, after.platforms[self.lead])
             pursuit = Pursuit(
@@ -342,7 +343,8 @@ class MatchVelocity(BackupController, type="match_velocity"):
             wider = after_step(env, bound, tube=tube, before=own, after=moved, kept=kept)
             to_turn = self._sign * asked["heading_rate"] * env.dt + self.dead_zone
 
-        # Where one of them may turn the long way round and the other one not, nothing is known.
+        # Nothing is known where only one of the true and the predicted way may turn the long way
+        # round.
         doubt = tube.heading + wrong_heading + ROUNDING
         same_way = (to_turn >= doubt) & (to_turn + doubt < 2.0 * jnp.pi)
         return wider.replace(position=jnp.where(same_way, wider.position, LOST))
@@ -462,7 +464,13 @@ def _acceleration(env: Environment, sim: Sim, name: str) -> Float[Array, " d"]:
 
 
 def _spare(env: Environment, asked: Mapping[str, Number], name: str) -> Any:
-    """Return by how much a control could be changed within its bounds, times the step."""
+    """Return by how much a control could be changed both ways within its bounds, times the step.
+
+    Args:
+        env: the environment.
+        asked: the controls by name, before they are clipped.
+        name: the name of the control.
+    """
     actuator = next(actuator for actuator in env.actuators if actuator.name == name)
     spare = jnp.minimum(asked[name] - actuator.low, actuator.high - asked[name])
     return env.dt * jnp.maximum(spare, 0.0)

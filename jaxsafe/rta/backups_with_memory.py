@@ -71,7 +71,7 @@ class HoldPosition(BackupController, type="hold_position"):
     Each axis is taken as a double integrator with the state z = ∫e dt, e and v, where e is the
     distance from the place. The thrust is −m (k_i z + k_r e + k_v v), which minimises the integral
     of w_i² z² + w_r² e² + w_v² v² + (F/m)². So k_i = w_i, k_r² = w_r² + 2 k_i k_v and k_v² = w_v² +
-    2 k_r. While the thrust is at a bound z rests, so that it does not wind up.
+    2 k_r. While the thrust is at a bound, z rests, so that it does not wind up.
     """
 
     position_weight: Annotated[Number, Unit("1/s²"), Positive] = 0.01

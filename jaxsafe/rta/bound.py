@@ -56,8 +56,8 @@ class UncertaintyBound(Component):
     def errors(self, facts: SpeedLimitFacts) -> Errors:
         """Return the errors of the state in which the next control begins to act.
 
-        That is the measured state, and with a delay the one that is predicted from it. Until then
-        controls may be as strong as can be.
+        That is the measured state. With a delay it is the state that is predicted from it, and the
+        controls that act until then are taken to be as strong as they can be.
         """
         errors = self.measured
         for _ in range(self.delay):
@@ -70,15 +70,14 @@ class UncertaintyBound(Component):
         Args:
             facts: numbers of the spacecraft.
             errors: the errors before the step.
-            acceleration: that of the thrust on the step, as the filter knows it [m/s²].
+            acceleration: the acceleration by the thrust on the step, as the filter knows it [m/s²].
         """
         dt = facts.dt
         n = facts.mean_motion
         wrong_thrust = self.mass / (1.0 - self.mass) + 2.0 * jnp.sin(self.misalignment / 2.0)
         wrong = wrong_thrust * acceleration + self.process
-        orbit = (
-            1.0 + 2.0 * (n * dt) ** 2
-        )  # what the norms of the exact map have beyond their limits
+        # The norms of the exact map are at most by this factor above 1, dt and 3 n² dt.
+        orbit = 1.0 + 2.0 * (n * dt) ** 2
         return Errors(
             position=orbit * (errors.position + dt * errors.velocity + 0.5 * dt**2 * wrong),
             velocity=orbit * (errors.velocity + 3.0 * n**2 * dt * errors.position + dt * wrong),
@@ -91,8 +90,8 @@ class UncertaintyBound(Component):
 
         Args:
             speed_limits: the facts of the limits. The largest answer counts.
-            acceleration: that of the thrust on a step to the state [m/s²], as the filter knows it.
-                None stands for the state before the step.
+            acceleration: the acceleration by the thrust on the step to that state [m/s²], as the
+                filter knows it. None stands for the state before the step.
         """
         facts = speed_limits[0]
         errors = self.errors(facts)
@@ -102,9 +101,11 @@ class UncertaintyBound(Component):
         return errors.velocity + jnp.max(slopes) * errors.position
 
     def reduced(self, facts: SpeedLimitFacts) -> SpeedLimitFacts:
-        """Return the facts with less thrust, as far as the bound takes its effect away.
+        """Return the facts for which Proposition 11 asks the brake to hold the limit.
 
-        A measured speed may be above the limit by what is lost there, so the limit is higher.
+        The thrust is weaker by the h that the bound may cost before and after a step, divided by
+        the length of a step. The limit is higher by what the bound costs before the step, because
+        the measured speed may be above the true one by so much.
         """
         before = self.lost([facts])
         after = self.lost([facts], facts.strongest)

@@ -44,7 +44,10 @@ class Cascade(RTA, type="cascade"):
 
     @property
     def constraints(self) -> tuple[str, ...]:
-        """The constraints of all stages in a row, which `info.rta.constraint` indexes."""
+        """The constraints of all stages, one stage after another.
+
+        `info.rta.constraint` is an index into them.
+        """
         return tuple(name for stage in self.stages for name in _constraints(stage.rta))
 
     def problem(self) -> str | None:
@@ -58,6 +61,7 @@ class Cascade(RTA, type="cascade"):
 
     @property
     def _first_indices(self) -> list[int]:
+        """The index of each stage's first constraint among those of all stages."""
         counts = [len(_constraints(stage.rta)) for stage in self.stages]
         return [sum(counts[:index]) for index in range(len(counts))]
 

@@ -35,8 +35,9 @@ def ahead_of_delay(
         controls: the controls under way.
 
     Returns:
-        The filter without delay, whose measured state has the errors of the prediction, the
-        predicted simulation, and whether the state after each control is certified.
+        The filter without delay, the predicted simulation, and whether the state after each control
+        is certified. The filter takes the predicted state for a measured one, with the errors of
+        the prediction.
     """
     bound = rta.bound
     assert bound is not None
@@ -44,14 +45,14 @@ def ahead_of_delay(
     if rta.has_tubes:
         ahead = rta.replace(bound=bound.after_delay(errors_after_delay(env, bound)))
 
-        def one_way(sim: Sim, control: Float[Array, " m"]) -> tuple[Sim, Array]:
+        def one_step_in_tube(sim: Sim, control: Float[Array, " m"]) -> tuple[Sim, Array]:
             later = advance(env, sim, control)
             assert ahead.bound is not None
             tube = rta.backups[0].first_tube(env, sim, later, ahead.bound)
             least = jnp.min(rta.compared(env, rta.margins(env, sim, later)))
             return later, least - tube.position >= rta.required_margin(env)
 
-        sim, certified = jax.lax.scan(one_way, start, controls)
+        sim, certified = jax.lax.scan(one_step_in_tube, start, controls)
         return ahead, sim, certified
     facts = [speed_limit_facts(env, name) for name in rta.constraints]
 
@@ -61,9 +62,9 @@ def ahead_of_delay(
         if facts[0] is not None:
             acceleration = safe_norm(control) / facts[0].mass
             errors = bound.errors_after(facts[0], errors, acceleration)
-        there = rta.replace(bound=bound.after_delay(errors))
-        value = there.follow(env, sim, later).values[0]
-        return (later, errors), value >= there.margin_to_certify(env)
+        rta_there = rta.replace(bound=bound.after_delay(errors))
+        value = rta_there.follow(env, sim, later).values[0]
+        return (later, errors), value >= rta_there.margin_to_certify(env)
 
     (sim, errors), certified = jax.lax.scan(one_step, (start, bound.measured), controls)
     return rta.replace(bound=bound.after_delay(errors)), sim, certified

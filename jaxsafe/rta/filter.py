@@ -43,16 +43,19 @@ Margin = Annotated[Number, Unit("as the constraint"), Range(0.0)]
 """A value of h, in the unit of the constraint."""
 
 NO_CONSTRAINT = functools.partial(jnp.full, (), -1, jnp.int32)
-"""The index of a constraint where there is none, as an array."""
+"""A function that returns the index −1 as an array. It stands for "no constraint"."""
 
 Proposal = (
     tuple[Float[Array, " m"], Bool[Array, ""]]
     | tuple[Float[Array, " m"], Bool[Array, ""], Int[Array, ""]]
 )
-"""A control, whether it meets a filter's own constraints, and if known for which it was changed."""
+"""A control, and whether it meets the filter's own constraints.
+
+A filter that knows for which constraint it changed the control adds the index of that constraint.
+"""
 
 Faults = dict[str, Bool[Array, ""]]
-"""Reasons why a proof does not hold, in words, each with whether it applies at a given state."""
+"""Reasons, in words, why a proof may not hold, and whether each applies at a given state."""
 
 
 class RTA(Component):
@@ -60,8 +63,8 @@ class RTA(Component):
 
     It is pure. What it remembers is part of the environment's state.
 
-    It predicts with the numbers of the environment, or by `model` with numbers of its own, by
-    dotted path. So a filter with `{deputy.mass: 12}` takes the mass for 12 kg, whatever it is.
+    It predicts with the numbers of the environment. `model` replaces some of them by dotted path.
+    So a filter with `{deputy.mass: 12}` predicts with a mass of 12 kg, whatever the true mass is.
     """
 
     model: Mapping[ParameterPath, Annotated[Number, Unit("physical")]] = dataclasses.field(
@@ -71,7 +74,7 @@ class RTA(Component):
     def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
         """Return reasons why the filter would be useless, each with whether it applies at a state.
 
-        They are asked for once, when the filter is built.
+        They are asked for once, when the environment is built.
         """
         return {}
 
@@ -92,13 +95,13 @@ class RTA(Component):
             sim: the simulation before the step.
             memory: the memory after the last step.
             desired: the agent's control in physical units and action order. Elements that are not
-                numbers are never passed on.
+                finite are never passed on.
         """
         raise NotImplementedError
 
 
 class UnderWay(Record):
-    """Controls that have been chosen but do not act yet, the next one first."""
+    """Controls that have been chosen but do not act yet. The first one acts next."""
 
     controls: Float[Array, "delay m"]
     certified: Bool[Array, " delay"]  # whether the state after each is known to be safe
@@ -111,7 +114,7 @@ class RTAMemory(Record):
     backup_index: Int[Array, ""]  # the backup controller that the last certificate is about
     certified: Bool[Array, ""]  # whether following that backup controller is known to be safe
     ahead: Mapping[str, Any]  # platforms at the end of the certificate's horizon; empty without one
-    # `Sim.actuators` and `Sim.remembered` at that end.
+    # `Sim.actuators` and `Sim.remembered` at the end of the horizon.
     actuators_ahead: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     remembered_ahead: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     backups: tuple[Any, ...] = ()  # what each backup controller remembers
@@ -124,14 +127,14 @@ class BackupController(Component):
 
     It has a name, because a filter may have several. A law without memory writes `control` alone.
     One with memory writes `init` and `act`. A memory begins at the state where the controller takes
-    over, and moves only while it acts or is predicted to.
+    over, and changes only while the controller acts or is predicted to act.
     """
 
     name: str
     within_limits: ClassVar[bool] = False
-    """Whether no state of the plant reaches a limit before the end of a step.
+    """Whether the plant reaches no limit of its state within a step while the controller acts.
 
-    Prediction is then cheaper.
+    The filter then predicts with the plant's `step_within_limits`, which is cheaper.
     """
     knows_bound: ClassVar[bool] = False
     """Whether `faults` takes the `bound` of a filter into account."""
@@ -157,7 +160,7 @@ class BackupController(Component):
         return self.control(env, sim, later), memory
 
     def unfinished(self, env: Environment, sim: Sim, memory: Any) -> Bool[Array, ""]:
-        """Return whether a manoeuvre is under way, which the filter lets the controller finish."""
+        """Return whether a manoeuvre is under way. The filter lets the controller finish it."""
         return jnp.zeros((), bool)
 
     @property
@@ -169,7 +172,7 @@ class BackupController(Component):
         """Return reasons why this controller is not proved to keep the constraints.
 
         There are none by default. At a state where a reason applies, the filter certifies nothing.
-        A filter is refused when it is built if a reason applies at every one of a few starts.
+        A filter is refused when it is built if a reason applies at all of a few sampled starts.
 
         Args:
             env: the environment, with the numbers of this episode.
@@ -184,7 +187,7 @@ class BackupController(Component):
 
     @property
     def has_tubes(self) -> bool:
-        """Whether it has tubes, without which it is not proved with a `bound` and a horizon."""
+        """Whether it has tubes. Without them it is not proved with a `bound` and a horizon."""
         return False
 
     def first_tube(
@@ -203,9 +206,17 @@ class BackupController(Component):
     def next_tube(
         self, env: Environment, before: Sim, after: Sim, bound: UncertaintyBound, tube: Tube
     ) -> Tube:
-        """Return the tube after a step in which this controller acts, given the one before it.
+        """Return the tube after a step in which this controller acts.
 
-        In the prediction it acts on the predicted state, in truth on the measured one.
+        In the prediction the controller acts on the predicted state. In truth it acts on the
+        measured one.
+
+        Args:
+            env: the environment.
+            before: the predicted simulation before the step.
+            after: the predicted simulation after the step.
+            bound: how far the true world may be from the predicted one.
+            tube: the tube before the step.
         """
         raise NotImplementedError
 
@@ -217,16 +228,17 @@ class TerminalSet(Component):
     """
 
     knows_bound: ClassVar[bool] = False
-    """Whether `faults` takes the `bound` of a filter into account, and `contains_tube` is known."""
+    """Whether `faults` takes the `bound` of a filter into account, and there is `contains_tube`."""
 
     def contains(self, env: Environment, sim: Sim) -> Bool[Array, ""]:
         """Return whether a state is in the set."""
         raise NotImplementedError
 
     def contains_tube(self, env: Environment, sim: Sim, tube: Tube) -> Bool[Array, ""]:
-        """Return whether all states of a tube about a predicted one are in the set.
+        """Return whether all states of a tube about a predicted state are in the set.
 
-        With a `bound` the backup controllers must stay safe from there within it.
+        From all of them the backup controllers must stay safe in every world within the filter's
+        `bound`.
         """
         raise NotImplementedError
 
@@ -240,7 +252,8 @@ class Paths(Record):
 
     margins: Float[Array, "backups c"]  # smallest h of each constraint on the way
     least: Float[Array, " backups"]  # the smallest of these, to be compared with the margin
-    certified: Bool[Array, " backups"]  # whether all but the margin holds: terminal set and proof
+    # Whether the way ends in the terminal set and the proof holds. The margin is not looked at.
+    certified: Bool[Array, " backups"]
     memories_ahead: tuple[Any, ...]  # what each backup controller remembers at its end
     # Platforms, `Sim.actuators` and `Sim.remembered` at the end, [backups, ...]; empty without a
     # horizon.
@@ -275,7 +288,8 @@ class CertifiedRTA(RTA):
     A change of each control by at most `tolerance`, as a share of its range, is no intervention.
 
     A `bound` says how far the true world may be from the one that the filter predicts with. The
-    filter then keeps so much more of a speed limit that its certificates hold in the true world.
+    filter then keeps a larger margin of a speed limit, so that its certificates hold in the true
+    world.
     With a horizon it predicts a tube that holds all ways of the true world. Such a certificate is
     true for as long as its backup controller acts, so it is not renewed.
     """
@@ -294,8 +308,8 @@ class CertifiedRTA(RTA):
     """Whether what the filter proposes may act by itself, without any backup controller."""
 
     def problem(self) -> str | None:
-        alone = self.backup_optional and not self.enforce
-        if not self.constraints or not (self.backups or alone):
+        needs_no_backup = self.backup_optional and not self.enforce
+        if not self.constraints or not (self.backups or needs_no_backup):
             expected = "expected at least one constraint and one backup controller"
             without = "; with enforce: false it needs no backup controller"
             return expected + (without if self.backup_optional else "")
@@ -314,7 +328,8 @@ class CertifiedRTA(RTA):
     ) -> Proposal:
         """Return the control to certify and whether it meets the filter's own constraints.
 
-        A third value may say for which of `constraints` the control was changed, by its index.
+        A third value may be the index of the one of `constraints` for which the control was
+        changed.
 
         Args:
             env: the environment.
@@ -333,14 +348,14 @@ class CertifiedRTA(RTA):
 
         Args:
             env: the environment.
-            name: the name of a constraint, which may have a margin of its own. None stands for
-                those that have none.
+            name: the name of a constraint, which may have a margin of its own. None stands for all
+                constraints without a margin of their own.
         """
-        own = {other: constraint(env, other).required_margin for other in self.constraints}
+        own_margins = {other: constraint(env, other).required_margin for other in self.constraints}
         margin = self.margin
-        names = [other for other in self.constraints if own[other] is None]
+        names = [other for other in self.constraints if own_margins[other] is None]
         if name is not None and name not in names:
-            margin = jnp.asarray(own[name])
+            margin = jnp.asarray(own_margins[name])
             names = [name]
         facts = [speed_limit_facts(env, other) for other in names]
         least_margins = [limit.least_margin for limit in facts if limit]
@@ -351,12 +366,12 @@ class CertifiedRTA(RTA):
     ) -> Number:
         """Return the h that a predicted state must have to be certified.
 
-        It is `required_margin`, and with a `bound` also what the true h may be below the predicted.
+        It is `required_margin`. A `bound` adds how far the true h may be below the predicted one.
 
         Args:
             env: the environment.
-            control: the control of the step to that state. The weaker it is, the less is unknown
-                of it. None stands for the state before a step.
+            control: the control of the step to that state. A weaker control adds less, because less
+                of its effect is unknown. None stands for the state before a step.
         """
         required = self.required_margin(env)
         return required if self.bound is None else required + self.lost(env, control)
@@ -370,16 +385,16 @@ class CertifiedRTA(RTA):
         if self.bound is None or self.has_tubes:
             return jnp.zeros_like(env.dt)
         facts = [speed_limit_facts(env, name) for name in self.constraints]
-        known = [limit for limit in facts if limit]
-        if len(known) < len(facts) or not self._bound_is_proved:
+        speed_limits = [limit for limit in facts if limit]
+        if len(speed_limits) < len(facts) or not self._bound_is_proved:
             return jnp.full_like(env.dt, jnp.inf)
-        acceleration = None if control is None else safe_norm(control) / known[0].mass
-        return self.bound.lost(known, acceleration)
+        acceleration = None if control is None else safe_norm(control) / speed_limits[0].mass
+        return self.bound.lost(speed_limits, acceleration)
 
     @property
     def _bound_is_proved(self) -> bool:
-        known = all(backup.proved.knows_bound for backup in self.backups)
-        return self.has_tubes or (not self.horizon and known)
+        all_know_bound = all(backup.proved.knows_bound for backup in self.backups)
+        return self.has_tubes or (not self.horizon and all_know_bound)
 
     @property
     def has_tubes(self) -> bool:
@@ -412,16 +427,17 @@ class CertifiedRTA(RTA):
         """Return the memory at the start of an episode and the facts about the start.
 
         The memory holds the backup controller that is safest from there. With a delay the controls
-        under way are 0, as near as their bounds allow. The states after them must be safe as well.
+        under way are 0, or as near to 0 as their bounds allow. The states after them must be safe
+        as well.
         """
         if self.bound is not None and self.bound.delay:
-            none, _ = admissible(env, jnp.zeros(env.action_size, env.dt.dtype))
-            controls = jnp.tile(none, (self.bound.delay, 1))
-            _, start = self.replace(bound=self.bound.replace(delay=0)).begin(env, sim)
-            ahead, later, certified = ahead_of_delay(self, env, sim, controls)
-            memory, info = ahead.begin(env, later)
+            no_control, _ = admissible(env, jnp.zeros(env.action_size, env.dt.dtype))
+            controls = jnp.tile(no_control, (self.bound.delay, 1))
+            _, start_info = self.replace(bound=self.bound.replace(delay=0)).begin(env, sim)
+            undelayed, predicted, certified = ahead_of_delay(self, env, sim, controls)
+            memory, info = undelayed.begin(env, predicted)
             memory = memory.replace(under_way=UnderWay(controls=controls, certified=certified))
-            return memory, info.replace(certified=start.certified & jnp.all(certified))
+            return memory, info.replace(certified=start_info.certified & jnp.all(certified))
         paths = self.follow(env, sim, sim)
         best = self._best(env, paths)
         memory = RTAMemory(
@@ -449,14 +465,15 @@ class CertifiedRTA(RTA):
     ) -> tuple[Float[Array, " m"], RTAMemory, RTAInfo]:
         """Propose a control, certify it, else back up. Arguments and results are those of `RTA`.
 
-        With a delay this is done in the state in which the control will begin to act. It is
-        certified only if the controls that act before it are.
+        With a delay this is done in the state in which the control will begin to act. The control
+        is certified only if all controls that act before it are.
         """
         if self.bound is not None and self.bound.delay:
             assert isinstance(memory.under_way, UnderWay)
-            controls, certified = memory.under_way.controls, memory.under_way.certified
-            ahead, later, _ = ahead_of_delay(self, env, sim, controls)
-            control, memory, info = ahead.filter(env, later, memory, desired)
+            controls = memory.under_way.controls
+            certified = memory.under_way.certified
+            undelayed, predicted, _ = ahead_of_delay(self, env, sim, controls)
+            control, memory, info = undelayed.filter(env, predicted, memory, desired)
             under_way = UnderWay(
                 controls=jnp.concatenate([controls[1:], control[None]]),
                 certified=jnp.append(certified[1:], info.certified),
@@ -474,17 +491,19 @@ class CertifiedRTA(RTA):
 
         # A certificate with a horizon takes many predicted steps, so only one is made per step.
         # From a certified state it is a certificate of the proposal. From any other state the
-        # backup acts whatever is proposed, so it is one of the backup.
+        # backup acts whatever is proposed, so it is a certificate of the backup.
         certified_before = memory.certified if self.enforce and self.horizon else jnp.ones((), bool)
         after_proposal = advance(env, sim, proposal, later=later)
         after_backup = advance(env, sim, backup, later=later)
-        taken_over = self._fresh(env, after_proposal)
-        gone_on = self._gone_on(env, after_backup, index=memory.backup_index, moved=moved)
+        memories_if_passed = self._fresh(env, after_proposal)
+        memories_if_backed_up = self._memories_after(
+            env, after_backup, index=memory.backup_index, moved=moved
+        )
         paths = self.follow(
             env,
             sim,
             _where(certified_before, after_proposal, after_backup),
-            memories=_where(certified_before, taken_over, gone_on),
+            memories=_where(certified_before, memories_if_passed, memories_if_backed_up),
         )
         best = self._best(env, paths)
         to_pass = self.margin_to_certify(env, proposal)
@@ -536,7 +555,7 @@ class CertifiedRTA(RTA):
             certified=certified,
             ahead=ahead,
             actuators_ahead=actuators_ahead,
-            backups=_where(passes, taken_over, gone_on),
+            backups=_where(passes, memories_if_passed, memories_if_backed_up),
             backups_ahead=memories_ahead,
             remembered_ahead=remembered_ahead,
         )
@@ -564,9 +583,9 @@ class CertifiedRTA(RTA):
         return margins_of(env, sim, before=before, names=self.constraints)
 
     def compared(self, env: Environment, margins: Float[Array, " c"]) -> Float[Array, " c"]:
-        """Return the h of each constraint, so that all are to be compared with `required_margin`.
+        """Return the h of each constraint, shifted so that `required_margin` is the margin of all.
 
-        Constraints that have a margin of their own are moved by the difference.
+        A constraint with a margin of its own is shifted by the difference of the two margins.
         """
         if all(constraint(env, name).required_margin is None for name in self.constraints):
             return margins
@@ -574,7 +593,7 @@ class CertifiedRTA(RTA):
         return margins + self.required_margin(env) - jnp.stack(own)
 
     def closest(self, env: Environment, margins: Float[Array, " c"]) -> Int[Array, ""]:
-        """Return the index of the constraint of which least is left above its margin."""
+        """Return the index of the constraint that is closest to its margin."""
         return jnp.argmin(self.compared(env, margins)).astype(jnp.int32)
 
     def certify(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, " backups"]:
@@ -582,7 +601,7 @@ class CertifiedRTA(RTA):
 
         It is to be compared with `margin_to_certify`. It is −∞ for a way that proves nothing. Such
         a way ends outside the terminal set, or the proof of the controller or of the set does not
-        hold for the numbers of the environment.
+        hold for the numbers of the environment. The shape is (backups,).
 
         Args:
             env: the environment, with the numbers of this episode.
@@ -671,9 +690,9 @@ class CertifiedRTA(RTA):
         plant = env.agent_platform
 
         def with_agent(sim: Sim, agent: tuple[Any, Any, Any]) -> Sim:
-            """Return the simulation with what depends on the agent.
+            """Return the simulation with another state and other actuators of the agent.
 
-            That is its state, its actuators, and what statuses remember.
+            What the statuses remember depends on the agent too, so it is replaced as well.
             """
             state, actuators, remembered = agent
             platforms = {**sim.platforms, env.agent: state}
@@ -743,9 +762,10 @@ class CertifiedRTA(RTA):
         after_backup: Sim,
         backup_margin: Float[Array, ""],
     ) -> tuple[Bool[Array, ""], Sim, tuple[Any, ...]]:
-        """Return whether the state after a step of the backup is certified, and its horizon's end.
+        """Return whether the state after a step of the backup is certified.
 
-        The end is the simulation there and the memories of the backup controllers.
+        The other two values are the simulation and the memories of the backup controllers at the
+        end of the new certificate's horizon.
 
         All steps of the new certificate but the last are steps of the one before it. So only the
         last step is predicted.
@@ -798,12 +818,12 @@ class CertifiedRTA(RTA):
         memories: tuple[Any, ...],
         later: Others,
     ) -> tuple[Float[Array, " m"], tuple[Any, ...]]:
-        """Return the control of a backup controller by its index, and all memories after they act.
+        """Return the control of a backup controller, and the memories as if all had acted.
 
         Args:
             env: the environment.
             sim: the simulation before the step.
-            index: the index of the controller.
+            index: the index of the controller whose control is returned.
             memories: what each backup controller remembers.
             later: the other platforms after the step.
         """
@@ -821,22 +841,22 @@ class CertifiedRTA(RTA):
         """Return the memories of backup controllers that take over at a state."""
         return tuple(backup.init(env, sim) for backup in self.backups)
 
-    def _gone_on(
+    def _memories_after(
         self, env: Environment, sim: Sim, index: Int[Array, ""], moved: tuple[Any, ...]
     ) -> tuple[Any, ...]:
-        """Return the memories after a step of one backup controller.
+        """Return the memories of all backup controllers after a step of one of them.
 
         Args:
             env: the environment.
             sim: the simulation after the step.
-            index: the index of the controller that acted. The others would take over now.
+            index: the index of the controller that acted. The others begin anew.
             moved: the memories of all controllers, as if each had acted.
         """
         pairs = zip(moved, self._fresh(env, sim), strict=True)
         return tuple(_where(index == i, acted, fresh) for i, (acted, fresh) in enumerate(pairs))
 
     def _unfinished(self, env: Environment, sim: Sim, memory: RTAMemory) -> Bool[Array, ""]:
-        """Return whether the backup controller in reserve has a manoeuvre under way."""
+        """Return whether the last certificate's backup controller has a manoeuvre under way."""
         pairs = enumerate(zip(self.backups, memory.backups, strict=True))
         under_way = [
             (memory.backup_index == i) & backup.unfinished(env, sim, own)

@@ -31,7 +31,7 @@ LARGEST_LATERAL = 4.0
 """Largest speed across the lead's course in the set, in units of its `tolerance`."""
 
 LARGEST_ASTRAY = 5.43
-"""Largest difference of the relative velocity from the one that is aimed at, in those units."""
+"""Largest difference of the relative velocity from the one aimed at, in units of `tolerance`."""
 
 ROUNDED = 1.001
 """Numbers of this ratio count as equal, because the proof has more reserve."""
@@ -40,7 +40,7 @@ ROUNDED = 1.001
 def in_formation(
     own: Any, lead: Any, gravity: Number, slowest: Number, tube: TubeInSpace, tolerance: Number
 ) -> Bool[Array, ""]:
-    """Return whether all velocities and banks of a tube are in the set of Proposition 15.
+    """Return whether all velocities and all banks of a tube are in the set of Proposition 15.
 
     Args:
         own: the predicted state of the agent.
@@ -51,16 +51,16 @@ def in_formation(
         tolerance: F, the size of the set [ft/s].
     """
     level_speed = lead.speed * jnp.cos(lead.flight_path_angle)
-    apart = wrap(own.heading - lead.heading, -jnp.pi, 2.0 * jnp.pi)
+    heading_error = wrap(own.heading - lead.heading, -jnp.pi, 2.0 * jnp.pi)
     sideways = gravity * jnp.tan(own.roll)
     own_speed = jnp.maximum(own.speed - tube.speed, slowest)
     strongest = (jnp.abs(sideways) + tube.sideways) / own_speed
-    mixed = jnp.abs(apart + SLOW_MODE * sideways / own.speed) + tube.slow
+    mixed = jnp.abs(heading_error + SLOW_MODE * sideways / own.speed) + tube.slow
     mixed += SLOW_MODE * strongest * tube.speed / own.speed
     climb = jnp.abs(own.flight_path_angle - lead.flight_path_angle) + tube.climb
     return (
         (level_speed * mixed <= LARGEST_MIXED * tolerance)
-        & (level_speed * (jnp.abs(apart) + tube.heading) <= LARGEST_LATERAL * tolerance)
+        & (level_speed * (jnp.abs(heading_error) + tube.heading) <= LARGEST_LATERAL * tolerance)
         & (level_speed * strongest <= tolerance)
         & (jnp.abs(own.speed - lead.speed) + tube.speed <= tolerance)
         & (lead.speed * climb <= tolerance)

@@ -4,8 +4,9 @@ The cost is fixed and the derivatives are exact.
 
 Both minimisers lie on a path that bends only where an element of the control reaches a bound. The
 reason is that the Lagrangian separates over the elements: for a multiplier λ each element is the
-clip of its own minimiser. Along the path the constraint changes monotonically. The values at the
-bends tell on which piece of the path it is met first. On that piece it is one scalar equation.
+clip of its own minimiser. Along the path the constraint changes monotonically. Its values at the
+bends tell on which piece of the path it is met first. On that piece the constraint is one scalar
+equation.
 """
 
 from __future__ import annotations

@@ -88,7 +88,7 @@ PLANAR_AWAY_TIME = 10
 """The `away_time` [s] of `match_velocity` for which Proposition 13 is proved."""
 
 CLOSE = 1.001
-"""Numbers of this ratio count as equal to those of a proof, because the proof has more reserve."""
+"""Numbers of this ratio count as equal in a proof, because every proof has more reserve."""
 
 
 def brake_faults(env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
@@ -115,18 +115,20 @@ def brake_faults(env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
             needed = margin + bound.lost([facts], facts.strongest)
             errors = bound.errors_after(facts, bound.errors(facts), facts.strongest)
             farthest = braking.farthest(distance + errors.position, speed + errors.velocity)
-        known = jnp.where(jnp.isfinite(farthest), farthest, 0.0)
-        of_limit = {
+        distance_to_hold = jnp.where(jnp.isfinite(farthest), farthest, 0.0)
+        faults_of_limit = {
             "mean motion and step are too large": facts.mean_motion * env.dt
             > MAX_ORBIT_ANGLE_PER_STEP,
             f"margin is not below the speed limit at the chief{within}": ~(needed < facts.floor),
             f"thrust cannot stop the spacecraft{within}": ~jnp.isfinite(farthest),
-            f"thrust cannot hold the speed limit{within}": ~(braking.room(known, margin) > 0.0),
+            f"thrust cannot hold the speed limit{within}": ~(
+                braking.room(distance_to_hold, margin) > 0.0
+            ),
             "margin is too small for what the limit changes within a step": ~(
-                facts.needed_margin(known) <= margin
+                facts.needed_margin(distance_to_hold) <= margin
             ),
         }
-        for fault, applies in of_limit.items():  # several limits may share a fault
+        for fault, applies in faults_of_limit.items():  # several limits may share a fault
             faults[fault] = applies | faults.get(fault, False)
     return faults
 
@@ -299,7 +301,7 @@ def aligned_or_slow_faults(
 
 
 def _farthest(env: Environment, sim: Sim, facts: SpeedLimitFacts) -> Any:
-    """Return the largest distance [m] from the chief that `align_and_brake` reaches."""
+    """Return the largest distance [m] from the chief that `align_and_brake` may reach."""
     distance, speed = distance_and_speed(env, sim)
     # cos 8° ≥ 0.98: the axis is aligned to 6°, and the body turns by 2° within a step.
     aligned = facts.replace(weakest=0.98 * facts.weakest)
@@ -549,7 +551,7 @@ def _faults_in_space(
     bank_tangent = jnp.tan(state.roll)
     if turn is not None:
         bank_tangent = turn.at * state.speed / plant.gravity
-    moved = [
+    moves = [
         jnp.asarray(value != 0.0)
         for control, ends in extremes.items()
         if control != "heading_rate"
@@ -559,7 +561,7 @@ def _faults_in_space(
     low, high = plant.flight_path_angle_limits
     max_climb = jnp.minimum(jnp.minimum(-low, high), 0.35)
     return {
-        f"{name!r} may change its speed, its roll or its angle of climb": jnp.any(jnp.stack(moved)),
+        f"{name!r} may change its speed, its roll or its angle of climb": jnp.any(jnp.stack(moves)),
         f"{name!r} turns faster than the agent can copy": ~(
             jnp.abs(bank_tangent) <= 0.98 * jnp.tan(max_bank)
         ),
@@ -578,7 +580,7 @@ def slow_actuators(env: Environment, proved: str) -> Faults:
 
     Args:
         env: the environment.
-        proved: the type of the part that takes it that controls act at once.
+        proved: the type of the part whose proof needs controls that act at once.
     """
     slow = [actuator.name for actuator in env.actuators if not actuator.at_once]
     if not slow:
@@ -593,8 +595,8 @@ def slow_actuators(env: Environment, proved: str) -> Faults:
 def _is_budget(env: Environment, name: str) -> bool:
     """Return whether a constraint rests on sums of the agent's Δv alone."""
     statuses = {status.name: status for status in env.status}
-    sums = [statuses[other] for other in status_names([constraint(env, name)])]
-    added = [statuses[other] for other in status_names(sums)]
+    sums = [statuses[status] for status in status_names([constraint(env, name)])]
+    added = [statuses[status] for status in status_names(sums)]
     return (
         bool(sums and added)
         and all(total.remembers for total in sums)
@@ -607,11 +609,15 @@ def _true() -> Bool[Array, ""]:
 
 
 def _is(value: Number, expected: float) -> Bool[Array, ""]:
+    """Return whether a number is the expected one, up to `CLOSE`."""
     return jnp.abs(value - expected) <= (CLOSE - 1.0) * abs(expected)
 
 
 def _speed_limits(env: Environment, rta: CertifiedRTA) -> list[SpeedLimitFacts] | str:
-    """Return the facts of all constraints of a filter, or a fault if nothing is proved of one."""
+    """Return the facts of all speed limits of a filter.
+
+    If one of its constraints is no speed limit of which something is proved, return a fault.
+    """
     facts_by_name = {name: speed_limit_facts(env, name) for name in rta.constraints}
     unknown = next((name for name, facts in facts_by_name.items() if facts is None), None)
     if unknown:
@@ -625,10 +631,13 @@ def _speed_limits(env: Environment, rta: CertifiedRTA) -> list[SpeedLimitFacts] 
 def _packaged_but(keeper: type[BackupController], rta: CertifiedRTA) -> bool:
     """Return whether a filter has a packaged backup controller of another class than `keeper`.
 
-    Nothing is known here of the backup controllers of users, so they do not count.
+    Backup controllers of users do not count, because nothing is known of them here.
     """
-    found = [type(backup.proved) for backup in rta.backups]
-    return any(kind.__module__ == keeper.__module__ and kind is not keeper for kind in found)
+    classes = [type(backup.proved) for backup in rta.backups]
+    return any(
+        backup_class.__module__ == keeper.__module__ and backup_class is not keeper
+        for backup_class in classes
+    )
 
 
 def _separates(env: Environment, limit: Any, platforms: set[str]) -> bool:

@@ -2,8 +2,8 @@
 
 Each element of the control is free or rests on one of its bounds, and each constraint is active or
 not. For a few of both there are few such patterns. All patterns are solved side by side, by
-elimination of as many unknowns as there are constraints. So the cost is fixed, there is no
-iteration and no start, and the derivative is that of the active set.
+elimination of as many unknowns as there are constraints. So the cost is fixed, nothing is iterated
+from a starting point, and the derivative is that of the active set.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jaxsafe.rta.projection import within
 from jaxsafe.types import Number, Record
 
 Slack = Number | Sequence[Number | None] | None
-"""Cost σ of missing a row: one for all rows, one for each, or None where no row may be missed."""
+"""Cost σ of missing a row: one for all rows, or one for each. With None a row must be met."""
 
 
 class Solution(Record):
@@ -29,8 +29,8 @@ class Solution(Record):
 
     control: Float[Array, " m"]
     solved: Bool[Array, ""]  # whether some control meets all rows without slack
-    feasible: Bool[Array, ""]  # whether besides each row with slack can be met by itself
-    # By row, how much the nearest control would move per unit of the row. 0 where it is not active.
+    feasible: Bool[Array, ""]  # whether also each row with slack can be met by itself
+    # How far each row of unit length moves the nearest control. 0 where a row is not active.
     multipliers: Float[Array, " c"]
 
 
@@ -45,8 +45,8 @@ def nearest_solution(
 ) -> Solution:
     """Return the nearest control argmin ‖w − u‖² + Σ σ s².
 
-    It is subject to rows·w + s ≥ offsets, s ≥ 0 and low ≤ w ≤ high. A row without a `slack` σ has s
-    = 0.
+    It is subject to rows·w + s ≥ offsets, s ≥ 0 and low ≤ w ≤ high. A row without a `slack` σ has
+    s = 0.
 
     For a pattern with free elements F and active rows S the solution is w_F = u_F + A_SFᵀλ, where
     (A_SF A_SFᵀ + I/σ) λ = b_S − A_S w⁰, and w⁰ is u on F and the bounds elsewhere. The optimum is
@@ -71,9 +71,8 @@ def nearest_solution(
     count, size = rows.shape
     slacks = list(slack) if isinstance(slack, Sequence) else [slack] * count
     squared = jnp.sum(rows * rows, axis=-1)
-    scale = jnp.sqrt(
-        jnp.where(squared > 0.0, squared, 1.0)
-    )  # the length of a row of zeros has no derivative
+    # The length of a row of zeros has no derivative, so 1 takes its place.
+    scale = jnp.sqrt(jnp.where(squared > 0.0, squared, 1.0))
     rows = rows / scale[:, None]
     offsets = offsets / scale
     costs = [None if sigma is None else sigma * scale[i] ** 2 for i, sigma in enumerate(slacks)]
@@ -139,9 +138,9 @@ def nearest_solution(
 def _patterns(size: int, soft: Sequence[bool]) -> tuple[np.ndarray, np.ndarray]:
     """Return for each pattern the side of every element and whether each row is active.
 
-    A side is −1 for the low bound, 0 for a free element and 1 for the high bound. No more rows
-    without slack than free elements can be active without depending on each other. All rows with
-    slack (`soft`) can.
+    A side is −1 for the low bound, 0 for a free element and 1 for the high bound. If more rows
+    without slack are active than elements are free, the rows depend on each other, so such patterns
+    are left out. Rows with slack (`soft`) may all be active.
 
     Returns:
         Sides of shape (size, patterns) and activity of shape (count, patterns).

@@ -27,7 +27,6 @@ if TYPE_CHECKING:
 MAX_ORBIT_ANGLE_PER_STEP = 0.05
 """Largest angle of the chief's orbit in a step [rad] for which the proofs' series hold."""
 
-
 _POINT_MASSES = (Spacecraft, DoubleIntegrator)
 """Platforms with a thruster pair per axis. A double integrator moves as at a mean motion of 0."""
 
@@ -39,9 +38,7 @@ class SpeedLimitFacts(Record):
     slope: Float[Array, ""]  # ν₁ [1/s]
     constant_to: Float[Array, ""]  # r₀ [m]
     mean_motion: Float[Array, ""]  # n [rad/s], not negative; 0 without gravity
-    weakest: Float[
-        Array, ""
-    ]  # least acceleration by thrust [m/s²], over both directions of all axes
+    weakest: Float[Array, ""]  # least acceleration by thrust of any axis and direction [m/s²]
     strongest: Float[Array, ""]  # largest acceleration by thrust [m/s²]
     spin: Float[Array, ""]  # highest rate at which the thrust turns [rad/s]
     axes: Float[Array, ""]  # number of axes of a point mass
@@ -99,7 +96,7 @@ class SpeedLimitFacts(Record):
         Where it is positive, a step of braking from h = `margin` keeps h at `margin` or above.
 
         Args:
-            distance: from the chief [m].
+            distance: the distance from the chief [m].
             margin: h at the beginning of the step [m/s].
         """
         n = self.mean_motion
@@ -120,8 +117,8 @@ class SpeedLimitFacts(Record):
         It is infinite if the point mass may never stop.
 
         Args:
-            distance: from the chief at the beginning [m].
-            speed: at the beginning [m/s].
+            distance: the distance from the chief at the beginning [m].
+            speed: the speed at the beginning [m/s].
         """
         n = self.mean_motion
         dt = self.dt
@@ -199,7 +196,8 @@ def distance_and_speed(env: Environment, sim: Sim) -> tuple[Float[Array, ""], Fl
 def off_centre(env: Environment, sim: Sim) -> Any:
     """Return whether an anchor is elsewhere than at the origin of Hill's frame.
 
-    A spacecraft there would not stay at rest.
+    The proofs take the chief to be at the origin, because a spacecraft elsewhere would not stay at
+    rest.
     """
     anchors = [platform.name for platform in env.platforms if type(platform) is Anchor]
     displaced = [jnp.any(sim.platforms[name].position != 0.0) for name in anchors]

@@ -59,8 +59,8 @@ def after_step(
         tube: the tube before the step.
         before: the predicted state before the step.
         after: the predicted state after the step.
-        kept: heading and speed are what controls leave of the differences by the end of the step.
-            None stands for the same controls on both ways.
+        kept: its heading and speed are what the controls leave of the differences by the end of the
+            step. None stands for the same controls on both ways.
     """
     kept = tube if kept is None else kept
     push = bound.process * env.dt
@@ -86,7 +86,8 @@ def errors_after_delay(env: Environment, bound: UncertaintyBound) -> Errors:
     gains = [actuator.high for actuator in env.actuators if actuator.name == "acceleration"]
     faster = jnp.asarray(1.0 + sum(gains) * env.dt / slowest)
     faster = jnp.clip(faster, 1.0, fastest / slowest)
-    position, velocity = bound.position, bound.velocity
+    position = bound.position
+    velocity = bound.velocity
     push = 1.02 * bound.process * env.dt  # asin is longer than the sine
     for _ in range(bound.delay):
         position = position + env.dt * (0.5 * (3.0 + faster) * velocity + 0.5 * push)

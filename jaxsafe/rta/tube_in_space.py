@@ -1,7 +1,7 @@
 """Tubes about the predicted way of an aircraft in space, which banks in order to turn.
 
-Proposition 14 of docs/safety/proofs.md proves them, for steps of 1 s. So no length of a step
-appears in the formulas of the turn.
+Proposition 14 of docs/safety/proofs.md proves them for steps of 1 s. So the formulas of the turn do
+not contain the length of a step.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class TubeInSpace(Tube):
 
     climb: Float[Array, ""]  # of the flight path angle [rad]
     sideways: Float[Array, ""]  # of g tan φ, the acceleration across the velocity [ft/s²]
-    # Of ψ + c g tan φ/v̄, with the predicted speed v̄ and the two c above [rad].
+    # Of the mixtures ψ + c g tan φ/v̄, with the predicted speed v̄ and the two times c above [rad].
     slow: Float[Array, ""]
     fast: Float[Array, ""]
 
@@ -50,9 +50,10 @@ class Pursuit(Record):
     error: Float[Array, ""]  # heading error ē [rad]
     apart: Float[Array, ""]  # difference of the velocities that are aimed at [ft/s]
     lead_level_speed: Float[Array, ""]  # horizontal speed of the lead [ft/s]
-    spare_acceleration: Float[Array, ""]  # by which the command could be changed, times 1 s [ft/s]
-    spare_climb: Float[Array, ""]  # the same of the flight path angle [rad]
-    climb_by_error: Float[Array, ""]  # change of the angle aimed at, by that of ē [rad]
+    spare_acceleration: Float[Array, ""]  # how far the command is from its bounds, times 1 s [ft/s]
+    spare_climb: Float[Array, ""]  # the same of the flight path angle rate [rad]
+    # How far the flight path angle that is aimed at may change because ē is wrong [rad].
+    climb_by_error: Float[Array, ""]
 
 
 def first_in_space(
@@ -70,17 +71,17 @@ def first_in_space(
     plain = measured(bound, before)
     climb = plain.heading
     heading = largest_turn(bound.velocity, before.speed * _level(plant, before, climb))
-    none = jnp.zeros_like(plain.position)
+    zero = jnp.zeros_like(plain.position)
     tube = TubeInSpace(
         position=plain.position,
         heading=heading,
         speed=plain.speed,
         climb=climb,
-        sideways=none,
+        sideways=zero,
         slow=heading,
         fast=heading,
     )
-    by_speed = _turn_by_speed(plant, before, after, speed=tube.speed, sideways=none)
+    by_speed = _turn_by_speed(plant, before, after, speed=tube.speed, sideways=zero)
     turned = heading + by_speed
     kept = tube.replace(heading=turned, slow=turned, fast=turned)
     return _moved(env, bound, tube=tube, kept=kept, turn=by_speed, before=before, after=after)
@@ -113,7 +114,7 @@ def next_in_space(
     speed = jnp.maximum(tube.speed - pursuit.spare_acceleration, bound.velocity + pursuit.apart)
     climb = jnp.maximum(tube.climb - pursuit.spare_climb, wrong_climb)
 
-    # The bank that is asked for, as g tan φ, and by how much it may be another one.
+    # The bank that is asked for, as g tan φ, and how far the true one may be from it.
     speed_error = tube.speed + bound.velocity
     asked = TURN_GAIN * before.speed * pursuit.error
     noise = (before.speed + speed_error) * wrong_heading
@@ -128,7 +129,8 @@ def next_in_space(
     least_roll = arctan(jnp.maximum(now - tube.sideways, lowest) / g)
     most_roll = arctan(jnp.minimum(now + tube.sideways, highest) / g)
 
-    # Which of the ways to change the bank may act on the true way or between the two.
+    # Which kinds of bank change may occur on the true way, or between it and the predicted one. The
+    # bank follows what is asked for, rests at its limit, or changes at the fastest roll.
     roll = next(actuator for actuator in env.actuators if actuator.name == "roll_rate")
     down, up = roll.low * env.dt, roll.high * env.dt
     least_step = arctan(least_asked / g) - most_roll
@@ -143,8 +145,8 @@ def next_in_space(
     may_rest = may_rest & ~(only_down | only_up)
     downwards = _stretches(plant, least_roll, most_roll, down)
     upwards = _stretches(plant, least_roll, most_roll, up)
-    # Of a mixture of ways the rows are its corners: the share of what is asked for, and that of the
-    # bank before.
+    # The true bank change is a mixture of those kinds. Each row is a corner of the mixtures: the
+    # share of what is asked for, ϑ, and the share of the bank before the step, μ.
     follows = jnp.stack([1.0 + 0.0 * g, *[0.0 * g] * 5])
     stays = jnp.stack([0.0 * g, 0.0 * g, *downwards, *upwards])
     allowed = jnp.stack([may_follow, may_rest, may_down, may_down, may_up, may_up])
@@ -166,19 +168,20 @@ def next_in_space(
     most = (0.5 + (stretch - 1.0) / 6.0) * after.speed / slow
     ratio = before.speed / after.speed
 
-    # Axes: g tan φ, ψ and its two mixtures with δ; the corners of a and b; the ways of the bank.
-    whole = jnp.array([0.0, 1.0, 1.0, 1.0])
-    delay = jnp.array([1.0, 0.0, SLOW_MODE, FAST_MODE])
-    of_last = whole[:, None] * jnp.stack([least, most, least, most]) + delay[:, None]
-    of_first = whole[:, None] * jnp.stack([least, least, most, most])
-    known = _combined(
+    # The axes are g tan φ, ψ and the two mixtures of ψ and δ, then the corners of a and b, then the
+    # kinds of bank change.
+    of_psi = jnp.array([0.0, 1.0, 1.0, 1.0])
+    of_delta = jnp.array([1.0, 0.0, SLOW_MODE, FAST_MODE])
+    of_last = of_psi[:, None] * jnp.stack([least, most, least, most]) + of_delta[:, None]
+    of_first = of_psi[:, None] * jnp.stack([least, least, most, most])
+    by_tube = _combined(
         tube,
         before.speed,
-        of_heading=whole[:, None, None] - TURN_GAIN * ratio * of_last[..., None] * follows,
+        of_heading=of_psi[:, None, None] - TURN_GAIN * ratio * of_last[..., None] * follows,
         of_turn=ratio * (of_first[..., None] + of_last[..., None] * stays),
     )
-    by_noise = jnp.max(follows) * (whole * most + delay) * noise / after.speed
-    turned, heading, slow_mode, fast_mode = known + by_noise
+    by_noise = jnp.max(follows) * (of_psi * most + of_delta) * noise / after.speed
+    turned, heading, slow_mode, fast_mode = by_tube + by_noise
 
     sideways = jnp.minimum(widest, after.speed * turned)
     by_speed = _turn_by_speed(
@@ -206,30 +209,37 @@ def _combined(
     of_heading: Float[Array, "k corners ways"],
     of_turn: Float[Array, "k corners ways"],
 ) -> Float[Array, " k"]:
-    """Return the largest sums of heading and turn rate in a tube, each with its factors.
+    """Return the largest weighted sums of heading and turn rate in a tube.
 
-    Any two of the four bounds that a tube has of them bound such a sum. The best pair counts.
+    A tube bounds the heading, the turn rate and two mixtures of both. Any two of these four bounds
+    bound such a sum, and the best pair counts.
+
+    Args:
+        tube: the tube.
+        speed: the predicted speed [ft/s].
+        of_heading: the weight of the heading in each of k sums, at each corner.
+        of_turn: the weight of the turn rate.
     """
     widths_and_times = ((tube.heading, 0.0), (tube.slow, SLOW_MODE), (tube.fast, FAST_MODE))
     turn = tube.sideways / speed
     largest = []
-    for i, (one, one_time) in enumerate(widths_and_times):
-        rest = of_turn - one_time * of_heading
-        largest.append(jnp.abs(of_heading) * one + jnp.abs(rest) * turn)
-        for other, other_time in widths_and_times[i + 1 :]:
-            of_other = rest / (other_time - one_time)
-            largest.append(jnp.abs(of_heading - of_other) * one + jnp.abs(of_other) * other)
+    for i, (width, time) in enumerate(widths_and_times):
+        rest = of_turn - time * of_heading
+        largest.append(jnp.abs(of_heading) * width + jnp.abs(rest) * turn)
+        for other_width, other_time in widths_and_times[i + 1 :]:
+            of_other = rest / (other_time - time)
+            largest.append(jnp.abs(of_heading - of_other) * width + jnp.abs(of_other) * other_width)
     return jnp.min(jnp.max(jnp.stack(largest), axis=(-2, -1)), axis=0)
 
 
 def _stretches(plant: Dubins3D, low: Number, high: Number, step: Number) -> tuple[Any, Any]:
-    """Return the least and largest ratio of 1/cos² of a bank after a step of it and before.
+    """Return the least and the largest ratio of 1/cos² of a bank after a roll to that before it.
 
     Args:
         plant: the aircraft.
-        low: the least bank before the step [rad].
-        high: the largest bank before the step [rad].
-        step: what is added to it [rad]. Beyond the limits of the bank nothing is.
+        low: the least bank before the roll [rad].
+        high: the largest bank before the roll [rad].
+        step: what the roll adds to the bank [rad]. It adds nothing beyond the limits of the bank.
     """
     limits = plant.roll_limits
     ends = [
@@ -243,7 +253,15 @@ def _stretches(plant: Dubins3D, low: Number, high: Number, step: Number) -> tupl
 def wrong_course(
     plant: Dubins3D, bound: UncertaintyBound, tube: TubeInSpace, before: Any, pursuit: Pursuit
 ) -> Any:
-    """Return by how much the heading error of the true control is measured wrongly [rad]."""
+    """Return how wrong the heading error that the true control acts on may be [rad].
+
+    Args:
+        plant: the aircraft.
+        bound: the bound on what is not known.
+        tube: the tube before the step.
+        before: the predicted state before the step.
+        pursuit: what the controller asks for.
+    """
     own_speed = jnp.maximum(before.speed - tube.speed, plant.speed_limits[0])
     level_speed = own_speed * _level(plant, before, tube.climb)
     return largest_turn(bound.velocity, level_speed) + pursuit.apart / pursuit.lead_level_speed
@@ -296,7 +314,15 @@ def _level(plant: Dubins3D, state: Any, climb: Number) -> Any:
 def _turn_by_speed(
     plant: Dubins3D, before: Any, after: Any, speed: Number, sideways: Number
 ) -> Any:
-    """Return how far other speeds turn the true heading from the predicted one in a step [rad]."""
+    """Return how far a wrong speed turns the true heading from the predicted one in a step [rad].
+
+    Args:
+        plant: the aircraft.
+        before: the predicted state before the step.
+        after: the predicted state after the step.
+        speed: how far the true speed may be from the predicted one [ft/s].
+        sideways: how far g tan φ may be from the predicted one [ft/s²].
+    """
     slow = jnp.minimum(before.speed, after.speed)
     bank = jnp.maximum(jnp.abs(before.roll), jnp.abs(after.roll))
     acceleration = plant.gravity * jnp.tan(bank) + sideways

@@ -1,6 +1,6 @@
 """Proofs about learned controllers: the closed loop keeps its speed limit from a whole box.
 
-`jaxsafe.verify(env, policy, box)` proves or refutes it, see `jaxsafe.verify.verify.verify`.
+`jaxsafe.verify(env, policy, box)` proves or refutes that. It is `jaxsafe.verify.verify.verify`.
 """
 
 from jaxsafe.schema.callable_package import make_callable

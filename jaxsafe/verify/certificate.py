@@ -1,4 +1,4 @@
-"""Certificates: what a verification knows as an .npz file of numbers and one JSON text.
+"""Certificates: what a verification knows, as an .npz file of numbers and one JSON text.
 
 A certificate holds the closed loop as a list of operations with its numbers, the boxes, and for
 each proved box what the proof says of the policy in every step. `check.py` needs nothing else.
@@ -25,24 +25,27 @@ from jaxsafe.verify.tube import Claims
 from jaxsafe.verify.verify import Boxes, Counterexample, Verification
 
 FORMAT = "jaxsafe certificate 1"
-"""What a header says of the form of the file."""
+"""Name and version of the format, which stand in the header of every certificate."""
 
 PROGRAMS = ("first", "following")
+"""The programs of a loop, fields of `Loop`."""
 
 
-def save_certificate(path: str | os.PathLike, known: Verification, about: dict[str, Any]) -> None:
+def save_certificate(
+    path: str | os.PathLike, verification: Verification, about: dict[str, Any]
+) -> None:
     """Write a certificate.
 
     Args:
         path: the file.
-        known: what is known.
+        verification: what is verification.
         about: what else the header says, such as the policy and the version.
     """
-    arrays = {f"{name}/{end}": x for name, end, x in _boxes(known)}
-    arrays |= {f"claims/{name}": x for name, x in known.claims._asdict().items()}
+    arrays = {f"{name}/{end}": x for name, end, x in _boxes(verification)}
+    arrays |= {f"claims/{name}": x for name, x in verification.claims._asdict().items()}
     programs = {}
     for name in PROGRAMS:
-        program = getattr(known.loop, name)
+        program = getattr(verification.loop, name)
         rows = []
         for index, op in enumerate(program.ops):
             rows.append([op.kind, list(op.inputs), op.output, op.size, len(op.constants)])
@@ -50,21 +53,21 @@ def save_certificate(path: str | os.PathLike, known: Verification, about: dict[s
                 place = f"{name}/{index}/{number}"
                 arrays |= {f"{place}/{key}": x for key, x in constant._asdict().items()}
         programs[name] = {"ops": rows, "input": program.input, "output": program.output}
-    violation = known.counterexample
+    violation = verification.counterexample
     header = {
         "format": FORMAT,
         "property": "safe",
-        "result": known.result,
-        "steps": known.steps,
-        "unit": known.loop.following.unit,
-        "dimension": known.loop.dimension,
-        "actions": known.loop.actions,
-        "plant": known.loop.plant._asdict(),
+        "result": verification.result,
+        "steps": verification.steps,
+        "unit": verification.loop.following.unit,
+        "dimension": verification.loop.dimension,
+        "actions": verification.loop.actions,
+        "plant": verification.loop.plant._asdict(),
         "programs": programs,
-        "margin": known.margin if math.isfinite(known.margin) else None,
+        "margin": verification.margin if math.isfinite(verification.margin) else None,
         "counterexample": None if violation is None else violation._asdict(),
-        "seconds": known.seconds,
-        "bounded": known.bounded,
+        "seconds": verification.seconds,
+        "bounded": verification.bounded,
         **about,
     }
     buffer = io.BytesIO()
@@ -72,14 +75,14 @@ def save_certificate(path: str | os.PathLike, known: Verification, about: dict[s
     write_bytes(Path(path), buffer.getvalue())
 
 
-def _boxes(known: Verification) -> Iterator[tuple[str, str, np.ndarray]]:
+def _boxes(verification: Verification) -> Iterator[tuple[str, str, np.ndarray]]:
     for name in ("box", "proved", "refuted", "open"):
-        for end, array in getattr(known, name)._asdict().items():
+        for end, array in getattr(verification, name)._asdict().items():
             yield name, end, array
 
 
 def load_certificate(path: str | os.PathLike) -> Verification:
-    """Read a certificate, to look at it or to go on from it.
+    """Return the verification that a certificate holds, to look at it or to go on from it.
 
     Raises:
         ConfigError: the file cannot be read, or is no certificate.

@@ -60,7 +60,12 @@ def fill(low, high, first, last):
 
 
 def ends(f, sets):
-    """Return the interval of a form (slope, centre, radius, low, high) over sets of states."""
+    """Return the interval of a form over sets of states.
+
+    A form (slope, centre, radius, low, high) says of a vector v that |v - slope y - centre| <=
+    radius and low <= v <= high. A set (centre, wide, thin, reach) holds the states y = centre +
+    wide e + f with |e| <= 1 and |f| <= thin, and reach bounds |y|.
+    """
     centre, wide, thin, reach = sets
     half = np.abs(f[0] @ wide).sum(-1) + times(np.abs(f[0]), thin) + f[2]
     half = up(half) + 4 * E * (times(np.abs(f[0]), reach) + np.abs(f[1]))
@@ -69,25 +74,23 @@ def ends(f, sets):
 
 
 def terms(f, sets):
-    """Bound the size of the terms of a form."""
+    """Return a bound on the terms of a form that may cancel, over sets of states."""
     return up(times(np.abs(f[0]), sets[3]) + np.abs(f[1]))
 
 
 def size(f, sets):
-    """Bound the size of the values of a form."""
+    """Return a bound on the absolute values of a form over sets of states."""
     return np.minimum(up(terms(f, sets) + f[2]), np.maximum(np.abs(f[3]), np.abs(f[4])))
 
 
 def linearise(kind, constants, x, sets):
-    """Return coefficients, offset, noise and interval of an operation."""
+    """Return an operation as coefficients of its inputs, offset, noise, least and largest value."""
     if kind == "affine":
         (low, noise), *matrices = constants
         high, far = low, np.abs(low)
         for (m, radius), f in zip(matrices, x, strict=True):
             noise = noise + size(f, sets) @ radius.T
-            if (
-                m.size > 1024
-            ):  # here forms alone are tighter, and intervals are not worth their time
+            if m.size > 1024:  # intervals are wider than forms here and not worth their time
                 low, high = low - np.inf, high + np.inf
                 continue
             a, b = (np.where(m != 0, m * v[:, None], 0) for v in f[3:])
@@ -129,19 +132,20 @@ def linearise(kind, constants, x, sets):
 
 
 def act(kind, a, v):
-    """Return what an input with coefficients a adds, for slopes or columns v."""
+    """Return what an input adds to the result of an operation with coefficients a.
+
+    v holds the slopes of the input, or other columns.
+    """
     if kind == "affine":
         return a @ v
     return (a[..., None] * v).sum(1, keepdims=True) if kind == "norm" else a[..., None] * v
 
 
 def bound(program, unit, sets, low, high):
-    """Return slope, centre, radius and least value of each output of a program."""
+    """Return slope, centre, radius, least and largest value of each output of a program."""
     zero = np.zeros_like(low)
-    forms, tape = (
-        {program["input"]: (np.eye(low.shape[1]) + zero[..., None], zero, zero, low, high)},
-        [],
-    )
+    forms = {program["input"]: (np.eye(low.shape[1]) + zero[..., None], zero, zero, low, high)}
+    tape = []
     for kind, keys, key, constants in program["ops"]:
         x = [forms[k] for k in keys]
         local, offset, noise, bottom, top = linearise(kind, constants, x, sets)
@@ -170,7 +174,11 @@ def bound(program, unit, sets, low, high):
 
 
 def gap(plant, speed, far, near):
-    """Return by how much h may fall inside a step below its values at both ends."""
+    """Return by how much h may fall inside a step below its values at both ends.
+
+    This is the lemma of docs/verification.md. speed and far bound ||v|| and ||r|| at both ends, and
+    near is at most ||r|| at one end.
+    """
     n, dt, a = plant["mean_motion"], plant["dt"], plant["acceleration"]
     v = (speed + dt / 2 * (a + 3 * n**2 * far)) / (1 - n * dt - 0.75 * (n * dt) ** 2)
     jerk = 3 * n**2 * v + 2 * n * (first := a + 2 * n * v + 3 * n**2 * (far + dt / 2 * v))
@@ -243,7 +251,7 @@ def read(path):
 
 
 def main(path, *others):
-    """Check a certificate, and that others are about the same loop."""
+    """Check a certificate, and that the others are about the same loop."""
     head, arrays = read(path)
     for other in others:
         a, b = (

@@ -1,9 +1,9 @@
 """Affine bounds of a program: one form per vector, with a rule per operation.
 
-A form says of a vector v, a function of the loop's state y, that |v − slope·y − centre| ≤ radius
-and low ≤ v ≤ high, for every y of a domain. Each operation adds what its linearisation and the
-rounding leave open as a noise. The noises of all operations are carried to the outputs at once,
-backwards, so that they may cancel on the way as far as the network lets them.
+A form is about a vector v that is a function of the loop's state y. It says that
+|v − slope·y − centre| ≤ radius and low ≤ v ≤ high for every y of a domain. Each operation adds a
+noise: what its linearisation and the rounding leave open. The noises of all operations are carried
+backwards to the outputs at once, so that they cancel on the way as far as the network lets them.
 
 All functions work on a batch of domains. Each operation is a program of its own, which is compiled
 once per size. One program for a whole step took XLA minutes to compile.
@@ -53,7 +53,7 @@ class Domain(NamedTuple):
 
 
 class Form(NamedTuple):
-    """Bounds of a vector, see the module."""
+    """Bounds of a vector v over a domain, as the module's docstring explains them."""
 
     slope: Float[Array, "s d"]
     centre: Float[Array, " s"]
@@ -84,7 +84,7 @@ class Linearised(NamedTuple):
 
 
 class Bounds(NamedTuple):
-    """Bounds of the outputs of a program: those of a form without `mass`."""
+    """Bounds of the outputs of a program. They are those of a form, without `mass`."""
 
     slope: Float[Array, "o d"]
     centre: Float[Array, " o"]
@@ -111,9 +111,10 @@ def bound(program: Program, domain: Domain) -> Bounds:
     noises = {}
     coefficients = {}
     for op in program.ops:
-        given = [forms[key] for key in op.inputs]
-        out = _forwards(op.kind, program.unit, op.constants, domain, given)
-        forms[op.output], noises[op.output], coefficients[op.output] = out
+        inputs = [forms[key] for key in op.inputs]
+        forms[op.output], noises[op.output], coefficients[op.output] = _forwards(
+            op.kind, program.unit, op.constants, domain, inputs
+        )
     form = forms[program.output]
     rows = {
         program.output: jnp.broadcast_to(
@@ -205,15 +206,18 @@ def _forwards(
 def _backwards(
     kind: str, coefficients: Any, row: Array, noise: Array, together: Array, before: list[Any]
 ) -> tuple[list[Array], Array]:
-    """Carry what the outputs get of an operation's result to its inputs.
+    """Carry the outputs' coefficients of an operation's result backwards to its inputs.
 
     Args:
         kind: the kind of the operation.
-        coefficients: those of its inputs.
-        row: how much of the result each output gets, `[batch, outputs, size]`.
-        noise: the noise of the operation `[batch, size]`.
-        together: how far noises have moved the outputs so far `[batch, outputs]`.
-        before: what the outputs get of the inputs through later operations, None for nothing.
+        coefficients: the operation's coefficients of its inputs.
+        row: the outputs' coefficients of its result, `[batch, outputs, size]`.
+        noise: the noise of the operation, `[batch, size]`.
+        together: how far the noises of later operations may move the outputs, `[batch, outputs]`.
+        before: the outputs' coefficients of each input through later operations, or None.
+
+    Returns:
+        The outputs' coefficients of each input, and `together` with the noise of the operation.
     """
     together = together + (jnp.abs(row) * noise[:, None]).sum(-1)
     moved = []
@@ -306,10 +310,10 @@ def _univariate(
     Args:
         function: the function. It is monotone. It may take a constant as a second argument, at
             which it has its only kink.
-        turns: the points at which its derivative is a given slope.
-        within: its range.
+        turns: the function from a slope to the points at which the derivative has that slope.
+        within: the range of the function.
         rounding: the relative error of the loop's own function, in units.
-        valid: whether the rule holds on an interval.
+        valid: whether the rule holds on an interval, given its ends. None stands for always.
         rising: whether the function rises.
     """
 

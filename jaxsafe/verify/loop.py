@@ -1,7 +1,7 @@
 """The closed loop that is proved: its state, its first and its following step, and its property.
 
-The state of the loop is what the agent's platform is, and the action that is held until the next
-step. One step of the loop is `jaxsafe.step` followed by the policy.
+The state of the loop is the position and the velocity of the agent's platform, and the action that
+is held in the next step. One step of the loop is `jaxsafe.step` followed by the policy.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SINGLE = 2.0**-24
 
 
 class Plant(NamedTuple):
-    """What the bound between two samples needs to know."""
+    """What the bound between two samples needs to know of the plant and of the speed limit."""
 
     mean_motion: float
     acceleration: float
@@ -50,8 +50,9 @@ class Loop(NamedTuple):
     """
 
     first: Program
-    """From a start, whose action is not looked at."""
+    """The program of the start. It does not look at the action in its state."""
     following: Program
+    """The program of every further step."""
     dimension: int
     """Number of axes of the position."""
     actions: int
@@ -168,17 +169,18 @@ def _require_provable(env: Environment) -> None:
 
 
 def _wrong_limit(env: Environment, constraint: Any) -> str:
-    """Return why a constraint is not that of Eq. (14), or an empty string."""
+    """Return why a constraint is not the speed limit of Eq. (14), or an empty string."""
     if type(constraint) is not SpeedLimit:
         return "it is no speed_limit"
     status = {item.name: item for item in env.status}
-    limit, speed = status[constraint.velocity_limit], status[constraint.speed]
+    limit = status[constraint.velocity_limit]
+    speed = status[constraint.speed]
     if type(limit) is not VelocityLimit or type(speed) is not Speed:
         return "its limit or its speed is another status"
     distance = status[limit.distance]
     if type(distance) is not Distance or {distance.of, speed.of} != {env.agent}:
         return "its distance is another status"
-    if distance.to not in {one.name for one in env.platforms if type(one) is Anchor}:
+    if distance.to not in {item.name for item in env.platforms if type(item) is Anchor}:
         return "its distance is not to an anchor"
     return "constant_to is not 0" if float(limit.constant_to) else ""
 
@@ -201,7 +203,7 @@ def _require_markov(env: Environment, template: State, dimension: int) -> None:
     """Check that position, velocity and action decide everything that a step and a policy see.
 
     Raises:
-        ConfigError: something else of the state changes, and is looked at.
+        ConfigError: a step or the policy looks at something else of the state that changes.
     """
     leaves, tree = jax.tree.flatten(template)
     paths = [
@@ -228,7 +230,7 @@ def _require_markov(env: Environment, template: State, dimension: int) -> None:
     )(jnp.zeros(2 * dimension)).jaxpr
     for index, (path, stays, needed) in enumerate(zip(paths, kept, used, strict=False)):
         chosen = [i == index for i in range(len(paths))]
-        # What stays as it is must not tell one start from another.
+        # What a step leaves as it is must also be the same from every start.
         stays = stays and not any(partial_eval.dce_jaxpr(begun, chosen)[1])
         if needed and not stays and path not in moving:
             raise ConfigError(f"env: the loop remembers {path}; a proof needs one that does not")

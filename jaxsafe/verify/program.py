@@ -2,7 +2,7 @@
 
 The list is read off the program that JAX makes of `jaxsafe.step` and the policy. So a proof is
 about the loop that runs, and not about a second model of it. Everything linear between two
-operations that are not becomes one matrix.
+nonlinear operations becomes one matrix.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ ELEMENTARY = 16.0
 FINE = 2.0**-40
 """A bound on the relative error of sums of up to 4,000 terms in double precision."""
 
+# Operations that only call another jaxpr.
 _INLINED = (
     "jit",
     "pjit",
@@ -39,6 +40,7 @@ _INLINED = (
     "remat",
     "checkpoint",
 )
+# Operations that move or copy numbers and do not change them.
 _MOVING = [
     "reshape",
     "squeeze",
@@ -53,6 +55,7 @@ _MOVING = [
     "copy",
     "convert_element_type",
 ]
+# Functions of one number that have a rule of their own in `forms`.
 _UNIVARIATE = ("tanh", "exp", "log", "sqrt", "abs", "square")
 
 
@@ -122,8 +125,8 @@ RULED = ("affine", *FUNCTIONS)
 class _Affine:
     """An array that is affine in earlier vectors, the bases, up to errors.
 
-    By base it has the coefficients, of the shape of the array and then of the base, and bounds on
-    their errors. The base None stands for the number 1.
+    For each base there are coefficients and bounds on their errors. Both have the shape of the
+    array and a last axis for the elements of the base. The base None stands for the number 1.
     """
 
     def __init__(self, shape: Sequence[int], terms: dict[int | None, Any], errors: Any) -> None:
@@ -165,7 +168,7 @@ def trace(function: Callable[[Array], Array], size: int, unit: float) -> Program
     closed = jax.make_jaxpr(function)(jnp.zeros(size))
     builder = _Builder(unit)
     start = builder.base((size,))
-    [result] = builder.run(closed.jaxpr, closed.consts, [start])  # the start has the number 1
+    [result] = builder.run(closed.jaxpr, closed.consts, [start])
     if not isinstance(result, _Affine):
         raise ConfigError("verify: the loop does not depend on its state")
     output = builder.vector(result)
@@ -175,7 +178,8 @@ def trace(function: Callable[[Array], Array], size: int, unit: float) -> Program
         if op.output in needed:
             needed.update(op.inputs)
             ops.append(op)
-    return Program(tuple(reversed(ops)), 1, output, unit)
+    # `start` was the first base, so its number is 1.
+    return Program(ops=tuple(reversed(ops)), input=1, output=output, unit=unit)
 
 
 class _Builder:
@@ -207,7 +211,10 @@ class _Builder:
         return out
 
     def vector(self, item: Any) -> int:
-        """Return the number of the vector that an array is, and compute it if it has none yet."""
+        """Return the number of the vector with the elements of an array.
+
+        If there is none yet, add the operation that computes it.
+        """
         if not isinstance(item, _Affine):
             raise ConfigError(
                 "verify: no rule for a comparison, or for a random number, in the loop"
@@ -233,7 +240,10 @@ class _Builder:
         return self.count
 
     def literal(self, value: Any) -> Constant | None:
-        """Return a number of the program. One that single precision cannot hold is rounded."""
+        """Return a constant of the jaxpr, or None for a key of random numbers.
+
+        A number that single precision cannot hold has the rounding of the loop as its radius.
+        """
         if jnp.issubdtype(jnp.result_type(value), jax.dtypes.prng_key):
             return None
         array = np.asarray(value)
@@ -244,7 +254,7 @@ class _Builder:
         return Constant(array, np.where(inexact, self.unit * np.abs(array), 0.0))
 
     def run(self, jaxpr: Any, consts: Sequence[Any], arguments: Sequence[Any]) -> list[Any]:
-        """Return the outputs of a jaxpr. Only what they need is looked at."""
+        """Return the outputs of a jaxpr. Equations that they do not need are left out."""
         values: dict[Any, Any] = dict(zip(jaxpr.invars, arguments, strict=True))
         values |= dict(zip(jaxpr.constvars, map(self.literal, consts), strict=True))
         needed = {var for var in jaxpr.outvars if not isinstance(var, Literal)}
@@ -336,7 +346,10 @@ class _Builder:
         return self.rounded(a.shape, terms, errors)
 
     def rounded(self, shape: Any, terms: Any, errors: Any) -> _Affine:
-        """Return an array with the rounding of a basic operation, in the loop and here."""
+        """Return an array whose errors include the rounding of a basic operation.
+
+        That is the rounding of the loop, and the rounding of the numbers here.
+        """
         share = BASIC * self.unit * (1.0 + 1e-6) + FINE
         errors = {
             key: (1.0 + 1e-6) * (error + share * np.abs(terms[key]))
@@ -355,7 +368,7 @@ class _Builder:
         return self.rounded(item.shape, terms, errors)
 
     def contracted(self, item: _Affine, matrix: Constant, count: int) -> _Affine:
-        """Return an array times a matrix, whose products are summed in any order."""
+        """Return an array times a matrix. Each sum has `count` products, in any order."""
         value, radius = matrix
 
         def moved(x: np.ndarray, m: np.ndarray) -> np.ndarray:
@@ -374,7 +387,7 @@ class _Builder:
         return _Affine((*item.shape[:-1], value.shape[1]), terms, errors)
 
     def fold(self, eqn: Any, x: list[Constant]) -> list[Constant]:
-        """Return the outputs of an operation on constants, with the error that the loop makes."""
+        """Return the outputs of an operation on constants, with the errors of the loop as radii."""
         name, several = eqn.primitive.name, eqn.primitive.multiple_results
         out = eqn.primitive.bind(*(jnp.asarray(item.value) for item in x), **eqn.params)
         outs = [np.asarray(item) for item in (out if several else [out])]
@@ -566,4 +579,7 @@ _ERRORS: dict[str, Callable[..., Any]] = {
         ra + 2.0**-20 * np.abs(a), axis=tuple(axes)
     ),
 }
-"""By how much the errors of its arguments move the result of an operation of numbers."""
+"""By how much errors of the arguments move the result of an operation on constants.
+
+Each function takes the result, each argument with its radius, and the parameters of the operation.
+"""

@@ -63,11 +63,15 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
         loop: the closed loop.
         steps: number of steps.
         low: the lowest (position, velocity) of each box.
-        high: the highest.
+        high: the highest (position, velocity) of each box.
     """
-    size, total = low.shape[-1], low.shape[-1] + loop.actions
+    size = low.shape[-1]
+    total = size + loop.actions
     domain = _boxes(low, high, loop.actions, steps)
-    samples, claims, lows, highs = [], [], [], []
+    samples = []
+    claims = []
+    lows = []
+    highs = []
     for t in range(steps + 1):
         bounds = _with_room(bound(loop.following if t else loop.first, domain), size)
         domain, sample = _following(bounds, domain, size, loop.dimension, t)
@@ -85,7 +89,10 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
 
 @jax.jit
 def _with_room(bounds: Bounds, size: int) -> Bounds:
-    """Return bounds whose claims about actions a checker with other roundings can confirm."""
+    """Widen the bounds of the actions, so that a checker that rounds otherwise confirms them.
+
+    The first `size` outputs are position and velocity, and stay as they are.
+    """
     wider = bounds.radius * (1.0 + ROOM) + FINE
     acts = jnp.arange(wider.shape[-1]) >= size
     return bounds._replace(radius=jnp.where(acts, wider, bounds.radius))
@@ -122,14 +129,15 @@ def _following(
 
     Args:
         bounds: bounds of the step's outputs.
-        domain: the states before it.
+        domain: the states before the step.
         size: number of elements of position and velocity.
         dimension: number of elements of a position.
-        t: the number of the step. It has generators of its own.
+        t: the number of the step, which has generators of its own.
     """
     total = domain.centre.shape[0]
     actions = total - size
-    slope, radius = bounds.slope[:total], bounds.radius[:total]
+    slope = bounds.slope[:total]
+    radius = bounds.radius[:total]
     fine = FINE * (jnp.abs(slope) @ domain.reach + jnp.abs(bounds.centre[:total]))
     acts = jnp.arange(total) >= size
     rounded = jnp.diag((1.0 + FINE) * (jnp.where(acts, 0.0, radius) + fine))
@@ -193,7 +201,8 @@ def between(plant: Plant, speed: Array, distance: Array, nearest: Array) -> Arra
         distance: a bound on ‖r‖ at the ends [m].
         nearest: a lower bound of ‖r‖ at one end [m].
     """
-    n, time = plant.mean_motion, plant.dt
+    n = plant.mean_motion
+    time = plant.dt
     share = 1.0 - n * time - 0.75 * (n * time) ** 2
     v = (speed + 0.5 * time * (plant.acceleration + 3.0 * n**2 * distance)) / share
     r = distance + 0.5 * time * v

@@ -40,7 +40,7 @@ MAX_BOUND = 1e6
 """Largest absolute value of a bound of a box [m, m/s]."""
 
 Box = Mapping[str, Any]
-"""Intervals by field, `deputy.position` or `position`: one for each axis, or one for all."""
+"""Intervals by field, `deputy.position` or `position`: one for each axis, or one for all axes."""
 
 
 class Boxes(NamedTuple):
@@ -120,14 +120,14 @@ def verify(
         steps: number of steps.
         arithmetic: `float32` proves the loop as it runs in single precision, `real` that of real
             numbers.
-        seconds: when to stop. What is left is open then.
-        max_boxes: how many boxes to bound at most.
+        seconds: the time after which to stop [s]. Boxes that are left are then open.
+        max_boxes: the largest number of boxes to bound.
         everything: whether to go on after a counterexample, for a map of the box.
         resume: a verification of the same loop and box to go on from.
         progress: a function that is called after each batch of boxes.
 
     Returns:
-        What is known. Ctrl-C ends the search like a limit, once.
+        What is known. The first Ctrl-C ends the search as a limit does.
 
     Raises:
         ConfigError: the box is no box of starts, or nothing can be proved of the loop.
@@ -160,7 +160,7 @@ def corners(env: Environment, box: Box) -> Boxes:
     """Return the corners of a box of starts.
 
     Raises:
-        ConfigError: a field is missing or unknown, or its intervals are none.
+        ConfigError: a field is missing or unknown, or its value is not made of intervals.
     """
     names = {f"{env.agent}.{field}": field for field in FIELDS}
     for key in box:
@@ -272,8 +272,8 @@ class _Search:
         low, high = (np.stack(ends) for ends in zip(*batch, strict=True))
         try:
             parts = [slice(i, i + BATCH) for i in range(0, count, BATCH)]
-            found = list(self.pool.map(lambda part: self.bound(low[part], high[part]), parts))
-            margin, claims = jax.tree.map(lambda *x: np.concatenate(x), *found)
+            bounds = list(self.pool.map(lambda part: self.bound(low[part], high[part]), parts))
+            margin, claims = jax.tree.map(lambda *x: np.concatenate(x), *bounds)
             done = margin.min(axis=1) >= 0.0  # false where a bound is not a number
             least = self.flown(low[~done], high[~done]) if not done.all() else np.zeros(0)
         except BaseException:
@@ -293,16 +293,17 @@ class _Search:
                 self.halve(low[index], high[index], int(widths.argmax()))
 
     def bound(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, Claims]:
-        """Return the margins of each box, and the claims."""
+        """Return a lower bound of h in each step from each box, and the claims."""
         count = len(low)
         # Batches have one size, so that nothing is compiled again.
         full = [np.concatenate([x, np.repeat(x[:1], BATCH - count, axis=0)]) for x in (low, high)]
         with jax.enable_x64(True):
-            found = tube(self.loop, self.steps, *map(jnp.asarray, full))
-            margin, claims = jax.device_get((found.margin, found.claims))
+            tubes = tube(self.loop, self.steps, *map(jnp.asarray, full))
+            margin, claims = jax.device_get((tubes.margin, tubes.claims))
         return margin[:count], jax.tree.map(lambda x: x[:count], claims)
 
     def halve(self, low: np.ndarray, high: np.ndarray, axis: int) -> None:
+        """Put both halves of a box into the queue."""
         middle = 0.5 * (low[axis] + high[axis])
         for side in (low, high):
             ends = low.copy(), high.copy()
@@ -310,7 +311,10 @@ class _Search:
             self.waiting.append(ends)
 
     def flown(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the least margin of some flights from each box, and keep the first violation."""
+        """Return the least margin of some flights from each box, and keep the first violation.
+
+        One flight begins in the middle of the box, the others at random starts.
+        """
         self.key, own = jax.random.split(self.key)
         share = jax.random.uniform(own, (len(low), SAMPLES, low.shape[-1])).at[:, 0].set(0.5)
         lowest, highest = (jnp.asarray(x, jnp.float32)[:, None] for x in (low, high))
