@@ -5,19 +5,17 @@ Proposition 15 of docs/safety/proofs.md proves it.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
-from jaxsafe.processors.constraint import Separation
-from jaxsafe.rta.filter import CertifiedRTA, Faults
+from jaxsafe.rta.bound import UncertaintyBound
+from jaxsafe.rta.filter import Faults
 from jaxsafe.rta.tube_in_space import SLOW_MODE, TubeInSpace
 from jaxsafe.simulation.dubins import Dubins3D
 from jaxsafe.simulation.trig import wrap
-from jaxsafe.transition import constraint
 from jaxsafe.types import Number
 
 if TYPE_CHECKING:
@@ -69,39 +67,34 @@ def in_formation(
 
 def formation_faults(
     env: Environment,
-    rta: CertifiedRTA,
+    bound: UncertaintyBound,
     terminal: VelocityMatched,
     backups: Sequence[MatchVelocity],
     state: Any,
     name: str,
     extremes: Mapping[str, tuple[Number, Number]],
+    lowest: Float[Array, ""],
+    authority: Mapping[str, Float[Array, ""]],
 ) -> Faults:
     """Return what is missing for Propositions 14 and 15.
 
     Args:
         env: the environment.
-        rta: the filter, which has a bound.
+        bound: the filter's bound.
         terminal: the terminal set.
         backups: the backup controllers `match_velocity`.
         state: the state of the lead.
         name: the name of the lead.
         extremes: the smallest and the largest value of each of the lead's controls.
+        lowest: the distance T that the filter keeps, the margin included [ft].
+        authority: how far each control can be changed both ways from 0, times the step.
     """
-    bound = rta.bound
-    assert bound is not None
     plant = cast(Dubins3D, env.agent_platform)
     slowest, fastest = plant.speed_limits
-    limits = [cast(Separation, constraint(env, limit)) for limit in rta.constraints]
-    kept = [limit.minimum + rta.required_margin(env, limit.name) for limit in limits]
-    lowest = functools.reduce(jnp.maximum, kept)  # T
     tolerance = terminal.tolerance  # F
     outer = jnp.stack([backup.clearance for backup in backups])  # C
     gain = jnp.stack([jnp.asarray(backup.away_gain, env.dt.dtype) for backup in backups])  # κ
     zone = jnp.min(jnp.stack([backup.dead_zone for backup in backups]))
-    ranges = {actuator.name: (actuator.low, actuator.high) for actuator in env.actuators}
-    authority = {
-        control: env.dt * jnp.minimum(-low, high) for control, (low, high) in ranges.items()
-    } | {control: jnp.zeros_like(env.dt) for control in plant.inputs if control not in ranges}
 
     missing = outer - lowest  # Q
     astray = LARGEST_ASTRAY * tolerance

@@ -13,10 +13,11 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool
+from jaxtyping import Array, Bool, Float
 
 from jaxsafe.processors.constraint import Separation
 from jaxsafe.processors.status import DeltaV, Distance
+from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.filter import BackupController, CertifiedRTA, Faults
 from jaxsafe.rta.formation import formation_faults
 from jaxsafe.rta.speed_limit import (
@@ -341,13 +342,14 @@ def velocity_matched_faults(
     if type(lead) is not type(plant):
         return {"velocity_matched is proved for two aircraft of one kind": _true()}
     proved = [backup.proved for backup in rta.backups]
-    leads = [backup.lead for backup in proved if type(backup) is keeper]
-    if _packaged_but(keeper, rta) or any(followed != name for followed in leads):
+    keepers = [backup for backup in proved if type(backup) is keeper]
+    if _packaged_but(keeper, rta) or any(backup.lead != name for backup in keepers):
         fault = f"velocity_matched is proved to be kept by match_velocity of {name!r} alone"
         return {fault: _true()}
     limits = [cast(Separation, constraint(env, limit)) for limit in rta.constraints]
     if not all(_separates(env, limit, {agent, name}) for limit in limits):
         return {f"velocity_matched keeps separations of {agent!r} and {name!r} alone": _true()}
+    kept = jnp.stack([limit.minimum + rta.required_margin(env, limit.name) for limit in limits])
     if type(lead.controller) not in (Uncontrolled, Scripted):
         return {f"what {name!r} may do is not known: give it a script": _true()}
     script = lead.controller.commands if type(lead.controller) is Scripted else ()
@@ -364,30 +366,26 @@ def velocity_matched_faults(
     any_speed = (lead.speed_limits[0] >= slowest) & (lead.speed_limits[1] <= fastest)
     faults = {
         "clearance of velocity_matched is below the separation and the margin": jnp.any(
-            jnp.stack(
-                [
-                    ~(limit.minimum + rta.required_margin(env, limit.name) <= terminal.clearance)
-                    for limit in limits
-                ]
-            )
+            ~(kept <= terminal.clearance)
         ),
         f"{name!r} may fly at speeds that the agent cannot": ~jnp.where(
             steady, own_speed, any_speed
         ),
     }
     if rta.bound is not None:
-        followed = [backup for backup in proved if type(backup) is keeper]
         return faults | _faults_with_bound(
             env,
-            rta,
+            rta.bound,
             terminal=terminal,
-            backups=followed,
+            backups=keepers,
             state=state,
             name=name,
             extremes=extremes,
+            limits=limits,
+            kept=kept,
         )
     if type(plant) is Dubins2D:
-        zones = [backup.dead_zone for backup in proved if type(backup) is keeper]
+        zones = [backup.dead_zone for backup in keepers]
         return faults | _faults_in_plane(
             env, terminal=terminal, dead_zones=zones, name=name, extremes=extremes
         )
@@ -436,27 +434,29 @@ def _faults_in_plane(
 
 def _faults_with_bound(
     env: Environment,
-    rta: CertifiedRTA,
+    bound: UncertaintyBound,
     terminal: VelocityMatched,
     backups: Sequence[MatchVelocity],
     state: Any,
     name: str,
     extremes: Mapping[str, tuple[Number, Number]],
+    limits: Sequence[Separation],
+    kept: Float[Array, " c"],
 ) -> Faults:
     """Return what is missing for Propositions 12 and 13, or in space for 14 and 15.
 
     Args:
         env: the environment.
-        rta: the filter, which has a bound.
+        bound: the filter's bound.
         terminal: the terminal set.
         backups: the backup controllers `match_velocity`.
         state: the state of the lead.
         name: the name of the lead.
         extremes: the smallest and the largest value of each of the lead's controls.
+        limits: the separations of the filter.
+        kept: the distance that each of them asks for, with its margin [ft].
     """
-    bound = rta.bound
-    assert bound is not None
-    plant = env.agent_platform
+    plant = cast(Aircraft, env.agent_platform)
     if bound.delay and type(plant) is Dubins3D:
         return {"rta.bound.delay is not proved for aircraft in space": _true()}
     if bound.delay:
@@ -465,24 +465,29 @@ def _faults_with_bound(
         "rta.bound.mass is not proved for aircraft": bound.mass > 0.0,
         "rta.bound.misalignment is not proved for aircraft": bound.misalignment > 0.0,
     }
-    if type(plant) is Dubins3D:
-        return unknown_thrust | formation_faults(
-            env, rta, terminal=terminal, backups=backups, state=state, name=name, extremes=extremes
-        )
-    plant = cast(Dubins2D, plant)
-    if any(backup.away_time != PLANAR_AWAY_TIME for backup in backups):
-        return {"rta.bound in the plane is proved for an away_time of 10 s alone": _true()}
     dt = env.dt
-    slowest, fastest = plant.speed_limits
-    limits = [cast(Separation, constraint(env, limit)) for limit in rta.constraints]
-    kept = jnp.stack([limit.minimum + rta.required_margin(env, limit.name) for limit in limits])
-    minimum = jnp.min(jnp.stack([limit.minimum for limit in limits]))
-    outer = jnp.stack([backup.clearance for backup in backups])
-    zones = jnp.stack([backup.dead_zone for backup in backups])
     ranges = {actuator.name: (actuator.low, actuator.high) for actuator in env.actuators}
     authority = {
         control: dt * jnp.minimum(-low, high) for control, (low, high) in ranges.items()
     } | {control: jnp.zeros_like(dt) for control in plant.inputs if control not in ranges}
+    if type(plant) is Dubins3D:
+        return unknown_thrust | formation_faults(
+            env,
+            bound,
+            terminal=terminal,
+            backups=backups,
+            state=state,
+            name=name,
+            extremes=extremes,
+            lowest=jnp.max(kept),
+            authority=authority,
+        )
+    if any(backup.away_time != PLANAR_AWAY_TIME for backup in backups):
+        return {"rta.bound in the plane is proved for an away_time of 10 s alone": _true()}
+    slowest, fastest = plant.speed_limits
+    minimum = jnp.min(jnp.stack([limit.minimum for limit in limits]))
+    outer = jnp.stack([backup.clearance for backup in backups])
+    zones = jnp.stack([backup.dead_zone for backup in backups])
 
     away_gain = 1.0 / PLANAR_AWAY_TIME
     unknown = bound.velocity + away_gain * bound.position
