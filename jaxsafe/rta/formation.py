@@ -31,8 +31,8 @@ LARGEST_LATERAL = 4.0
 LARGEST_ASTRAY = 5.43
 """Largest difference of the relative velocity from the one aimed at, in units of `tolerance`."""
 
-ROUNDED = 1.001
-"""Numbers of this ratio count as equal, because the proof has more reserve."""
+CLOSE = 1.001
+"""Numbers of this ratio count as equal in a proof, because every proof has more reserve."""
 
 
 def in_formation(
@@ -112,13 +112,13 @@ def formation_faults(
             jnp.any(moves != 0.0) | (state.roll != 0.0)
         ),
         "rta.bound is larger than tolerance of velocity_matched allows": ~(
-            (needed <= ROUNDED * tolerance) & (bound.position < 0.5 * lowest)
+            (needed <= CLOSE * tolerance) & (bound.position < 0.5 * lowest)
         ),
         "rta.bound: clearance of match_velocity is too small for tolerance of velocity_matched": ~(
-            jnp.min(gain * missing) * ROUNDED >= astray
+            jnp.min(gain * missing) * CLOSE >= astray
         ),
         "rta.bound: clearance of velocity_matched is below that of match_velocity": ~(
-            terminal.clearance * ROUNDED >= jnp.max(outer)
+            terminal.clearance * CLOSE >= jnp.max(outer)
         ),
         f"rta.bound: {name!r} flies too close to the agent's slowest or fastest speed": ~(
             (state.speed - relative_speed >= slowest) & (state.speed + relative_speed <= fastest)

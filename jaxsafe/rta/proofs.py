@@ -19,7 +19,7 @@ from jaxsafe.processors.constraint import Separation
 from jaxsafe.processors.status import DeltaV, Distance
 from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.filter import BackupController, CertifiedRTA, Faults
-from jaxsafe.rta.formation import formation_faults
+from jaxsafe.rta.formation import CLOSE, formation_faults
 from jaxsafe.rta.speed_limit import (
     MAX_ORBIT_ANGLE_PER_STEP,
     SpeedLimitFacts,
@@ -87,9 +87,6 @@ PROVED_MARGIN = 2.5e-4 / 0.2
 
 PLANAR_AWAY_TIME = 10
 """The `away_time` [s] of `match_velocity` for which Proposition 13 is proved."""
-
-CLOSE = 1.001
-"""Numbers of this ratio count as equal in a proof, because every proof has more reserve."""
 
 
 def brake_faults(env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
