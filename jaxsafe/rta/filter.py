@@ -514,14 +514,12 @@ class CertifiedRTA(RTA):
 
         backup_margin = self.lowest(env, sim, after_backup)
         new_certificate = passes | ~certified_before
+        ends = ({}, {}, {})  # nothing is renewed with tubes or without a horizon
+        memories_ahead = paths.memories_ahead
         if self.has_tubes:
             backup_certified = jnp.where(
                 certified_before, _finite(after_backup), paths.values[best] >= to_back_up
             )
-            ahead = {}
-            actuators_ahead = {}
-            remembered_ahead = {}
-            memories_ahead = paths.memories_ahead
         elif self.horizon:
             backup_certified, end, memories_ahead = self._renew(
                 env, sim, memory=memory, after_backup=after_backup, backup_margin=backup_margin
@@ -530,7 +528,7 @@ class CertifiedRTA(RTA):
                 certified_before, backup_certified, paths.values[best] >= to_back_up
             )
             new_ends = (paths.ahead, paths.actuators_ahead, paths.remembered_ahead)
-            ahead, actuators_ahead, remembered_ahead = _where(
+            ends = _where(
                 new_certificate,
                 _selected(new_ends, best),
                 (end.platforms, end.actuators, end.remembered),
@@ -538,10 +536,7 @@ class CertifiedRTA(RTA):
             memories_ahead = _where(new_certificate, paths.memories_ahead, memories_ahead)
         else:
             backup_certified = self.follow(env, sim, after_backup).values[0] >= to_back_up
-            ahead = {}
-            actuators_ahead = {}
-            remembered_ahead = {}
-            memories_ahead = paths.memories_ahead
+        ahead, actuators_ahead, remembered_ahead = ends
         actual = jnp.where(passes, proposal, backup)
         correction = jnp.where(jnp.isfinite(desired), actual - wanted, actual)
         certified = jnp.where(passes, safe, backup_certified)
