@@ -20,8 +20,11 @@ from jaxtyping import Array, Bool, Float
 from jaxsafe.rta.projection import within
 from jaxsafe.types import Number, Record
 
-Slack = Number | Sequence[Number | None] | None
-"""Cost σ of missing a row: one for all rows, or one for each. With None a row must be met."""
+ROUNDINGS_MISSED = 30.0
+"""By how many rounding units a row of unit length may be missed and still count as met.
+
+In float32 that is 4e-6.
+"""
 
 
 class Solution(Record):
@@ -40,8 +43,7 @@ def nearest_solution(
     high: Float[Array, " m"],
     rows: Float[Array, "c m"],
     offsets: Float[Array, " c"],
-    slack: Slack = None,
-    tolerance: Number | None = None,
+    slack: Number | Sequence[Number | None] | None = None,
 ) -> Solution:
     """Return the nearest control argmin ‖w − u‖² + Σ σ s².
 
@@ -62,8 +64,6 @@ def nearest_solution(
         offsets: right-hand sides b of the constraints, shape (c,).
         slack: cost σ > 0 of missing a constraint, one for all rows or one for each. A row with None
             may not be missed.
-        tolerance: by how much a row of unit length may be missed and still count as met. None
-            stands for 30 times the rounding unit, which is 4e-6 in float32.
 
     Returns:
         The solution. If there is none, its control is u within its bounds.
@@ -77,7 +77,7 @@ def nearest_solution(
     offsets = offsets / scale
     costs = [None if sigma is None else sigma * scale[i] ** 2 for i, sigma in enumerate(slacks)]
     soft = [cost is not None for cost in costs]
-    allowed = 30.0 * float(jnp.finfo(u.dtype).eps) if tolerance is None else tolerance
+    allowed = ROUNDINGS_MISSED * float(jnp.finfo(u.dtype).eps)
 
     # Vectors and matrices are lists of their elements. Each element is an array over the patterns,
     # because SIMD runs along the long axis.
