@@ -201,11 +201,12 @@ def filter_by_simplex(
         inside = jnp.ones((), bool) if terminal is None else terminal(last)
         return least, jnp.all(least >= 0.0) & inside
 
+    backup_control = back_up(state)
     after_wanted = step(state, wanted)
-    after_backup = step(state, back_up(state))
+    after_backup = step(state, backup_control)
     least, safe = certify(after_wanted)
     passes = safe & finite
-    actual = jnp.where(passes, wanted, back_up(state))
+    actual = jnp.where(passes, wanted, backup_control)
     changed = jnp.any(actual != wanted)
     after = jax.tree.map(lambda a, b: jnp.where(passes, a, b), after_wanted, after_backup)
     info = RTAInfo(

@@ -51,9 +51,7 @@ class Blend(CertifiedRTA, type="blend"):
             return paths.values[best], self.closest(env, paths.margins[best])
 
         values, closest = jax.vmap(predict)(mixed)
-        margins = jax.vmap(lambda u: self.margin_to_certify(env, u))
-        needed = self.required_margin(env) if self.bound is None else margins(mixed)
-        certified = values >= needed
+        certified = values >= jax.vmap(lambda u: self.margin_to_certify(env, u))(mixed)
         largest = self.parts - 1 - jnp.argmax(certified[::-1])
         control = jnp.where(jnp.any(certified), mixed[largest], backup)
         return control, jnp.any(certified), closest[-1]

@@ -225,9 +225,9 @@ def _require_markov(env: Environment, template: State, dimension: int) -> None:
     kept = [jaxpr.outvars[count + i] is jaxpr.invars[i] for i in range(len(leaves))]
     used = partial_eval.dce_jaxpr(jaxpr, [i < count for i in range(len(jaxpr.outvars))])[1]
     moving = {f"sim.platforms.{env.agent}.{field}" for field in FIELDS}
-    begun = jax.make_jaxpr(
-        lambda x: jax.tree.leaves(reset_to(env, start_of(env, x))[0]), return_shape=False
-    )(jnp.zeros(2 * dimension)).jaxpr
+    begun = jax.make_jaxpr(lambda x: jax.tree.leaves(reset_to(env, start_of(env, x))[0]))(
+        jnp.zeros(2 * dimension)
+    ).jaxpr
     for index, (path, stays, needed) in enumerate(zip(paths, kept, used, strict=False)):
         chosen = [i == index for i in range(len(paths))]
         # What a step leaves as it is must also be the same from every start.
