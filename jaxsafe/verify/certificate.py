@@ -10,7 +10,6 @@ import io
 import json
 import math
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +29,9 @@ FORMAT = "jaxsafe certificate 1"
 PROGRAMS = ("first", "following")
 """The programs of a loop, fields of `Loop`."""
 
+BOXES = ("box", "proved", "refuted", "open")
+"""The sets of boxes of a verification, fields of `Verification`."""
+
 
 def save_certificate(
     path: str | os.PathLike, verification: Verification, about: dict[str, Any]
@@ -41,7 +43,11 @@ def save_certificate(
         verification: what is verification.
         about: what else the header says, such as the policy and the version.
     """
-    arrays = {f"{name}/{end}": x for name, end, x in _boxes(verification)}
+    arrays = {
+        f"{name}/{end}": x
+        for name in BOXES
+        for end, x in getattr(verification, name)._asdict().items()
+    }
     arrays |= {f"claims/{name}": x for name, x in verification.claims._asdict().items()}
     programs = {}
     for name in PROGRAMS:
@@ -71,14 +77,8 @@ def save_certificate(
         **about,
     }
     buffer = io.BytesIO()
-    np.savez_compressed(buffer, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
+    np.savez_compressed(buffer, header=np.array(json.dumps(header)), **arrays)
     write_bytes(Path(path), buffer.getvalue())
-
-
-def _boxes(verification: Verification) -> Iterator[tuple[str, str, np.ndarray]]:
-    for name in ("box", "proved", "refuted", "open"):
-        for end, array in getattr(verification, name)._asdict().items():
-            yield name, end, array
 
 
 def load_certificate(path: str | os.PathLike) -> Verification:
@@ -92,10 +92,7 @@ def load_certificate(path: str | os.PathLike) -> Verification:
         if not isinstance(header, dict) or header.get("format") != FORMAT:
             raise ConfigError(f"{path}: no certificate: expected format {FORMAT!r}")
         arrays = {name: archive.read(name) for name in archive.names if name != "header"}
-        boxes = {
-            name: Boxes(*(arrays[f"{name}/{end}"] for end in Boxes._fields))
-            for name in ("box", "proved", "refuted", "open")
-        }
+        boxes = {name: Boxes(*(arrays[f"{name}/{end}"] for end in Boxes._fields)) for name in BOXES}
         programs = {name: _program(header, arrays, name) for name in PROGRAMS}
         violation = header["counterexample"]
         return Verification(
