@@ -169,7 +169,7 @@ class ExplicitASIF(CertifiedRTA, type="explicit_asif"):
     slack: SlackCost | None = None
 
     def unsuited(self, env: Environment, sim: Sim) -> dict[str, Bool[Array, ""]]:
-        rows, _ = self.rows(env, sim, env.action_size)
+        rows, _ = self.rows(env, sim)
         no_influence = {}
         for name, row in zip(self.constraints, rows, strict=True):
             degree = self._degree(env, name)
@@ -181,7 +181,7 @@ class ExplicitASIF(CertifiedRTA, type="explicit_asif"):
     def propose(
         self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]
     ) -> Proposal:
-        rows, offsets = self.rows(env, sim, desired.shape[0])
+        rows, offsets = self.rows(env, sim)
         limits = [constraint(env, name) for name in self.constraints]
         low, high = bounds(env)
         return nearest_by_priority(
@@ -195,24 +195,21 @@ class ExplicitASIF(CertifiedRTA, type="explicit_asif"):
             miss_least=not self.backups,
         )
 
-    def rows(
-        self, env: Environment, sim: Sim, size: int
-    ) -> tuple[Float[Array, "c m"], Float[Array, " c"]]:
+    def rows(self, env: Environment, sim: Sim) -> tuple[Float[Array, "c m"], Float[Array, " c"]]:
         """Return the barrier rows a·u ≥ b, one for each of c constraints.
 
         Args:
             env: the environment.
             sim: the simulation at the state.
-            size: the number m of controls.
 
         Returns:
             a of shape (c, m) and b of shape (c,).
         """
-        rows = [self._row(env, sim, name, size) for name in self.constraints]
+        rows = [self._row(env, sim, name) for name in self.constraints]
         return jnp.stack([a for a, _ in rows]), jnp.stack([b for _, b in rows])
 
     def _row(
-        self, env: Environment, sim: Sim, name: str, size: int
+        self, env: Environment, sim: Sim, name: str
     ) -> tuple[Float[Array, " m"], Float[Array, ""]]:
         limit = constraint(env, name)
         strengthening = limit.strengthening
@@ -220,7 +217,7 @@ class ExplicitASIF(CertifiedRTA, type="explicit_asif"):
             h=lambda platforms: limit.margin(judge(env, sim.replace(platforms=platforms))),
             derivative=functools.partial(_derivative, env, sim),
             state=sim.platforms,
-            still=jnp.zeros(size, env.dt.dtype),
+            still=jnp.zeros(env.action_size, env.dt.dtype),
             alpha=(self.strengthening if strengthening is None else strengthening).of,
             degree=self._degree(env, name),
         )

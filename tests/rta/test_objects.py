@@ -43,7 +43,7 @@ SPEED_LIMIT = {
 
 def rows(env: Environment) -> tuple[jax.Array, jax.Array]:
     assert env.rta is not None
-    return env.rta.rows(env, jaxsafe.reset_to(env, FAST)[0].sim, 2)
+    return env.rta.rows(env, jaxsafe.reset_to(env, FAST)[0].sim)
 
 
 @pytest.mark.thorough

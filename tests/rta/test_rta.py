@@ -628,7 +628,7 @@ def test_barrier_rows_are_the_change_of_h_along_the_plant(task: str, degree: int
         degree=degree,
     )
     sim = jaxsafe.reset(env, jax.random.key(1))[0].sim
-    rows, offsets = rta.rows(env, sim, env.action_size)
+    rows, offsets = rta.rows(env, sim)
     low, high = bounds(env)
     u = low + 0.8 * (high - low)
     t = 1e-3
