@@ -189,7 +189,10 @@ def _plant(env: Environment) -> Plant:
     platform = env.agent_platform
     assert isinstance(platform, ThrustedSpacecraft)
     largest = [max(abs(float(a.low)), abs(float(a.high))) for a in env.actuators]
-    limit = next(item for item in env.status if isinstance(item, VelocityLimit))
+    [constraint] = env.constraints
+    assert isinstance(constraint, SpeedLimit)
+    limit = next(item for item in env.status if item.name == constraint.velocity_limit)
+    assert isinstance(limit, VelocityLimit)
     grown = 1.0 + 1e-6  # the loop rounds the acceleration
     return Plant(
         mean_motion=float(getattr(platform, "mean_motion", 0.0)),

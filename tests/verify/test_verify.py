@@ -301,6 +301,15 @@ def test_a_search_that_stops_goes_on_and_loses_nothing(proof: Verification, tmp_
         verify(env, braking, SMALL_BOX, steps=6, resume=part)
 
 
+def test_the_bound_between_two_samples_is_about_the_limit_of_the_constraint() -> None:
+    env = jaxsafe.make("docking2d")
+    limit = next(status for status in env.status if status.name == "velocity_limit")
+    flat = limit.replace(name="flat_limit", slope=jnp.zeros_like(limit.slope))
+    distance, *others = env.status
+    loop = closed_loop(env.replace(status=(distance, flat, *others)), braking)
+    assert loop.plant.slope == pytest.approx(float(limit.slope))
+
+
 def test_nothing_dips_below_the_bound_between_two_samples() -> None:
     loop = closed_loop(jaxsafe.make("docking2d"), braking)
     n, limit = loop.plant.mean_motion, lambda r: 0.2 + loop.plant.slope * r
