@@ -180,7 +180,9 @@ def gap(plant, speed, far, near):
     near is at most ||r|| at one end.
     """
     n, dt, a = plant["mean_motion"], plant["dt"], plant["acceleration"]
-    v = (speed + dt / 2 * (a + 3 * n**2 * far)) / (1 - n * dt - 0.75 * (n * dt) ** 2)
+    share = 1 - n * dt - 0.75 * (n * dt) ** 2
+    need(share > 0, "a step is too long for the bound between its ends")
+    v = (speed + dt / 2 * (a + 3 * n**2 * far)) / share
     jerk = 3 * n**2 * v + 2 * n * (first := a + 2 * n * v + 3 * n**2 * (far + dt / 2 * v))
     chord = np.maximum(near - dt * v, 1e-300)
     lag = np.minimum(2 * dt * v, (dt * v) ** 2 / 2 / chord)

@@ -270,6 +270,16 @@ def test_the_certificate_of_another_loop_is_refused(proof: Verification, tmp_pat
     )
 
 
+def test_a_step_too_long_for_the_bound_between_its_ends_is_refused(
+    proof: Verification, tmp_path: Path
+) -> None:
+    plant = proof.loop.plant._replace(mean_motion=1.0)
+    save_certificate(
+        tmp_path / "long.npz", proof._replace(loop=proof.loop._replace(plant=plant)), {}
+    )
+    assert "a step is too long" in run_check(tmp_path / "long.npz").stderr
+
+
 @pytest.mark.thorough
 def test_a_violation_is_flown_again_from_its_start() -> None:
     env = jaxsafe.make("docking2d")
