@@ -85,7 +85,7 @@ class Verification(NamedTuple):
     steps: int
     seconds: float
     bounded: int
-    """Number of boxes that were bounded."""
+    """Number of boxes that were bounded, before `resume` too."""
 
     def shares(self) -> dict[str, float]:
         """Return which share of the volume is proved, refuted and open."""
@@ -121,7 +121,7 @@ def verify(
         arithmetic: `float32` proves the loop as it runs in single precision, `real` that of real
             numbers.
         seconds: the time after which to stop [s]. Boxes that are left are then open.
-        max_boxes: the largest number of boxes to bound.
+        max_boxes: the largest number of boxes to bound. Those before `resume` do not count.
         everything: whether to go on after a counterexample, for a map of the box.
         resume: a verification of the same loop and box to go on from.
         progress: a function that is called after each batch of boxes.
@@ -254,13 +254,15 @@ class _Search:
         self.margin = math.inf
         self.counterexample: Counterexample | None = None
         self.bounded = 0
-        self.earlier = 0.0
+        self.earlier_seconds = 0.0
+        self.earlier_bounded = 0
         if known is not None:
             self.proved = [(*known.proved, known.claims)] if len(known.proved.low) else []
             self.refuted = [known.refuted]
             self.margin = known.margin
             self.counterexample = known.counterexample
-            self.earlier = known.seconds
+            self.earlier_seconds = known.seconds
+            self.earlier_bounded = known.bounded
         self.pool = ThreadPoolExecutor(usable_cores())
         self.key = jax.random.key(0)
         self.fly = jax.jit(jax.vmap(lambda x: _margins(env, policy, steps, x)))
@@ -357,8 +359,8 @@ class _Search:
             box=self.whole,
             loop=self.loop,
             steps=self.steps,
-            seconds=self.earlier + seconds,
-            bounded=self.bounded,
+            seconds=self.earlier_seconds + seconds,
+            bounded=self.earlier_bounded + self.bounded,
         )
 
 

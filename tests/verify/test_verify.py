@@ -307,6 +307,8 @@ def test_a_search_that_stops_goes_on_and_loses_nothing(proof: Verification, tmp_
     whole = verify(env, braking, wide, steps=6, resume=load_certificate(tmp_path / "part.npz"))
     assert whole.result == "proved"
     assert len(whole.proved.low) >= len(part.proved.low)
+    assert whole.bounded >= part.bounded + len(part.open.low)
+    assert whole.seconds >= part.seconds
     with pytest.raises(ConfigError, match=r"^resume: the box is not that of the certificate"):
         verify(env, braking, SMALL_BOX, steps=6, resume=part)
 
