@@ -393,7 +393,10 @@ class _Builder:
         outs = [np.asarray(item) for item in (out if several else [out])]
         exact = not any(np.any(item.radius) for item in x)
         if outs[0].dtype.kind != "f":
-            if not exact and np.any(np.abs(x[0].value - x[1].value) <= x[0].radius + x[1].radius):
+            # Of inexact numbers only a comparison of two is known, where they are far enough apart.
+            if not exact and (
+                len(x) != 2 or np.any(np.abs(x[0].value - x[1].value) <= x[0].radius + x[1].radius)
+            ):
                 raise ConfigError(f"verify: rounding decides the operation {name!r} of numbers")
             return [Constant(item, np.zeros(item.shape)) for item in outs]
         if name == "select_n" or (name in _MOVING and not exact):

@@ -413,6 +413,15 @@ def test_a_guarded_root_needs_the_guard_behind_it_too() -> None:
         trace(half_guarded, 2, 0.0)
 
 
+def test_a_fact_about_one_rounded_constant_is_refused() -> None:
+    def checked(y: jax.Array) -> jax.Array:
+        return jnp.where(jnp.isfinite(jnp.asarray(0.1)), y, 0.0)
+
+    message = r"^verify: rounding decides the operation 'is_finite' of numbers"
+    with jax.enable_x64(True), pytest.raises(ConfigError, match=message):
+        trace(checked, 2, 2.0**-24)
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(not PUBLISHED.exists(), reason="the published network is not here")
 def test_the_published_network_is_safe_in_the_whole_box(tmp_path: Path) -> None:
