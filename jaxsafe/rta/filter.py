@@ -289,9 +289,8 @@ class CertifiedRTA(RTA):
 
     A `bound` says how far the true world may be from the one that the filter predicts with. The
     filter then keeps a larger margin of a speed limit, so that its certificates hold in the true
-    world.
-    With a horizon it predicts a tube that holds all ways of the true world. Such a certificate is
-    true for as long as its backup controller acts, so it is not renewed.
+    world. With a horizon it predicts a tube that holds all ways of the true world. Such a
+    certificate is true for as long as its backup controller acts, so it is not renewed.
     """
 
     constraints: tuple[ConstraintName, ...]

@@ -129,7 +129,7 @@ def _require_provable(env: Environment) -> None:
     """Refuse loops of which nothing can be proved.
 
     Raises:
-        ConfigError: the loop is one.
+        ConfigError: nothing can be proved of the loop.
     """
     if env.rta is not None:
         raise ConfigError(
@@ -172,12 +172,12 @@ def _wrong_limit(env: Environment, constraint: Any) -> str:
     """Return why a constraint is not the speed limit of Eq. (14), or an empty string."""
     if type(constraint) is not SpeedLimit:
         return "it is no speed_limit"
-    status = {item.name: item for item in env.status}
-    limit = status[constraint.velocity_limit]
-    speed = status[constraint.speed]
+    statuses = {item.name: item for item in env.status}
+    limit = statuses[constraint.velocity_limit]
+    speed = statuses[constraint.speed]
     if type(limit) is not VelocityLimit or type(speed) is not Speed:
         return "its limit or its speed is another status"
-    distance = status[limit.distance]
+    distance = statuses[limit.distance]
     if type(distance) is not Distance or {distance.of, speed.of} != {env.agent}:
         return "its distance is another status"
     if distance.to not in {item.name for item in env.platforms if type(item) is Anchor}:
@@ -188,15 +188,17 @@ def _wrong_limit(env: Environment, constraint: Any) -> str:
 def _plant(env: Environment) -> Plant:
     platform = env.agent_platform
     assert isinstance(platform, ThrustedSpacecraft)
-    largest = [max(abs(float(a.low)), abs(float(a.high))) for a in env.actuators]
+    largest = [
+        max(abs(float(actuator.low)), abs(float(actuator.high))) for actuator in env.actuators
+    ]
     [constraint] = env.constraints
     assert isinstance(constraint, SpeedLimit)
     limit = next(item for item in env.status if item.name == constraint.velocity_limit)
     assert isinstance(limit, VelocityLimit)
-    grown = 1.0 + 1e-6  # the loop rounds the acceleration
+    rounding = 1.0 + 1e-6  # the loop rounds the acceleration
     return Plant(
         mean_motion=float(getattr(platform, "mean_motion", 0.0)),
-        acceleration=grown * float(np.linalg.norm(largest)) / float(platform.mass),
+        acceleration=rounding * float(np.linalg.norm(largest)) / float(platform.mass),
         slope=float(limit.slope),
         dt=float(env.dt),
     )

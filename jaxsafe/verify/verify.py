@@ -317,8 +317,8 @@ class _Search:
 
         One flight begins in the middle of the box, the others at random starts.
         """
-        self.key, own = jax.random.split(self.key)
-        share = jax.random.uniform(own, (len(low), SAMPLES, low.shape[-1])).at[:, 0].set(0.5)
+        self.key, own_key = jax.random.split(self.key)
+        share = jax.random.uniform(own_key, (len(low), SAMPLES, low.shape[-1])).at[:, 0].set(0.5)
         lowest, highest = (jnp.asarray(x, jnp.float32)[:, None] for x in (low, high))
         starts = np.asarray(jnp.clip(lowest + share * (highest - lowest), lowest, highest))
         margins = np.asarray(self.fly(starts.reshape(-1, starts.shape[-1])))
@@ -326,14 +326,10 @@ class _Search:
         if margins[worst].min() < 0.0 and self.counterexample is None:
             when = int(np.argmax(margins[worst] < 0.0))
             start = starts.reshape(-1, starts.shape[-1])[worst]
-            named = start_of(self.env, start)
             self.counterexample = Counterexample(
-                {
-                    name: {k: v.tolist() for k, v in fields.items()}
-                    for name, fields in named.items()
-                },
-                when,
-                float(margins[worst, when]),
+                start=jax.tree.map(lambda x: x.tolist(), start_of(self.env, start)),
+                step=when,
+                margin=float(margins[worst, when]),
             )
         return margins.reshape(len(low), -1).min(axis=1)
 
