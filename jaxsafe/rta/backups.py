@@ -16,6 +16,7 @@ from jaxsafe.rta.filter import BackupController, CertifiedRTA, Faults, TerminalS
 from jaxsafe.rta.formation import in_formation
 from jaxsafe.rta.projection import project_box_ball
 from jaxsafe.rta.proofs import (
+    Aircraft,
     align_and_brake_faults,
     aligned_or_slow_faults,
     at_rest_faults,
@@ -44,8 +45,6 @@ from jaxsafe.types import ConstraintName, Length, Number, PlatformName, Positive
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
-
-Aircraft = Dubins2D | Dubins3D
 
 LOST = 1e6
 """Radius [ft] of a tube of which nothing is known."""
