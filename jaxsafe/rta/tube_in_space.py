@@ -181,9 +181,9 @@ def next_in_space(
         of_turn=ratio * (of_first[..., None] + of_last[..., None] * stays),
     )
     by_noise = jnp.max(follows) * (of_psi * most + of_delta) * noise / after.speed
-    turned, heading, slow_mode, fast_mode = by_tube + by_noise
+    turn_rate, heading, slow_mode, fast_mode = by_tube + by_noise
 
-    sideways = jnp.minimum(widest, after.speed * turned)
+    sideways = jnp.minimum(widest, after.speed * turn_rate)
     by_speed = _turn_by_speed(
         plant,
         before,
