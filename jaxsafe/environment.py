@@ -550,7 +550,10 @@ def _together(env: Environment, before: TimeStep, now: TimeStep) -> TimeStep:
         rta=rta,
     )
     return now.replace(
-        reward=before.reward + now.reward, cost=jnp.maximum(before.cost, now.cost), info=info
+        reward=before.reward + now.reward,
+        cost=jnp.maximum(before.cost, now.cost),
+        costs=jax.tree.map(jnp.maximum, before.costs, now.costs),
+        info=info,
     )
 
 
@@ -703,7 +706,7 @@ def _begin(
     )
     # The time step is made of `sim`, in which nothing has ended. The first step is always taken.
     timestep = _time_step(env, sim, observation=observation, reward=zero, info=info)
-    return state, timestep.replace(cost=zero)
+    return state, timestep.replace(cost=zero, costs=dict.fromkeys(timestep.costs, zero))
 
 
 def _checked(env: Environment, action: Array) -> Array:
@@ -888,16 +891,19 @@ def _info(
 def _time_step(
     env: Environment, sim: Sim, *, observation: Array, reward: Array, info: Info
 ) -> TimeStep:
-    violated = sim.ended[DIVERGED] | _any(~(margin >= 0.0) for margin in info.margins.values())
+    # A margin that is not a number is violated too.
+    violated = {name: ~(margin >= 0.0) for name, margin in info.margins.items()}
+    dtype = observation.dtype
     terminated = _any(sim.ended[name] for name, ends in env._ends.items() if ends == "terminated")
     truncated = _any(sim.ended[name] for name, ends in env._ends.items() if ends == "truncated")
     return TimeStep(
         observation=observation,
         reward=reward,
-        cost=violated.astype(observation.dtype),
+        cost=(sim.ended[DIVERGED] | _any(violated.values())).astype(dtype),
         terminated=terminated,
         truncated=truncated,
         info=info,
+        costs={name: flag.astype(dtype) for name, flag in violated.items()},
     )
 
 

@@ -198,6 +198,7 @@ def _transition(
         action=action,
         reward=timestep.reward,
         cost=timestep.cost,
+        costs=timestep.costs,
         terminated=timestep.terminated,
         truncated=timestep.truncated,
         next_observation=timestep.observation,

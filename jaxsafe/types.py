@@ -329,6 +329,8 @@ class TimeStep(Record):
     terminated: Bool[Array, ""]  # the task ended: there is no value beyond this state
     truncated: Bool[Array, ""]  # cut short: the value of `observation` still counts
     info: Info
+    # By the name of the constraint: 1 on a step that violates it, else 0. `cost` is the largest.
+    costs: Mapping[str, Float[Array, ""]] = dataclasses.field(default_factory=dict)
 
     @property
     def done(self) -> Bool[Array, ""]:
@@ -353,6 +355,7 @@ class Transition(Record):
     memory: Any  # what a `RecurrentPolicy` remembered when it acted, else `()`
     info: Info
     state: State | None  # the state before the step, if it was asked for
+    costs: Mapping[str, Float[Array, ""]] = dataclasses.field(default_factory=dict)
 
     @property
     def done(self) -> Bool[Array, ""]:

@@ -63,6 +63,7 @@ def check_sums(timestep: TimeStep, taken: Any) -> None:
     expected = {
         "reward": (timestep.reward, taken.reward.sum()),
         "cost": (timestep.cost, taken.cost.max()),
+        "costs": (timestep.costs, {name: x.max() for name, x in taken.costs.items()}),
         "observation": (timestep.observation, last.observation),
         "done": (timestep.done, last.done),
         "outcome": (info.outcome, last.info.outcome),

@@ -1,6 +1,7 @@
 """`reset`, `reset_to` and `step`: structure, chosen starts, and the facts about an environment."""
 
 import re
+from pathlib import Path
 from typing import Any
 
 import chex
@@ -466,6 +467,21 @@ def test_a_status_that_is_not_a_number_ends_the_episode() -> None:
     ):
         ended, outcome, timestep = ends(env, [distance, 0.0])
         assert (ended, outcome, float(timestep.cost)) == expected
+
+
+def test_each_constraint_has_a_cost_by_its_name() -> None:
+    env = jaxsafe.make(Path(__file__).parent.parent / "configs" / "custom_env.yaml")
+    state, timestep = jaxsafe.reset_to(
+        env, {"deputy": {"position": [0.0, 60.0], "velocity": [0.0, 0.3]}}, {"deputy.mass": 12.0}
+    )
+    assert set(timestep.costs) == {"velocity_limit", "keep_out_speed", "keep_out"}
+    assert all(float(cost) == 0.0 for cost in timestep.costs.values())  # no step was taken
+    _, timestep = jaxsafe.step(env, state, jnp.zeros(2))
+    costs = {name: float(cost) for name, cost in timestep.costs.items()}
+    assert costs == {"velocity_limit": 0.0, "keep_out_speed": 1.0, "keep_out": 1.0}
+    assert float(timestep.cost) == 1.0
+    for name, margin in timestep.info.margins.items():
+        assert costs[name] == float(margin < 0.0)
 
 
 def test_success_is_an_outcome_that_training_and_evaluation_ask_for() -> None:

@@ -32,8 +32,8 @@ except ImportError as error:
 class BraxEnv(Env):
     """One task as an environment of Brax.
 
-    `pipeline_state` is the `State` of the environment. `metrics` are `cost`, `success`, and
-    `reward_…` for each reward term. Brax sums them over episodes.
+    `pipeline_state` is the `State` of the environment. `metrics` are `cost`, `success`, `cost_…`
+    for each safety constraint and `reward_…` for each reward term. Brax sums them over episodes.
 
     `done` is 1 where the task ended. If a task truncates an episode by itself, Brax sees a
     termination. None of the five tasks does that. The limit that Brax knows of is its own
@@ -112,6 +112,7 @@ class BraxEnv(Env):
         return {
             "cost": timestep.cost,
             "success": _number(self.env.succeeded(timestep.info.outcome)),
+            **{f"cost_{name}": cost for name, cost in timestep.costs.items()},
             **terms,
         }
 

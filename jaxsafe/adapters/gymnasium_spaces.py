@@ -63,6 +63,7 @@ def facts(env: Environment, timestep: TimeStep) -> dict[str, Any]:
     outcomes = np.array(env.outcomes, object)
     entries = {
         "cost": timestep.cost,
+        "costs": timestep.costs,
         "outcome": outcomes[info.outcome],
         "is_success": env.succeeded(info.outcome),
         **{name: getattr(info, name) for name in _FACTS},

@@ -61,8 +61,8 @@ class GymnaxEnv:
 
     Its methods work under `jax.vmap` over keys and states, and over parameters.
 
-    `info` holds `cost`, `is_success`, `terminated`, `truncated` and `final_observation`. The final
-    observation is the one that the step led to, before any reset.
+    `info` holds `cost`, `costs` (by constraint), `is_success`, `terminated`, `truncated` and
+    `final_observation`. The final observation is the one that the step led to, before any reset.
 
     A discrete action of the task is a choice for each actuator. Here it is one choice among all
     combinations of these. A mixed action is a mapping from the name of each actuator to its
@@ -189,6 +189,7 @@ def _step(
     following, observation = restarted(params.env, state, timestep, key)
     info = {
         "cost": timestep.cost,
+        "costs": timestep.costs,
         "is_success": params.env.succeeded(timestep.info.outcome),
         "terminated": timestep.terminated,
         "truncated": timestep.truncated,

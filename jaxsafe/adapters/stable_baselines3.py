@@ -30,10 +30,10 @@ class SB3VecEnv(VecEnv):
 
     An environment whose episode ends starts a new one in the same step.
 
-    For each environment `infos` holds `cost`. Where an episode has ended it also holds
-    `terminal_observation`, `TimeLimit.truncated`, `is_success` and `outcome`. `reset_infos` holds,
-    for each environment, the `info` that `GymEnv.reset` would return at its latest start.
-    `set_options` takes the options of `GymEnv.reset`.
+    For each environment `infos` holds `cost`, and `costs` by constraint. Where an episode has ended
+    it also holds `terminal_observation`, `TimeLimit.truncated`, `is_success` and `outcome`.
+    `reset_infos` holds, for each environment, the `info` that `GymEnv.reset` would return at its
+    latest start. `set_options` takes the options of `GymEnv.reset`.
     """
 
     def __init__(
@@ -96,12 +96,13 @@ class SB3VecEnv(VecEnv):
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         observation, reward, terminated, truncated, batch = self.env.step(self._actions)
         done = terminated | truncated
-        infos: list[dict[str, Any]] = [{"cost": cost} for cost in batch["cost"].tolist()]
+        infos = _costs(batch)
         begun = {name: value for name, value in batch.items() if name in self.reset_infos[0]}
+        final = batch["final_info"] if done.any() else {}
+        last = _costs(final) if done.any() else []
         for index in np.flatnonzero(done):
-            final = batch["final_info"]
             infos[index] = {
-                "cost": final["cost"][index].item(),
+                **last[index],
                 "terminal_observation": batch["final_obs"][index],
                 "TimeLimit.truncated": bool(truncated[index] and not terminated[index]),
                 "is_success": bool(final["is_success"][index]),
@@ -155,3 +156,16 @@ def _check_actions(env: Environment) -> None:
                 f"actuator {name}: Stable-Baselines3 needs actions with bounds;"
                 " leave post_activation: clip"
             )
+
+
+def _costs(infos: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return for each environment its cost, and its costs by constraint.
+
+    Args:
+        infos: the infos of the batch, in Gymnasium's form.
+    """
+    names = [name for name in infos["costs"] if not name.startswith("_")]
+    columns = zip(*(infos["costs"][name].tolist() for name in names), strict=True)
+    rows = [dict(zip(names, row, strict=True)) for row in columns] or [{}] * len(infos["cost"])
+    pairs = zip(infos["cost"].tolist(), rows, strict=True)
+    return [{"cost": cost, "costs": costs} for cost, costs in pairs]

@@ -132,8 +132,8 @@ def _chunk(
     policy = policy_of(parameters)
     after, steps = rollout(env, policy, key, CHUNK, num_envs, record="transitions", start=start)
     low, high = action_bounds(env)
-    margins = [steps.info.margins[constraint.name] for constraint in env.constraints]
-    violated = jnp.stack(margins, axis=-1) < 0.0 if margins else steps.reward[..., None][..., :0]
+    costs = [steps.costs[constraint.name] for constraint in env.constraints]
+    none = jnp.zeros((*steps.reward.shape, 0))
     return after, Dataset(
         observation=steps.observation,
         action=jnp.clip(steps.action, jnp.stack(low), jnp.stack(high)).astype(steps.action.dtype),
@@ -141,7 +141,7 @@ def _chunk(
         next_observation=steps.next_observation,
         terminated=steps.terminated,
         truncated=steps.truncated,
-        costs=violated.astype(jnp.float32),
+        costs=jnp.stack(costs, axis=-1) if costs else none,
         control=steps.info.control_actual,
         success=steps.done & env.succeeded(steps.info.outcome),
     )

@@ -32,6 +32,7 @@ def test_a_step_is_ours(brax: Any) -> None:
         np.testing.assert_allclose(state.obs, timestep.observation, rtol=1e-6)
         np.testing.assert_allclose(state.reward, timestep.reward, rtol=1e-6)
         assert state.metrics["cost"] == timestep.cost
+        assert state.metrics["cost_velocity_limit"] == timestep.costs["velocity_limit"]
     assert float(state.done) == 1.0
     assert (env.observation_size, env.action_size) == (6, 2)
 

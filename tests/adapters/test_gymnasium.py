@@ -327,6 +327,7 @@ def test_info_says_what_happened() -> None:
     assert (info["cost"], info["is_success"], info["intervening"]) == (1.0, False, True)
     assert info["margins"]["velocity_limit"] < 0.0 < info["severity"]["velocity_limit"]
     assert isinstance(info["cost"], float)
+    assert info["costs"] == {"velocity_limit": 1.0}
     assert isinstance(info["rta"]["certified"], bool)
     assert not np.array_equal(info["control_desired"], info["control_actual"])
     assert sum(info["reward_terms"].values()) == pytest.approx(sum(info["reward_totals"].values()))

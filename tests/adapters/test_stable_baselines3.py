@@ -25,7 +25,7 @@ def test_the_end_of_an_episode_is_told_as_the_library_wants_it(make: Any) -> Non
     for _ in range(2):
         *_, done, infos = env.step(zero)
         assert not done.any()
-        assert infos == [{"cost": 0.0}] * 3
+        assert infos == [{"cost": 0.0, "costs": {"velocity_limit": 0.0}}] * 3
     observation, reward, done, infos = env.step(zero)
     assert done.all()
     assert reward.dtype == np.float32
