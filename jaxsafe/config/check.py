@@ -106,8 +106,7 @@ def _check_problems(env: Environment) -> None:
 
     A part with traced numbers is passed over, because they cannot be judged.
     """
-    filters = [(env.rta, "rta")] if env.rta else []
-    for part, place in (*_parts(env), *filters):
+    for part, place in _parts_and_filter(env):
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(part)):
             continue
         for component, component_place in _with_inner(part, place):
@@ -129,6 +128,13 @@ def _parts(env: Environment) -> Iterator[tuple[Component, str]]:
     for section in _SECTIONS:
         for part in getattr(env, section):
             yield part, f"{section}.{part.name}"
+
+
+def _parts_and_filter(env: Environment) -> Iterator[tuple[Component, str]]:
+    """Yield every part of every section and the filter, each with its place."""
+    yield from _parts(env)
+    if env.rta is not None:
+        yield env.rta, "rta"
 
 
 def _with_inner(component: Component, place: str) -> Iterator[tuple[Component, str]]:
@@ -170,12 +176,12 @@ def _check_names(place: str, names: Sequence[str]) -> None:
 
 
 def _check_space(env: Environment) -> None:
-    """Check that all platforms have the same dimension, and that the other parts fit them."""
+    """Check that all platforms have the same dimension, and that parts and filter fit them."""
     dimensions = {platform.name: platform.dimension for platform in env.platforms}
     if len(set(dimensions.values())) > 1:
         found = ", ".join(f"{name} {dimension}" for name, dimension in dimensions.items())
         raise ConfigError(f"platforms: expected the same dimension for all, found {found}")
-    for part, place in _parts(env):
+    for part, place in _parts_and_filter(env):
         for component, component_place in _with_inner(part, place):
             for name, misfit in component.misfits(env).items():
                 raise ConfigError(f"{join(component_place, name)}: {misfit}")

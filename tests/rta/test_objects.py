@@ -298,6 +298,45 @@ def test_a_latched_manoeuvre_is_finished() -> None:
     assert jaxsafe.config.load(jaxsafe.config.dump(env)) == env
 
 
+class Planar(Brake, type="of_tests_planar_brake"):
+    """A backup controller of the tests that is meant for the plane."""
+
+    def misfits(self, env: Environment) -> dict[str, str]:
+        return {} if env.agent_platform.dimension == 2 else {"": "expected a task in the plane"}
+
+
+class Thrifty(Simplex, type="of_tests_thrifty"):
+    """A filter of the tests that is meant for one actuator."""
+
+    def misfits(self, env: Environment) -> dict[str, str]:
+        return (
+            {} if env.action_size == 1 else {"": f"expected one actuator, found {env.action_size}"}
+        )
+
+
+@pytest.mark.parametrize(
+    ("filter_type", "backup_type", "message"),
+    [
+        ("of_tests_thrifty", "brake", "rta: expected one actuator, found 3"),
+        ("simplex", "of_tests_planar_brake", "rta.backups.own: expected a task in the plane"),
+    ],
+)
+def test_a_filter_and_its_parts_say_what_does_not_fit_them(
+    filter_type: str, backup_type: str, message: str
+) -> None:
+    rta = {
+        "type": filter_type,
+        "constraints": ["velocity_limit"],
+        "margin": 2.5e-4,
+        "backups": [{"type": backup_type, "name": "own"}],
+    }
+    with pytest.raises(ConfigError) as caught:
+        jaxsafe.make("docking3d", {"rta": rta})
+    assert str(caught.value) == message
+    task = "docking1d" if filter_type != "simplex" else "docking2d"
+    assert jaxsafe.make(task, {"rta": rta}).rta is not None
+
+
 HOLD = {"position_weight": 0.02, "velocity_weight": 0.2, "integral_weight": 0.0005}
 
 
