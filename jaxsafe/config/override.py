@@ -28,11 +28,11 @@ def override(env: Environment, changes: Mapping[str, Any], place: str = "") -> E
     Args:
         env: the environment.
         changes: new values by path. A path consists of field names and of the names of parts in a
-            list. It may begin with the name of a platform. The new value of a list of parts may be
-            a list of names, which keeps these parts in this order:
-            `{"observation": ["position", "velocity"]}`. A path that ends in `type` replaces a part
-            by one of another type, which keeps the fields that both types have:
-            `{"deputy.type": "two_body", "deputy.eccentricity": 0.1}`.
+            list. It may begin with the name of a platform. In the new value of a list of parts a
+            name stands for the part that has it now: `{"observation": ["position", "velocity"]}`
+            keeps these two in this order. New parts may stand beside names. A path that ends in
+            `type` replaces a part by one of another type, which keeps the fields that both types
+            have: `{"deputy.type": "two_body", "deputy.eccentricity": 0.1}`.
         place: what stands before the paths in error messages, such as `env` on a command line.
 
     Raises:

@@ -55,8 +55,8 @@ def set_path(
 ) -> Any:
     """Return the component with the value at one dotted path replaced.
 
-    If the path leads to a list of named parts, a list of names keeps the parts with these names, in
-    this order. A text with commas is read as a list if the field holds or takes a list.
+    If the path leads to a list of named parts, a name in the new list stands for the part that has
+    it now. A text with commas is read as a list if the field holds or takes a list.
 
     Args:
         component: the component.
@@ -102,9 +102,13 @@ def _set(
     content = getattr(component, head)
     if not rest:
         value = as_list(value, content, table[head], field_place)
-        if are_names(content, value):
-            picked = tuple(content[index_of(content, name, field_place)] for name in value)
-            return component.replace(**{head: picked})
+        if has_names(content, value):
+            value = tuple(
+                content[index_of(content, item, field_place)] if isinstance(item, str) else item
+                for item in value
+            )
+            if all(any(item is part for part in content) for item in value):
+                return component.replace(**{head: value})
         return component.replace(**{head: convert(value, table[head], field_place)})
     if isinstance(content, Component):
         return component.replace(**{head: _set(content, rest, value, convert, field_place)})
@@ -211,13 +215,13 @@ def as_list(value: Any, content: Any, field: Field, place: str) -> Any:
     return yaml12.parse(f"[{value}]", place)
 
 
-def are_names(content: Any, value: Any) -> bool:
-    """Return whether a field holds named parts and the value for it is a list of names."""
+def has_names(content: Any, value: Any) -> bool:
+    """Return whether a field holds named parts and the value for it is a list with names."""
     named = (
         isinstance(content, tuple) and content and all(hasattr(part, "name") for part in content)
     )
-    listed = isinstance(value, (list, tuple)) and value
-    return bool(named and listed and all(isinstance(name, str) for name in value))
+    listed = isinstance(value, (list, tuple))
+    return bool(named and listed and any(isinstance(item, str) for item in value))
 
 
 def index_of(items: tuple, name: str, place: str) -> int:

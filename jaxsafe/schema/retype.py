@@ -8,7 +8,7 @@ from typing import Any
 
 from jaxsafe.schema.component import Component, Kind, choices, fields, normalise
 from jaxsafe.schema.convert import bare, choose_class, is_component, to_component, to_value
-from jaxsafe.schema.dotted_paths import are_names, as_list, index_of, join, set_path
+from jaxsafe.schema.dotted_paths import as_list, has_names, index_of, join, set_path
 
 TYPE = "type"
 """Last name of a path that leads to the type of a part."""
@@ -70,7 +70,7 @@ def _change_types(
         for other in [other for other in remaining if _names(component, other)[:-1] == names]:
             name = other.rpartition(".")[2]
             field = new_fields.get(name)
-            if field is None or are_names(entries.get(name), remaining[other]):
+            if field is None or has_names(entries.get(name), remaining[other]):
                 continue
             if field.required or name in entries:
                 value = as_list(remaining.pop(other), entries.get(name), field, join(place, other))

@@ -269,6 +269,23 @@ def test_a_list_of_names_keeps_those_parts_in_that_order(env: Environment) -> No
     assert load(dump(changed)) == changed
 
 
+def test_new_parts_stand_beside_names_of_those_that_are_there(env: Environment) -> None:
+    apart = {"type": "separation", "name": "apart", "distance": "docking_distance", "minimum": 2}
+    fixed = {"type": "fixed", "name": "velocity", "value": [0.0, 0.1]}
+    changes = {"constraints": [apart, "velocity_limit"], "deputy.start": ["position", fixed]}
+    changed = jaxsafe.override(env, changes)
+    assert [part.name for part in changed.constraints] == ["apart", "velocity_limit"]
+    assert changed.constraints[1] == env.constraints[0]
+    assert changed.agent_platform.start[0] == env.agent_platform.start[0]
+    assert changed.agent_platform.start[1].type_name == "fixed"
+    elliptic = jaxsafe.override(env, {"deputy.type": "two_body", **changes})
+    assert elliptic.agent_platform.start == changed.agent_platform.start
+    as_parts = jaxsafe.override(env, {"constraints": [changed.constraints[0], "velocity_limit"]})
+    assert as_parts.constraints == changed.constraints
+    message = fault(lambda: jaxsafe.override(env, {"constraints": [apart, "velocity_limt"]}))
+    assert re.search(r"constraints\.velocity_limt: unknown name.* Did you mean 'vel", message)
+
+
 def test_a_component_is_taken_as_it_is_written(env: Environment) -> None:
     written = Failure(name="failure", values={"crash": -1, "distance": -2.0})
     read = {"type": "failure", "name": "failure", "values": {"crash": -1, "distance": -2.0}}
@@ -420,7 +437,7 @@ def test_make_with_overrides_is_override_of_make(env: Environment) -> None:
         (
             "observation",
             ["position", 3],
-            r"observation\.\[0\]: expected a mapping of fields, found 'position'",
+            r"observation\.\[1\]: expected a mapping of fields, found 3",
         ),
         (
             "status",
