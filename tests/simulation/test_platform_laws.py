@@ -132,6 +132,10 @@ def test_gradients_of_a_step_are_those_of_finite_differences(model: Model) -> No
     expected = (moved(flat + h * along) - moved(flat - h * along)) / (2.0 * h)
     size = jnp.maximum(1.0, jnp.abs(expected))
     np.testing.assert_allclose((slope - expected) / size, 0.0, atol=2e-5)
+    # Backwards, the derivative along a direction is that along the transposed one.
+    weights = jnp.asarray(rng.normal(size=slope.shape)) / size
+    gradient = jax.jit(jax.grad(lambda flat: jnp.vdot(weights, moved(flat))))(flat)
+    np.testing.assert_allclose(jnp.vdot(gradient, along), jnp.vdot(weights, slope), rtol=1e-9)
 
 
 @of_every_model
@@ -145,7 +149,13 @@ def test_derivatives_at_rest_without_control_are_finite(model: Model) -> None:
 
     along = [jnp.ones_like(number) for number in numbers]
     slopes = jax.jit(lambda: jax.jvp(moved, tuple(numbers), tuple(along))[1])()
-    assert all(bool(jnp.isfinite(leaf).all()) for leaf in jax.tree.leaves(slopes))
+
+    def total(numbers: list[jax.Array]) -> jax.Array:
+        return jnp.sum(ravel_pytree(moved(*numbers))[0])
+
+    gradients = jax.jit(jax.grad(total))(numbers)
+    for leaf in jax.tree.leaves((slopes, gradients)):
+        assert bool(jnp.isfinite(leaf).all())
 
 
 @of_every_model
