@@ -38,6 +38,7 @@ from jaxsafe.simulation.geometry import (
     to_global,
 )
 from jaxsafe.simulation.initializers import Direction, Initializer
+from jaxsafe.simulation.integrate import runge_kutta
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.simulation.regions import Offset, Region
 from jaxsafe.simulation.scripted import Command, Scripted
@@ -145,6 +146,7 @@ __all__ = [
     "place",
     "register",
     "rotation",
+    "runge_kutta",
     "safe_norm",
     "to_body",
     "to_global",

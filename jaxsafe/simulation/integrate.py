@@ -186,7 +186,7 @@ def runge_kutta(
         limit: returns a state brought back into its limits. It is applied after each of these
             steps.
     """
-    h = dt / substeps
+    h = jnp.asarray(dt) / substeps
     split, join = _in_scalars(state)
 
     # The stages are a loop over single numbers. Without a loop XLA would compute a stage again for

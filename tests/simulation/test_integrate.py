@@ -19,6 +19,7 @@ from jaxsafe.simulation.integrate import (
     WEIGHTS,
     pieces,
     ramp,
+    runge_kutta,
     sine_ratios,
     time_to_limit,
 )
@@ -174,3 +175,16 @@ def test_partial_weights_integrate_quadratics_up_to_each_node(degree: int) -> No
     np.testing.assert_allclose(
         np.array(PARTIAL_WEIGHTS) @ nodes**degree, nodes ** (degree + 1) / (degree + 1), atol=1e-15
     )
+
+
+@pytest.mark.parametrize("substeps", [1, 8])
+def test_runge_kutta_steps_of_any_tree_are_of_order_four(substeps: int) -> None:
+    def derivative(state: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        return {"place": state["speed"], "speed": -state["place"]}
+
+    start = {"place": jnp.array([1.0, 0.0]), "speed": jnp.array([0.0, 1.0])}
+    moved = runge_kutta(derivative, start, 0.8, substeps)
+    error = 0.8**5 / 120 / substeps**4 + 1e-6
+    cosine, sine = math.cos(0.8), math.sin(0.8)
+    np.testing.assert_allclose(moved["place"], [cosine, sine], atol=error)
+    np.testing.assert_allclose(moved["speed"], [-sine, cosine], atol=error)
