@@ -117,14 +117,18 @@ class Flight(Described):
         """How the episode ended: one of `env.outcomes`, or `running` if it was given up."""
         return self.env.outcomes[int(self.timesteps.info.outcome[-1])]
 
-    def plot(self) -> Figure:
-        """Return a figure of the path, and of distance, controls and margins over time.
+    def plot(self, world: bool = False) -> Figure:
+        """Return a figure of the paths, and of distance, controls and margins over time.
 
         It is a matplotlib `Figure`, which a notebook shows.
+
+        Args:
+            world: whether the paths are drawn in the axes of the world. By default they are as seen
+                from the first platform that is not the agent.
         """
         from jaxsafe.plot.flight import flight_figure
 
-        return flight_figure(self.env, (self.states, self.timesteps), self._title())
+        return flight_figure(self.env, (self.states, self.timesteps), self._title(), world)
 
     def animate(self, path: str | os.PathLike | None = None) -> Film:
         """Return a film of the episode, which a notebook shows.

@@ -137,6 +137,35 @@ def test_a_region_in_place_is_drawn_where_the_map_stays_too(task: str, drawn: bo
     assert ("zone" in [patch.get_label() for patch in panel.patches]) == drawn
 
 
+@pytest.mark.parametrize("world", [False, True])
+def test_all_craft_are_drawn_in_either_axes(world: bool) -> None:
+    start = {"type": "fixed", "name": "position", "value": [-100.0, 80.0]}
+    drift = {"type": "fixed", "name": "velocity", "value": [2.0, 0.0]}
+    chaser = {"type": "spacecraft", "name": "chaser", "dimension": 2, "start": [start, drift]}
+    moved = {"type": "fixed", "name": "position", "value": [5000.0, 0.0]}
+    changes = {
+        "chief.type": "spacecraft",
+        "chief.start": [moved, drift],
+        "platforms": ["chief", "deputy", chaser],
+        "terminal.timeout.limit": 20,
+    }
+    flight = jaxsafe.fly(jaxsafe.make("docking2d", changes), lambda key, o: jnp.zeros(2))
+    panel = flight.plot(world=world).axes[0]
+    lines = {line.get_label(): line for line in panel.lines}
+    assert {"chief", "chaser", "deputy"} <= set(lines)
+    chief = lines["chief"].get_xydata()[0]
+    expected = flight.platforms["chief"].position[-1] if world else np.zeros(2)
+    np.testing.assert_allclose(chief, expected, atol=1e-3)
+    for name in ("chaser", "deputy"):
+        path = flight.platforms[name].position
+        seen = path if world else path - flight.platforms["chief"].position
+        shown = lines[name].get_xydata()
+        np.testing.assert_allclose(shown[-1], seen[-1], atol=1e-3)
+        low, high = np.transpose([panel.get_xlim(), panel.get_ylim()])
+        assert (low < seen[-1]).all()
+        assert (seen[-1] < high).all()
+
+
 @pytest.mark.thorough
 def test_a_filter_shows_in_a_flight() -> None:
     env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 60}, rta="explicit_simplex")

@@ -11,11 +11,13 @@ from matplotlib.patches import Circle
 
 from jaxsafe.environment import Environment, control_unit, length_unit
 from jaxsafe.plot.style import (
+    AMBER,
     BLUE,
     FORBIDDEN,
     GREEN,
     ORANGE,
     PURPLE,
+    SKY,
     Ball,
     NotebookFigure,
     centre_patch,
@@ -37,27 +39,38 @@ from jaxsafe.types import State, TimeStep
 COLOURS = (BLUE, ORANGE, GREEN, PURPLE)
 """Colours of several curves in a panel."""
 
+CRAFT_COLOURS = ("black", PURPLE, AMBER, SKY)
+"""Colours of the platforms that are not the agent."""
+
 MAP_WIDTH = 3.8
 """Width of a panel of the path in inches."""
+
+NAMES_PER_MAP = 3
+"""Number of names of a legend that fit below a map."""
 
 CURVES_WIDTH = 4.6
 """Width of the panels over time in inches."""
 
 
 @styled
-def flight_figure(env: Environment, episode: tuple[State, TimeStep], title: str) -> NotebookFigure:
+def flight_figure(
+    env: Environment, episode: tuple[State, TimeStep], title: str, world: bool = False
+) -> NotebookFigure:
     """Return a figure of one episode.
 
-    The path is relative to the first platform that is not the agent. If that platform has a
-    heading, x is along it. If it moves, regions that stay in place are left out. A path in space is
+    The paths are relative to the first platform that is not the agent. If that platform has a
+    heading, x is along it. If it moves, regions that stay in place are left out. Paths in space are
     drawn in space and from above.
 
     Args:
         env: the environment of the episode.
         episode: states and time steps from the start to the end, [steps + 1].
         title: the title, to which the outcome is added.
+        world: whether paths are drawn in the axes of the world instead. Regions are then where they
+            are at the end.
     """
     states, timesteps = episode
+    origin = None if world else _first_other(env)
     views = [(0, 1)] if env.agent_platform.dimension < 3 else [(0, 1, 2), (0, 1)]
     widths = [MAP_WIDTH * len(views), CURVES_WIDTH]
     figure = NotebookFigure(figsize=(sum(widths), 4.2), layout="constrained")
@@ -66,14 +79,15 @@ def flight_figure(env: Environment, episode: tuple[State, TimeStep], title: str)
     for number, view in enumerate(views, start=1):
         spatial = len(view) == 3
         panel = left.add_subplot(1, len(views), number, projection="3d" if spatial else None)
-        _draw_path(panel, view, env, states)
+        _draw_path(panel, view, env, states, origin)
     handles, names = left.axes[-1].get_legend_handles_labels()
-    left.legend(handles, names, loc="outside lower center", ncols=len(names))
+    columns = min(len(names), NAMES_PER_MAP * len(views))
+    left.legend(handles, names, loc="outside lower center", ncols=columns)
     distance, controls, margins = right.subplots(3, 1, sharex=True)
     times = np.asarray(states.sim.time)
-    path = _relative_path(env, states, env.agent)
+    path = _path(states, env.agent, _first_other(env))
     distance.plot(times, np.linalg.norm(path, axis=1), color=BLUE, linewidth=1.4)
-    name = f"distance to\nthe {plain(_origin(env) or 'origin')}"
+    name = f"distance to\nthe {plain(_first_other(env) or 'origin')}"
     distance.set(ylabel=labelled(name, length_unit(env)), ylim=(0.0, None))
     _draw_controls(controls, env, timesteps, times)
     _draw_margins(margins, env, timesteps, times)
@@ -84,34 +98,33 @@ def flight_figure(env: Environment, episode: tuple[State, TimeStep], title: str)
     return figure
 
 
-def _origin(env: Environment) -> str | None:
+def _first_other(env: Environment) -> str | None:
     """Return the name of the first platform that is not the agent."""
-    others = [platform.name for platform in env.platforms if platform.name != env.agent]
-    return others[0] if others else None
+    return next((platform.name for platform in env.platforms if platform.name != env.agent), None)
 
 
-def _origin_moves(env: Environment, states: State) -> bool:
-    """Return whether the first platform that is not the agent changes its place."""
-    origin = _origin(env)
-    return origin is not None and bool(np.ptp(states.sim.platforms[origin].position, axis=0).any())
+def _moves(states: State, name: str | None) -> bool:
+    """Return whether a platform changes its place."""
+    return name is not None and bool(np.ptp(states.sim.platforms[name].position, axis=0).any())
 
 
-def _heads(env: Environment, states: State) -> str | None:
+def _heads(states: State, origin: str | None) -> str | None:
     """Return the name of the platform along whose heading x is, or None."""
-    origin = _origin(env)
     return origin if origin and "heading" in vars(states.sim.platforms[origin]) else None
 
 
-def _relative_path(env: Environment, states: State, of: str) -> np.ndarray:
-    """Return the positions of a platform or region as seen from `_origin`, shape (steps, d)."""
+def _path(states: State, of: str, origin: str | None) -> np.ndarray:
+    """Return the positions of a platform or region, shape (steps, d).
+
+    They are as seen from the platform `origin`, or those of the world if it is None.
+    """
     sim = states.sim
     place = sim.platforms[of] if of in sim.platforms else sim.regions[of]
     path = in_plane(np.array(place.position, float))
-    origin = _origin(env)
     if origin is None:
         return path
     path -= in_plane(np.array(sim.platforms[origin].position, float))
-    if _heads(env, states):
+    if _heads(states, origin):
         heading = sim.platforms[origin].heading
         x = np.cos(heading) * path[:, 0] + np.sin(heading) * path[:, 1]
         path[:, 1] = np.cos(heading) * path[:, 1] - np.sin(heading) * path[:, 0]
@@ -119,36 +132,57 @@ def _relative_path(env: Environment, states: State, of: str) -> np.ndarray:
     return path
 
 
-def _draw_path(panel: Any, view: tuple[int, ...], env: Environment, states: State) -> None:
-    """Draw the path in space, or in the plane of two axes."""
+def _draw_path(
+    panel: Any, view: tuple[int, ...], env: Environment, states: State, origin: str | None
+) -> None:
+    """Draw the paths in space, or in the plane of two axes, as seen from the platform `origin`."""
     axes = list(view)
     spatial = len(view) == 3
     forbidden = kept_out(env)
+    heads = _heads(states, origin)
     for region in env.regions:
-        if region.on is None and _origin_moves(env, states):
+        if region.on is None and _moves(states, origin):
             continue  # it has no fixed position on a map that moves
-        place = np.nan_to_num(_relative_path(env, states, region.name)[-1])
+        place = np.nan_to_num(_path(states, region.name, origin)[-1])
         if spatial:
             region_surface(panel, region, place, region.name in forbidden)
             continue
-        turned = _heads(env, states) is not None
-        patch = panel.add_patch(region_patch(region, False, region.name in forbidden, turned))
+        patch = region_patch(region, False, region.name in forbidden, turned=heads is not None)
+        panel.add_patch(patch)
         centre_patch(patch, place[axes])
         patch.set_label(plain(region.name))
-    for radius in keep_away_distances(env):
+    others = [platform.name for platform in env.platforms if platform.name != env.agent]
+    for radius in keep_away_distances(env) if others else []:
+        place = np.nan_to_num(_path(states, others[0], origin)[-1])
         if spatial:
-            region_surface(panel, Ball(radius), np.zeros(3), forbidden=True)
+            region_surface(panel, Ball(radius), place, forbidden=True)
         else:
-            panel.add_patch(Circle((0.0, 0.0), radius, label="too near", **FORBIDDEN))
-    heads = _heads(env, states)
-    if origin := _origin(env):
-        look = {"color": "black", "markersize": 7, "label": plain(origin), "zorder": 1}
-        panel.plot(*np.zeros((len(view), 1)), ">" if heads else "*", **look)
-    path = _relative_path(env, states, env.agent)
+            panel.add_patch(Circle(tuple(place[axes]), radius, label="too near", **FORBIDDEN))
+    shown = [_path(states, env.agent, origin)]
+    for name, colour in zip(others, cycle(CRAFT_COLOURS), strict=False):
+        path = _path(states, name, origin)
+        look = {"color": colour, "markersize": 7, "label": plain(name), "zorder": 1}
+        marker = ">" if _heads(states, name) and name == origin else "*"
+        if name != origin:
+            shown.append(path)
+            if _moves(states, name):
+                marker = "o"
+                look["markersize"] = 4
+                panel.plot(*path[:, axes].T, color=colour, linewidth=1.0, linestyle="--", zorder=1)
+        panel.plot(*path[-1:, axes].T, marker, **look)
+    path = shown[0]
     panel.plot(*path[:, axes].T, color=BLUE, linewidth=1.4, label=plain(env.agent))
     panel.plot(*path[:1, axes].T, "o", color=BLUE, markersize=4)
-    half = 1.1 * np.nanmax(np.abs(path)) or 1.0
-    set_frame(panel, view, frame_labels(heads, length_unit(env)), half)
+    everywhere = np.concatenate(shown)
+    if origin is None:
+        low = np.nanmin(everywhere, axis=0)
+        high = np.nanmax(everywhere, axis=0)
+        centre = (low + high) / 2.0
+        half = 0.55 * np.max(high - low) or 1.0
+    else:
+        centre = np.zeros(everywhere.shape[1])
+        half = 1.1 * np.nanmax(np.abs(everywhere)) or 1.0
+    set_frame(panel, view, frame_labels(heads, length_unit(env)), half, centre)
 
 
 def _draw_controls(panel: Axes, env: Environment, timesteps: TimeStep, times: np.ndarray) -> None:

@@ -274,25 +274,35 @@ def frame_labels(heads: str | None, unit: str | None) -> list[str]:
     return [labelled(plain(f"{side} the {heads}"), unit) for side in sides]
 
 
-def set_frame(panel: Any, view: Sequence[int], labels: Sequence[str], half: float) -> None:
+def set_frame(
+    panel: Any,
+    view: Sequence[int],
+    labels: Sequence[str],
+    half: float,
+    centre: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+) -> None:
     """Set labels, limits, numbers and proportions of axes that show positions.
 
     Args:
         panel: axes in the plane or in space.
         view: the coordinates that are shown.
         labels: the labels of `frame_labels`.
-        half: half the width of what is shown, whose middle is the origin.
+        half: half the width of what is shown.
+        centre: the middle of what is shown.
     """
     spatial = len(view) == 3
     for coordinate, letter in zip(view, "xyz", strict=False):
         axis = getattr(panel, f"{letter}axis")
         axis.set_label_text(labels[coordinate])
-        getattr(panel, f"set_{letter}lim")(-half, half)
+        middle = float(centre[coordinate])
+        getattr(panel, f"set_{letter}lim")(middle - half, middle + half)
         axis.set_major_locator(MaxNLocator(4))
         if spatial:
             # Numbers near the ends of axes in space would meet at the corners.
-            last = nice(0.8 * half, up=False)
-            axis.set_major_locator(FixedLocator([-last, 0.0, last]))
+            space = nice(0.8 * half, up=False)
+            first = np.ceil((middle - 0.8 * half) / space - 1e-6)
+            last = np.floor((middle + 0.8 * half) / space + 1e-6)
+            axis.set_major_locator(FixedLocator(space * np.arange(first, last + 1)))
             axis.labelpad = SPACE_LABEL_PAD
     if spatial:
         panel.set_box_aspect((1.0, 1.0, 1.0), zoom=ZOOM)
