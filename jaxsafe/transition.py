@@ -17,12 +17,13 @@ from jaxsafe.schema.dotted_paths import references
 from jaxsafe.schema.errors import part
 from jaxsafe.simulation.between import regions_on_the_way
 from jaxsafe.simulation.controllers import Controls
-from jaxsafe.types import RefersInDetail, Sim
+from jaxsafe.types import RefersInDetail, RegionState, Sim
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
     from jaxsafe.processors.constraint import Constraint
     from jaxsafe.simulation.platform import Platform
+    from jaxsafe.simulation.regions import Region
 
 Others = Mapping[str, Any]
 """The states of all platforms but the agent's, by name."""
@@ -128,31 +129,51 @@ def undirected(platform: Platform, sim: Sim) -> Controls:
 
 def place_regions(env: Environment, sim: Sim) -> Sim:
     """Return the simulation with its regions where the platforms put them."""
-    regions = {}
-    moving, measured = _in_detail(env)
-    for region in env.regions:
+    regions: dict[str, RegionState] = {}
+    moving, measured, related = _in_detail(env)
+
+    def put(region: Region, guests: Mapping[str, RegionState]) -> None:
         with part("regions", region.name):
             regions[region.name] = region.place(
-                sim.platforms,
+                {**sim.platforms, **guests},
                 regions,
                 moves=region.name in moving,
                 measures=region.name in measured,
             )
+
+    for region in env.regions:
+        put(region, {})
+    for region in env.regions:
+        if names := related.get(region.name):
+            put(region, {name: regions[name] for name in names})
     return sim.replace(regions=regions)
 
 
-def _in_detail(env: Environment) -> tuple[set[str], set[str]]:
-    """Return the names of the regions whose motion, and of those whose distance, some part uses."""
+def _in_detail(env: Environment) -> tuple[set[str], set[str], Mapping[str, list[str]]]:
+    """Return the regions of which some part asks for more than position and content.
+
+    Returns:
+        The regions whose motion, and those whose distances, are named by some part. The last is,
+        by region, the other regions whose centres it relates to: those that one part names
+        together with it.
+    """
     if not env.regions:
-        return set(), set()
-    in_detail = [
-        (refers.section, name)
-        for _, refers, name in references(env, "")
-        if isinstance(refers, RefersInDetail)
-    ]
-    moving = {name for section, name in in_detail if section == "places"}
-    measured = {name for section, name in in_detail if section == "regions"}
-    return moving, measured
+        return set(), set(), {}
+    named = [found for found in references(env, "") if found[1].section in ("places", "regions")]
+    detailed = [found for found in named if isinstance(found[1], RefersInDetail)]
+    moving = {name for _, refers, name in detailed if refers.section == "places"}
+    measured = {name for _, refers, name in detailed if refers.section == "regions"}
+    names = {region.name for region in env.regions} - {platform.name for platform in env.platforms}
+    of_part: dict[str, tuple[set[str], set[str]]] = {}
+    for where, refers, name in named:
+        if name in names:
+            places, regions = of_part.setdefault(where.rpartition(".")[0], (set(), set()))
+            (places if refers.section == "places" else regions).add(name)
+    related: dict[str, set[str]] = {}
+    for places, regions in of_part.values():
+        for region in regions:
+            related.setdefault(region, set()).update(places - {region})
+    return moving, measured, {region: sorted(others) for region, others in related.items()}
 
 
 def update_statuses(

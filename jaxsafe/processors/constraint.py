@@ -19,7 +19,7 @@ from jaxsafe.types import (
     Extent,
     Length,
     Number,
-    PlatformName,
+    PlaceName,
     Radians,
     Reach,
     ShapeName,
@@ -145,11 +145,13 @@ class UpperLimit(Constraint, type="upper_limit"):
 class KeepOut(Constraint, type="keep_out"):
     """The margin h = distance to the boundary of a region − clearance, negative inside the region.
 
+    The distance is that of a platform, or of the centre of another region, such as the tip of a
+    boom that a platform carries.
     A filter bounds it between two samples, so nothing slips through a corner of the region.
     """
 
     between: ClassVar[bool] = True
-    of: PlatformName
+    of: PlaceName
     region: ShapeName
     clearance: Annotated[Length, Reach] = 0.0
     scale: Annotated[Length, Extent] = 1.0

@@ -169,21 +169,22 @@ class VectorObservation(Observation):
 class Observe(VectorObservation, type="observe"):
     """A quantity of a platform: a field of its state, or its velocity.
 
-    With `relative_to` the same quantity of that platform is subtracted.
+    A region has the quantities `position` and `velocity`. With `relative_to` the same quantity of
+    that platform or region is subtracted.
     """
 
-    of: PlatformName
+    of: PlaceName
     what: str
-    relative_to: PlatformName | None = None
+    relative_to: PlaceName | None = None
 
     def misfits(self, env: Environment) -> dict[str, str]:
         return _not_observable(env, self.what, self.of, self.relative_to or self.of)
 
     def vector(self, sim: Sim) -> Float[Array, " d"]:
-        own = getattr(sim.platforms[self.of], self.what)
+        own = getattr(place(sim, self.of), self.what)
         if self.relative_to is None:
             return own
-        return own - getattr(sim.platforms[self.relative_to], self.what)
+        return own - getattr(place(sim, self.relative_to), self.what)
 
 
 class ObserveRegion(VectorObservation, type="observe_region"):
@@ -281,10 +282,11 @@ class ObserveStatus(Observation, type="observe_status"):
         return jnp.atleast_1d(jnp.asarray(sim.status[self.status], jnp.result_type(float)))
 
 
-def _not_observable(env: Environment, what: str, *platforms: str) -> dict[str, str]:
-    """Return what is wrong with a quantity, if one of the platforms does not have it."""
-    for name in platforms:
-        quantities = env.platform(name).quantities()
+def _not_observable(env: Environment, what: str, *places: str) -> dict[str, str]:
+    """Return what is wrong with a quantity, if one of the platforms or regions does not have it."""
+    platforms = {platform.name: platform for platform in env.platforms}
+    for name in places:
+        quantities = platforms[name].quantities() if name in platforms else ("position", "velocity")
         if what not in quantities:
             choices = nearest(what, quantities)
             return {"what": f"{name} has no quantity {what!r}; choose from {choices}"}

@@ -13,29 +13,39 @@ from jaxsafe.processors.status import Status
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.cwh import MEAN_MOTION, MeanMotion, cwh_flow
 from jaxsafe.simulation.geometry import closest_approach, safe_norm
-from jaxsafe.types import Extent, Length, Number, PlatformName, Positive, Seconds, Sim
+from jaxsafe.types import (
+    Extent,
+    Length,
+    Number,
+    PlaceName,
+    PlatformName,
+    Positive,
+    Seconds,
+    Sim,
+    place,
+)
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
 
 
 class BrakingDistance(Constraint, type="braking_distance"):
-    """Room to stop before a sphere around another platform: h = d − c²/2a.
+    """Room to stop before a sphere around another platform or a region's centre: h = d − c²/2a.
 
     d is the distance to the sphere, c the speed towards it, or 0 if the platform moves away, and a
     the `deceleration`. So h ≥ 0 is c ≤ √(2ad), as in Dunlap, van Wijk and Hobbs, arXiv:2302.02885.
     The platform stays outside of the sphere, or inside of it.
     """
 
-    of: PlatformName
-    to: PlatformName
+    of: PlaceName
+    to: PlaceName
     radius: Annotated[Length, Extent]
     stay: Literal["outside", "inside"] = "outside"
     deceleration: Annotated[Number, Unit("m/s² or ft/s²"), Positive]
 
     def margin(self, sim: Sim) -> Float[Array, ""]:
-        own = sim.platforms[self.of]
-        other = sim.platforms[self.to]
+        own = place(sim, self.of)
+        other = place(sim, self.to)
         apart = own.position - other.position
         distance = safe_norm(apart)
         outwards = jnp.sum(apart * (own.velocity - other.velocity))
@@ -51,14 +61,15 @@ class BrakingDistance(Constraint, type="braking_distance"):
 class DriftDistance(Status, type="drift_distance"):
     """Smallest distance to an anchor in the next `duration` seconds if all thrust fails.
 
-    A separation of this status makes a spacecraft passively safe, as in Dunlap, van Wijk and Hobbs,
-    arXiv:2302.02885. The drift is the closed form of Clohessy-Wiltshire motion. The result is a
-    lower bound: the smallest distance on the straight lines between `samples` + 1 instants, less
-    what the drift may bend between two of them (Proposition 10 of docs/safety/proofs.md).
+    Instead of an anchor it may be the centre of a region at rest. A separation of this status makes
+    a spacecraft passively safe, as in Dunlap, van Wijk and Hobbs, arXiv:2302.02885. The drift is
+    the closed form of Clohessy-Wiltshire motion. The result is a lower bound: the smallest distance
+    on the straight lines between `samples` + 1 instants, less what the drift may bend between two
+    of them (Proposition 10 of docs/safety/proofs.md).
     """
 
     of: PlatformName
-    to: PlatformName
+    to: PlaceName
     duration: Seconds
     samples: Annotated[int, Range(1, largest=1000)] = 60
     mean_motion: MeanMotion = MEAN_MOTION
@@ -95,7 +106,7 @@ class DriftDistance(Status, type="drift_distance"):
             return cwh_flow(r=own.position, v=own.velocity, a=still, n=self.mean_motion, t=time)
 
         places, velocities = jax.vmap(at)(times)
-        return places - sim.platforms[self.to].position, safe_norm(velocities)
+        return places - place(sim, self.to).position, safe_norm(velocities)
 
     def _acceleration(self, sim: Sim) -> Float[Array, ""]:
         """Return the largest acceleration [m/s²] of the drift, whose path is a moving ellipse."""

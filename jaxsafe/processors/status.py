@@ -74,13 +74,13 @@ class Distance(Status, type="distance"):
 
 
 class RegionDistance(Status, type="region_distance"):
-    """Distance of a platform to the centre of a region."""
+    """Distance of a platform or of a region's centre to the centre of a region."""
 
-    of: PlatformName
+    of: PlaceName
     region: RegionName
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
-        return safe_norm(sim.platforms[self.of].position - sim.regions[self.region].position)
+        return safe_norm(place(sim, self.of).position - sim.regions[self.region].position)
 
     def on_the_way(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, ""]:
         return _nearest(env, before, sim, self.of, self.region)
@@ -90,9 +90,9 @@ class RegionDistance(Status, type="region_distance"):
 
 
 class SignedDistance(Status, type="signed_distance"):
-    """Distance of a platform to the boundary of a region, negative inside."""
+    """Distance of a platform or a region's centre to the boundary of a region, negative inside."""
 
-    of: PlatformName
+    of: PlaceName
     region: ShapeName
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
@@ -103,9 +103,9 @@ class SignedDistance(Status, type="signed_distance"):
 
 
 class InRegion(Status, type="in_region"):
-    """Whether a platform is inside a region, Eq. (13)."""
+    """Whether a platform or the centre of another region is inside a region, Eq. (13)."""
 
-    of: PlatformName
+    of: PlaceName
     region: RegionName
 
     def misfits(self, env: Environment) -> dict[str, str]:
@@ -454,7 +454,9 @@ class Not(Status, type="not"):
 
 
 def on_itself(env: Environment, of: str, region: str) -> dict[str, str]:
-    """Return what is wrong if a region is carried by the very platform that it is related to."""
+    """Return what is wrong if a region is related to itself or to what carries it."""
+    if of == region:
+        return {"of": "it is the region itself; choose another"}
     if all((other.name, other.on) != (region, of) for other in env.regions):
         return {}
     return {"of": f"region {region!r} is on {of!r} itself; choose another"}

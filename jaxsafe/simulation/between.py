@@ -65,7 +65,9 @@ def regions_on_the_way(env: Environment, before: Sim, sim: Sim) -> Mapping[str, 
 def _signed_distance_bounds(
     env: Environment, region: Region, before: Sim, sim: Sim, of: str
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return bounds of the signed distance of a platform to a region on the way, low and high.
+    """Return bounds of the signed distance of a platform or region to a region on the way.
+
+    The first is the lower one.
 
     Seen from axes that turn by φ in the step, a straight line is bent. Let its length be L, and let
     its points be no farther away than R. Then its second derivative with respect to the share of
@@ -74,7 +76,7 @@ def _signed_distance_bounds(
     offsets = []
     global_offsets = []
     for instant in (before, sim):
-        offset = instant.platforms[of].position - instant.regions[region.name].position
+        offset = place(instant, of).position - instant.regions[region.name].position
         axes = None if region.on is None else region.axes(place(instant, region.on))
         global_offsets.append(offset)
         offsets.append(offset if axes is None else to_body(axes, offset))

@@ -623,24 +623,32 @@ def test_a_barrier_keeps_an_approach_within_its_cone() -> None:
     assert least[1] >= 0.0
 
 
+ON_ARM = {"on": "deputy", "offset": {"type": "body_displacement", "by": [6, 0]}}
+
+
 @pytest.mark.thorough
-def test_bounds_on_the_way_hold_for_a_carrier_that_turns() -> None:
+@pytest.mark.parametrize(
+    ("of", "regions"),
+    [
+        ("chief", [ON_ARM | {"type": "box", "name": "zone", "turns": True, "size": [8, 1]}]),
+        (
+            "tip",
+            [
+                ON_ARM | {"type": "circle", "name": "tip", "radius": 1},
+                {"type": "box", "name": "zone", "on": "chief", "size": [8, 1]},
+            ],
+        ),
+    ],
+    ids=["a platform and a region that turns", "the tip of an arm and a region at rest"],
+)
+def test_bounds_on_the_way_hold_for_a_carrier_that_turns(of: str, regions: list) -> None:
     """Compare with many small steps of the same motion."""
     tree = data()
-    tree["regions"] = [
-        {
-            "type": "box",
-            "name": "arm",
-            "on": "deputy",
-            "turns": True,
-            "offset": {"type": "body_displacement", "by": [6, 0]},
-            "size": [8, 1],
-        }
-    ]
+    tree["regions"] = regions
     tree["status"] = [{"type": "elapsed_time", "name": "time"}]
     tree["constraints"] = [
-        {"type": "keep_out", "name": "out", "of": "chief", "region": "arm"},
-        {"type": "keep_in", "name": "in", "of": "chief", "region": "arm"},
+        {"type": "keep_out", "name": "out", "of": of, "region": "zone"},
+        {"type": "keep_in", "name": "in", "of": of, "region": "zone"},
     ]
     tree["terminal"] = [{"type": "timeout", "name": "timeout", "limit": 100}]
     tree["reward"] = [{"type": "constant", "name": "time", "value": -0.01}]
@@ -677,6 +685,50 @@ def test_bounds_on_the_way_hold_for_a_carrier_that_turns() -> None:
     true, bound = jax.vmap(bounds)(positions, rates)
     assert (np.asarray(bound) <= np.asarray(true) + 1e-4).all()
     assert (np.asarray(true - bound)[np.abs(rates) < 0.05] < 2.0).all()
+
+
+def test_a_region_may_stand_where_a_platform_is() -> None:
+    """The tip of an arm is inside a zone, near its edge and near another region."""
+    tree = data()
+    tree["regions"] = [
+        ON_ARM | {"type": "circle", "name": "tip", "radius": 1},
+        {"type": "circle", "name": "zone", "on": "chief", "radius": 5},
+    ]
+    related = {"of": "tip", "region": "zone"}
+    tree["status"] = [
+        {"type": "in_region", "name": "inside", **related},
+        {"type": "signed_distance", "name": "edge", **related},
+        {"type": "region_distance", "name": "centre", **related},
+        {"type": "drift_distance", "name": "drift", "of": "deputy", "to": "tip", "duration": 1},
+    ]
+    room = {"of": "tip", "to": "zone", "radius": 1, "deceleration": 0.1}
+    tree["constraints"] = [
+        {"type": "keep_in", "name": "in", **related},
+        {"type": "braking_distance", "name": "room", **room},
+    ]
+    tree["terminal"] = [{"type": "timeout", "name": "timeout", "limit": 100}]
+    tree["reward"] = [{"type": "constant", "name": "time", "value": -0.01}]
+    seen = {"type": "observe", "relative_to": "chief"}
+    tree["observation"] = [
+        {**seen, "name": "place", "of": "tip", "what": "position"},
+        {**seen, "name": "way", "of": "zone", "what": "velocity"},
+    ]
+    env = from_data(tree, "")
+    start = {"position": [-3.0, 0.0], "velocity": [0.0, 0.0], "attitude": 0.0}
+    _, timestep = jaxsafe.reset_to(env, {"deputy": {**start, "attitude_rate": 0.0}})
+    np.testing.assert_allclose(timestep.observation, [3.0, 0.0, 0.0, 0.0], atol=1e-6)
+    status = timestep.info.status
+    assert status["inside"]
+    np.testing.assert_allclose([status["edge"], status["centre"]], [-2.0, 3.0], rtol=1e-6)
+    np.testing.assert_allclose(status["drift"], 6.0, atol=1e-3)
+    margins = timestep.info.margins
+    np.testing.assert_allclose([margins["in"], margins["room"]], [2.0, 2.0], rtol=1e-6)
+    for path, value, message in (
+        ("status.edge.of", "zone", r"^status\.edge\.of: it is the region itself; choose another"),
+        ("observation.way.what", "speed", r"what: zone has no quantity 'speed'; choose from pos"),
+    ):
+        with pytest.raises(jaxsafe.ConfigError, match=message):
+            jaxsafe.override(env, {path: value})
 
 
 @pytest.mark.parametrize(
