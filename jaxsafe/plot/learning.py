@@ -5,8 +5,17 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-from jaxsafe.plot.curves import Axis, Rows, curve_table, panel_grid, without_diverged
+from jaxsafe.plot.curves import (
+    MIN_SEEDS_FOR_MEAN,
+    SEED_COLOURS,
+    Axis,
+    Rows,
+    curve_table,
+    panel_grid,
+    without_diverged,
+)
 from jaxsafe.plot.style import BLUE, fitted, plain, styled
 
 PANELS = (
@@ -41,7 +50,8 @@ WORST_SHOWN = -0.5
 def learning_curves(rows: Rows, x: str, title: str, width: float | None = None) -> Figure | None:
     """Return a figure with a small panel for each diagnostic, or None if the log has none.
 
-    A panel shows the median of the seeds, and their range. Logs of older versions have no
+    A panel shows the median of the seeds, and their range. Fewer than `MIN_SEEDS_FOR_MEAN` seeds
+    are drawn alone, in the colours of `training_curves`. Logs of older versions have no
     diagnostics.
 
     Args:
@@ -60,7 +70,10 @@ def learning_curves(rows: Rows, x: str, title: str, width: float | None = None) 
     )
     for panel, (name, quantity, factor) in zip(panels, shown, strict=True):
         at, values = curve_table(rows, axis.column, name)
-        _band(panel, at / axis.unit, factor * values)
+        if values.shape[1] < MIN_SEEDS_FOR_MEAN:
+            _draw_seeds(panel, at / axis.unit, factor * values)
+        else:
+            _band(panel, at / axis.unit, factor * values)
         panel.set_title(quantity)
         panel.margins(x=0.0)
         panel.set_xlim(left=0.0)
@@ -69,10 +82,32 @@ def learning_curves(rows: Rows, x: str, title: str, width: float | None = None) 
         if name == "explained_variance":
             panel.set_ylim(max(WORST_SHOWN, panel.get_ylim()[0]), 1.05)
     figure.supxlabel(axis.label, fontsize="medium")
-    several = len({row["seed"] for row in rows}) > 1
-    shown_seeds = "median and range of the seeds" if several else "one seed"
+    seeds = sorted({row["seed"] for row in rows})
+    alone = 1 < len(seeds) < MIN_SEEDS_FOR_MEAN
+    if alone:
+        entries = [
+            Line2D([], [], color=colour, label=f"seed {seed}")
+            for seed, colour in zip(seeds, SEED_COLOURS, strict=False)
+        ]
+        # Below the panels it would lie on the label of the horizontal axis.
+        panels[-1].legend(handles=entries, loc="best")
+    shown_seeds = "one seed" if len(seeds) == 1 else "median and range of the seeds"
+    shown_seeds = "every seed" if alone else shown_seeds
     figure.suptitle(fitted(f"{plain(title)}\neach update, {shown_seeds}{left_out}", figure))
     return figure
+
+
+def _draw_seeds(panel: Axes, at: np.ndarray, values: np.ndarray) -> None:
+    """Draw each seed alone, where it has a value.
+
+    Args:
+        panel: the panel.
+        at: the horizontal axis, shape (points,).
+        values: the values, shape (points, seeds).
+    """
+    for seed, colour in zip(values.T, SEED_COLOURS, strict=False):
+        known = ~np.isnan(seed)
+        panel.plot(at[known], seed[known], color=colour, linewidth=1.0)
 
 
 def _band(panel: Axes, at: np.ndarray, values: np.ndarray) -> None:

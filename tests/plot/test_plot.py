@@ -405,7 +405,7 @@ def diagnostics(num_seeds: int = 4) -> list[dict]:
 
 
 def test_what_is_learnt_is_drawn_as_the_median_and_the_range_of_the_seeds() -> None:
-    log = diagnostics()
+    log = diagnostics(num_seeds=5)
     figure = learning_curves(log, "steps", "title")
     assert figure is not None
     assert len([panel for panel in figure.axes if panel.axison]) == len(DIAGNOSTICS)
@@ -414,7 +414,7 @@ def test_what_is_learnt_is_drawn_as_the_median_and_the_range_of_the_seeds() -> N
         ("value loss", "value_loss", 1),
         ("clip fraction [%]", "clip_fraction", 100),
     ):
-        values = factor * np.array([row[name] for row in log]).reshape(50, 4)
+        values = factor * np.array([row[name] for row in log]).reshape(50, 5)
         (line,) = panels[title].lines
         np.testing.assert_allclose(line.get_ydata(), np.median(values, axis=1))
         np.testing.assert_allclose(line.get_xdata(), np.arange(1, 51) / 10)
@@ -424,6 +424,19 @@ def test_what_is_learnt_is_drawn_as_the_median_and_the_range_of_the_seeds() -> N
     assert panels["explained variance"].lines[0].get_xdata()[0] == 0.2
     assert figure.get_supxlabel() == "environment steps per seed [k]"
     assert figure.get_suptitle() == "title\neach update, median and range of the seeds"
+
+
+def test_what_fewer_than_five_seeds_learn_is_drawn_one_by_one() -> None:
+    log = diagnostics(num_seeds=2)
+    figure = learning_curves(log, "steps", "title")
+    assert figure is not None
+    panels = {panel.get_title(): panel for panel in figure.axes}
+    values = np.array([row["entropy"] for row in log]).reshape(50, 2)
+    drawn = [line.get_ydata() for line in panels["entropy [nat]"].lines]
+    np.testing.assert_allclose(drawn, values.T)
+    assert list(panels["entropy [nat]"].collections) == []  # no band
+    assert entries(figure) == [f"seed {seed}" for seed in sorted({row["seed"] for row in log})]
+    assert figure.get_suptitle() == "title\neach update, every seed"
 
 
 @pytest.mark.parametrize("left_out", [(), ("cost_value_loss",)])
@@ -451,7 +464,7 @@ def test_the_figure_of_what_is_learnt_has_what_the_log_has() -> None:
     assert figure.get_suptitle() == "title\neach update, one seed"
     nothing = [row | dict.fromkeys(DIAGNOSTICS) for row in without_cost]
     assert learning_curves(nothing, "steps", "title") is None
-    broken = [row | {"diverged": row["seed"] == 8} for row in diagnostics()]
+    broken = [row | {"diverged": row["seed"] == 8} for row in diagnostics(num_seeds=6)]
     figure = learning_curves(broken, "steps", "title")
     assert figure is not None
     assert figure.get_suptitle().endswith("range of the seeds, without seed 8, which diverged")
