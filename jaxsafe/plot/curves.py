@@ -7,6 +7,7 @@ are the means of the latest training episodes.
 from __future__ import annotations
 
 import dataclasses
+import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Self
 
@@ -68,6 +69,12 @@ PANEL_RATIO = 0.78
 
 LEGEND_ENTRY_WIDTH = 2.7
 """Width of a legend entry in inches, which decides how many stand side by side."""
+
+LEGEND_HANDLE_WIDTH = 0.5
+"""Width in inches that a legend entry needs beside its text."""
+
+LEGEND_CHARACTERS_PER_INCH = 14
+"""Number of characters of a legend entry that fit into an inch."""
 
 SEED_COLOURS = (BLUE, ORANGE, GREEN, PURPLE)
 """Colours of seeds that are drawn one by one."""
@@ -351,9 +358,16 @@ def curve_entries(rows: Rows, evaluations: Rows, colours: tuple[str, str]) -> li
 
 
 def add_legend(figure: Figure, spare: Sequence[Axes], entries: Sequence[Any]) -> None:
-    """Put a legend into the first spare panel, or else below the panels."""
+    """Put a legend into the spare panels, or else below the panels."""
     if spare:
-        spare[0].legend(handles=entries, loc="center left")
+        grid = spare[0].get_gridspec()
+        room = len(spare) * figure.get_figwidth() / (grid.ncols if grid else 1)
+        characters = int(LEGEND_CHARACTERS_PER_INCH * (room - LEGEND_HANDLE_WIDTH))
+        for entry in entries:
+            entry.set_label("\n".join(textwrap.wrap(entry.get_label(), characters)))
+        legend = spare[0].legend(handles=entries, loc="center left", borderaxespad=0.0)
+        # The layout would widen one column of panels for a legend that stretches over two.
+        legend.set_in_layout(False)
         return
     columns = max(1, int(figure.get_figwidth() / LEGEND_ENTRY_WIDTH))
     # Rows of equal length leave no gap at the end.
