@@ -88,22 +88,23 @@ def main(argv: Sequence[str]) -> int:
 def _expand(options: Options) -> tuple[list[Path], bool]:
     """Return the run directories, and whether the user asks for a figure of several runs.
 
+    A pattern that only one run fits stands for that run.
+
     Raises:
         ConfigError: no run fits a pattern.
     """
-    several = isinstance(options.given["run"], list)
+    listed = isinstance(options.given["run"], list)
     paths: list[Path] = []
     for typed in options.run:
         if Path(typed).exists() or not glob.has_magic(typed):
             paths.append(Path(typed))
             continue
-        several = True
         matches = [Path(name) for name in sorted(glob.glob(typed))]
         matches = [path for path in matches if (path / "config.yaml").exists()]
         if not matches:
             raise ConfigError(f"run: no run fits {typed!r}")
         paths += matches
-    return paths, several
+    return paths, listed or len(paths) > 1
 
 
 def _width(typed: str | None) -> float | None:

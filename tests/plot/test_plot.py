@@ -794,6 +794,17 @@ def test_several_runs_in_one_figure_with_a_table(
             main(words)
 
 
+def test_a_pattern_that_one_run_fits_draws_that_run(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(whole, Path("runs") / "only", ignore=shutil.ignore_patterns("figures"))
+    assert main(["run=runs/*", "format=svg", "panels=[return]"]) == 0
+    assert (tmp_path / "runs" / "only" / "figures" / "training_steps.svg").exists()
+    with pytest.raises(ConfigError, match="out: means nothing but for several runs"):
+        main(["run=runs/*", "out=both.png"])
+
+
 @pytest.mark.thorough
 def test_a_pattern_stands_for_runs_and_labels_name_them(
     whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
