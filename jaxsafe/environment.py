@@ -50,6 +50,7 @@ from jaxsafe.types import (
     Sim,
     State,
     TimeStep,
+    require_key,
     units,
 )
 from jaxsafe.uncertain import (
@@ -363,7 +364,11 @@ def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:
     Returns:
         The state and the first time step, whose reward and cost are 0, and whose `terminated` and
         `truncated` are False.
+
+    Raises:
+        ConfigError: the key is a plain number.
     """
+    require_key("reset: key", key)
     parameters = _draw_parameters(env, key)
     env = drawn(env, parameters)
     sim = empty_sim(env)

@@ -29,7 +29,7 @@ from jaxsafe.schema.describe import Described, Rows, brief
 from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.storage.columns import flat
 from jaxsafe.storage.files import write_csv
-from jaxsafe.types import Key, State, TimeStep
+from jaxsafe.types import Key, State, TimeStep, require_key
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -257,8 +257,10 @@ def fly(
         The episode up to its end. An episode of more than 25,000 steps is given up.
 
     Raises:
-        ConfigError: the start or the policy does not fit the environment.
+        ConfigError: the start or the policy does not fit the environment, or the key is a plain
+            number.
     """
+    require_key("fly: key", key)
     require_hashable(policy)
     key_start, key_act = jax.random.split(jax.random.key(0) if key is None else key)
     state, timestep = _reset(env, key_start) if start is None else _started(env, start, key_start)

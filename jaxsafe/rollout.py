@@ -15,7 +15,7 @@ from jaxsafe.autoreset import choose, renew
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment, reset, step
 from jaxsafe.schema.errors import ConfigError, nearest, show
-from jaxsafe.types import Key, Record, State, TimeStep, Transition
+from jaxsafe.types import Key, Record, State, TimeStep, Transition, require_key
 
 Policy = Callable[[Key, Array], Array]
 """`policy(key, observation)` returns an action. Both are batched if the environments are."""
@@ -137,12 +137,13 @@ def rollout(
 
     Raises:
         ConfigError: `num_steps` or `num_envs` is not a whole number or is too small, `record` is
-            unknown, `start` is not a `RolloutState` or has a batch of another size, or the actions
-            have another shape.
+            unknown, `start` is not a `RolloutState` or has a batch of another size, the key is a
+            plain number, or the actions have another shape.
     """
     require_count("rollout: num_steps", num_steps, least=0)
     if num_envs is not None:
         require_count("rollout: num_envs", num_envs, least=1)
+    require_key("rollout: key", key)
     if record not in RECORDS:
         choice = nearest(record, RECORDS)
         raise ConfigError(f"rollout: record: unknown record {show(record)}; choose from {choice}")

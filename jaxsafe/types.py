@@ -14,10 +14,12 @@ from typing import Annotated, Any, Self, dataclass_transform
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.schema.component import Range, Refers, Unit
 from jaxsafe.schema.describe import Described, Rows, brief, unbroken
+from jaxsafe.schema.errors import ConfigError
 
 Key = Array
 """A typed PRNG key, as made by `jax.random.key`."""
@@ -177,6 +179,20 @@ def is_key(x: Any) -> bool:
     Such keys need care, because files and other processes receive only the words of a key.
     """
     return hasattr(x, "dtype") and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def require_key(what: str, key: Any) -> None:
+    """Reject a plain number where a key is needed.
+
+    Args:
+        what: the function and the argument, for the message.
+        key: the key.
+
+    Raises:
+        ConfigError: it is a number.
+    """
+    if isinstance(key, int | np.integer):
+        raise ConfigError(f"{what}: expected a key, such as jax.random.key({key}), found {key}")
 
 
 def units(record: type[Record]) -> dict[str, str]:

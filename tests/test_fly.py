@@ -182,6 +182,7 @@ def test_a_filter_shows_in_a_flight() -> None:
         ({"policy": Unhashable()}, "policy: expected a function, found Unhashable, which has no"),
         ({"start": "here"}, "fly: start: expected what reset or reset_to returns"),
         ({"start": {"chief": {}}}, "reset_to: "),
+        ({"key": 3}, r"fly: key: expected a key, such as jax.random.key\(3\), found 3"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(

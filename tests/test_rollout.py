@@ -256,6 +256,16 @@ def test_the_key_decides_everything(env: Environment, single: TimeStep) -> None:
 
 
 @pytest.mark.thorough
+def test_a_number_in_place_of_a_key_is_refused(env: Environment) -> None:
+    for call in (
+        lambda: jaxsafe.rollout(env, policy, 3, num_steps=2),  # type: ignore
+        lambda: jaxsafe.evaluate(env, policy, key=3, episodes=2),  # type: ignore
+        lambda: env.reset(3),  # type: ignore
+    ):
+        with pytest.raises(ConfigError, match=r"key: expected a key, such as jax.random.key\(3\)"):
+            call()
+
+
 def test_discrete_actions_roll_out_with_a_new_key_at_every_step() -> None:
     env = jaxsafe.make("docking3d", {"terminal.timeout.limit": LENGTH - 1}, actions="discrete")
 

@@ -8,7 +8,7 @@ from jaxsafe.environment import Environment
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.metrics import metrics_in
 from jaxsafe.rollout import Policy, RecurrentPolicy, require_count, require_hashable
-from jaxsafe.types import Key
+from jaxsafe.types import Key, require_key
 
 
 def evaluate(
@@ -34,11 +34,12 @@ def evaluate(
         task. A metric is None if the environment does not measure it or it is not finite.
 
     Raises:
-        ConfigError: the number of episodes is not a whole number of at least 1, or the policy
-            returns actions of another shape.
+        ConfigError: the number of episodes is not a whole number of at least 1, the key is a
+            plain number, or the policy returns actions of another shape.
     """
     count = num_episodes if episodes is None else episodes
     require_count("evaluate: episodes", count, least=1)
+    require_key("evaluate: key", key)
     require_hashable(policy)
     key = jax.random.key(0) if key is None else key
     sums = jax.jit(run_episodes, static_argnums=(1, 3))(env, policy, key, count)
