@@ -51,7 +51,7 @@ class _Trained(Described):
             action, memory = agent.act(env, params, key, observation, deterministic, memory)
             return _within_bounds(env, action), memory
 
-        # Without compilation each call would work out anew how the networks' inputs are computed.
+        # Without compilation each call would work out again how the networks' inputs are computed.
         object.__setattr__(self, "_act", jax.jit(act))
 
     @property

@@ -133,8 +133,8 @@ def _reason(verification: Verification) -> str:
         return f"{len(verification.open.low):,} boxes are left"
     count = len(verification.proved.low)
     return (
-        f"h ≥ {verification.margin:.3g} m/s on all ways of {verification.steps} steps "
-        f"from {count:,} boxes, between samples too"
+        f"h ≥ {verification.margin:.3g} m/s for {verification.steps} steps from every start in "
+        f"{count:,} box{'es' * (count != 1)}, between samples too"
     )
 
 

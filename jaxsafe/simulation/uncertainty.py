@@ -113,7 +113,7 @@ class Disturbance(Uncertainty):
 
 
 class BoundedDisturbance(Disturbance, type="bounded"):
-    """A disturbance that is drawn anew every step, uniformly from the ball of radius `bound`."""
+    """A disturbance that is drawn at every step, uniformly from the ball of radius `bound`."""
 
     draws: ClassVar[bool] = True
     bound: Size
@@ -125,7 +125,7 @@ class BoundedDisturbance(Disturbance, type="bounded"):
 
 
 class NormalDisturbance(Disturbance, type="normal"):
-    """A disturbance of independent normal numbers, drawn anew every step.
+    """A disturbance of independent normal numbers, drawn at every step.
 
     `deviation` is the standard deviation of each component.
     """
@@ -333,7 +333,7 @@ class StateError(Uncertainty):
 
 
 class NavigationError(StateError, type="navigation"):
-    """An error of navigation that is drawn anew every step, with a `bias`.
+    """An error of navigation that is drawn at every step, with a `bias`.
 
     It is uniform in the ball of radius `bound`, or normal with the standard deviation `deviation`.
     """

@@ -93,7 +93,7 @@ def refuse_other(path: Path, first: Setting) -> None:
     if _content(path)["first"] != yaml12.parse(now, "first"):
         raise ConfigError(
             f"resume: the recipe or the environment of {path} has changed since it was begun;"
-            " begin it anew"
+            " start it again from the beginning"
         )
 
 

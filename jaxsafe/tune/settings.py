@@ -33,7 +33,7 @@ Each setting is a training. Checking this many takes half a minute before the fi
 """
 
 MANY_SETTINGS = 500
-"""Number of settings from which the user is told that they are being checked."""
+"""Number of settings from which a line says that they are being checked."""
 
 _RANGE = re.compile(r"(log|uniform)\(\s*([^,\s]+)\s*,\s*([^,\s]+)\s*\)")
 

@@ -92,7 +92,7 @@ def test_equal_keys_give_equal_episodes_and_others_give_others() -> None:
         for key in (KEY, KEY, jax.random.key(1))
     )
     pushes = [state.memory.uncertainty["normal"] for state, _ in first]
-    assert len({tuple(np.asarray(push).tolist()) for push in pushes}) == 3  # drawn anew every step
+    assert len({tuple(np.asarray(push).tolist()) for push in pushes}) == 3  # drawn at every step
     for (state, timestep), (state_again, timestep_again) in zip(first, again, strict=True):
         jax.tree.map(np.testing.assert_array_equal, state, state_again)
         np.testing.assert_array_equal(timestep.observation, timestep_again.observation)
