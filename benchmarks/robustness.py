@@ -30,7 +30,7 @@ from jaxsafe.config import override
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.bounded_worlds import world_at
 from jaxsafe.evaluate.run_adversaries import attack
-from jaxsafe.plot.style import GREY, save, styled
+from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, save, styled
 from jaxsafe.storage import provenance
 from jaxsafe.storage.files import write_json
 from jaxsafe.transition import bounds
@@ -38,6 +38,13 @@ from jaxsafe.transition import bounds
 OUT = Path(__file__).parent / "results" / "robustness.json"
 FIGURE = Path(__file__).parent.parent / "docs" / "figures_robust.png"
 FILTERS = ("none", "default", "robust")
+LOOKS: dict[str, dict[str, Any]] = {
+    "none": {"color": ORANGE, "linewidth": 3.0, "alpha": 0.6},
+    "default": {"color": BLUE},
+    "robust": {"color": GREEN, "linestyle": "--"},
+}
+"""Look of the line of each filter. Lines on top of each other stay visible."""
+
 BOUND = {"process": 0.01, "mass": 0.05, "misalignment": 0.05, "position": 1.0, "velocity": 0.01}
 """A push of 1 cm/s a step, 5 % of the mass, 3° of the thrust, and errors of 1 m and 1 cm/s."""
 
@@ -116,7 +123,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
                 of_filter = [row for row in rows if (row["task"], row["rta"]) == (task, rta)]
                 levels = [row["level"] for row in of_filter]
                 values = [unit * row[name] for row in of_filter]
-                panel.plot(levels, values, marker="o", markersize=3, label=rta)
+                panel.plot(levels, values, marker="o", markersize=3, label=rta, **LOOKS[rta])
             panel.axvline(1.0, color=GREY, linewidth=0.8, linestyle=":")
             panel.set_xlabel("uncertainty, as a multiple of the bound")
             panel.set_ylabel(label)
