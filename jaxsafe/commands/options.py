@@ -18,7 +18,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from jaxsafe.config import arguments
 from jaxsafe.schema.component import Component, Field, Range, fields, marks
 from jaxsafe.schema.convert import bare
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, meant_environment, nearest, show
 
 Count = Annotated[int, Range(1, largest=arguments.MAX_COUNT)]
 """A number of episodes, steps or environments."""
@@ -277,5 +277,8 @@ def _numbers(value: Any, field: Field, key: str) -> tuple[float, ...]:
 
 
 def _refuse(given: Iterable[str], known: Iterable[str]) -> None:
+    known = list(known)
     for name in given:
+        if "env.PATH" in known and (hint := meant_environment(name, ("env", "sweep"))):
+            raise ConfigError(hint)
         raise ConfigError(f"{name}: unknown option; choose from {nearest(name, known)}")

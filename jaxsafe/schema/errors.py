@@ -73,6 +73,19 @@ def printable(text: str) -> str:
     return text.translate(CONTROL_ESCAPES | TEXT_CONTROLS).encode(errors="replace").decode()
 
 
+def meant_environment(name: str, groups: Iterable[str]) -> str | None:
+    """Return what to say of an option such as `deputy.mass`, which lacks its `env.`, or None.
+
+    Args:
+        name: the option.
+        groups: the first words that options with dots may have. One near to them is misspelt.
+    """
+    head, dot, _ = name.partition(".")
+    if not dot or difflib.get_close_matches(head, list(groups), n=1):
+        return None
+    return f"{name}: unknown option; a field of the environment is written env.{name}"
+
+
 def nearest(found: object, allowed: Iterable[object]) -> str:
     """List the allowed names, then the one nearest to `found`: `a, b, c. Did you mean 'b'?`."""
     names = [str(name) for name in allowed]

@@ -11,6 +11,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -164,11 +165,20 @@ def test_bad_options_of_train_are_told_in_one_line(
         ("epochs=3", "Did you mean 'ppo.num_epochs'"),
         ("env.obs=position", "Did you mean 'observation'"),
         ("env.mass=14", "env.mass: unknown field 'mass'; .* Did you mean 'env.deputy.mass'"),
+        ("deputy.mass=14", "deputy.mass: unknown option; .* is written env.deputy.mass"),
+        ("pppo.gamma=0.9", "Did you mean 'ppo'"),
         ("env.deputy.mas=14", "env.deputy.mas: unknown field 'mas'; .* Did you mean 'mass'"),
     ],
 )
 def test_near_misses_lead_on(fails: Callable[..., str], word: str, message: str) -> None:
     assert re.search(message, fails(train, "docking3d", word))
+
+
+@pytest.mark.parametrize("command", [evaluate, config])
+def test_a_field_of_the_environment_without_env_is_led_on(
+    command: Any, fails: Callable[..., str]
+) -> None:
+    assert "is written env.deputy.mass" in fails(command, "docking2d", "deputy.mass=14")
 
 
 def test_lists_of_a_training_need_no_brackets(fails: Callable[..., str]) -> None:

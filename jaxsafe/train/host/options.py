@@ -19,7 +19,7 @@ from jaxsafe.processors.reward import Intervention
 from jaxsafe.schema.component import Component, Range, normalise
 from jaxsafe.schema.convert import to_value
 from jaxsafe.schema.dotted_paths import set_path
-from jaxsafe.schema.errors import ConfigError, ConfigWarning, nearest, show
+from jaxsafe.schema.errors import ConfigError, ConfigWarning, meant_environment, nearest, show
 from jaxsafe.schema.retype import set_paths
 from jaxsafe.train.host.sinks import LIBRARIES, library
 from jaxsafe.train.host.starts import with_unproved_starts
@@ -241,6 +241,9 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         arguments.options["rta_training"] = current_name("rta_training", value)
     base = None if like is None else _base(text(like, "like"), arguments.options)
     config = base.config if base else TrainConfig()
+    for option in arguments.options:
+        if hint := meant_environment(option, ("agent", "ppo")):
+            raise ConfigError(hint)
     # This comes first, so that a misspelt option is reported before anything slow begins.
     config = set_paths(config, arguments.options)
     env, rta_training = _environment(task, config, base, arguments.options)
