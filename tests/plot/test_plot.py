@@ -753,7 +753,8 @@ def test_several_runs_in_one_figure_with_a_table(
         shutil.copytree(whole, name)
     assert main(["run=[ppo,limited]", "x=wall", "out=both.png"]) == 0
     heads, first, second, *written = capsys.readouterr().out.splitlines()
-    assert "cost/episode" in heads
+    assert "success, stochastic" in heads
+    assert "violating steps in training" in heads
     assert [(line.split()[0], *line.split()[-2:]) for line in (first, second)] == [
         ("ppo", "ppo", "none"),
         ("limited", "ppo", "none"),
