@@ -40,9 +40,9 @@ class Options(PolicyOptions):
         "The data.": ("steps", "seed", "format", "out"),
     }
 
-    run: (
-        Annotated[str, Option(first=True, examples=("run=runs/docking3d", "env=docking3d"))] | None
-    ) = None
+    run: Annotated[  # pyright: ignore[reportIncompatibleVariableOverride] it may be left out here
+        str | None, Option(first=True, examples=("run=runs/docking3d", "env=docking3d"))
+    ] = None
     """The policies, as for `jaxsafe evaluate`. With kind=random there are none."""
     kind: Literal["random", "expert", "medium", "replay", "filtered"] = "expert"
     """Where the steps come from.
@@ -139,16 +139,17 @@ def _policies(options: Options) -> _Policies:
         env = options.make(str(options.env))
         policy = random_policy(env)
         return _Policies(options.task, env, lambda _: policy, [()])
-    if options.run is None:
+    run = options.run
+    if run is None:
         raise ConfigError("run: missing; the policies, for instance run=pretrained/docking2d")
     if options.kind == "filtered" and options.rta is None:
         options = options.replace(rta="default")
     if options.kind in ("medium", "replay"):
-        subjects = list(_at_checkpoints(options.run, options.kind))
+        subjects = list(_at_checkpoints(run, options.kind))
     elif options.is_foreign():
         subjects = [load_foreign(options)]
     else:
-        subjects = [load(options.run, None)]
+        subjects = [load(run, None)]
     first = subjects[0]
     env = first.env if options.is_foreign() else options.change(first.env, first.name)
     return _Policies(

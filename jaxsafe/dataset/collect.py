@@ -118,33 +118,41 @@ def _steps(advance: Callable[..., Any], key: Key, num_steps: int, num_envs: int)
     for number in range(-(-per_env // CHUNK)):
         start, part = advance(jax.random.fold_in(key, number), start)
         parts.append(jax.device_get(part))
-    steps = Dataset(*(np.concatenate(arrays)[:per_env] for arrays in zip(*parts, strict=True)))
+    steps = Dataset(**{name: _column(parts, name)[:per_env] for name in Dataset._fields})
     steps.truncated[-1] |= ~steps.terminated[-1]
     flat = Dataset(*(np.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:])[:num_steps] for x in steps))
     flat.truncated[-1] |= ~flat.terminated[-1]
     return flat
 
 
+def _column(parts: Sequence[dict[str, np.ndarray]], name: str) -> np.ndarray:
+    """Return a field of all steps. The arrays are copies, which may be written to."""
+    return np.concatenate([part[name] for part in parts])
+
+
 def _chunk(
     env: Environment, parameters: Any, key: Key, start: Any, policy_of: Any, num_envs: int
-) -> tuple[Any, Any]:
-    """Return where a rollout has got to, and its steps [CHUNK, num_envs, …]."""
+) -> tuple[Any, dict[str, Array]]:
+    """Return where a rollout has got to, and the fields of its steps [CHUNK, num_envs, …]."""
     policy = policy_of(parameters)
     after, steps = rollout(env, policy, key, CHUNK, num_envs, record="transitions", start=start)
     low, high = action_bounds(env)
     costs = [steps.costs[constraint.name] for constraint in env.constraints]
     none = jnp.zeros((*steps.reward.shape, 0))
-    return after, Dataset(
-        observation=steps.observation,
-        action=jnp.clip(steps.action, jnp.stack(low), jnp.stack(high)).astype(steps.action.dtype),
-        reward=steps.reward,
-        next_observation=steps.next_observation,
-        terminated=steps.terminated,
-        truncated=steps.truncated,
-        costs=jnp.stack(costs, axis=-1) if costs else none,
-        control=steps.info.control_actual,
-        success=steps.done & env.succeeded(steps.info.outcome),
-    )
+    action = jnp.clip(steps.action, jnp.stack(low), jnp.stack(high))
+    return after, {
+        "observation": steps.observation,
+        "action": jnp.clip(steps.action, jnp.stack(low), jnp.stack(high)).astype(
+            steps.action.dtype
+        ),
+        "reward": steps.reward,
+        "next_observation": steps.next_observation,
+        "terminated": steps.terminated,
+        "truncated": steps.truncated,
+        "costs": jnp.stack(costs, axis=-1) if costs else none,
+        "control": steps.info.control_actual,
+        "success": steps.done & env.succeeded(steps.info.outcome),
+    }
 
 
 def random_policy(env: Environment) -> Policy:

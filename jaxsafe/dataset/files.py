@@ -109,23 +109,20 @@ def save_minari(
             constraint.name: _with_first(data.costs[part, index])
             for index, constraint in enumerate(env.constraints)
         }
-        buffers.append(
-            EpisodeBuffer(
-                id=number,
-                observations=np.concatenate(
-                    [data.observation[part], data.next_observation[part][-1:]]
-                ),
-                actions=data.action[part],
-                rewards=data.reward[part].tolist(),
-                terminations=data.terminated[part].tolist(),
-                truncations=data.truncated[part].tolist(),
-                infos={
-                    "cost": _with_first(data.costs[part].max(axis=1, initial=0.0)),
-                    "costs": costs,
-                    "success": _with_first(data.success[part]),
-                },
-            )
-        )
+        last = data.next_observation[part][-1:]
+        episode: dict[str, Any] = {
+            "observations": np.concatenate([data.observation[part], last]),
+            "actions": data.action[part],
+            "rewards": data.reward[part].tolist(),
+            "terminations": data.terminated[part].tolist(),
+            "truncations": data.truncated[part].tolist(),
+            "infos": {
+                "cost": _with_first(data.costs[part].max(axis=1, initial=0.0)),
+                "costs": costs,
+                "success": _with_first(data.success[part]),
+            },
+        }
+        buffers.append(EpisodeBuffer(id=number, **episode))
     try:
         # Minari warns of each field of authors and links that is left out.
         with warnings.catch_warnings(action="ignore", category=UserWarning):
