@@ -142,9 +142,7 @@ def _chunk(
     action = jnp.clip(steps.action, jnp.stack(low), jnp.stack(high))
     return after, {
         "observation": steps.observation,
-        "action": jnp.clip(steps.action, jnp.stack(low), jnp.stack(high)).astype(
-            steps.action.dtype
-        ),
+        "action": action.astype(steps.action.dtype),
         "reward": steps.reward,
         "next_observation": steps.next_observation,
         "terminated": steps.terminated,
