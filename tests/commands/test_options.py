@@ -103,10 +103,14 @@ def test_the_value_of_the_first_option_may_stand_alone_as_the_first_word() -> No
         Options.parse([""])
 
 
+POLICY_COMMANDS = ("evaluate", "plot", "export", "dataset", "verify")
+"""Commands whose first word is a run or a policy."""
+
+
 def test_every_command_has_an_option_that_may_stand_first() -> None:
     for name in commands.COMMANDS:
         options = importlib.import_module(f"jaxsafe.commands.{name}").Options
-        expected = "run" if name in ("evaluate", "plot", "export", "verify") else "env"
+        expected = "run" if name in POLICY_COMMANDS else "env"
         assert options.arguments(["x"]) == {expected: "x"}
 
 
