@@ -70,7 +70,7 @@ def main(argv: Sequence[str]) -> int:
     import jax
 
     from jaxsafe.dataset.collect import collect_from_each
-    from jaxsafe.dataset.files import facts, save_dataset, save_minari
+    from jaxsafe.dataset.files import facts, require_minari, save_dataset, save_minari
     from jaxsafe.envs import find_task
     from jaxsafe.storage.provenance import versions
 
@@ -79,6 +79,8 @@ def main(argv: Sequence[str]) -> int:
     place = Path(options.out or f"{name}_{options.kind}.npz")
     if options.format == "npz" and place.suffix != ".npz":
         raise ConfigError(f"out: expected NAME.npz, found {place}")
+    if options.format == "minari":
+        require_minari(env)
     key = jax.random.key(options.seed)
     data = collect_from_each(env, policy_of, parameters, key, options.steps)
     found = facts(env, data)

@@ -93,15 +93,12 @@ def save_minari(
     Raises:
         ConfigError: Minari is not installed, it has such a dataset, or the name is none for it.
     """
-    try:
-        import minari
-        from minari.data_collector import EpisodeBuffer
-    except ImportError:
-        raise ConfigError("format: minari is not installed; pip install 'minari[hdf5]'") from None
+    require_minari(env)
+    import minari
+    from minari.data_collector import EpisodeBuffer
+
     from jaxsafe.adapters.gymnasium_spaces import spaces
 
-    if env.action_kind == "mixed":
-        raise ConfigError("format: minari takes continuous or discrete actions; use format=npz")
     observation_space, action_space = spaces(env)
     buffers = []
     for number, part in enumerate(data.episodes()):
@@ -137,6 +134,20 @@ def save_minari(
             )
     except (ValueError, FileExistsError) as error:
         raise ConfigError(f"out: {name}: {str(error).splitlines()[0]}") from None
+
+
+def require_minari(env: Environment) -> None:
+    """Refuse a dataset that Minari cannot take, before its steps are collected.
+
+    Raises:
+        ConfigError: Minari is not installed, or actions mix numbers and choices.
+    """
+    try:
+        import minari  # noqa: F401
+    except ImportError:
+        raise ConfigError("format: minari is not installed; pip install 'minari[hdf5]'") from None
+    if env.action_kind == "mixed":
+        raise ConfigError("format: minari takes continuous or discrete actions; use format=npz")
 
 
 def _with_first(values: np.ndarray) -> np.ndarray:

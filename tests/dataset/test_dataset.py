@@ -1,5 +1,6 @@
 """Data for offline learning: every step is one that the environment took."""
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +139,12 @@ def test_minari_reads_every_episode(
         assert dataset.spec.action_space.contains(episode.actions[0])
     with pytest.raises(ConfigError, match="out: jaxsafe/docking2d/test-v0: "):
         main(words)
+
+
+def test_without_minari_nothing_is_collected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "minari", None)
+    with pytest.raises(ConfigError, match="format: minari is not installed; pip install"):
+        main(["env=docking2d", "kind=random", "format=minari", "steps=1_000_000"])
 
 
 @pytest.mark.parametrize(
