@@ -31,7 +31,7 @@ from jaxsafe.rta.filter import RTA
 from jaxsafe.schema.component import Component, Range, Unit
 from jaxsafe.schema.describe import Described, Rows, brief, unbroken
 from jaxsafe.schema.dotted_paths import set_path
-from jaxsafe.schema.errors import ConfigError, nearest, part, show
+from jaxsafe.schema.errors import ConfigError, choices_text, part, show
 from jaxsafe.schema.ties import Tie, follow
 from jaxsafe.simulation.controllers import Actuator
 from jaxsafe.simulation.initializers import uniform
@@ -415,9 +415,7 @@ def reset_to(
     names = [platform.name for platform in env.platforms]
     for name in start:
         if name not in names:
-            raise ConfigError(
-                f"reset_to: unknown platform {show(name)}; choose from {nearest(name, names)}"
-            )
+            raise ConfigError(f"reset_to: unknown platform {show(name)}{choices_text(name, names)}")
     platforms = {
         platform.name: platform.place(start.get(platform.name, {})) for platform in env.platforms
     }
@@ -599,10 +597,8 @@ def _chosen_parameters(env: Environment, parameters: Mapping[str, Any]) -> Param
     """Check the numbers that a user chose in place of random ones, and convert them."""
     for path in parameters:
         if path not in env.randomize:
-            choices = nearest(path, env.randomize) or "none"
-            raise ConfigError(
-                f"reset_to: parameter {show(path)} is not random; choose from {choices}"
-            )
+            hint = choices_text(path, env.randomize)
+            raise ConfigError(f"reset_to: parameter {show(path)} is not random{hint}")
     for path in env.randomize:
         if path not in parameters:
             raise ConfigError(

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 from jaxsafe.autoreset import choose, renew
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment, reset, step
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.types import Key, Record, State, TimeStep, Transition, require_key
 
 Policy = Callable[[Key, Array], Array]
@@ -145,8 +145,9 @@ def rollout(
         require_count("rollout: num_envs", num_envs, least=1)
     require_key("rollout: key", key)
     if record not in RECORDS:
-        choice = nearest(record, RECORDS)
-        raise ConfigError(f"rollout: record: unknown record {show(record)}; choose from {choice}")
+        raise ConfigError(
+            f"rollout: record: unknown record {show(record)}{choices_text(record, RECORDS)}"
+        )
     if start is not None:
         num_envs = _num_envs(start, num_envs)
     key_start, key_run = jax.random.split(key)

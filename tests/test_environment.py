@@ -104,13 +104,13 @@ def test_reset_to_may_move_the_chief(env: Environment) -> None:
         (
             {"deputi": {}},
             (
-                r"^reset_to: unknown platform 'deputi'; choose from chief, deputy\. Did you mean"
-                r" 'deputy'\?$"
+                r"^reset_to: unknown platform 'deputi'\. Did you mean 'deputy'\? Choose from chief,"
+                r" deputy$"
             ),
         ),
         (
             {"deputy": {"positon": [1, 2]}},
-            r"^reset_to: deputy has no field 'positon'; .* Did you mean 'position'\?$",
+            r"^reset_to: deputy has no field 'positon'\. Did you mean 'position'\? Choose from",
         ),
         (
             {"deputy": {"position": [1, 2, 3], "velocity": [0, 0]}},

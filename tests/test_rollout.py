@@ -381,7 +381,10 @@ def test_a_policy_that_forgets_the_batch_is_told_so(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"record": "transition"}, "rollout: record: unknown record 'transition'; choose from"),
+        (
+            {"record": "transition"},
+            "rollout: record: unknown record 'transition'. Did you mean 'transitions'",
+        ),
         ({"start": 3}, "rollout: start: expected the RolloutState that an earlier rollout"),
     ],
 )

@@ -16,7 +16,7 @@ import numpy as np
 from jaxsafe.config import override
 from jaxsafe.environment import Environment
 from jaxsafe.envs import make
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, show
 
 FORKED = (
     "forked processes would wait for ever for JAX's threads; start workers with context='spawn'"
@@ -64,7 +64,7 @@ def environment(
     choices = list(inspect.signature(make).parameters)[1:]
     for option in options:
         if option not in choices:
-            raise ConfigError(f"{option}: unknown option; choose from {nearest(option, choices)}")
+            raise ConfigError(f"{option}: unknown option{choices_text(option, choices)}")
     if not isinstance(task, Environment):
         return make(task, overrides, **options)
     if options:

@@ -30,7 +30,7 @@ from jaxsafe.adapters import FORKED, checked_count, elements, environment, refus
 from jaxsafe.adapters.gymnasium_spaces import facts, masked, spaces
 from jaxsafe.adapters.packed_batch import Episodes, PackedBatch
 from jaxsafe.environment import Environment, reset_to
-from jaxsafe.schema.errors import ConfigError, nearest
+from jaxsafe.schema.errors import ConfigError, choices_text
 from jaxsafe.types import Key
 from jaxsafe.uncertain import episode_key, random_parts
 
@@ -675,7 +675,7 @@ def _checked_options(
         raise ConfigError(f"reset: options: expected a dict, found {options!r}")
     for option in options or {}:
         if option not in known:
-            raise ConfigError(f"reset: options: unknown {option!r}; choose from {', '.join(known)}")
+            raise ConfigError(f"reset: options: unknown {option!r}{choices_text(option, known)}")
     return options or {}
 
 
@@ -704,14 +704,14 @@ def _checked_mode(mode: AutoresetMode | str) -> AutoresetMode:
     except ValueError:
         choices = [member.value for member in AutoresetMode]
         raise ConfigError(
-            f"autoreset_mode: unknown mode {mode!r}; choose from {nearest(str(mode), choices)}"
+            f"autoreset_mode: unknown mode {mode!r}{choices_text(str(mode), choices)}"
         ) from None
 
 
 def _checked_render_mode(render_mode: str | None, known: Sequence[str]) -> str | None:
     if render_mode not in (None, *known):
         raise ConfigError(
-            f"render_mode: found {render_mode!r}; choose from {', '.join(known)}, None"
+            f"render_mode: found {render_mode!r}{choices_text(render_mode, [*known, None])}"
         )
     return render_mode
 

@@ -18,7 +18,7 @@ from jaxsafe.environment import Environment
 from jaxsafe.envs.task import registered
 from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.schema.component import choices
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.schema.user_modules import import_modules
 
 CONTROLLER = "controller/"
@@ -109,7 +109,7 @@ def find_law(run: str, env: Environment) -> ControlLaw:
     if name not in laws:
         whose = env.task or "this environment"
         raise ConfigError(
-            f"controller: {whose} has no controller {show(name)}; choose from {nearest(name, laws)}"
+            f"controller: {whose} has no controller {show(name)}{choices_text(name, laws)}"
         )
     return laws[name]()
 

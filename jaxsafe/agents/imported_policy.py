@@ -23,7 +23,7 @@ from jaxsafe.agents.networks import MAX_LAYERS, Params
 from jaxsafe.agents.onnx_reader import Network, read_graph
 from jaxsafe.environment import Environment
 from jaxsafe.rollout import Policy, RecurrentPolicy
-from jaxsafe.schema.errors import ConfigError, nearest
+from jaxsafe.schema.errors import ConfigError, choices_text
 from jaxsafe.storage.archive import open_archive
 
 ACTIVATIONS: Mapping[str, Callable[[Array], Array]] = {
@@ -151,7 +151,7 @@ def _read_layers(
     """
     if activation not in ACTIVATIONS:
         raise ConfigError(
-            f"activation: found {activation!r}; choose from {nearest(activation, ACTIVATIONS)}"
+            f"activation: found {activation!r}{choices_text(activation, ACTIVATIONS)}"
         )
     with open_archive(path, "cannot be read: not an .npz of numbers") as archive:
         count = len(archive.names) // 2

@@ -28,7 +28,7 @@ from jaxsafe.control.law import LawPolicy
 from jaxsafe.environment import Environment
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.convert import to_component, to_data
-from jaxsafe.schema.errors import ConfigError, nearest
+from jaxsafe.schema.errors import ConfigError, choices_text
 from jaxsafe.schema.user_modules import imports_allowed
 from jaxsafe.storage.archive import Archive, open_archive
 from jaxsafe.storage.files import parse_json, write_bytes
@@ -199,8 +199,8 @@ def find_policy(policy: str | os.PathLike) -> Path:
     name = str(policy).removeprefix(PRETRAINED)
     if name not in pretrained:
         raise ConfigError(
-            f"policy: {str(policy)!r} is no .npz file and not pretrained; "
-            f"choose from {nearest(name, pretrained)}"
+            f"policy: {str(policy)!r} is no .npz file and not pretrained"
+            f"{choices_text(name, pretrained)}"
         )
     return pretrained[name]
 

@@ -44,10 +44,10 @@ def main() -> None:
             print(_list() if name in HELP else f"jaxsafe {version()}")
         return
     if name not in COMMANDS:
-        from jaxsafe.schema.errors import nearest, show
+        from jaxsafe.schema.errors import choices_text, show
 
-        choice = nearest(name, COMMANDS)
-        print(f"error: unknown command {show(name)}; choose from {choice}", file=sys.stderr)
+        hint = choices_text(name, COMMANDS)
+        print(f"error: unknown command {show(name)}{hint}", file=sys.stderr)
         sys.exit(2)
     sys.argv = [f"jaxsafe {name}", *words]
     importlib.import_module(f"jaxsafe.commands.{name}").command()

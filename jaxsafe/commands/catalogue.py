@@ -97,11 +97,10 @@ def find(name: str) -> list[type[Component]]:
     matches = [cls for cls in dict.fromkeys(types) if title(cls) == name]
     if not matches:
         near = difflib.get_close_matches(name, [*SECTIONS, *map(title, types)], n=3, cutoff=0.6)
-        hint = f". Did you mean {' or '.join(map(repr, dict.fromkeys(near)))}?" if near else ""
-        raise ConfigError(
-            f"types: nothing is called {show(name)}; choose from the types and from the sections "
-            f"{', '.join(SECTIONS)}{hint}"
-        )
+        hint = f"; choose from the types and from the sections {', '.join(SECTIONS)}"
+        if near:
+            hint = f". Did you mean {' or '.join(map(repr, dict.fromkeys(near)))}?"
+        raise ConfigError(f"types: nothing is called {show(name)}{hint}")
     return matches
 
 

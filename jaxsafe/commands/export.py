@@ -15,7 +15,7 @@ from jaxsafe.commands import cli
 from jaxsafe.commands.options import Count, File, Option, Seed
 from jaxsafe.commands.policy_options import PolicyOptions, differences
 from jaxsafe.schema.component import Range
-from jaxsafe.schema.errors import ConfigError, missing, nearest
+from jaxsafe.schema.errors import ConfigError, choices_text, missing
 
 if TYPE_CHECKING:
     from jaxsafe.agents.imported_policy import ForeignPolicy
@@ -116,9 +116,7 @@ def main(argv: Sequence[str]) -> int:
         boxes = [f"box.{name}" for name in options.box]
         options.refuse_beside(["steps", *boxes], "without format=vnnlib")
     if options.inputs not in kinds:
-        raise ConfigError(
-            f"inputs: found {options.inputs!r}; choose from {nearest(options.inputs, kinds)}"
-        )
+        raise ConfigError(f"inputs: found {options.inputs!r}{choices_text(options.inputs, kinds)}")
     about = {"policy": stem, "jaxsafe": versions()["jaxsafe"]}
     if form == "vnnlib":
         target = Path(out or f"{stem}_closed_loop.vnnlib")

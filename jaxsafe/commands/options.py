@@ -18,7 +18,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from jaxsafe.config import arguments
 from jaxsafe.schema.component import Component, Field, Range, fields, marks
 from jaxsafe.schema.convert import bare
-from jaxsafe.schema.errors import ConfigError, meant_environment, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, meant_environment, show
 
 Count = Annotated[int, Range(1, largest=arguments.MAX_COUNT)]
 """A number of episodes, steps or environments."""
@@ -180,10 +180,14 @@ class CommandOptions(Component):
     def refuse_others(self, *names: str) -> None:
         """Refuse all options except these and the options of every command.
 
+        Args:
+            names: the options. The first one is the reason why there may be no others.
+
         Raises:
             ConfigError: another option was given.
         """
-        _refuse(self.without(*names), names)
+        for name in self.without(*names):
+            raise ConfigError(f"{name}: no option beside {names[0]}{choices_text(name, names)}")
 
     def without(self, *names: str) -> dict[str, Any]:
         """Return the options that were given, except these and the options of every command."""
@@ -256,7 +260,7 @@ def _name(value: Any, field: Field, key: str) -> str:
     if names and name not in names:
         kind = option(field).kind
         unknown = f"unknown {kind}" if kind else "found"
-        raise ConfigError(f"{key}: {unknown} {show(name)}; choose from {nearest(name, names)}")
+        raise ConfigError(f"{key}: {unknown} {show(name)}{choices_text(name, names)}")
     return name
 
 
@@ -281,4 +285,4 @@ def _refuse(given: Iterable[str], known: Iterable[str]) -> None:
     for name in given:
         if "env.PATH" in known and (hint := meant_environment(name, ("env", "sweep"))):
             raise ConfigError(hint)
-        raise ConfigError(f"{name}: unknown option; choose from {nearest(name, known)}")
+        raise ConfigError(f"{name}: unknown option{choices_text(name, known)}")

@@ -21,7 +21,7 @@ from jaxsafe.environment import Environment, empty_sim, modelled, reset, step
 from jaxsafe.schema.component import Component, fields
 from jaxsafe.schema.convert import to_value
 from jaxsafe.schema.dotted_paths import join, references, set_path
-from jaxsafe.schema.errors import ConfigError, nearest, show, summarise_error
+from jaxsafe.schema.errors import ConfigError, choices_text, show, summarise_error
 from jaxsafe.schema.ties import follow
 from jaxsafe.schema.user_modules import modules
 from jaxsafe.simulation.platform import Platform
@@ -159,8 +159,7 @@ def _check_reference(place: str, name: str, known: Iterable[str], which: str = "
     known = list(known)
     if name not in known:
         raise ConfigError(
-            f"{place}: nothing{which} is called {show(name)}; "
-            f"choose from {nearest(name, known) or 'none'}"
+            f"{place}: nothing{which} is called {show(name)}{choices_text(name, known)}"
         )
 
 
@@ -195,8 +194,8 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
     for name in controller.names:
         if name not in platform.inputs:
             raise ConfigError(
-                f"{place}.controller.{parts}: {platform.type_name} has no control {name!r};"
-                f" choose from {nearest(name, platform.inputs) or 'none'}"
+                f"{place}.controller.{parts}: {platform.type_name} has no control {name!r}"
+                f"{choices_text(name, platform.inputs)}"
             )
     if is_agent and not (controller.takes_actions and controller.names):
         raise ConfigError(
@@ -217,7 +216,7 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
             if name not in rest:
                 which = "" if name == initializer.name else f"{name}: "
                 raise ConfigError(
-                    f"{start_place}: {which}no such state field; choose from {nearest(name, rest)}"
+                    f"{start_place}: {which}no such state field{choices_text(name, rest)}"
                 )
         undrawn = sorted({*initializer.draws} - drawn)
         if initializer.redraws and undrawn:

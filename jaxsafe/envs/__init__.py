@@ -27,7 +27,7 @@ from jaxsafe.envs.task import (
 )
 from jaxsafe.rta.filter import RTA
 from jaxsafe.schema.dotted_paths import get_path, set_path
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.simulation.controllers import AgentController, Continuous, Discrete, Mixed
 
 __all__ = [
@@ -175,7 +175,7 @@ def _variant_values(name: str, variant: str) -> dict[str, Any]:
     """
     if variant not in VARIANTS:
         raise ConfigError(
-            f"variant: unknown variant {show(variant)}; choose from {nearest(variant, VARIANTS)}"
+            f"variant: unknown variant {show(variant)}{choices_text(variant, VARIANTS)}"
         )
     task = TASKS.get(name.rpartition(":")[2])
     if task is None:
@@ -200,17 +200,13 @@ def _filter(name: str, rta: str | RTA) -> RTA | None:
     presets = {"none": lambda: None, **(task.filters if task else {})}
     if not isinstance(rta, str) or rta not in presets:
         choices = [*presets, "FILE.yaml"]
-        raise ConfigError(
-            f"rta: {name} has no preset {show(rta)}; choose from {nearest(rta, choices)}"
-        )
+        raise ConfigError(f"rta: {name} has no preset {show(rta)}{choices_text(rta, choices)}")
     return presets[rta]()
 
 
 def _with_actions(env: Environment, actions: str) -> Environment:
     if actions not in _ACTIONS:
-        raise ConfigError(
-            f"actions: unknown kind {show(actions)}; choose from {nearest(actions, _ACTIONS)}"
-        )
+        raise ConfigError(f"actions: unknown kind {show(actions)}{choices_text(actions, _ACTIONS)}")
     actuators = env.actuators
     if actions == "continuous":
         actuators = tuple(actuator.replace(discrete=False) for actuator in actuators)

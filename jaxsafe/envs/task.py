@@ -21,7 +21,7 @@ from gymnasium.envs import registration
 from jaxsafe.control.law import ControlLaw
 from jaxsafe.environment import Environment
 from jaxsafe.rta.filter import RTA
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.schema.user_modules import import_modules
 
 Filters = Mapping[str, Callable[[], RTA]]
@@ -110,8 +110,8 @@ def find_task(name: str, place: str = "env", others: Sequence[str] = ()) -> Task
     task = registered(short)
     if task is None:
         raise ConfigError(
-            f"{place}: unknown task {show(short)} and not a .yaml file; "
-            f"choose from {nearest(short, [*TASKS, *STARTERS, *others])}"
+            f"{place}: unknown task {show(short)} and not a .yaml file"
+            f"{choices_text(short, [*TASKS, *STARTERS, *others])}"
         )
     return task
 

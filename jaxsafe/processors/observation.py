@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from jaxsafe.processors.processor import Processor
 from jaxsafe.schema.component import ANY, Range, Unit
-from jaxsafe.schema.errors import nearest
+from jaxsafe.schema.errors import choices_text
 from jaxsafe.simulation.geometry import direction, mag_norm, to_body
 from jaxsafe.simulation.vectors import Vector
 from jaxsafe.types import (
@@ -288,8 +288,7 @@ def _not_observable(env: Environment, what: str, *places: str) -> dict[str, str]
     for name in places:
         quantities = platforms[name].quantities() if name in platforms else ("position", "velocity")
         if what not in quantities:
-            choices = nearest(what, quantities)
-            return {"what": f"{name} has no quantity {what!r}; choose from {choices}"}
+            return {"what": f"{name} has no quantity {what!r}{choices_text(what, quantities)}"}
     return {}
 
 

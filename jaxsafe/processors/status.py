@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.processors.processor import Limit, Processor, Side, beyond
 from jaxsafe.schema.component import ANY, Range, Unit
+from jaxsafe.schema.errors import choices_text
 from jaxsafe.simulation.between import bend
 from jaxsafe.simulation.geometry import angle_between, closest_approach, safe_norm, to_body
 from jaxsafe.simulation.vectors import Vector
@@ -255,7 +256,7 @@ class VectorComponent(Status, type="component"):
         axes = "xyz"[: env.agent_platform.dimension]
         if self.axis in axes:
             return {}
-        return {"axis": f"found {self.axis!r}; choose from {', '.join(axes)}"}
+        return {"axis": f"found {self.axis!r}{choices_text(self.axis, axes)}"}
 
 
 class ControlStatus(Status):

@@ -17,7 +17,7 @@ from jaxsafe.plot.figures import Episodes, Rows, speed_distance, trajectories
 from jaxsafe.plot.interventions import interventions, most_altered
 from jaxsafe.plot.learning import learning_curves
 from jaxsafe.plot.style import keep_away_distances, kept_out, save, to_bytes
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.storage.files import read_rows
 from jaxsafe.storage.forms import (
     ANYTHING,
@@ -98,7 +98,7 @@ def draw(
             of a column of `panels`.
     """
     if x not in AXES:
-        raise ConfigError(f"x: unknown axis {show(x)}; choose from {nearest(x, AXES)}")
+        raise ConfigError(f"x: unknown axis {show(x)}{choices_text(x, AXES)}")
     rows = progress(run)
     config, env, name = run_directory.read(run, "run")
     seeds = len({row["seed"] for row in rows})

@@ -33,7 +33,7 @@ from jaxsafe.schema.component import (
 )
 from jaxsafe.schema.component import field as field_of
 from jaxsafe.schema.dotted_paths import join
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.schema.user_modules import import_modules
 
 DIRECTORY: ContextVar[Path] = ContextVar("DIRECTORY", default=Path())
@@ -77,9 +77,7 @@ def to_component(data: Any, base: type[Kind], place: str) -> Kind:
     entries = cls.prepared(entries, label)
     for name in entries:
         if name not in table:
-            raise ConfigError(
-                f"{label}: unknown field {show(name)}; choose from {nearest(name, table)}"
-            )
+            raise ConfigError(f"{label}: unknown field {show(name)}{choices_text(name, table)}")
     for name, field in table.items():
         if field.required and name not in entries:
             raise ConfigError(f"{label}: field {name!r} is missing; it takes {expects(field)}")
@@ -137,15 +135,13 @@ def choose_class(entries: dict, base: type[Kind], place: str) -> tuple[type[Kind
     if not options:
         return base, entries
     if "type" not in entries:
-        raise ConfigError(
-            f"{place}: field 'type' is missing; choose from {nearest('', sorted(options))}"
-        )
+        raise ConfigError(f"{place}: field 'type' is missing{choices_text('', sorted(options))}")
     kind = entries.pop("type")
     if isinstance(kind, str) and ":" in kind:
         return _import_class(kind, base, place), entries
     if not isinstance(kind, str) or kind not in options:
         raise ConfigError(
-            f"{place}: unknown type {show(kind)}; choose from {nearest(kind, sorted(options))}"
+            f"{place}: unknown type {show(kind)}{choices_text(kind, sorted(options))}"
         )
     return options[kind], entries
 
@@ -161,7 +157,7 @@ def _no_mapping(data: Any, base: type[Component], place: str) -> ConfigError:
         field.required for option in options.values() for field in fields(option).values()
     )
     if isinstance(data, str) and name_suffices:
-        return ConfigError(f"{place}: found {show(data)}; choose from {nearest(data, options)}")
+        return ConfigError(f"{place}: found {show(data)}{choices_text(data, options)}")
     return ConfigError(
         f"{place or 'environment'}: expected a mapping of fields, found {_show(data)}"
     )
@@ -207,9 +203,7 @@ def _to_structure(value: Any, hint: Any, field: Field, place: str) -> Any:
         return _to_mapping(value, arguments[1], place)
     if origin is Literal:
         if value not in arguments:
-            raise ConfigError(
-                f"{place}: found {_show(value)}; choose from {nearest(value, arguments)}"
-            )
+            raise ConfigError(f"{place}: found {_show(value)}{choices_text(value, arguments)}")
         return value
     given = value
     if hint is int and isinstance(value, float) and value.is_integer():

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Annotated, Any
 
 from jaxsafe.schema.component import Component, Field, Refers, fields
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, show
 
 Convert = Callable[[Any, Field, str], Any]
 """`convert(value, field, place)` returns the value that the field takes.
@@ -92,11 +92,11 @@ def _set(
         return component.replace(**{shorthand: _set_item(parts, path, value, convert, place)})
     if head not in table:
         meant = _meant(component, path, [*table, *names], shorthand)
-        # A path that leads into another part is shown whole.
-        hint = f". Did you mean {join(place, meant) if '.' in meant else meant!r}?" if meant else ""
+        if meant and "." in meant:
+            meant = join(place, meant)  # a path that leads into another part is shown whole
         raise ConfigError(
-            f"{join(place, head)}: unknown field {show(head)}; "
-            f"choose from {', '.join([*table, *names])}{hint}"
+            f"{join(place, head)}: unknown field {show(head)}"
+            f"{choices_text(head, [*table, *names], meant)}"
         )
     field_place = join(place, head)
     content = getattr(component, head)
@@ -119,7 +119,7 @@ def _set(
         key = ".".join(rest)
         if not by_path and key not in content:
             raise ConfigError(
-                f"{field_place}: unknown name {show(key)}; choose from {nearest(key, content)}"
+                f"{field_place}: unknown name {show(key)}{choices_text(key, content)}"
             )
         entries = {**content, key: value}
         return component.replace(**{head: convert(entries, table[head], field_place)})
@@ -233,7 +233,7 @@ def index_of(items: tuple, name: str, place: str) -> int:
     names = [getattr(item, "name", str(index)) for index, item in enumerate(items)]
     if name not in names:
         raise ConfigError(
-            f"{join(place, name)}: unknown name {show(name)}; choose from {nearest(name, names)}"
+            f"{join(place, name)}: unknown name {show(name)}{choices_text(name, names)}"
         )
     return names.index(name)
 

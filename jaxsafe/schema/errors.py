@@ -23,6 +23,10 @@ MAX_PRINTED_BITS = 10_000
 """A longer whole number is not printed, because Python refuses to write more than 4300 digits."""
 
 
+MAX_CHOICES = 10
+"""Most names that are listed after a near miss, so that the end of the line does not hide it."""
+
+
 class ConfigError(ValueError):
     """A value from outside is wrong.
 
@@ -86,12 +90,24 @@ def meant_environment(name: str, groups: Iterable[str]) -> str | None:
     return f"{name}: unknown option; a field of the environment is written env.{name}"
 
 
-def nearest(found: object, allowed: Iterable[object]) -> str:
-    """List the allowed names, then the one nearest to `found`: `a, b, c. Did you mean 'b'?`."""
+def choices_text(found: object, allowed: Iterable[object], meant: str | None = None) -> str:
+    """Return the end of a message about a wrong name.
+
+    It is `. Did you mean 'b'? Choose from a, b, c`, or `; choose from a, b, c` if no name is near.
+
+    Args:
+        found: the wrong name, or another value that stands in its place.
+        allowed: the names that are allowed. Many of them are left out after a near one.
+        meant: the name that was probably meant, if the caller knows better than which is nearest.
+    """
     names = [str(name) for name in allowed]
     word = found if isinstance(found, str) else show(found)
-    matches = difflib.get_close_matches(word, names, n=1, cutoff=0.5)
-    return ", ".join(names) + (f". Did you mean {matches[0]!r}?" if matches else "")
+    meant = meant or next(iter(difflib.get_close_matches(word, names, n=1, cutoff=0.5)), None)
+    listed = ", ".join(names) or "none"
+    if meant is None:
+        return f"; choose from {listed}"
+    hint = f". Did you mean {meant!r}?"
+    return f"{hint} Choose from {listed}" if len(names) <= MAX_CHOICES else hint
 
 
 @contextmanager

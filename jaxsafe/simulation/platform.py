@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jaxsafe.schema.component import Component, Range
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.simulation.controllers import Controller, Controls, Uncontrolled
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.simulation.initializers import Initializer
@@ -173,8 +173,8 @@ class Platform(Component):
         for name in values:
             if name not in vars(rest):
                 raise ConfigError(
-                    f"reset_to: {self.name} has no field {show(name)};"
-                    f" choose from {nearest(name, vars(rest))}"
+                    f"reset_to: {self.name} has no field {show(name)}"
+                    f"{choices_text(name, vars(rest))}"
                 )
         for name in self.random_fields:
             if name not in values:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsafe.schema.component import Component, Range, choices
-from jaxsafe.schema.errors import nearest
+from jaxsafe.schema.errors import choices_text
 from jaxsafe.simulation.geometry import (
     Coordinates,
     Heading,
@@ -143,8 +143,8 @@ class Region(Component):
         if space not in self.dimensions:
             fitting = [name for name, kind in choices(Region).items() if space in kind.dimensions]
             return {
-                "": f"a {self.type_name} is no part of a space of {space} dimensions;"
-                f" choose from {nearest('', sorted(fitting))}"
+                "": f"a {self.type_name} is no part of a space of {space} dimensions"
+                f"{choices_text('', sorted(fitting))}"
             }
         return {}
 

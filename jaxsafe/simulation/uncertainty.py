@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.schema.component import ANY, Component, Range, Unit
-from jaxsafe.schema.errors import nearest
+from jaxsafe.schema.errors import choices_text
 from jaxsafe.simulation.controllers import Bound, TimeConstant
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.types import Key, Number, PlatformName, Sim
@@ -314,8 +314,8 @@ class StateError(Uncertainty):
         rest = env.platform(self.of).rest()
         fields = [name for name in {**vars(rest), "velocity": None} if name != "orientation"]
         if self.what not in fields:
-            choices = nearest(self.what, fields)
-            return {"what": f"{self.of} has no {self.what!r} in its state; choose from {choices}"}
+            hint = choices_text(self.what, fields)
+            return {"what": f"{self.of} has no {self.what!r} in its state{hint}"}
         return {}
 
     def true(self, sim: Sim) -> Array:
@@ -381,6 +381,6 @@ def _no_actuators(env: Environment, field: str, names: tuple[str, ...]) -> dict[
     actuators = [actuator.name for actuator in env.actuators]
     for name in names:
         if name not in actuators:
-            choices = nearest(name, actuators) or "none"
-            return {field: f"{env.agent} has no actuator {name!r}; choose from {choices}"}
+            hint = choices_text(name, actuators)
+            return {field: f"{env.agent} has no actuator {name!r}{hint}"}
     return {}

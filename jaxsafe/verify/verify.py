@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jaxsafe.devices.seed_mapper import usable_cores
 from jaxsafe.environment import Environment, reset_to, step
 from jaxsafe.rollout import Policy, RecurrentPolicy
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.verify.loop import FIELDS, Loop, closed_loop, start_of
 from jaxsafe.verify.tube import Claims, tube
 
@@ -165,7 +165,7 @@ def corners(env: Environment, box: Box) -> Boxes:
     names = {f"{env.agent}.{field}": field for field in FIELDS}
     for key in box:
         if key not in names and key not in FIELDS:
-            raise ConfigError(f"box.{key}: no field of a start; choose from {nearest(key, names)}")
+            raise ConfigError(f"box.{key}: no field of a start{choices_text(key, names)}")
     dimension = env.agent_platform.dimension
     ends = []
     for name, field in names.items():

@@ -588,11 +588,11 @@ def test_workers_that_are_spawned_work() -> None:
         (lambda: GymEnv("doking3d"), "Did you mean 'docking3d'"),
         (
             lambda: GymEnv("docking2d", action="discrete"),
-            "action: unknown option; choose from .*'actions'",
+            r"action: unknown option\. Did you mean 'actions'\?",
         ),
         (
             lambda: GymEnv("docking2d", render_mode="rgb"),
-            "render_mode: found 'rgb'; choose from rgb_array, human, None",
+            r"found 'rgb'\. Did you mean 'rgb_array'\? Choose from rgb_array, human, None$",
         ),
         (
             lambda: GymVectorEnv("docking2d", 1, render_mode="human"),

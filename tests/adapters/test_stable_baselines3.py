@@ -94,7 +94,8 @@ def test_options_place_environments_and_the_infos_of_starts_are_kept(make: Any) 
         env.set_options([placed(20.0)])
     env.set_options({"stat": {}})
     with pytest.raises(
-        ConfigError, match="reset: options: unknown 'stat'; choose from start, parameters"
+        ConfigError,
+        match=r"options: unknown 'stat'\. Did you mean 'start'\? Choose from start, parameters",
     ):
         env.reset()
 

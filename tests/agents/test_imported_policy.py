@@ -184,7 +184,7 @@ def test_changes_of_the_environment_come_before_what_a_network_must_fit(
     )
     with pytest.raises(ConfigError, match=r"four\.npz: does not take an observation of 6 numbers"):
         main(["run=four.npz", "env=docking2d"])
-    with pytest.raises(ConfigError, match=r"variant: unknown variant 'relesed'; choose from"):
+    with pytest.raises(ConfigError, match=r"variant 'relesed'\. Did you mean 'released'\?"):
         main([*words, "variant=relesed"])
 
 
@@ -452,7 +452,9 @@ def test_more_mistakes_are_named(tmp_path: Path) -> None:
     np.savez(tmp_path / "x.npz", w=np.ones(3))
     with pytest.raises(ConfigError, match="expected kernel_0, bias_0, kernel_1, …, found w"):
         read_foreign(tmp_path / "x.npz", env)
-    with pytest.raises(ConfigError, match="activation: found 'gelu'; choose from"):
+    with pytest.raises(
+        ConfigError, match=r"activation: found 'gelu'\. Did you mean 'relu'\? Choose from"
+    ):
         read_foreign(tmp_path / "x.npz", env, "gelu")
     with pytest.raises(ConfigError, match=r"env: missing; the task in which x\.onnx shall act"):
         main(["run=x.onnx"])

@@ -208,9 +208,15 @@ def test_a_network_of_a_users_module_is_trained_and_read_in_another_process(
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"agent.actor": "mpl"}, "agent.actor: found 'mpl'; choose from mlp, gru"),
+        (
+            {"agent.actor": "mpl"},
+            r"agent.actor: found 'mpl'. Did you mean 'mlp'\? Choose from mlp, gru",
+        ),
         ({"agent.actor.width": 3}, "agent.actor.width: unknown field 'width'; choose from"),
-        ({"agent.actor.activation": "tan"}, "agent.actor.activation: found 'tan'; choose from"),
+        (
+            {"agent.actor.activation": "tan"},
+            r"agent.actor.activation: found 'tan'. Did you mean 'tanh'\? Choose from",
+        ),
         ({"agent.critic": {"type": "mlp", "hidden": [0]}}, r"agent.critic.hidden.\[0\]: expected"),
         ({"agent.actor": "nowhere:Net"}, "cannot import 'nowhere'"),
         ({"agent.actor": "math:Net"}, "agent.actor: math has no Network with a type called 'Net'"),
@@ -218,7 +224,10 @@ def test_a_network_of_a_users_module_is_trained_and_read_in_another_process(
             {"agent.actor": "gru", "ppo.num_envs": 6, "ppo.num_minibatches": 4},
             "expected a divisor of ppo.num_envs = 6, because a network remembers, found 4",
         ),
-        ({"agent.hidden": [8]}, "agent.hidden: unknown field 'hidden'; choose from"),
+        (
+            {"agent.hidden": [8]},
+            r"agent.hidden: unknown field 'hidden'. Did you mean 'agent.actor.hidden'\?",
+        ),
     ],
 )
 def test_what_no_network_can_be_is_told_in_one_line(options: dict[str, Any], message: str) -> None:

@@ -58,6 +58,6 @@ def test_pretrained_policies_are_evaluated_by_name(
 def test_an_unknown_name_is_told_with_those_that_are_known() -> None:
     with pytest.raises(
         ConfigError,
-        match=r"policy: 'docking' is no .npz file and not pretrained; choose from docking2d, ",
+        match=r"not pretrained\. Did you mean 'docking3d'\? Choose from docking2d, ",
     ):
         jaxsafe.load_policy("docking")

@@ -334,7 +334,10 @@ def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["tasks=docking4d"], "tasks: found 'docking4d'; choose from rejoin2d"),
+        (
+            ["tasks=docking4d"],
+            "tasks: found 'docking4d'. Did you mean 'docking3d'? Choose from rejoin2d",
+        ),
         (
             ["kinds=[engineered_features,plane]"],
             "kinds: found 'plane'; choose from engineered_features, observation_only,"

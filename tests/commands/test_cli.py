@@ -74,14 +74,12 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
     [
         (
             ["env=doking3d"],
-            "env: unknown task 'doking3d' and not a .yaml file; choose from rejoin2d, rejoin3d,"
-            " docking2d, "
-            "docking3d, docking2d_oriented, docking1d. Did you mean 'docking3d'?",
+            "env: unknown task 'doking3d' and not a .yaml file. Did you mean 'docking3d'? "
+            "Choose from rejoin2d, rejoin3d, docking2d, docking3d, docking2d_oriented, docking1d\n",
         ),
         (["seeds=2"], "env: missing; for instance env=docking3d"),
         (["env="], "env: expected a name or a path, found None"),
-        (["env=docking3d", "sedes=2"], "sedes: unknown field 'sedes'; choose from"),
-        (["env=docking3d", "sedes=2"], "Did you mean 'seeds'?"),
+        (["env=docking3d", "sedes=2"], "sedes: unknown field 'sedes'. Did you mean 'seeds'?\n"),
         (["env=docking3d", "seeds=0"], "seeds: expected a whole number ≥ 1, found 0"),
         (["env=docking3d", "seeds=ten"], "seeds: expected a whole number ≥ 1, found 'ten'"),
         (["env=docking3d", "seeds=2.5"], "seeds: expected a whole number ≥ 1, found 2.5"),
@@ -90,8 +88,8 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
         (["env=docking3d", "seeds"], "argument 'seeds': expected key=value"),
         (
             ["env=docking3d", "preset=engineered_featurs"],
-            "preset: unknown preset 'engineered_featurs'; choose from engineered_features,"
-            " observation_only, many_envs, shortest_time. Did you mean 'engineered_features'?",
+            "preset: unknown preset 'engineered_featurs'. Did you mean 'engineered_features'? "
+            "Choose from engineered_features, observation_only, many_envs, shortest_time\n",
         ),
         (["env=docking3d", "ppo.gama=0.9"], "ppo.gama: unknown field 'gama'"),
         (["env=docking3d", "ppo.gamma=1.5"], "ppo.gamma: expected a number in [0, 1], found 1.5"),
@@ -122,8 +120,8 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
         ),
         (
             ["env=docking3d", "agent.features=dock"],
-            "agent.features: found 'dock'; choose from none, docking, approach, "
-            "rejoin. Did you mean 'docking'?",
+            "agent.features: found 'dock'. Did you mean 'docking'? "
+            "Choose from none, docking, approach, rejoin\n",
         ),
         (["env=docking3d", "actions=discret"], "Did you mean 'discrete'?"),
         (
@@ -144,7 +142,7 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
         ),
         (["env=nowhere.yaml"], "nowhere.yaml: cannot be read: No such file or directory"),
         (["resume=runs/x"], "resume: no run in 'runs/x' (a directory with config.yaml)"),
-        (["resume=runs/x", "seeds=5"], "seeds: unknown option; choose from resume"),
+        (["resume=runs/x", "seeds=5"], "seeds: no option beside resume. Did you mean 'steps'?"),
         (["env=docking3d", "out=/proc/nowhere"], "out: cannot write /proc/nowhere"),
     ],
 )
@@ -158,16 +156,16 @@ def test_bad_options_of_train_are_told_in_one_line(
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("gamma=0.9", "gamma: unknown field 'gamma'; .* Did you mean 'ppo.gamma'"),
-        ("lr=1e-3", "lr: unknown field 'lr'; .* Did you mean 'ppo.learning_rate'"),
-        ("ppo.lr=1e-3", "ppo.lr: unknown field 'lr'; .* Did you mean 'learning_rate'"),
+        ("gamma=0.9", "gamma: unknown field 'gamma'. Did you mean 'ppo.gamma'"),
+        ("lr=1e-3", "lr: unknown field 'lr'. Did you mean 'ppo.learning_rate'"),
+        ("ppo.lr=1e-3", "ppo.lr: unknown field 'lr'. Did you mean 'learning_rate'"),
         ("ent_coef=0", "Did you mean 'ppo.entropy_coefficient'"),
         ("epochs=3", "Did you mean 'ppo.num_epochs'"),
         ("env.obs=position", "Did you mean 'observation'"),
-        ("env.mass=14", "env.mass: unknown field 'mass'; .* Did you mean 'env.deputy.mass'"),
+        ("env.mass=14", "env.mass: unknown field 'mass'. Did you mean 'env.deputy.mass'"),
         ("deputy.mass=14", "deputy.mass: unknown option; .* is written env.deputy.mass"),
         ("pppo.gamma=0.9", "Did you mean 'ppo'"),
-        ("env.deputy.mas=14", "env.deputy.mas: unknown field 'mas'; .* Did you mean 'mass'"),
+        ("env.deputy.mas=14", "env.deputy.mas: unknown field 'mas'. Did you mean 'mass'"),
     ],
 )
 def test_near_misses_lead_on(fails: Callable[..., str], word: str, message: str) -> None:
@@ -274,7 +272,7 @@ def test_an_unwritable_output_is_told_in_one_line(
         (["run=pretrained/x"], "policy: 'pretrained/x' is no .npz file and not pretrained"),
         (["run=x.npz"], "x.npz: cannot be read: No such file or directory"),
         (["run=runs/x", "render=avi"], "render: found 'avi'; choose from gif, mp4"),
-        (["run=runs/x", "episods=5"], "episods: unknown option; choose from"),
+        (["run=runs/x", "episods=5"], "episods: unknown option. Did you mean 'episodes'?"),
         (
             ["docking3d"],
             "run: docking3d is a task; name a run of it, or pretrained/docking3d for the policy",
@@ -289,7 +287,7 @@ def test_bad_options_of_evaluate_are_told_in_one_line(
 
 def test_bad_options_of_plot_are_told_in_one_line(fails: Callable[..., str]) -> None:
     assert "run: no run in 'x'" in fails(plot, "run=x")
-    assert "x: unknown axis 'stps'; choose from steps, wall. Did you mean 'steps'?" in fails(
+    assert "x: unknown axis 'stps'. Did you mean 'steps'? Choose from steps, wall" in fails(
         plot, "run=x", "x=stps"
     )
 
@@ -804,8 +802,9 @@ def test_a_command_is_called_by_its_name(
         commands.main()
     assert left.value.code == 2
     told = capsys.readouterr().err
-    assert told.startswith("error: unknown command 'trian'; choose from train, evaluate")
-    assert told.endswith("Did you mean 'train'?\n")
+    assert told.startswith(
+        "error: unknown command 'trian'. Did you mean 'train'? Choose from train, ev"
+    )
     for name in commands.COMMANDS:
         assert callable(importlib.import_module(f"jaxsafe.commands.{name}").command)
 

@@ -54,7 +54,10 @@ def test_options_have_the_type_of_their_annotation() -> None:
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("nam=x", "nam: unknown option; choose from name, count, .*, box.PATH, imports. Did"),
+        (
+            "nam=x",
+            r"nam: unknown option. Did you mean 'name'\? Choose from name, count, .*, imports$",
+        ),
         ("given=x", "given: unknown option"),
         ("overrides=x", "overrides: unknown option"),
         ("name=[x]", r"name: expected a name or a path, found \['x'\]"),
@@ -63,9 +66,12 @@ def test_options_have_the_type_of_their_annotation() -> None:
         ("count=1e10", "count: expected a whole number from 1 to 2,147,483,647, found 1000"),
         ("seed=true", "seed: expected a whole number ≥ 0, found True"),
         ("ends=[2,1]", r"ends: expected two ends, found \[2, 1\]"),
-        ("kinds=[small,larg]", "kinds: unknown kind 'larg'; choose from small, large. Did you"),
+        (
+            "kinds=[small,larg]",
+            r"kinds: unknown kind 'larg'. Did you mean 'large'\? Choose from small, large$",
+        ),
         ("kinds=[]", "kinds: expected at least one of small, large, found none"),
-        ("color=blu", "color: found 'blu'; choose from red, blue. Did you mean 'blue'"),
+        ("color=blu", r"color: found 'blu'. Did you mean 'blue'\? Choose from red, blue$"),
         ("fast=1", "fast: expected true or false, found 1"),
         ("imports=no", "imports: expected true or false, found 'no'"),
         ("fast", "argument 'fast': expected key=value"),
@@ -88,7 +94,7 @@ def test_an_option_that_is_missing_or_there_twice_is_told() -> None:
         Options.parse(["name=a", "number=2", "count=2"])
     with pytest.raises(ConfigError, match=r"^seed: means nothing here; leave it out$"):
         Options.parse(["name=a", "seed=0"]).refuse_beside(["count", "seed"], "here")
-    with pytest.raises(ConfigError, match=r"^seed: unknown option; choose from name$"):
+    with pytest.raises(ConfigError, match=r"^seed: no option beside name; choose from name$"):
         Options.parse(["name=a", "imports=false", "seed=0"]).refuse_others("name")
 
 

@@ -238,7 +238,10 @@ def test_in_a_file_the_tie_wins_and_says_so(env: Environment) -> None:
         ({SCALE: {"to": LIMIT, "times": float("nan")}}, r"times: expected a number"),
         ({SCALE: {"to": LIMIT, "times": 10**400}}, r"times: expected a number .*, found 1000"),
         ({SCALE: {"to": LIMIT, "times": True}}, r"times: expected a number .*, found True"),
-        ({SCALE: {"too": LIMIT}}, r"unknown field 'too'; choose from to, times. Did you mean 'to'"),
+        (
+            {SCALE: {"too": LIMIT}},
+            r"unknown field 'too'\. Did you mean 'to'\? Choose from to, times",
+        ),
         ({SCALE: LIMIT}, r"expected a mapping of fields, found 'terminal"),
         ([SCALE], r": expected a mapping of names"),
     ],

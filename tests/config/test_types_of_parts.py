@@ -103,7 +103,7 @@ def test_a_part_that_is_not_there_is_made_of_the_given_fields() -> None:
     [
         (
             {"deputy.type": "two_bodies"},
-            "deputy: unknown type 'two_bodies'; choose from anchor, double_integrator, dubins2d, ",
+            "deputy: unknown type 'two_bodies'. Did you mean 'two_body'?",
         ),
         (
             {"deputy.type": "two_body_j2"},
@@ -112,7 +112,7 @@ def test_a_part_that_is_not_there_is_made_of_the_given_fields() -> None:
         (
             {"deputy.type": "reaction_wheel_spacecraft"},
             "platforms.deputy.controller.actuators: reaction_wheel_spacecraft has no control"
-            " 'thrust_x'; choose from thrust, wheel_acceleration",
+            " 'thrust_x'. Did you mean 'thrust'? Choose from thrust, wheel_acceleration",
         ),
         (
             {"deputy.type": "spacecraft", "deputy.eccentricity": 0.1},

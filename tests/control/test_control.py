@@ -254,7 +254,7 @@ def test_a_controller_says_what_it_is_and_what_it_lacks() -> None:
         (lambda: jaxsafe.load_policy("controller/pd"), "env: missing; the environment in which"),
         (
             lambda: jaxsafe.load_policy("controller/pf", env=env),
-            "controller: docking2d has no controller 'pf'; choose from pd, lqr, mpc",
+            "controller: docking2d has no controller 'pf'. Did you mean 'pd'. Choose from pd, lqr",
         ),
         (
             lambda: LQR().policy(jaxsafe.make("rejoin2d")),

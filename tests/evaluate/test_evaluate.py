@@ -132,12 +132,13 @@ def test_evaluations_get_directories_of_their_own(whole: Path, tmp_path: Path) -
 
 def test_a_checkpoint_that_is_not_there_is_told_with_those_that_are(whole: Path) -> None:
     with pytest.raises(
-        ConfigError, match=r"checkpoint: no step 641 in .*; choose from 320, 640, 960, 1280"
+        ConfigError,
+        match=r"checkpoint: no step 641 in .*\. Did you mean '640'\? Choose from 320, 640, 960",
     ):
         main([f"run={whole}", "checkpoint=641"])
     with pytest.raises(
         ConfigError,
-        match=r"checkpoint: found 'lst'; choose from last, best, 320.*Did you mean 'last'\?",
+        match=r"checkpoint: found 'lst'\. Did you mean 'last'\? Choose from last, best, 320",
     ):
         main([f"run={whole}", "checkpoint=lst"])
 

@@ -408,7 +408,7 @@ def test_the_command_writes_each_format(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["run=pretrained/doking"], "Did you mean 'docking2d'|choose from"),
+        (["run=pretrained/doking"], r"Did you mean 'docking3d'\?"),
         (
             ["run=pretrained/docking2d", "format=torch"],
             "format: found 'torch'; choose from onnx, stablehlo, vnnlib",

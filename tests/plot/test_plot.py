@@ -787,7 +787,7 @@ def test_several_runs_in_one_figure_with_a_table(
         (["run=[ppo,limited]", "labels=[x,x]"], "labels: expected different ones, found x, x"),
         (["run=ppo", "width=1"], "width: expected a number of inches from 2 to 40, found 1"),
         (["run=ppo", "width=wide"], "width: expected a number of inches"),
-        (["run=ppo", "panels=[reward]"], "panels: unknown panel 'reward'; choose from .*return"),
+        (["run=ppo", "panels=[reward]"], "panels: unknown panel 'reward'. Did you mean 'return'"),
         (["run=ppo", "panels=[intervention_share]"], "panels: no values of intervention_share"),
         (["run=ppo", "format=bmp"], "format: unknown format 'bmp'; choose from png, pdf, svg"),
     ):

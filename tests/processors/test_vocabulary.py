@@ -734,7 +734,11 @@ def test_a_region_may_stand_where_a_platform_is() -> None:
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        ("status.closing.of", "foccus", r"closing\.of: nothing is called 'foccus'; choose from"),
+        (
+            "status.closing.of",
+            "foccus",
+            r"closing\.of: nothing is called 'foccus'\. Did you mean 'focus'",
+        ),
         ("regions.camera.on", "focus", r"camera\.on: nothing listed before it is called 'focus'"),
         ("regions.camera.on", "nobody", r"camera\.on: nothing is called 'nobody'; choose from"),
         ("regions.zone.size", [1], r"regions\.zone\.size: expected 2 numbers, found 1"),
@@ -749,7 +753,11 @@ def test_a_region_may_stand_where_a_platform_is() -> None:
         ),
         ("status.effort.scale", [1, 1, 1], r"effort\.scale: expected 1 or 2 numbers, found 3"),
         ("status.effort.scale", 0, r"effort\.scale: expected"),
-        ("status.near.side", "over", r"near\.side: found 'over'; choose from above, below"),
+        (
+            "status.near.side",
+            "over",
+            r"near\.side: found 'over'\. Did you mean 'above'\? Choose from above, below",
+        ),
         ("status.far.status", "distance", r"far\.status: expected a status that is true or false"),
         ("status.budget.status", "late", r"nothing listed before it is called 'late'"),
         ("status.near_and_late.statuses", [], r"near_and_late: expected at least one status"),
@@ -757,7 +765,11 @@ def test_a_region_may_stand_where_a_platform_is() -> None:
         ("status.off_sun.first.along", [1], r"first\.along: expected 2 numbers, found 1"),
         ("constraints.zone.of", "chief", None),
         ("constraints.room.of", "chief", r"room\.of: region 'room' is on 'chief' itself"),
-        ("constraints.sun.keep", "in", r"sun\.keep: found 'in'; choose from inside, outside"),
+        (
+            "constraints.sun.keep",
+            "in",
+            r"sun\.keep: found 'in'\. Did you mean 'inside'\? Choose from inside, outside",
+        ),
         ("reward.smooth.condition", "jerk", r"smooth\.condition: expected a status that is true"),
         ("observation.time.offset", [1, 2], r"observation\.time.*offset: expected 1 or 1 numbers"),
         ("observation.attitude.of", "sun", r"attitude\.of: nothing is called 'sun'"),

@@ -129,7 +129,7 @@ def test_a_weaving_lead_comes_back_to_its_heading_after_a_period() -> None:
                 "commands": [{"type": "constant", "name": "heading_rat", "at": 0}],
             },
             (
-                r"platforms\.lead\.controller\.commands: dubins2d has no control 'heading_rat'; .*"
+                r"platforms\.lead\.controller\.commands: dubins2d has no control 'heading_rat'\."
                 r" Did you mean 'heading_rate'\?"
             ),
         ),
@@ -158,8 +158,8 @@ def test_a_weaving_lead_comes_back_to_its_heading_after_a_period() -> None:
                 "commands": [{"type": "constat", "name": "heading_rate", "at": 0}],
             },
             (
-                r"heading_rate: unknown type 'constat'; choose from constant, .*schedule,"
-                r" sinusoid\. Did you mean 'constant'\?"
+                r"heading_rate: unknown type 'constat'\. Did you mean 'constant'\? Choose from"
+                r" constant, .*schedule, sinusoid$"
             ),
         ),
         (

@@ -502,7 +502,10 @@ def test_a_recipe_travels_with_the_file_of_an_environment(
         resolve({"env": "mine.yaml", "preset": "x"})
     environment = text.partition("recipes:")[0]
     for recipes, place in (
-        ("{mine: {ppo: {gama: 1}}}", r"mine\.ppo\.gama: unknown field 'gama'; .* mean 'gamma'"),
+        (
+            "{mine: {ppo: {gama: 1}}}",
+            r"mine\.ppo\.gama: unknown field 'gama'\. Did you mean 'gamma'",
+        ),
         ("{a: {steps: 0}, b: {}}", r"a\.steps: expected a whole number ≥ 1, found 0"),
     ):
         Path("mine.yaml").write_text(f"{environment}recipes: {recipes}\n", encoding="utf-8")
@@ -824,7 +827,10 @@ def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(tmp_path: Path) -> 
         (["algorithm=ppo_lagrangian"], "cost_limit: missing; the violating steps"),
         (["cost_limit=5"], "cost_limit: plain PPO has none; add algorithm=ppo_lagrangian"),
         (["algorithm=ppo_lagrangian", "cost_limit=0"], "cost_limit: expected a number > 0"),
-        (["algorithm=trpo"], "algorithm: found .trpo.; choose from ppo, ppo_lagrangian"),
+        (
+            ["algorithm=trpo"],
+            "algorithm: found .trpo.. Did you mean 'ppo'. Choose from ppo, ppo_lagrangian",
+        ),
         (
             ["agent.cost_critic=true"],
             "agent.cost_critic: follows from the algorithm; give algorithm=ppo_lagrangian",

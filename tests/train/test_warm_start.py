@@ -78,7 +78,7 @@ def test_a_run_that_has_ended_goes_on(
     ("words", "message"),
     [
         (["from=nowhere"], "from: no run in 'nowhere'"),
-        (["from=pretrained/docking9d"], "is no .npz file and not pretrained; choose from"),
+        (["from=pretrained/docking9d"], "is no .npz file and not pretrained. Did you mean"),
         (["from=pretrained/docking2d"], "agent.actor.hidden: the training starts from pretrained"),
     ],
 )

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsafe.devices import processes
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.storage.forms import check
 from jaxsafe.types import is_key
 
@@ -235,8 +235,8 @@ class Checkpoints:
     def _read(self, step: int, **args: Any) -> Any:
         if step not in self.steps:
             raise ConfigError(
-                f"checkpoint: no step {show(step)} in {self.directory}; "
-                f"choose from {nearest(step, self.steps) or 'none'}"
+                f"checkpoint: no step {show(step)} in {self.directory}"
+                f"{choices_text(step, self.steps)}"
             )
         content = {}
         reason = ""

@@ -19,7 +19,7 @@ from jaxsafe.processors.reward import Intervention
 from jaxsafe.schema.component import Component, Range, normalise
 from jaxsafe.schema.convert import to_value
 from jaxsafe.schema.dotted_paths import set_path
-from jaxsafe.schema.errors import ConfigError, ConfigWarning, meant_environment, nearest, show
+from jaxsafe.schema.errors import ConfigError, ConfigWarning, choices_text, meant_environment, show
 from jaxsafe.schema.retype import set_paths
 from jaxsafe.train.host.sinks import LIBRARIES, library
 from jaxsafe.train.host.starts import with_unproved_starts
@@ -483,9 +483,7 @@ def recipe(task: str, preset: str | None, source: str | None = None) -> dict[str
     if name not in presets and RENAMED["preset"].get(name) in presets:
         name = current_name("preset", name)
     if name not in presets:
-        raise ConfigError(
-            f"preset: unknown preset {show(name)}; choose from {nearest(name, presets)}"
-        )
+        raise ConfigError(f"preset: unknown preset {show(name)}{choices_text(name, presets)}")
     return {"recipe": available.source, "preset": name, **flatten(presets[name] or {})}
 
 

@@ -17,7 +17,7 @@ from jaxsafe.agents.networks import Params
 from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.storage.files import finite
 from jaxsafe.storage.forms import AMOUNT, COUNT, check
 from jaxsafe.train import ppo
@@ -212,7 +212,7 @@ def load_params(
     except ValueError:  # no whole number, or one of thousands of digits
         choices = ["last", "best", *map(str, checkpoints.steps)]
         raise ConfigError(
-            f"checkpoint: found {show(which)}; choose from {nearest(which, choices)}"
+            f"checkpoint: found {show(which)}{choices_text(which, choices)}"
         ) from None
     content, _ = restore(checkpoints, step, env, config)
     params = content["best"]["params"] if which == "best" else content["state"].average

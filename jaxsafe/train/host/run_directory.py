@@ -17,7 +17,7 @@ from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.convert import to_component, to_data, to_value
 from jaxsafe.schema.dotted_paths import set_path
-from jaxsafe.schema.errors import ConfigError, nearest
+from jaxsafe.schema.errors import ConfigError, choices_text
 from jaxsafe.schema.user_modules import import_modules, modules
 from jaxsafe.storage.files import write_text
 from jaxsafe.storage.provenance import commit, versions
@@ -141,10 +141,8 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
             if path.parent.is_dir()
             else []
         )
-        choice = f"; choose from {nearest(path, sorted(beside))}" if beside else ""
-        raise ConfigError(
-            f"{option}: no run in {str(path)!r} (a directory with config.yaml){choice}"
-        )
+        hint = choices_text(str(path), sorted(beside)) if beside else ""
+        raise ConfigError(f"{option}: no run in {str(path)!r} (a directory with config.yaml){hint}")
     content = read_content(path)
     config, env = from_described(content, f"{path / 'config.yaml'}: ")
     name = str(content["env"])
