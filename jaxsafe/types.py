@@ -101,7 +101,8 @@ class Record(Described):
     """Base class of what components compute.
 
     A record is a frozen dataclass in which every field is a leaf or a subtree. It prints a line for
-    each field, with the numbers of small arrays and the types and shapes of others.
+    each field, with the numbers of small arrays and the types and shapes of others. Fields of a
+    record inside it share lines.
     """
 
     def __init_subclass__(cls) -> None:
@@ -114,18 +115,33 @@ class Record(Described):
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]
 
     def _rows(self) -> Rows:
-        return _lines(self, "")
+        return _lines(self)
 
 
-def _lines(record: Record, prefix: str) -> Iterator[tuple[str, str]]:
+def _lines(record: Record, place: str = "") -> Iterator[tuple[str, str]]:
     """Yield the path and the text of each field of a record, without fields that have no text.
 
-    A field that is itself a record of records or mappings yields its own fields one by one.
+    A field that is itself a record of records or mappings yields its numbers in one line, and then
+    its records and mappings one by one.
+
+    Args:
+        record: the record.
+        place: the path of the record, or nothing if each of its own numbers has a line.
     """
+    symbols = units(type(record))
+    leaves = {
+        name: (value, symbols.get(name, ""))
+        for name, value in vars(record).items()
+        if not _is_tree(value)
+    }
+    if place and (text := _named(leaves)):
+        yield place, text
     for name, value in vars(record).items():
-        path = f"{prefix}{name}"
+        path = f"{place}.{name}" if place else name
         if isinstance(value, Record) and any(map(_is_tree, vars(value).values())):
-            yield from _lines(value, f"{path}.")
+            yield from _lines(value, path)
+            continue
+        if place and name in leaves:
             continue
         parts = {path: value}
         if isinstance(value, Mapping) and any(map(_is_tree, value.values())):
@@ -153,18 +169,15 @@ def _in_one_line(value: Any) -> str:
 def _named(values: Mapping[str, tuple[Any, str]]) -> str:
     """Return values as text with their names and units, without those that have no text.
 
-    Neighbours that are shown by the same type and shape share this text.
+    Neighbours with the same text share it.
     """
     texts = {
         name: f"{_in_one_line(value)} {unit}".strip() for name, (value, unit) in values.items()
     }
     parts = []
     for text, group in itertools.groupby(filter(texts.get, texts), key=texts.get):
-        names = list(group)
-        if str(text).endswith("]"):
-            parts.append(f"{', '.join(names)} {text}")
-        else:
-            parts += [unbroken(f"{name} {text}") for name in names]
+        *others, last = group
+        parts += [*others, unbroken(f"{last} {text}")]
     return ", ".join(parts)
 
 
@@ -286,6 +299,21 @@ class State(Record):
     # Words of the key from which the episode's disturbances and errors of sensors are drawn,
     # uint32 of shape (2,), or () if nothing is random.
     key: Any = ()
+
+    def _rows(self) -> Rows:
+        """Yield a line for each part, one for all regions, and one with names for the memory."""
+        regions, remembered = [], []
+        for path, text in _lines(self):
+            if path.startswith("sim.regions."):
+                regions.append(f"{path.removeprefix('sim.regions.')} {text}")
+            elif path.startswith("memory."):
+                remembered.append(path.removeprefix("memory."))
+            else:
+                yield path, text
+        if regions:
+            yield "sim.regions", "; ".join(regions)
+        if remembered:
+            yield "memory", f"of {', '.join(remembered)}"
 
 
 class RTAInfo(Record):
