@@ -238,7 +238,6 @@ def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax
         thorough("safety/proofs"),
         thorough("controllers"),
         "deviations",
-        thorough("own_training_loop"),
         thorough("adapters/gymnasium"),
         "adapters/safety_gymnasium",
         pytest.param("adapters/gymnax", marks=pytest.mark.peer),

@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +40,32 @@ def test_the_notebook_reads_the_log_of_a_run(
     assert sum("image/png" in output.get("data", {}) for output in outputs) == 2
 
 
+def shapes(outputs: list[Any]) -> list[str]:
+    """Return the outputs that are tuples of shapes."""
+    texts = [output.get("data", {}).get("text/plain", "") for output in outputs]
+    return [text for text in texts if text.startswith("((")]
+
+
 def test_tutorials_show_what_their_code_returns() -> None:
     for path in TUTORIALS:
         cells = nbformat.read(path, as_version=4).cells
         code = [cell for cell in cells if cell.cell_type == "code"]
         assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1)), path
         assert cells[0].source.startswith("# "), path
+
+
+@pytest.mark.thorough
+@pytest.mark.filterwarnings("default")  # warnings of Jupyter's packages
+def test_a_training_loop_by_hand_learns_to_keep_the_limit(tmp_path: Path) -> None:
+    path = DOCS / "tutorials" / "own_training_loop.ipynb"
+    stored, executed = (
+        [output for cell in notebook.cells for output in cell.get("outputs", [])]
+        for notebook in (nbformat.read(path, as_version=4), execute(path, tmp_path))
+    )
+    assert shapes(executed) == shapes(stored) != []
+    [printed] = [output.text for output in executed if output.output_type == "stream"]
+    before, after = map(float, re.findall(r"return (-?[\d.]+),", printed))
+    assert before < after
 
 
 @pytest.mark.slow
