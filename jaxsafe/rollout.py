@@ -28,7 +28,7 @@ RECORDS = ("timesteps", "transitions", "states")
 class RecurrentPolicy:
     """A policy that remembers.
 
-    It can stand wherever a policy is run step by step. Its memory starts afresh with each episode.
+    It can stand wherever a policy is run step by step. Its memory starts again with each episode.
     """
 
     act: Callable[[Key, Array, Any], tuple[Array, Any]]
@@ -138,12 +138,13 @@ def rollout(
     Raises:
         ConfigError: `num_steps` or `num_envs` is not a whole number or is too small, `record` is
             unknown, `start` is not a `RolloutState` or has a batch of another size, the key is a
-            plain number, or the actions have another shape.
+            plain number, the policy is no function, or the actions have another shape.
     """
     require_count("rollout: num_steps", num_steps, least=0)
     if num_envs is not None:
         require_count("rollout: num_envs", num_envs, least=1)
     require_key("rollout: key", key)
+    require_policy(policy)
     if record not in RECORDS:
         raise ConfigError(
             f"rollout: record: unknown record {show(record)}{choices_text(record, RECORDS)}"
@@ -255,12 +256,27 @@ def require_batch(env: Environment, action: Array, num_envs: int) -> None:
         )
 
 
+def require_policy(policy: Policy | RecurrentPolicy) -> None:
+    """Refuse what cannot be called, such as the name of a policy that is to be loaded first.
+
+    Raises:
+        ConfigError: it is neither a function nor a `RecurrentPolicy`.
+    """
+    if not callable(policy) and not isinstance(policy, RecurrentPolicy):
+        hint = f"; write jaxsafe.load_policy({show(policy)})" if isinstance(policy, str) else ""
+        raise ConfigError(
+            f"policy: expected a function of a key and an observation, found {show(policy)}{hint}"
+        )
+
+
 def require_hashable(policy: Policy | RecurrentPolicy) -> None:
     """Refuse a policy that has no hash, because its compiled program could not be kept.
 
     Raises:
-        ConfigError: the policy has no hash. Equinox modules with arrays have none.
+        ConfigError: the policy is no function or has no hash. Equinox modules with arrays have
+            none.
     """
+    require_policy(policy)
     try:
         hash(policy)
     except TypeError:

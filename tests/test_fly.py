@@ -180,6 +180,11 @@ def test_a_filter_shows_in_a_flight() -> None:
     [
         ({"policy": lambda key, o: jnp.zeros((16, 2))}, r"action: expected shape \(2,\)"),
         ({"policy": Unhashable()}, "policy: expected a function, found Unhashable, which has no"),
+        (
+            {"policy": "docking3d"},
+            r"policy: expected a function of a key and an observation, found 'docking3d'; "
+            r"write jaxsafe\.load_policy\('docking3d'\)$",
+        ),
         ({"start": "here"}, "fly: start: expected what reset or reset_to returns"),
         ({"start": {"chief": {}}}, "reset_to: "),
         ({"key": 3}, r"fly: key: expected a key, such as jax.random.key\(3\), found 3"),

@@ -386,10 +386,11 @@ def test_a_policy_that_forgets_the_batch_is_told_so(
             "rollout: record: unknown record 'transition'. Did you mean 'transitions'",
         ),
         ({"start": 3}, "rollout: start: expected the RolloutState that an earlier rollout"),
+        ({"policy": 3}, "policy: expected a function of a key and an observation, found 3$"),
     ],
 )
-def test_a_wrong_record_or_start_is_refused(
+def test_a_wrong_policy_record_or_start_is_refused(
     arguments: dict[str, Any], message: str, env: Environment
 ) -> None:
     with pytest.raises(ConfigError, match=message):
-        jaxsafe.rollout(env, policy, jax.random.key(0), 2, **arguments)
+        jaxsafe.rollout(env, key=jax.random.key(0), num_steps=2, **{"policy": policy, **arguments})

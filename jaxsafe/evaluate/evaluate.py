@@ -35,7 +35,7 @@ def evaluate(
 
     Raises:
         ConfigError: the number of episodes is not a whole number of at least 1, the key is a
-            plain number, or the policy returns actions of another shape.
+            plain number, or the policy is no function or returns actions of another shape.
     """
     count = num_episodes if episodes is None else episodes
     require_count("evaluate: episodes", count, least=1)
