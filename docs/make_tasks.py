@@ -67,7 +67,7 @@ CAPTION = {
     ),
     "wingman": (
         "A scripted policy flies to the rejoin point and ignores the lead. One wingman succeeds,"
-        " the other crashes into the lead on its way. Dots and squares are starts."
+        " the other crashes into the lead. Dots and squares are starts."
     ),
 }
 """A caption that says what the figure shows, by agent."""

@@ -73,7 +73,7 @@ class ApproachFeatures(Features, type="approach"):
     these are:
 
     - v/limit.
-    - p·v/limit, the part of v/limit along the way to the chief.
+    - p·v/limit, the part of v/limit in the direction of the chief.
     - The remaining part of v/limit, which is across p.
     - ‖v‖/limit, which is 1 at the limit.
 
@@ -109,19 +109,19 @@ class ApproachFeatures(Features, type="approach"):
 
 
 class RejoinFeatures(Features, type="rejoin"):
-    """The observation, the way to the rejoin point, the relative velocity and the miss distance.
+    """The observation, the rejoin point, the relative velocity and the miss distance.
 
     All vectors are turned from the wingman's body frame into its level frame, in which left is left
     however the wingman rolls. With p the direction of the lead and w its velocity relative to the
     wingman, the features are:
 
     - p, in space only.
-    - The way to the rejoin point, as a vector. It is small near the point, where its direction
+    - d, the vector to the rejoin point. It is small near the point, where its direction
       turns quickly.
     - w.
-    - w + way/10 s, the change of velocity that would take the wingman to the point in 10 s. A pilot
+    - w + d/10 s, the change of velocity that would take the wingman to the point in 10 s. A pilot
       who keeps it at zero arrives, and stays.
-    - The way and the change once more, five times as long and clipped to [−1, 1].
+    - d and the change once more, five times as long and clipped to [−1, 1].
     - The cosine between p and w.
     - The part of p across w. It is 0 on a collision course.
     - That part times the observed distance. This is the miss distance if neither aircraft
@@ -137,10 +137,12 @@ class RejoinFeatures(Features, type="rejoin"):
         self, env: Environment, observation: Float[Array, "*batch o"]
     ) -> Float[Array, "*batch i"]:
         distance, bearing = _magnitude_and_direction(env, observation, "lead_position")
-        way_length, way_direction = _magnitude_and_direction(env, observation, "rejoin_position")
+        rejoin_distance, rejoin_direction = _magnitude_and_direction(
+            env, observation, "rejoin_position"
+        )
         speed, heading = _magnitude_and_direction(env, observation, "lead_velocity")
         own_speed, own_heading = _magnitude_and_direction(env, observation, "wingman_velocity")
-        way = way_length * way_direction
+        offset = rejoin_distance * rejoin_direction
         relative = speed * heading - own_speed * own_heading
         course = relative / (_norm(relative) + 0.01)
         closing = jnp.sum(bearing * course, axis=-1, keepdims=True)
@@ -152,11 +154,11 @@ class RejoinFeatures(Features, type="rejoin"):
         ]
         miss = 4.0 * across * distance
         per_10_s = _scale(env, "rejoin_position")[0] / (10.0 * _scale(env, "wingman_velocity")[0])
-        change = relative + per_10_s * way
-        near, urgent = (jnp.clip(5.0 * vector, -1.0, 1.0) for vector in (way, change))
+        change = relative + per_10_s * offset
+        near, urgent = (jnp.clip(5.0 * vector, -1.0, 1.0) for vector in (offset, change))
         # In the plane the observation already has the direction of the lead in the level frame.
         level = () if "roll" not in env.observation_names else (bearing,)
-        aim = (*level, way, near, relative, change, urgent)
+        aim = (*level, offset, near, relative, change, urgent)
         return jnp.concatenate([observation, *aim, closing, 4.0 * across, miss, *danger], axis=-1)
 
 

@@ -70,7 +70,7 @@ class LQR(ControlLaw, type="lqr"):
     K minimises Σ xᵀQx + uᵀRu for the plant's own step, which is linear. Q and R follow Bryson's
     rule: the weight of a quantity is 1/(its largest acceptable value)². The slow poles are near
     −`speed`/`position`, so with 150 m and 0.5 m/s the deputy of the paper flies below the speed
-    limit on its way from 150 m: ‖v‖ ≈ ‖r‖/300 s.
+    limit from 150 m on: ‖v‖ ≈ ‖r‖/300 s.
     """
 
     position: Annotated[Length, Positive] = 150.0

@@ -30,7 +30,7 @@ from jaxsafe.types import (
 class Pursuit(ControlLaw, type="pursuit"):
     """Pursuit of a region that moves with a lead, and then formation hold.
 
-    The desired velocity is the lead's plus `gain` times d, where d is the way to the region's
+    The desired velocity is the lead's plus `gain` times d, where d is the vector to the region's
     centre. The second part is at most `closing`. So the error decays like exp(−`gain` t) once it is
     small. Far away the agent closes in at a constant speed, on a course near that of the lead. In
     the plane the agent takes the desired heading and speed as fast as its bounds allow.

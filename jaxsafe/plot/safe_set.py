@@ -2,8 +2,8 @@
 
 The command is `python -m jaxsafe.plot.safe_set env=rejoin2d`.
 
-H(x) is the smallest h on the way of the best backup controller from x. Without a horizon it is h(x)
-itself. A state is certified where H(x) reaches the margin that the filter keeps. A plane for
+H(x) is the smallest h on the flight of the best backup controller from x. Without a horizon it is
+h(x) itself. A state is certified where H(x) reaches the margin that the filter keeps. A plane for
 docking shows distance against speed, and a plane for rejoin shows the surroundings of the lead.
 """
 

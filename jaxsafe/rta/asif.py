@@ -341,7 +341,7 @@ def nearest_by_priority(
 class ImplicitASIF(CertifiedRTA, type="implicit_asif"):
     """An ASIF whose safe set is known only through backup controllers.
 
-    H(x) is the smallest h on the way of the best backup controller from x. H after the step is
+    H(x) is the smallest h on the flight of the best backup controller from x. H after the step is
     linearised at the desired control, by differentiating the prediction. That gives one half-space
     to project onto: H(x′) + ∇H·(u − u_des) ≥ margin + `spare`.
 

@@ -198,7 +198,7 @@ class AlignedOrSlow(TerminalSet, type="aligned_or_slow"):
 
 
 class MatchVelocity(BackupController, type="match_velocity"):
-    """A turn one way to the lead's heading, at the lead's speed.
+    """A turn to one side, up to the lead's heading, at the lead's speed.
 
     Afterwards the relative position stays as it is.
 

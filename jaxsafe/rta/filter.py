@@ -591,7 +591,7 @@ class CertifiedRTA(RTA):
         return jnp.argmin(self.compared(env, margins)).astype(jnp.int32)
 
     def certify(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, " backups"]:
-        """Return for each backup controller the smallest h on its way from `sim`.
+        """Return for each backup controller the smallest h on its flight from `sim`.
 
         It is to be compared with `margin_to_certify`. It is −∞ for a way that proves nothing. Such
         a way ends outside the terminal set, or the proof of the controller or of the set does not

@@ -98,7 +98,7 @@ class Region(Component):
     on: PlaceName | None
     """What carries the region. null stands for the origin, so that the region stays in place."""
     offset: Offset | None = None
-    """The way from what carries the region to its centre."""
+    """The vector from what carries the region to its centre."""
 
     def contains(self, offset: Float[Array, " d"]) -> Bool[Array, ""]:
         """Return whether a point is inside.

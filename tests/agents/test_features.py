@@ -123,7 +123,7 @@ def test_rejoin_features_are_level_however_the_wingman_rolls() -> None:
     ahead = turn @ [600.0, -300.0, 100.0]
     np.testing.assert_allclose(inputs[0][:3], ahead / np.linalg.norm(ahead), atol=1e-6)
     for other in inputs[1:]:
-        # These inputs are the lead, and the way to the rejoin point.
+        # These inputs are the lead, and the vector to the rejoin point.
         np.testing.assert_allclose(other[:9], inputs[0][:9], atol=1e-5)
 
 
