@@ -31,7 +31,7 @@ from jaxsafe.schema.convert import to_component, to_data
 from jaxsafe.schema.errors import ConfigError, choices_text
 from jaxsafe.schema.user_modules import imports_allowed
 from jaxsafe.storage.archive import Archive, open_archive
-from jaxsafe.storage.files import parse_json, write_bytes
+from jaxsafe.storage.files import write_bytes
 from jaxsafe.storage.forms import COUNT, TEXT, check
 
 FORMAT = "jaxsafe policy 2"
@@ -98,10 +98,8 @@ def read_policy(path: str | os.PathLike) -> SavedPolicy:
     with open_archive(
         path, "not a policy file (.npz without pickles, as in <run>/policy/)"
     ) as archive:
-        header = parse_json(str(archive.read("header")), infinite=True)
-    file_format = header.pop("format", None) if isinstance(header, dict) else None
-    if file_format not in (FORMAT, OLD_FORMAT):
-        raise ConfigError(f"{path}: not a policy file: expected format {FORMAT!r}")
+        header = archive.header("a policy file", FORMAT, OLD_FORMAT, infinite=True)
+    file_format = header.pop("format")
     from jaxsafe.config import build
 
     agent_data = header.pop("agent", None)

@@ -16,7 +16,7 @@ from jaxsafe.dataset.collect import Dataset
 from jaxsafe.environment import Environment
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.archive import open_archive
-from jaxsafe.storage.files import parse_json, write_bytes
+from jaxsafe.storage.files import write_bytes
 
 FORMAT = "jaxsafe dataset 1"
 """What a header says of the form of the file."""
@@ -68,10 +68,8 @@ def load_dataset(path: str | os.PathLike) -> tuple[Dataset, dict[str, Any]]:
     Raises:
         ConfigError: the file cannot be read, or is no dataset.
     """
-    with open_archive(path, "no dataset, or a damaged one") as archive:
-        header = parse_json(str(archive.read("header")), infinite=False)
-        if not isinstance(header, dict) or header.get("format") != FORMAT:
-            raise ConfigError(f"{path}: no dataset: expected format {FORMAT!r}")
+    with open_archive(path, "not a dataset, or a damaged one") as archive:
+        header = archive.header("a dataset", FORMAT)
         return Dataset(*(archive.read(name) for name in Dataset._fields)), header
 
 

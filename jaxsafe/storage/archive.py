@@ -16,12 +16,16 @@ import numpy as np
 from numpy.lib import format as npy
 
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.storage.files import parse_json
 
 MAX_ARRAY_BYTES = 2**28
 """The largest size of an array: 256 MiB, or 67 million weights.
 
 There is a limit because a few compressed bytes can stand for terabytes.
 """
+
+CERTIFICATE = "jaxsafe certificate 1"
+"""What the header of a certificate of `jaxsafe verify` gives as its format."""
 
 _HEADER_READERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 """How the header of an array is read, by the version of its format."""
@@ -33,8 +37,9 @@ class Archive:
     A file that is damaged may raise anything, which `open_archive` turns into a ConfigError.
     """
 
-    def __init__(self, file: zipfile.ZipFile) -> None:
+    def __init__(self, path: str | os.PathLike, file: zipfile.ZipFile) -> None:
         """Read only the names of the arrays."""
+        self._path = path
         self._file = file
         self.names = [name.removesuffix(".npy") for name in file.namelist()]
 
@@ -56,6 +61,22 @@ class Archive:
                 raise ValueError(f"{name} does not have the size that it claims")
         return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran_order else "C")
 
+    def header(self, what: str, *formats: str, infinite: bool = False) -> dict[str, Any]:
+        """Return the mapping that the array `header` holds as a JSON text.
+
+        Args:
+            what: what the file should be, for the error.
+            formats: what `format` may be in the header, the one of today first.
+            infinite: whether numbers may be infinite or NaN.
+
+        Raises:
+            ConfigError: the header has another format, or none.
+        """
+        header = parse_json(str(self.read("header")), infinite=infinite)
+        if not isinstance(header, dict) or header.get("format") not in formats:
+            raise ConfigError(f"{self._path}: not {what}: expected format {formats[0]!r}")
+        return header
+
 
 @contextmanager
 def open_archive(path: str | os.PathLike, wrong: str) -> Iterator[Archive]:
@@ -70,7 +91,7 @@ def open_archive(path: str | os.PathLike, wrong: str) -> Iterator[Archive]:
     """
     try:
         with zipfile.ZipFile(path) as file:
-            yield Archive(file)
+            yield Archive(path, file)
     except ConfigError:
         raise
     except OSError as error:

@@ -15,16 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from jaxsafe.schema.errors import ConfigError
-from jaxsafe.storage.archive import open_archive
-from jaxsafe.storage.files import parse_json, write_bytes
-from jaxsafe.verify.loop import Loop, Plant
+from jaxsafe.storage.archive import CERTIFICATE, open_archive
+from jaxsafe.storage.files import write_bytes
+from jaxsafe.verify.loop import Loop, Plant, columns
 from jaxsafe.verify.program import RULED, Constant, Op, Program
 from jaxsafe.verify.tube import Claims
 from jaxsafe.verify.verify import Boxes, Counterexample, Verification
-
-FORMAT = "jaxsafe certificate 1"
-"""Name and version of the format, which stand in the header of every certificate."""
 
 PROGRAMS = ("first", "following")
 """The programs of a loop, fields of `Loop`."""
@@ -40,7 +36,7 @@ def save_certificate(
 
     Args:
         path: the file.
-        verification: what is verification.
+        verification: what it holds.
         about: what else the header says, such as the policy and the version.
     """
     arrays = {
@@ -61,12 +57,13 @@ def save_certificate(
         programs[name] = {"ops": rows, "input": program.input, "output": program.output}
     violation = verification.counterexample
     header = {
-        "format": FORMAT,
+        "format": CERTIFICATE,
         "property": "safe",
         "result": verification.result,
         "steps": verification.steps,
         "unit": verification.loop.following.unit,
         "dimension": verification.loop.dimension,
+        "columns": columns(verification.loop.dimension),
         "actions": verification.loop.actions,
         "plant": verification.loop.plant._asdict(),
         "programs": programs,
@@ -87,10 +84,8 @@ def load_certificate(path: str | os.PathLike) -> Verification:
     Raises:
         ConfigError: the file cannot be read, or is no certificate.
     """
-    with open_archive(path, "no certificate, or a damaged one") as archive:
-        header = parse_json(str(archive.read("header")), infinite=False)
-        if not isinstance(header, dict) or header.get("format") != FORMAT:
-            raise ConfigError(f"{path}: no certificate: expected format {FORMAT!r}")
+    with open_archive(path, "not a certificate, or a damaged one") as archive:
+        header = archive.header("a certificate", CERTIFICATE)
         arrays = {name: archive.read(name) for name in archive.names if name != "header"}
         boxes = {name: Boxes(*(arrays[f"{name}/{end}"] for end in Boxes._fields)) for name in BOXES}
         programs = {name: _program(header, arrays, name) for name in PROGRAMS}

@@ -31,6 +31,11 @@ SINGLE = 2.0**-24
 """Unit roundoff of single precision."""
 
 
+def columns(dimension: int) -> list[str]:
+    """Return what each number of a box is, such as `position.x`."""
+    return [f"{field}.{axis}" for field in FIELDS for axis in "xyz"[:dimension]]
+
+
 class Plant(NamedTuple):
     """What the bound between two samples needs to know of the plant and of the speed limit."""
 

@@ -96,7 +96,7 @@ def test_a_file_has_all_that_was_collected(env: Any, data: Any, tmp_path: Path) 
     returns = [data.reward[part].sum() for part in whole]
     assert header["mean_return"] == pytest.approx(np.mean(returns), rel=1e-5)
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ConfigError, match=r"data\.npz: no dataset, or a damaged one"):
+    with pytest.raises(ConfigError, match=r"data\.npz: not a dataset, or a damaged one"):
         load_dataset(path)
 
 

@@ -53,8 +53,11 @@ def test_every_second_start_is_in_a_box_that_is_not_proved(unproved: Path) -> No
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"env": "docking3d"}, "boxes of 4 numbers; expected position and velocity of 'deputy', 6"),
-        ({"env": "rejoin2d"}, "expected position and velocity of 'wingman', 4 numbers"),
+        (
+            {"env": "docking3d"},
+            "velocity.y; the start of 'deputy' draws position, velocity in 3 axes",
+        ),
+        ({"env": "rejoin2d"}, "the start of 'wingman' draws position, heading, speed in 2 axes"),
         ({"env": "docking2d", "starts": "missing.npz"}, "missing.npz"),
     ],
 )

@@ -10,10 +10,7 @@ from jaxsafe.environment import Environment
 from jaxsafe.schema.convert import normalise
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.starts_in_boxes import SometimesInBoxes
-from jaxsafe.storage.archive import open_archive
-
-FIELDS = ("position", "velocity")
-"""The fields of the agent's platform that a box of a certificate has, one after the other."""
+from jaxsafe.storage.archive import CERTIFICATE, open_archive
 
 
 def with_unproved_starts(env: Environment, path: str) -> Environment:
@@ -27,15 +24,17 @@ def with_unproved_starts(env: Environment, path: str) -> Environment:
         ConfigError: the file is no certificate, it has no such box, or its boxes are not of the
             agent's platform.
     """
-    low, high = _unproved(path)
+    columns, low, high = _unproved(path)
     platform = env.agent_platform
+    fields = dict.fromkeys(column.partition(".")[0] for column in columns)
     axes = "xyz"[: platform.dimension]
-    columns = [f"{field}.{axis}" for field in FIELDS for axis in axes]
     drawn = platform.random_fields
-    if low.shape[1] != len(columns) or not set(FIELDS) <= set(drawn):
+    if not fields.keys() <= set(drawn) or columns != [
+        f"{x}.{axis}" for x in fields for axis in axes
+    ]:
         raise ConfigError(
-            f"starts: {path} has boxes of {low.shape[1]} numbers; expected position and velocity "
-            f"of {env.agent!r}, {len(columns)} numbers that its start draws"
+            f"starts: {path} has boxes of {', '.join(columns)}; "
+            f"the start of {env.agent!r} draws {', '.join(drawn)} in {len(axes)} axes"
         )
     boxes = SometimesInBoxes(
         name="boxes",
@@ -47,9 +46,10 @@ def with_unproved_starts(env: Environment, path: str) -> Environment:
     return env.replace(platforms=platforms)
 
 
-def _unproved(path: str) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of the boxes that a certificate does not prove."""
-    with open_archive(path, "no certificate, or a damaged one") as archive:
+def _unproved(path: str) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Return the columns and the corners of the boxes that a certificate does not prove."""
+    with open_archive(path, "not a certificate, or a damaged one") as archive:
+        columns = archive.header("a certificate", CERTIFICATE)["columns"]
         ends: list[Any] = []
         for end in ("low", "high"):
             parts = [archive.read(f"{kind}/{end}") for kind in ("refuted", "open")]
@@ -57,4 +57,4 @@ def _unproved(path: str) -> tuple[np.ndarray, np.ndarray]:
     low, high = ends
     if not len(low):
         raise ConfigError(f"starts: {path} has no box that is open or refuted")
-    return low, high
+    return columns, low, high
