@@ -105,7 +105,7 @@ def same_options(item: Item, content: Mapping[str, Any], place: str) -> bool:
     Args:
         item: what would be trained today.
         content: the content of a `config.yaml`, or what `options_of` once returned.
-        place: what stands before places in messages of errors.
+        place: what stands before places in error messages.
 
     Raises:
         ConfigError: the content cannot be read.

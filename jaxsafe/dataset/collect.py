@@ -98,9 +98,8 @@ def collect_from_each(
     for number, own in enumerate(parameters):
         advance = functools.partial(run, env, own)
         parts.append(_steps(advance, jax.random.fold_in(key, number), count, num_envs))
-    data = Dataset(*(np.concatenate(arrays)[:num_steps] for arrays in zip(*parts, strict=True)))
-    data.truncated[-1] |= ~data.terminated[-1]
-    return data
+    whole = Dataset(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+    return _first(whole, num_steps)
 
 
 def _num_envs(env: Environment, num_steps: int) -> int:
@@ -118,11 +117,16 @@ def _steps(advance: Callable[..., Any], key: Key, num_steps: int, num_envs: int)
     for number in range(-(-per_env // CHUNK)):
         start, part = advance(jax.random.fold_in(key, number), start)
         parts.append(jax.device_get(part))
-    steps = Dataset(**{name: _column(parts, name)[:per_env] for name in Dataset._fields})
-    steps.truncated[-1] |= ~steps.terminated[-1]
-    flat = Dataset(*(np.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:])[:num_steps] for x in steps))
-    flat.truncated[-1] |= ~flat.terminated[-1]
-    return flat
+    steps = _first(Dataset(**{name: _column(parts, name) for name in Dataset._fields}), per_env)
+    flat = Dataset(*(np.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]) for x in steps))
+    return _first(flat, num_steps)
+
+
+def _first(steps: Dataset, count: int) -> Dataset:
+    """Return the first steps, of which the last is truncated if the episode does not end there."""
+    cut = Dataset(*(array[:count] for array in steps))
+    cut.truncated[-1] |= ~cut.terminated[-1]
+    return cut
 
 
 def _column(parts: Sequence[dict[str, np.ndarray]], name: str) -> np.ndarray:

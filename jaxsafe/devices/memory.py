@@ -21,7 +21,7 @@ except ImportError:  # Windows
 
 GIB = 2**30
 
-MEMORY_OPTIONS = "ppo.num_envs, ppo.num_steps, seeds"
+OPTIONS = "ppo.num_envs, ppo.num_steps, seeds"
 """Options to name when a training does not fit into memory."""
 
 COMPILE_BYTES = 1450 * 2**20
@@ -88,7 +88,7 @@ def footprint(compiled: jax.stages.Compiled) -> int:
     )
 
 
-def require(needed: int, devices: int, options: str, once: int = 0) -> None:
+def require(needed: int, devices: int, once: int = 0) -> None:
     """Refuse a training that does not fit into memory.
 
     If it does not fit in one process, all processes refuse it. The CPU devices of all processes on
@@ -97,7 +97,6 @@ def require(needed: int, devices: int, options: str, once: int = 0) -> None:
     Args:
         needed: bytes on each device.
         devices: number of devices of this process that take part.
-        options: names of the options that decide how much is needed.
         once: bytes that this process takes once, whatever the number of devices: `COMPILE_BYTES` or
             `RUN_BYTES`. They are in the memory of the machine, so they do not count on an
             accelerator.
@@ -115,7 +114,7 @@ def require(needed: int, devices: int, options: str, once: int = 0) -> None:
         if free is not None and short:
             reason = f"{free / GIB:,.1f} GiB are free"
         raise ConfigError(
-            f"{options}: this training needs {total / GIB:,.1f} GiB of memory, {reason}"
+            f"{OPTIONS}: this training needs {total / GIB:,.1f} GiB of memory, {reason}"
         )
 
 

@@ -214,8 +214,8 @@ class Batch(NamedTuple):
     """Memories and ends of episodes, if a network is recurrent. Samples are sequences [n, t, …]."""
 
 
-def over_devices(whole: Any, split: Any) -> TrainState:
-    """Return a `TrainState` that has one of two values in each field, such as shardings.
+def by_axes(whole: Any, split: Any) -> TrainState:
+    """Return a `TrainState` with one of two values in each field, such as two shardings.
 
     Args:
         whole: the value of fields that all devices of a seed have whole.

@@ -22,7 +22,7 @@ from jaxsafe.train import ppo, recent_episodes
 from jaxsafe.train.ppo import PPO, Diagnostics, TrainState
 from jaxsafe.types import Key
 
-STATE = ppo.over_devices(SPLIT_BY_SEED, SPLIT_BY_ENV)
+STATE = ppo.by_axes(SPLIT_BY_SEED, SPLIT_BY_ENV)
 """Sharding of the training states of all seeds."""
 
 Curves = dict[str, jax.Array]

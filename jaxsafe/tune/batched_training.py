@@ -137,14 +137,11 @@ class BatchedTraining:
         """
         like = self.mapper.like(jax.eval_shape(self._init, (), (trainings, keys)))
         state = memory.size(like) // self.mapper.mesh.size
-        memory.require(
-            state, self.mapper.num_local_devices, memory.MEMORY_OPTIONS, memory.COMPILE_BYTES
-        )
+        memory.require(state, self.mapper.num_local_devices, memory.COMPILE_BYTES)
         compiled = self.mapper.map(self._one_chunk).lower((), (trainings, like)).compile()
         memory.require(
             memory.footprint(compiled),
             self.mapper.num_local_devices,
-            memory.MEMORY_OPTIONS,
             memory.RUN_BYTES,
         )
         return compiled

@@ -190,7 +190,7 @@ def gap(plant, speed, far, near):
 
 
 def follow(head, low, high, claims):
-    """Check the claims of some boxes, and return a lower bound of h on all ways from them."""
+    """Check the claims of some boxes, and bound h below along all episodes from them."""
     d, m = head["dimension"], head["actions"]
     zeros = np.zeros((len(low), m))
     low, high = (np.concatenate([v, zeros], axis=1) for v in (low, high))

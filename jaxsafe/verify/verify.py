@@ -78,7 +78,7 @@ class Verification(NamedTuple):
     claims: Claims
     """What the proof says of the policy, by proved box, see `jaxsafe.verify.tube.Claims`."""
     margin: float
-    """A lower bound of h on all ways from the proved boxes."""
+    """A lower bound of h along all episodes from the proved boxes."""
     counterexample: Counterexample | None
     box: Boxes
     loop: Loop

@@ -78,9 +78,9 @@ def test_what_compiling_takes_is_counted(
 
 def test_what_a_process_takes_once_is_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "available", lambda: 10 * memory.GIB)
-    memory.require(4 * memory.GIB, 2, "x", 2 * memory.GIB)
-    with pytest.raises(ConfigError, match=r"x: this training needs 11.0 GiB of memory"):
-        memory.require(4 * memory.GIB, 2, "x", 3 * memory.GIB)
+    memory.require(4 * memory.GIB, 2, 2 * memory.GIB)
+    with pytest.raises(ConfigError, match=r"seeds: this training needs 11.0 GiB of memory"):
+        memory.require(4 * memory.GIB, 2, 3 * memory.GIB)
 
 
 TRAINING = """
@@ -137,9 +137,9 @@ def test_processes_of_one_machine_share_its_memory(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(memory, "available", lambda: 10 * memory.GIB)
     monkeypatch.setattr(processes, "count_on_this_machine", lambda: 4)
     with pytest.raises(
-        ConfigError, match=r"x: this training needs 16.0 GiB of memory, 10.0 GiB are free"
+        ConfigError, match=r"seeds: this training needs 16.0 GiB of memory, 10.0 GiB are free"
     ):
-        memory.require(2 * memory.GIB, 2, "x")
+        memory.require(2 * memory.GIB, 2)
 
 
 @pytest.mark.parametrize(
@@ -182,20 +182,20 @@ def test_the_limit_of_the_process_is_known(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_devices_of_one_machine_share_its_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "available", lambda: 10 * memory.GIB)
-    memory.require(5 * memory.GIB, 2, "x")
+    memory.require(5 * memory.GIB, 2)
     with pytest.raises(
-        ConfigError, match=r"x: this training needs 12.0 GiB of memory, 10.0 GiB are free"
+        ConfigError, match=r"seeds: this training needs 12.0 GiB of memory, 10.0 GiB are free"
     ):
-        memory.require(4 * memory.GIB, 3, "x")
+        memory.require(4 * memory.GIB, 3)
 
 
 def test_every_process_refuses_what_does_not_fit_in_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "available", lambda: 10 * memory.GIB)
     monkeypatch.setattr(processes, "any_process", lambda _: True)
     with pytest.raises(
-        ConfigError, match=r"x: this training needs 2.0 GiB of memory, another process has less"
+        ConfigError, match=r"seeds: this training needs 2.0 GiB of memory, another process has less"
     ):
-        memory.require(memory.GIB, 2, "x")
+        memory.require(memory.GIB, 2)
 
 
 def test_what_is_counted() -> None:

@@ -215,9 +215,7 @@ class Training:
         state_bytes = (
             memory.size(content) // self.config.seeds * self.mapper.padded // self.mapper.mesh.size
         )
-        memory.require(
-            state_bytes, self.mapper.num_local_devices, memory.MEMORY_OPTIONS, memory.COMPILE_BYTES
-        )
+        memory.require(state_bytes, self.mapper.num_local_devices, memory.COMPILE_BYTES)
         begin = time.monotonic()
         keys = self.mapper.keys(self.config.seed)
         fresh, advance = programs(self.mapper, self.chunk, self.config.num_updates)
@@ -307,7 +305,6 @@ class Training:
         memory.require(
             memory.footprint(compiled) - state_bytes,
             self.mapper.num_local_devices,
-            memory.MEMORY_OPTIONS,
             memory.RUN_BYTES,
         )
 
