@@ -352,13 +352,23 @@ def reset_batch(
         What `reset` returns, for each environment.
     """
     size = num_envs // shard.count
-    return _starts(env, key, shard.first(size) + jnp.arange(size), axis)
+    return draw_starts(env, key, shard.first(size) + jnp.arange(size), axis)
 
 
-def _starts(
-    env: Environment, key: Key, indices: Int[Array, " n"], axis: int
+def draw_starts(
+    env: Environment, key: Key, indices: Int[Array, " n"], axis: Literal[0, -1] = 0
 ) -> tuple[State, TimeStep]:
-    """Draw the starts of the environments with these indices, each from a key of its own."""
+    """Draw the starts of some environments of a batch, each from a key of its own.
+
+    Args:
+        env: the environment.
+        key: a typed PRNG key of the batch.
+        indices: the indices of the environments.
+        axis: the axis of the environments in all leaves, the first or the last.
+
+    Returns:
+        What `reset` returns, for each environment.
+    """
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, indices)
     return jax.vmap(reset, in_axes=(None, 0), out_axes=axis)(env, keys)
 
@@ -394,7 +404,7 @@ def step_or_reset_batch(
 
     def draw(parameters: tuple[Environment, Key, Array], indices: Array) -> tuple[State, Array]:
         env, key, first = parameters
-        fresh_state, fresh = _starts(env, key, first + indices, axis)
+        fresh_state, fresh = draw_starts(env, key, first + indices, axis)
         return fresh_state, fresh.observation
 
     carry = renew(

@@ -20,10 +20,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsafe import environment
+from jaxsafe.autoreset import renew
 from jaxsafe.config.arguments import MAX_COUNT
 from jaxsafe.environment import Environment, drawn, step
 from jaxsafe.evaluate.adversaries import ADVERSARIES
-from jaxsafe.rollout import reset_batch
+from jaxsafe.rollout import draw_starts, reset_batch
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.controllers import Continuous
@@ -61,7 +62,7 @@ SEARCH_ROUNDS = 8
 """Number of rounds of the search from each start."""
 
 _EVENTS = ("violating", "violating_inside", "intervening", "uncertified", "infeasible")
-_SUMMED = (*_EVENTS, "steps", "ended", "correction", "unsafe_starts")
+_SUMMED = (*_EVENTS, "steps", "begun", "ended", "correction", "unsafe_starts")
 _LOWEST = ("lowest", "lowest_inside")
 
 Counts = dict[str, Float[Array, " n"]]
@@ -97,13 +98,11 @@ def attack(env: Environment, name: str, num_steps: int, num_envs: int, key: Key)
         sequences_per_start = SEARCH_POPULATION * SEARCH_ROUNDS
         starts = max(1, round(num_steps * num_envs / (steps_per_sequence * sequences_per_start)))
         counts = _search(physical, starts, key)
-        begun = starts * sequences_per_start
+        episodes = starts * sequences_per_start
         whole = False
-        episodes = begun
     else:
         counts = _follow(physical, name, num_steps, num_envs, key)
         ended = int(np.sum(counts["ended"]))
-        begun = num_envs + ended
         whole = bool(np.all(counts["ended"] > 0))
         episodes = ended if whole else num_envs
     values = {entry: np.asarray(value, float) for entry, value in counts.items()}
@@ -122,7 +121,7 @@ def attack(env: Environment, name: str, num_steps: int, num_envs: int, key: Key)
         "mean_correction": float(total["correction"] / steps),
         "uncertified_steps": int(total["uncertified"]),
         "infeasible_steps": int(total["infeasible"]),
-        "unsafe_starts": float(total["unsafe_starts"] / begun),
+        "unsafe_starts": float(total["unsafe_starts"] / total["begun"]),
         "whole_episodes": whole,
         "violation_bound": 3.0 / episodes if clean and name != SEARCH else None,
     }
@@ -152,25 +151,41 @@ def _follow(env: Environment, name: str, num_steps: int, num_envs: int, key: Key
     def act(state: State, key: Key) -> Float[Array, " m"]:
         return adversary(drawn(env, state.parameters), _remembering(env, state), key)
 
-    def replace_ended(done: Array, fresh: State, state: State) -> State:
-        return jax.tree.map(lambda a, b: jnp.where(done, a, b), fresh, state)
+    @jax.jit
+    def draw(parameters: tuple[Environment, Key], indices: Array) -> tuple[State, Array]:
+        state, first = draw_starts(*parameters, indices)
+        return state, _unsafe(first)
 
-    def one_step(carry: tuple[State, Counts], key: Key) -> tuple[tuple[State, Counts], None]:
-        state, counts = carry
-        key_act, key_reset = jax.random.split(key)
-        keys = jax.random.split(key_act, num_envs)
-        controls = jax.vmap(act)(state, keys)
-        after, done, step_counts = _step(env, state, controls)
-        fresh, first = reset_batch(env, key_reset, num_envs)
-        step_counts["unsafe_starts"] = done & _unsafe(first)
-        return (jax.vmap(replace_ended)(done, fresh, after), _add(counts, step_counts)), None
+    def one_step(
+        carry: tuple[State, Array, Counts], keys: tuple[Key, Key]
+    ) -> tuple[tuple[State, Array, Counts], None]:
+        state, begun, counts = carry
+        key_start, key_act = keys
+        state, unsafe = renew(begun, draw, (env, key_start), (state, jnp.zeros(num_envs, bool)))
+        controls = jax.vmap(act)(state, jax.random.split(key_act, num_envs))
+        state, ended, step_counts = _step(env, state, controls)
+        step_counts |= {
+            "begun": begun.astype(jnp.float32),
+            "unsafe_starts": unsafe.astype(jnp.float32),
+        }
+        return (state, ended, _add(counts, step_counts)), None
 
+    # The first starts are drawn in the loop too, because every copy of a filter compiles for long.
     key_start, key_run = jax.random.split(key)
-    state, first = reset_batch(env, key_start, num_envs)
-    counts = {**_empty_counts(num_envs), "unsafe_starts": _unsafe(first).astype(jnp.float32)}
-    keys = jax.random.split(key_run, num_steps)
-    (_, counts), _ = jax.lax.scan(one_step, (state, counts), keys)
+    keys = jax.vmap(jax.random.split)(jax.random.split(key_run, num_steps))
+    key_starts = jnp.concatenate([key_start[None], keys[:-1, 1]])
+    shapes, _ = jax.eval_shape(draw, (env, key), jnp.arange(num_envs))
+    nothing = jax.tree.map(functools.partial(_blank, key), shapes)
+    carry = (nothing, jnp.ones(num_envs, bool), _empty_counts(num_envs))
+    (_, _, counts), _ = jax.lax.scan(one_step, carry, (key_starts, keys[:, 0]))
     return counts
+
+
+def _blank(key: Key, leaf: jax.ShapeDtypeStruct) -> Array:
+    """Return an array of a shape and type, whatever its values. Keys have no zero."""
+    if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+        return jnp.broadcast_to(key, leaf.shape)
+    return jnp.zeros(leaf.shape, leaf.dtype)
 
 
 @functools.partial(jax.jit, static_argnums=1)
@@ -241,7 +256,7 @@ def _search(env: Environment, num_starts: int, key: Key) -> Counts:
             for name, value in counts.items()
         }
         begun = float(SEARCH_POPULATION * SEARCH_ROUNDS)
-        return counts | {"unsafe_starts": _unsafe(first) * begun}
+        return counts | {"begun": begun, "unsafe_starts": _unsafe(first) * begun}
 
     return jax.lax.map(search_from_start, jax.random.split(key, num_starts))
 
@@ -288,6 +303,7 @@ def _step(
         "correction": zero if info.rta is None else info.rta.correction,
         "uncertified": zero + 1.0 if info.rta is None else ~info.rta.certified | ~finite,
         "infeasible": zero if info.rta is None else ~info.rta.feasible,
+        "begun": zero,
         "unsafe_starts": zero,
         "lowest": lowest,
         "lowest_inside": inside,
