@@ -22,12 +22,17 @@ class Options(PolicyOptions):
     groups: ClassVar = {
         "The policies.": ("run", "checkpoint", "deterministic", "activation"),
         "The environment in which they act.": ("env", "env.PATH", "actions", "variant", "rta"),
-        "The episodes, and what is kept of them.": ("episodes", "seed", "out"),
+        "The episodes, and what is kept of them.": ("episodes", "cases", "seed", "out"),
         "A film of an episode.": ("render", "film", "film_seed"),
     }
 
     episodes: Count = 1000
     """Number of episodes of each seed."""
+    cases: str | None = None
+    """A CSV or YAML file of starts. There is one episode from each.
+
+    A task stands for the file that comes with it: 1,000 random starts, and a grid.
+    """
     seed: Seed = 0
     """Seed of the starts and of the noise. 0 gives those of the results of the run itself."""
     checkpoint: str | None = None
@@ -57,7 +62,9 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.agents.callables import draws
     from jaxsafe.commands.evaluation import Film, evaluate
     from jaxsafe.commands.policies import load, load_foreign
+    from jaxsafe.evaluate.cases import load_cases
     from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
+    from jaxsafe.train.host.options import cases_file
     from jaxsafe.train.host.results import table
 
     options = Options.parse(argv)
@@ -91,11 +98,16 @@ def main(argv: Sequence[str]) -> int:
     env = subject.env if foreign else options.change(subject.env, subject.name)
     if difference := differences(subject.env, env):
         print(difference)
+    cases = None
+    if options.cases is not None:
+        options.refuse_beside(["episodes"], "beside cases, which say how many there are")
+        cases = load_cases(env, cases_file(options.cases))
     request: dict[str, Any] = {
         "run": options.run,
-        "episodes": options.episodes,
+        "episodes": options.episodes if cases is None else cases.size,
         "evaluation_seed": options.seed,
         "checkpoint": options.checkpoint or "last",
+        **({} if options.cases is None else {"cases": options.cases}),
         "changes": {
             name: value
             for name, value in options.changes.items()
@@ -103,7 +115,7 @@ def main(argv: Sequence[str]) -> int:
         },
     }
     path, results, films = evaluate(
-        subject, env, kinds, request=request, out=options.out, film=film
+        subject, env, kinds, request=request, out=options.out, film=film, cases=cases
     )
     print("\n".join([table(results, path), *films]))
     return cli.DIVERGED if "diverged" in results else 0

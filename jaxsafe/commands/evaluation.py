@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxsafe.commands.policies import Subject
 from jaxsafe.environment import Environment, filter_name, require_success
+from jaxsafe.evaluate.cases import Cases
 from jaxsafe.evaluate.evaluator import Evaluator, episode_rows, given_up
 from jaxsafe.metrics import Episode
 from jaxsafe.storage.files import append_rows, write_json
@@ -55,6 +56,7 @@ def evaluate(
     request: dict[str, Any],
     out: str | None,
     film: Film | None = None,
+    cases: Cases | None = None,
 ) -> tuple[Path, dict[str, Any], list[str]]:
     """Evaluate every policy and write `results.json` and `eval.jsonl`.
 
@@ -62,10 +64,11 @@ def evaluate(
         subject: the policies.
         env: the environment to evaluate in. The policies fit it.
         kinds: `stochastic`, `deterministic` or both.
-        request: what was asked for: `run`, `episodes`, `evaluation_seed`, `checkpoint` and
-            `changes`. It becomes part of the results.
+        request: what was asked for: `run`, `episodes`, `evaluation_seed`, `checkpoint`, `changes`,
+            and `cases` if there are any. It becomes part of the results.
         out: a new directory. None makes one in `subject.place`.
         film: the film to make of each kind of evaluation, or None.
+        cases: the starts of the episodes. None stands for random ones.
 
     Returns:
         The path of `results.json`, its content, and lines about the films.
@@ -76,13 +79,13 @@ def evaluate(
     require_success(env)
     episodes = request["episodes"]
     seed = request["evaluation_seed"]
+    started = "" if cases is None else f"-{Path(request['cases']).stem}"
+    changed = "-changed" * bool(request["changes"])
     path = run_directory.make(
-        out,
-        subject.place,
-        f"{request['checkpoint']}-{episodes}-seed{seed}" + "-changed" * bool(request["changes"]),
+        out, subject.place, f"{request['checkpoint']}-{episodes}{started}-seed{seed}{changed}"
     )
     try:
-        evaluator = Evaluator(subject.mapper, env, subject.agent)
+        evaluator = Evaluator(subject.mapper, env, subject.agent, cases)
         sums = {
             kind: evaluator.run(subject.params, episodes, seed, kind == "deterministic")
             for kind in kinds

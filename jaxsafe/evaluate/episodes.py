@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from jaxsafe.environment import Environment, step
+from jaxsafe.evaluate.cases import Cases, reset_to_cases
 from jaxsafe.metrics import Episode, accumulate, begin
 from jaxsafe.processors.terminal import Timeout
 from jaxsafe.rollout import (
@@ -38,18 +39,22 @@ Carry = tuple[Array, State, Array, Any, Episode]
 
 
 def run_episodes(
-    env: Environment, policy: Policy | RecurrentPolicy, key: Key, num_episodes: int
+    env: Environment,
+    policy: Policy | RecurrentPolicy,
+    key: Key,
+    num_episodes: int,
+    cases: Cases | None = None,
 ) -> Episode:
     """Run one episode in each of `num_episodes` environments.
 
     They run until all episodes have ended or `max_steps` is reached. Starts depend on the key only,
-    so that policies are compared from the same starts.
+    so that policies are compared from the same starts. Or they are `cases`, one for each episode.
 
     Returns:
         Sums over each episode. Every field has the shape [num_episodes].
     """
     key_start, key_act = jax.random.split(key)
-    state, timestep = reset_batch(env, key_start, num_episodes)
+    state, timestep = _starts(env, key_start, num_episodes, cases)
     episode = begin(timestep, sum_controls=True)
     limit = max_steps(env)
 
@@ -84,15 +89,19 @@ class Position(NamedTuple):
 
 
 def begin_recording(
-    env: Environment, policy: Policy | RecurrentPolicy, key: Key, num_episodes: int
+    env: Environment,
+    policy: Policy | RecurrentPolicy,
+    key: Key,
+    num_episodes: int,
+    cases: Cases | None = None,
 ) -> tuple[Position, tuple[State, TimeStep]]:
-    """Start the episodes that `run_episodes` runs with the same key.
+    """Start the episodes that `run_episodes` runs with the same key and the same cases.
 
     Returns:
         The position after the starts, and the states and time steps of the starts [num_episodes].
     """
     key_start, _ = jax.random.split(key)
-    state, timestep = reset_batch(env, key_start, num_episodes)
+    state, timestep = _starts(env, key_start, num_episodes, cases)
     position = Position(
         num_steps=jnp.zeros((), jnp.int32),
         state=state,
@@ -100,6 +109,15 @@ def begin_recording(
         memory=first_memory(policy, num_episodes),
     )
     return position, (state, timestep)
+
+
+def _starts(
+    env: Environment, key: Key, num_episodes: int, cases: Cases | None
+) -> tuple[State, TimeStep]:
+    """Return random starts, or those of the cases."""
+    if cases is None:
+        return reset_batch(env, key, num_episodes)
+    return reset_to_cases(env, cases, key)
 
 
 def record_steps(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax
 
 from jaxsafe.environment import Environment
+from jaxsafe.evaluate.cases import load_cases
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.metrics import metrics_in
 from jaxsafe.rollout import Policy, RecurrentPolicy, require_count, require_hashable
@@ -18,6 +19,7 @@ def evaluate(
     num_episodes: int = 1000,
     *,
     episodes: int | None = None,
+    cases: str | None = None,
 ) -> dict[str, float | None]:
     """Return the metrics of Section 5 over whole episodes of a policy.
 
@@ -28,6 +30,9 @@ def evaluate(
         key: a typed PRNG key. It decides starts and noise. None stands for `jax.random.key(0)`.
         num_episodes: how many episodes run side by side.
         episodes: another name of `num_episodes`, which the command uses.
+        cases: a CSV or YAML file of starts with a column for each field, such as
+            `deputy.position.x`. There is an episode from each start, whatever `num_episodes` is.
+            None stands for random starts.
 
     Returns:
         The metrics by name: rates as fractions in [0, 1], lengths in steps, Δv in the unit of the
@@ -35,12 +40,15 @@ def evaluate(
 
     Raises:
         ConfigError: the number of episodes is not a whole number of at least 1, the key is a
-            plain number, or the policy is no function or returns actions of another shape.
+            plain number, the policy is no function or returns actions of another shape, or the
+            cases do not fit.
     """
     count = num_episodes if episodes is None else episodes
     require_count("evaluate: episodes", count, least=1)
     require_key("evaluate: key", key)
     require_hashable(policy)
     key = jax.random.key(0) if key is None else key
-    sums = jax.jit(run_episodes, static_argnums=(1, 3))(env, policy, key, count)
+    starts = None if cases is None else load_cases(env, cases)
+    count = count if starts is None else starts.size
+    sums = jax.jit(run_episodes, static_argnums=(1, 3))(env, policy, key, count, starts)
     return metrics_in(env, jax.device_get(sums))

@@ -12,6 +12,7 @@ from jaxsafe.agents.networks import Params
 from jaxsafe.devices.background_compile import CompiledInBackground
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
+from jaxsafe.evaluate.cases import Cases
 from jaxsafe.evaluate.episodes import begin_recording, max_steps, record_steps, run_episodes
 from jaxsafe.metrics import METRICS, Episode, measures, metrics_in
 from jaxsafe.rollout import Policy, RecurrentPolicy
@@ -55,7 +56,7 @@ EVALUATION_KINDS = ("stochastic", "deterministic")
 class Recorder(NamedTuple):
     """Two compiled functions that record some episodes of one policy."""
 
-    begin: Callable[..., Any]  # (parameters, key) -> (position, starts)
+    begin: Callable[..., Any]  # (parameters, key, cases) -> (position, starts)
     go_on: Callable[..., Any]  # (parameters, key, deterministic, position) -> (position, steps)
 
 
@@ -70,11 +71,21 @@ class Acting(Protocol):
 class Evaluator:
     """Runs whole batches of episodes for every seed, with programs that are compiled once."""
 
-    def __init__(self, mapper: SeedMapper, env: Environment, agent: Acting) -> None:
-        """Prepare to evaluate policies of `agent` in `env`. `mapper` maps over their seeds."""
+    def __init__(
+        self, mapper: SeedMapper, env: Environment, agent: Acting, cases: Cases | None = None
+    ) -> None:
+        """Prepare to evaluate policies.
+
+        Args:
+            mapper: maps over their seeds.
+            env: the environment.
+            agent: the agent, which makes a policy of parameters.
+            cases: the starts of the episodes, one after another. None stands for random ones.
+        """
         self.mapper = mapper
         self.env = env
         self.agent = agent
+        self.cases = cases
         self._shared = mapper.replicate((env, agent))
         self._run = mapper.map(self._one_seed)
         self._recorders: dict[int, Recorder] = {}
@@ -89,12 +100,15 @@ class Evaluator:
             return
         key = jax.random.key(0)
         deterministic = np.asarray(True)
-        self._run = CompiledInBackground(self._run, self._arguments(key, deterministic), params)
+        cases = self._cases(0, EPISODES_PER_BATCH)
+        arguments = self._arguments(key, deterministic, cases)
+        self._run = CompiledInBackground(self._run, arguments, params)
         params_of_seed = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), params)
         begin, go_on = self._recorder(MIN_RECORDED_EPISODES)
-        position, _ = jax.eval_shape(begin, params_of_seed, key)
+        cases = self._cases(0, MIN_RECORDED_EPISODES)
+        position, _ = jax.eval_shape(begin, params_of_seed, key, cases)
         self._recorders[MIN_RECORDED_EPISODES] = Recorder(
-            begin=CompiledInBackground(begin, params_of_seed, key),
+            begin=CompiledInBackground(begin, params_of_seed, key, cases),
             go_on=CompiledInBackground(go_on, params_of_seed, key, deterministic, position),
         )
 
@@ -112,8 +126,9 @@ class Evaluator:
             Sums over each episode on the host. Every field has the shape [seeds, num_episodes].
         """
 
-        def run_batch(key: Key) -> Episode:
-            arguments = self._arguments(key, np.asarray(deterministic))
+        def run_batch(key: Key, first: int) -> Episode:
+            cases = self._cases(first, EPISODES_PER_BATCH)
+            arguments = self._arguments(key, np.asarray(deterministic), cases)
             return self.mapper.gather(self._run(arguments, params))
 
         return in_batches(run_batch, num_episodes, seed)
@@ -148,6 +163,7 @@ class Evaluator:
                 params,
                 key,
                 deterministic=np.asarray(deterministic),
+                first_case=batch * EPISODES_PER_BATCH,
                 chosen=range(count),
                 size=max(count, MIN_RECORDED_EPISODES),
             )
@@ -171,17 +187,24 @@ class Evaluator:
             params,
             key,
             deterministic=np.asarray(deterministic),
+            first_case=batch * EPISODES_PER_BATCH,
             chosen=[index],
             size=EPISODES_PER_BATCH,
         )
         return episode
 
     def _episodes(
-        self, params: Params, key: Key, deterministic: Any, chosen: Sequence[int], size: int
+        self,
+        params: Params,
+        key: Key,
+        deterministic: Any,
+        first_case: int,
+        chosen: Sequence[int],
+        size: int,
     ) -> Iterator[tuple[State, TimeStep]]:
         """Yield chosen episodes of a batch of `size` episodes, each up to its end."""
         begin, go_on = self._recorder(size)
-        position, first = begin(params, key)
+        position, first = begin(params, key, self._cases(first_case, size))
         pieces = {i: [jax.tree.map(lambda x, i=i: np.asarray(x)[i : i + 1], first)] for i in chosen}
         running = [*chosen]
         limit = min(max_steps(self.env), MAX_RECORDED_STEPS)
@@ -202,20 +225,23 @@ class Evaluator:
             yield jax.tree.map(lambda *x: np.concatenate(x), *episode)
 
     def _one_seed(self, shared: tuple, params: Params) -> Episode:
-        env, agent, key, deterministic = shared
+        env, agent, key, deterministic, cases = shared
         policy = agent.policy(env, params, deterministic)
-        return run_episodes(env, policy, key, EPISODES_PER_BATCH)
+        return run_episodes(env, policy, key, EPISODES_PER_BATCH, cases)
 
-    def _arguments(self, key: Key, deterministic: Any) -> tuple:
-        return *self._shared, *self.mapper.replicate((key, deterministic))
+    def _arguments(self, key: Key, deterministic: Any, cases: Cases | None) -> tuple:
+        return *self._shared, *self.mapper.replicate((key, deterministic, cases))
+
+    def _cases(self, first: int, count: int) -> Cases | None:
+        return None if self.cases is None else self.cases.part(first, count)
 
     def _recorder(self, num_episodes: int) -> Recorder:
         """Return the functions that record this number of episodes. They are compiled once."""
         if num_episodes not in self._recorders:
 
-            def begin(params: Params, key: Key) -> Any:
+            def begin(params: Params, key: Key, cases: Cases | None) -> Any:
                 policy = self.agent.policy(self.env, params, True)
-                return begin_recording(self.env, policy, key, num_episodes)
+                return begin_recording(self.env, policy, key, num_episodes, cases)
 
             def go_on(params: Params, key: Key, deterministic: Any, position: Any) -> Any:
                 policy = self.agent.policy(self.env, params, deterministic)
@@ -231,11 +257,12 @@ class Evaluator:
         return self._recorders[num_episodes]
 
 
-def in_batches(run: Callable[[Key], Episode], num_episodes: int, seed: int) -> Episode:
+def in_batches(run: Callable[[Key, int], Episode], num_episodes: int, seed: int) -> Episode:
     """Run as many batches as needed and join their episodes.
 
     Args:
-        run: runs a batch with a key. Each field of its result is [seeds, EPISODES_PER_BATCH].
+        run: runs a batch with a key and the index of its first episode. Each field of its result
+            is [seeds, EPISODES_PER_BATCH].
         num_episodes: the number of episodes.
         seed: the seed of the evaluation.
 
@@ -243,7 +270,10 @@ def in_batches(run: Callable[[Key], Episode], num_episodes: int, seed: int) -> E
         The first episodes of these batches. Each field is [seeds, num_episodes].
     """
     num_batches = -(-num_episodes // EPISODES_PER_BATCH)
-    batches = [run(key) for key in batch_keys(seed, num_batches)]
+    batches = [
+        run(key, index * EPISODES_PER_BATCH)
+        for index, key in enumerate(batch_keys(seed, num_batches))
+    ]
     return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, :num_episodes], *batches)
 
 

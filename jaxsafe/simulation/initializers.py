@@ -252,7 +252,8 @@ def read_cases(path: Any, place: str = "cases") -> dict[str, list[float]]:
         with full_path.open(newline="", encoding="utf-8-sig") as file:
             names, *rows = list(csv.reader(file)) or [[]]
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise ConfigError(f"{place}: cannot read {full_path}: {error}") from None
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(f"{place}: cannot read {full_path}: {reason}") from None
     names = [name.strip() for name in names]
     if not names or len(set(names)) < len(names):
         raise ConfigError(f"{place}: {full_path}: expected different names in row 1, found {names}")

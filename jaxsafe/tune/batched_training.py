@@ -158,7 +158,7 @@ class BatchedTraining:
             deterministic: whether actions are the mode of the policy's distribution.
         """
 
-        def batch(key: Key) -> Episode:
+        def batch(key: Key, _: int) -> Episode:
             shared = self.mapper.replicate((key, np.asarray(deterministic)))
             return self.mapper.gather(self._evaluate(shared, (trainings, params)))
 

@@ -567,6 +567,22 @@ def configs() -> Path:
     )
 
 
+def cases_file(name: str) -> str:
+    """Return the file of the starts that a task is evaluated from, or `name` if it is a file.
+
+    Raises:
+        ConfigError: no task has such a file.
+    """
+    if Path(name).suffix:
+        return name
+    files = {path.stem: path for path in sorted((configs() / "cases").glob("*.csv"))}
+    if name not in files:
+        raise ConfigError(
+            f"cases: expected a .csv or .yaml file, or a task, found {name}{choices_text(name, files)}"
+        )
+    return str(files[name])
+
+
 def flatten(tree: Mapping[str, Any], place: str = "") -> dict[str, Any]:
     """Return the values of nested mappings by dotted path."""
     flat: dict[str, Any] = {}

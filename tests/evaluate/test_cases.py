@@ -1,0 +1,146 @@
+"""Evaluations from chosen starts."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from default_cases import thorough
+
+import jaxsafe
+from jaxsafe.commands.evaluate import main
+from jaxsafe.devices.seed_mapper import SeedMapper
+from jaxsafe.environment import Environment
+from jaxsafe.evaluate.cases import column_names, columns_of, load_cases, reset_to_cases
+from jaxsafe.evaluate.evaluator import Evaluator
+from jaxsafe.rollout import reset_batch
+from jaxsafe.schema.errors import ConfigError
+
+CONFIGS = Path(__file__).parents[2] / "configs" / "cases"
+
+
+@jax.tree_util.register_static
+class Idle:
+    """A policy that never pushes."""
+
+    def policy(self, env: Any, params: Any, deterministic: Any) -> Any:
+        return lambda key, observation: jnp.zeros((*observation.shape[:-1], 2))
+
+
+def write(path: Path, columns: dict[str, np.ndarray]) -> str:
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
+    return str(path)
+
+
+def short_docking() -> Environment:
+    return jaxsafe.make("docking2d", {"terminal.timeout.limit": 3.0})
+
+
+def test_each_case_is_the_start_of_an_episode_in_order(tmp_path: Path) -> None:
+    env = short_docking()
+    position = np.stack([np.linspace(100.0, 150.0, 130), np.zeros(130)], axis=-1)
+    columns = dict(zip(("deputy.position.x", "deputy.position.y"), position.T, strict=True))
+    columns |= {"deputy.velocity.x": np.zeros(130), "deputy.velocity.y": np.zeros(130)}
+    cases = load_cases(env, write(tmp_path / "line.csv", columns))
+    assert cases.size == 130
+    evaluator = Evaluator(SeedMapper(1), env, Idle(), cases)
+    sums = evaluator.run({"none": np.zeros(1)}, cases.size, seed=0, deterministic=True)
+    assert sums.length.shape == (1, 130)
+    recorded = [
+        states.sim.platforms["deputy"].position[0] for states, _ in evaluator.episodes({}, 130, 0)
+    ]
+    np.testing.assert_allclose(recorded, position, rtol=1e-6)
+    states, _ = evaluator.episode({}, 117, seed=0, deterministic=True)
+    np.testing.assert_allclose(states.sim.platforms["deputy"].position[0], position[117], rtol=1e-6)
+
+
+def test_drawn_numbers_are_columns_too(tmp_path: Path) -> None:
+    env = jaxsafe.make("docking2d", {"randomize": {"deputy.mass": [8.0, 16.0]}})
+    assert column_names(env)[-1] == "deputy.mass"
+    states, timestep = reset_batch(env, jax.random.key(1), 5)
+    file = write(tmp_path / "drawn.csv", columns_of(env, states))
+    again, same = reset_to_cases(env, load_cases(env, file), jax.random.key(2))
+    np.testing.assert_array_equal(again.parameters["deputy.mass"], states.parameters["deputy.mass"])
+    np.testing.assert_array_equal(same.observation, timestep.observation)
+
+
+@pytest.mark.parametrize(
+    "task",
+    ["docking3d", *(thorough(task) for task in jaxsafe.TASKS if task != "docking3d")],
+)
+def test_the_cases_of_a_task_are_its_own_starts_and_a_grid(task: str) -> None:
+    env = jaxsafe.make(task)
+    cases = load_cases(env, str(CONFIGS / f"{task}.csv"))
+    starts, first = reset_batch(env, jax.random.key(0), 1000)
+    random = reset_to_cases(env, cases.part(0, 1000), jax.random.key(0))[1]
+    np.testing.assert_allclose(random.observation, first.observation, rtol=1e-4, atol=1e-3)
+    states, grid = reset_to_cases(env, cases.part(1000, cases.size - 1000), jax.random.key(0))
+    assert not np.any(grid.done)
+    assert not np.any(grid.cost)
+    own, extreme = columns_of(env, starts), columns_of(env, states)
+    for name in column_names(env):
+        spread = np.ptp(own[name])
+        assert np.min(extreme[name]) <= np.min(own[name]) + 0.05 * spread
+        # The last quarter turn is three quarters of the way.
+        assert np.max(extreme[name]) >= np.max(own[name]) - 0.26 * spread
+
+
+def test_a_yaml_file_and_python_give_what_a_csv_file_gives(tmp_path: Path) -> None:
+    env = short_docking()
+    columns = {name: np.array([80.0, 90.0]) for name in column_names(env)[:2]}
+    columns |= {name: np.zeros(2) for name in column_names(env)[2:]}
+    table = write(tmp_path / "two.csv", columns)
+    mapping = tmp_path / "two.yaml"
+    mapping.write_text("".join(f"{name}: {column.tolist()}\n" for name, column in columns.items()))
+    rows = [
+        jaxsafe.evaluate(env, Idle().policy(0, 0, 0), cases=file) for file in (table, str(mapping))
+    ]
+    assert rows[0] == rows[1]
+    assert rows[0]["episode_length"] == 4.0  # the first step after the limit
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("deputy.position.x,deputy.position.y\n1,2\n", "deputy.velocity is missing"),
+        ("deputy.velocity.x\n1\n", "expected all of deputy.velocity.x, deputy.velocity.y, or none"),
+        ("deputy.mass\n1\n", "unknown column 'deputy.mass'; choose from deputy.position.x"),
+        (
+            "deputy.position.x\nnan\n",
+            "case 0: deputy.position.x: expected a finite number, found nan",
+        ),
+        ("deputy.position.x\n", "expected columns of one length of at least 1"),
+    ],
+)
+def test_what_are_no_starts_is_refused_in_one_line(
+    content: str, message: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "wrong.csv"
+    file.write_text(content)
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_cases(short_docking(), str(file))
+    assert str(caught.value).startswith(f"cases: {file}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_the_command_flies_from_the_cases(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    env = jaxsafe.load_policy(whole / "policy" / "seed_0.npz").env
+    states, _ = reset_batch(env, jax.random.key(4), 3)
+    file = write(tmp_path / "three.csv", columns_of(env, states))
+    out = tmp_path / "out"
+    assert main([f"run={whole}", f"cases={file}", f"out={out}"]) == 0
+    results = json.loads((out / "results.json").read_text())
+    assert (results["cases"], results["episodes"]) == (file, 3)
+    assert len((out / "eval.jsonl").read_text().splitlines()) == 2 * 3 * 3
+    for wrong in (["cases=docking9"], [f"cases={file}", "episodes=3"]):
+        with pytest.raises(ConfigError, match="cases"):
+            main([f"run={whole}", *wrong])
