@@ -25,6 +25,8 @@ SAFETY_METRICS = (
     "episode_safety_violation_rate",
     "episode_cost",
     "episode_violation_severity_mean",
+    "episode_violation_severity_p95",
+    "episode_violation_severity_p99",
     "episode_violation_severity_max",
 )
 """The metrics that only an environment with safety constraints has."""
@@ -186,7 +188,8 @@ def summarise(
         A value for every name of `METRICS`. Rates are fractions in [0, 1], Δv is in m/s, length in
         steps. `control_effort` is the mean magnitude of the controls that acted, each as a share of
         its full magnitude, over controls and steps. Severity is a share of the limit. Its mean is
-        over violating steps, and 0 if there are none. A value that is not finite is None too.
+        over violating steps, and 0 if there are none. Its percentiles p95 and p99 are over
+        episodes, of the largest severity of each. A value that is not finite is None too.
     """
     mean = {
         name: float(np.mean(value))
@@ -199,6 +202,7 @@ def summarise(
     ]
     successes = np.atleast_1d(np.asarray(success, int))
     violating = mean["violating_steps"]
+    p95, p99 = np.percentile(np.asarray(episodes.severity_max), (95, 99), method="higher")
     steps = mean["length"]
     values = {
         "average_return": mean["episode_return"],
@@ -211,6 +215,8 @@ def summarise(
         "episode_safety_violation_rate": violating / max(steps, MIN_STEPS),
         "episode_cost": violating,
         "episode_violation_severity_mean": mean["severity_sum"] / violating if violating else 0.0,
+        "episode_violation_severity_p95": float(p95),
+        "episode_violation_severity_p99": float(p99),
         "episode_violation_severity_max": float(np.max(episodes.severity_max)),
         "mean_reward": mean["episode_return"] / max(steps, MIN_STEPS),
         "intervention_rate": mean["interventions"] / max(steps, MIN_STEPS),

@@ -143,6 +143,8 @@ def test_the_metrics_of_three_episodes_are_those_worked_out_by_hand(episodes: Ep
             "episode_safety_violation_rate": 3.0 / 7,  # per step
             "episode_cost": 3.0 / 3,
             "episode_violation_severity_mean": 2.6 / 3,  # over the three violating steps
+            "episode_violation_severity_p95": 2.0,
+            "episode_violation_severity_p99": 2.0,
             "episode_violation_severity_max": 2.0,
             "mean_reward": 3.0 / 7,
             "intervention_rate": 2.0 / 7,
@@ -399,3 +401,15 @@ def test_the_stratified_bootstrap_resamples_within_tasks() -> None:
         0.5,
         0.5,
     ]
+
+
+def test_the_tail_of_severity_is_over_episodes(episodes: Episode) -> None:
+    worst = jnp.arange(1000) / 1000.0
+    many = jax.tree.map(lambda leaf: jnp.resize(leaf, 1000), episodes).replace(severity_max=worst)
+    computed = summarise(many, SUCCESS)
+    assert computed["episode_violation_severity_p95"] == pytest.approx(0.95)
+    assert computed["episode_violation_severity_p99"] == pytest.approx(0.99)
+    assert summarise(many, SUCCESS, has_constraints=False)["episode_violation_severity_p99"] is None
+    infinite = summarise(many.replace(severity_max=worst.at[-3:].set(jnp.inf)), SUCCESS)
+    assert infinite["episode_violation_severity_p99"] == pytest.approx(0.99)
+    assert infinite["episode_violation_severity_max"] is None

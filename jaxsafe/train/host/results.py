@@ -40,6 +40,8 @@ _ROWS = (
     ("episode_safety_violation_rate", "violating steps", "%"),
     ("episode_cost", "violating steps per episode", ""),
     ("episode_violation_severity_mean", "violation severity, mean", "%"),
+    ("episode_violation_severity_p95", "violation severity, 95 % of episodes below", "%"),
+    ("episode_violation_severity_p99", "violation severity, 99 % of episodes below", "%"),
     ("episode_violation_severity_max", "violation severity, max", "%"),
     ("intervention_rate", "steps with an intervention", "%"),
 )
@@ -60,7 +62,11 @@ _METRICS = {
 }
 """The form of the values of each metric. Every evaluation has these metrics."""
 
-_NEW = ("control_effort",)
+_NEW = (
+    "control_effort",
+    "episode_violation_severity_p95",
+    "episode_violation_severity_p99",
+)
 """Metrics that the results of earlier versions lack."""
 
 
