@@ -25,6 +25,7 @@ from jaxsafe.train.host.results import mean_text
 ROOT = Path(__file__).parent.parent
 RESULTS = ROOT / "benchmarks" / "results"
 BASELINES = ROOT / "docs" / "baselines"
+SUBMITTED = ROOT / "docs" / "submitted"
 
 Results = Mapping[str, Any]
 """The content of a file of results."""
@@ -655,6 +656,40 @@ def readme_tasks(_: Results) -> str:
     return markdown(["", *heads.split(" | ")], rows)
 
 
+def reported(_: Results) -> str:
+    """Return the table of published and submitted results: the paper's, ours, and those of others.
+
+    A submitted result is the `results.json` of a run, as `docs/submitted/NAME-TASK.json`.
+    """
+    rows = []
+    for task in TASKS:
+        rows.append([task, "the paper", "–", f"{TASKS[task].paper_steps:,}", "–", "–", "Table 2"])
+        for kind, who in (("engineered_features", "jaxsafe, PPO"), ("rta", "jaxsafe, PPO, filter")):
+            file = BASELINES / f"{task}-{kind}.json"
+            rows.append([task, *_reported(who, read_json(file)["results"], file)])
+        for file in sorted(SUBMITTED.glob(f"*-{task}.json")):
+            who = file.stem.removesuffix(f"-{task}")
+            rows.append([task, *_reported(who, read_json(file), file)])
+    heads = (
+        "task | who | seeds | 80 % success after | success [%] | violating steps of the training"
+        " | file"
+    )
+    return markdown(heads.split(" | "), rows)
+
+
+def _reported(who: str, results: Results, file: Path) -> list[str]:
+    """Return the cells of a result after that of its task."""
+    success = [results["evaluation"][kind]["success_rate"] for kind in EVALUATION_KINDS]
+    return [
+        who,
+        str(results["seeds"]),
+        _until(results["interaction_efficiency"]["timesteps"]),
+        " / ".join(f"{100 * rate['mean']:.2f}" for rate in success),
+        f"{results['training_cost']['mean']:,.0f}",
+        f"[{file.stem}]({file.relative_to(ROOT / 'docs')})",
+    ]
+
+
 def goals(_: Results) -> str:
     """Return the table of ratios that were aimed for, and of those that four results reach.
 
@@ -980,6 +1015,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("", adversaries, "docs/safety/attacks.md"),
     ("", filtered_training, "docs/safety/cost.md"),
     ("", readme_tasks, "README.md"),
+    ("", reported, "docs/protocol.md"),
 )
 """The file of results, the function that makes a table from it, and the page of the table.
 

@@ -15,6 +15,7 @@ COMMANDS = {
     "config": "print an environment as YAML",
     "verify": "prove that a policy is safe from every start in a box",
     "falsify": "let adversaries try to break a filter",
+    "check": "check that results have what the protocol of the benchmark asks for",
     "safe_set": "draw where a filter certifies",
 }
 """What each command does, in the order of the list that `jaxsafe` prints."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxsafe.commands.policies import Subject
 from jaxsafe.environment import Environment, filter_name, require_success
+from jaxsafe.envs.identity import identity
 from jaxsafe.evaluate.cases import Cases
 from jaxsafe.evaluate.evaluator import Evaluator, episode_rows, given_up
 from jaxsafe.metrics import Episode
@@ -103,6 +104,7 @@ def evaluate(
     results = {
         **subject.facts,
         **request,
+        "task": identity(env),
         "rta": filter_name(env),
         "versions": versions(),
         "evaluation": evaluation(env, sums, left_out),

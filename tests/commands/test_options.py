@@ -109,7 +109,7 @@ def test_the_value_of_the_first_option_may_stand_alone_as_the_first_word() -> No
         Options.parse([""])
 
 
-POLICY_COMMANDS = ("evaluate", "plot", "export", "dataset", "verify")
+POLICY_COMMANDS = ("evaluate", "plot", "export", "dataset", "verify", "check")
 """Commands whose first word is a run or a policy."""
 
 

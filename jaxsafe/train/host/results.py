@@ -8,6 +8,7 @@ from typing import Any
 
 from jaxsafe.agents.policy_file import save_policy
 from jaxsafe.environment import Environment, filter_name
+from jaxsafe.envs.identity import identity
 from jaxsafe.evaluate.evaluator import EVALUATION_KINDS, given_up, metrics_per_seed
 from jaxsafe.metrics import ENOUGH_SEEDS, Episode, interaction_efficiency, over_seeds, with_interval
 from jaxsafe.storage.files import read_json, write_json
@@ -84,7 +85,9 @@ def finish(training: Training) -> dict[str, Any]:
     left_out = [seed - config.seed for seed in training.diverged]
     results = {
         **facts(config, env, name),
+        "task": identity(env),
         "steps": training.step,
+        "episodes": config.episodes,
         "wall_s": round(training.clock.seconds, 2),
         "compile_s": round(training.compile_s, 2),
         # Seconds spent on everything up to the last update.

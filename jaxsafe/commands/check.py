@@ -1,0 +1,50 @@
+"""Check whether the results of a run have all that the protocol of the benchmark asks for.
+
+The protocol is docs/protocol.md. The exit code is 1 if something is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from jaxsafe.commands import cli
+from jaxsafe.commands.options import CommandOptions, Option
+from jaxsafe.schema.errors import ConfigError
+
+
+class Options(CommandOptions):
+    """The options of `jaxsafe check`."""
+
+    run: Annotated[
+        str,
+        Option(
+            first=True, examples=("run=runs/docking3d",), takes="a directory, or a results.json"
+        ),
+    ]
+    """A run directory, whose evaluations count too, or a single results.json."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the command and return its exit code."""
+    from jaxsafe.runs.protocol import findings, read_all
+    from jaxsafe.train.host.log import headline
+
+    options = Options.parse(argv)
+    try:
+        results, *others = read_all(options.run)
+    except ConfigError as error:
+        raise ConfigError(f"run: {error}") from None
+    found = findings(results, others)
+    width = max(len(finding.what) for finding in found)
+    print(f"{headline(results)}\n")
+    for what, reported, detail in found:
+        print(f"{'reported' if reported else 'MISSING':8}  {what:{width}}  {detail}")
+    missing = sum(not finding.reported for finding in found)
+    print(f"\n{missing} of {len(found)} are missing" if missing else "\nall is there")
+    return 1 if missing else 0
+
+
+def command() -> None:
+    """Run the command on the words of the command line."""
+    cli.run(main, Options)
