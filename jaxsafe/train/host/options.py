@@ -578,7 +578,8 @@ def cases_file(name: str) -> str:
     files = {path.stem: path for path in sorted((configs() / "cases").glob("*.csv"))}
     if name not in files:
         raise ConfigError(
-            f"cases: expected a .csv or .yaml file, or a task, found {name}{choices_text(name, files)}"
+            f"cases: expected a .csv or .yaml file, or a task, found {name}"
+            f"{choices_text(name, files)}"
         )
     return str(files[name])
 
