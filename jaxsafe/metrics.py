@@ -9,6 +9,7 @@ The paper defines it as the share *without* one, and yet calls lower better.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -81,14 +82,19 @@ class Episode(Record):
     reward_totals: Mapping[str, Float[Array, ""]]  # Σ of each reward term
     # Σ |u| of each control that acted, in the order of the action; () where it is not summed.
     controls: tuple[Float[Array, ""], ...] = ()
+    # Σ of the cost of each constraint that is followed, by its name; empty where none is.
+    costs: Mapping[str, Float[Array, ""]] = dataclasses.field(default_factory=dict)
 
 
-def begin(timestep: TimeStep, sum_controls: bool = False) -> Episode:
+def begin(
+    timestep: TimeStep, sum_controls: bool = False, cost_names: Sequence[str] = ()
+) -> Episode:
     """Return the sums at the start of an episode: all zero, in the shapes of `timestep`.
 
     Args:
         timestep: the first time step.
         sum_controls: whether to sum up the controls too, from which `control_effort` comes.
+        cost_names: the constraints whose costs are summed up too.
     """
     num_controls = timestep.info.control_actual.shape[-1] if sum_controls else 0
     zero = jnp.zeros_like(timestep.reward)
@@ -105,6 +111,7 @@ def begin(timestep: TimeStep, sum_controls: bool = False) -> Episode:
         interventions=count,
         reward_totals=jax.tree.map(jnp.zeros_like, timestep.info.reward_totals),
         controls=(zero,) * num_controls,
+        costs=dict.fromkeys(cost_names, zero),
     )
 
 
@@ -127,6 +134,7 @@ def accumulate(episode: Episode, timestep: TimeStep) -> Episode:
         controls=tuple(
             total + jnp.abs(info.control_actual[..., i]) for i, total in enumerate(episode.controls)
         ),
+        costs={name: total + timestep.costs[name] for name, total in episode.costs.items()},
     )
 
 
@@ -194,7 +202,7 @@ def summarise(
     mean = {
         name: float(np.mean(value))
         for name, value in vars(episodes).items()
-        if name not in ("reward_totals", "controls")
+        if name not in ("reward_totals", "controls", "costs")
     }
     effort = [
         float(np.mean(total)) / (full or 1.0)

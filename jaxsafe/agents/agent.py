@@ -76,6 +76,11 @@ class Agent(Component):
     """
     cost_critic: bool = False
     """Whether a second critic estimates the future cost. `algorithm=ppo_lagrangian` sets it."""
+    cost_names: tuple[str, ...] = ()
+    """The constraints whose costs the second critic estimates, one output each.
+
+    Without any it has one output, for the cost of the step. A `cost_limit` with names sets it.
+    """
 
     @property
     def networks(self) -> dict[str, Network]:
@@ -242,7 +247,8 @@ class Agent(Component):
     ) -> Float[Array, "*batch"]:
         """Return the output of a critic `[*batch]`.
 
-        The output of `cost_critic` is (1 − γ)·V_C(s), the average cost of a step from here on.
+        The output of `cost_critic` is (1 − γ)·V_C(s), the average cost of a step from here on. With
+        `cost_names` it is that of each constraint, `[*batch, c]`.
 
         Args:
             name: `critic` or `cost_critic`.
@@ -251,14 +257,20 @@ class Agent(Component):
                 are sequences `[n, t, c]`.
             sequences: what else a recurrent critic needs to know of the sequences.
         """
-        return self._outputs(name, None, params, critic_inputs, sequences)[..., 0]
+        return self._estimate(name, self._outputs(name, None, params, critic_inputs, sequences))
+
+    def _estimate(
+        self, name: str, outputs: Float[Array, "*batch o"]
+    ) -> Float[Array, "*batch"] | Float[Array, "*batch o"]:
+        """Return the estimates of a critic. A single one has no axis of its own."""
+        return outputs if name == "cost_critic" and self.cost_names else outputs[..., 0]
 
     def critic_step(
         self, name: str, params: Params, critic_inputs: Float[Array, "*batch c"], memory: Memory
     ) -> tuple[Float[Array, "*batch"], Memory]:
         """Return the output of a recurrent critic for one step, and what it remembers after it."""
         memory, outputs = self._apply(name, None, params, memory, critic_inputs)
-        return outputs[..., 0], memory
+        return self._estimate(name, outputs), memory
 
     def act(
         self,
@@ -306,7 +318,11 @@ class Agent(Component):
         network = self.networks[name]
         if name == "actor" and env is not None:
             return network.module(num_outputs(env), 0.01)
-        return network.module(1, 1.0)
+        return network.module(self._num_estimates(name), 1.0)
+
+    def _num_estimates(self, name: str) -> int:
+        """Return how many outputs a critic has."""
+        return len(self.cost_names) or 1 if name == "cost_critic" else 1
 
     def _apply(self, name: str, env: Environment | None, params: Params, *arguments: Any) -> Any:
         """Return what the module of a network returns."""
@@ -353,7 +369,8 @@ def check_agent(agent: Agent, env: Environment, place: str = "agent") -> None:
             f"{place}.log_std: expected one number or {env.action_size}, one for each action, "
             f"found {count}"
         )
-    wanted = dict.fromkeys(agent.networks, 1) | {"actor": num_outputs(env)}
+    wanted = {name: agent._num_estimates(name) for name in agent.networks}
+    wanted["actor"] = num_outputs(env)
     try:
         shapes = jax.eval_shape(lambda: agent.first_outputs(env))
     except ConfigError:

@@ -30,11 +30,15 @@ PANELS = (
     ("grad_norm", "gradient norm", 1.0),
     ("learning_rate", "learning rate", 1.0),
     ("gamma", "discount factor γ", 1.0),
+    ("multiplier", "multiplier of the cost", 1.0),
 )
 """Column of the progress log, label, and factor of each panel."""
 
-LOGARITHMIC = ("value_loss", "cost_value_loss")
-"""Columns on a logarithmic axis, because they fall by orders of magnitude during a training."""
+NAMED_PANELS = {"multiplier": "multiplier of", "episode_cost": "cost of an episode,"}
+"""Label of the panels that each limited constraint has, by the first part of their columns."""
+
+LOGARITHMIC = ("value_loss", "cost_value_loss", "multiplier")
+"""Columns on a logarithmic axis, because they change by orders of magnitude during a training."""
 
 IN_ROW = 5
 """Number of panels in a row."""
@@ -61,7 +65,8 @@ def learning_curves(rows: Rows, x: str, title: str, width: float | None = None) 
         width: the width of the figure in inches.
     """
     rows, left_out = without_diverged(rows)
-    shown = [panel for panel in PANELS if any(row.get(panel[0]) is not None for row in rows)]
+    panels_of_run = [*PANELS, *_named_panels(rows)]
+    shown = [panel for panel in panels_of_run if any(row.get(panel[0]) is not None for row in rows)]
     if not shown:
         return None
     axis = Axis.of(x, rows)
@@ -77,7 +82,7 @@ def learning_curves(rows: Rows, x: str, title: str, width: float | None = None) 
         panel.set_title(quantity)
         panel.margins(x=0.0)
         panel.set_xlim(left=0.0)
-        if name in LOGARITHMIC and np.nanmax(values, initial=0.0) > 0.0:
+        if name.partition("/")[0] in LOGARITHMIC and np.nanmax(values, initial=0.0) > 0.0:
             panel.set_yscale("log")
         if name == "explained_variance":
             panel.set_ylim(max(WORST_SHOWN, panel.get_ylim()[0]), 1.05)
@@ -95,6 +100,16 @@ def learning_curves(rows: Rows, x: str, title: str, width: float | None = None) 
     shown_seeds = "every seed" if alone else shown_seeds
     figure.suptitle(fitted(f"{plain(title)}\neach update, {shown_seeds}{left_out}", figure))
     return figure
+
+
+def _named_panels(rows: Rows) -> list[tuple[str, str, float]]:
+    """Return the panels of the constraints that have a limit of their own."""
+    parts = [(name, *name.partition("/")) for name in (rows[0] if rows else ())]
+    return [
+        (column, f"{NAMED_PANELS[first]}\n{plain(name)}", 1.0)
+        for column, first, slash, name in parts
+        if slash and first in NAMED_PANELS
+    ]
 
 
 def _draw_seeds(panel: Axes, at: np.ndarray, values: np.ndarray) -> None:

@@ -229,7 +229,8 @@ def normalise(value: Any) -> Any:
         changes = {}
         for name, field in fields(type(value)).items():
             content = getattr(value, name)
-            changes[name] = _as_array(content) if field.unit else normalise(content)
+            is_number = field.unit or (isinstance(content, int | float) and not field.static)
+            changes[name] = _as_array(content) if is_number else normalise(content)
         return value.replace(**changes)
     if isinstance(value, tuple):
         return tuple(map(normalise, value))

@@ -121,6 +121,8 @@ def expects(field: Field) -> str:
         unit = "" if symbol in _UNITS_WITHOUT_SYMBOL else f" in {symbol}"
         return f"{_SHAPES[field.unit.length]}{unit} {field.range or ''}".rstrip()
     core = bare(field.hint)
+    if is_union(core):
+        return " or ".join(expects(field_of("", member)) for member in members(core))
     if typing.get_origin(core) is Literal:
         return "one of " + ", ".join(map(str, typing.get_args(core)))
     by_type = {str: "a name", int: "a whole number", bool: "true or false", float: "a number"}
@@ -197,6 +199,8 @@ def _to_structure(value: Any, hint: Any, field: Field, place: str) -> Any:
         return None
     if is_component(hint):
         return to_component(value, hint, place)
+    if is_union(hint):
+        return to_value(value, _member(value, hint), place)
     if origin is tuple:
         return _to_tuple(value, arguments[0], field, place)
     if is_mapping(hint):
@@ -234,6 +238,12 @@ def _to_tuple(value: Any, item_hint: Any, field: Field, place: str) -> tuple:
         item_place = join(place, name if isinstance(name, str) else f"[{index}]")
         items.append(_to_structure(item, item_hint, field, item_place))
     return tuple(items)
+
+
+def _member(value: Any, hint: Any) -> Field:
+    """Return a field that takes the value alone, for an annotation `number | Mapping[…]`."""
+    fits = isinstance(value, Mapping)
+    return next(field_of("", member) for member in members(hint) if is_mapping(member) == fits)
 
 
 def _to_mapping(value: Any, item_hint: Any, place: str) -> dict[str, Any]:
@@ -295,10 +305,19 @@ def bare(hint: Any) -> Any:
     return bare(inner) if optional else hint
 
 
+def is_union(hint: Any) -> bool:
+    """Return whether an annotation is `X | Y`."""
+    return typing.get_origin(hint) in (typing.Union, types.UnionType)
+
+
+def members(hint: Any) -> list[Any]:
+    """Return X and Y of an annotation `X | Y` or `X | Y | None`."""
+    return [member for member in typing.get_args(hint) if member is not type(None)]
+
+
 def is_optional(hint: Any) -> bool:
     """Return whether an annotation allows None."""
-    is_union = typing.get_origin(hint) in (typing.Union, types.UnionType)
-    return is_union and type(None) in typing.get_args(hint)
+    return is_union(hint) and type(None) in typing.get_args(hint)
 
 
 def is_component(hint: Any) -> bool:

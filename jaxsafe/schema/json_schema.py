@@ -10,7 +10,16 @@ import typing
 from typing import Any, Literal
 
 from jaxsafe.schema.component import ANY, Component, Field, Range, choices, field, fields
-from jaxsafe.schema.convert import bare, expects, is_component, is_mapping, is_optional, to_data
+from jaxsafe.schema.convert import (
+    bare,
+    expects,
+    is_component,
+    is_mapping,
+    is_optional,
+    is_union,
+    members,
+    to_data,
+)
 from jaxsafe.schema.field_docs import field_docs, summary
 
 DRAFT = "https://json-schema.org/draft/2020-12/schema"
@@ -94,6 +103,9 @@ def _value(hint: Any, entry: Field, definitions: dict[str, Schema]) -> Schema:
         schema = _numbers(entry.unit.length, entry.range or Range())
     elif is_component(core):
         schema = _reference(core, definitions)
+    elif is_union(core):
+        each = [_value(item, field("", item), definitions) for item in members(core)]
+        schema = {"anyOf": each}
     elif typing.get_origin(core) is tuple:
         item = typing.get_args(core)[0]
         schema = {"type": "array", "items": _value(item, field("", item), definitions)}

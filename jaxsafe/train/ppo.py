@@ -2,7 +2,7 @@
 
 If the agent has a critic of the cost, this is PPO-Lagrangian (Ray, Achiam and Amodei 2019), which
 maximises rewards less a multiplier times costs. The multiplier grows while the episodes cost more
-than `cost_limit`.
+than `cost_limit`. Each constraint may have a limit and a multiplier of its own.
 
 `update` reads like the algorithm: collect a batch, estimate advantages, improve the networks over
 some epochs. Seeds, devices and files are the caller's business. Hyperparameters that are numbers
@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -33,13 +33,16 @@ from jaxsafe.environment import Environment, longest_episode
 from jaxsafe.metrics import Episode, accumulate, begin
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 from jaxsafe.schema.component import Component, Range
-from jaxsafe.schema.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError, nearest, show
 from jaxsafe.train.recent_episodes import Window, empty_window, latest_cost, push
 from jaxsafe.train.shuffle import shuffle
 from jaxsafe.types import Dimensionless, Key, Positive, Record, State, TimeStep
 
 Share = Range(0.0, 1.0)
 """Range of a number from 0 to 1."""
+
+CostLimit = Annotated[Dimensionless, Range(0.0)]
+"""Number of violating steps that an episode may have."""
 
 MAX_COUNT = 2**31 - 1
 """The largest number of environments, steps or minibatches. Programs count in 32 bits."""
@@ -127,10 +130,11 @@ class PPO(Component):
 
     `desired` is the control that the agent chose, and `actual` is the one that acted.
     """
-    cost_limit: Annotated[Dimensionless, Positive] = 25.0
+    cost_limit: CostLimit | Mapping[str, CostLimit] = 25.0
     """Number of violating steps that an episode may have, with PPO-Lagrangian.
 
-    `jaxsafe train` sets it by the option `cost_limit`.
+    A mapping has a number for each constraint that is limited, by its name. `jaxsafe train` sets it
+    by the option `cost_limit`.
     """
     multiplier: Annotated[Dimensionless, Positive] = 0.01
     """Multiplier of the cost at the start, in reward per violating step, with PPO-Lagrangian."""
@@ -176,7 +180,7 @@ class TrainState(Record):
     average: Params
     """Average of the networks over the latest updates. It is evaluated and kept."""
     multiplier: Any = ()
-    """Multiplier of the cost, with PPO-Lagrangian."""
+    """Multiplier of the cost, or of each of the agent's `cost_names` [c], with PPO-Lagrangian."""
 
 
 class Transition(NamedTuple):
@@ -194,7 +198,7 @@ class Transition(NamedTuple):
     """Inputs of the true next observation, before any reset."""
     episode: Episode  # sums including this step
     cost: Any = ()
-    """The cost of the step, if there is a critic of it."""
+    """The cost of the step, if there is a critic of it. With `cost_names` it is [t, n, c]."""
 
 
 class Batch(NamedTuple):
@@ -207,7 +211,7 @@ class Batch(NamedTuple):
     advantage: Array
     value_target: Array
     cost_target: Any = ()
-    """(1 − γ) times the discounted cost to come, if there is a critic of it."""
+    """(1 − γ) times the discounted cost to come, if there is a critic of it, as in `Transition`."""
     weight: Any = ()
     """The weight of each sample, with `complete_episodes`. The mean over the whole batch is 1."""
     sequences: Sequences | None = None
@@ -240,7 +244,10 @@ def init(env: Environment, agent: Agent, ppo: PPO, key: Key, shard: Shard = WHOL
     key_params, key_reset, key_run = jax.random.split(key, 3)
     params = agent.init(key_params, env)
     env_state, timestep = reset_batch(env, key_reset, ppo.num_envs, shard)
-    episode = begin(timestep)
+    episode = begin(timestep, cost_names=agent.cost_names)
+    multiplier = jnp.asarray(ppo.multiplier)
+    if agent.cost_names:
+        multiplier = jnp.broadcast_to(multiplier, len(agent.cost_names))
     return TrainState(
         params=params,
         optimizer=_optimizer(ppo).init(params),
@@ -252,7 +259,7 @@ def init(env: Environment, agent: Agent, ppo: PPO, key: Key, shard: Shard = WHOL
         key=key_run,
         num_updates=jnp.zeros((), jnp.int32),
         average=params,
-        multiplier=jnp.asarray(ppo.multiplier) if agent.cost_critic else (),
+        multiplier=multiplier if agent.cost_critic else (),
     )
 
 
@@ -302,7 +309,9 @@ def update(
     params = {**params, "log_std": params["log_std"] - ppo.noise_decay / total_updates}
     episode, done, counts = shard.join((transitions.episode, transitions.done, counts), axis=1)
     window = push(state.window, episode, done, counts)
-    multiplier = dual_ascent(ppo, state.multiplier, window, done) if agent.cost_critic else ()
+    multiplier = ()
+    if agent.cost_critic:
+        multiplier = dual_ascent(ppo, state.multiplier, window, done, agent.cost_names)
     share = 1.0 / jnp.maximum(ppo.averaging * total_updates, 1.0)
     average = jax.tree.map(
         lambda old, new: (1.0 - share) * old + share * new, state.average, params
@@ -349,6 +358,28 @@ def check_complete_episodes(env: Environment, ppo: PPO) -> None:
     )
 
 
+def check_cost_limit(env: Environment, agent: Agent, ppo: PPO) -> None:
+    """Check that the limits are for constraints of the environment, as the agent's critic is.
+
+    Raises:
+        ConfigError: a limit is for something else, or the critic has other outputs.
+    """
+    if not agent.cost_critic:
+        return
+    limits = ppo.cost_limit if isinstance(ppo.cost_limit, Mapping) else {}
+    constraints = [constraint.name for constraint in env.constraints]
+    unknown = [name for name in limits if name not in constraints]
+    if unknown or (not limits and isinstance(ppo.cost_limit, Mapping)):
+        found = f"unknown constraint {show(unknown[0])}" if unknown else "expected a constraint"
+        allowed = nearest(unknown[0] if unknown else "", constraints)
+        raise ConfigError(f"cost_limit: {found}; choose from {allowed or 'none'}")
+    if agent.cost_names != tuple(sorted(limits)):
+        raise ConfigError(
+            f"agent.cost_names: expected the names in ppo.cost_limit, {show(sorted(limits))},"
+            f" found {show(list(agent.cost_names))}"
+        )
+
+
 def _longest(env: Environment, ppo: PPO) -> Array:
     """Return the number of steps after which every episode of the training has ended."""
     time_limit = longest_episode(env)
@@ -364,7 +395,7 @@ def _start_afresh(
     return state.replace(
         env_state=env_state,
         observation=timestep.observation,
-        episode=begin(timestep),
+        episode=begin(timestep, cost_names=agent.cost_names),
         memory=_fresh_memory(agent, timestep.observation.shape[0]),
     )
 
@@ -426,20 +457,29 @@ def diverged(state: TrainState) -> Bool[Array, ""]:
     return ~jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(watched)]))
 
 
-def dual_ascent(ppo: PPO, multiplier: Array, window: Window, done: Array) -> Array:
+def dual_ascent(
+    ppo: PPO, multiplier: Array, window: Window, done: Array, cost_names: Sequence[str] = ()
+) -> Array:
     """Return the multiplier λ after an update. It changes only if episodes ended.
 
     Its logarithm rises by rate·clip(J_C/limit − 1, −1, 1), where J_C is the mean cost of the latest
     finished episodes. The rule acts on the logarithm, because what a violating step is worth in
-    reward differs by orders of magnitude between tasks.
+    reward differs by orders of magnitude between tasks. A multiplier whose limit is 0 never falls:
+    its logarithm rises by the rate while there is any cost.
 
     Args:
         ppo: the hyperparameters.
-        multiplier: the multiplier before the update.
+        multiplier: the multiplier before the update, or that of each constraint [c].
         window: the latest finished episodes, including those of this update.
         done: whether episodes ended, by step and environment.
+        cost_names: the constraints that have a limit each. Without any, one number is the limit.
     """
-    excess = jnp.clip(latest_cost(window) / ppo.cost_limit - 1.0, -1.0, 1.0)
+    limit: Any = ppo.cost_limit
+    if cost_names:
+        limit = jnp.stack([jnp.asarray(limit[name]) for name in cost_names])
+    cost = latest_cost(window, cost_names)
+    excess = jnp.clip(cost / limit - 1.0, -1.0, 1.0)
+    excess = jnp.where(limit > 0.0, excess, jnp.sign(cost))
     following = jnp.clip(multiplier * jnp.exp(ppo.multiplier_rate * excess), 1e-4, 1e2)
     return jnp.where(jnp.any(done), following, multiplier)
 
@@ -507,7 +547,7 @@ def collect(
             done=done,
             next_inputs=agent.inputs(env, timestep.observation),
             episode=episode,
-            cost=timestep.cost if agent.cost_critic else (),
+            cost=_costs(agent, timestep) if agent.cost_critic else (),
         )
         return (
             env_state,
@@ -526,6 +566,13 @@ def collect(
         memory={**state.memory, "actor": actor_memory},
     )
     return state, transitions
+
+
+def _costs(agent: Agent, timestep: TimeStep) -> Float[Array, "n ..."]:
+    """Return the cost of the step [n], or that of each of the agent's `cost_names` [n, c]."""
+    if not agent.cost_names:
+        return timestep.cost
+    return jnp.stack([timestep.costs[name] for name in agent.cost_names], axis=-1)
 
 
 def _acted(env: Environment, action: Array, timestep: TimeStep) -> Array:
@@ -681,7 +728,7 @@ def loss(
     }
     if agent.cost_critic:
         rate = agent.critic_output("cost_critic", params, seen, batch.sequences)
-        cost_error = 0.5 * (rate - batch.cost_target) ** 2
+        cost_error = _over_costs(agent, 0.5 * (rate - batch.cost_target) ** 2)
         terms["cost_value_loss"] = mean(cost_error)
         value_error += cost_error
     total = mean(
@@ -730,11 +777,14 @@ def _to_batch(
     cost_target = ()
     if agent.cost_critic:
         rate, next_rate, after["cost_critic"] = judge("cost_critic", memory["cost_critic"])
+        terminated, done = t.terminated, t.done
+        if agent.cost_names:
+            terminated, done = terminated[..., None], done[..., None]
         cost_advantage = gae(
-            (1.0 - gamma) * t.cost, rate, next_rate, t.terminated, t.done, gamma, ppo.gae_lambda
+            (1.0 - gamma) * t.cost, rate, next_rate, terminated, done, gamma, ppo.gae_lambda
         )
         cost_target = cost_advantage + rate
-        advantage -= state.multiplier * cost_advantage / (1.0 - gamma)
+        advantage -= _over_costs(agent, state.multiplier * cost_advantage / (1.0 - gamma))
     part = Batch(
         inputs=t.inputs,
         totals=t.totals,
@@ -764,6 +814,11 @@ def _to_batch(
     return state, batch._replace(sequences=sequences), explained
 
 
+def _over_costs(agent: Agent, values: Array) -> Array:
+    """Return the sum of values over the agent's `cost_names`, which are the last axis if any."""
+    return jnp.sum(values, axis=-1) if agent.cost_names else values
+
+
 def _judge(
     agent: Agent,
     params: Params,
@@ -772,7 +827,7 @@ def _judge(
     seen: Float[Array, "t n c"],
     next_seen: Float[Array, "t n c"],
     done: Bool[Array, "t n"],
-) -> tuple[Float[Array, "t n"], Float[Array, "t n"], Memory]:
+) -> tuple[Float[Array, "t n ..."], Float[Array, "t n ..."], Memory]:
     """Return the output of a critic for each state, and for its successor before any reset.
 
     Args:
@@ -807,13 +862,14 @@ def _judge(
 
 def _in_chunks(
     critic: Callable[[Array], Array], seen: Float[Array, "t n c"]
-) -> Float[Array, "t n"]:
+) -> Float[Array, "t n ..."]:
     """Return the output of a critic for each sample. On a CPU it sees `CHUNK` samples at a time."""
     t, n, size = seen.shape
     parts = _num_chunks(t * n)
     if parts == 1:
         return critic(seen)
-    return jax.lax.map(critic, seen.reshape(parts, -1, size)).reshape(t, n)
+    outputs = jax.lax.map(critic, seen.reshape(parts, -1, size))
+    return outputs.reshape(t, n, *outputs.shape[2:])
 
 
 def _num_chunks(samples: int) -> int:

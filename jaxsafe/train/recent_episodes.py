@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import functools
 import operator
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -93,15 +94,27 @@ def total_cost(window: Window) -> Array:
     return window.cost + window.running_cost
 
 
-def latest_cost(window: Window) -> Array:
+def latest_cost(window: Window, names: Sequence[str] = ()) -> Array:
     """Return the mean cost of the latest finished episodes, in violating steps per episode.
 
     It is 0 while there are none.
+
+    Args:
+        window: the window.
+        names: the constraints whose costs are returned, shape [names]. Without any it is one
+            number, for the steps that violate any constraint.
     """
     available = jnp.minimum(window.count, COST_EPISODES)
     age = (window.count - 1 - jnp.arange(SIZE)) % SIZE
-    cost = jnp.sum(jnp.where(age < available, window.episodes.violating_steps, 0))
-    return cost / jnp.maximum(available, 1)
+
+    def mean(costs: Array) -> Array:
+        total = jnp.sum(jnp.where(age < available, costs, jnp.zeros_like(costs)))
+        dtype = jnp.result_type(float)
+        return total.astype(dtype) / jnp.maximum(available, 1).astype(dtype)
+
+    if not names:
+        return mean(window.episodes.violating_steps)
+    return jnp.stack([mean(window.episodes.costs[name]) for name in names])
 
 
 def means(
@@ -144,4 +157,5 @@ def means(
         "intervention_share": mean_share_of_steps(episodes.interventions),
         **{f"outcome/{name}": value for name, value in share.items()},
         **{f"reward/{name}": mean(total) for name, total in episodes.reward_totals.items()},
+        **{f"episode_cost/{name}": mean(total) for name, total in episodes.costs.items()},
     }

@@ -75,9 +75,11 @@ def train(
         The state and the curves. `state.average` holds the parameters for `agent.policy`.
 
     Raises:
-        ConfigError: an episode may be longer than the batch with `complete_episodes`.
+        ConfigError: an episode may be longer than the batch with `complete_episodes`, or a limit of
+            the cost is for no constraint of the environment.
     """
     ppo.check_complete_episodes(env, hyperparameters)
+    ppo.check_cost_limit(env, agent, hyperparameters)
     shared = (env, normalise(agent), normalise(hyperparameters))
     state = _begin(shared, key)
     if params is not None:
@@ -161,7 +163,10 @@ def chunk(
             "cost": recent_episodes.total_cost(state.window),
             "diverged": ppo.diverged(state),
         }
-        if agent.cost_critic:
+        if agent.cost_names:
+            for index, name in enumerate(agent.cost_names):
+                counts[f"multiplier/{name}"] = state.multiplier[index]
+        elif agent.cost_critic:
             counts["multiplier"] = state.multiplier
         means = recent_episodes.means(state.window, env.outcomes, env.successes)
         return state, {**counts, **means, **diagnostics}

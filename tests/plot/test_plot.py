@@ -470,6 +470,19 @@ def test_the_figure_of_what_is_learnt_has_what_the_log_has() -> None:
     assert figure.get_suptitle().endswith("range of the seeds, without seed 8, which diverged")
 
 
+def test_each_limited_constraint_has_a_panel_of_its_multiplier_and_of_its_cost() -> None:
+    by_name = {"multiplier/velocity_limit": 0.5, "episode_cost/velocity_limit": 3.0}
+    figure = learning_curves([row | by_name for row in diagnostics(5)], "steps", "title")
+    assert figure is not None
+    panels = {panel.get_title(): panel for panel in figure.axes}
+    multiplier = panels["multiplier of\nvelocity_limit"]
+    assert multiplier.get_yscale() == "log"
+    np.testing.assert_array_equal(multiplier.lines[0].get_ydata(), 0.5)
+    np.testing.assert_array_equal(
+        panels["cost of an episode,\nvelocity_limit"].lines[0].get_ydata(), 3.0
+    )
+
+
 def test_a_run_of_an_older_version_is_drawn_without_what_is_learnt(
     whole: Path, tmp_path: Path
 ) -> None:

@@ -14,6 +14,7 @@ from jaxsafe.processors.reward import Failure
 from jaxsafe.schema.component import ANY, Component, Range, Unit, choices, field, fields, normalise
 from jaxsafe.schema.convert import expects, to_value
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.schema.json_schema import json_schema
 from jaxsafe.types import Length, Positive, StatusName
 
 Size = Annotated[Any, Unit("m"), Positive]
@@ -53,6 +54,7 @@ class Whole(Component):
     interval: Annotated[Any, Unit("m", length=2)] = (0.0, 1.0)
     scale: Annotated[Any, Unit("m", length=ANY), Range(nonzero=True)] = 1.0
     table: dict[str, Length]
+    either: Size | dict[str, Size] | None = None
     part: Part = SmallPart(name="part")
     parts: tuple[Part, ...] = ()
 
@@ -222,6 +224,31 @@ def test_any_numbers_compile_once() -> None:
     built = [normalise(Whole(name="whole", length=value, table={"a": value})) for value in values]
     assert [float(area(whole)) for whole in built] == [2.0 * float(value) + 1.0 for value in values]
     assert float(area(jax.tree.map(lambda leaf: 2 * leaf, built[0]))) == 6.0
+
+
+def test_a_field_may_take_a_number_or_a_number_for_each_name() -> None:
+    field_either = fields(Whole)["either"]
+    assert not field_either.static
+    assert expects(field_either) == "a number in m > 0 or a mapping"
+    assert to_value(2, field_either, "here") == jnp.array(2.0)
+    assert to_value({"b": 1, "a": 2}, field_either, "here") == {"a": 2.0, "b": 1.0}
+    assert to_value(None, field_either, "here") is None
+    for wrong, message in (
+        (0, "here: expected a number in m > 0, found 0"),
+        ({"a": 0}, "here.a: expected a number in m > 0, found 0"),
+        (["a"], "here: expected a number in m > 0, found .'a'."),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            to_value(wrong, field_either, "here")
+    for value in (0.1, {"b": 0.1, "a": 1}):
+        leaves = jax.tree.leaves(normalise(Whole(name="whole", table={}, either=value)).either)
+        assert all(isinstance(leaf, jax.Array) and not leaf.weak_type for leaf in leaves)
+    schema = json_schema(Whole)["properties"]["either"]
+    number = {"type": "number", "exclusiveMinimum": 0.0}
+    assert schema["anyOf"][0]["anyOf"] == [
+        number,
+        {"type": "object", "additionalProperties": number},
+    ]
 
 
 def test_a_change_of_structure_compiles_anew() -> None:

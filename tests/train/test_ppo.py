@@ -3,16 +3,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from default_cases import thorough
-from probe_environments import Constant, Match, Position, probe
+from probe_environments import Allowed, Constant, Match, Position, probe
 
 from jaxsafe.agents.agent import Agent
-from jaxsafe.agents.networks import MLP
+from jaxsafe.agents.networks import GRU, MLP, Network
+from jaxsafe.config import build
 from jaxsafe.environment import Environment
+from jaxsafe.processors.constraint import SpeedLimit
 from jaxsafe.schema.component import normalise
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import ppo as ppo_module
 from jaxsafe.train.ppo import (
     PPO,
     TrainState,
+    check_cost_limit,
     collect,
     discount,
     dual_ascent,
@@ -360,6 +364,88 @@ def test_the_multiplier_follows_the_excess() -> None:
         assert float(computed) == pytest.approx(2.0 * np.exp(change), rel=1e-5)
         # Without finished episodes nothing new is known.
         assert float(dual_ascent(SMALL, jnp.array(2.0), window, none)) == 2.0
+
+
+@pytest.mark.parametrize("network", [MLP(hidden=(16,)), thorough(GRU(hidden=(16,), units=16))])
+def test_a_limit_of_the_only_constraint_is_a_limit_of_the_cost(network: Network) -> None:
+    env = probe(Push(name="reward"), steps=3, most=0.2)
+    agent = normalise(Agent(actor=network, cost_critic=True))
+    whole = train(env, 3, SMALL.replace(cost_limit=0.5), agent)
+    by_name = agent.replace(cost_names=("push",))
+    named = train(env, 3, SMALL.replace(cost_limit={"push": jnp.array(0.5)}), by_name)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), named.params, whole.params
+    )
+    assert named.multiplier.shape == (1,)
+    np.testing.assert_allclose(named.multiplier[0], whole.multiplier, rtol=1e-6)
+    episodes = named.window.episodes
+    np.testing.assert_array_equal(episodes.costs["push"], episodes.violating_steps)
+    assert float(jnp.max(episodes.costs["push"])) > 0.0
+
+
+def two_limits() -> Environment:
+    """Return an environment that pays for pushing, with two constraints of the push."""
+    env = probe(Push(name="reward"), most=0.2)
+    return build(
+        env.replace(
+            status=(*env.status, Allowed(name="more", most=0.6)),
+            constraints=(
+                *env.constraints,
+                SpeedLimit(name="hard_push", speed="hard", velocity_limit="more"),
+            ),
+        )
+    )
+
+
+@pytest.mark.thorough
+def test_each_constraint_has_a_limit_of_its_own_and_others_have_none() -> None:
+    agent = AGENT.replace(cost_critic=True)
+    for limits in ({"hard_push": 0.2}, {"hard_push": 0.2, "push": 2.0}):
+        some = SMALL.replace(cost_limit=limits, multiplier=2.0)
+        state = train(two_limits(), 200, some, agent.replace(cost_names=tuple(sorted(limits))))
+        episodes = state.window.episodes
+        assert float(jnp.mean(episodes.costs["hard_push"])) <= 0.3
+        assert float(jnp.mean(episodes.violating_steps)) > 0.9  # of the push that may be too hard
+
+
+def test_each_multiplier_follows_the_excess_of_its_constraint() -> None:
+    agent = AGENT.replace(cost_critic=True, cost_names=("hard_push", "push"))
+    state = init(two_limits(), agent, SMALL, jax.random.key(0))
+    costs = {"hard_push": jnp.full(100, 1.0), "push": jnp.full(100, 3.0)}
+    window = state.window.replace(
+        episodes=state.window.episodes.replace(costs=costs), count=jnp.array(100)
+    )
+    rate = float(SMALL.multiplier_rate)
+    for limits, changes in (
+        ((1.0, 2.0), (0.0, 0.5 * rate)),
+        ((4.0, 3.0), (-0.75 * rate, 0.0)),
+        ((0.0, 6.0), (rate, -0.5 * rate)),
+    ):
+        ppo = SMALL.replace(cost_limit=dict(zip(agent.cost_names, limits, strict=True)))
+        computed = dual_ascent(
+            ppo, jnp.array([2.0, 1.0]), window, jnp.array([True]), agent.cost_names
+        )
+        np.testing.assert_allclose(computed, [2.0, 1.0] * np.exp(changes), rtol=1e-5)
+
+
+def test_the_critic_of_costs_must_be_that_of_the_limits() -> None:
+    agent = AGENT.replace(cost_critic=True)
+    for limits, names, message in (
+        ({"push": 1.0}, (), r"agent.cost_names: expected the names .*, \['push'\], found \[\]"),
+        (1.0, ("push",), r"agent.cost_names: expected the names .*, \[\], found \['push'\]"),
+        ({"pull": 1.0}, ("pull",), "cost_limit: unknown constraint 'pull'; choose from push, hard"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            check_cost_limit(
+                two_limits(), agent.replace(cost_names=names), SMALL.replace(cost_limit=limits)
+            )
+
+
+def test_a_multiplier_whose_limit_is_0_never_falls() -> None:
+    state = init(probe(Push(name="reward"), most=0.2), AGENT, SMALL, jax.random.key(0))
+    window = state.window.replace(count=jnp.array(100))
+    none_allowed = SMALL.replace(cost_limit=jnp.array(0.0))
+    assert float(dual_ascent(none_allowed, jnp.array(2.0), window, jnp.array([True]))) == 2.0
 
 
 @pytest.mark.thorough

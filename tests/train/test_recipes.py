@@ -174,6 +174,12 @@ def test_what_follows_from_an_option_of_the_other_run_follows_from_a_new_one(
     assert (float(config.ppo.cost_limit), config.agent.cost_critic) == (5.0, True)
     config, _, _ = resolve({"like": limited, "algorithm": "ppo"})
     assert (config.cost_limit, config.agent.cost_critic) == (None, False)
+    by_name = run_with("by_name", algorithm="ppo_lagrangian", cost_limit={"velocity_limit": 5})
+    config, _, _ = resolve({"like": by_name})
+    assert config.ppo.cost_limit == {"velocity_limit": 5.0}
+    assert config.agent.cost_names == ("velocity_limit",)
+    config, _, _ = resolve({"like": by_name, "cost_limit": 4})
+    assert (float(config.ppo.cost_limit), config.agent.cost_names) == (4.0, ())
 
 
 def test_a_run_that_cannot_be_followed_is_told(whole: Path, tmp_path: Path) -> None:

@@ -798,14 +798,20 @@ def test_a_checkpoint_without_room_is_one_line_and_leaves_the_one_before(
 
 
 @pytest.mark.thorough
-def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(tmp_path: Path) -> None:
-    words = [*TINY, "algorithm=ppo_lagrangian", "cost_limit=3"]
+@pytest.mark.parametrize(
+    ("limit", "column"),
+    [("3", "multiplier"), ("{velocity_limit: 3}", "multiplier/velocity_limit")],
+)
+def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(
+    tmp_path: Path, limit: str, column: str
+) -> None:
+    words = [*TINY, "algorithm=ppo_lagrangian", f"cost_limit={limit}"]
     straight = tmp_path / "straight"
     stopped = tmp_path / "stopped"
     assert command.main([*words, f"out={straight}"]) == 0
     rows = logs(straight)["progress.jsonl"]
-    assert all(row["multiplier"] > 0.0 for row in rows if row["episodes"])
-    assert len({row["multiplier"] for row in rows}) > 3
+    assert all(row[column] > 0.0 for row in rows if row["episodes"])
+    assert len({row[column] for row in rows}) > 3
     assert all(row["cost_value_loss"] >= 0.0 for row in rows)
     policy = load_policy(straight / "policy" / "seed_0.npz")
     assert policy(jax.random.key(0), np.zeros(6, np.float32)).shape == (2,)
@@ -816,9 +822,11 @@ def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(tmp_path: Path) -> 
     shutil.rmtree(stopped / "checkpoints" / str(last))
     (stopped / "results.json").unlink()
     assert command.main([f"resume={stopped}"]) == 0
-    assert [row["multiplier"] for row in logs(stopped)["progress.jsonl"]] == [
-        row["multiplier"] for row in rows
-    ]
+    resumed = logs(stopped)["progress.jsonl"]
+    assert [row[column] for row in resumed] == [row[column] for row in rows]
+    if limit != "3":  # docking has one constraint
+        column = "episode_cost/velocity_limit"
+        assert [row[column] for row in resumed] == [row["episode_cost"] for row in rows]
 
 
 @pytest.mark.parametrize(
@@ -826,7 +834,23 @@ def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(tmp_path: Path) -> 
     [
         (["algorithm=ppo_lagrangian"], "cost_limit: missing; the violating steps"),
         (["cost_limit=5"], "cost_limit: plain PPO has none; add algorithm=ppo_lagrangian"),
-        (["algorithm=ppo_lagrangian", "cost_limit=0"], "cost_limit: expected a number > 0"),
+        (["algorithm=ppo_lagrangian", "cost_limit=-1"], "cost_limit: expected a number ≥ 0"),
+        (
+            ["algorithm=ppo_lagrangian", "cost_limit={velocity: 1}"],
+            "cost_limit: unknown constraint 'velocity'; choose from velocity_limit. Did you mean",
+        ),
+        (
+            ["algorithm=ppo_lagrangian", "cost_limit={}"],
+            "cost_limit: expected a constraint; choose from velocity_limit",
+        ),
+        (
+            ["algorithm=ppo_lagrangian", "cost_limit={velocity_limit: -1}"],
+            "cost_limit.velocity_limit: expected a number ≥ 0, found -1",
+        ),
+        (
+            ["agent.cost_names=[velocity_limit]"],
+            "agent.cost_names: follows from the algorithm; give cost_limit={NAME: N}",
+        ),
         (
             ["algorithm=trpo"],
             "algorithm: found .trpo.. Did you mean 'ppo'. Choose from ppo, ppo_lagrangian",

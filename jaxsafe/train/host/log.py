@@ -201,7 +201,8 @@ def progress_rows(
     num_seeds, num_updates = curves["count"].shape
     sound = ~curves["diverged"]
     known = (curves["count"] > 0) & sound
-    measured = columns(env) + (["multiplier"] if "multiplier" in curves else [])
+    measured = columns(env)
+    measured += [name for name in curves if name.startswith(("episode_cost/", "multiplier"))]
     diagnostics = [name for name in DIAGNOSTICS if name in curves]
     return [
         {

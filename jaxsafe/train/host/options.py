@@ -24,8 +24,13 @@ from jaxsafe.schema.retype import set_paths
 from jaxsafe.train.host.sinks import LIBRARIES, library
 from jaxsafe.train.host.starts import with_unproved_starts
 from jaxsafe.train.host.warm_start import agent_options
-from jaxsafe.train.ppo import MAX_COUNT, PPO, check_complete_episodes
-from jaxsafe.types import Dimensionless, Positive
+from jaxsafe.train.ppo import (
+    MAX_COUNT,
+    PPO,
+    CostLimit,
+    check_complete_episodes,
+    check_cost_limit,
+)
 
 Count = Annotated[int, Range(1, largest=MAX_COUNT)]
 """A number of devices or episodes."""
@@ -84,8 +89,12 @@ class TrainConfig(Component):
     """
     algorithm: Literal["ppo", "ppo_lagrangian"] = "ppo"
     """The algorithm. `ppo_lagrangian` also keeps the violating steps below `cost_limit`."""
-    cost_limit: Annotated[Dimensionless, Positive] | None = None
-    """Number of violating steps that an episode may have, with `algorithm=ppo_lagrangian`."""
+    cost_limit: CostLimit | Mapping[str, CostLimit] | None = None
+    """Number of violating steps that an episode may have, with `algorithm=ppo_lagrangian`.
+
+    It may be one for each constraint, for instance cost_limit='{velocity_limit: 1, keep_out: 0}'.
+    A constraint without a limit is not limited then.
+    """
     seeds: Annotated[int, Range(1, largest=MAX_SEEDS)] = 1
     """Number of seeds, which are trained as one program."""
     seed: Annotated[int, Range(0, 2**31 - 1)] = 0
@@ -282,6 +291,7 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
             f"ppo.num_envs × ppo.num_steps: expected less than 2³¹, found {config.ppo.batch_size:,}"
         )
     check_complete_episodes(env, config.ppo)
+    check_cost_limit(env, config.agent, config.ppo)
     if config.num_updates >= 2**31:
         raise ConfigError(
             f"steps: expected less than 2³¹ updates of {config.ppo.batch_size:,}, "
@@ -387,7 +397,9 @@ def _base(run: str, given: Mapping[str, Any]) -> Base:
     config = config.replace(
         out=None,
         cost_limit=config.cost_limit if same_algorithm else None,
-        agent=config.agent.replace(cost_critic=defaults.agent.cost_critic),
+        agent=config.agent.replace(
+            cost_critic=defaults.agent.cost_critic, cost_names=defaults.agent.cost_names
+        ),
         ppo=config.ppo.replace(cost_limit=defaults.ppo.cost_limit),
     )
     if config.rta_training == "corrected_action":
@@ -405,7 +417,13 @@ def _inherit_agent(arguments: Arguments, source: str) -> None:
         given = [name for name in arguments.options if f"{name}.".startswith(f"{path}.")]
         if given:
             raise ConfigError(f"{given[0]}: the training starts from {source}, which decides it")
-        if path != "agent.cost_critic":
+        if path == "agent.cost_names":
+            limits = arguments.options.get("cost_limit")
+            names = sorted(limits) if isinstance(limits, Mapping) else []
+            if names != value:
+                kind = f"one for each of {', '.join(value)}" if value else "a number"
+                raise ConfigError(f"cost_limit: expected {kind}, because {source} has that")
+        elif path != "agent.cost_critic":
             arguments.options[path] = value
         elif value and arguments.options.get("algorithm") != "ppo_lagrangian":
             raise ConfigError(f"from: {source} was trained with algorithm=ppo_lagrangian; add it")
@@ -424,6 +442,7 @@ def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfi
     """
     for path, instead in (
         ("agent.cost_critic", "algorithm=ppo_lagrangian"),
+        ("agent.cost_names", "cost_limit={NAME: N}"),
         ("ppo.cost_limit", "cost_limit=N"),
     ):
         if path in given:
@@ -445,8 +464,9 @@ def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfi
             "ppo.gamma: expected less than 1 with algorithm=ppo_lagrangian, "
             f"found {float(config.ppo.gamma)}"
         )
+    limits = config.cost_limit if isinstance(config.cost_limit, Mapping) else {}
     return config.replace(
-        agent=config.agent.replace(cost_critic=True),
+        agent=config.agent.replace(cost_critic=True, cost_names=tuple(limits)),
         ppo=config.ppo.replace(cost_limit=config.cost_limit),
     )
 
