@@ -2,7 +2,8 @@
 
 If the agent has a critic of the cost, this is PPO-Lagrangian (Ray, Achiam and Amodei 2019), which
 maximises rewards less a multiplier times costs. The multiplier grows while the episodes cost more
-than `cost_limit`. Each constraint may have a limit and a multiplier of its own.
+than `cost_limit`. Each constraint may have a limit and a multiplier of its own. With further gains
+a PID controller moves the multiplier (Stooke, Achiam and Abbeel 2020).
 
 `update` reads like the algorithm: collect a batch, estimate advantages, improve the networks over
 some epochs. Seeds, devices and files are the caller's business. Hyperparameters that are numbers
@@ -43,6 +44,9 @@ Share = Range(0.0, 1.0)
 
 CostLimit = Annotated[Dimensionless, Range(0.0)]
 """Number of violating steps that an episode may have."""
+
+Gain = Annotated[Dimensionless, Range(0.0, largest=10.0)]
+"""Gain of a multiplier's logarithm on the excess of the cost as a share of its limit."""
 
 MAX_COUNT = 2**31 - 1
 """The largest number of environments, steps or minibatches. Programs count in 32 bits."""
@@ -140,6 +144,16 @@ class PPO(Component):
     """Multiplier of the cost at the start, in reward per violating step, with PPO-Lagrangian."""
     multiplier_rate: Annotated[Dimensionless, Range(0.0)] = 0.03
     """Largest change of the multiplier's logarithm in an update, with PPO-Lagrangian."""
+    multiplier_proportional: Gain = 0.0
+    """Rise of the multiplier's logarithm while the cost is twice its limit, with PPO-Lagrangian.
+
+    It is the proportional gain of PID-Lagrangian, and `multiplier_rate` is the integral one.
+    """
+    multiplier_derivative: Gain = 0.0
+    """Rise of the multiplier's logarithm while the cost grows by its limit from update to update.
+
+    It is the derivative gain of PID-Lagrangian. A cost that falls does not count.
+    """
 
     @property
     def batch_size(self) -> int:
@@ -180,7 +194,14 @@ class TrainState(Record):
     average: Params
     """Average of the networks over the latest updates. It is evaluated and kept."""
     multiplier: Any = ()
-    """Multiplier of the cost, or of each of the agent's `cost_names` [c], with PPO-Lagrangian."""
+    """Multiplier of the cost, or of each of the agent's `cost_names` [c], with PPO-Lagrangian.
+
+    It is the part that the integral gain moves. `price` returns the whole multiplier.
+    """
+    multiplier_boost: Any = ()
+    """What the other gains add to the multiplier's logarithm, in the shape of `multiplier`."""
+    cost_excess: Any = ()
+    """The latest excess of the cost as a share of its limit, in the shape of `multiplier`."""
 
 
 class Transition(NamedTuple):
@@ -245,9 +266,12 @@ def init(env: Environment, agent: Agent, ppo: PPO, key: Key, shard: Shard = WHOL
     params = agent.init(key_params, env)
     env_state, timestep = reset_batch(env, key_reset, ppo.num_envs, shard)
     episode = begin(timestep, cost_names=agent.cost_names)
-    multiplier = jnp.asarray(ppo.multiplier)
-    if agent.cost_names:
-        multiplier = jnp.broadcast_to(multiplier, len(agent.cost_names))
+    multiplier: Any = ()
+    no_excess: Any = ()
+    if agent.cost_critic:
+        shape = (len(agent.cost_names),) if agent.cost_names else ()
+        multiplier = jnp.broadcast_to(jnp.asarray(ppo.multiplier), shape)
+        no_excess = jnp.zeros_like(multiplier)
     return TrainState(
         params=params,
         optimizer=_optimizer(ppo).init(params),
@@ -259,7 +283,9 @@ def init(env: Environment, agent: Agent, ppo: PPO, key: Key, shard: Shard = WHOL
         key=key_run,
         num_updates=jnp.zeros((), jnp.int32),
         average=params,
-        multiplier=multiplier if agent.cost_critic else (),
+        multiplier=multiplier,
+        multiplier_boost=no_excess,
+        cost_excess=no_excess,
     )
 
 
@@ -309,9 +335,8 @@ def update(
     params = {**params, "log_std": params["log_std"] - ppo.noise_decay / total_updates}
     episode, done, counts = shard.join((transitions.episode, transitions.done, counts), axis=1)
     window = push(state.window, episode, done, counts)
-    multiplier = ()
     if agent.cost_critic:
-        multiplier = dual_ascent(ppo, state.multiplier, window, done, agent.cost_names)
+        state = dual_ascent(ppo, state, window, done, agent.cost_names)
     share = 1.0 / jnp.maximum(ppo.averaging * total_updates, 1.0)
     average = jax.tree.map(
         lambda old, new: (1.0 - share) * old + share * new, state.average, params
@@ -322,7 +347,6 @@ def update(
         window=window,
         num_updates=state.num_updates + 1,
         average=average,
-        multiplier=multiplier,
     )
     diagnostics = {
         **losses,
@@ -458,18 +482,21 @@ def diverged(state: TrainState) -> Bool[Array, ""]:
 
 
 def dual_ascent(
-    ppo: PPO, multiplier: Array, window: Window, done: Array, cost_names: Sequence[str] = ()
-) -> Array:
-    """Return the multiplier λ after an update. It changes only if episodes ended.
+    ppo: PPO, state: TrainState, window: Window, done: Array, cost_names: Sequence[str] = ()
+) -> TrainState:
+    """Return the state with its multiplier λ after an update. It changes only if episodes ended.
 
-    Its logarithm rises by rate·clip(J_C/limit − 1, −1, 1), where J_C is the mean cost of the latest
-    finished episodes. The rule acts on the logarithm, because what a violating step is worth in
-    reward differs by orders of magnitude between tasks. A multiplier whose limit is 0 never falls:
-    its logarithm rises by the rate while there is any cost.
+    Its logarithm rises by rate·e, where e = clip(J_C/limit − 1, −1, 1) and J_C is the mean cost of
+    the latest finished episodes. The rule acts on the logarithm, because what a violating step is
+    worth in reward differs by orders of magnitude between tasks. A multiplier whose limit is 0
+    never falls: its logarithm rises by the rate while there is any cost.
+
+    The other gains of a PID controller add K_P·e + K_D·max(0, e − e') to the logarithm, where e' is
+    the excess before the update.
 
     Args:
         ppo: the hyperparameters.
-        multiplier: the multiplier before the update, or that of each constraint [c].
+        state: the state before the update.
         window: the latest finished episodes, including those of this update.
         done: whether episodes ended, by step and environment.
         cost_names: the constraints that have a limit each. Without any, one number is the limit.
@@ -480,8 +507,20 @@ def dual_ascent(
     cost = latest_cost(window, cost_names)
     excess = jnp.clip(cost / limit - 1.0, -1.0, 1.0)
     excess = jnp.where(limit > 0.0, excess, jnp.sign(cost))
-    following = jnp.clip(multiplier * jnp.exp(ppo.multiplier_rate * excess), 1e-4, 1e2)
-    return jnp.where(jnp.any(done), following, multiplier)
+    following = jnp.clip(state.multiplier * jnp.exp(ppo.multiplier_rate * excess), 1e-4, 1e2)
+    growth = jnp.maximum(excess - state.cost_excess, 0.0)
+    boost = ppo.multiplier_proportional * excess + ppo.multiplier_derivative * growth
+    known = jnp.any(done)
+    return state.replace(
+        multiplier=jnp.where(known, following, state.multiplier),
+        multiplier_boost=jnp.where(known, boost, state.multiplier_boost),
+        cost_excess=jnp.where(known, excess, state.cost_excess),
+    )
+
+
+def price(state: TrainState) -> Array:
+    """Return the multiplier of the cost, or of each constraint that has one [c]."""
+    return state.multiplier * jnp.exp(state.multiplier_boost)
 
 
 def learning_rate(ppo: PPO, progress: Array | float) -> Array:
@@ -784,7 +823,7 @@ def _to_batch(
             (1.0 - gamma) * t.cost, rate, next_rate, terminated, done, gamma, ppo.gae_lambda
         )
         cost_target = cost_advantage + rate
-        advantage -= _over_costs(agent, state.multiplier * cost_advantage / (1.0 - gamma))
+        advantage -= _over_costs(agent, price(state) * cost_advantage / (1.0 - gamma))
     part = Batch(
         inputs=t.inputs,
         totals=t.totals,

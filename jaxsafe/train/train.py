@@ -165,9 +165,9 @@ def chunk(
         }
         if agent.cost_names:
             for index, name in enumerate(agent.cost_names):
-                counts[f"multiplier/{name}"] = state.multiplier[index]
+                counts[f"multiplier/{name}"] = ppo.price(state)[index]
         elif agent.cost_critic:
-            counts["multiplier"] = state.multiplier
+            counts["multiplier"] = ppo.price(state)
         means = recent_episodes.means(state.window, env.outcomes, env.successes)
         return state, {**counts, **means, **diagnostics}
 

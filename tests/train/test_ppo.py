@@ -24,6 +24,7 @@ from jaxsafe.train.ppo import (
     gae,
     init,
     learning_rate,
+    price,
     update,
 )
 from jaxsafe.types import Sim
@@ -335,7 +336,7 @@ def test_costs_are_kept_within_their_limit(limit: float, low: float, high: float
     ppo = SMALL.replace(cost_limit=limit, multiplier=2.0)
     state = train(env, 200, ppo, agent)
     assert low <= float(jnp.mean(state.window.episodes.violating_steps)) <= high
-    assert float(state.multiplier) < 2.0  # the multiplier fell while nothing exceeded the limit
+    assert float(price(state)) < 2.0  # the multiplier fell while nothing exceeded the limit
 
 
 @pytest.mark.thorough
@@ -352,18 +353,18 @@ def test_the_critic_of_costs_expects_what_a_step_costs() -> None:
 def test_the_multiplier_follows_the_excess() -> None:
     env = probe(Constant(name="reward"), most=-1.0)
     state = init(env, AGENT.replace(cost_critic=True), SMALL, jax.random.key(0))
+    state = state.replace(multiplier=jnp.array(2.0))
     costs = state.window.episodes.replace(violating_steps=jnp.full(100, 3))
     window = state.window.replace(episodes=costs, count=jnp.array(100))
     some = jnp.array([True])
     none = jnp.array([False])
     rate = float(SMALL.multiplier_rate)
     for limit, change in ((3.0, 0.0), (6.0, -0.5 * rate), (2.0, 0.5 * rate), (0.1, rate)):
-        computed = dual_ascent(
-            SMALL.replace(cost_limit=jnp.array(limit)), jnp.array(2.0), window, some
-        )
+        ppo = SMALL.replace(cost_limit=jnp.array(limit))
+        computed = price(dual_ascent(ppo, state, window, some))
         assert float(computed) == pytest.approx(2.0 * np.exp(change), rel=1e-5)
         # Without finished episodes nothing new is known.
-        assert float(dual_ascent(SMALL, jnp.array(2.0), window, none)) == 2.0
+        assert float(price(dual_ascent(ppo, state, window, none))) == 2.0
 
 
 @pytest.mark.parametrize("network", [MLP(hidden=(16,)), thorough(GRU(hidden=(16,), units=16))])
@@ -422,10 +423,9 @@ def test_each_multiplier_follows_the_excess_of_its_constraint() -> None:
         ((0.0, 6.0), (rate, -0.5 * rate)),
     ):
         ppo = SMALL.replace(cost_limit=dict(zip(agent.cost_names, limits, strict=True)))
-        computed = dual_ascent(
-            ppo, jnp.array([2.0, 1.0]), window, jnp.array([True]), agent.cost_names
-        )
-        np.testing.assert_allclose(computed, [2.0, 1.0] * np.exp(changes), rtol=1e-5)
+        before = state.replace(multiplier=jnp.array([2.0, 1.0]))
+        after = dual_ascent(ppo, before, window, jnp.array([True]), agent.cost_names)
+        np.testing.assert_allclose(price(after), [2.0, 1.0] * np.exp(changes), rtol=1e-5)
 
 
 def test_the_critic_of_costs_must_be_that_of_the_limits() -> None:
@@ -442,10 +442,47 @@ def test_the_critic_of_costs_must_be_that_of_the_limits() -> None:
 
 
 def test_a_multiplier_whose_limit_is_0_never_falls() -> None:
-    state = init(probe(Push(name="reward"), most=0.2), AGENT, SMALL, jax.random.key(0))
+    env = probe(Push(name="reward"), most=0.2)
+    state = init(env, AGENT.replace(cost_critic=True), SMALL, jax.random.key(0))
     window = state.window.replace(count=jnp.array(100))
     none_allowed = SMALL.replace(cost_limit=jnp.array(0.0))
-    assert float(dual_ascent(none_allowed, jnp.array(2.0), window, jnp.array([True]))) == 2.0
+    after = dual_ascent(none_allowed, state, window, jnp.array([True]))
+    assert float(after.multiplier) == float(state.multiplier)
+
+
+def test_the_gains_of_pid_lagrangian_act_on_the_excess_and_on_its_growth() -> None:
+    env = probe(Push(name="reward"), most=0.2)
+    state = init(env, AGENT.replace(cost_critic=True), SMALL, jax.random.key(0))
+    gains = {"multiplier_proportional": 0.2, "multiplier_derivative": 0.4}
+    ppo = SMALL.replace(cost_limit=2.0, multiplier_rate=0.0, **gains)
+    # An excess that did not grow has no derivative part.
+    for cost, boost in (
+        (3, 0.2 * 0.5 + 0.4 * 0.5),
+        (3, 0.2 * 0.5),
+        (8, 0.2 + 0.4 * 0.5),
+        (1, -0.1),
+    ):
+        episodes = state.window.episodes.replace(violating_steps=jnp.full(100, cost))
+        window = state.window.replace(episodes=episodes, count=jnp.array(100))
+        state = dual_ascent(ppo, state, window, jnp.array([True]))
+        expected = float(SMALL.multiplier) * np.exp(boost)
+        assert float(price(state)) == pytest.approx(expected, rel=1e-5)
+        unchanged = dual_ascent(ppo.replace(cost_limit=1.0), state, window, jnp.array([False]))
+        assert float(price(unchanged)) == float(price(state))
+    integral_only = dual_ascent(SMALL, state, state.window, jnp.array([True]))
+    assert float(price(integral_only)) == float(integral_only.multiplier)
+
+
+def test_the_whole_multiplier_is_the_price_of_the_cost() -> None:
+    env = probe(Push(name="reward"), most=0.2)
+    agent = AGENT.replace(cost_critic=True)
+    state = init(env, agent, SMALL, jax.random.key(0))
+    one_update = jax.jit(lambda state: update(env, agent, SMALL, 10, state)[0].params)
+    boosted = one_update(state.replace(multiplier_boost=jnp.log(jnp.array(300.0))))
+    larger = one_update(state.replace(multiplier=300.0 * state.multiplier))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), boosted, larger)
+    plain = one_update(state)
+    assert float(jnp.max(jnp.abs(plain["log_std"] - boosted["log_std"]))) > 1e-3
 
 
 @pytest.mark.thorough

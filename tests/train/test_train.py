@@ -803,13 +803,20 @@ def test_a_checkpoint_without_room_is_one_line_and_leaves_the_one_before(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    ("limit", "column"),
-    [("3", "multiplier"), ("{velocity_limit: 3}", "multiplier/velocity_limit")],
+    ("limit", "column", "options"),
+    [
+        ("3", "multiplier", []),
+        (
+            "{velocity_limit: 3}",
+            "multiplier/velocity_limit",
+            ["ppo.multiplier_proportional=0.3", "ppo.multiplier_derivative=0.5"],
+        ),
+    ],
 )
 def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(
-    tmp_path: Path, limit: str, column: str
+    tmp_path: Path, limit: str, column: str, options: list[str]
 ) -> None:
-    words = [*TINY, "algorithm=ppo_lagrangian", f"cost_limit={limit}"]
+    words = [*TINY, "algorithm=ppo_lagrangian", f"cost_limit={limit}", *options]
     straight = tmp_path / "straight"
     stopped = tmp_path / "stopped"
     assert command.main([*words, f"out={straight}"]) == 0

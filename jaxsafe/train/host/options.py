@@ -448,8 +448,8 @@ def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfi
         if path in given:
             raise ConfigError(f"{path}: follows from the algorithm; give {instead}")
     if config.algorithm == "ppo":
-        for path in ("ppo.multiplier", "ppo.multiplier_rate"):
-            if path in given:
+        for path in given:
+            if path.startswith("ppo.multiplier"):
                 raise ConfigError(f"{path}: plain PPO has none; add algorithm=ppo_lagrangian")
         if config.cost_limit is not None:
             raise ConfigError("cost_limit: plain PPO has none; add algorithm=ppo_lagrangian")

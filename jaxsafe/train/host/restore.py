@@ -46,10 +46,10 @@ def structure(env: Environment, config: TrainConfig) -> dict[str, Any]:
     }
 
 
-NEWER = ("control_desired", "control_actual", "costs")
+NEWER = ("control_desired", "control_actual", "costs", "multiplier_boost", "cost_excess")
 """Arrays that older checkpoints lack, by the last part of their names.
 
-They are 0 then, or empty, because no part of an older environment looks at them.
+They are 0 then, or empty, because no part of an older environment or algorithm looks at them.
 """
 
 MAY_CHANGE = (
