@@ -48,6 +48,9 @@ CostLimit = Annotated[Dimensionless, Range(0.0)]
 Gain = Annotated[Dimensionless, Range(0.0, largest=10.0)]
 """Gain of a multiplier's logarithm on the excess of the cost as a share of its limit."""
 
+MULTIPLIERS = (1e-4, 1e2)
+"""Smallest and largest multiplier of a cost."""
+
 MAX_COUNT = 2**31 - 1
 """The largest number of environments, steps or minibatches. Programs count in 32 bits."""
 
@@ -140,10 +143,13 @@ class PPO(Component):
     A mapping has a number for each constraint that is limited, by its name. `jaxsafe train` sets it
     by the option `cost_limit`.
     """
-    multiplier: Annotated[Dimensionless, Positive] = 0.01
+    multiplier: Annotated[Dimensionless, Range(*MULTIPLIERS)] = 0.01
     """Multiplier of the cost at the start, in reward per violating step, with PPO-Lagrangian."""
     multiplier_rate: Annotated[Dimensionless, Range(0.0)] = 0.03
-    """Largest change of the multiplier's logarithm in an update, with PPO-Lagrangian."""
+    """Largest change of the multiplier's logarithm in an update, with PPO-Lagrangian.
+
+    With 0 the multiplier is fixed, and needs no `cost_limit`.
+    """
     multiplier_proportional: Gain = 0.0
     """Rise of the multiplier's logarithm while the cost is twice its limit, with PPO-Lagrangian.
 
@@ -507,7 +513,8 @@ def dual_ascent(
     cost = latest_cost(window, cost_names)
     excess = jnp.clip(cost / limit - 1.0, -1.0, 1.0)
     excess = jnp.where(limit > 0.0, excess, jnp.sign(cost))
-    following = jnp.clip(state.multiplier * jnp.exp(ppo.multiplier_rate * excess), 1e-4, 1e2)
+    following = state.multiplier * jnp.exp(ppo.multiplier_rate * excess)
+    following = jnp.clip(following, *MULTIPLIERS)
     growth = jnp.maximum(excess - state.cost_excess, 0.0)
     boost = ppo.multiplier_proportional * excess + ppo.multiplier_derivative * growth
     known = jnp.any(done)

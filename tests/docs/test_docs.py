@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from default_cases import thorough
 
 import jaxsafe
 from jaxsafe.config import dump, load
+from jaxsafe.config.arguments import Arguments
 from jaxsafe.envs import TASKS
 from jaxsafe.parts import (
     Constraint,
@@ -35,7 +37,7 @@ from jaxsafe.parts import (
 )
 from jaxsafe.schema import yaml12
 from jaxsafe.schema.convert import to_component
-from jaxsafe.train.host.options import recipe
+from jaxsafe.train.host.options import recipe, resolve
 
 ROOT = Path(__file__).parents[2]
 CUSTOM = ROOT / "configs" / "custom_env.yaml"
@@ -275,6 +277,37 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_pa
     process = run(["program.py"], tmp_path)
     assert process.returncode == 0, process.stderr
     assert process.stdout.split(f"{MARK}\n")[:-1] == expected
+
+
+def trainings_of_the_page_of_constrained_learning() -> list[dict[str, Any]]:
+    page = (ROOT / "docs" / "constrained.md").read_text(encoding="utf-8")
+    lines = [line for line in page.splitlines() if line.startswith("python -m jaxsafe.train ")]
+    return [Arguments.parse(shlex.split(line)[3:]).options for line in lines]
+
+
+def test_the_trainings_of_the_page_of_constrained_learning_are_some(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(CUSTOM.parent)
+    trainings = trainings_of_the_page_of_constrained_learning()
+    names = [resolve(options)[0].agent.cost_names for options in trainings]
+    assert ("keep_out", "velocity_limit") in names
+    assert len(names) >= 8
+
+
+def test_early_termination_ends_an_episode_at_its_first_violation() -> None:
+    (options,) = (
+        options
+        for options in trainings_of_the_page_of_constrained_learning()
+        if "env.terminal" in options
+    )
+    env = resolve(options)[1]
+    step = jax.jit(jaxsafe.step)
+    for speed, outcome in ((0.3, "running"), (0.5, "violation")):  # the limit is 0.41 m/s
+        start = {"deputy": {"position": [100.0, 0.0], "velocity": [0.0, speed]}}
+        _, timestep = step(env, jaxsafe.reset_to(env, start)[0], jnp.zeros(2))
+        assert env.outcomes[int(timestep.info.outcome)] == outcome
+        assert bool(timestep.terminated) == (timestep.cost > 0.0) == (outcome == "violation")
 
 
 def test_every_part_in_the_tables_of_the_vocabulary_is_one() -> None:

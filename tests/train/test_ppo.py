@@ -398,6 +398,14 @@ def two_limits() -> Environment:
     )
 
 
+def test_a_multiplier_with_a_rate_of_0_is_a_fixed_penalty() -> None:
+    agent = AGENT.replace(cost_critic=True)
+    fixed = SMALL.replace(multiplier=jnp.array(0.05), multiplier_rate=jnp.array(0.0))
+    state = train(probe(Push(name="reward"), most=0.2), 3, fixed, agent)
+    assert int(state.window.count) > 0
+    assert float(price(state)) == float(fixed.multiplier)
+
+
 @pytest.mark.thorough
 def test_each_constraint_has_a_limit_of_its_own_and_others_have_none() -> None:
     agent = AGENT.replace(cost_critic=True)

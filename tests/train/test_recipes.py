@@ -174,6 +174,9 @@ def test_what_follows_from_an_option_of_the_other_run_follows_from_a_new_one(
     assert (float(config.ppo.cost_limit), config.agent.cost_critic) == (5.0, True)
     config, _, _ = resolve({"like": limited, "algorithm": "ppo"})
     assert (config.cost_limit, config.agent.cost_critic) == (None, False)
+    penalty = {"algorithm": "ppo_lagrangian", "ppo.multiplier": 0.05, "ppo.multiplier_rate": 0}
+    config, _, _ = resolve({"like": run_with("penalty", **penalty)})
+    assert (config.cost_limit, config.agent.cost_critic) == (None, True)
     by_name = run_with("by_name", algorithm="ppo_lagrangian", cost_limit={"velocity_limit": 5})
     config, _, _ = resolve({"like": by_name})
     assert config.ppo.cost_limit == {"velocity_limit": 5.0}

@@ -844,6 +844,14 @@ def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(
     ("words", "message"),
     [
         (["algorithm=ppo_lagrangian"], "cost_limit: missing; the violating steps"),
+        (
+            ["algorithm=ppo_lagrangian", "ppo.multiplier_rate=0", "ppo.multiplier_derivative=1"],
+            "cost_limit: missing; the violating steps",
+        ),
+        (
+            ["algorithm=ppo_lagrangian", "cost_limit=1", "ppo.multiplier=500"],
+            r"ppo.multiplier: expected a number in \[0.0001, 100\], found 500",
+        ),
         (["cost_limit=5"], "cost_limit: plain PPO has none; add algorithm=ppo_lagrangian"),
         (["algorithm=ppo_lagrangian", "cost_limit=-1"], "cost_limit: expected a number ≥ 0"),
         (

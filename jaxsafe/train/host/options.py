@@ -454,10 +454,15 @@ def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfi
         if config.cost_limit is not None:
             raise ConfigError("cost_limit: plain PPO has none; add algorithm=ppo_lagrangian")
         return config
-    if config.cost_limit is None:
+    gains = (
+        config.ppo.multiplier_rate,
+        config.ppo.multiplier_proportional,
+        config.ppo.multiplier_derivative,
+    )
+    if config.cost_limit is None and any(float(gain) > 0.0 for gain in gains):
         raise ConfigError(
-            "cost_limit: missing; the violating steps that an episode may have, "
-            "for instance cost_limit=5"
+            "cost_limit: missing; the violating steps that an episode may have, for instance "
+            "cost_limit=5, or ppo.multiplier_rate=0 for a fixed multiplier"
         )
     if float(config.ppo.gamma) >= 1.0:
         raise ConfigError(
@@ -467,7 +472,9 @@ def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfi
     limits = config.cost_limit if isinstance(config.cost_limit, Mapping) else {}
     return config.replace(
         agent=config.agent.replace(cost_critic=True, cost_names=tuple(limits)),
-        ppo=config.ppo.replace(cost_limit=config.cost_limit),
+        ppo=config.ppo
+        if config.cost_limit is None
+        else config.ppo.replace(cost_limit=config.cost_limit),
     )
 
 
