@@ -84,6 +84,9 @@ class Environment(Component, Described):
     every episode draws it. `tied` names numbers that follow other numbers when these are changed or
     drawn, such as a slope that is twice the mean motion.
 
+    `cost` says what a step costs that violates a constraint: 1, or its `severity`, which is how far
+    the constraint is violated as a share of its limit.
+
     `uncertainty` lists how the world differs from its model: disturbances, faults, delays. No
     filter knows of them.
     """
@@ -99,6 +102,7 @@ class Environment(Component, Described):
     regions: tuple[Region, ...] = ()
     status: tuple[Status, ...] = ()
     constraints: tuple[Constraint, ...] = ()
+    cost: Literal["violation", "severity"] = "violation"
     uncertainty: tuple[Uncertainty, ...] = ()
     terminal: tuple[Terminal, ...]
     reward: tuple[Reward, ...]
@@ -892,19 +896,21 @@ def _info(
 def _time_step(
     env: Environment, sim: Sim, *, observation: Array, reward: Array, info: Info
 ) -> TimeStep:
-    # A margin that is not a number is violated too.
-    violated = {name: ~(margin >= 0.0) for name, margin in info.margins.items()}
     dtype = observation.dtype
+    # A margin that is not a number is violated too.
+    costs = {name: (~(margin >= 0.0)).astype(dtype) for name, margin in info.margins.items()}
+    if env.cost == "severity":
+        costs = {name: severity.astype(dtype) for name, severity in info.severity.items()}
     terminated = _any(sim.ended[name] for name, ends in env._ends.items() if ends == "terminated")
     truncated = _any(sim.ended[name] for name, ends in env._ends.items() if ends == "truncated")
     return TimeStep(
         observation=observation,
         reward=reward,
-        cost=(sim.ended[DIVERGED] | _any(violated.values())).astype(dtype),
+        cost=functools.reduce(jnp.maximum, costs.values(), sim.ended[DIVERGED].astype(dtype)),
         terminated=terminated,
         truncated=truncated,
         info=info,
-        costs={name: flag.astype(dtype) for name, flag in violated.items()},
+        costs=costs,
     )
 
 

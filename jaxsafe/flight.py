@@ -99,7 +99,7 @@ class Flight(Described):
 
     @property
     def costs(self) -> np.ndarray:
-        """1 for each step that violates a safety constraint, else 0, [n]."""
+        """The cost of each step, [n]: 1 if it violates a constraint, else 0, or the severity."""
         return self.timesteps.cost[1:]
 
     @property
@@ -194,7 +194,7 @@ class Flight(Described):
 
     def _rows(self) -> Rows:
         yield "return", brief(self.rewards.sum())
-        yield "violating steps", f"{int(self.costs.sum())} of {len(self)}"
+        yield "violating steps", f"{int((self.costs > 0.0).sum())} of {len(self)}"
         for name, margin in self.margins.items():
             yield "least margin", f"{name} {brief(margin.min())}"
         yield "altered steps", f"{int(self.intervening.sum())} of {len(self)}"

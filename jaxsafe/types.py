@@ -368,12 +368,14 @@ class TimeStep(Record):
 
     observation: Float[Array, " observation"]
     reward: Float[Array, ""]
-    # 1 on a step that violates a safety constraint or ends with `diverged`, else 0.
+    # 1 on a step that violates a safety constraint or ends with `diverged`, else 0. Where the
+    # environment has `cost: severity`, it is the largest severity.
     cost: Float[Array, ""]
     terminated: Bool[Array, ""]  # the task ended: there is no value beyond this state
     truncated: Bool[Array, ""]  # cut short: the value of `observation` still counts
     info: Info
-    # By the name of the constraint: 1 on a step that violates it, else 0. `cost` is the largest.
+    # By the name of the constraint: 1 on a step that violates it, else 0, or the severity. The
+    # largest is `cost`.
     costs: Mapping[str, Float[Array, ""]] = dataclasses.field(default_factory=dict)
 
     @property

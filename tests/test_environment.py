@@ -484,6 +484,19 @@ def test_each_constraint_has_a_cost_by_its_name() -> None:
         assert costs[name] == float(margin < 0.0)
 
 
+def test_the_cost_may_be_how_far_a_constraint_is_violated() -> None:
+    file = Path(__file__).parent.parent / "configs" / "custom_env.yaml"
+    start = {"deputy": {"position": [0.0, 60.0], "velocity": [0.0, 0.3]}}
+    env = jaxsafe.make(file, {"cost": "severity"})
+    state, timestep = jaxsafe.reset_to(env, start, {"deputy.mass": 12.0})
+    assert not any(map(float, (timestep.cost, *timestep.costs.values())))
+    _, timestep = jaxsafe.step(env, state, jnp.zeros(2))
+    assert timestep.costs == timestep.info.severity
+    assert timestep.costs["velocity_limit"] == 0.0 < timestep.costs["keep_out_speed"]
+    assert timestep.cost == max(timestep.costs.values())
+    assert float(timestep.cost) not in (0.0, 1.0)
+
+
 def test_success_is_an_outcome_that_training_and_evaluation_ask_for() -> None:
     plain = jaxsafe.make("docking2d")
     require_success(plain)

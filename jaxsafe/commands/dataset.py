@@ -103,10 +103,11 @@ def main(argv: Sequence[str]) -> int:
         f"{cost:.2f} {constraint}"
         for constraint, cost in zip(found["constraints"], found["mean_costs"], strict=True)
     )
+    counted = "violating steps" if env.cost == "violation" else "cost"
     print(
         f"{found['steps']:,} steps in {found['episodes']:,} episodes of {KINDS[options.kind]}\n"
         f"return {found['mean_return']:.3f}, success {found['success_rate']:.1%}, "
-        f"violating steps of an episode: {costs or 'no constraint'}\nwritten to {where}"
+        f"{counted} of an episode: {costs or 'no constraint'}\nwritten to {where}"
     )
     return 0
 

@@ -42,8 +42,10 @@ class Dataset(NamedTuple):
     terminated: Bool[np.ndarray, " n"]
     truncated: Bool[np.ndarray, " n"]
     costs: Float[np.ndarray, "n c"]
-    """1 for each safety constraint that the step violates, else 0, in the order of
-    `env.constraints`."""
+    """The cost of the step for each safety constraint, in the order of `env.constraints`.
+
+    It is 1 where the step violates it, else 0, or the severity if the environment says so.
+    """
     control: Float[np.ndarray, "n m"]
     """The control that acted, after run time assurance, in physical units."""
     success: Bool[np.ndarray, " n"]

@@ -31,6 +31,7 @@ PANELS = (
     ("learning_rate", "learning rate", 1.0),
     ("gamma", "discount factor γ", 1.0),
     ("multiplier", "multiplier of the cost", 1.0),
+    ("episode_severity", "severity of an episode", 1.0),
 )
 """Column of the progress log, label, and factor of each panel."""
 

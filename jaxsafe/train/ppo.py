@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -43,7 +43,10 @@ Share = Range(0.0, 1.0)
 """Range of a number from 0 to 1."""
 
 CostLimit = Annotated[Dimensionless, Range(0.0)]
-"""Number of violating steps that an episode may have."""
+"""The cost that an episode may have.
+
+It is a number of violating steps, or the sum of their severity if the environment says so.
+"""
 
 Gain = Annotated[Dimensionless, Range(0.0, largest=10.0)]
 """Gain of a multiplier's logarithm on the excess of the cost as a share of its limit."""
@@ -138,7 +141,7 @@ class PPO(Component):
     `desired` is the control that the agent chose, and `actual` is the one that acted.
     """
     cost_limit: CostLimit | Mapping[str, CostLimit] = 25.0
-    """Number of violating steps that an episode may have, with PPO-Lagrangian.
+    """The cost that an episode may have, with PPO-Lagrangian. By default it is in violating steps.
 
     A mapping has a number for each constraint that is limited, by its name. `jaxsafe train` sets it
     by the option `cost_limit`.
@@ -342,7 +345,7 @@ def update(
     episode, done, counts = shard.join((transitions.episode, transitions.done, counts), axis=1)
     window = push(state.window, episode, done, counts)
     if agent.cost_critic:
-        state = dual_ascent(ppo, state, window, done, agent.cost_names)
+        state = dual_ascent(env, agent, ppo, state, window, done)
     share = 1.0 / jnp.maximum(ppo.averaging * total_updates, 1.0)
     average = jax.tree.map(
         lambda old, new: (1.0 - share) * old + share * new, state.average, params
@@ -488,7 +491,7 @@ def diverged(state: TrainState) -> Bool[Array, ""]:
 
 
 def dual_ascent(
-    ppo: PPO, state: TrainState, window: Window, done: Array, cost_names: Sequence[str] = ()
+    env: Environment, agent: Agent, ppo: PPO, state: TrainState, window: Window, done: Array
 ) -> TrainState:
     """Return the state with its multiplier λ after an update. It changes only if episodes ended.
 
@@ -501,16 +504,20 @@ def dual_ascent(
     the excess before the update.
 
     Args:
+        env: the environment.
+        agent: the agent. Each of its `cost_names` has a limit, or else one number is the limit.
         ppo: the hyperparameters.
         state: the state before the update.
         window: the latest finished episodes, including those of this update.
         done: whether episodes ended, by step and environment.
-        cost_names: the constraints that have a limit each. Without any, one number is the limit.
     """
     limit: Any = ppo.cost_limit
-    if cost_names:
-        limit = jnp.stack([jnp.asarray(limit[name]) for name in cost_names])
-    cost = latest_cost(window, cost_names)
+    episodes = window.episodes
+    costs = episodes.severity_sum if env.cost == "severity" else episodes.violating_steps
+    if agent.cost_names:
+        limit = jnp.stack([jnp.asarray(limit[name]) for name in agent.cost_names])
+        costs = jnp.stack([episodes.costs[name] for name in agent.cost_names], axis=-1)
+    cost = latest_cost(window, costs)
     excess = jnp.clip(cost / limit - 1.0, -1.0, 1.0)
     excess = jnp.where(limit > 0.0, excess, jnp.sign(cost))
     following = state.multiplier * jnp.exp(ppo.multiplier_rate * excess)

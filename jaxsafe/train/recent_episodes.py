@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.metrics import Episode
 from jaxsafe.types import Record
@@ -94,31 +93,26 @@ def total_cost(window: Window) -> Array:
     return window.cost + window.running_cost
 
 
-def latest_cost(window: Window, names: Sequence[str] = ()) -> Array:
-    """Return the mean cost of the latest finished episodes, in violating steps per episode.
-
-    It is 0 while there are none.
+def latest_cost(window: Window, costs: Float[Array, "episodes ..."]) -> Array:
+    """Return the mean cost of the latest finished episodes. It is 0 while there are none.
 
     Args:
         window: the window.
-        names: the constraints whose costs are returned, shape [names]. Without any it is one
-            number, for the steps that violate any constraint.
+        costs: the cost of each episode in the window [SIZE], or its cost by constraint [SIZE, c].
     """
     available = jnp.minimum(window.count, COST_EPISODES)
     age = (window.count - 1 - jnp.arange(SIZE)) % SIZE
-
-    def mean(costs: Array) -> Array:
-        total = jnp.sum(jnp.where(age < available, costs, jnp.zeros_like(costs)))
-        dtype = jnp.result_type(float)
-        return total.astype(dtype) / jnp.maximum(available, 1).astype(dtype)
-
-    if not names:
-        return mean(window.episodes.violating_steps)
-    return jnp.stack([mean(window.episodes.costs[name]) for name in names])
+    latest = (age < available).reshape(SIZE, *(1,) * (costs.ndim - 1))
+    total = jnp.sum(jnp.where(latest, costs, jnp.zeros_like(costs)), axis=0)
+    dtype = jnp.result_type(float)
+    return total.astype(dtype) / jnp.maximum(available, 1).astype(dtype)
 
 
 def means(
-    window: Window, outcomes: tuple[str, ...], successes: tuple[str, ...]
+    window: Window,
+    outcomes: tuple[str, ...],
+    successes: tuple[str, ...],
+    severity: bool = False,
 ) -> dict[str, Array]:
     """Return averages over the episodes in the window, by column of the progress log.
 
@@ -131,6 +125,7 @@ def means(
         outcomes: names of the outcomes, as `env.outcomes`. The first one means that the episode
             still runs.
         successes: names of the outcomes that count as success.
+        severity: whether the severity of the violations is averaged too.
     """
     filled = (jnp.arange(SIZE, dtype=window.count.dtype) < window.count).astype(
         jnp.result_type(float)
@@ -154,6 +149,7 @@ def means(
         "delta_v": mean(episodes.delta_v),
         "violating_share": mean_share_of_steps(episodes.violating_steps),
         "episode_cost": mean(episodes.violating_steps),
+        **({"episode_severity": mean(episodes.severity_sum)} if severity else {}),
         "intervention_share": mean_share_of_steps(episodes.interventions),
         **{f"outcome/{name}": value for name, value in share.items()},
         **{f"reward/{name}": mean(total) for name, total in episodes.reward_totals.items()},

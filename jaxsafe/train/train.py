@@ -168,7 +168,9 @@ def chunk(
                 counts[f"multiplier/{name}"] = ppo.price(state)[index]
         elif agent.cost_critic:
             counts["multiplier"] = ppo.price(state)
-        means = recent_episodes.means(state.window, env.outcomes, env.successes)
+        means = recent_episodes.means(
+            state.window, env.outcomes, env.successes, severity=env.cost == "severity"
+        )
         return state, {**counts, **means, **diagnostics}
 
     return jax.lax.scan(one_update, state, None, length=length)

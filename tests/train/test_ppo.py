@@ -352,8 +352,8 @@ def test_the_critic_of_costs_expects_what_a_step_costs() -> None:
 @pytest.mark.thorough
 def test_the_multiplier_follows_the_excess() -> None:
     env = probe(Constant(name="reward"), most=-1.0)
-    state = init(env, AGENT.replace(cost_critic=True), SMALL, jax.random.key(0))
-    state = state.replace(multiplier=jnp.array(2.0))
+    agent = AGENT.replace(cost_critic=True)
+    state = init(env, agent, SMALL, jax.random.key(0)).replace(multiplier=jnp.array(2.0))
     costs = state.window.episodes.replace(violating_steps=jnp.full(100, 3))
     window = state.window.replace(episodes=costs, count=jnp.array(100))
     some = jnp.array([True])
@@ -361,10 +361,10 @@ def test_the_multiplier_follows_the_excess() -> None:
     rate = float(SMALL.multiplier_rate)
     for limit, change in ((3.0, 0.0), (6.0, -0.5 * rate), (2.0, 0.5 * rate), (0.1, rate)):
         ppo = SMALL.replace(cost_limit=jnp.array(limit))
-        computed = price(dual_ascent(ppo, state, window, some))
+        computed = price(dual_ascent(env, agent, ppo, state, window, some))
         assert float(computed) == pytest.approx(2.0 * np.exp(change), rel=1e-5)
         # Without finished episodes nothing new is known.
-        assert float(price(dual_ascent(ppo, state, window, none))) == 2.0
+        assert float(price(dual_ascent(env, agent, ppo, state, window, none))) == 2.0
 
 
 @pytest.mark.parametrize("network", [MLP(hidden=(16,)), thorough(GRU(hidden=(16,), units=16))])
@@ -419,7 +419,8 @@ def test_each_constraint_has_a_limit_of_its_own_and_others_have_none() -> None:
 
 def test_each_multiplier_follows_the_excess_of_its_constraint() -> None:
     agent = AGENT.replace(cost_critic=True, cost_names=("hard_push", "push"))
-    state = init(two_limits(), agent, SMALL, jax.random.key(0))
+    env = two_limits()
+    state = init(env, agent, SMALL, jax.random.key(0))
     costs = {"hard_push": jnp.full(100, 1.0), "push": jnp.full(100, 3.0)}
     window = state.window.replace(
         episodes=state.window.episodes.replace(costs=costs), count=jnp.array(100)
@@ -432,7 +433,7 @@ def test_each_multiplier_follows_the_excess_of_its_constraint() -> None:
     ):
         ppo = SMALL.replace(cost_limit=dict(zip(agent.cost_names, limits, strict=True)))
         before = state.replace(multiplier=jnp.array([2.0, 1.0]))
-        after = dual_ascent(ppo, before, window, jnp.array([True]), agent.cost_names)
+        after = dual_ascent(env, agent, ppo, before, window, jnp.array([True]))
         np.testing.assert_allclose(price(after), [2.0, 1.0] * np.exp(changes), rtol=1e-5)
 
 
@@ -451,16 +452,18 @@ def test_the_critic_of_costs_must_be_that_of_the_limits() -> None:
 
 def test_a_multiplier_whose_limit_is_0_never_falls() -> None:
     env = probe(Push(name="reward"), most=0.2)
-    state = init(env, AGENT.replace(cost_critic=True), SMALL, jax.random.key(0))
+    agent = AGENT.replace(cost_critic=True)
+    state = init(env, agent, SMALL, jax.random.key(0))
     window = state.window.replace(count=jnp.array(100))
     none_allowed = SMALL.replace(cost_limit=jnp.array(0.0))
-    after = dual_ascent(none_allowed, state, window, jnp.array([True]))
+    after = dual_ascent(env, agent, none_allowed, state, window, jnp.array([True]))
     assert float(after.multiplier) == float(state.multiplier)
 
 
 def test_the_gains_of_pid_lagrangian_act_on_the_excess_and_on_its_growth() -> None:
     env = probe(Push(name="reward"), most=0.2)
-    state = init(env, AGENT.replace(cost_critic=True), SMALL, jax.random.key(0))
+    agent = AGENT.replace(cost_critic=True)
+    state = init(env, agent, SMALL, jax.random.key(0))
     gains = {"multiplier_proportional": 0.2, "multiplier_derivative": 0.4}
     ppo = SMALL.replace(cost_limit=2.0, multiplier_rate=0.0, **gains)
     # An excess that did not grow has no derivative part.
@@ -472,13 +475,36 @@ def test_the_gains_of_pid_lagrangian_act_on_the_excess_and_on_its_growth() -> No
     ):
         episodes = state.window.episodes.replace(violating_steps=jnp.full(100, cost))
         window = state.window.replace(episodes=episodes, count=jnp.array(100))
-        state = dual_ascent(ppo, state, window, jnp.array([True]))
+        state = dual_ascent(env, agent, ppo, state, window, jnp.array([True]))
         expected = float(SMALL.multiplier) * np.exp(boost)
         assert float(price(state)) == pytest.approx(expected, rel=1e-5)
-        unchanged = dual_ascent(ppo.replace(cost_limit=1.0), state, window, jnp.array([False]))
+        other = ppo.replace(cost_limit=1.0)
+        unchanged = dual_ascent(env, agent, other, state, window, jnp.array([False]))
         assert float(price(unchanged)) == float(price(state))
-    integral_only = dual_ascent(SMALL, state, state.window, jnp.array([True]))
+    integral_only = dual_ascent(env, agent, SMALL, state, state.window, jnp.array([True]))
     assert float(price(integral_only)) == float(integral_only.multiplier)
+
+
+def test_the_cost_of_an_episode_may_be_its_severity() -> None:
+    env = probe(Push(name="reward"), most=0.2).replace(cost="severity")
+    agent = AGENT.replace(cost_critic=True)
+    state = init(env, agent, SMALL, jax.random.key(0))
+    episodes = state.window.episodes.replace(
+        violating_steps=jnp.full(100, 3), severity_sum=jnp.full(100, 0.25)
+    )
+    window = state.window.replace(episodes=episodes, count=jnp.array(100))
+    ppo = SMALL.replace(cost_limit=jnp.array(0.5))
+    after = dual_ascent(env, agent, ppo, state, window, jnp.array([True]))
+    assert float(after.cost_excess) == pytest.approx(-0.5)
+
+
+@pytest.mark.thorough
+def test_a_limit_of_the_severity_lets_small_violations_be() -> None:
+    env = probe(Push(name="reward"), most=0.2).replace(cost="severity")
+    agent = AGENT.replace(cost_critic=True)
+    state = train(env, 200, SMALL.replace(cost_limit=0.5, multiplier=2.0), agent)
+    assert float(jnp.mean(state.window.episodes.severity_sum)) < 0.7  # unlimited it is 4
+    assert float(jnp.mean(state.window.episodes.violating_steps)) > 0.7
 
 
 def test_the_whole_multiplier_is_the_price_of_the_cost() -> None:

@@ -106,7 +106,7 @@ def test_a_share_of_steps_is_the_mean_of_the_shares_of_the_episodes() -> None:
 def test_the_latest_cost_is_that_of_the_last_episodes() -> None:
     rng = np.random.default_rng(1)
     window = empty_window(episodes_like(np.zeros(1, np.float32)))
-    assert float(latest_cost(window)) == 0.0
+    assert float(latest_cost(window, window.episodes.violating_steps)) == 0.0
     finished: list[int] = []
     for _ in range(60):
         costs = rng.integers(0, 50, (4, 2))
@@ -116,5 +116,7 @@ def test_the_latest_cost_is_that_of_the_last_episodes() -> None:
         )
         window = jax.jit(push)(window, episodes, jnp.asarray(done))
         finished += costs[done].tolist()
-        assert float(latest_cost(window)) == pytest.approx(np.mean(finished[-25:]))
+        assert float(latest_cost(window, window.episodes.violating_steps)) == pytest.approx(
+            np.mean(finished[-25:])
+        )
     assert len(finished) > 2 * SIZE

@@ -809,7 +809,11 @@ def test_a_checkpoint_without_room_is_one_line_and_leaves_the_one_before(
         (
             "{velocity_limit: 3}",
             "multiplier/velocity_limit",
-            ["ppo.multiplier_proportional=0.3", "ppo.multiplier_derivative=0.5"],
+            [
+                "ppo.multiplier_proportional=0.3",
+                "ppo.multiplier_derivative=0.5",
+                "env.cost=severity",
+            ],
         ),
     ],
 )
@@ -837,7 +841,7 @@ def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(
     assert [row[column] for row in resumed] == [row[column] for row in rows]
     if limit != "3":  # docking has one constraint
         column = "episode_cost/velocity_limit"
-        assert [row[column] for row in resumed] == [row["episode_cost"] for row in rows]
+        assert [row[column] for row in resumed] == [row["episode_severity"] for row in rows]
 
 
 @pytest.mark.parametrize(

@@ -237,6 +237,7 @@ def columns(env: Environment) -> list[str]:
         "length",
         *(["delta_v"] if measured["has_delta_v"] else []),
         *(["violating_share", "episode_cost"] if measured["has_constraints"] else []),
+        *(["episode_severity"] if env.cost == "severity" else []),
         *(["intervention_share"] if measured["has_rta"] else []),
     ]
     return [
