@@ -181,6 +181,11 @@ def test_what_follows_from_an_option_of_the_other_run_follows_from_a_new_one(
     config, _, _ = resolve({"like": by_name})
     assert config.ppo.cost_limit == {"velocity_limit": 5.0}
     assert config.agent.cost_names == ("velocity_limit",)
+    further = {"env": "docking2d", "from": by_name, "algorithm": "ppo_lagrangian"}
+    config, _, _ = resolve({**further, "cost_limit": {"velocity_limit": 2}})
+    assert config.agent.cost_names == ("velocity_limit",)
+    expected = f"cost_limit: expected one for each of velocity_limit, because {by_name} has that"
+    assert refused(**further, cost_limit=2) == expected
     config, _, _ = resolve({"like": by_name, "cost_limit": 4})
     assert (float(config.ppo.cost_limit), config.agent.cost_names) == (4.0, ())
 

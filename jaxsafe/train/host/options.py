@@ -413,14 +413,15 @@ def _inherit_agent(arguments: Arguments, source: str) -> None:
     Raises:
         ConfigError: there is no such run or policy, or the user asks for another agent.
     """
-    for path, value in agent_options(source).items():
+    inherited = agent_options(source)
+    for path, value in inherited.items():
         given = [name for name in arguments.options if f"{name}.".startswith(f"{path}.")]
         if given:
             raise ConfigError(f"{given[0]}: the training starts from {source}, which decides it")
         if path == "agent.cost_names":
             limits = arguments.options.get("cost_limit")
             names = sorted(limits) if isinstance(limits, Mapping) else []
-            if names != value:
+            if names != value and inherited.get("agent.cost_critic"):
                 kind = f"one for each of {', '.join(value)}" if value else "a number"
                 raise ConfigError(f"cost_limit: expected {kind}, because {source} has that")
         elif path != "agent.cost_critic":
