@@ -34,7 +34,7 @@ from jaxsafe.environment import Environment, longest_episode
 from jaxsafe.metrics import Episode, accumulate, begin
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 from jaxsafe.schema.component import Component, Range
-from jaxsafe.schema.errors import ConfigError, nearest, show
+from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.train.recent_episodes import Window, empty_window, latest_cost, push
 from jaxsafe.train.shuffle import shuffle
 from jaxsafe.types import Dimensionless, Key, Positive, Record, State, TimeStep
@@ -404,8 +404,8 @@ def check_cost_limit(env: Environment, agent: Agent, ppo: PPO) -> None:
     unknown = [name for name in limits if name not in constraints]
     if unknown or (not limits and isinstance(ppo.cost_limit, Mapping)):
         found = f"unknown constraint {show(unknown[0])}" if unknown else "expected a constraint"
-        allowed = nearest(unknown[0] if unknown else "", constraints)
-        raise ConfigError(f"cost_limit: {found}; choose from {allowed or 'none'}")
+        choices = choices_text(unknown[0] if unknown else "", constraints)
+        raise ConfigError(f"cost_limit: {found}{choices}")
     if agent.cost_names != tuple(sorted(limits)):
         raise ConfigError(
             f"agent.cost_names: expected the names in ppo.cost_limit, {show(sorted(limits))},"

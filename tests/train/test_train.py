@@ -860,7 +860,7 @@ def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(
         (["algorithm=ppo_lagrangian", "cost_limit=-1"], "cost_limit: expected a number ≥ 0"),
         (
             ["algorithm=ppo_lagrangian", "cost_limit={velocity: 1}"],
-            "cost_limit: unknown constraint 'velocity'; choose from velocity_limit. Did you mean",
+            "cost_limit: unknown constraint 'velocity'. Did you mean 'velocity_limit'.",
         ),
         (
             ["algorithm=ppo_lagrangian", "cost_limit={}"],
