@@ -87,6 +87,10 @@ class Environment(Component, Described):
     `cost` says what a step costs that violates a constraint: 1, or its `severity`, which is how far
     the constraint is violated as a share of its limit.
 
+    `measure` names metrics of one's own, which trainings and evaluations report. Each is a status
+    and what to take of it over the steps of an episode, such as `speed.maximum`: the `mean`, the
+    `maximum`, the `minimum` or the `final` value.
+
     `uncertainty` lists how the world differs from its model: disturbances, faults, delays. No
     filter knows of them.
     """
@@ -103,6 +107,7 @@ class Environment(Component, Described):
     status: tuple[Status, ...] = ()
     constraints: tuple[Constraint, ...] = ()
     cost: Literal["violation", "severity"] = "violation"
+    measure: tuple[str, ...] = ()
     uncertainty: tuple[Uncertainty, ...] = ()
     terminal: tuple[Terminal, ...]
     reward: tuple[Reward, ...]

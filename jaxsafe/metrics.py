@@ -45,6 +45,9 @@ METRICS = (
 )
 """The names that `summarise` returns."""
 
+OVER_STEPS = ("mean", "maximum", "minimum", "final")
+"""What a metric of one's own takes of a status over the steps of an episode."""
+
 ENOUGH_EPISODES = 20
 """Training episodes that a seed must finish before its success rate counts in Table 2."""
 
@@ -84,10 +87,15 @@ class Episode(Record):
     controls: tuple[Float[Array, ""], ...] = ()
     # Σ of the cost of each constraint that is followed, by its name; empty where none is.
     costs: Mapping[str, Float[Array, ""]] = dataclasses.field(default_factory=dict)
+    # Each of `Environment.measure` so far, a sum where the mean is asked for; empty without any.
+    measured: Mapping[str, Float[Array, ""]] = dataclasses.field(default_factory=dict)
 
 
 def begin(
-    timestep: TimeStep, sum_controls: bool = False, cost_names: Sequence[str] = ()
+    timestep: TimeStep,
+    sum_controls: bool = False,
+    cost_names: Sequence[str] = (),
+    measure: Sequence[str] = (),
 ) -> Episode:
     """Return the sums at the start of an episode: all zero, in the shapes of `timestep`.
 
@@ -95,6 +103,7 @@ def begin(
         timestep: the first time step.
         sum_controls: whether to sum up the controls too, from which `control_effort` comes.
         cost_names: the constraints whose costs are summed up too.
+        measure: the metrics of one's own, as `Environment.measure`.
     """
     num_controls = timestep.info.control_actual.shape[-1] if sum_controls else 0
     zero = jnp.zeros_like(timestep.reward)
@@ -112,6 +121,7 @@ def begin(
         reward_totals=jax.tree.map(jnp.zeros_like, timestep.info.reward_totals),
         controls=(zero,) * num_controls,
         costs=dict.fromkeys(cost_names, zero),
+        measured=dict.fromkeys(measure, zero),
     )
 
 
@@ -135,7 +145,34 @@ def accumulate(episode: Episode, timestep: TimeStep) -> Episode:
             total + jnp.abs(info.control_actual[..., i]) for i, total in enumerate(episode.controls)
         ),
         costs={name: total + timestep.costs[name] for name, total in episode.costs.items()},
+        measured={
+            name: _measured(name, before, episode.length, info.status)
+            for name, before in episode.measured.items()
+        },
     )
+
+
+def _measured(
+    name: str, before: Array, length: Array, status: Mapping[str, Array]
+) -> Float[Array, ...]:
+    """Return a metric of one's own after a step, from what it was after `length` steps."""
+    source, _, over_steps = name.rpartition(".")
+    value = status[source].astype(before.dtype)
+    follow = {"mean": jnp.add, "maximum": jnp.maximum, "minimum": jnp.minimum}
+    if over_steps == "final":
+        return value
+    return jnp.where(length == 0, value, follow[over_steps](before, value))
+
+
+def over_episode(name: str, measured: Any, length: Any) -> Any:
+    """Return a metric of one's own over whole episodes: a sum becomes a mean.
+
+    Args:
+        name: its name.
+        measured: what `Episode.measured` has of it.
+        length: the number of steps of each episode.
+    """
+    return measured / length if name.endswith(".mean") else measured
 
 
 def measures(env: Environment) -> dict[str, bool]:
@@ -193,7 +230,8 @@ def summarise(
         full_controls: the largest magnitude of each control. Empty means that it is not known.
 
     Returns:
-        A value for every name of `METRICS`. Rates are fractions in [0, 1], Δv is in m/s, length in
+        A value for every name of `METRICS` and each metric of one's own, which is a mean over
+        episodes. Rates are fractions in [0, 1], Δv is in m/s, length in
         steps. `control_effort` is the mean magnitude of the controls that acted, each as a share of
         its full magnitude, over controls and steps. Severity is a share of the limit. Its mean is
         over violating steps, and 0 if there are none. Its percentiles p95 and p99 are over
@@ -202,7 +240,7 @@ def summarise(
     mean = {
         name: float(np.mean(value))
         for name, value in vars(episodes).items()
-        if name not in ("reward_totals", "controls", "costs")
+        if name not in ("reward_totals", "controls", "costs", "measured")
     }
     effort = [
         float(np.mean(total)) / (full or 1.0)
@@ -228,6 +266,10 @@ def summarise(
         "episode_violation_severity_max": float(np.max(episodes.severity_max)),
         "mean_reward": mean["episode_return"] / max(steps, MIN_STEPS),
         "intervention_rate": mean["interventions"] / max(steps, MIN_STEPS),
+        **{
+            name: float(np.mean(over_episode(name, value, np.maximum(episodes.length, 1))))
+            for name, value in episodes.measured.items()
+        },
     }
     measured = {
         "success_rate": bool((successes >= 0).any()),

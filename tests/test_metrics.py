@@ -1,5 +1,6 @@
 """The metrics of Section 5, over streams of time steps written by hand."""
 
+import functools
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from scipy.stats import bootstrap, trim_mean
 import jaxsafe
 from jaxsafe.metrics import (
     METRICS,
+    OVER_STEPS,
     Episode,
     accumulate,
     begin,
@@ -405,7 +407,9 @@ def test_the_stratified_bootstrap_resamples_within_tasks() -> None:
 
 def test_the_tail_of_severity_is_over_episodes(episodes: Episode) -> None:
     worst = jnp.arange(1000) / 1000.0
-    many = jax.tree.map(lambda leaf: jnp.resize(leaf, 1000), episodes).replace(severity_max=worst)
+    many = jax.tree.map(lambda leaf: jnp.resize(leaf, (1000,)), episodes).replace(
+        severity_max=worst
+    )
     computed = summarise(many, SUCCESS)
     assert computed["episode_violation_severity_p95"] == pytest.approx(0.95)
     assert computed["episode_violation_severity_p99"] == pytest.approx(0.99)
@@ -413,3 +417,16 @@ def test_the_tail_of_severity_is_over_episodes(episodes: Episode) -> None:
     infinite = summarise(many.replace(severity_max=worst.at[-3:].set(jnp.inf)), SUCCESS)
     assert infinite["episode_violation_severity_p99"] == pytest.approx(0.99)
     assert infinite["episode_violation_severity_max"] is None
+
+
+def test_metrics_of_ones_own_are_taken_over_the_steps_of_an_episode() -> None:
+    names = [f"height.{over_steps}" for over_steps in OVER_STEPS]
+    heights = [-3.0, -1.0, -5.0]
+    steps = [
+        step.replace(info=step.info.replace(status={**step.info.status, "height": jnp.array(x)}))
+        for step, x in zip([time_step(0.0), time_step(0.0), time_step(0.0)], heights, strict=True)
+    ]
+    episode = functools.reduce(accumulate, steps, begin(steps[0], measure=names))
+    computed = summarise(jax.tree.map(lambda leaf: leaf[None], episode), SUCCESS)
+    assert [computed[name] for name in names] == [-3.0, -1.0, -5.0, -5.0]
+    assert {*computed} == {*METRICS, *names}

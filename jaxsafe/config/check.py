@@ -18,6 +18,7 @@ from jax.core import Tracer
 
 from jaxsafe.config.tied import check_ties, one_number
 from jaxsafe.environment import Environment, empty_sim, modelled, reset, step
+from jaxsafe.metrics import OVER_STEPS
 from jaxsafe.schema.component import Component, fields
 from jaxsafe.schema.convert import to_value
 from jaxsafe.schema.dotted_paths import join, references, set_path
@@ -84,6 +85,7 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
     for place, refers, name in references(env.rta, "rta") if env.rta else ():
         if refers.section != "parameters":
             _check_reference(place, name, names[refers.section])
+    _check_measure(env, names["status"])
     _check_problems(env)
     for platform in env.platforms:
         _check_platform(platform, is_agent=platform.name == env.agent)
@@ -161,6 +163,17 @@ def _check_reference(place: str, name: str, known: Iterable[str], which: str = "
         raise ConfigError(
             f"{place}: nothing{which} is called {show(name)}{choices_text(name, known)}"
         )
+
+
+def _check_measure(env: Environment, statuses: Sequence[str]) -> None:
+    """Refuse a metric of one's own that is of no status, or takes something unknown of it."""
+    allowed = [f"{status}.{over_steps}" for status in statuses for over_steps in OVER_STEPS]
+    for name in env.measure:
+        if name not in allowed:
+            raise ConfigError(
+                f"measure: expected STATUS.{{{', '.join(OVER_STEPS)}}}, found {show(name)}"
+                f"{choices_text(name, allowed)}"
+            )
 
 
 def _check_names(place: str, names: Sequence[str]) -> None:

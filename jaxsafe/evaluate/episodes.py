@@ -55,7 +55,7 @@ def run_episodes(
     """
     key_start, key_act = jax.random.split(key)
     state, timestep = _starts(env, key_start, num_episodes, cases)
-    episode = begin(timestep, sum_controls=True)
+    episode = begin(timestep, sum_controls=True, measure=env.measure)
     limit = max_steps(env)
 
     def going(carry: Carry) -> Array:

@@ -14,7 +14,7 @@ from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.cases import Cases
 from jaxsafe.evaluate.episodes import begin_recording, max_steps, record_steps, run_episodes
-from jaxsafe.metrics import METRICS, Episode, measures, metrics_in
+from jaxsafe.metrics import METRICS, Episode, measures, metrics_in, over_episode
 from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.types import Key, State, TimeStep
 
@@ -308,6 +308,10 @@ def episode_rows(
     names = ("episode_return", "length", *needs)
     columns = {name: np.asarray(getattr(episodes, name)).tolist() for name in names}
     unmeasured = {name for name, what in needs.items() if not measured[what]}
+    columns |= {
+        name: np.asarray(over_episode(name, value, np.maximum(episodes.length, 1))).tolist()
+        for name, value in episodes.measured.items()
+    }
     outcomes = np.asarray(episodes.outcome)
     succeeded = env.succeeded(outcomes)
     return [
@@ -346,7 +350,7 @@ def metrics_per_seed(env: Environment, episodes: Episode) -> dict[str, list[floa
     metrics = [
         metrics_in(env, jax.tree.map(lambda x, i=i: x[i], episodes)) for i in range(num_seeds)
     ]
-    return {name: [of_seed[name] for of_seed in metrics] for name in METRICS}
+    return {name: [of_seed[name] for of_seed in metrics] for name in (*METRICS, *env.measure)}
 
 
 def _step_row(env: Environment, state: Any, timestep: Any, t: int) -> dict[str, Any]:

@@ -35,8 +35,13 @@ PANELS = (
 )
 """Column of the progress log, label, and factor of each panel."""
 
-NAMED_PANELS = {"multiplier": "multiplier of", "episode_cost": "cost of an episode,"}
-"""Label of the panels that each limited constraint has, by the first part of their columns."""
+NAMED_PANELS = {
+    "multiplier": "multiplier of",
+    "episode_cost": "cost of an episode,",
+    "measured": "measured",
+}
+"""Label of the panels of limited constraints and of one's own metrics, by the first part of their
+columns."""
 
 LOGARITHMIC = ("value_loss", "cost_value_loss", "multiplier")
 """Columns on a logarithmic axis, because they change by orders of magnitude during a training."""

@@ -274,7 +274,7 @@ def init(env: Environment, agent: Agent, ppo: PPO, key: Key, shard: Shard = WHOL
     key_params, key_reset, key_run = jax.random.split(key, 3)
     params = agent.init(key_params, env)
     env_state, timestep = reset_batch(env, key_reset, ppo.num_envs, shard)
-    episode = begin(timestep, cost_names=agent.cost_names)
+    episode = begin(timestep, cost_names=agent.cost_names, measure=env.measure)
     multiplier: Any = ()
     no_excess: Any = ()
     if agent.cost_critic:
@@ -428,7 +428,7 @@ def _start_afresh(
     return state.replace(
         env_state=env_state,
         observation=timestep.observation,
-        episode=begin(timestep, cost_names=agent.cost_names),
+        episode=begin(timestep, cost_names=agent.cost_names, measure=env.measure),
         memory=_fresh_memory(agent, timestep.observation.shape[0]),
     )
 

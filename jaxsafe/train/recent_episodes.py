@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsafe.metrics import Episode
+from jaxsafe.metrics import Episode, over_episode
 from jaxsafe.types import Record
 
 SIZE = 100
@@ -154,4 +154,8 @@ def means(
         **{f"outcome/{name}": value for name, value in share.items()},
         **{f"reward/{name}": mean(total) for name, total in episodes.reward_totals.items()},
         **{f"episode_cost/{name}": mean(total) for name, total in episodes.costs.items()},
+        **{
+            f"measured/{name}": mean(over_episode(name, value, lengths))
+            for name, value in episodes.measured.items()
+        },
     }

@@ -429,6 +429,12 @@ def test_make_with_overrides_is_override_of_make(env: Environment) -> None:
         ),
         ("reward.delta_v.name", "success", r"reward: the name 'success' stands twice"),
         (
+            "measure",
+            ["cost.maximum"],
+            r"measure: expected STATUS.{mean, maximum, minimum, final}, f",
+        ),
+        ("measure", ["speed.max"], r"found 'speed.max'. Did you mean 'speed.mean'."),
+        (
             "observation",
             ["position", "velocty"],
             r"observation\.velocty: unknown name.* Did you mean 'velocity'\?",

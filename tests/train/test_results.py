@@ -3,7 +3,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tiny_run import TINY
 
+from jaxsafe.commands.train import main
 from jaxsafe.train.host.comparison import csv_rows, latex
 from jaxsafe.train.host.log import headline
 from jaxsafe.train.host.results import check_results, table
@@ -83,3 +85,21 @@ def test_tables_of_several_runs_have_intervals_where_they_are_known(results: dic
     assert r" & 1,200 & never \\" in text
     body = [line for line in text.splitlines() if "&" in line]
     assert {line.replace(r"\&", "").count("&") for line in body} == {6}
+
+
+def test_metrics_of_ones_own_are_in_logs_results_and_the_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    names = ["speed.maximum", "docking_distance.final"]
+    assert main([*TINY, f"env.measure=[{', '.join(names)}]", f"out={run}"]) == 0
+    told = capsys.readouterr().out
+    progress = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
+    episodes = [json.loads(line) for line in (run / "eval.jsonl").read_text().splitlines()]
+    results = json.loads((run / "results.json").read_text())
+    for name in names:
+        assert name in told
+        assert progress[-1][f"measured/{name}"] > 0.0
+        final = [row[name] for row in episodes if row["final"] and row["kind"] == "deterministic"]
+        mean = results["evaluation"]["deterministic"][name]["mean"]
+        assert mean == pytest.approx(sum(final) / len(final), rel=1e-4)

@@ -244,6 +244,7 @@ def columns(env: Environment) -> list[str]:
         *first,
         *(f"outcome/{name}" for name in env.outcomes[1:]),
         *(f"reward/{term.name}" for term in env.reward),
+        *(f"measured/{name}" for name in env.measure),
     ]
 
 

@@ -46,7 +46,14 @@ def structure(env: Environment, config: TrainConfig) -> dict[str, Any]:
     }
 
 
-NEWER = ("control_desired", "control_actual", "costs", "multiplier_boost", "cost_excess")
+NEWER = (
+    "control_desired",
+    "control_actual",
+    "costs",
+    "multiplier_boost",
+    "cost_excess",
+    "measured",
+)
 """Arrays that older checkpoints lack, by the last part of their names.
 
 They are 0 then, or empty, because no part of an older environment or algorithm looks at them.

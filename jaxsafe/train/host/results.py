@@ -10,7 +10,14 @@ from jaxsafe.agents.policy_file import save_policy
 from jaxsafe.environment import Environment, filter_name
 from jaxsafe.envs.identity import identity
 from jaxsafe.evaluate.evaluator import EVALUATION_KINDS, given_up, metrics_per_seed
-from jaxsafe.metrics import ENOUGH_SEEDS, Episode, interaction_efficiency, over_seeds, with_interval
+from jaxsafe.metrics import (
+    ENOUGH_SEEDS,
+    METRICS,
+    Episode,
+    interaction_efficiency,
+    over_seeds,
+    with_interval,
+)
 from jaxsafe.storage.files import read_json, write_json
 from jaxsafe.storage.forms import (
     AMOUNT,
@@ -171,6 +178,9 @@ def table(results: dict[str, Any], path: Path) -> str:
     for name, label, unit in _ROWS:
         if all(metrics.get(name, {}).get("mean") is not None for metrics in evaluations.values()):
             rows.append([label, *(_cell(metrics[name], unit) for metrics in evaluations.values())])
+    kinds = [*evaluations.values()]
+    own = [name for name in kinds[0] if name not in METRICS]
+    rows += [[name, *(_cell(of_kind[name], "") for of_kind in kinds)] for name in own]
     worst = [least([metrics["success_rate"]]) for metrics in evaluations.values()]
     rows.append(["worst seed, success rate", *(percent(rate, 1) for rate in worst)])
     lines += [*columns(rows), *told_diverged(results), *told_violations(results)]
