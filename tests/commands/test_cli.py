@@ -801,10 +801,7 @@ def test_a_command_is_called_by_its_name(
     with pytest.raises(SystemExit) as left:
         commands.main()
     assert left.value.code == 2
-    told = capsys.readouterr().err
-    assert told.startswith(
-        "error: unknown command 'trian'. Did you mean 'train'? Choose from train, ev"
-    )
+    assert capsys.readouterr().err == "error: unknown command 'trian'. Did you mean 'train'?\n"
     for name in commands.COMMANDS:
         assert callable(importlib.import_module(f"jaxsafe.commands.{name}").command)
 

@@ -442,7 +442,7 @@ def test_the_critic_of_costs_must_be_that_of_the_limits() -> None:
     for limits, names, message in (
         ({"push": 1.0}, (), r"agent.cost_names: expected the names .*, \['push'\], found \[\]"),
         (1.0, ("push",), r"agent.cost_names: expected the names .*, \[\], found \['push'\]"),
-        ({"pull": 1.0}, ("pull",), "cost_limit: unknown constraint 'pull'; choose from push, hard"),
+        ({"pull": 1.0}, ("pull",), "cost_limit: unknown constraint 'pull'. Did you mean 'push'"),
     ):
         with pytest.raises(ConfigError, match=message):
             check_cost_limit(
