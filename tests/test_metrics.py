@@ -102,7 +102,7 @@ def test_steps_add_up(episodes: Episode) -> None:
         "severity_max": [0.0, 2.0, 0.1],
         "interventions": [0, 1, 1],
     }
-    assert set(vars(episodes)) == {*expected, "reward_totals", "controls", "costs"}
+    assert set(vars(episodes)) == {*expected, "reward_totals", "controls", "costs", "measured"}
     for name, values in expected.items():
         np.testing.assert_allclose(getattr(episodes, name), values, rtol=1e-6, err_msg=name)
     np.testing.assert_allclose(episodes.reward_totals["term"], [30.0, 20.0, -20.0])

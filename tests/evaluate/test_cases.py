@@ -73,7 +73,7 @@ def test_drawn_numbers_are_columns_too(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "task",
-    ["docking3d", *(thorough(task) for task in jaxsafe.TASKS if task != "docking3d")],
+    ["docking2d", *(thorough(task) for task in jaxsafe.TASKS if task != "docking2d")],
 )
 def test_the_cases_of_a_task_are_its_own_starts_and_a_grid(task: str) -> None:
     env = jaxsafe.make(task)

@@ -87,6 +87,7 @@ def test_tables_of_several_runs_have_intervals_where_they_are_known(results: dic
     assert {line.replace(r"\&", "").count("&") for line in body} == {6}
 
 
+@pytest.mark.thorough
 def test_metrics_of_ones_own_are_in_logs_results_and_the_table(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
