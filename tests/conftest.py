@@ -34,6 +34,22 @@ jax.config.update("jax_compilation_cache_dir", str(_cache))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 
+MAX_MAPS = 40_000
+"""Memory maps of a process at which its compiled programs are given up. Linux allows 65,530."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_memory_maps() -> Iterator[None]:
+    """Give compiled programs up before a process has too many memory maps.
+
+    Each program has some, and a long run of one process ended in a segmentation fault.
+    """
+    yield
+    maps = Path("/proc/self/maps")
+    if maps.exists() and maps.read_text().count("\n") > MAX_MAPS:
+        jax.clear_caches()
+
+
 @pytest.fixture(scope="session")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the directory of a finished training run that nobody interrupted."""
