@@ -109,7 +109,7 @@ def learning_curves(rows: Rows, x: str, title: str, width: float | None = None) 
 
 
 def _named_panels(rows: Rows) -> list[tuple[str, str, float]]:
-    """Return the panels of the constraints that have a limit of their own."""
+    """Return the panels of constraints with a limit of their own and of one's own metrics."""
     parts = [(name, *name.partition("/")) for name in (rows[0] if rows else ())]
     return [
         (column, f"{NAMED_PANELS[first]}\n{plain(name)}", 1.0)

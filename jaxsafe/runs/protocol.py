@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jaxsafe.envs.task import default_filter
+from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
 from jaxsafe.storage.files import read_json
 from jaxsafe.train.host.results import check_results
 
@@ -15,9 +16,6 @@ SEEDS = 10
 
 EPISODES = 1000
 """Least number of episodes of each seed."""
-
-KINDS = ("deterministic", "stochastic")
-"""Kinds of evaluation: actions are the mode of their distribution, or sampled."""
 
 
 class Finding(NamedTuple):
@@ -91,7 +89,7 @@ def findings(results: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) ->
         ),
         Finding(
             "deterministic and sampled actions",
-            {*KINDS} <= {*results["evaluation"]},
+            {*EVALUATION_KINDS} <= {*results["evaluation"]},
             ", ".join(results["evaluation"]),
         ),
         Finding(
