@@ -3,8 +3,10 @@
 These are modes for debugging, for other random numbers and for double precision.
 """
 
+import contextlib
+import gc
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from typing import Any
 
@@ -22,6 +24,22 @@ from jaxsafe.train.train import begin, chunk
 
 Mode = Callable[[], AbstractContextManager]
 
+
+@contextlib.contextmanager
+def checking_leaks() -> Iterator[None]:
+    """Check for leaked tracers.
+
+    JAX collects garbage after each trace. The objects that exist already are left out of that, or
+    it would take minutes after many other tests.
+    """
+    gc.freeze()
+    try:
+        with jax.checking_leaks():
+            yield
+    finally:
+        gc.unfreeze()
+
+
 CHECKED_WHILE_TRACING: dict[str, Mode] = {
     "x64": lambda: jax.enable_x64(True),
     "rank_promotion": lambda: jax.numpy_rank_promotion("raise"),
@@ -32,7 +50,7 @@ CHECKED_WHILE_RUNNING: dict[str, Mode] = {
     "unsafe_rbg": lambda: jax.default_prng_impl("unsafe_rbg"),
     "key_reuse": lambda: jax.debug_key_reuse(True),
     "nans": lambda: jax.debug_nans(True),
-    "tracer_leaks": jax.checking_leaks,
+    "tracer_leaks": checking_leaks,
 }
 TRAININGS: dict[str, dict[str, Any]] = {
     "ppo": {},

@@ -15,6 +15,7 @@ from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from test_modes import checking_leaks
 
 import jaxsafe
 from jaxsafe import ConfigError
@@ -275,7 +276,7 @@ MODES = {
     "double_precision": lambda: jax.enable_x64(True),
     "rank_promotion": lambda: jax.numpy_rank_promotion("raise"),
     "dtype_promotion": lambda: jax.numpy_dtype_promotion("strict"),
-    "tracer_leaks": jax.checking_leaks,
+    "tracer_leaks": checking_leaks,
     "no_jit": lambda: jax.disable_jit(),
 }
 

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 import jaxsafe
 from jaxsafe.environment import Environment
-from jaxsafe.rta.filter import BackupController, TerminalSet
+from jaxsafe.rta.certificate import BackupController, TerminalSet
 from jaxsafe.rta.simplex import Simplex
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
