@@ -17,7 +17,9 @@ from jaxsafe.processors.reward import Bound, Reward
 from jaxsafe.processors.status import Status
 from jaxsafe.processors.strengthening import Strengthening
 from jaxsafe.processors.terminal import Terminal
-from jaxsafe.rta.filter import RTA, BackupController, CertifiedRTA, Faults, RTAMemory, TerminalSet
+from jaxsafe.rta.certificate import BackupController, Faults, TerminalSet
+from jaxsafe.rta.certified import CertifiedRTA
+from jaxsafe.rta.filter import RTA, RTAMemory
 from jaxsafe.schema.component import ANY, Component, Range, Refers, Unit
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.schema.ties import Tie

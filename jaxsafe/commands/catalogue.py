@@ -27,7 +27,8 @@ from jaxsafe.processors.terminal import Terminal
 from jaxsafe.rta.asif import Strengthening
 from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.cascade import Stage
-from jaxsafe.rta.filter import RTA, BackupController, TerminalSet
+from jaxsafe.rta.certificate import BackupController, TerminalSet
+from jaxsafe.rta.filter import RTA
 from jaxsafe.schema.component import Component, Field, choices, fields
 from jaxsafe.schema.convert import bare, expects, is_component, to_data
 from jaxsafe.schema.errors import ConfigError, show

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.processors.terminal import TooFar, time_limit
-from jaxsafe.rta.filter import CertifiedRTA
+from jaxsafe.rta.certified import CertifiedRTA
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.transition import advance, bounds, smallest_margin
 from jaxsafe.types import Key, Sim

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from jaxsafe.config import override
 from jaxsafe.environment import Environment
-from jaxsafe.rta.filter import CertifiedRTA
+from jaxsafe.rta.certified import CertifiedRTA
 from jaxsafe.schema.errors import ConfigError
 
 

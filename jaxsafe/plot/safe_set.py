@@ -34,7 +34,7 @@ from jaxsafe.plot.style import (
     plain,
     styled,
 )
-from jaxsafe.rta.filter import CertifiedRTA
+from jaxsafe.rta.certified import CertifiedRTA
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.cwh import ThrustedSpacecraft
 from jaxsafe.simulation.dubins import Dubins2D, Dubins3D

@@ -17,7 +17,9 @@ from jaxsafe.rta.backups import (
 from jaxsafe.rta.backups_with_memory import HoldPosition, Latched
 from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.cascade import Cascade, Stage
-from jaxsafe.rta.filter import RTA, BackupController, CertifiedRTA, RTAMemory, TerminalSet
+from jaxsafe.rta.certificate import BackupController, TerminalSet
+from jaxsafe.rta.certified import CertifiedRTA
+from jaxsafe.rta.filter import RTA, RTAMemory
 from jaxsafe.rta.own_simulator import Barrier, Plant, filter_by_asif, filter_by_simplex
 from jaxsafe.rta.simplex import Blend, CollisionSimplex, Simplex
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsafe.processors.constraint import SlackCost
 from jaxsafe.processors.strengthening import Polynomial, Strengthening
-from jaxsafe.rta.filter import CertifiedRTA, Proposal
+from jaxsafe.rta.certified import CertifiedRTA, Proposal
 from jaxsafe.rta.projection import project_box_ball, project_box_halfspace
 from jaxsafe.rta.proofs import slow_actuators
 from jaxsafe.rta.qp import nearest_solution

@@ -12,7 +12,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsafe.rta.asif import linear, speed_ball
 from jaxsafe.rta.bound import UncertaintyBound
-from jaxsafe.rta.filter import BackupController, CertifiedRTA, Faults, TerminalSet
+from jaxsafe.rta.certificate import BackupController, Faults, TerminalSet
+from jaxsafe.rta.certified import CertifiedRTA
 from jaxsafe.rta.formation import in_formation
 from jaxsafe.rta.projection import project_box_ball
 from jaxsafe.rta.proofs import (

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsafe.rta.filter import BackupController, CertifiedRTA, Faults
+from jaxsafe.rta.certificate import BackupController, Faults
+from jaxsafe.rta.certified import CertifiedRTA
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.cwh import Spacecraft
 from jaxsafe.transition import Others, bounds

@@ -20,7 +20,7 @@ from jaxsafe.types import Sim
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
-    from jaxsafe.rta.filter import CertifiedRTA
+    from jaxsafe.rta.certified import CertifiedRTA
 
 
 def ahead_of_delay(

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsafe.rta.bound import UncertaintyBound
-from jaxsafe.rta.filter import Faults
+from jaxsafe.rta.certificate import Faults
 from jaxsafe.rta.tube_in_space import SLOW_MODE, TubeInSpace
 from jaxsafe.simulation.dubins import Dubins3D
 from jaxsafe.simulation.trig import wrap

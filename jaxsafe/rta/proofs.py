@@ -18,7 +18,8 @@ from jaxtyping import Array, Bool, Float
 from jaxsafe.processors.constraint import Separation
 from jaxsafe.processors.status import DeltaV, Distance
 from jaxsafe.rta.bound import UncertaintyBound
-from jaxsafe.rta.filter import BackupController, CertifiedRTA, Faults
+from jaxsafe.rta.certificate import BackupController, Faults
+from jaxsafe.rta.certified import CertifiedRTA
 from jaxsafe.rta.formation import CLOSE, formation_faults
 from jaxsafe.rta.speed_limit import (
     MAX_ORBIT_ANGLE_PER_STEP,

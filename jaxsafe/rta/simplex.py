@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.rta.filter import RTA, CertifiedRTA, Proposal, RTAMemory, admissible
+from jaxsafe.rta.certified import CertifiedRTA, Proposal
+from jaxsafe.rta.filter import RTA, RTAMemory, admissible
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.geometry import direction, safe_norm, to_body
 from jaxsafe.transition import advance, undirected
