@@ -38,7 +38,13 @@ from jaxsafe.simulation.initializers import uniform
 from jaxsafe.simulation.platform import Platform, placed
 from jaxsafe.simulation.regions import Region
 from jaxsafe.simulation.uncertainty import Uncertainty
-from jaxsafe.transition import advance, status_names, update_statuses, with_memory
+from jaxsafe.transition import (
+    advance,
+    status_names,
+    update_statuses,
+    with_centres,
+    with_memory,
+)
 from jaxsafe.types import (
     Info,
     Key,
@@ -384,7 +390,7 @@ def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:
     platform_keys = jax.random.split(key, len(env.platforms))
     for platform, platform_key in zip(env.platforms, platform_keys, strict=True):
         with part("platforms", platform.name):
-            platform_state = platform.reset(platform_key, sim)
+            platform_state = platform.reset(platform_key, with_centres(env, sim, platform))
             sim = sim.replace(platforms={**sim.platforms, platform.name: platform_state})
     return _with_own_buffers(_begin(env, sim, parameters, key), others=env)
 

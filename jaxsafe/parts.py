@@ -48,6 +48,7 @@ from jaxsafe.simulation.uncertainty import ActuatorFault, Disturbance, Uncertain
 from jaxsafe.simulation.vectors import Vector
 from jaxsafe.types import (
     AnyStatusName,
+    CentreName,
     ConstraintName,
     Dimensionless,
     FlagName,
@@ -84,6 +85,7 @@ __all__ = [
     "AnyStatusName",
     "BackupController",
     "Bound",
+    "CentreName",
     "CertifiedRTA",
     "Command",
     "Component",

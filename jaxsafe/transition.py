@@ -6,7 +6,7 @@ speaks about the very state that the step will reach.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
@@ -147,6 +147,41 @@ def place_regions(env: Environment, sim: Sim) -> Sim:
         if names := related.get(region.name):
             put(region, {name: regions[name] for name in names})
     return sim.replace(regions=regions)
+
+
+def with_centres(env: Environment, sim: Sim, platform: Platform) -> Sim:
+    """Return the simulation with the centres of regions, if the start of a platform names some.
+
+    Args:
+        env: the environment.
+        sim: the simulation with the platforms that are placed before this one.
+        platform: the platform.
+    """
+    named = {name for _, refers, name in references(platform, "") if refers.section == "places"}
+    if named <= sim.platforms.keys():
+        return sim
+    # Where a region stays in place, only the dimension of the platforms matters.
+    platforms = {other.name: other.rest() for other in env.platforms} | {**sim.platforms}
+    regions: dict[str, RegionState] = {}
+    for region in regions_so_far(env, sim.platforms):
+        with part("regions", region.name):
+            placed = region.place(platforms, regions, moves=True)
+        regions[region.name] = placed.replace(inside={})
+    return sim.replace(regions=regions)
+
+
+def regions_so_far(env: Environment, platforms: Container[str]) -> list[Region]:
+    """Return the regions that some platforms carry, or that stay in place.
+
+    Args:
+        env: the environment.
+        platforms: the names of the platforms.
+    """
+    found: dict[str, Region] = {}
+    for region in env.regions:
+        if region.on is None or region.on in platforms or region.on in found:
+            found[region.name] = region
+    return [*found.values()]
 
 
 def _in_detail(env: Environment) -> tuple[set[str], set[str], Mapping[str, list[str]]]:

@@ -70,13 +70,8 @@ class RefersInDetail(Refers):
     """Mark of a name that asks a region for more than its position and content.
 
     A region named in this way also computes how it moves, or how far away its boundary is. Other
-    regions leave that out, see `RegionState`. The section `places` stands for `platforms` and
-    `regions` together.
+    regions leave that out, see `RegionState`.
     """
-
-    @property
-    def where(self) -> str:
-        return "`platforms` or `regions`" if self.section == "places" else super().where
 
 
 PlatformName = Annotated[str, Refers("platforms")]
@@ -84,6 +79,8 @@ RegionName = Annotated[str, Refers("regions")]
 """Name of a region whose position and content are needed."""
 ShapeName = Annotated[str, RefersInDetail("regions")]
 """Name of a region for which the distances of platforms to its boundary are needed too."""
+CentreName = Annotated[str, Refers("places")]
+"""Name of a platform or region whose position is needed."""
 PlaceName = Annotated[str, RefersInDetail("places")]
 """Name of a platform or region whose position, velocity and orientation are needed."""
 StatusName = Annotated[str, Refers("status", boolean=False)]

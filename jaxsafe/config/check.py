@@ -26,7 +26,7 @@ from jaxsafe.schema.errors import ConfigError, choices_text, show, summarise_err
 from jaxsafe.schema.ties import follow
 from jaxsafe.schema.user_modules import modules
 from jaxsafe.simulation.platform import Platform
-from jaxsafe.transition import judge
+from jaxsafe.transition import judge, regions_so_far
 
 MAX_PARTS = 1000
 """Largest number of parts of a section.
@@ -71,12 +71,14 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
             for place, refers, name in references(part, f"{section}.{part.name}"):
                 # Later parts are not there yet when a start is drawn, a region is placed or a
                 # status is evaluated.
-                early = section in ("status", "regions") or place.startswith(
-                    f"platforms.{part.name}.start"
-                )
+                at_start = place.startswith(f"platforms.{part.name}.start")
+                early = at_start or section in ("status", "regions")
                 known = names[refers.section]
-                ordered = early and refers.section == section
-                if ordered:
+                which = ""
+                if at_start and refers.section == "places":
+                    known = earlier + [region.name for region in regions_so_far(env, earlier)]
+                    which = " placed before it"
+                elif early and refers.section == section:
                     known = earlier
                 elif section == "regions" and refers.section == "places":
                     known = names["platforms"] + earlier

@@ -93,7 +93,8 @@ class Range:
 class Refers:
     """Mark of a string field that names another part of the environment, such as a status.
 
-    `section` is where that part is listed. `boolean` says whether a status must be true or false
+    `section` is where that part is listed. The section `places` stands for `platforms` and
+    `regions` together. `boolean` says whether a status must be true or false
     (True) or a number (False); None allows both.
     """
 
@@ -103,7 +104,7 @@ class Refers:
     @property
     def where(self) -> str:
         """The section in which the part is listed, as messages write it."""
-        return f"`{self.section}`"
+        return "`platforms` or `regions`" if self.section == "places" else f"`{self.section}`"
 
 
 @dataclasses.dataclass(frozen=True)

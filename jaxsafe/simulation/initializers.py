@@ -2,7 +2,7 @@
 
 The paper describes them in Section 4 "Initialization" and in Tables 3 and 4. Initializers run in
 the order in which they are listed, platform after platform. So a later one may refer to a field
-that was drawn earlier, or to an earlier platform.
+that was drawn earlier, to an earlier platform, or to a region that such platforms carry.
 """
 
 from __future__ import annotations
@@ -24,15 +24,16 @@ from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.simulation.geometry import direction, safe_norm
 from jaxsafe.types import (
     MAX_DISTANCE,
+    CentreName,
     Key,
     MetresPerSecond,
     Number,
     PerSecond,
     Place,
-    PlatformName,
     Reach,
     Sim,
     Turn,
+    place,
 )
 
 TWO_PI = 2.0 * jnp.pi
@@ -62,7 +63,8 @@ class Initializer(Component):
         Args:
             key: a typed PRNG key.
             drawn: the fields of this platform that were drawn before, by name.
-            sim: the simulation with the platforms that were placed before.
+            sim: the simulation with the platforms that were placed before, and the regions that
+                they carry or that stay in place.
         """
         raise NotImplementedError
 
@@ -269,24 +271,26 @@ def read_cases(path: Any, place: str = "cases") -> dict[str, list[float]]:
 
 
 class AtDistance(Initializer, type="at_distance"):
-    """A position at a random distance and in a random direction from another platform."""
+    """A position at a random distance and in a random direction from a platform or region."""
 
-    about: PlatformName
+    about: CentreName
+    """An earlier platform, or a region that stays in place or that earlier platforms carry."""
     distance: Distances
     direction: Direction = Direction()
 
     def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Float[Array, " d"]:
         distance, *angles = uniform(key, self.distance, *self.direction.intervals)
-        return sim.platforms[self.about].position + distance * self.direction.vector(*angles)
+        return place(sim, self.about).position + distance * self.direction.vector(*angles)
 
 
 class AroundAtAltitude(Initializer, type="around_at_altitude"):
-    """A position at a random horizontal distance and azimuth from another platform.
+    """A position at a random horizontal distance and azimuth from a platform or region.
 
-    Its altitude z is random and does not depend on the other platform.
+    Its altitude z is random and does not depend on it.
     """
 
-    about: PlatformName
+    about: CentreName
+    """An earlier platform, or a region that stays in place or that earlier platforms carry."""
     distance: Distances
     azimuth: Angles = (0.0, TWO_PI)
     altitude: Interval
@@ -294,17 +298,18 @@ class AroundAtAltitude(Initializer, type="around_at_altitude"):
     def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Float[Array, " 3"]:
         distance, azimuth, altitude = uniform(key, self.distance, self.azimuth, self.altitude)
         return jnp.append(
-            sim.platforms[self.about].position[:2] + distance * direction(azimuth), altitude
+            place(sim, self.about).position[:2] + distance * direction(azimuth), altitude
         )
 
 
 class BelowSpeedLimit(Initializer, type="below_speed_limit"):
     """A velocity in a random direction, at a uniform share of the limit ν₀ + ν₁‖r‖, Eq. (14).
 
-    The position r, relative to the platform `about`, is the one drawn before.
+    The position r, relative to the platform or region `about`, is the one drawn before.
     """
 
-    about: PlatformName
+    about: CentreName
+    """An earlier platform, or a region that stays in place or that earlier platforms carry."""
     floor: Annotated[MetresPerSecond, Range(0.0, largest=1e9)]
     slope: Annotated[PerSecond, Range(0.0, largest=1e3)]
     share: Shares = (0.0, 1.0)
@@ -313,7 +318,7 @@ class BelowSpeedLimit(Initializer, type="below_speed_limit"):
     def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Float[Array, " d"]:
         share, *angles = uniform(key, self.share, *self.direction.intervals)
         limit = self.floor + self.slope * safe_norm(
-            drawn["position"] - sim.platforms[self.about].position
+            drawn["position"] - place(sim, self.about).position
         )
         return limit * share * self.direction.vector(*angles)
 

@@ -786,7 +786,7 @@ def test_every_number_replaced_by_a_word_a_truth_value_or_nan_is_refused(
         (
             "platforms.1.start.0.about",
             "deputy",
-            r"nothing listed before it is called 'deputy'; choose from chief",
+            r"nothing placed before it is called 'deputy'; choose from chief, docking_region",
         ),
         (
             "platforms.1.start.0.name",
@@ -987,7 +987,7 @@ def test_a_status_may_refer_only_to_earlier_ones(tree: dict[str, Any]) -> None:
     tree["status"].reverse()
     tree["platforms"].reverse()
     assert (
-        "platforms.deputy.start.position.about: nothing listed before it is called 'chief'"
+        "platforms.deputy.start.position.about: nothing placed before it is called 'chief'"
         in fault_in(tree)
     )
 

@@ -264,6 +264,45 @@ def test_a_rejoin_starts_as_in_table_3(task: str) -> None:
         assert spearmanr(drawn[first][0], drawn[second][0]).pvalue > LEVEL, (first, second)
 
 
+def test_a_start_may_be_about_a_region_that_an_earlier_platform_carries() -> None:
+    near = {"about": "rejoin_region", "distance": [10.0, 140.0]}
+    changes = {f"wingman.start.position.{name}": value for name, value in near.items()}
+    env = jaxsafe.make("rejoin2d", changes)
+    state, timestep = draw_starts(env, jax.random.split(jax.random.key(8), NUM_STARTS))
+    lead = state.sim.platforms["lead"]
+    angle = np.asarray(lead.heading, float) + np.pi + np.pi / 3
+    point = np.asarray(lead.position, float) + 500.0 * np.stack([np.cos(angle), np.sin(angle)], -1)
+    x, y = (np.asarray(state.sim.platforms["wingman"].position, float) - point).T
+    assert is_uniform(np.hypot(x, y), 10.0, 140.0)
+    assert is_uniform(np.arctan2(y, x) % (2 * np.pi), 0.0, 2 * np.pi)
+    assert timestep.info.status["in_rejoin"].all()
+
+
+def test_a_start_may_be_about_a_region_in_its_place_or_on_another_region() -> None:
+    docking = jaxsafe.make("docking2d")
+    zone = {"type": "circle", "name": "zone", "on": None, "radius": 1.0}
+    zone["offset"] = {"type": "displacement", "by": [30.0, 40.0]}
+    gate = {**zone, "name": "gate", "on": "zone"}
+    about = {"type": "at_distance", "name": "position", "about": "gate", "distance": [2.0, 2.0]}
+    alone = {
+        "platforms": [docking.agent_platform, docking.platform("chief")],
+        "regions": [*docking.regions, zone, gate],
+        "deputy.start": [about],
+    }
+    env = jaxsafe.make("docking2d", alone)
+    deputy = env.reset(jax.random.key(0))[0].sim.platforms["deputy"]
+    way = np.asarray(deputy.position) - [60.0, 80.0]
+    assert np.linalg.norm(way) == pytest.approx(2.0, rel=1e-4)
+    for path, value, fault in (
+        ("regions.zone.on", "deputy", "'gate'; choose from none"),
+        ("deputy.start.position.about", "docking_region", "'docking_region'; choose from zone"),
+    ):
+        with pytest.raises(jaxsafe.ConfigError) as error:
+            jaxsafe.make("docking2d", {**alone, path: value})
+        place = "platforms.deputy.start.position.about: nothing placed before it is called "
+        assert str(error.value).startswith(f"{place}{fault}")
+
+
 def test_an_oriented_start_has_any_attitude_and_no_turn_rate() -> None:
     state, _ = draw_starts(
         jaxsafe.make("docking2d_oriented"), jax.random.split(jax.random.key(8), NUM_STARTS)
