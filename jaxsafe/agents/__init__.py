@@ -1,4 +1,4 @@
-"""Agents: what they see, their networks, their distributions over actions, and policy files."""
+"""Agents: what they see, their networks and distributions, policy files, and pilots."""
 
 from jaxsafe.agents.agent import Agent
 from jaxsafe.agents.distributions import Categorical, Gaussian, Joint
@@ -10,6 +10,7 @@ from jaxsafe.agents.features import (
     RejoinFeatures,
 )
 from jaxsafe.agents.networks import GRU, MLP, Network
+from jaxsafe.agents.pilot import Pilot
 from jaxsafe.agents.policy_file import SavedPolicy, load_policy, read_policy, save_policy
 from jaxsafe.agents.trained_policy import TrainedPolicy, TrainedRecurrentPolicy
 
@@ -24,6 +25,7 @@ __all__ = [
     "Gaussian",
     "Joint",
     "Network",
+    "Pilot",
     "PlainFeatures",
     "RejoinFeatures",
     "SavedPolicy",

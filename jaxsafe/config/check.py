@@ -80,10 +80,11 @@ def check(env: Environment, before: Environment | None = None) -> Environment:
                     which = " placed before it"
                 elif early and refers.section == section:
                     known = earlier
+                    which = " listed before it"
                 elif section == "regions" and refers.section == "places":
                     known = names["platforms"] + earlier
-                    ordered = name in names["regions"]
-                _check_reference(place, name, known, " listed before it" if ordered else "")
+                    which = " listed before it" if name in names["regions"] else ""
+                _check_reference(place, name, known, which)
     for place, refers, name in references(env.rta, "rta") if env.rta else ():
         if refers.section != "parameters":
             _check_reference(place, name, names[refers.section])
@@ -204,12 +205,13 @@ def _check_space(env: Environment) -> None:
 def _check_platform(platform: Platform, is_agent: bool) -> None:
     place = f"platforms.{platform.name}"
     controller = platform.controller
-    parts = "actuators" if controller.takes_actions else "commands"
-    _check_names(f"{place}.controller.{parts}", controller.names)
+    parts = [name for name in ("actuators", "commands") if name in fields(type(controller))]
+    control_place = ".".join([place, "controller", *parts])
+    _check_names(control_place, controller.names)
     for name in controller.names:
         if name not in platform.inputs:
             raise ConfigError(
-                f"{place}.controller.{parts}: {platform.type_name} has no control {name!r}"
+                f"{control_place}: {platform.type_name} has no control {name!r}"
                 f"{choices_text(name, platform.inputs)}"
             )
     if is_agent and not (controller.takes_actions and controller.names):
@@ -219,7 +221,7 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
     if controller.takes_actions and not is_agent:
         raise ConfigError(
             f"{place}.controller ({controller.type_name}): only the agent takes actions; "
-            "choose from scripted, uncontrolled"
+            "choose from pilot, scripted, uncontrolled"
         )
     first = [initializer for initializer in platform.start if not initializer.redraws]
     _check_names(f"{place}.start", [name for initializer in first for name in initializer.draws])

@@ -843,7 +843,7 @@ def test_every_number_replaced_by_a_word_a_truth_value_or_nan_is_refused(
             {"type": "continuous", "actuators": []},
             (
                 r"platforms\.chief\.controller \(continuous\): only the agent takes actions; choose"
-                r" from scripted, uncontrolled"
+                r" from pilot, scripted, uncontrolled"
             ),
         ),
         (
@@ -1126,7 +1126,8 @@ def test_only_the_agent_may_take_actions(task: str) -> None:
         )
     )
     assert message.startswith(
-        "platforms.lead.controller (discrete): only the agent takes actions; choose from scripted"
+        "platforms.lead.controller (discrete): only the agent takes actions; choose from pilot, "
+        "scripted, uncontrolled"
     )
     assert "cannot be the agent" in fault(
         lambda: jaxsafe.make(task, {"wingman.controller": {"type": "scripted"}})
