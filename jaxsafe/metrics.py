@@ -82,9 +82,10 @@ class Episode(Record):
     severity_sum: Float[Array, ""]  # Σ max(0, −h)/limit
     severity_max: Float[Array, ""]
     interventions: Int[Array, ""]  # steps on which run time assurance changed the control
+    # Σ of the mean of |u| over the controls, each as a share of its full magnitude; 0 where the
+    # full magnitudes are not known.
+    control_effort: Float[Array, ""]
     reward_totals: Mapping[str, Float[Array, ""]]  # Σ of each reward term
-    # Σ |u| of each control that acted, in the order of the action; () where it is not summed.
-    controls: tuple[Float[Array, ""], ...] = ()
     # Σ of the cost of each constraint that is followed, by its name; empty where none is.
     costs: Mapping[str, Float[Array, ""]] = dataclasses.field(default_factory=dict)
     # Each of `Environment.measure` so far, a sum where the mean is asked for; empty without any.
@@ -93,7 +94,6 @@ class Episode(Record):
 
 def begin(
     timestep: TimeStep,
-    sum_controls: bool = False,
     cost_names: Sequence[str] = (),
     measure: Sequence[str] = (),
 ) -> Episode:
@@ -101,11 +101,9 @@ def begin(
 
     Args:
         timestep: the first time step.
-        sum_controls: whether to sum up the controls too, from which `control_effort` comes.
         cost_names: the constraints whose costs are summed up too.
         measure: the metrics of one's own, as `Environment.measure`.
     """
-    num_controls = timestep.info.control_actual.shape[-1] if sum_controls else 0
     zero = jnp.zeros_like(timestep.reward)
     count = jnp.zeros(timestep.reward.shape, jnp.int32)
     return Episode(
@@ -118,15 +116,24 @@ def begin(
         severity_sum=zero,
         severity_max=zero,
         interventions=count,
+        control_effort=zero,
         reward_totals=jax.tree.map(jnp.zeros_like, timestep.info.reward_totals),
-        controls=(zero,) * num_controls,
         costs=dict.fromkeys(cost_names, zero),
         measured=dict.fromkeys(measure, zero),
     )
 
 
-def accumulate(episode: Episode, timestep: TimeStep) -> Episode:
-    """Add one time step to the sums of an episode."""
+def accumulate(
+    episode: Episode, timestep: TimeStep, full_controls: Sequence[Array] = ()
+) -> Episode:
+    """Add one time step to the sums of an episode.
+
+    Args:
+        episode: the sums so far.
+        timestep: the time step.
+        full_controls: the largest magnitude of each control, as `full_controls` returns them.
+            Without them `control_effort` stays 0.
+    """
     info = timestep.info
     no_severity = jnp.zeros_like(timestep.reward)
     severity = jnp.max(jnp.stack([*info.severity.values(), no_severity]), axis=0)
@@ -140,16 +147,21 @@ def accumulate(episode: Episode, timestep: TimeStep) -> Episode:
         severity_sum=episode.severity_sum + severity,
         severity_max=jnp.maximum(episode.severity_max, severity),
         interventions=episode.interventions + info.intervening.astype(jnp.int32),
+        control_effort=episode.control_effort + _effort(info.control_actual, full_controls),
         reward_totals=info.reward_totals,
-        controls=tuple(
-            total + jnp.abs(info.control_actual[..., i]) for i, total in enumerate(episode.controls)
-        ),
         costs={name: total + timestep.costs[name] for name, total in episode.costs.items()},
         measured={
             name: _measured(name, before, episode.length, info.status)
             for name, before in episode.measured.items()
         },
     )
+
+
+def _effort(controls: Float[Array, "... m"], full_controls: Sequence[Array]) -> Any:
+    """Return the mean magnitude of some controls, each as a share of its full magnitude."""
+    # A sum written out keeps the loop over environments free of a reduction.
+    shares = [jnp.abs(controls[..., i]) / full for i, full in enumerate(full_controls)]
+    return sum(shares) / max(len(shares), 1)
 
 
 def _measured(
@@ -183,24 +195,25 @@ def measures(env: Environment) -> dict[str, bool]:
         "has_delta_v_l1": "delta_v_l1" in statuses,
         "has_constraints": bool(env.constraints),
         "has_rta": env.rta is not None,
+        "has_controls": bool(env.actuators),
     }
 
 
-def full_controls(env: Environment) -> tuple[float, ...]:
+def full_controls(env: Environment) -> tuple[Array, ...]:
     """Return the largest magnitude of each control, in the order of the action.
 
-    It is `()` if the agent's controller lists no actuators.
+    It is 1 for a control that is always 0, and there are none if the agent's controller lists no
+    actuators.
     """
-    return tuple(
-        max(abs(float(actuator.low)), abs(float(actuator.high))) for actuator in env.actuators
-    )
+    largest = [
+        jnp.maximum(jnp.abs(actuator.low), jnp.abs(actuator.high)) for actuator in env.actuators
+    ]
+    return tuple(jnp.where(value > 0.0, value, 1.0) for value in largest)
 
 
 def metrics_in(env: Environment, episodes: Episode) -> dict[str, float | None]:
     """Return the metrics over a set of finished episodes of an environment, as `summarise` does."""
-    return summarise(
-        episodes, env.success_indices, **measures(env), full_controls=full_controls(env)
-    )
+    return summarise(episodes, env.success_indices, **measures(env))
 
 
 def summarise(
@@ -210,7 +223,7 @@ def summarise(
     has_rta: bool = False,
     has_delta_v_l1: bool | None = None,
     has_constraints: bool = True,
-    full_controls: Sequence[float] = (),
+    has_controls: bool = False,
 ) -> dict[str, float | None]:
     """Return the metrics over a set of finished episodes.
 
@@ -227,7 +240,8 @@ def summarise(
             if it has `delta_v`.
         has_constraints: whether the environment has safety constraints. Then their violations are
             counted.
-        full_controls: the largest magnitude of each control. Empty means that it is not known.
+        has_controls: whether the full magnitudes of the controls were known. Then their effort was
+            summed.
 
     Returns:
         A value for every name of `METRICS` and each metric of one's own, which is a mean over
@@ -240,12 +254,8 @@ def summarise(
     mean = {
         name: float(np.mean(value))
         for name, value in vars(episodes).items()
-        if name not in ("reward_totals", "controls", "costs", "measured")
+        if name not in ("reward_totals", "costs", "measured")
     }
-    effort = [
-        float(np.mean(total)) / (full or 1.0)
-        for total, full in zip(episodes.controls, full_controls, strict=False)
-    ]
     successes = np.atleast_1d(np.asarray(success, int))
     violating = mean["violating_steps"]
     p95, p99 = np.percentile(np.asarray(episodes.severity_max), (95, 99), method="higher")
@@ -256,7 +266,7 @@ def summarise(
         "success_rate": float(np.mean(np.isin(episodes.outcome, successes))),
         "control_usage": mean["delta_v"],
         "control_usage_l1": mean["delta_v_l1"],
-        "control_effort": sum(effort) / max(len(effort), 1) / max(steps, MIN_STEPS),
+        "control_effort": mean["control_effort"] / max(steps, MIN_STEPS),
         "safety_violation_rate": float(np.mean(np.asarray(episodes.violating_steps) > 0)),
         "episode_safety_violation_rate": violating / max(steps, MIN_STEPS),
         "episode_cost": violating,
@@ -275,7 +285,7 @@ def summarise(
         "success_rate": bool((successes >= 0).any()),
         "control_usage": has_delta_v,
         "control_usage_l1": has_delta_v if has_delta_v_l1 is None else has_delta_v_l1,
-        "control_effort": bool(effort),
+        "control_effort": has_controls,
         "intervention_rate": has_rta,
         **dict.fromkeys(SAFETY_METRICS, has_constraints),
     }

@@ -101,8 +101,9 @@ def test_steps_add_up(episodes: Episode) -> None:
         "severity_sum": [0.0, 2.5, 0.1],
         "severity_max": [0.0, 2.0, 0.1],
         "interventions": [0, 1, 1],
+        "control_effort": [0.0, 0.0, 0.0],
     }
-    assert set(vars(episodes)) == {*expected, "reward_totals", "controls", "costs", "measured"}
+    assert set(vars(episodes)) == {*expected, "reward_totals", "costs", "measured"}
     for name, values in expected.items():
         np.testing.assert_allclose(getattr(episodes, name), values, rtol=1e-6, err_msg=name)
     np.testing.assert_allclose(episodes.reward_totals["term"], [30.0, 20.0, -20.0])
@@ -200,6 +201,7 @@ def test_an_environment_says_what_it_measures() -> None:
         "has_delta_v_l1": True,
         "has_constraints": True,
         "has_rta": True,
+        "has_controls": True,
     }
     custom = jaxsafe.make(str(Path(__file__).parent.parent / "configs" / "custom_env.yaml"))
     assert measures(custom) | {"has_rta": False} == {
@@ -207,6 +209,7 @@ def test_an_environment_says_what_it_measures() -> None:
         "has_delta_v_l1": False,
         "has_constraints": True,
         "has_rta": False,
+        "has_controls": True,
     }
     assert not measures(jaxsafe.make("rejoin2d"))["has_delta_v"]
 
@@ -218,12 +221,11 @@ def test_control_effort_is_the_mean_share_of_full_control_over_controls_and_step
         timestep.replace(info=timestep.info.replace(control_actual=jnp.asarray(control)))
         for timestep, control in zip(timesteps, controls, strict=True)
     ]
-    episode = begin(timesteps[0], sum_controls=True)
+    episode = begin(timesteps[0])
     for timestep in timesteps:
-        episode = accumulate(episode, timestep)
-    np.testing.assert_allclose(episode.controls, [1.5, 60.0])
+        episode = accumulate(episode, timestep, (jnp.asarray(1.0), jnp.asarray(80.0)))
     episodes = jax.tree.map(lambda leaf: leaf[None], episode)
-    computed = summarise(episodes, SUCCESS, full_controls=(1.0, 80.0))["control_effort"]
+    computed = summarise(episodes, SUCCESS, has_controls=True)["control_effort"]
     assert computed == pytest.approx((1.5 / 1.0 + 60.0 / 80.0) / 2 / 3)
     assert summarise(episodes, SUCCESS)["control_effort"] is None
 
@@ -231,7 +233,9 @@ def test_control_effort_is_the_mean_share_of_full_control_over_controls_and_step
 def test_full_controls_are_the_larger_limits_in_either_direction() -> None:
     limits = {"wingman.controller.actuators.acceleration.low": -200.0}
     env = jaxsafe.make("rejoin2d", limits)
-    assert full_controls(env) == pytest.approx((0.17, 200.0))
+    assert np.asarray(full_controls(env)) == pytest.approx([0.17, 200.0])
+    useless = {f"deputy.controller.actuators.thrust_x.{end}": 0.0 for end in ("low", "high")}
+    assert np.asarray(full_controls(jaxsafe.make("docking2d", useless))).tolist() == [1.0, 1.0]
 
 
 def test_a_figure_that_is_not_finite_is_none(episodes: Episode) -> None:

@@ -21,6 +21,7 @@ PANELS = (
     "return",
     "length",
     "delta_v",
+    "control_effort",
     "violating_share",
     "episode_cost",
     "intervention_share",

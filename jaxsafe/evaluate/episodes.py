@@ -10,7 +10,7 @@ from jaxtyping import Array, Int
 
 from jaxsafe.environment import Environment, step
 from jaxsafe.evaluate.cases import Cases, reset_to_cases
-from jaxsafe.metrics import Episode, accumulate, begin
+from jaxsafe.metrics import Episode, accumulate, begin, full_controls
 from jaxsafe.processors.terminal import Timeout
 from jaxsafe.rollout import (
     Policy,
@@ -55,7 +55,8 @@ def run_episodes(
     """
     key_start, key_act = jax.random.split(key)
     state, timestep = _starts(env, key_start, num_episodes, cases)
-    episode = begin(timestep, sum_controls=True, measure=env.measure)
+    episode = begin(timestep, measure=env.measure)
+    full = full_controls(env)
     limit = max_steps(env)
 
     def going(carry: Carry) -> Array:
@@ -68,9 +69,8 @@ def run_episodes(
         require_batch(env, action, observation.shape[0])
         state, timestep = jax.vmap(step, in_axes=(None, 0, 0))(env, state, action)
         running = episode.outcome == 0
-        episode = jax.tree.map(
-            lambda new, old: jnp.where(running, new, old), accumulate(episode, timestep), episode
-        )
+        later = accumulate(episode, timestep, full)
+        episode = jax.tree.map(lambda new, old: jnp.where(running, new, old), later, episode)
         return t + 1, state, timestep.observation, memory, episode
 
     memory = first_memory(policy, num_episodes)

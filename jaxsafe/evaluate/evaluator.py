@@ -304,9 +304,12 @@ def episode_rows(
         "violating_steps": "has_constraints",
         "severity_max": "has_constraints",
         "interventions": "has_rta",
+        "control_effort": "has_controls",
     }
     names = ("episode_return", "length", *needs)
     columns = {name: np.asarray(getattr(episodes, name)).tolist() for name in names}
+    share = np.asarray(episodes.control_effort) / np.maximum(episodes.length, 1)
+    columns["control_effort"] = share.tolist()
     unmeasured = {name for name, what in needs.items() if not measured[what]}
     columns |= {
         name: np.asarray(over_episode(name, value, np.maximum(episodes.length, 1))).tolist()

@@ -158,7 +158,7 @@ def evaluations(run: Path, progress: Sequence[Mapping[str, Any]]) -> list[dict[s
         "return": NUMBER_OR_NULL,
     }
     log = read_rows(run / "eval.jsonl", form)
-    optional = ("delta_v", "violating_steps", "interventions")
+    optional = ("delta_v", "control_effort", "violating_steps", "interventions")
     logged = {name: NUMBER_OR_NULL for name in optional if any(name in row for row in log)}
     for number, row in enumerate(log, start=1):
         check(row, logged, f"{run / 'eval.jsonl'}, row {number}")

@@ -31,7 +31,7 @@ from jaxsafe.autoreset import choose
 from jaxsafe.devices.backend import accelerated, packing, scan_packed
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment, longest_episode
-from jaxsafe.metrics import Episode, accumulate, begin
+from jaxsafe.metrics import Episode, accumulate, begin, full_controls
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 from jaxsafe.schema.component import Component, Range
 from jaxsafe.schema.errors import ConfigError, choices_text, show
@@ -573,6 +573,7 @@ def collect(
     """
     start = (state.env_state, state.observation, state.episode, state.memory["actor"])
     fresh_memory = _fresh_memory(agent, state.observation.shape[0])["actor"]
+    full = full_controls(env)
 
     def one_step(
         carry: tuple[State, Array, Episode, Memory], key: Key
@@ -589,7 +590,7 @@ def collect(
         if ppo.learns_from == "actual":
             action = _acted(env, action, timestep)
         done = timestep.done
-        episode = accumulate(episode, timestep)
+        episode = accumulate(episode, timestep, full)
         transition = Transition(
             inputs=inputs,
             totals=totals,

@@ -147,6 +147,7 @@ def means(
         "return": mean(episodes.episode_return),
         "length": mean(episodes.length),
         "delta_v": mean(episodes.delta_v),
+        "control_effort": mean_share_of_steps(episodes.control_effort),
         "violating_share": mean_share_of_steps(episodes.violating_steps),
         "episode_cost": mean(episodes.violating_steps),
         **({"episode_severity": mean(episodes.severity_sum)} if severity else {}),

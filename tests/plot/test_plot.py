@@ -150,6 +150,7 @@ def test_an_evaluation_is_the_mean_of_its_episodes() -> None:
         "return": 0.5,
         "length": 10.0,
         "delta_v": None,
+        "control_effort": None,
         "episode_cost": 2.0,
         "violating_share": 0.2,
         "intervention_share": None,

@@ -95,11 +95,13 @@ def test_a_share_of_steps_is_the_mean_of_the_shares_of_the_episodes() -> None:
         length=jnp.array([[10, 90]]),
         violating_steps=jnp.array([[5, 15]]),
         interventions=jnp.array([[1, 45]]),
+        control_effort=jnp.array([[2.5, 9.0]]),
     )
     window = push(empty_window(episodes), episodes, jnp.ones((1, 2), bool))
     row = means(window, ENV.outcomes, ENV.successes)
     assert float(row["violating_share"]) == pytest.approx((5 / 10 + 15 / 90) / 2)
     assert float(row["intervention_share"]) == pytest.approx((1 / 10 + 45 / 90) / 2)
+    assert float(row["control_effort"]) == pytest.approx((2.5 / 10 + 9.0 / 90) / 2)
 
 
 @pytest.mark.thorough

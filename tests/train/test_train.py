@@ -76,6 +76,7 @@ def test_progress_has_a_row_for_every_update_of_every_seed(whole: Path) -> None:
     last = rows[-1]
     outcomes = ("success", "crash", "distance", "timeout", "velocity")
     assert sum(last[f"outcome/{name}"] for name in outcomes) == pytest.approx(1.0, abs=1e-5)
+    assert 0.0 < last["control_effort"] < 1.0
     terms = ("distance_change", "velocity_constraint", "delta_v", "success", "failure")
     assert sum(last[f"reward/{name}"] for name in terms) == pytest.approx(last["return"], abs=1e-4)
     for row in rows:  # what is learnt is known before an episode has ended

@@ -236,6 +236,7 @@ def columns(env: Environment) -> list[str]:
         "return",
         "length",
         *(["delta_v"] if measured["has_delta_v"] else []),
+        *(["control_effort"] if measured["has_controls"] else []),
         *(["violating_share", "episode_cost"] if measured["has_constraints"] else []),
         *(["episode_severity"] if env.cost == "severity" else []),
         *(["intervention_share"] if measured["has_rta"] else []),

@@ -53,6 +53,7 @@ NEWER = (
     "multiplier_boost",
     "cost_excess",
     "measured",
+    "control_effort",
 )
 """Arrays that older checkpoints lack, by the last part of their names.
 
