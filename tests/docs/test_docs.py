@@ -22,9 +22,11 @@ import pytest
 from default_cases import thorough
 
 import jaxsafe
+from jaxsafe.commands.catalogue import SECTIONS, title, types_of
 from jaxsafe.config import dump, load
 from jaxsafe.config.arguments import Arguments
 from jaxsafe.envs import TASKS
+from jaxsafe.metrics import METRICS
 from jaxsafe.parts import (
     Constraint,
     Initializer,
@@ -36,7 +38,10 @@ from jaxsafe.parts import (
     Vector,
 )
 from jaxsafe.schema import yaml12
+from jaxsafe.schema.component import fields
 from jaxsafe.schema.convert import to_component
+from jaxsafe.schema.dotted_paths import get_path
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.host.options import recipe, resolve
 
 ROOT = Path(__file__).parents[2]
@@ -335,6 +340,88 @@ def test_every_part_in_the_tables_of_the_vocabulary_is_one() -> None:
                 assert isinstance(to_component({**needed, **data}, base, written), base)
             found.add(data["type"])
     assert len(found) >= 40
+
+
+def rows_of_the_paper() -> dict[str, list[list[str]]]:
+    """Return the cells of each row about the paper, by section of the page."""
+    page = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    sections = {}
+    for text in page.split("\n## ")[1:]:
+        heading, _, body = text.partition("\n")
+        rows = [line.strip("| ").split(" | ") for line in body.splitlines() if line[:2] == "| "]
+        sections[heading] = [row for row in rows if row[0] != "the paper"]
+    return sections
+
+
+def is_known(name: str) -> bool:
+    """Return whether a name is importable, a type, a field, a number of a task, or a metric."""
+    types = [cls for section in SECTIONS.values() for cls in types_of(section)]
+    owner, _, field = name.partition(".")
+    if owner == "jaxsafe":
+        return importable(name)
+    if owner == "timestep":
+        record = "Info" if field.startswith("info.") else "TimeStep"
+        return importable(f"jaxsafe.types.{record}.{field.rpartition('.')[2]}")
+    if any(title(cls) == owner and field in ("", *fields(cls)) for cls in types):
+        return True
+    return name in (*SECTIONS, *METRICS) or any(leads_somewhere(task, name) for task in TASKS)
+
+
+def leads_somewhere(task: str, path: str) -> bool:
+    """Return whether a task has something at a dotted path."""
+    try:
+        get_path(jaxsafe.make(task), path)
+    except (AttributeError, ConfigError, KeyError, TypeError):
+        return False
+    return True
+
+
+def unknown_options(command: str) -> list[str]:
+    """Return the options of a command line that its page of the reference does not have."""
+    reference = (ROOT / "docs" / "reference" / "options.md").read_text(encoding="utf-8")
+    words = command.split()[1:]
+    named = [word for word in words if "=" not in word]
+    heading = f"## jaxsafe {' '.join(named[: 2 if named[:2] == ['config', 'types'] else 1])}\n"
+    assert heading in reference, command
+    known = re.findall(r"^\| `(.*?)` \|", reference.split(heading)[1].split("\n## ")[0], re.M)
+    options = [word.partition("=")[0].removeprefix("sweep.") for word in words if "=" in word]
+    options = ["env.PATH" if option.startswith("env.") else option for option in options]
+    training = reference.split("## jaxsafe train\n")[1].split("\n## ")[0]
+    known += re.findall(r"^\| `(.*?)` \|", training, re.M) if named[0] == "tune" else []
+    return [option for option in options if option not in known]
+
+
+def test_every_name_on_the_page_of_the_paper_is_one() -> None:
+    for rows in rows_of_the_paper().values():
+        for _, _, names, _ in rows:
+            shown = re.findall("`(.*?)`", names)
+            assert shown or "](" in names, names
+            for name in shown:
+                if name.startswith("jaxsafe "):
+                    assert unknown_options(name) == [], name
+                else:
+                    assert is_known(name), name
+    assert not is_known("simplexx")
+    assert not is_known("simplex.releas")
+    assert not is_known("deputy.mas")
+    assert not is_known("timestep.info.outcomes")
+    assert unknown_options("jaxsafe train stepss=3 env.x=2") == ["stepss"]
+
+
+def test_the_page_of_the_paper_gives_reasons_and_counts_its_rows() -> None:
+    page = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    total = [0, 0, 0, 0]
+    for heading, rows in rows_of_the_paper().items():
+        answers = [answer.partition(": ") for *_, answer in rows]
+        for answer, _, reason in answers:
+            assert (answer == "yes") != bool(reason), (answer, reason)
+        counts = [len(rows)]
+        counts += [sum(word == answer for word, *_ in answers) for answer in ("yes", "other", "no")]
+        assert counts[0] == sum(counts[1:])
+        total = [a + b for a, b in zip(total, counts, strict=True)]
+        anchor = heading.lower().replace(",", "").replace(" ", "-")
+        assert f"| [{heading}](#{anchor}) | {' | '.join(map(str, counts))} |" in page
+    assert f"| all | {' | '.join(map(str, total))} |" in page
 
 
 @pytest.mark.thorough
