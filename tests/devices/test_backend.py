@@ -1,7 +1,10 @@
 """Programs take other paths on an accelerator, and the results are the same."""
 
 import os
+import subprocess
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -111,3 +114,24 @@ def test_llvm_keeps_its_expensive_passes_for_an_accelerator(
     monkeypatch.setattr("importlib.util.find_spec", lambda _: plugin)
     claim_cores()
     assert ("disable_expensive_passes" in os.environ["XLA_FLAGS"]) == disabled
+
+
+def test_a_cached_program_loads_without_a_word_even_if_jax_came_first(tmp_path: Path) -> None:
+    code = (
+        "import jax, jaxsafe\n"
+        "from jaxsafe.devices.compilation_cache import enable_compilation_cache\n"
+        "enable_compilation_cache()\n"
+        "print(jax.jit(lambda x: x + 1)(2))"
+    )
+    kept = {"JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL"}
+    own = {name: value for name, value in os.environ.items() if name not in kept}
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env={**own, "XDG_CACHE_HOME": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert (done.stdout, done.stderr) == ("3\n", "")
+    assert any((tmp_path / "jaxsafe").iterdir())
