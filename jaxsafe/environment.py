@@ -460,9 +460,13 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
         The next state, and the time step that led there.
 
     Raises:
-        ConfigError: the action has another shape, or is not whole numbers where actions are
-            discrete.
+        ConfigError: the state is something else, or the action has another shape, or is not whole
+            numbers where actions are discrete.
     """
+    if not isinstance(state, State):
+        raise ConfigError(
+            f"step: state: expected the State that reset or step returned, found {show(state)}"
+        )
     env = drawn(env, state.parameters)
     action = _checked(env, action)
     controls = env.agent_platform.controller.control(action, state.sim)
@@ -730,11 +734,19 @@ def _checked(env: Environment, action: Array) -> Array:
 
     JAX itself would clamp an index out of range and say nothing.
     """
-    action = jnp.asarray(action)
-    if action.shape != (env.action_size,):
-        names = ", ".join(env.action_names)
+    expected = (env.action_size,)
+    names = ", ".join(env.action_names)
+    try:
+        action = jnp.asarray(action)
+    except (TypeError, ValueError):  # text, None, or rows of different lengths
         raise ConfigError(
-            f"action: expected shape {(env.action_size,)} ({names}), found {action.shape}"
+            f"action: expected shape {expected} ({names}), found {show(action)}"
+        ) from None
+    if action.shape != expected:
+        batched = action.shape[1:] == expected
+        advice = "; for a batch, write jax.vmap around step" if batched else ""
+        raise ConfigError(
+            f"action: expected shape {expected} ({names}), found {action.shape}{advice}"
         )
     kind = env.action_kind
     if kind == "mixed":

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, overload
 
@@ -57,10 +58,50 @@ def first_memory(policy: Policy | RecurrentPolicy, num_envs: int | None = None) 
 def act(
     policy: Policy | RecurrentPolicy, key: Key, observation: Array, memory: Any
 ) -> tuple[Array, Any]:
-    """Return the action of a policy, and the memory of the policy after it."""
-    if isinstance(policy, RecurrentPolicy):
-        return policy.act(key, observation, memory)
-    return policy(key, observation), memory
+    """Return the action of a policy, and the memory of the policy after it.
+
+    Raises:
+        ConfigError: a `RecurrentPolicy` returns no pair, or a memory of another shape.
+    """
+    with _policy_hints(observation):
+        if not isinstance(policy, RecurrentPolicy):
+            return policy(key, observation), memory
+        returned = policy.act(key, observation, memory)
+    if not isinstance(returned, tuple) or len(returned) != 2:
+        raise ConfigError(
+            f"policy: expected an action and the memory after it, found {show(returned)}"
+        )
+    before, after = (jax.tree.map(jnp.shape, tree) for tree in (memory, returned[1]))
+    if before != after:
+        raise ConfigError(
+            f"policy: expected a memory of shape {show(before)} after each action, as before it, "
+            f"found {show(after)}"
+        )
+    return returned
+
+
+@contextmanager
+def _policy_hints(observation: Array) -> Iterator[None]:
+    """Add a note to every error inside that says what a policy must be like.
+
+    A compiled program does not contain it, because it runs only while the program is traced.
+    """
+    try:
+        yield
+    except ConfigError:
+        raise
+    except Exception as error:
+        if isinstance(error, jax.errors.JAXTypeError):
+            hint = "it is compiled, so write jnp in place of np, and jnp.where in place of if"
+        elif jnp.ndim(observation) > 1:
+            hint = (
+                f"it gets a batch, observations of shape {jnp.shape(observation)}; "
+                "for a policy of one observation, write jax.vmap around it"
+            )
+        else:
+            hint = f"it gets a key and an observation of shape {jnp.shape(observation)}"
+        error.add_note(f"in the policy: {hint}")
+        raise
 
 
 class RolloutState(Record):

@@ -192,17 +192,23 @@ def is_key(x: Any) -> bool:
 
 
 def require_key(what: str, key: Any) -> None:
-    """Reject a plain number where a key is needed.
+    """Reject a plain number, or several keys, where one key is needed.
 
     Args:
         what: the function and the argument, for the message.
         key: the key.
 
     Raises:
-        ConfigError: it is a number.
+        ConfigError: it is a number, or there are several keys.
     """
     if isinstance(key, int | np.integer):
         raise ConfigError(f"{what}: expected a key, such as jax.random.key({key}), found {key}")
+    typed = isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    if typed and key.ndim:
+        raise ConfigError(
+            f"{what}: expected one key, found keys of shape {key.shape}; "
+            "for one call with each, use jax.vmap"
+        )
 
 
 def units(record: type[Record]) -> dict[str, str]:

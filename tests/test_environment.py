@@ -548,3 +548,21 @@ def test_reset_to_refuses_what_is_no_mapping_of_numbers(
 ) -> None:
     with pytest.raises(ConfigError, match=f"^reset_to: .*{message}"):
         jaxsafe.reset_to(env, start, parameters)
+
+
+@pytest.mark.parametrize(
+    ("state", "action", "message"),
+    [
+        (None, jnp.zeros((4, 2)), r"found \(4, 2\); for a batch, write jax.vmap around step$"),
+        (None, jnp.zeros((2, 3)), r"found \(2, 3\)$"),
+        (None, "left", "found 'left'$"),
+        (None, None, "found None$"),
+        ("timestep", jnp.zeros(2), "step: state: expected the State that reset or step returned"),
+    ],
+)
+def test_a_step_from_what_is_no_state_or_action_is_refused(
+    state: Any, action: Any, message: str, env: Environment
+) -> None:
+    start, timestep = jaxsafe.reset_to(env, START)
+    with pytest.raises(ConfigError, match=message):
+        jaxsafe.step(env, timestep if state else start, action)

@@ -1,6 +1,7 @@
 """One whole episode as arrays: it is what the steps say."""
 
 import csv
+import re
 from pathlib import Path
 from typing import Any
 
@@ -175,6 +176,10 @@ def test_a_filter_shows_in_a_flight() -> None:
     np.testing.assert_array_equal(altered, flight.intervening)
 
 
+def recurrent(act: Any) -> RecurrentPolicy:
+    return RecurrentPolicy(lambda key, observation, memory: act(memory), memory=0.0)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -187,6 +192,13 @@ def test_a_filter_shows_in_a_flight() -> None:
         ),
         ({"start": "here"}, "fly: start: expected what reset or reset_to returns"),
         ({"start": {"chief": {}}}, "reset_to: "),
+        ({"policy": lambda key, o: None}, r"action: expected shape \(2,\) .*, found None"),
+        ({"policy": recurrent(lambda memory: 0.0)}, "policy: expected an action and the memory"),
+        (
+            {"policy": recurrent(lambda memory: (jnp.zeros(2), jnp.zeros(4)))},
+            r"policy: expected a memory of shape \(\) after each action, .* found \(4,\)",
+        ),
+        ({"key": jax.random.split(jax.random.key(0), 4)}, r"one key, found keys of shape \(4,\)"),
         ({"key": 3}, r"fly: key: expected a key, such as jax.random.key\(3\), found 3"),
     ],
 )
@@ -196,3 +208,19 @@ def test_what_does_not_fit_is_refused_in_one_line(
     with pytest.raises(ConfigError, match=message) as caught:
         jaxsafe.fly(env, **{"policy": policy, **arguments})
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("policy", "hint"),
+    [
+        (lambda key, o: np.clip(o[:2], -1, 1), "write jnp in place of np, and jnp.where in place"),
+        (lambda key, o: jnp.ones(2) if o[0] > 0 else jnp.zeros(2), "jnp.where in place of if"),
+        (lambda observation: jnp.zeros(2), r"it gets a key and an observation of shape \(6,\)$"),
+    ],
+)
+def test_an_error_in_a_policy_says_what_a_policy_must_be_like(
+    policy: Any, hint: str, env: Environment
+) -> None:
+    with pytest.raises(TypeError) as caught:
+        jaxsafe.fly(env, policy)
+    assert re.search(f"^in the policy: .*{hint}", "\n".join(caught.value.__notes__), re.M)
