@@ -10,7 +10,7 @@ from jaxsafe.config import dump, load, override
 from jaxsafe.environment import Environment, reset, reset_to, step
 from jaxsafe.envs import make
 from jaxsafe.rollout import rollout
-from jaxsafe.schema.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError, choices_text
 
 if TYPE_CHECKING:
     from jaxsafe.evaluate.evaluate import evaluate
@@ -60,8 +60,9 @@ def __getattr__(name: str) -> Any:
         from jaxsafe.storage.provenance import version
 
         return version()
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    hint = choices_text(name, __all__)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}{hint}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__} - {"Any", "TYPE_CHECKING", "importlib"})
+    return sorted({*globals(), *__all__} - {"Any", "TYPE_CHECKING", "choices_text", "importlib"})

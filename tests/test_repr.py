@@ -116,4 +116,6 @@ def test_the_package_says_its_version_and_tasks() -> None:
     assert "docking2d" in jaxsafe.TASKS
     with pytest.raises(AttributeError, match="module 'jaxsafe' has no attribute 'tasks'"):
         _ = jaxsafe.tasks  # type: ignore[attr-defined]
+    with pytest.raises(AttributeError, match=r"'evalute'\. Did you mean 'evaluate'\?"):
+        _ = jaxsafe.evalute  # type: ignore[attr-defined]
     assert all(hasattr(jaxsafe, name) for name in jaxsafe.__all__)

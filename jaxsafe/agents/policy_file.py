@@ -189,6 +189,11 @@ def find_policy(policy: str | os.PathLike) -> Path:
     path = Path(policy)
     if path.suffix == ".npz":
         return path
+    if (path / "config.yaml").is_file():
+        raise ConfigError(
+            f"policy: {str(policy)!r} is a run; "
+            f"jaxsafe.open_run({str(policy)!r}).policy() returns its policy"
+        )
     pretrained = {file.stem: file for file in sorted(_PRETRAINED.glob("*.npz"))}
     if not pretrained:
         raise ConfigError(

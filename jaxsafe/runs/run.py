@@ -42,8 +42,14 @@ class Run(Described):
         Raises:
             ConfigError: there is no run at this path, it has not finished, or its files are broken.
         """
+        from jaxsafe.agents.policy_file import is_single
         from jaxsafe.train.host import run_directory
 
+        if is_single(os.fspath(path)):
+            raise ConfigError(
+                f"run: {os.fspath(path)!r} is one policy and no run; "
+                f"write jaxsafe.load_policy({os.fspath(path)!r})"
+            )
         self.path = Path(path)
         self.config, self.env, self.task = run_directory.read(self.path, "run")
         if not (self.path / "results.json").exists():

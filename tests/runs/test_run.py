@@ -194,3 +194,11 @@ def test_seeds_that_cannot_share_the_cores_are_told(
 def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="run: no run in "):
         jaxsafe.open_run(tmp_path)
+    with pytest.raises(ConfigError, match=r"write jaxsafe\.load_policy\('pretrained/docking2d'\)"):
+        jaxsafe.open_run("pretrained/docking2d")
+
+
+def test_a_run_in_place_of_a_policy_is_told_how_it_has_some(whole: Path) -> None:
+    call = re.escape(f"is a run; jaxsafe.open_run({str(whole)!r}).policy() returns its policy")
+    with pytest.raises(ConfigError, match=call):
+        jaxsafe.load_policy(whole)
