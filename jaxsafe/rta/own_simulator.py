@@ -12,13 +12,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from jaxsafe.processors.strengthening import Polynomial
 from jaxsafe.rta.asif import barrier_row, nearest_by_priority
 from jaxsafe.rta.filter import NO_CONSTRAINT
 from jaxsafe.rta.projection import within
-from jaxsafe.schema.errors import ConfigError
+from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.types import Number, RTAInfo
@@ -50,6 +52,10 @@ class Plant:
         Raises:
             ConfigError: the platform has no actuators, or one has a lag or a rate limit.
         """
+        if not isinstance(platform, Platform):
+            raise ConfigError(
+                f"Plant.of: expected a platform, such as env.agent_platform, found {show(platform)}"
+            )
         actuators = getattr(platform.controller, "actuators", ())
         if not actuators:
             raise ConfigError(f"platforms.{platform.name}.controller: expected actuators")
@@ -107,12 +113,14 @@ def filter_by_asif(
         The control that acts, and what happened. `predicted_margin` is the smallest h at x.
 
     Raises:
-        ConfigError: the plant has no derivative, or there is no constraint.
+        ConfigError: the plant has no derivative, or there is no constraint, or a function or the
+            control has another form than it should.
     """
     derivative = _given(plant.derivative, "filter_by_asif: the plant needs a `derivative`")
-    barriers = _barriers(constraints)
     state = jax.tree.map(jnp.asarray, state)
-    wanted, finite = _admissible(plant, control)
+    barriers = _barriers(constraints, state)
+    wanted, finite = _wanted(plant, control, "filter_by_asif")
+    _require_like(state, jax.eval_shape(derivative, state, wanted), "plant: derivative")
     rows = [
         barrier_row(
             h=barrier.h,
@@ -174,17 +182,19 @@ def filter_by_simplex(
         The control that acts, and what happened. `certified` says so of the state after it.
 
     Raises:
-        ConfigError: the plant has no step, there is no constraint, or only one of horizon and
-            terminal set is given.
+        ConfigError: the plant has no step, there is no constraint, only one of horizon and terminal
+            set is given, or a function or the control has another form than it should.
     """
     step = _given(plant.step, "filter_by_simplex: the plant needs a `step`")
-    barriers = _barriers(constraints)
     if (horizon > 0) != (terminal is not None):
         raise ConfigError(
             "filter_by_simplex: a horizon needs a terminal set, and the set a horizon"
         )
     state = jax.tree.map(jnp.asarray, state)
-    wanted, finite = _admissible(plant, control)
+    barriers = _barriers(constraints, state)
+    wanted, finite = _wanted(plant, control, "filter_by_simplex")
+    _require_like(state, jax.eval_shape(step, state, wanted), "plant: step")
+    _require_like(wanted, jax.eval_shape(backup, state), "filter_by_simplex: backup", "the control")
 
     def back_up(x: Any) -> Control:
         return _admissible(plant, backup(x))[0]
@@ -228,10 +238,62 @@ def _given(function: Callable | None, fault: str) -> Callable:
     return function
 
 
-def _barriers(constraints: Constraints) -> list[Barrier]:
-    if not constraints:
-        raise ConfigError("constraints: expected at least one function h(x) or barrier")
-    return [item if isinstance(item, Barrier) else Barrier(h=item) for item in constraints]
+def _barriers(constraints: Constraints, state: Any) -> list[Barrier]:
+    if not isinstance(constraints, Sequence) or not constraints:
+        found = "" if isinstance(constraints, Sequence) else f", found {show(constraints)}"
+        raise ConfigError(f"constraints: expected a list of functions h(x) or barriers{found}")
+    barriers = [item if isinstance(item, Barrier) else Barrier(h=item) for item in constraints]
+    for index, barrier in enumerate(barriers):
+        place = f"constraints: {index}"
+        if not callable(barrier.alpha):
+            raise ConfigError(
+                f"{place}: alpha: expected a function, such as Polynomial(linear=0.1).of, "
+                f"found {show(barrier.alpha)}"
+            )
+        if barrier.degree < 1:
+            raise ConfigError(f"{place}: degree: expected 1 or more, found {barrier.degree}")
+        margin = jax.eval_shape(barrier.h, state)
+        dtype = getattr(margin, "dtype", bool)
+        if jnp.shape(margin) or not jnp.issubdtype(dtype, jnp.floating):
+            raise ConfigError(f"{place}: h: expected one real number, found {_forms(margin)}")
+    return barriers
+
+
+def _wanted(plant: Plant, control: Any, place: str) -> tuple[Control, Bool[Array, ""]]:
+    """Return the desired control within its bounds, and whether it was finite.
+
+    Raises:
+        ConfigError: the control is no vector, or the bounds do not fit it or each other.
+    """
+    shape = np.shape(control)
+    if len(shape) != 1:
+        advice = "; for a batch, write jax.vmap around it" if len(shape) == 2 else ""
+        raise ConfigError(f"{place}: control: expected shape (m,), found {shape}{advice}")
+    for name, bound in {"low": plant.low, "high": plant.high}.items():
+        if np.shape(bound) not in ((), shape):
+            raise ConfigError(
+                f"plant: {name}: expected a number or shape {shape} as the control, "
+                f"found {np.shape(bound)}"
+            )
+    traced = isinstance(plant.low, Tracer) or isinstance(plant.high, Tracer)
+    if not traced and np.any(np.asarray(plant.low) > np.asarray(plant.high)):
+        raise ConfigError(f"plant: low: {show(plant.low)} is above high, {show(plant.high)}")
+    return _admissible(plant, control)
+
+
+def _require_like(expected: Any, found: Any, place: str, what: str = "the state") -> None:
+    """Refuse what a function returns if it has another form than its state or control."""
+    same = jax.tree.structure(expected) == jax.tree.structure(found)
+    if not same or jax.tree.map(jnp.shape, expected) != jax.tree.map(jnp.shape, found):
+        raise ConfigError(
+            f"{place}: expected the form of {what}, {_forms(expected)}, found {_forms(found)}"
+        )
+
+
+def _forms(tree: Any) -> str:
+    """Return a text with the types and shapes of all arrays of a tree."""
+    forms = jax.tree.map(lambda x: f"{jnp.result_type(x)}{list(jnp.shape(x))}", tree)
+    return show(forms).replace("'", "")
 
 
 def _admissible(plant: Plant, control: Any) -> tuple[Control, Bool[Array, ""]]:

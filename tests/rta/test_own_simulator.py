@@ -117,7 +117,7 @@ def test_what_is_missing_is_told_in_one_line() -> None:
         filter_by_asif(plant, [jnp.sum], x, x)
     with pytest.raises(ConfigError, match=r"^filter_by_simplex: a horizon needs a terminal set"):
         filter_by_simplex(plant, [jnp.sum], x, x, backup=lambda x: x, horizon=3)
-    with pytest.raises(ConfigError, match=r"^constraints: expected at least one"):
+    with pytest.raises(ConfigError, match=r"^constraints: expected a list of functions h"):
         filter_by_simplex(plant, [], x, x, backup=lambda x: x)
     chief = jaxsafe.make("docking2d").platform("chief")
     with pytest.raises(ConfigError, match=r"^platforms\.chief\.controller: expected actuators"):
@@ -125,3 +125,54 @@ def test_what_is_missing_is_told_in_one_line() -> None:
     late = jaxsafe.make("docking2d", {"deputy.controller.actuators.thrust_x.time_constant": 1.0})
     with pytest.raises(ConfigError, match=r"thrust_x: expected an actuator that acts at once"):
         Plant.of(late.platform("deputy"), 1.0)
+    with pytest.raises(ConfigError, match=r"^Plant\.of: expected a platform, such as env\.agent_"):
+        Plant.of(jaxsafe.make("docking2d"), 1.0)  # type: ignore[arg-type]
+
+
+def slide(x: jax.Array, u: jax.Array) -> jax.Array:
+    return jnp.concatenate([x[1:], u])
+
+
+def height(x: jax.Array) -> jax.Array:
+    return x[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"constraints": height}, "constraints: expected a list of .*, found <function height"),
+        ({"constraints": [jnp.sin]}, r"constraints: 0: h: expected one real .*float32\[2\]$"),
+        ({"constraints": [lambda x: x[0] > 0]}, r"constraints: 0: h: .* number, found bool\[\]$"),
+        ({"constraints": [height, Barrier(h=height, degree=0)]}, "constraints: 1: degree: expec"),
+        (
+            {"constraints": [Barrier(h=height, alpha=Polynomial(linear=1.0))]},  # type: ignore
+            r"constraints: 0: alpha: expected a function, such as Polynomial\(linear=0\.1\)\.of",
+        ),
+        ({"u": 1.0}, r"filter_by_asif: control: expected shape \(m,\), found \(\)$"),
+        ({"u": jnp.ones((5, 1))}, r"found \(5, 1\); for a batch, write jax.vmap around it$"),
+        ({"low": [-1.0, -1.0]}, r"plant: low: expected a number or shape \(1,\) .* \(2,\)$"),
+        ({"low": 2.0}, "plant: low: 2.0 is above high, 1.0$"),
+        (
+            {"derivative": lambda x, u: u},
+            r"plant: derivative: expected the form of the state, float32\[2\], found float32\[1\]$",
+        ),
+    ],
+)
+def test_a_function_or_control_of_another_form_is_refused(
+    changes: dict[str, Any], message: str
+) -> None:
+    given = {"low": -1.0, "derivative": slide, "constraints": [height], "u": jnp.ones(1), **changes}
+    plant = Plant(low=given["low"], high=1.0, derivative=given["derivative"], step=slide)
+    with pytest.raises(ConfigError, match=message):
+        filter_by_asif(plant, given["constraints"], jnp.ones(2), given["u"])
+
+
+def test_a_backup_or_step_of_another_form_is_refused() -> None:
+    plant = Plant(low=-1.0, high=1.0, step=lambda x, u: u)
+    with pytest.raises(ConfigError, match=r"^plant: step: expected the form of the state"):
+        filter_by_simplex(plant, [height], jnp.ones(2), jnp.ones(1), backup=lambda x: x[:1])
+    plant = Plant(low=-1.0, high=1.0, step=slide)
+    with pytest.raises(
+        ConfigError, match=r"^filter_by_simplex: backup: expected the form of the c"
+    ):
+        filter_by_simplex(plant, [height], jnp.ones(2), jnp.ones(1), backup=lambda x: x)
