@@ -223,6 +223,9 @@ def test_a_directory_that_holds_something_is_never_overwritten(
         in message
     )
     assert "env: run is a run; resume=run goes on with it" in fails(train, "run")
+    (tmp_path / "run" / "results.json").write_text("precious")
+    message = fails(train, "env=docking3d", "out=run")
+    assert "it is a finished run, which jaxsafe.open_run('run') opens" in message
     assert (tmp_path / "run" / "config.yaml").read_text() == "precious"
 
 

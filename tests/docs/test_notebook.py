@@ -54,6 +54,13 @@ def test_tutorials_show_what_their_code_returns() -> None:
         assert cells[0].source.startswith("# "), path
 
 
+def test_tutorials_in_one_directory_do_not_train_into_the_same_run() -> None:
+    code = "\n".join(cell.source for path in TUTORIALS for cell in nbformat.read(path, 4).cells)
+    names = re.findall(r'jaxsafe\.train\([^)]*out="([^"]*)"', code)
+    assert names
+    assert len(names) == len(set(names))
+
+
 @pytest.mark.thorough
 @pytest.mark.filterwarnings("default")  # warnings of Jupyter's packages
 def test_a_training_loop_by_hand_learns_to_keep_the_limit(tmp_path: Path) -> None:

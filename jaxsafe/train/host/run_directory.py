@@ -111,11 +111,14 @@ def make(out: str | None, parent: Path, name: str) -> Path:
         if path.exists() and (
             not path.is_dir() or any(file.suffix != ".part" for file in path.iterdir())
         ):
-            advice = (
-                f"continue it with resume={path}"
-                if (path / "config.yaml").exists()
-                else "choose an empty one"
-            )
+            advice = "choose an empty one"
+            if (path / "config.yaml").exists():
+                advice = f"continue it with resume={path}"
+            if (path / "results.json").exists():
+                advice = (
+                    f"it is a finished run, which jaxsafe.open_run({str(path)!r}) opens and "
+                    f"resume={path} steps=… trains for longer"
+                )
             raise ConfigError(
                 f"out: {path} already holds something and is never overwritten; {advice}"
             )
