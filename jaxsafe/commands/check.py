@@ -6,6 +6,7 @@ The protocol is docs/protocol.md. The exit code is 1 if something is missing.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 from jaxsafe.commands import cli
@@ -35,7 +36,7 @@ def main(argv: Sequence[str]) -> int:
         results, *others = read_all(options.run)
     except ConfigError as error:
         raise ConfigError(f"run: {error}") from None
-    found = findings(results, others)
+    found = findings(results, others, options.run if Path(options.run).is_dir() else "RUN")
     width = max(len(finding.what) for finding in found)
     print(f"{headline(results)}\n")
     for what, reported, detail in found:

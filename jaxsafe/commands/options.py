@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import itertools
 import re
 import typing
 from collections.abc import Iterable, Mapping, Sequence
@@ -32,7 +33,10 @@ class Option:
     """A mark of an option, which says what the type of the option leaves open."""
 
     first: bool = False
-    """Whether the first word of a command line may be the value alone, as `docking3d` for `env`."""
+    """Whether the first word of a command line may be the value alone, as `docking3d` for `env`.
+
+    If the option takes a list, the first words may be its items.
+    """
 
     examples: tuple[str, ...] = ()
     """Words to show if the option is missing. The usage line shows the first one."""
@@ -106,15 +110,17 @@ class CommandOptions(Component):
         """
         words = list(argv)
         table = options_of(cls).values()
-        named = next((field.name for field in table if option(field).first), None)
-        place = next((i for i, word in enumerate(words) if not word.startswith("imports=")), 0)
-        if named and words and re.fullmatch(r"[^-=][^=]*", words[place]):
-            words[place] = f"{named}={words[place]}"
         lists = {
             option(field).prefix or field.name
             for field in table
             if option(field).lists or typing.get_origin(bare(field.hint)) is tuple
         }
+        named = next((field.name for field in table if option(field).first), None)
+        begin = next((i for i, word in enumerate(words) if not word.startswith("imports=")), 0)
+        alone = itertools.takewhile(re.compile(r"[^-=][^=]*").fullmatch, words[begin:])
+        # A shell makes several words of `runs/*`.
+        if named and (values := list(alone)[: None if named in lists else 1]):
+            words[begin : begin + len(values)] = [f"{named}={','.join(values)}"]
         return arguments.Arguments.parse(words, lists).options
 
     @classmethod

@@ -70,7 +70,7 @@ class Arguments:
                 )
             if not equals or not key:
                 raise ConfigError(
-                    f"argument {show(word)}: expected key=value, for instance seeds=10"
+                    f"argument {show(word)}: expected key=value; the word help lists the options"
                 )
             if key in options:
                 raise ConfigError(f"{key}: given twice")

@@ -48,12 +48,15 @@ def read_all(place: str) -> list[dict[str, Any]]:
     return found
 
 
-def findings(results: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) -> list[Finding]:
+def findings(
+    results: Mapping[str, Any], others: Sequence[Mapping[str, Any]], run: str = "RUN"
+) -> list[Finding]:
     """Return what the protocol asks for, each with whether it is there.
 
     Args:
         results: the results of a training, or of an evaluation.
         others: the results of further evaluations of the same policies.
+        run: the run that the commands to type shall name.
     """
     name = str(results.get("env", "TASK"))
     task = results.get("task", {"id": None, "changes": []})
@@ -80,12 +83,14 @@ def findings(results: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) ->
         Finding(
             f"{SEEDS} seeds or more, none diverged",
             results["seeds"] == sound >= SEEDS,
-            f"{sound} of {results['seeds']} seeds",
+            f"{sound} of {results['seeds']} seeds"
+            + ("" if sound >= SEEDS else f"; train with seeds={SEEDS}"),
         ),
         Finding(
             f"{EPISODES:,} episodes per seed or more",
             episodes >= EPISODES,
-            f"{episodes:,} episodes",
+            f"{episodes:,} episodes"
+            + ("" if episodes >= EPISODES else f"; train with episodes={EPISODES}"),
         ),
         Finding(
             "deterministic and sampled actions",
@@ -107,12 +112,12 @@ def findings(results: Mapping[str, Any], others: Sequence[Mapping[str, Any]]) ->
             len(filters) > 1 or default_filter(name) is None,
             ", ".join(filters)
             if len(filters) > 1
-            else f"only {filters[0]}; jaxsafe evaluate RUN rta={other_filter}",
+            else f"only rta={filters[0]}; jaxsafe evaluate {run} rta={other_filter}",
         ),
         Finding(
             "the fixed starts of the task",
             starts,
-            "there" if starts else f"jaxsafe evaluate RUN cases={name}",
+            "there" if starts else f"jaxsafe evaluate {run} cases={name}",
         ),
         Finding(
             "steps and violating steps of the training",

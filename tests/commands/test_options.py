@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import pytest
 
 from jaxsafe import commands
-from jaxsafe.commands import cli
+from jaxsafe.commands import cli, plot
 from jaxsafe.commands.help_text import REST, entries, grouped, help_text
 from jaxsafe.commands.options import CommandOptions, Count, Option, Seed
 from jaxsafe.schema.errors import ConfigError
@@ -107,6 +107,14 @@ def test_the_value_of_the_first_option_may_stand_alone_as_the_first_word() -> No
         Options.parse(["this", "name=that"])
     with pytest.raises(ConfigError, match=r"^argument '': expected key=value"):
         Options.parse([""])
+
+
+def test_a_pattern_that_the_shell_has_replaced_is_a_list() -> None:
+    for words in (["runs/a", "runs/b"], ["runs/a,runs/b"], ["imports=false", "runs/a", "runs/b"]):
+        assert plot.Options.parse([*words, "x=wall"]).run == ("runs/a", "runs/b")
+    assert plot.Options.parse(["runs/a", "x=wall"]).given["run"] == "runs/a"
+    with pytest.raises(ConfigError, match=r"^argument 'runs/b': expected key=value; the word help"):
+        plot.Options.parse(["runs/a", "x=wall", "runs/b"])
 
 
 POLICY_COMMANDS = ("evaluate", "plot", "export", "dataset", "verify", "check")

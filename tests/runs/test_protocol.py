@@ -49,11 +49,18 @@ def test_what_is_missing_is_named(
     results, others = complete
     others = [{**other, "task": change.get("task", other["task"])} for other in others]
     assert missing({**results, **change}, others) == [what]
+    found = {finding.what: finding.detail for finding in findings({**results, **change}, others)}
+    for option in ("seeds", "episodes"):
+        if option in change:
+            assert found[what].endswith(f"; train with {option}={results[option]}")
 
 
 def test_evaluations_are_missing_where_there_are_none(complete: tuple[dict, list[dict]]) -> None:
     results, others = complete
     assert missing(results, []) == ["with and without a filter", "the fixed starts of the task"]
+    found = {finding.what: finding.detail for finding in findings(results, [], "runs/x")}
+    assert found["with and without a filter"].endswith("; jaxsafe evaluate runs/x rta=default")
+    assert found["the fixed starts of the task"] == "jaxsafe evaluate runs/x cases=docking2d"
     elsewhere = [{**other, "task": {"id": None, "changes": []}} for other in others]
     assert missing(results, elsewhere) == missing(results, [])
     tailless = copy.deepcopy(results)
