@@ -45,7 +45,7 @@ class Constraint(Component):
     """
 
     name: str
-    required_margin: Annotated[Number, Unit("as the constraint"), Range(0.0)] | None = None
+    required_margin: Annotated[Number, Unit("the unit of the constraint"), Range(0.0)] | None = None
     """The h that a certificate asks for."""
     strengthening: Strengthening | None = None
     """The function α of the barrier row, for filters that have such rows."""

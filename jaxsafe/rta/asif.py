@@ -349,7 +349,7 @@ class ImplicitASIF(CertifiedRTA, type="implicit_asif"):
     The spare lets it pass more often, and so does linearising `rounds` times.
     """
 
-    spare: Annotated[Number, Unit("as the constraint"), Range(0.0)] = 0.0
+    spare: Annotated[Number, Unit("the unit of the constraint"), Range(0.0)] = 0.0
     rounds: Annotated[int, Range(1, 8)] = 2
 
     def propose(

@@ -47,7 +47,7 @@ from jaxsafe.types import ConstraintName, Number, Record, RTAInfo, Sim
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
 
-Margin = Annotated[Number, Unit("as the constraint"), Range(0.0)]
+Margin = Annotated[Number, Unit("the unit of the constraint"), Range(0.0)]
 """A value of h, in the unit of the constraint."""
 
 Proposal = (

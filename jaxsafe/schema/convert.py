@@ -272,6 +272,11 @@ def _to_array(value: Any, field: Field, place: str) -> jax.Array:
         raise wrong from None
     dimensions = {None: (0,), ANY: (0, 1)}.get(length, (1,))
     if array.ndim not in dimensions or (length == 2 and array.shape != (2,)):
+        if isinstance(value, jax.Array | np.ndarray) and array.ndim - 1 in dimensions:
+            raise ConfigError(
+                f"{place}: expected {expects(field)}, found an array of shape {array.shape}; "
+                "for an environment with each value, use jax.vmap"
+            )
         raise wrong
     if not isinstance(array, Tracer):
         with np.errstate(over="ignore"):  # a number beyond the largest float32 becomes infinite

@@ -170,6 +170,13 @@ def _meant(
     return next(iter([*short, *alike]), None)
 
 
+def find_path(component: Component, name: str) -> str | None:
+    """Return the shortest path to a field of a component that has this name, or None."""
+    paths = _paths(component, component.shorthand)
+    ends_so = (path for path in paths if path.rpartition(".")[2] == name)
+    return min(ends_so, key=lambda path: path.count("."), default=None)
+
+
 def _paths(component: Component, shorthand: str | None = None) -> Iterator[str]:
     """Yield the path of every field of a component and of the components inside it."""
     for name in fields(type(component)):

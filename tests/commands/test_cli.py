@@ -80,6 +80,11 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
         (["seeds=2"], "env: missing; for instance env=docking3d"),
         (["env="], "env: expected a name or a path, found None"),
         (["env=docking3d", "sedes=2"], "sedes: unknown field 'sedes'. Did you mean 'seeds'?\n"),
+        (
+            ["env=docking3d", "mass=14"],
+            "mass: unknown option; a field of the environment is written env.deputy.mass",
+        ),
+        (["env=docking3d", "gpu=1"], "gpu: unknown field 'gpu'; choose from preset"),
         (["env=docking3d", "seeds=0"], "seeds: expected a whole number ≥ 1, found 0"),
         (["env=docking3d", "seeds=ten"], "seeds: expected a whole number ≥ 1, found 'ten'"),
         (["env=docking3d", "seeds=2.5"], "seeds: expected a whole number ≥ 1, found 2.5"),

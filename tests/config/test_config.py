@@ -343,6 +343,11 @@ def test_make_with_overrides_is_override_of_make(env: Environment) -> None:
         ("reward.delta_v", 1, r"reward\.delta_v: name one of its fields: .*scale"),
         ("reward", 1, r"reward: expected a list, found 1"),
         ("deputy.mass", 0, r"deputy\.mass: expected a number in kg > 0, found 0"),
+        (
+            "deputy.mass",
+            np.array([10.0, 12.0]),
+            r"found an array of shape \(2,\); for an environment with each value, use jax\.vmap$",
+        ),
         ("deputy.mass", "heavy", r"deputy\.mass: expected a number in kg > 0, found 'heavy'"),
         ("deputy.mass", "12", r"deputy\.mass: expected a number .*, found '12'"),
         ("deputy.mass", True, r"deputy\.mass: expected a number .*, found True"),

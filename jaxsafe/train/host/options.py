@@ -16,9 +16,9 @@ from jaxsafe.config.arguments import Arguments, text
 from jaxsafe.environment import Environment, require_success
 from jaxsafe.envs import STARTERS, TASKS, adapt, find_task, is_file, make, short_name
 from jaxsafe.processors.reward import Intervention
-from jaxsafe.schema.component import Component, Range, normalise
+from jaxsafe.schema.component import Component, Range, fields, normalise
 from jaxsafe.schema.convert import to_value
-from jaxsafe.schema.dotted_paths import set_path
+from jaxsafe.schema.dotted_paths import find_path, set_path
 from jaxsafe.schema.errors import ConfigError, ConfigWarning, choices_text, meant_environment, show
 from jaxsafe.schema.retype import set_paths
 from jaxsafe.train.host.sinks import LIBRARIES, library
@@ -254,7 +254,12 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         if hint := meant_environment(option, ("agent", "ppo")):
             raise ConfigError(hint)
     # This comes first, so that a misspelt option is reported before anything slow begins.
-    config = set_paths(config, arguments.options)
+    try:
+        config = set_paths(config, arguments.options)
+    except ConfigError:
+        if task is not None:
+            _refuse_fields(task, arguments.options)
+        raise
     env, rta_training = _environment(task, config, base, arguments.options)
     if "starts" in arguments.options and config.starts is not None:
         env = with_unproved_starts(env, config.starts)
@@ -316,6 +321,18 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
             library(sink)
     check_agent(config.agent, env)
     return config, env, short_name(name)
+
+
+def _refuse_fields(task: str, options: Mapping[str, Any]) -> None:
+    """Refuse options that are fields of the environment, such as `mass`, which lack their path."""
+    known = fields(TrainConfig)
+    env = make(task)
+    for option in options:
+        path = None if option in known or "." in option else find_path(env, option)
+        if path is not None:
+            raise ConfigError(
+                f"{option}: unknown option; a field of the environment is written env.{path}"
+            )
 
 
 def _environment(
