@@ -64,7 +64,9 @@ def read_graph(path: Path) -> tuple[Network, dict[str, np.ndarray]]:
         }
     except ConfigError:
         raise
-    # protobuf, the checker, numpy and the file system have errors of their own.
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror or error}") from None
+    # protobuf, the checker and numpy have errors of their own.
     except Exception as error:
         reason = next(iter(str(error).splitlines()), type(error).__name__)
         raise ConfigError(f"{path}: cannot be read: {reason}") from None

@@ -446,7 +446,7 @@ def test_the_address_of_the_repository_is_written_in_one_place() -> None:
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("page", ["quickstart", "concepts", "tasks/docking2d"])
+@pytest.mark.parametrize("page", ["quickstart", "concepts", "tasks/docking2d", "api/train"])
 def test_the_code_of_a_first_page_runs(page: str, tmp_path: Path) -> None:
     blocks = BLOCK.findall((ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8"))
     program = "\n".join(text for kind, text in blocks if kind == "python")
