@@ -38,7 +38,7 @@ class Options(SingleOptions):
         "The policy.": ("run", "seed", "activation"),
         "The environment in which it acts.": ("env", "env.PATH", "actions", "variant", "rta"),
         "What is proved.": ("property", "steps", "box.FIELD", "arithmetic"),
-        "The search.": ("minutes", "boxes", "everything", "resume", "out"),
+        "The search.": ("minutes", "boxes", "everything", "resolution", "resume", "out"),
     }
 
     property: Literal["safe"] = "safe"
@@ -64,6 +64,11 @@ class Options(SingleOptions):
     """Largest number of boxes to bound."""
     everything: bool = False
     """Whether to go on after a violation, for a map of the whole box."""
+    resolution: Count = 2048
+    """How fine the smallest boxes are. A box of at most 18 m / N and 0.1 m/s / N is not halved.
+
+    A map needs no more than 4.
+    """
     resume: File | None = None
     """A certificate of the same loop and box to go on from."""
     out: File | None = None
@@ -92,6 +97,7 @@ def main(argv: Sequence[str]) -> int:
         seconds=math.inf if options.minutes is None else 60.0 * options.minutes,
         max_boxes=options.boxes,
         everything=options.everything,
+        resolution=options.resolution,
         resume=earlier,
         progress=_Progress(),
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Literal, NamedTuple
@@ -30,14 +29,17 @@ FIRST_WIDTHS = (18.0, 0.1)
 SCALES = (6.0, 0.047)
 """Widths that count the same when a box is halved, of positions [m] and of velocities [m/s]."""
 
-SMALLEST = 2.0**-10
-"""A box whose widths are below this share of `SCALES` stays open."""
+RESOLUTION = 2048
+"""The default resolution: a box below this part of `FIRST_WIDTHS` is not halved."""
 
 SAMPLES = 16
 """Number of starts that are flown from a box without a proof."""
 
 MAX_BOUND = 1e6
 """Largest absolute value of a bound of a box [m, m/s]."""
+
+_Corners = tuple[np.ndarray, np.ndarray]
+"""The lowest and the highest corner of a box."""
 
 Box = Mapping[str, Any]
 """Intervals by field, `deputy.position` or `position`: one for each axis, or one for all axes."""
@@ -103,6 +105,7 @@ def verify(
     seconds: float = math.inf,
     max_boxes: int = 100_000,
     everything: bool = False,
+    resolution: int = RESOLUTION,
     resume: Verification | None = None,
     progress: Callable[[Verification], None] = lambda _: None,
 ) -> Verification:
@@ -123,6 +126,7 @@ def verify(
         seconds: the time after which to stop [s]. Boxes that are left are then open.
         max_boxes: the largest number of boxes to bound. Those before `resume` do not count.
         everything: whether to go on after a counterexample, for a map of the box.
+        resolution: a box is not halved if all its widths are at most this part of `FIRST_WIDTHS`.
         resume: a verification of the same loop and box to go on from.
         progress: a function that is called after each batch of boxes.
 
@@ -139,21 +143,22 @@ def verify(
         )
     loop = closed_loop(env, policy, arithmetic)
     whole = corners(env, box)
-    if resume is None:
-        waiting = _cells(whole, loop.dimension)
-    else:
+    search = _Search(env, policy, loop, whole, steps, resolution)
+    if resume is not None:
         _require_same(resume, loop, whole, steps)
-        waiting = [*zip(*resume.open, strict=True)]
-    search = _Search(env, policy, loop, whole, steps, deque(waiting), resume)
+        search.go_on(resume)
+    most = search.known.bounded + max_boxes
     try:
-        while search.waiting and search.bounded < max_boxes:
-            if time.monotonic() - began > seconds or (search.counterexample and not everything):
+        while search.known.waiting and search.known.bounded < most:
+            if time.monotonic() - began > seconds:
+                break
+            if search.known.counterexample and not everything:
                 break
             search.advance()
-            progress(search.known(time.monotonic() - began))
+            progress(search.verification(time.monotonic() - began))
     except KeyboardInterrupt:
         pass
-    return search.known(time.monotonic() - began)
+    return search.verification(time.monotonic() - began)
 
 
 def corners(env: Environment, box: Box) -> Boxes:
@@ -211,7 +216,7 @@ def _same_numbers(a: Any, b: Any) -> bool:
     )
 
 
-def _cells(whole: Boxes, dimension: int) -> list[tuple[np.ndarray, np.ndarray]]:
+def _cells(whole: Boxes, dimension: int) -> list[_Corners]:
     """Return the first boxes, none of them wider than `FIRST_WIDTHS`."""
     largest = np.repeat(FIRST_WIDTHS, dimension)
     counts = np.maximum(1, np.ceil((whole.high[0] - whole.low[0]) / largest)).astype(int)
@@ -229,6 +234,23 @@ def _cells(whole: Boxes, dimension: int) -> list[tuple[np.ndarray, np.ndarray]]:
     return list(zip(low, high, strict=True))
 
 
+class _Known(NamedTuple):
+    """What a search knows at one time. It is replaced as a whole, so that Ctrl-C loses no box."""
+
+    waiting: list[_Corners]
+    """Boxes to bound, as their lowest and highest corner."""
+    proved: list[Any]
+    """Corners and claims of proved boxes, by batch."""
+    refuted: list[Any]
+    stuck: list[Any]
+    """Boxes that are too small to halve."""
+    margin: float = math.inf
+    counterexample: Counterexample | None = None
+    seconds: float = 0.0
+    """The time that earlier searches took [s]."""
+    bounded: int = 0
+
+
 class _Search:
     """The boxes of a search, and what is known of them."""
 
@@ -239,125 +261,146 @@ class _Search:
         loop: Loop,
         whole: Boxes,
         steps: int,
-        waiting: deque[tuple[np.ndarray, np.ndarray]],
-        known: Verification | None,
+        resolution: int,
     ) -> None:
         self.env = env
         self.loop = loop
         self.whole = whole
         self.steps = steps
-        self.waiting = waiting
+        self.resolution = resolution
         self.scales = np.repeat(SCALES, loop.dimension)
-        self.proved: list[Any] = []
-        self.refuted: list[Any] = []
-        self.stuck: list[Any] = []
-        self.margin = math.inf
-        self.counterexample: Counterexample | None = None
-        self.bounded = 0
-        self.earlier_seconds = 0.0
-        self.earlier_bounded = 0
-        if known is not None:
-            self.proved = [(*known.proved, known.claims)] if len(known.proved.low) else []
-            self.refuted = [known.refuted]
-            self.margin = known.margin
-            self.counterexample = known.counterexample
-            self.earlier_seconds = known.seconds
-            self.earlier_bounded = known.bounded
+        self.most = BATCH * usable_cores()
         self.pool = ThreadPoolExecutor(usable_cores())
         self.key = jax.random.key(0)
         self.fly = jax.jit(jax.vmap(lambda x: _margins(env, policy, steps, x)))
+        self.known = _Known(_cells(whole, loop.dimension), [], [], [])
+
+    def go_on(self, earlier: Verification) -> None:
+        """Begin with what an earlier search knows."""
+        self.known = _Known(
+            waiting=[*zip(*earlier.open, strict=True)],
+            proved=[(*earlier.proved, earlier.claims)] if len(earlier.proved.low) else [],
+            refuted=[earlier.refuted],
+            stuck=[],
+            margin=earlier.margin,
+            counterexample=earlier.counterexample,
+            seconds=earlier.seconds,
+            bounded=earlier.bounded,
+        )
 
     def advance(self) -> None:
         """Bound one batch of boxes on each core."""
-        count = min(BATCH * usable_cores(), len(self.waiting))
-        batch = [self.waiting.popleft() for _ in range(count)]
-        low, high = (np.stack(ends) for ends in zip(*batch, strict=True))
-        try:
-            parts = [slice(i, i + BATCH) for i in range(0, count, BATCH)]
-            bounds = list(self.pool.map(lambda part: self.bound(low[part], high[part]), parts))
-            margin, claims = jax.tree.map(lambda *x: np.concatenate(x), *bounds)
-            done = margin.min(axis=1) >= 0.0  # false where a bound is not a number
-            least = self.flown(low[~done], high[~done]) if not done.all() else np.zeros(0)
-        except BaseException:
-            self.waiting.extendleft(reversed(batch))
-            raise
-        self.bounded += len(batch)
-        if done.any():
-            self.margin = min(self.margin, float(margin[done].min()))
-            self.proved.append((low[done], high[done], jax.tree.map(lambda x: x[done], claims)))
-        for index, violated in zip(np.flatnonzero(~done), least < 0.0, strict=True):
-            widths = (high[index] - low[index]) / self.scales
-            if widths.max() < SMALLEST:
-                (self.refuted if violated else self.stuck).append(
-                    (low[index][None], high[index][None])
-                )
-            else:
-                self.halve(low[index], high[index], int(widths.argmax()))
+        known = self.known
+        count = min(self.most, len(known.waiting))
+        low, high = (np.stack(ends) for ends in zip(*known.waiting[:count], strict=True))
+        parts = [slice(i, i + BATCH) for i in range(0, count, BATCH)]
+        bounds = list(self.pool.map(lambda part: self.bound(low[part], high[part]), parts))
+        margin, claims = jax.tree.map(lambda *x: np.concatenate(x), *bounds)
+        done = margin.min(axis=1) >= 0.0  # false where a bound is not a number
+        share = np.zeros(count)
+        violation = None
+        if not done.all():
+            share[~done], violation = self.flown(low[~done], high[~done], known.bounded)
+        widths = (high - low) / np.repeat(FIRST_WIDTHS, self.loop.dimension)
+        small = widths.max(axis=1) * self.resolution <= 1.0
+        # Where all flights violate the property, smaller boxes would say nothing more.
+        refuted = ~done & ((share == 1.0) | (small & (share > 0.0)))
+        stuck = ~done & small & ~refuted
+        wide = np.flatnonzero(~done & ~refuted & ~stuck)
+        proved = [(low[done], high[done], jax.tree.map(lambda x: x[done], claims))]
+        halves = [half for i in wide for half in self.halves(low[i], high[i])]
+        self.known = known._replace(
+            waiting=known.waiting[count:] + halves,
+            proved=known.proved + (proved if done.any() else []),
+            refuted=[*known.refuted, (low[refuted], high[refuted])],
+            stuck=[*known.stuck, (low[stuck], high[stuck])],
+            margin=min(known.margin, float(margin[done].min(initial=math.inf))),
+            counterexample=known.counterexample or violation,
+            bounded=known.bounded + count,
+        )
 
     def bound(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, Claims]:
         """Return a lower bound of h in each step from each box, and the claims."""
         count = len(low)
-        # Batches have one size, so that nothing is compiled again.
-        full = [np.concatenate([x, np.repeat(x[:1], BATCH - count, axis=0)]) for x in (low, high)]
+        full = [_filled(x, BATCH) for x in (low, high)]
         with jax.enable_x64(True):
             tubes = tube(self.loop, self.steps, *map(jnp.asarray, full))
             margin, claims = jax.device_get((tubes.margin, tubes.claims))
         return margin[:count], jax.tree.map(lambda x: x[:count], claims)
 
-    def halve(self, low: np.ndarray, high: np.ndarray, axis: int) -> None:
-        """Put both halves of a box into the queue."""
+    def halves(self, low: np.ndarray, high: np.ndarray) -> list[_Corners]:
+        """Return both halves of a box. It is cut where it is widest."""
+        axis = int(((high - low) / self.scales).argmax())
         middle = 0.5 * (low[axis] + high[axis])
-        for side in (low, high):
-            ends = low.copy(), high.copy()
-            ends[0 if side is high else 1][axis] = middle
-            self.waiting.append(ends)
+        top, bottom = high.copy(), low.copy()
+        top[axis] = bottom[axis] = middle
+        return [(low, top), (bottom, high)]
 
-    def flown(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the least margin of some flights from each box, and keep the first violation.
+    def flown(
+        self, low: np.ndarray, high: np.ndarray, number: int
+    ) -> tuple[np.ndarray, Counterexample | None]:
+        """Fly from some starts in each box: from the middle, and from random ones.
 
-        One flight begins in the middle of the box, the others at random starts.
+        Args:
+            low: the lowest corners of the boxes.
+            high: the highest corners of the boxes.
+            number: the number of the random draw.
+
+        Returns:
+            The share of the flights from each box that violate the property, and the worst one.
         """
-        self.key, own_key = jax.random.split(self.key)
-        share = jax.random.uniform(own_key, (len(low), SAMPLES, low.shape[-1])).at[:, 0].set(0.5)
-        lowest, highest = (jnp.asarray(x, jnp.float32)[:, None] for x in (low, high))
-        starts = np.asarray(jnp.clip(lowest + share * (highest - lowest), lowest, highest))
-        margins = np.asarray(self.fly(starts.reshape(-1, starts.shape[-1])))
+        count = len(low)
+        full = [_filled(x, self.most)[:, None] for x in (low, high)]
+        key = jax.random.fold_in(self.key, number)
+        share = jax.random.uniform(key, (self.most, SAMPLES, low.shape[-1])).at[:, 0].set(0.5)
+        lowest, highest = (jnp.asarray(x, jnp.float32) for x in full)
+        starts = jnp.clip(lowest + share * (highest - lowest), lowest, highest)
+        starts = starts.reshape(-1, starts.shape[-1])
+        margins = np.asarray(self.fly(starts))[: count * SAMPLES]
+        share_violating = (margins.min(axis=1) < 0.0).reshape(count, SAMPLES).mean(axis=1)
+        if not share_violating.any():
+            return share_violating, None
         worst = int(np.argmin(margins.min(axis=1)))
-        if margins[worst].min() < 0.0 and self.counterexample is None:
-            when = int(np.argmax(margins[worst] < 0.0))
-            start = starts.reshape(-1, starts.shape[-1])[worst]
-            self.counterexample = Counterexample(
-                start=jax.tree.map(lambda x: x.tolist(), start_of(self.env, start)),
-                step=when,
-                margin=float(margins[worst, when]),
-            )
-        return margins.reshape(len(low), -1).min(axis=1)
+        when = int(np.argmax(margins[worst] < 0.0))
+        start = start_of(self.env, starts[worst])
+        violation = Counterexample(
+            start=jax.tree.map(lambda x: x.tolist(), start),
+            step=when,
+            margin=float(margins[worst, when]),
+        )
+        return share_violating, violation
 
-    def known(self, seconds: float) -> Verification:
+    def verification(self, seconds: float) -> Verification:
         """Return what is known now."""
+        known = self.known
         size = self.whole.low.shape[-1]
-        waiting = [(low[None], high[None]) for low, high in self.waiting]
-        left = _pile(size, [*self.stuck, *waiting])
-        claims = [item[2] for item in self.proved]
+        waiting = [(low[None], high[None]) for low, high in known.waiting]
+        left = _pile(size, [*known.stuck, *waiting])
+        claims = [item[2] for item in known.proved]
         total = size + self.loop.actions
         actions = self.loop.actions
         shapes = ((actions, total), (actions,), (actions,))
         empty = Claims(*(np.zeros((0, self.steps + 1, *shape)) for shape in shapes))
-        result = "refuted" if self.counterexample else "open" if len(left.low) else "proved"
+        result = "refuted" if known.counterexample else "open" if len(left.low) else "proved"
         return Verification(
             result=result,
-            proved=_pile(size, self.proved),
-            refuted=_pile(size, self.refuted),
+            proved=_pile(size, known.proved),
+            refuted=_pile(size, known.refuted),
             open=left,
             claims=jax.tree.map(lambda *x: np.concatenate(x), empty, *claims),
-            margin=self.margin,
-            counterexample=self.counterexample,
+            margin=known.margin,
+            counterexample=known.counterexample,
             box=self.whole,
             loop=self.loop,
             steps=self.steps,
-            seconds=self.earlier_seconds + seconds,
-            bounded=self.earlier_bounded + self.bounded,
+            seconds=known.seconds + seconds,
+            bounded=known.bounded,
         )
+
+
+def _filled(corners: np.ndarray, count: int) -> np.ndarray:
+    """Repeat the first box to a fixed number of boxes, so that nothing is compiled again."""
+    return np.concatenate([corners, np.repeat(corners[:1], count - len(corners), axis=0)])
 
 
 def _pile(size: int, items: Sequence[Any]) -> Boxes:

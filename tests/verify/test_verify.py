@@ -1,6 +1,7 @@
 """Proofs about closed loops: every bound holds, and a certificate that says too much is refused."""
 
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -24,7 +25,7 @@ from jaxsafe.verify.forms import Domain, bound
 from jaxsafe.verify.loop import closed_loop, start_of
 from jaxsafe.verify.program import ELEMENTARY, FUNCTIONS, RULED, trace
 from jaxsafe.verify.tube import between, tube
-from jaxsafe.verify.verify import Verification, verify
+from jaxsafe.verify.verify import Boxes, Verification, _Search, verify
 
 PUBLISHED = Path(os.environ.get("JAXSAFE_PUBLISHED_NETWORK", "docking2d_published.onnx"))
 """The network of the community's docking benchmark, which does not come with this package."""
@@ -311,6 +312,97 @@ def test_a_search_that_stops_goes_on_and_loses_nothing(proof: Verification, tmp_
     assert whole.seconds >= part.seconds
     with pytest.raises(ConfigError, match=r"^resume: the box is not that of the certificate"):
         verify(env, braking, SMALL_BOX, steps=6, resume=part)
+
+
+def sorted_boxes(boxes: Boxes) -> np.ndarray:
+    """Return the corners of boxes in an order that does not depend on the search."""
+    corners = np.concatenate(boxes, axis=1)
+    return corners[np.lexsort(corners.T)]
+
+
+def interrupt_at(number: int) -> Callable[..., Any]:
+    """Return a tracing function that raises Ctrl-C before the given line of a batch."""
+    count = 0
+
+    def trace_line(frame: Any, event: str, argument: Any) -> Any:
+        nonlocal count
+        count += event == "line"
+        if count == number and event == "line":
+            raise KeyboardInterrupt
+        return trace_line
+
+    def trace_call(frame: Any, event: str, argument: Any) -> Any:
+        return trace_line if frame.f_code is _Search.advance.__code__ else None
+
+    return trace_call
+
+
+def test_ctrl_c_at_any_line_of_a_batch_loses_no_box(proof: Verification) -> None:
+    env = jaxsafe.make("docking2d")
+    wide = Boxes(np.array([[70.0, 70, -0.4, -0.4]]), np.array([[106.0, 106, 0.4, 0.4]]))
+    search = _Search(env, braking, proof.loop, wide, 6, resolution=2)
+    search.advance()
+    begun = search.known
+    assert begun.proved
+    assert begun.waiting
+    before = sys.gettrace()
+    ended = False
+    number = 0
+    while not ended:
+        number += 1
+        search.known = begun
+        sys.settrace(interrupt_at(number))
+        try:
+            search.advance()
+            ended = True
+        except KeyboardInterrupt:
+            ended = False
+        finally:
+            sys.settrace(before)
+        assert sum(search.verification(0.0).shares().values()) == pytest.approx(1.0, abs=1e-12)
+        assert (search.known is begun) == (not ended)
+    assert number > 20
+
+
+@pytest.mark.slow
+def test_an_interrupted_proof_ends_as_one_that_was_not_interrupted(tmp_path: Path) -> None:
+    words = [sys.executable, "-u", "-m", "jaxsafe.verify", "run=pretrained/docking2d", "steps=20"]
+    words += ["box.position=[70,106]", "box.velocity=[-0.2,0.2]"]
+    whole, part, rest = (tmp_path / f"{name}.npz" for name in ("whole", "part", "rest"))
+    assert subprocess.run([*words, f"out={whole}"], check=False).returncode == EXIT_CODES["proved"]
+    process = subprocess.Popen([*words, f"out={part}"], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    first = process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    said = first + process.communicate(timeout=120)[0]
+    assert process.returncode == EXIT_CODES["open"], said
+    assert "\nopen: " in said
+    assert f"resume={part}" in said
+    interrupted, expected = load_certificate(part), load_certificate(whole)
+    assert 0 < interrupted.bounded < expected.bounded
+    assert sum(interrupted.shares().values()) == pytest.approx(1.0, abs=1e-12)
+    done = subprocess.run([*words, f"resume={part}", f"out={rest}"], check=False)
+    assert done.returncode == EXIT_CODES["proved"]
+    resumed = load_certificate(rest)
+    np.testing.assert_array_equal(sorted_boxes(resumed.proved), sorted_boxes(expected.proved))
+    assert resumed.shares() == pytest.approx(expected.shares(), abs=1e-12)
+    assert resumed.margin == pytest.approx(expected.margin, rel=1e-6)
+    assert resumed.bounded == expected.bounded
+    assert run_check(rest, whole).returncode == 0
+
+
+@pytest.mark.thorough
+def test_a_map_tells_refuted_boxes_from_proved_ones() -> None:
+    env = jaxsafe.make("docking2d")
+    box = {"position": [[80, 98], [80, 98]], "velocity": [[-0.1, 0.4], [0.0, 0.1]]}
+    known = verify(env, speeding, box, steps=2, everything=True, resolution=4)
+    assert known.result == "refuted"
+    shares = known.shares()
+    assert sum(shares.values()) == pytest.approx(1.0)
+    assert shares["refuted"] > 0.1
+    assert shares["proved"] > 0.1
+    widths = (known.open.high - known.open.low) * 4 / [18.0, 18.0, 0.1, 0.1]
+    assert (widths <= 1.0).all()
 
 
 def test_the_bound_between_two_samples_is_about_the_limit_of_the_constraint() -> None:
