@@ -1,5 +1,7 @@
 """The parts and the plan of the studies in `examples/studies`."""
 
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,7 @@ import numpy as np
 import pytest
 
 import jaxsafe
+from jaxsafe.storage.files import read_json
 
 STUDIES = Path(__file__).parents[2] / "examples" / "studies"
 PUBLISHED = STUDIES / "published_docking"
@@ -91,3 +94,42 @@ def test_the_reward_of_a_step_is_that_of_the_study(modules: None) -> None:
     too_slow = -0.0075 * abs(speed - (0.5 * 0.001027 * distance - 0.2))
     expected = progress + too_slow - 0.0025
     assert float(timestep.reward) == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_a_policy_that_breaks_the_limit_is_retrained_until_it_is_proved(tmp_path: Path) -> None:
+    script = STUDIES / "prove_and_retrain.py"
+    box = ["position=70,106", "velocity=-0.28,0.28"]
+    words = [sys.executable, script, *box, "first_steps=200000", "seed=0", f"out={tmp_path}"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    first, *_, last = read_json(tmp_path / "results.json")["rows"]
+    assert first["result"] == "refuted"
+    assert first["refuted"] > 0.01
+    assert last["result"] == "proved"
+    assert last["proved"] == pytest.approx(1.0)
+
+
+@pytest.mark.thorough
+def test_the_benchmark_for_verifiers_has_the_form_of_the_competition(
+    modules: None, tmp_path: Path
+) -> None:
+    import verifier_benchmark  # pyright: ignore[reportMissingImports]
+
+    assert verifier_benchmark.main(["tasks=docking2d", "horizons=1,2", f"out={tmp_path}"]) == 0
+    lines = (tmp_path / "instances.csv").read_text().splitlines()
+    assert lines == [f"onnx/docking2d_{n}.onnx,vnnlib/docking2d_{n}.vnnlib,1000" for n in (1, 2)]
+    expected = {word for line in lines for word in line.split(",")[:2]}
+    written = {str(path.relative_to(tmp_path)) for path in tmp_path.glob("*/*")}
+    assert written == expected
+    words = (tmp_path / "README.md").read_text(encoding="utf-8")
+    assert "| docking2d, N = 2 | position in [70, 106] m, velocity in [-0.28, 0.28] m/s |" in words
+
+
+def test_starts_of_the_benchmark_keep_the_speed_limit(modules: None) -> None:
+    import verifier_benchmark  # pyright: ignore[reportMissingImports]
+
+    for task, box in verifier_benchmark.BOXES.items():
+        axes = jaxsafe.make(task).agent_platform.dimension
+        nearest, fastest = box["position"][0] * axes**0.5, box["velocity"][1] * axes**0.5
+        assert fastest < 0.2 + 2 * 0.001027 * nearest

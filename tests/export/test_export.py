@@ -34,12 +34,14 @@ def unclipped(policy: SavedPolicy, observations: np.ndarray) -> jax.Array:
     return jax.jit(act)(jax.random.key(0), observations)
 
 
-def run(model: Any, inputs: np.ndarray) -> np.ndarray:
+def session(model: Any) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
-    return onnxruntime.InferenceSession(model.SerializeToString(), options).run(
-        None, {"input": inputs}
-    )[0]
+    return onnxruntime.InferenceSession(model.SerializeToString(), options)
+
+
+def run(model: Any, inputs: np.ndarray) -> np.ndarray:
+    return session(model).run(None, {"input": inputs})[0]
 
 
 @pytest.mark.parametrize(
@@ -217,6 +219,81 @@ def test_a_property_names_its_box_and_what_must_not_happen(tmp_path: Path) -> No
     ]
     assert text.count("(and (<= Y_") == 2
     assert text.count("(") == text.count(")")
+
+
+def read_property(text: str) -> list[Any]:
+    """Return what a VNN-LIB file asserts, as nested lists of words."""
+    words = re.sub(r";.*", "", text).replace("(", " ( ").replace(")", " ) ").split()
+    stack: list[list[Any]] = [[]]
+    for word in words:
+        if word == "(":
+            stack.append([])
+        elif word == ")":
+            done = stack.pop()
+            stack[-1].append(done)
+        else:
+            stack[-1].append(word)
+    assert len(stack) == 1
+    return [term[1] for term in stack[0] if term[0] == "assert"]
+
+
+def value(term: Any, known: dict[str, np.ndarray]) -> Any:
+    """Return the value of a term of VNN-LIB at many points."""
+    if isinstance(term, str):
+        return known[term] if term in known else float(term)
+    name, *arguments = term
+    of = [value(argument, known) for argument in arguments]
+    compare = {"<=": np.less_equal, ">=": np.greater_equal}
+    if name in compare:
+        return compare[name](*of)
+    return {"and": np.logical_and, "or": np.logical_or}[name].reduce(of)
+
+
+@pytest.mark.parametrize(
+    "task", one_of_each_kind(["docking2d", "docking3d", "docking2d_oriented"], ["docking2d"])
+)
+def test_the_property_read_back_is_that_the_environment_violates_its_limit(
+    task: str, tmp_path: Path
+) -> None:
+    policy = saved(task)
+    words = ["format=vnnlib", "steps=2", "box.position=[70,75]", "box.velocity=[-0.4,0.4]"]
+    words += ["box.attitude=[-3,3]"] * (task == "docking2d_oriented")
+    path = tmp_path / "x.vnnlib"
+    assert main([f"run=pretrained/{task}", *words, f"out={path}"]) == 0
+    names = functions.state_names(policy.env)
+    fields = [name.split(".")[1] for name in names]
+    ends = {"position": (70, 75), "velocity": (-0.4, 0.4), "attitude": (-3, 3)}
+    low, high = np.array([ends[field] for field in fields], np.float32).T
+    share = np.random.default_rng(0).uniform(-0.02, 1.02, (400, len(names)))
+    starts = (low + share * (high - low)).astype(np.float32)
+    graph = session(onnx.load(path.with_suffix(".onnx")))
+    margins = np.concatenate([graph.run(None, {"input": start[None]})[0] for start in starts])
+
+    def fly(start: jax.Array) -> jax.Array:
+        parts = {"position": start[: fields.count("position")]}
+        parts["velocity"] = start[len(parts["position"]) :][: len(parts["position"])]
+        if "attitude" in fields:
+            parts["attitude"] = start[-1]
+        state, timestep = jaxsafe.reset_to(policy.env, {"deputy": parts})
+        flown = [timestep.info.margins["velocity_limit"]]
+        for _ in range(2):
+            action = policy.agent.policy(policy.env, policy.params, True)(
+                jax.random.key(0), timestep.observation[None]
+            )[0]
+            state, timestep = jaxsafe.step(policy.env, state, action)
+            flown.append(timestep.info.margins["velocity_limit"])
+        return jnp.stack(flown)
+
+    flown = np.asarray(jax.jit(jax.vmap(fly))(starts))
+    np.testing.assert_allclose(margins, flown, atol=1e-5)
+    known = {f"X_{i}": x for i, x in enumerate(starts.T.astype(float))}
+    known |= {f"Y_{i}": y for i, y in enumerate(margins.T)}
+    asked = np.logical_and.reduce([value(term, known) for term in read_property(path.read_text())])
+    inside = np.all((starts >= low) & (starts <= high), axis=1)
+    clear = np.abs(flown).min(axis=1) > 1e-5  # rounding decides nothing
+    expected = inside & (flown <= 0.0).any(axis=1)
+    np.testing.assert_array_equal(asked[clear], expected[clear])
+    assert 0 < asked.sum() < inside.sum() < len(starts)
 
 
 def test_a_search_finds_the_least_margin() -> None:
