@@ -8,6 +8,7 @@ write.
 
 from __future__ import annotations
 
+import math
 import re
 import statistics
 import sys
@@ -963,9 +964,16 @@ def _program(row: Results) -> list[str]:
 
 def verification(results: Results) -> str:
     """Return the table of what was proved from a box of starts, and how long it took."""
+
+    def policy(row: Results) -> str:
+        name = f"`{row['policy']}`" if row["policy"].startswith("pretrained/") else row["policy"]
+        return name if row["mass"] == 12.0 else f"{name}, {row['mass']:g} kg"
+
     rows = (
         [
-            f"`{row['policy']}`" if row["policy"].startswith("pretrained/") else row["policy"],
+            policy(row),
+            "{:g} to {:g}".format(*row["box"]["position"]),
+            f"±{row['box']['velocity'][1]:g}",
             str(row["steps"]),
             row["arithmetic"],
             row["result"],
@@ -974,9 +982,28 @@ def verification(results: Results) -> str:
             f"{row['seconds']:.1f}",
             "" if row["check_seconds"] is None else f"{row['check_seconds']:.0f}",
         ]
-        for row in results["rows"]
+        for row in results["rows"].values()
     )
-    heads = "policy | steps | arithmetic | result | proved | boxes bounded | seconds | check [s]"
+    heads = (
+        "policy | positions [m] | velocities [m/s] | steps | arithmetic | result | proved | boxes bounded | "
+        "seconds | check [s]"
+    )
+    return markdown(heads.split(" | "), rows)
+
+
+def verification_tubes(results: Results) -> str:
+    """Return the table of boxes that were bounded over many steps in one piece."""
+    rows = (
+        [
+            f"{math.hypot(*row['centre'][:2]):.0f} m",
+            f"{row['widths'][0]:g} m, {row['widths'][1]:g} m/s",
+            f"{row['safe_steps']} of {row['steps']} s",
+            "–" if row["docked_after"] is None else f"after {row['docked_after']} s",
+        ]
+        for rows in results["tubes"].values()
+        for row in rows
+    )
+    heads = "distance | widths of the box | safe for | all docked"
     return markdown(heads.split(" | "), rows)
 
 
@@ -1002,6 +1029,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("memory", memory, "docs/scaling.md"),
     ("robustness", robustness, "docs/safety/attacks.md"),
     ("verification", verification, "docs/verification.md"),
+    ("verification", verification_tubes, "docs/verification.md"),
     ("uncertain_training", uncertain_training, "docs/safety/attacks.md"),
     ("datasets", datasets, "docs/dataset.md"),
     ("controllers", controllers, "docs/controllers.md"),

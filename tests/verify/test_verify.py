@@ -366,8 +366,8 @@ def test_ctrl_c_at_any_line_of_a_batch_loses_no_box(proof: Verification) -> None
 
 @pytest.mark.slow
 def test_an_interrupted_proof_ends_as_one_that_was_not_interrupted(tmp_path: Path) -> None:
-    words = [sys.executable, "-u", "-m", "jaxsafe.verify", "run=pretrained/docking2d", "steps=20"]
-    words += ["box.position=[70,106]", "box.velocity=[-0.2,0.2]"]
+    words = [sys.executable, "-u", "-m", "jaxsafe.verify", "run=pretrained/docking2d"]
+    words += ["box.position=[97,106]", "box.velocity=[-0.28,0.28]"]
     whole, part, rest = (tmp_path / f"{name}.npz" for name in ("whole", "part", "rest"))
     assert subprocess.run([*words, f"out={whole}"], check=False).returncode == EXIT_CODES["proved"]
     process = subprocess.Popen([*words, f"out={part}"], stdout=subprocess.PIPE, text=True)
