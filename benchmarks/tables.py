@@ -985,8 +985,8 @@ def verification(results: Results) -> str:
         for row in results["rows"].values()
     )
     heads = (
-        "policy | positions [m] | velocities [m/s] | steps | arithmetic | result | proved | boxes bounded | "
-        "seconds | check [s]"
+        "policy | positions [m] | velocities [m/s] | steps | arithmetic | result | proved | "
+        "boxes bounded | seconds | check [s]"
     )
     return markdown(heads.split(" | "), rows)
 
