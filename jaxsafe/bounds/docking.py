@@ -1,0 +1,371 @@
+"""Bounds of docking: a flight at the speed limit, and the primer vector of the least Δv."""
+
+from __future__ import annotations
+
+import itertools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import scipy.linalg
+from jaxtyping import Array, Float
+
+from jaxsafe.environment import Environment
+from jaxsafe.processors.reward import (
+    DeltaVCost,
+    DistanceChange,
+    Failure,
+    Success,
+    VelocityConstraint,
+)
+from jaxsafe.processors.status import Distance, InRegion, Speed, VelocityLimit
+from jaxsafe.processors.terminal import Crashed, Docked, Timeout, TooFar, time_limit
+from jaxsafe.simulation.cwh import Anchor, Spacecraft
+from jaxsafe.simulation.double_integrator import DoubleIntegrator
+from jaxsafe.simulation.oriented import OrientedSpacecraft
+from jaxsafe.transition import bounds as control_bounds
+from jaxsafe.types import State
+
+PLANTS = (Spacecraft, DoubleIntegrator, OrientedSpacecraft)
+REWARDS = (DistanceChange, VelocityConstraint, DeltaVCost, Success, Failure)
+ENDS = (Docked, Crashed, TooFar, Timeout)
+
+BLOCKS = 24
+"""Number of lengths of an episode for which a primer vector is sought.
+
+Lengths in between try those of the next shorter and the next longer one, as given by their values
+at start and end.
+"""
+
+SAMPLES = 60
+"""Number of instants at which the search looks at a primer vector."""
+
+ROUNDS = 300
+"""Number of steps of gradient ascent on a bound. More rounds make it tighter, never wrong."""
+
+
+def docking_bounds(env: Environment, starts: State) -> dict[str, np.ndarray] | None:
+    """Return the bounds that `best_possible` describes, or None if the task is another one."""
+    task = _Task.of(env)
+    if task is None:
+        return None
+    state = starts.sim.platforms[env.agent]
+    position = np.asarray(state.position, np.float64)
+    velocity = np.asarray(state.velocity, np.float64)
+    length = _least_length(task, np.linalg.norm(position, axis=-1))
+    delta_v, cost = _least_delta_v(task, np.concatenate([position, velocity], axis=-1), length)
+    bounds = {"length": length, "delta_v": delta_v}
+    if task.pays_to_break_the_limit:
+        return bounds
+    share = 0.5 ** (np.linalg.norm(position, axis=-1) / task.half_distance)
+    best = np.maximum(task.success - cost, 0.0)  # a failure pays nothing, or less
+    return {**bounds, "return": task.potential * (1.0 - share) + best}
+
+
+class _Task(NamedTuple):
+    """The numbers of a docking task on which the bounds rest."""
+
+    dimension: int
+    dt: float
+    mean_motion: float
+    push: float
+    """Largest acceleration by thrust [m/s²]."""
+    spin: float
+    """Largest rate at which the thrust turns within a step [rad/s]."""
+    radius: float
+    floor: float
+    slope: float
+    constant_to: float
+    last_step: int
+    """Largest number of steps of a success."""
+    potential: float
+    half_distance: float
+    success: float
+    time_scale: float
+    delta_v_cost: float
+    offset: float
+    """What a step above the limit costs at least."""
+    excess_cost: float
+    """What such a step costs in addition for each m/s above the limit."""
+
+    @classmethod
+    def of(cls, env: Environment) -> _Task | None:
+        """Return the numbers of an environment, or None if it is no docking task."""
+        plant = env.agent_platform
+        rewards = {type(term): term for term in env.reward}
+        limits = [item for item in env.status if type(item) is VelocityLimit]
+        last = time_limit(env)
+        known = (
+            type(plant) in PLANTS
+            and [type(item) for item in env.platforms if item is not plant] == [Anchor]
+            and set(rewards) == set(REWARDS)
+            and len(env.reward) == len(REWARDS)
+            and {type(condition) for condition in env.terminal} == set(ENDS)
+            and len(env.terminal) == len(ENDS)
+            and len(env.regions) == 1
+            and len(limits) == 1
+            and last is not None
+            and env.successes == ("success",)
+        )
+        if not known:
+            return None
+        numbers: Any = rewards
+        statuses = {status.name: type(status) for status in env.status}
+        docked: Any = next(item for item in env.terminal if type(item) is Docked)
+        measured = [numbers[DistanceChange].distance, docked.in_docking, docked.speed]
+        if [statuses[name] for name in measured] != [Distance, InRegion, Speed]:
+            return None
+        dt = float(env.dt)
+        low, high = control_bounds(env)
+        largest = np.maximum(-np.asarray(low, float), np.asarray(high, float))
+        names = env.action_names
+        thrusts = [largest[i] for i, name in enumerate(names) if name.startswith("thrust")]
+        spin = 0.0
+        if isinstance(plant, OrientedSpacecraft):
+            spin = float(np.max(np.abs(np.asarray(plant.attitude_rate_limits))))
+        failures = numbers[Failure].values
+        gains = (
+            numbers[DistanceChange].scale,
+            *(-value for value in failures.values()),
+            -numbers[DeltaVCost].scale,
+            -numbers[VelocityConstraint].scale,
+            -numbers[VelocityConstraint].offset,
+        )
+        if min(map(float, gains)) < 0.0:  # such rewards could pay for failures or for thrust
+            return None
+        return cls(
+            dimension=plant.dimension,
+            dt=dt,
+            mean_motion=float(getattr(plant, "mean_motion", 0.0)),
+            push=float(np.linalg.norm(thrusts)) / float(plant.mass),  # type: ignore[attr-defined]
+            spin=spin,
+            radius=float(env.regions[0].radius),  # type: ignore[attr-defined]
+            floor=float(limits[0].floor),
+            slope=float(limits[0].slope),
+            constant_to=float(limits[0].constant_to),
+            last_step=int(np.floor(float(last) / dt + 1e-6)) + 1,  # type: ignore[arg-type]
+            potential=float(numbers[DistanceChange].scale),
+            half_distance=float(numbers[DistanceChange].half_distance),
+            success=float(numbers[Success].value),
+            time_scale=float(numbers[Success].time_scale),
+            delta_v_cost=-float(numbers[DeltaVCost].scale),
+            offset=-float(numbers[VelocityConstraint].offset),
+            excess_cost=-float(numbers[VelocityConstraint].scale),
+        )
+
+    def limit(self, distance: Any) -> Any:
+        """Return the speed limit [m/s] at a distance."""
+        return self.floor + self.slope * np.maximum(distance - self.constant_to, 0.0)
+
+    @property
+    def pays_to_break_the_limit(self) -> bool:
+        """Whether a step above the limit may save more time than its penalty is worth.
+
+        A step that is e m/s too fast moves at most 2 e dt farther, once before its sample and once
+        after it. At the limit this way takes 2 e dt/ν₀, and the whole number of steps one more.
+        """
+        worth = 2.0 * self.dt / max(self.floor, 1e-9) / self.time_scale
+        return worth > self.excess_cost or self.dt / self.time_scale > self.offset
+
+
+def _least_length(task: _Task, distance: np.ndarray) -> np.ndarray:
+    """Return the least number of steps of a success that never exceeds the limit, per start.
+
+    In a step the distance falls by at most dt times the highest speed on the way. That is the limit
+    at the beginning of the step, and what the speed may bulge in between: dt²/8 times the largest
+    second derivative of the velocity. By induction nothing is nearer than the distance that falls
+    so in every step.
+    """
+    n = task.mean_motion
+    steps = np.zeros(distance.shape, int)
+    nearest = distance.astype(float)
+    for _ in range(task.last_step):
+        outside = nearest > task.radius
+        if not outside.any():
+            break
+        limit = task.limit(nearest)
+        bend = task.push * (2.0 * n + task.spin) + 8.0 * n**2 * limit + 6.0 * n**3 * nearest
+        nearest = nearest - task.dt * (limit + task.dt**2 / 8.0 * bend)
+        steps += outside
+    return steps
+
+
+def _least_delta_v(
+    task: _Task, states: np.ndarray, length: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least Δv of a success [m/s], and the least cost of time and Δv, per start.
+
+    Let q(t) be a primer vector: a solution of the adjoint of the linear motion, with the costate λ
+    at the start and p at the end. For every thrust acceleration a(t)
+
+        p·x(T) = λ·x(0) + ∫ q·a dt ≤ λ·x(0) + max‖q‖ ∫ ‖a‖ dt.
+
+    A success ends with ‖r‖ ≤ R and ‖v‖ ≤ V, so p·x(T) ≥ −R‖p_r‖ − V‖p_v‖. Hence
+
+        ∫ ‖a‖ dt ≥ (−λ·x(0) − R‖p_r‖ − V‖p_v‖) / max‖q‖
+
+    for every λ: the weak duality of Neustadt (1964) and the primer vector of Lawden (1963).
+    Gradient ascent looks for a good λ, for each start and some lengths T. What it finds is then
+    evaluated for every length in float64. Thrust may be as large as it likes here, in any
+    direction, and the speed limit counts at the end alone. So the bound holds for every success.
+
+    Args:
+        task: the task.
+        states: position and velocity at the start, (starts, 2d).
+        length: the least number of steps within the limit, per start.
+    """
+    size = task.dimension
+    speed = float(task.limit(task.radius))
+    step = scipy.linalg.expm(-task.dt * _motion(task))
+    back = [np.eye(2 * size)]
+    for _ in range(task.last_step):
+        back.append(step @ back[-1])
+    flows = np.stack(back)  # Φ(−k dt)
+    primers = np.swapaxes(flows[:, :, size:], 1, 2)  # q(k dt) = primers[k] λ
+    first = np.broadcast_to(primers[0], primers.shape)
+    costates = np.linalg.pinv(np.concatenate([first, primers], axis=1))  # λ of q(0) and q(k dt)
+    apart = _sampling(task)
+    edges = np.unique(np.round(np.geomspace(1, task.last_step + 1, BLOCKS + 1)).astype(int))
+    least = np.full(len(states), np.inf)
+    least_cost = np.full(len(states), np.inf)
+    before = None
+    for begin, after in itertools.pairwise(edges):
+        found = _ascend(states, flows, costates[after - 1], after - 1, (task.radius, speed))
+        tried = np.stack([found if before is None else before, found])
+        before = found
+        for count in range(begin, after):
+            costate = tried @ costates[count].T
+            arrival = costate @ flows[count]
+            target = task.radius * np.linalg.norm(arrival[..., :size], axis=-1)
+            target = target + speed * np.linalg.norm(arrival[..., size:], axis=-1)
+            samples = primers[np.unique([*range(0, count, apart), count])]
+            q = costate @ samples.reshape(-1, 2 * size).T
+            largest = _largest(task, q.reshape(*costate.shape[:-1], -1, size), apart)
+            value = -np.sum(costate * states, axis=-1) - target
+            delta_v = np.maximum(np.max(value / np.maximum(largest, 1e-300), axis=0), 0.0)
+            least = np.minimum(least, delta_v)
+            cost = count * task.dt / task.time_scale + task.delta_v_cost * delta_v
+            least_cost = np.where(length <= count, np.minimum(least_cost, cost), least_cost)
+    # Whoever breaks the limit may be a step faster for `offset`, and needs the least Δv of all.
+    too_fast = task.offset + (length - 1) * task.dt / task.time_scale + task.delta_v_cost * least
+    return least, np.minimum(least_cost, too_fast)
+
+
+def _sampling(task: _Task) -> int:
+    """Return the number of steps from one sample of a primer vector to the next."""
+    turn = task.mean_motion * task.dt
+    return max(1, min(100, int(0.02 / turn))) if turn else 100
+
+
+def _largest(task: _Task, q: np.ndarray, apart: int) -> np.ndarray:
+    """Return a bound on the largest ‖q(t)‖, given samples of q that are `apart` steps apart.
+
+    Between two samples q leaves the straight line by h²/8 ‖q̈‖ at most. A primer vector moves like
+    the spacecraft, so ‖q̈‖ ≤ 3n²‖q‖ + 2n‖q̇‖, and ‖q̇‖ is at most h/2 ‖q̈‖ above its mean value.
+
+    Args:
+        task: the task.
+        q: the samples, (…, samples, d).
+        apart: the number of steps from one sample to the next.
+    """
+    n = task.mean_motion
+    h = apart * task.dt
+    size = np.sqrt(np.max(np.sum(q**2, axis=-1), axis=-1))
+    rate = np.sqrt(np.max(np.sum(np.diff(q, axis=-2) ** 2, axis=-1), axis=-1))
+    # The last sample may be nearer than h, and then its rate is that of one step at least.
+    last = np.linalg.norm(q[..., -1, :] - q[..., -2, :], axis=-1) / task.dt
+    rate = np.maximum(rate / h, last)
+    bend = (3.0 * n**2 * size + 2.0 * n * rate) / (1.0 - 3.0 * n**2 * h**2 / 8.0 - n * h)
+    return size + h**2 / 8.0 * bend
+
+
+def _motion(task: _Task) -> np.ndarray:
+    """Return A of ẋ = A x for the motion without thrust, Eqs. (12), (16), with x = (r, v)."""
+    size = task.dimension
+    n = task.mean_motion
+    matrix = np.zeros((2 * size, 2 * size))
+    matrix[:size, size:] = np.eye(size)
+    if n:
+        matrix[size, 0] = 3.0 * n**2
+        matrix[size, size + 1] = 2.0 * n
+        matrix[size + 1, size] = -2.0 * n
+        if size == 3:
+            matrix[5, 2] = -(n**2)
+    return matrix
+
+
+def _ascend(
+    states: np.ndarray,
+    flows: np.ndarray,
+    to_costate: np.ndarray,
+    count: int,
+    ends: tuple[float, float],
+) -> np.ndarray:
+    """Return primer vectors at start and end that make the bound of one length large, per start.
+
+    The search begins with the transfer to the origin by a single push.
+
+    Args:
+        states: position and velocity at the start, (starts, 2d).
+        flows: Φ(−k dt) for every k, (steps, 2d, 2d).
+        to_costate: the matrix that makes λ of the primer vectors at start and end.
+        count: the number of steps.
+        ends: the largest distance and the largest speed at the end.
+
+    Returns:
+        q(0) and q(T) of shape (starts, 2d), in float64.
+    """
+    size = states.shape[1] // 2
+    # Φ(T) x(0) + Φ(T) (0, Δ) has the position 0.
+    flow = np.linalg.inv(flows[count])
+    push = -np.linalg.lstsq(flow[:size, size:], flow[:size] @ states.T, rcond=None)[0].T
+    push = push / np.maximum(np.linalg.norm(push, axis=1, keepdims=True), 1e-12)
+    # The number of samples is the same for all lengths, so that the search is compiled once.
+    samples = np.linspace(0, count, SAMPLES).round().astype(int)
+    arrays = (
+        np.concatenate([push, np.zeros_like(push)], axis=1),
+        states,
+        to_costate,
+        np.swapaxes(flows[samples][:, :, size:], 1, 2),
+        flows[count],
+        np.asarray(ends),
+    )
+    return np.asarray(_search(*(jnp.asarray(array, jnp.float32) for array in arrays)), np.float64)
+
+
+@jax.jit
+def _search(
+    start: Float[Array, "s x"],
+    states: Float[Array, "s x"],
+    to_costate: Float[Array, "x x"],
+    primers: Float[Array, "k d x"],
+    flow: Float[Array, "x x"],
+    ends: Float[Array, " 2"],
+) -> Float[Array, "s x"]:
+    """Return the primer vectors at start and end with the largest bound that was met."""
+    size = primers.shape[1]
+
+    def bound(ratios: Array, state: Array) -> Array:
+        costate = to_costate @ ratios
+        arrival = (costate @ flow).reshape(2, size)
+        norms = jnp.sqrt(jnp.sum(arrival**2, axis=-1) + 1e-20)
+        q = jnp.sqrt(jnp.sum((primers @ costate) ** 2, axis=-1) + 1e-20)
+        return (-costate @ state - norms @ ends) / jnp.max(q)
+
+    values = jax.vmap(jax.value_and_grad(bound))
+    optimiser = optax.adam(optax.cosine_decay_schedule(0.03, ROUNDS))
+
+    def improve(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], None]:
+        ratios, memory, best, best_value = carry
+        value, slope = values(ratios, states)
+        better = value > best_value
+        best = jnp.where(better[:, None], ratios, best)
+        change, memory = optimiser.update(-slope, memory)
+        following = optax.apply_updates(ratios, change)
+        return (following, memory, best, jnp.maximum(value, best_value)), None
+
+    begin = (start, optimiser.init(start), start, jnp.full(len(start), -jnp.inf))
+    (_, _, best, _), _ = jax.lax.scan(improve, begin, None, ROUNDS)
+    return best
