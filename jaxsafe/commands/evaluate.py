@@ -6,14 +6,23 @@ The results are written into a new directory, and a table of them is printed.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 from jaxsafe.commands import cli
-from jaxsafe.commands.options import Count, Directory, Seed
+from jaxsafe.commands.options import Count, Directory, Option, Seed
 from jaxsafe.commands.policy_options import PolicyOptions, differences
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores
 from jaxsafe.schema.errors import ConfigError
+
+FORMS = ("gif", "mp4", "png", "jsonl")
+"""The formats in which an episode is shown."""
+
+EPISODES = ("first", "failing", "violating", "worst")
+"""The episodes that can be shown."""
+
+MAPS = ("success", "violations", "return", "length", "delta_v")
+"""The panels of a map. `jaxsafe.plot.start_map` has their labels."""
 
 
 class Options(PolicyOptions):
@@ -22,8 +31,15 @@ class Options(PolicyOptions):
     groups: ClassVar = {
         "The policies.": ("run", "checkpoint", "deterministic", "activation"),
         "The environment in which they act.": ("env", "env.PATH", "actions", "variant", "rta"),
-        "The episodes, and what is kept of them.": ("episodes", "cases", "seed", "out"),
-        "A film of an episode.": ("render", "film", "film_seed"),
+        "The episodes, and what is kept of them.": (
+            "episodes",
+            "cases",
+            "seed",
+            "map",
+            "bounds",
+            "out",
+        ),
+        "Films, figures and logs of single episodes.": ("render", "film", "film_seed"),
     }
 
     episodes: Count = 1000
@@ -42,15 +58,22 @@ class Options(PolicyOptions):
     """
     deterministic: bool | None = None
     """Whether the policies act by their most probable action. By default both are measured."""
-    render: Literal["gif", "mp4"] | None = None
-    """Make a film of an episode. An mp4 needs ffmpeg on the PATH."""
-    film: Literal["first", "failing", "violating", "worst"] = "first"
-    """The episode to film: the first, the first that fails or violates, or the worst by return.
+    map: Annotated[tuple[str, ...], Option(names=MAPS, kind="panel")] = ()
+    """Draw a map of the starts, with a panel for each of these quantities: means over the seeds."""
+    bounds: bool = False
+    """Compare with what is possible: the gap of each episode to the bounds of its start."""
+    render: Annotated[tuple[str, ...], Option(names=FORMS, kind="format")] = ()
+    """Show an episode: as a film, as a figure (png), or as a log of all its steps (jsonl).
 
-    If there is no such episode, the first is filmed.
+    An mp4 needs ffmpeg on the PATH.
+    """
+    film: Annotated[tuple[str, ...], Option(names=EPISODES, kind="episode")] = ("first",)
+    """The episodes to show: the first, the first that fails or violates, or the worst by return.
+
+    If there is no such episode, the first is shown.
     """
     film_seed: Seed | None = None
-    """The training seed whose policy is filmed. By default it is the first one."""
+    """The training seed whose policy is shown. By default it is the first one."""
     out: Directory | None = None
     """Where to write. By default it is a new directory in RUN/evaluations, or in evaluations/."""
 
@@ -79,11 +102,11 @@ def main(argv: Sequence[str]) -> int:
     deterministic = True if foreign and options.deterministic is None else options.deterministic
     kinds = [kind for kind in EVALUATION_KINDS if deterministic in (None, kind == "deterministic")]
     film = None
-    if options.render is None:
-        options.refuse_beside(["film", "film_seed"], "without render=gif or render=mp4")
+    if not options.render:
+        options.refuse_beside(["film", "film_seed"], "without render=gif or another format")
     else:
         film = Film(options.render, options.film, options.film_seed)
-    if options.render == "mp4":
+    if "mp4" in options.render:
         from jaxsafe.plot.animation import require_ffmpeg
 
         require_ffmpeg()
@@ -115,7 +138,15 @@ def main(argv: Sequence[str]) -> int:
         },
     }
     path, results, films = evaluate(
-        subject, env, kinds, request=request, out=options.out, film=film, cases=cases
+        subject,
+        env,
+        kinds,
+        request=request,
+        out=options.out,
+        film=film,
+        cases=cases,
+        panels=options.map,
+        bounds=options.bounds,
     )
     print("\n".join([table(results, path), *films]))
     return cli.DIVERGED if "diverged" in results else 0

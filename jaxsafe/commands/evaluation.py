@@ -9,44 +9,54 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxsafe.bounds import best_possible
 from jaxsafe.commands.policies import Subject
 from jaxsafe.environment import Environment, filter_name, require_success
 from jaxsafe.envs.identity import identity
-from jaxsafe.evaluate.cases import Cases
-from jaxsafe.evaluate.evaluator import Evaluator, episode_rows, given_up
+from jaxsafe.evaluate.cases import Cases, columns_of
+from jaxsafe.evaluate.evaluator import (
+    Evaluator,
+    episode_rows,
+    gaps_per_seed,
+    given_up,
+    step_rows,
+)
 from jaxsafe.metrics import Episode
-from jaxsafe.storage.files import append_rows, write_json
+from jaxsafe.storage.files import append_rows, write_csv, write_json
 from jaxsafe.storage.provenance import versions
 from jaxsafe.train.host import run_directory
-from jaxsafe.train.host.results import diverged_seeds, evaluation
+from jaxsafe.train.host.results import diverged_seeds, evaluation, over_sound_seeds
+from jaxsafe.types import State, TimeStep
 
 
 class Film(NamedTuple):
-    """Which episode to film, and in which format."""
+    """Which episodes to show, and in which formats."""
 
-    form: str
-    """The format, `gif` or `mp4`."""
+    forms: Sequence[str]
+    """The formats: `gif` and `mp4` are films, `png` is a figure, and `jsonl` a log of the steps."""
 
-    which: str = "first"
+    which: Sequence[str] = ("first",)
     """The first episode, the first that is `failing` or `violating`, or the `worst` by return."""
 
     seed: int | None = None
     """The training seed of the policy. None stands for the first one."""
 
-    def choose(self, sums: Episode, env: Environment) -> int | None:
-        """Return the number of the episode, or None if there is no such episode.
+    @staticmethod
+    def choose(which: str, sums: Episode, env: Environment) -> int | None:
+        """Return the number of an episode, or None if there is no such episode.
 
         Args:
+            which: the name of the episode.
             sums: sums over the episodes of the policy, each field [episodes].
             env: the environment, which says what counts as success.
         """
-        if self.which == "worst":
+        if which == "worst":
             return int(np.argmin(sums.episode_return))
         flags = {
             "first": np.ones(len(sums.outcome), bool),
             "failing": ~env.succeeded(np.asarray(sums.outcome)),
             "violating": sums.violating_steps > 0,
-        }[self.which]
+        }[which]
         return int(np.argmax(flags)) if flags.any() else None
 
 
@@ -58,8 +68,10 @@ def evaluate(
     out: str | None,
     film: Film | None = None,
     cases: Cases | None = None,
+    panels: Sequence[str] = (),
+    bounds: bool = False,
 ) -> tuple[Path, dict[str, Any], list[str]]:
-    """Evaluate every policy and write `results.json` and `eval.jsonl`.
+    """Evaluate every policy and write `results.json`, `eval.jsonl` and `starts.csv`.
 
     Args:
         subject: the policies.
@@ -68,14 +80,18 @@ def evaluate(
         request: what was asked for: `run`, `episodes`, `evaluation_seed`, `checkpoint`, `changes`,
             and `cases` if there are any. It becomes part of the results.
         out: a new directory. None makes one in `subject.place`.
-        film: the film to make of each kind of evaluation, or None.
+        film: the episodes to show of each kind of evaluation, or None.
         cases: the starts of the episodes. None stands for random ones.
+        panels: the panels of a map of the starts, names of `jaxsafe.plot.start_map.PANELS`. If
+            there are none, no map is drawn.
+        bounds: whether to compare the episodes with what is possible.
 
     Returns:
-        The path of `results.json`, its content, and lines about the films.
+        The path of `results.json`, its content, and lines about films and maps.
 
     Raises:
-        ConfigError: `out` holds something, or no outcome of the environment counts as a success.
+        ConfigError: `out` holds something, no outcome of the environment counts as a success, or no
+            bounds are known.
     """
     require_success(env)
     episodes = request["episodes"]
@@ -87,6 +103,8 @@ def evaluate(
     )
     try:
         evaluator = Evaluator(subject.mapper, env, subject.agent, cases)
+        starts = evaluator.starts(episodes, seed)
+        possible = best_possible(env, starts) if bounds else None
         sums = {
             kind: evaluator.run(subject.params, episodes, seed, kind == "deterministic")
             for kind in kinds
@@ -97,10 +115,16 @@ def evaluate(
     first = subject.facts["seed"]
     left_out = _not_finite(subject)
     for kind, of_kind in sums.items():
-        rows = episode_rows(env, of_kind, first, step=subject.facts["steps"], kind=kind, final=True)
+        rows = episode_rows(
+            env, of_kind, first, possible, step=subject.facts["steps"], kind=kind, final=True
+        )
         append_rows(
             path / "eval.jsonl", (row for row in rows if row["seed"] - first not in left_out)
         )
+    columns = columns_of(env, starts)
+    if columns:
+        cells = zip(*(column.tolist() for column in columns.values()), strict=True)
+        write_csv(path / "starts.csv", [dict(zip(columns, row, strict=True)) for row in cells])
     results = {
         **subject.facts,
         **request,
@@ -110,8 +134,16 @@ def evaluate(
         "evaluation": evaluation(env, sums, left_out),
     }
     results |= given_up(env, sums) | diverged_seeds({first + index: None for index in left_out})
+    if possible is not None:
+        for kind, of_kind in sums.items():
+            results["evaluation"][kind] |= {
+                name: over_sound_seeds(values, left_out)
+                for name, values in gaps_per_seed(env, of_kind, possible).items()
+            }
     write_json(path / "results.json", results)
     lines = []
+    for kind, of_kind in sums.items() if panels else ():
+        lines.append(_map(subject, env, starts, of_kind, kind, panels, path))
     if film is not None:
         for kind, of_kind in sums.items():
             lines += _render(subject, evaluator, of_kind, seed, kind, film, path)
@@ -140,7 +172,7 @@ def _render(
     film: Film,
     path: Path,
 ) -> list[str]:
-    """Make a film of an episode of one policy, and return lines with its path.
+    """Show episodes of one policy, and return lines with the paths.
 
     Args:
         subject: the policies.
@@ -148,22 +180,70 @@ def _render(
         sums: sums over the episodes, each field [seeds, episodes].
         seed: the seed of the evaluation.
         kind: the kind of evaluation.
-        film: what to film.
+        film: what to show.
         path: the directory of the evaluation.
     """
-    from jaxsafe.plot.animation import animate
-
     env = evaluator.env
     first = subject.facts["seed"]
     index = 0 if film.seed is None else film.seed - first
     own = jax.tree.map(lambda x: np.asarray(x)[index], sums)
-    number = film.choose(own, env)
     whose = f"seed {first + index}, {kind}"
-    lines = []
-    if number is None:
-        lines.append(f"film: no {film.which} episode of {whose}; the first one is shown")
     params = jax.tree.map(lambda x: x[index], subject.mapper.gather(subject.params))
-    episode = evaluator.episode(params, number or 0, seed, kind == "deterministic")
-    title = f"{subject.name}, {whose}, episode {number or 0}"
-    file = animate(env, episode, path / f"episode_{kind}.{film.form}", title)
-    return [*lines, f"film of {whose}, episode {number or 0}: {file}"]
+    lines = []
+    for which in film.which:
+        number = film.choose(which, own, env)
+        if number is None:
+            lines.append(f"film: no {which} episode of {whose}; the first one is shown")
+        number = number or 0
+        episode = evaluator.episode(params, number, seed, kind == "deterministic")
+        title = f"{subject.name}, {whose}, episode {number}"
+        stem = f"episode_{kind}" + f"_{which}" * (len(film.which) > 1)
+        for form in film.forms:
+            file = _show(env, episode, path / f"{stem}.{form}", title)
+            lines.append(f"{KINDS_OF_FILE[form]} of {whose}, episode {number}: {file}")
+    return lines
+
+
+KINDS_OF_FILE = {"gif": "film", "mp4": "film", "png": "figure", "jsonl": "log"}
+"""What a format shows an episode as."""
+
+
+def _show(env: Environment, episode: tuple[State, TimeStep], file: Path, title: str) -> Path:
+    """Write an episode into a file in the format of its ending, and return the file."""
+    if file.suffix == ".jsonl":
+        append_rows(file, step_rows(env, *episode))
+        return file
+    if file.suffix == ".png":
+        from jaxsafe.plot.flight import flight_figure
+        from jaxsafe.plot.style import save
+
+        return save(flight_figure(env, episode, title), file)
+    from jaxsafe.plot.animation import animate
+
+    return animate(env, episode, file, title)
+
+
+def _map(
+    subject: Subject,
+    env: Environment,
+    starts: State,
+    sums: Episode,
+    kind: str,
+    panels: Sequence[str],
+    path: Path,
+) -> str:
+    """Draw the means over the seeds at every start, and return a line with the path."""
+    from jaxsafe.plot.start_map import start_map
+    from jaxsafe.plot.style import save
+
+    values = {
+        "success": env.succeeded(np.asarray(sums.outcome)),
+        "violations": sums.violating_steps,
+        "return": sums.episode_return,
+        "length": sums.length,
+        "delta_v": sums.delta_v,
+    }
+    means = {name: np.mean(np.asarray(values[name], float), axis=0) for name in panels}
+    title = f"{subject.name}, {kind}, {len(starts.num_steps):,} starts"
+    file = save(start_map(env, starts, means, title), path / f"map_{kind}.png")
+    return f"map of the starts, {kind}: {file}"

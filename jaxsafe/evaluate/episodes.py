@@ -54,7 +54,7 @@ def run_episodes(
         Sums over each episode. Every field has the shape [num_episodes].
     """
     key_start, key_act = jax.random.split(key)
-    state, timestep = _starts(env, key_start, num_episodes, cases)
+    state, timestep = starts_of(env, key_start, num_episodes, cases)
     episode = begin(timestep, measure=env.measure)
     full = full_controls(env)
     limit = max_steps(env)
@@ -101,7 +101,7 @@ def begin_recording(
         The position after the starts, and the states and time steps of the starts [num_episodes].
     """
     key_start, _ = jax.random.split(key)
-    state, timestep = _starts(env, key_start, num_episodes, cases)
+    state, timestep = starts_of(env, key_start, num_episodes, cases)
     position = Position(
         num_steps=jnp.zeros((), jnp.int32),
         state=state,
@@ -111,10 +111,17 @@ def begin_recording(
     return position, (state, timestep)
 
 
-def _starts(
+def starts_of(
     env: Environment, key: Key, num_episodes: int, cases: Cases | None
 ) -> tuple[State, TimeStep]:
-    """Return random starts, or those of the cases."""
+    """Return random starts, or those of the cases.
+
+    Args:
+        env: the environment.
+        key: the first part of the key of `run_episodes`.
+        num_episodes: the number of starts.
+        cases: the cases, or None.
+    """
     if cases is None:
         return reset_batch(env, key, num_episodes)
     return reset_to_cases(env, cases, key)

@@ -13,7 +13,13 @@ from jaxsafe.devices.background_compile import CompiledInBackground
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.cases import Cases
-from jaxsafe.evaluate.episodes import begin_recording, max_steps, record_steps, run_episodes
+from jaxsafe.evaluate.episodes import (
+    begin_recording,
+    max_steps,
+    record_steps,
+    run_episodes,
+    starts_of,
+)
 from jaxsafe.metrics import METRICS, Episode, measures, metrics_in, over_episode
 from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.types import Key, State, TimeStep
@@ -133,6 +139,19 @@ class Evaluator:
 
         return in_batches(run_batch, num_episodes, seed)
 
+    def starts(self, num_episodes: int, seed: int) -> State:
+        """Return the states at the starts of the episodes that `run` runs, arrays [num_episodes].
+
+        They are the same for the policies of all seeds and for both kinds of evaluation.
+        """
+        begin = jax.jit(starts_of, static_argnums=2)
+        batches = []
+        for index, key in enumerate(batch_keys(seed, -(-num_episodes // EPISODES_PER_BATCH))):
+            cases = self._cases(index * EPISODES_PER_BATCH, EPISODES_PER_BATCH)
+            state, _ = begin(self.env, jax.random.split(key)[0], EPISODES_PER_BATCH, cases)
+            batches.append(jax.device_get(state))
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[:num_episodes], *batches)
+
     def record(
         self, params: Params, num_episodes: int, seed: int, deterministic: bool = True
     ) -> Iterator[Iterator[dict[str, Any]]]:
@@ -147,7 +166,7 @@ class Evaluator:
         for state, timestep in self.episodes(
             params, num_episodes, seed=seed, deterministic=deterministic
         ):
-            yield (_step_row(self.env, state, timestep, t) for t in range(len(timestep.reward)))
+            yield step_rows(self.env, state, timestep)
 
     def episodes(
         self, params: Params, num_episodes: int, seed: int, deterministic: bool = True
@@ -287,7 +306,11 @@ def batch_keys(seed: int, batches: int) -> Iterator[Key]:
 
 
 def episode_rows(
-    env: Environment, episodes: Episode, first_seed: int, **common: Any
+    env: Environment,
+    episodes: Episode,
+    first_seed: int,
+    bounds: Mapping[str, np.ndarray] | None = None,
+    **common: Any,
 ) -> list[dict[str, Any]]:
     """Return a row for each episode of each seed, for `eval.jsonl`.
 
@@ -295,6 +318,7 @@ def episode_rows(
         env: the environment.
         episodes: sums over the episodes, each field [seeds, episodes].
         first_seed: the training seed of the first policy.
+        bounds: what is possible from each start, as `best_possible` returns it, or None.
         **common: entries that all rows have.
     """
     measured = measures(env)
@@ -330,6 +354,10 @@ def episode_rows(
                 else _short(column[seed][index])
                 for name, column in columns.items()
             },
+            **{
+                f"{name}_bound": _short(values[index].item())
+                for name, values in (bounds or {}).items()
+            },
         }
         for seed in range(outcomes.shape[0])
         for index in range(outcomes.shape[1])
@@ -354,6 +382,45 @@ def metrics_per_seed(env: Environment, episodes: Episode) -> dict[str, list[floa
         metrics_in(env, jax.tree.map(lambda x, i=i: x[i], episodes)) for i in range(num_seeds)
     ]
     return {name: [of_seed[name] for of_seed in metrics] for name in (*METRICS, *env.measure)}
+
+
+def gaps_per_seed(
+    env: Environment, episodes: Episode, bounds: Mapping[str, np.ndarray]
+) -> dict[str, list[float | None]]:
+    """Return how far the policy of each seed is from what is possible, on average over episodes.
+
+    `return_gap` is over all episodes. `length_gap` is over the successes without a violation, and
+    `delta_v_gap` over all successes. They are None where there is none.
+
+    Args:
+        env: the environment.
+        episodes: sums over the episodes, each field [seeds, episodes].
+        bounds: what is possible from each start, as `best_possible` returns it.
+    """
+    succeeded = np.asarray(env.succeeded(np.asarray(episodes.outcome)))
+    safe = succeeded & (np.asarray(episodes.violating_steps) == 0)
+    gaps = {
+        "return": (bounds["return"] - episodes.episode_return, np.ones_like(succeeded))
+        if "return" in bounds
+        else None,
+        "length": (episodes.length - bounds["length"], safe),
+        "delta_v": (episodes.delta_v - bounds["delta_v"], succeeded)
+        if "delta_v" in bounds
+        else None,
+    }
+    return {
+        f"{name}_gap": [
+            float(np.mean(of_seed[which])) if which.any() else None
+            for of_seed, which in zip(*gap, strict=True)
+        ]
+        for name, gap in gaps.items()
+        if gap is not None
+    }
+
+
+def step_rows(env: Environment, state: State, timestep: TimeStep) -> Iterator[dict[str, Any]]:
+    """Return the rows of an episode for a log, one per step. Every array is [steps + 1]."""
+    return (_step_row(env, state, timestep, t) for t in range(len(timestep.reward)))
 
 
 def _step_row(env: Environment, state: Any, timestep: Any, t: int) -> dict[str, Any]:

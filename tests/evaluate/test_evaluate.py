@@ -11,7 +11,7 @@ from default_cases import thorough
 from PIL import Image
 
 import jaxsafe
-from jaxsafe.commands.evaluate import main
+from jaxsafe.commands.evaluate import MAPS, main
 from jaxsafe.commands.evaluation import Film
 from jaxsafe.commands.policy_options import PolicyOptions, differences
 from jaxsafe.config import dump
@@ -20,6 +20,7 @@ from jaxsafe.evaluate import episodes as episodes_module
 from jaxsafe.evaluate import evaluator as seeds_module
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.evaluate.evaluator import Evaluator, batch_keys
+from jaxsafe.plot.start_map import PANELS, seen_from_the_other, start_map
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import read_rows
 
@@ -94,7 +95,7 @@ def test_a_film_shows_the_episode_that_is_asked_for(
         assert f"film of seed 1, stochastic, episode {row['episode']}: " in told
     for more, message in (
         (["film_seed=3"], "film_seed: expected a seed from 0 to 2, found 3"),
-        (["film=last"], "film: found 'last'; choose from first, failing, violating, worst"),
+        (["film=last"], "film: .*'last'; choose from first, failing, violating, worst"),
     ):
         with pytest.raises(ConfigError, match=message):
             main([*words[:-1], *more])
@@ -102,13 +103,54 @@ def test_a_film_shows_the_episode_that_is_asked_for(
         main([f"run={whole}", "film=worst"])
 
 
+def test_starts_figures_logs_maps_and_gaps_of_an_evaluation(tmp_path: Path) -> None:
+    place = tmp_path / "shown"
+    words = ["run=controller/pd", "env=docking1d"]
+    shown = ["render=png,jsonl", "film=first,worst", "map=success,violations", "bounds=true"]
+    assert main([*words, "episodes=120", f"out={place}", *shown]) == 0
+    rows = read_rows(place / "eval.jsonl")
+    worst = min(rows, key=lambda row: row["return"])
+    steps = read_rows(place / "episode_deterministic_worst.jsonl")
+    assert len(steps) == worst["length"] + 1
+    assert sum(step["reward"] for step in steps[1:]) == pytest.approx(worst["return"], rel=1e-3)
+    for name in ("episode_deterministic_first.png", "map_deterministic.png"):
+        with Image.open(place / name) as image:
+            assert min(image.size) > 200
+    # An evaluation from these starts is the same evaluation.
+    cases = f"cases={place / 'starts.csv'}"
+    assert main([*words, f"out={tmp_path / 'again'}", cases]) == 0
+    again = read_rows(tmp_path / "again" / "eval.jsonl")
+    assert [row["length"] for row in again] == [row["length"] for row in rows]
+    assert "return_bound" not in again[0]
+    metrics = json.loads((place / "results.json").read_text())["evaluation"]["deterministic"]
+    for name, sign in (("return", -1.0), ("length", 1.0), ("delta_v", 1.0)):
+        gaps = [sign * (row[name] - row[f"{name}_bound"]) for row in rows]
+        assert metrics[f"{name}_gap"]["mean"] == pytest.approx(np.mean(gaps), rel=1e-3)
+        assert min(gaps) > -1e-3
+        assert len(set(gaps)) > 3
+    assert metrics["length_gap"]["mean"] < 30.0
+
+
+def test_a_map_has_x_along_the_heading_of_the_other_craft() -> None:
+    env = jaxsafe.make("rejoin2d")
+    start = {
+        "lead": {"position": [5000.0, 5000.0], "heading": np.pi / 2, "speed": 250.0},
+        "wingman": {"position": [5000.0, 11000.0], "heading": 0.0, "speed": 300.0},
+    }
+    state = jax.tree.map(lambda leaf: leaf[None], jaxsafe.reset_to(env, start)[0])
+    np.testing.assert_allclose(seen_from_the_other(env, state), [[6000.0, 0.0]], atol=0.1)
+    panels = {name: np.ones(1) for name in MAPS}
+    assert list(PANELS) == list(MAPS)
+    assert len(start_map(env, state, panels, "title").axes) == 2 * len(panels)
+
+
 def test_a_film_of_what_did_not_happen_is_that_of_the_first_episode() -> None:
     env = jaxsafe.make("docking2d")
     flags = np.array([1, 1])
     sums: Any = SimpleNamespace(outcome=flags, violating_steps=np.zeros(2), episode_return=flags)
     for which in ("failing", "violating"):
-        assert Film("gif", which).choose(sums, env) is None
-    assert Film("gif").choose(sums, env) == 0
+        assert Film.choose(which, sums, env) is None
+    assert Film.choose("first", sums, env) == 0
 
 
 @pytest.mark.thorough

@@ -179,7 +179,11 @@ def table(results: dict[str, Any], path: Path) -> str:
         if all(metrics.get(name, {}).get("mean") is not None for metrics in evaluations.values()):
             rows.append([label, *(_cell(metrics[name], unit) for metrics in evaluations.values())])
     kinds = [*evaluations.values()]
-    own = [name for name in kinds[0] if name not in METRICS]
+    own = [
+        name
+        for name in kinds[0]
+        if name not in METRICS and all(of_kind[name]["mean"] is not None for of_kind in kinds)
+    ]
     rows += [[name, *(_cell(of_kind[name], "") for of_kind in kinds)] for name in own]
     worst = [least([metrics["success_rate"]]) for metrics in evaluations.values()]
     rows.append(["worst seed, success rate", *(percent(rate, 1) for rate in worst)])
