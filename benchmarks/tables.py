@@ -273,11 +273,44 @@ def controllers(results: Results) -> str:
             rows.append([task, *_flown(row, f"{row['training_steps']:,}")])
             rows[-1].insert(3, f"{paper:,}" if paper else "–")
         bound = results["bounds"][task]
-        best = f"≤ {bound['return']:.3f}" if "return" in bound else "–"
-        rows.append([task, "*bound*", *["–"] * 4, best, f"≥ {bound['length']:.0f}", "–"])
+        least = f"≥ {bound['delta_v']:.2f}" if "delta_v" in bound else "–"
+        best = [f"≤ {bound['return']:.3f}", f"≥ {bound['length']:.0f}", least]
+        rows.append([task, "*bound*", *["–"] * 4, *best])
     heads = ["task", "policy", "steps of training", "80 % after, paper's Table 2", "success"]
     heads.append("violating steps")
     return markdown([*heads, "return", "length [s]", "Δv [m/s]"], rows)
+
+
+def possible(results: Results) -> str:
+    """Return the table of bounds, the best flights found, and how far policies are from them."""
+    rows = []
+    for row in results["rows"]:
+        bound = row["bound"]
+        flown = [("*best found*", row["best"])]
+        flown += [
+            ("PPO, packaged" if policy["policy"] == "ppo" else f"`{policy['policy']}`", policy)
+            for policy in row["policies"]
+        ]
+        rows.append([row["task"], "*bound*", *_against(bound, bound)])
+        rows += [[row["task"], name, *_against(values, bound)] for name, values in flown]
+    heads = ["task", "policy", "return", "below the bound", "length [s]", "above the bound"]
+    return markdown([*heads, "Δv [m/s]", "above"], rows)
+
+
+def _against(values: Mapping[str, float], bound: Mapping[str, float]) -> list[str]:
+    """Return the cells of return, length and Δv, each followed by the gap to its bound."""
+    cells = []
+    for name, form, sign in (
+        ("return", ".3f", -1.0),
+        ("length", ".1f", 1.0),
+        ("delta_v", ".3f", 1.0),
+    ):
+        if name not in bound or not math.isfinite(values[name]):
+            cells += ["–", "–"]
+            continue
+        gap = sign * (values[name] - bound[name])
+        cells += [f"{values[name]:{form}}", "" if values is bound else f"{gap:{form}}"]
+    return cells
 
 
 def controllers_filtered(results: Results) -> str:
@@ -1034,6 +1067,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("datasets", datasets, "docs/dataset.md"),
     ("controllers", controllers, "docs/controllers.md"),
     ("controllers", controllers_filtered, "docs/controllers.md"),
+    ("possible", possible, "docs/possible.md"),
     ("adapters", adapters, "docs/adapters/gymnasium.md"),
     ("rta", filter_calls, "docs/safety/cost.md"),
     ("rta", filter_changes, "docs/safety/cost.md"),

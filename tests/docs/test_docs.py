@@ -244,6 +244,7 @@ def fly_around(env: jaxsafe.Environment, key: jax.Array) -> tuple[jax.Array, jax
         thorough("safety/presets"),
         thorough("safety/proofs"),
         thorough("controllers"),
+        thorough("possible"),
         "deviations",
         thorough("adapters/gymnasium"),
         "adapters/safety_gymnasium",
