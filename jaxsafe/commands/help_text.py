@@ -133,6 +133,8 @@ def shown(value: Any) -> str:
         return value
     if isinstance(value, list):
         return ",".join(map(shown, value))
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{name}: {shown(item)}" for name, item in value.items()) + "}"
     if isinstance(value, bool) or value is None:
         return json.dumps(value)
     return f"{value:_}" if isinstance(value, int) else f"{value:g}"

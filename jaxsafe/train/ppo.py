@@ -28,16 +28,18 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsafe.agents.agent import Agent, Sequences
 from jaxsafe.agents.networks import Memory, Params, unroll
 from jaxsafe.autoreset import choose
+from jaxsafe.config import override
 from jaxsafe.devices.backend import accelerated, packing, scan_packed
 from jaxsafe.devices.shard import WHOLE, Shard
-from jaxsafe.environment import Environment, longest_episode
+from jaxsafe.environment import Environment, drawn, longest_episode
 from jaxsafe.metrics import Episode, accumulate, begin, full_controls
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
-from jaxsafe.schema.component import Component, Range
+from jaxsafe.schema.component import ANY, Component, Range, Unit
+from jaxsafe.schema.dotted_paths import get_path
 from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.train.recent_episodes import Window, empty_window, latest_cost, push
 from jaxsafe.train.shuffle import shuffle
-from jaxsafe.types import Dimensionless, Key, Positive, Record, State, TimeStep
+from jaxsafe.types import Dimensionless, Key, Number, Positive, Record, State, TimeStep
 
 Share = Range(0.0, 1.0)
 """Range of a number from 0 to 1."""
@@ -163,6 +165,17 @@ class PPO(Component):
 
     It is the derivative gain of PID-Lagrangian. A cost that falls does not count.
     """
+    curriculum: Mapping[str, Annotated[Number, Unit("physical", length=ANY)]] = dataclasses.field(
+        default_factory=dict
+    )
+    """Numbers of the environment with which the training begins, by dotted path.
+
+    Each moves to its own value in the environment, by the same factor in every update if both are
+    above 0, and else by the same difference. Evaluations have the environment as it is. For
+    instance '{deputy.start.position.distance: [100, 150]}' lets starts move farther away.
+    """
+    curriculum_share: Annotated[Dimensionless, Range(0.0, 1.0, open_low=True)] = 0.5
+    """Share of the training after which the numbers of the `curriculum` have their own values."""
 
     @property
     def batch_size(self) -> int:
@@ -273,6 +286,7 @@ def init(env: Environment, agent: Agent, ppo: PPO, key: Key, shard: Shard = WHOL
     """
     key_params, key_reset, key_run = jax.random.split(key, 3)
     params = agent.init(key_params, env)
+    env = on_the_way(env, ppo, 0.0)
     env_state, timestep = reset_batch(env, key_reset, ppo.num_envs, shard)
     episode = begin(timestep, cost_names=agent.cost_names, measure=env.measure)
     multiplier: Any = ()
@@ -328,12 +342,13 @@ def update(
         The state after the update, and the diagnostics of the update.
     """
     key_collect, key_learn = jax.random.split(jax.random.fold_in(state.key, state.num_updates))
+    progress = state.num_updates / total_updates
+    env = on_the_way(env, ppo, progress)
     if ppo.complete_episodes:
         key_start, key_collect = jax.random.split(key_collect)
         state = _start_afresh(env, agent, ppo, state, key_start, shard)
     memory = state.memory
     state, transitions = collect(env, agent, ppo, state, key_collect, shard)
-    progress = state.num_updates / total_updates
     gamma = discount(ppo, progress)
     step_size = learning_rate(ppo, progress)
     counts = _counts(env, ppo, transitions) if ppo.complete_episodes else None
@@ -553,6 +568,36 @@ def discount(ppo: PPO, progress: Array | float) -> Array:
     soon finds a way to succeed. With a long one it then finds a quick way.
     """
     return 1.0 - (1.0 - jnp.asarray(ppo.gamma)) / jnp.asarray(ppo.horizon_growth) ** progress
+
+
+def on_the_way(env: Environment, ppo: PPO, progress: Array | float) -> Environment:
+    """Return the environment after the share `progress` of the training, see `PPO.curriculum`."""
+    if not ppo.curriculum:
+        return env
+    share = jnp.minimum(progress / ppo.curriculum_share, 1.0)
+    values = {}
+    for path, first in ppo.curriculum.items():
+        last = get_path(env, path)
+        positive = (first > 0.0) & (last > 0.0)
+        factor = jnp.where(positive, last, 1.0) / jnp.where(positive, first, 1.0)
+        line = first + (last - first) * share
+        values[path] = jnp.where(positive, first * factor**share, line)
+    return drawn(env, values)
+
+
+def check_curriculum(env: Environment, ppo: PPO) -> None:
+    """Check that the curriculum has numbers of the environment, as the environment takes them.
+
+    Raises:
+        ConfigError: a path leads to no number, or the number has another size or does not fit.
+    """
+    for path, value in ppo.curriculum.items():
+        override(env, {path: value}, "ppo.curriculum")
+        own = get_path(env, path)
+        if not isinstance(own, jax.Array) or own.shape != jnp.shape(value):
+            shape = own.size if isinstance(own, jax.Array) else None
+            expected = "a path to a number" if shape is None else f"{shape} numbers"
+            raise ConfigError(f"ppo.curriculum: {path}: expected {expected}, found {show(value)}")
 
 
 def collect(

@@ -76,10 +76,11 @@ def train(
 
     Raises:
         ConfigError: an episode may be longer than the batch with `complete_episodes`, or a limit of
-            the cost is for no constraint of the environment.
+            the cost is for no constraint of the environment, or the curriculum does not fit it.
     """
     ppo.check_complete_episodes(env, hyperparameters)
     ppo.check_cost_limit(env, agent, hyperparameters)
+    ppo.check_curriculum(env, hyperparameters)
     shared = (env, normalise(agent), normalise(hyperparameters))
     state = _begin(shared, key)
     if params is not None:

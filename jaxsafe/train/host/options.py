@@ -30,6 +30,7 @@ from jaxsafe.train.ppo import (
     CostLimit,
     check_complete_episodes,
     check_cost_limit,
+    check_curriculum,
 )
 
 Count = Annotated[int, Range(1, largest=MAX_COUNT)]
@@ -297,6 +298,7 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         )
     check_complete_episodes(env, config.ppo)
     check_cost_limit(env, config.agent, config.ppo)
+    check_curriculum(env, config.ppo)
     if config.num_updates >= 2**31:
         raise ConfigError(
             f"steps: expected less than 2³¹ updates of {config.ppo.batch_size:,}, "
