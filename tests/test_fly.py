@@ -154,6 +154,12 @@ def test_all_craft_are_drawn_in_either_axes(world: bool) -> None:
     panel = flight.plot(world=world).axes[0]
     lines = {line.get_label(): line for line in panel.lines}
     assert {"chief", "chaser", "deputy"} <= set(lines)
+    # From a moving chief one sees where it came from.
+    behind = lines.get("path of the chief")
+    assert (behind is None) == world
+    if behind is not None:
+        path = flight.platforms["chief"].position
+        np.testing.assert_allclose(behind.get_xydata(), path - path[-1], atol=1e-3)
     chief = lines["chief"].get_xydata()[0]
     expected = flight.platforms["chief"].position[-1] if world else np.zeros(2)
     np.testing.assert_allclose(chief, expected, atol=1e-3)

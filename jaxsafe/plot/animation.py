@@ -31,6 +31,7 @@ from jaxsafe.plot.style import (
     GREEN,
     GREY,
     ORANGE,
+    PATH_BEHIND,
     Ball,
     centre_patch,
     frame_labels,
@@ -45,6 +46,7 @@ from jaxsafe.plot.style import (
     region_surface,
     set_frame,
     styled,
+    within,
 )
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import write_bytes
@@ -166,6 +168,8 @@ class Moment(NamedTuple):
     """
 
     time: float  # [s]
+    origin: np.ndarray  # where the scene is seen from, in the axes of the world
+    turn: np.ndarray  # the rotation from the axes of the world into those of the picture
     places: Mapping[str, np.ndarray]  # the position of each platform and region
     directions: Mapping[str, np.ndarray]  # where each platform points, or else moves
     thrust: np.ndarray | None  # as a share of the largest thrust
@@ -216,8 +220,9 @@ class Ends:
 class Scene:
     """Picture of one step: the paths of all platforms, and two curves over time.
 
-    All is seen from the first platform that is not the agent, along its heading if it has one. What
-    stands still is drawn once, and again when an axis changes.
+    All is seen from the first platform that is not the agent, along its heading if it has one. A
+    dashed line shows where that platform came from, as seen from where it is. What stands still is
+    drawn once, and again when an axis changes.
     """
 
     def __init__(self, env: Environment, title: str) -> None:
@@ -263,6 +268,8 @@ class Scene:
         self.moments.append(
             Moment(
                 time=float(sim.time),
+                origin=origin,
+                turn=turn,
                 places=places,
                 directions={name: turn @ direction for name, direction in directions.items()},
                 thrust=self._thrust(np.asarray(control), directions[self.env.agent]),
@@ -361,16 +368,22 @@ class Scene:
         if radii:
             entries.append(Patch(label="too near", **FORBIDDEN))
         if self._spatial:
-            self._shadow = self._line("-", color=GREY, linewidth=1.0, alpha=0.5)
+            self._shadow = self._line(color=GREY, linewidth=1.0, alpha=0.5)
         for platform in self.env.platforms:
             name = platform.name
             colour = BLUE if name == self.env.agent else "black"
-            trail = self._line("-", color=colour, linewidth=1.4)
-            nose = self._line("-", color=colour, linewidth=2.6)
-            dot = self._line("o", color=colour, markersize=6, label=plain(name))
+            look = PATH_BEHIND if name == self._origin else {"color": colour, "linewidth": 1.4}
+            trail = self._line(**look)
+            nose = self._line(color=colour, linewidth=2.6)
+            dot = self._line(
+                marker="o", linestyle="", color=colour, markersize=6, label=plain(name)
+            )
             self._trails[name] = (trail, nose, dot)
             entries.append(dot)
-        self._arrow = self._line("-", color=AMBER, linewidth=2.2, label="thrust (length √thrust)")
+            if name == self._origin and self._turned:
+                trail.set_label(f"path of the {plain(name)}")
+                entries.append(trail)
+        self._arrow = self._line(color=AMBER, linewidth=2.2, label="thrust (length √thrust)")
         if self._thrust(np.zeros(len(self.env.actuators)), np.zeros(2)) is not None:
             entries.append(self._arrow)
         self.figure.legend(handles=entries, loc="lower left", ncols=len(entries))
@@ -378,10 +391,10 @@ class Scene:
         shadow = [] if self._shadow is None else [self._shadow]
         self._moving.append((self.map, [*self._regions.values(), *shadow, *lines, self._arrow]))
 
-    def _line(self, form: str, **look: Any) -> Any:
+    def _line(self, **look: Any) -> Any:
         """Return a line or a dot of the map that moves."""
         nothing = np.zeros((3 if self._spatial else 2, 0))
-        return self.map.plot(*nothing, form, animated=True, **look)[0]
+        return self.map.plot(*nothing, animated=True, **look)[0]
 
     def _set_up_curves(self) -> None:
         unit = length_unit(self.env)
@@ -465,11 +478,14 @@ class Scene:
         """Put everything that moves to where it is after the last of these steps."""
         now = past[-1]
         for name, (trail, nose, dot) in self._trails.items():
-            path = np.stack([moment.places[name] for moment in past])
+            if name == self._origin:
+                path = np.stack([moment.origin for moment in past]) - now.origin
+                path = path @ now.turn.T
+            else:
+                path = np.stack([moment.places[name] for moment in past])
             here = path[-1]
-            if self._spatial:  # axes in space do not clip
-                inside = (np.abs(path) <= self._reach).all(axis=1, keepdims=True)
-                path = np.where(inside, path, np.nan)
+            if self._spatial:
+                path = within(path, self._reach)
             _put(trail, path)
             _put(dot, here[None])
             tip = here + 0.12 * self._reach * now.directions[name]

@@ -18,8 +18,10 @@ from matplotlib.patches import Circle
 from jaxsafe.plot.curves import MILLIONS_FROM
 from jaxsafe.plot.style import (
     FORBIDDEN,
+    PATH_BEHIND,
     Ball,
     NotebookFigure,
+    along,
     centre_patch,
     fitted,
     frame_labels,
@@ -29,6 +31,7 @@ from jaxsafe.plot.style import (
     region_surface,
     set_frame,
     styled,
+    within,
 )
 
 LAST_COLOUR = 0.85
@@ -69,8 +72,9 @@ def trajectories(
     beside the paths. Paths in space are drawn in space, from above and from the side. Paths in the
     plane have a single row.
 
-    If the other platform has a heading, x is along it. Then the motion and the turn of that
-    platform do not show, and a region that it carries is at rest.
+    If the other platform has a heading, x is along it. Then the turn of that platform does not
+    show, and a region that it carries is at rest. A dashed line shows where that platform came
+    from, as seen from its end.
 
     Args:
         episodes: logged episodes, in the order of training.
@@ -122,6 +126,9 @@ def trajectories(
     grid = figure.add_gridspec(len(views), len(columns))
     turned = not alone and "heading" in last[0]["platforms"][first]
     labels = frame_labels(first if turned else None, unit)
+    behind = origin - origin[-1]
+    if turned:
+        behind = along(behind, last[-1]["platforms"][first]["heading"])
     panels: list[Any] = []
     for number, ((name, column), half) in enumerate(zip(columns, reach, strict=True)):
         for row, view in enumerate(views):
@@ -145,8 +152,11 @@ def trajectories(
             if not alone:
                 look = {"color": "black", "markersize": 7, "label": plain(first), "zorder": 1}
                 panel.plot(*np.zeros((len(view), 1)), ">" if turned else "*", **look)
+            if turned:
+                shown = within(behind, half) if spatial else behind
+                panel.plot(*shown[:, axes].T, label=f"path of the {plain(first)}", **PATH_BEHIND)
             for step, path in column:
-                shown = _within(path, half) if spatial else path
+                shown = within(path, half) if spatial else path
                 panel.plot(*shown[:, axes].T, color=colour(step), linewidth=1.2)
                 panel.plot(*shown[:1, axes].T, "o", color=colour(step), markersize=3)
             set_frame(panel, view, labels, half)
@@ -158,16 +168,6 @@ def trajectories(
     _colour_bar(figure, colours, panels)
     figure.suptitle(fitted(f"{plain(title)}\n{SUBTITLE}", figure))
     return figure
-
-
-def _within(path: np.ndarray, half: float) -> np.ndarray:
-    """Return a path with a gap where it leaves the box, because axes in space do not clip.
-
-    Args:
-        path: the path, shape (points, 3).
-        half: half the width of the box.
-    """
-    return np.where((np.abs(path) <= half).all(axis=1, keepdims=True), path, np.nan)
 
 
 def _farthest(paths: Sequence[np.ndarray]) -> float:
@@ -237,12 +237,7 @@ def _relative_path(rows: list[dict[str, Any]], of: str) -> np.ndarray:
     path = path - origin  # a null, from a training that diverged, is NaN here and leaves a gap
     if "heading" in rows[0]["platforms"][first]:
         heading = np.array([row["platforms"][first]["heading"] for row in rows], float)
-        cosine = np.cos(heading)
-        sine = np.sin(heading)
-        x = path[:, 0].copy()
-        y = path[:, 1].copy()
-        path[:, 0] = cosine * x + sine * y
-        path[:, 1] = cosine * y - sine * x
+        path = along(path, heading)
     return path
 
 

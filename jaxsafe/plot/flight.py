@@ -16,10 +16,12 @@ from jaxsafe.plot.style import (
     FORBIDDEN,
     GREEN,
     ORANGE,
+    PATH_BEHIND,
     PURPLE,
     SKY,
     Ball,
     NotebookFigure,
+    along,
     centre_patch,
     fitted,
     frame_labels,
@@ -33,6 +35,7 @@ from jaxsafe.plot.style import (
     region_surface,
     set_frame,
     styled,
+    within,
 )
 from jaxsafe.types import State, TimeStep
 
@@ -59,8 +62,9 @@ def flight_figure(
     """Return a figure of one episode.
 
     The paths are relative to the first platform that is not the agent. If that platform has a
-    heading, x is along it. If it moves, regions that stay in place are left out. Paths in space are
-    drawn in space and from above.
+    heading, x is along it. If it moves, regions that stay in place are left out, and a dashed line
+    shows where it came from, as seen from its end. Paths in space are drawn in space and from
+    above.
 
     Args:
         env: the environment of the episode.
@@ -125,11 +129,16 @@ def _path(states: State, of: str, origin: str | None) -> np.ndarray:
         return path
     path -= in_plane(np.array(sim.platforms[origin].position, float))
     if _heads(states, origin):
-        heading = sim.platforms[origin].heading
-        x = np.cos(heading) * path[:, 0] + np.sin(heading) * path[:, 1]
-        path[:, 1] = np.cos(heading) * path[:, 1] - np.sin(heading) * path[:, 0]
-        path[:, 0] = x
+        path = along(path, np.asarray(sim.platforms[origin].heading))
     return path
+
+
+def _path_behind(states: State, name: str) -> np.ndarray:
+    """Return where a platform has been, as seen from its end, shape (steps, d)."""
+    platform = states.sim.platforms[name]
+    path = in_plane(np.array(platform.position, float))
+    path -= path[-1]
+    return along(path, float(platform.heading[-1])) if _heads(states, name) else path
 
 
 def _draw_path(
@@ -182,6 +191,10 @@ def _draw_path(
     else:
         centre = np.zeros(everywhere.shape[1])
         half = 1.1 * np.nanmax(np.abs(everywhere)) or 1.0
+    if origin is not None and _moves(states, origin):
+        behind = _path_behind(states, origin)
+        behind = within(behind, half) if spatial else behind
+        panel.plot(*behind[:, axes].T, label=f"path of the {plain(origin)}", **PATH_BEHIND)
     set_frame(panel, view, frame_labels(heads, length_unit(env)), half, centre)
 
 

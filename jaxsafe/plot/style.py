@@ -67,6 +67,15 @@ FORBIDDEN: dict[str, Any] = {
 }
 """Look of a region to stay out of. The hatch tells it from a goal without its colour."""
 
+PATH_BEHIND: dict[str, Any] = {
+    "color": "black",
+    "linewidth": 1.0,
+    "linestyle": (0, (4, 3)),
+    "alpha": 0.6,
+    "zorder": 1,
+}
+"""Look of the path of a platform that all is seen from. It is where that platform came from."""
+
 NICE = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0)
 """Round numbers from 1 to 10. Others are a power of ten times one of these."""
 
@@ -259,6 +268,31 @@ def in_plane(vectors: np.ndarray) -> np.ndarray:
     """Return vectors on a line as vectors in the plane with y = 0, and all others as they are."""
     missing = max(0, 2 - vectors.shape[-1])
     return np.pad(vectors, [(0, 0)] * (vectors.ndim - 1) + [(0, missing)])
+
+
+def along(vectors: np.ndarray, heading: np.ndarray | float) -> np.ndarray:
+    """Return vectors in axes whose x is along a heading and whose z stays, shape (..., d).
+
+    Args:
+        vectors: the vectors in the axes of the world, shape (..., d) with d of at least 2.
+        heading: the heading in rad, a number or one for each vector.
+    """
+    cosine = np.cos(heading)
+    sine = np.sin(heading)
+    turned = vectors.copy()
+    turned[..., 0] = cosine * vectors[..., 0] + sine * vectors[..., 1]
+    turned[..., 1] = cosine * vectors[..., 1] - sine * vectors[..., 0]
+    return turned
+
+
+def within(path: np.ndarray, half: float) -> np.ndarray:
+    """Return a path with a gap where it leaves the box, because axes in space do not clip.
+
+    Args:
+        path: the path, shape (points, 3).
+        half: half the width of the box.
+    """
+    return np.where((np.abs(path) <= half).all(axis=1, keepdims=True), path, np.nan)
 
 
 def frame_labels(heads: str | None, unit: str | None) -> list[str]:

@@ -79,6 +79,12 @@ def test_a_scene_shows_the_agent_where_it_is_and_what_its_thrusters_do(
     arrow = points(scene._arrow)
     if task.startswith("rejoin"):
         assert len(arrow) == 0
+        # Where the lead came from lies straight behind it, as it flies straight on.
+        behind = points(scene._trails["lead"][0])
+        flown = np.linalg.norm(other.position[:13] - other.position[12], axis=1)
+        np.testing.assert_allclose(behind[:, 0], -flown, rtol=1e-5, atol=1e-2)
+        np.testing.assert_allclose(behind[:, 1:], 0.0, atol=1e-1)
+        assert flown[0] > 1000.0
         return
     thrust = timesteps.info.control_actual[12][:dimension]
     if task == "docking2d_oriented":

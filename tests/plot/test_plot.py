@@ -327,8 +327,13 @@ def test_paths_are_seen_from_the_lead_along_its_heading_with_the_region_that_it_
         for p, h, a, b in zip(lead, heading, ahead, aside, strict=True)
     ]
     panel = trajectories([(100, rows)], "title", "ft", env.regions).axes[0]
-    path = next(line for line in panel.lines if len(line.get_xdata()) > 1)
+    behind, path = (line for line in panel.lines if len(line.get_xdata()) > 1)
     np.testing.assert_allclose(path.get_xydata(), np.tile([-300.0, 100.0], (30, 1)), atol=1e-6)
+    # Where the lead came from is seen from where it is at the end.
+    from_end = lead - lead[-1]
+    expected = np.stack([from_end @ ahead[-1], from_end @ aside[-1]], axis=1)
+    np.testing.assert_allclose(behind.get_xydata(), expected, atol=1e-6)
+    assert behind.get_label() == "path of the lead"
     (region,) = panel.patches
     assert isinstance(region, Circle)
     np.testing.assert_allclose(region.center, [-250.0, 433.0], atol=1e-6)
