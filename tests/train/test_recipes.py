@@ -1,6 +1,9 @@
 """Which recipe a training takes, and trainings that take the options of another run."""
 
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -123,6 +126,20 @@ def test_a_printed_file_keeps_what_its_source_had(
     own = text.replace("recipe: docking2d\n", "") + "recipes:\n  quick: {steps: 7}\n"
     mine.write_text(own, encoding="utf-8")
     assert printed("mine.yaml") == own
+
+
+@pytest.mark.slow
+def test_every_seed_learns_the_composed_environment(tmp_path: Path) -> None:
+    """The command is that of docs/compose.md, with fewer episodes of evaluation."""
+    root = Path(__file__).parents[2]
+    page = (root / "docs" / "compose.md").read_text(encoding="utf-8")
+    [line] = re.findall(r"^jaxsafe (train configs/custom_env.yaml .*)$", page, re.MULTILINE)
+    options = ["episodes=100", f"out={tmp_path / 'run'}"]
+    command_line = [sys.executable, "-m", "jaxsafe", *shlex.split(line), *options]
+    subprocess.run(command_line, cwd=root, check=True, capture_output=True)
+    rates = jaxsafe.open_run(tmp_path / "run").results["evaluation"]["deterministic"]
+    assert len(rates["success_rate"]["per_seed"]) == 10
+    assert min(rates["success_rate"]["per_seed"]) >= 0.8
 
 
 # Options of another run
