@@ -129,6 +129,13 @@ def test_links_lead_to_files(page: Path) -> None:
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_no_line_of_a_page_is_a_comment(page: Path) -> None:
+    """The site leaves out a line that begins with a per cent sign."""
+    text = BLOCK.sub("", page.read_text(encoding="utf-8"))
+    assert re.findall(r"^\s*%.*", text, re.MULTILINE) == []
+
+
 @pytest.mark.thorough
 def test_the_site_builds_without_a_warning_twice_and_with_its_own_extra_alone(
     tmp_path: Path,
