@@ -15,15 +15,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Annulus, Circle, Rectangle
 
 import jaxsafe
+from jaxsafe.plot.style import BLUE, FORBIDDEN, GOAL, GREEN, GREY, ORANGE, PATH_BEHIND
 
-BLUE = "#0072B2"  # a colour of the Okabe-Ito palette
-ORANGE = "#D55E00"
-GREEN = "#009E73"
-GREY = "#6E6E6E"
 PALETTE = ("#3B2F8F", "#C2568F", "#A67C00")
 SEEDS = {
-    "rejoin2d": (5, 2),
-    "rejoin3d": (12, 6),
+    "rejoin2d": (5, 3),
+    "rejoin3d": (1, 127),
     "docking2d": (2, 9, 6),
     "docking3d": (2, 3, 8),
     "docking2d_oriented": (2, 9, 6),
@@ -233,16 +230,15 @@ def draw_rejoin(env: Any, episodes: list[tuple[Any, str]]) -> Figure:
         x, y = (wingman.position - lead.position)[:, :2].T
         c = np.cos(lead.heading)
         s = np.sin(lead.heading)
-        close.plot(c * x + s * y, c * y - s * x, color=colour, linewidth=1.6, label=outcome)
+        label = f"ended with {outcome}"
+        close.plot(c * x + s * y, c * y - s * x, color=colour, linewidth=1.6, label=label)
         for axes in height:
             axes.plot(
                 sim.time, (wingman.position - lead.position)[:, 2], color=colour, linewidth=1.6
             )
     angle = np.pi + float(region.offset.angle)
     centre = float(region.offset.distance) * np.array([np.cos(angle), np.sin(angle)])
-    close.add_patch(
-        Circle((centre[0], centre[1]), float(region.radius), color=GREEN, alpha=0.3, linewidth=0)
-    )
+    close.add_patch(Circle((centre[0], centre[1]), float(region.radius), **GOAL))
     close.text(
         centre[0] - float(region.radius) - 20,
         centre[1],
@@ -252,12 +248,13 @@ def draw_rejoin(env: Any, episodes: list[tuple[Any, str]]) -> Figure:
         va="center",
     )
     crash = float(env.constraints[0].minimum)
-    close.add_patch(Circle((0, 0), crash, color=ORANGE, alpha=0.35, linewidth=0))
+    close.add_patch(Circle((0, 0), crash, **FORBIDDEN))
     close.text(0, crash + 20, "crash", color=ORANGE, ha="center")
+    close.plot([-1e4, 0], [0, 0], label="path of the lead", **PATH_BEHIND)
     close.plot([centre[0], 0], [centre[1], 0], color=GREY, linewidth=0.8, linestyle=":")
     close.plot(0, 0, ">", color="black", markersize=8)
     ground.set(aspect="equal", xlabel="x [1000 ft]", ylabel="y [1000 ft]", title="from above")
-    close.legend(loc="upper left", frameon=False, title="outcome")
+    close.legend(loc="lower right", frameon=False)
     close.set(
         aspect="equal",
         xticks=range(-800, 900, 400),
