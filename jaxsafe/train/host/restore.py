@@ -54,6 +54,8 @@ NEWER = (
     "cost_excess",
     "measured",
     "control_effort",
+    "deferred",
+    "deferred_platforms",
 )
 """Arrays that older checkpoints lack, by the last part of their names.
 
