@@ -279,7 +279,10 @@ def test_an_unwritable_output_is_told_in_one_line(
         ),
         (["run=pretrained/x"], "policy: 'pretrained/x' is no .npz file and not pretrained"),
         (["run=x.npz"], "x.npz: cannot be read: No such file or directory"),
-        (["run=runs/x", "render=avi"], "render: found 'avi'; choose from gif, mp4"),
+        (
+            ["run=runs/x", "render=avi"],
+            "render: unknown format 'avi'; choose from gif, mp4, png, jsonl",
+        ),
         (["run=runs/x", "episods=5"], "episods: unknown option. Did you mean 'episodes'?"),
         (
             ["docking3d"],
