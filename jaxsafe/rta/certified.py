@@ -107,6 +107,10 @@ class CertifiedRTA(RTA):
     the literature work, and it serves to compare. Some of them then need no backup controller. What
     they propose acts, and nothing is certified.
 
+    Where a backup controller is `certain` of a state, nothing is predicted. The prediction is made
+    up for as soon as the filter may have to act. So all decisions are those of a filter that
+    predicts every time.
+
     A change of each control by at most `tolerance`, as a share of its range, is no intervention.
 
     A `bound` says how far the true world may be from the one that the filter predicts with. The
