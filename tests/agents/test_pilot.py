@@ -31,6 +31,7 @@ def three(**changes: Any) -> jaxsafe.Environment:
     return jaxsafe.make("rejoin2d", {"platforms": platforms, "lead.controller": controller})
 
 
+@pytest.mark.thorough
 def test_a_policy_flies_the_lead_as_it_flies_in_its_own_task() -> None:
     def coast(key: jax.Array, observation: jax.Array) -> jax.Array:
         return jnp.zeros(2)

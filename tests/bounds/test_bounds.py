@@ -46,7 +46,7 @@ def require_no_flight_beats_the_bounds(env: jaxsafe.Environment, policy: Any, co
     return int(succeeded.sum())
 
 
-@pytest.mark.parametrize("task", one_of_each_kind([*STARTERS, *TASKS]))
+@pytest.mark.parametrize("task", one_of_each_kind([*STARTERS, *TASKS], ["docking2d"]))
 def test_no_flight_beats_the_bounds(task: str) -> None:
     env = jaxsafe.make(task)
     name = next(iter(find_task(task).controllers))

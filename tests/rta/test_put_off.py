@@ -62,7 +62,8 @@ def test_a_prediction_that_is_put_off_would_have_certified(task: str) -> None:
     assert certified[certain].all()
 
 
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.thorough
+@pytest.mark.parametrize("task", ["rejoin2d", "rejoin3d"])
 def test_putting_off_changes_no_decision(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
     env = jaxsafe.make(task, rta="default")
 
