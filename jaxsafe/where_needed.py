@@ -23,7 +23,7 @@ MIN_PER_ROUND = 16
 """The least number of elements that are computed in one round."""
 
 FLAGS_PER_WORD = 32
-"""Number of environments whose flags share a word."""
+"""Number of elements whose flags share a word."""
 
 
 def where_needed(
@@ -88,12 +88,12 @@ def _in_rounds(
         return choose(needed, jax.vmap(function)(elements), none)
     per_round = max(MIN_PER_ROUND, int(size * PER_ROUND))
     flags = pack(needed)
-    tables, rows = _tables(elements)
-    start, _ = _tables(none)
+    tables, as_elements = _tables(elements)
+    start, as_results = _tables(none)
 
     def one_round(index: Array, results: list[Array]) -> list[Array]:
         indices = indices_of(flags, index * per_round + jnp.arange(per_round), size)
-        chosen = rows([table[jnp.minimum(indices, size - 1)] for table in tables])
+        chosen = as_elements([table[jnp.minimum(indices, size - 1)] for table in tables])
         found, _ = _tables(jax.vmap(function)(chosen))
         return [
             table.at[indices].set(new, mode="drop")
@@ -101,8 +101,7 @@ def _in_rounds(
         ]
 
     num_rounds = (flags.ends[-1] + per_round - 1) // per_round
-    _, as_tree = _tables(none)
-    return as_tree(jax.lax.fori_loop(0, num_rounds, one_round, start))
+    return as_results(jax.lax.fori_loop(0, num_rounds, one_round, start))
 
 
 def _tables(tree: Tree) -> tuple[list[Array], Callable[[list[Array]], Tree]]:
@@ -132,7 +131,7 @@ def _tables(tree: Tree) -> tuple[list[Array], Callable[[list[Array]], Tree]]:
 
 
 def choose(where: Array, fresh: Tree, old: Tree, axis: Literal[0, -1] = 0) -> Tree:
-    """Return a batch with the environments of `fresh` where `where` holds, and else those of `old`.
+    """Return a batch with the elements of `fresh` where `where` holds, and else those of `old`.
 
     The axes of `where` are the leading axes of all leaves, or the last axis with `axis=-1`.
     """
@@ -145,9 +144,9 @@ def choose(where: Array, fresh: Tree, old: Tree, axis: Literal[0, -1] = 0) -> Tr
 
 
 class Flags(NamedTuple):
-    """The flags of all environments, `FLAGS_PER_WORD` to a word.
+    """The flags of all elements of a batch, `FLAGS_PER_WORD` to a word.
 
-    Bit *b* of word *w* is the flag of environment *w* + *b* × (number of words).
+    Bit *b* of word *w* is the flag of element *w* + *b* × (number of words).
     """
 
     words: UInt32[Array, " words"]
@@ -172,13 +171,13 @@ def pack(where: Bool[Array, " n"]) -> Flags:
 
 
 def indices_of(flags: Flags, rank: Int[Array, " k"], size: int) -> Int[Array, " k"]:
-    """Return the indices of environments whose flag is set, given their ranks among these.
+    """Return the indices of elements whose flag is set, given their ranks among these.
 
     Args:
         flags: the flags of the batch.
-        rank: 0 for the first environment whose flag is set, 1 for the second, and so on.
+        rank: 0 for the first element whose flag is set, 1 for the second, and so on.
         size: size of the batch. It is returned for ranks beyond the last, because it is the index
-            of no environment.
+            of no element.
     """
     num_words = flags.ends.shape[0]
     word = jnp.searchsorted(flags.ends, rank, side="right", method="scan_unrolled")
