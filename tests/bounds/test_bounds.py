@@ -60,7 +60,7 @@ def test_no_flight_beats_the_bounds(task: str) -> None:
 @pytest.mark.parametrize("task", TASKS)
 def test_packaged_policies_do_not_beat_the_bounds(task: str, variant: Any) -> None:
     env = jaxsafe.make(task, variant=variant)
-    require_no_flight_beats_the_bounds(env, jaxsafe.load_policy(task, env=env), 1000)
+    require_no_flight_beats_the_bounds(env, jaxsafe.load_policy(task, env=env), 200)
 
 
 def on_a_line(positions: list[float], velocities: list[float]) -> State:

@@ -41,9 +41,12 @@ def test_the_notebook_reads_the_log_of_a_run(
 
 
 def shapes(outputs: list[Any]) -> list[str]:
-    """Return the outputs that are tuples of shapes."""
+    """Return the outputs that are tuples of shapes. Lengths of episodes are left out.
+
+    What is learnt depends on how sums are rounded, and that on the processor.
+    """
     texts = [output.get("data", {}).get("text/plain", "") for output in outputs]
-    return [text for text in texts if text.startswith("((")]
+    return [re.sub(r"\d{3,}", "…", text) for text in texts if text.startswith("((")]
 
 
 def test_tutorials_show_what_their_code_returns() -> None:

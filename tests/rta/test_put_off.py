@@ -62,8 +62,9 @@ def test_a_prediction_that_is_put_off_would_have_certified(task: str) -> None:
     assert certified[certain].all()
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("task", ["rejoin2d", "rejoin3d"])
+@pytest.mark.parametrize(
+    "task", [thorough("rejoin2d"), pytest.param("rejoin3d", marks=pytest.mark.slow)]
+)
 def test_putting_off_changes_no_decision(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
     env = jaxsafe.make(task, rta="default")
 
