@@ -12,12 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxsafe.autoreset import renew
+from jaxsafe.autoreset import choose, renew
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment, reset, step
 from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.types import Key, Record, State, TimeStep, Transition, require_key
-from jaxsafe.where_needed import choose
 
 Policy = Callable[[Key, Array], Array]
 """`policy(key, observation)` returns an action. Both are batched if the environments are."""

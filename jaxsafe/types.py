@@ -332,9 +332,7 @@ class RTAInfo(Record):
     certified: Bool[Array, ""]  # whether the control that acts is known to be safe
     # Smallest h that is predicted after the step, and for separations also within the step.
     predicted_margin: Float[Array, ""]
-    # Index of the backup controller in reserve. It is −1 far from all limits, where any of some
-    # would do and none has been chosen yet.
-    backup_index: Int[Array, ""]
+    backup_index: Int[Array, ""]  # index of the backup controller in reserve
     # Index into `env.rta.constraints` of the constraint for which the control was changed, or −1 if
     # it was not changed.
     constraint: Int[Array, ""] = dataclasses.field(

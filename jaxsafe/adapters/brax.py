@@ -17,10 +17,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from jaxsafe.adapters import checked_count, environment
+from jaxsafe.autoreset import choose
 from jaxsafe.environment import Environment, action_bounds, reset, step
 from jaxsafe.schema.errors import ConfigError, missing
 from jaxsafe.types import Key, TimeStep
-from jaxsafe.where_needed import choose
 
 try:
     from brax.envs.base import Env, State, Wrapper

@@ -16,9 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxsafe.autoreset import choose
 from jaxsafe.schema.component import Component, Range
 from jaxsafe.types import Key
-from jaxsafe.where_needed import choose
 
 if TYPE_CHECKING:
     from flax import linen

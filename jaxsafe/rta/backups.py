@@ -15,7 +15,6 @@ from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.certificate import BackupController, Faults, TerminalSet
 from jaxsafe.rta.certified import CertifiedRTA
 from jaxsafe.rta.formation import in_formation
-from jaxsafe.rta.matching import authority, flies_straight, in_plane, in_space
 from jaxsafe.rta.projection import project_box_ball
 from jaxsafe.rta.proofs import (
     Aircraft,
@@ -50,12 +49,6 @@ if TYPE_CHECKING:
 
 LOST = 1e6
 """Radius [ft] of a tube of which nothing is known."""
-
-BOUND_RESERVE = 1.1
-"""Factor of a bound that takes the place of a prediction."""
-
-ROUNDED = 5.0
-"""What such a bound leaves for rounding [ft]."""
 
 ROUNDING = 1e-4
 """Error [rad] of headings in single precision, with a large reserve."""
@@ -256,20 +249,17 @@ class MatchVelocity(BackupController, type="match_velocity"):
         faster = jnp.sum(away * lead.velocity) / lead.speed
         goal = lead_after.heading if self.climb is None else lead.heading
         goal += (lead.velocity[0] * away[1] - lead.velocity[1] * away[0]) / level_squared
-        return away, faster, level_squared, self._turn(goal - own.heading)
-
-    def _turn(self, angle: Array) -> Any:
-        """Return the turn of this controller for a difference of headings [rad]."""
-        return self._sign * wrap(self._sign * angle, -self.dead_zone, 2.0 * jnp.pi)
+        error = self._sign * wrap(self._sign * (goal - own.heading), -self.dead_zone, 2.0 * jnp.pi)
+        return away, faster, level_squared, error
 
     def duration(self, env: Environment) -> Number:
         """Return the time [s] of a full turn and, in space, of the roll that begins it."""
         if self.climb is None:
-            return (2.0 * jnp.pi - self.dead_zone) / authority(env, "heading_rate") + 2.0 * env.dt
+            return (2.0 * jnp.pi - self.dead_zone) / _authority(env, "heading_rate") + 2.0 * env.dt
         plant = cast(Dubins3D, env.agent_platform)
         bank = jnp.minimum(-plant.roll_limits[0], plant.roll_limits[1])
         turn = 2.0 * jnp.pi * plant.speed_limits[1] / (plant.gravity * jnp.tan(bank))
-        return turn + bank / authority(env, "roll_rate")
+        return turn + bank / _authority(env, "roll_rate")
 
     def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
         if rta.terminal is None:
@@ -278,36 +268,6 @@ class MatchVelocity(BackupController, type="match_velocity"):
             )
             return {fault: jnp.ones((), bool)}
         return {}
-
-    def certain(
-        self, env: Environment, sim: Sim, rta: CertifiedRTA, least: Number, margin: Number
-    ) -> Bool[Array, ""] | None:
-        terminal = rta.terminal
-        plant = env.agent_platform
-        matches = type(terminal) is VelocityMatched and type(plant) in (Dubins2D, Dubins3D)
-        if not matches or sim.actuators or sim.remembered:
-            return None
-        terminal = cast(VelocityMatched, terminal)
-        own = sim.platforms[env.agent]
-        lead = sim.platforms[self.lead]
-        holds = flies_straight(env, self.lead, lead)
-        error = self._turn(lead.heading - own.heading)
-        if self.climb is None:
-            manoeuvre = in_plane(env, own, lead, error)
-        else:
-            manoeuvre = in_space(env, own, lead, error, side=self._sign, dead_zone=self.dead_zone)
-            holds &= jnp.abs(env.dt - 1.0) <= 1e-3
-        drift = BOUND_RESERVE * manoeuvre.drift + ROUNDED
-        kept = jnp.maximum(self.clearance, terminal.clearance)
-        kept += terminal.drift * terminal.tolerance
-        distance = safe_norm(own.position - lead.position)
-        return (
-            holds
-            & manoeuvre.possible
-            & (manoeuvre.duration <= rta.horizon * env.dt)
-            & (least - drift >= margin)
-            & (distance - drift >= kept)
-        )
 
     @property
     def has_tubes(self) -> bool:
@@ -484,9 +444,9 @@ class VelocityMatched(TerminalSet, type="velocity_matched"):
         allowed = [
             0.02 * slowest,
             0.13 * plant.gravity,
-            authority(env, "acceleration") * dt,
-            0.98 * authority(env, "flight_path_angle_rate") * dt * slowest,
-            authority(env, "roll_rate") * dt * plant.gravity / 1.07,
+            _authority(env, "acceleration") * dt,
+            0.98 * _authority(env, "flight_path_angle_rate") * dt * slowest,
+            _authority(env, "roll_rate") * dt * plant.gravity / 1.07,
         ]
         return functools.reduce(jnp.minimum, allowed, self.tolerance)
 
@@ -535,3 +495,14 @@ def misalignment(state: Any) -> Float[Array, ""]:
 def _safe_sqrt(x: Array) -> Array:
     positive = x > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
+
+
+def _authority(env: Environment, name: str) -> Any:
+    """Return the largest value that a control can take in both directions.
+
+    It is 0 without such an actuator.
+    """
+    actuators = {actuator.name: actuator for actuator in env.actuators}
+    if name not in actuators:
+        return jnp.zeros_like(env.dt)
+    return jnp.maximum(jnp.minimum(-actuators[name].low, actuators[name].high), 0.0)

@@ -80,23 +80,6 @@ class BackupController(Component):
         """
         return {}
 
-    def certain(
-        self, env: Environment, sim: Sim, rta: CertifiedRTA, least: Number, margin: Number
-    ) -> Bool[Array, ""] | None:
-        """Return whether the flight from a state is certified whatever a prediction would say.
-
-        A filter predicts only where this does not hold. None stands for a controller that cannot
-        tell.
-
-        Args:
-            env: the environment, with the numbers of this episode.
-            sim: the simulation from which the controller acts.
-            rta: the filter that asks.
-            least: the smallest h at `sim`.
-            margin: the h that the flight must keep.
-        """
-        return None
-
     def duration(self, env: Environment) -> Number:
         """Return the longest time [s] to the terminal set, 0 where that is not known."""
         return jnp.zeros_like(env.dt)

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.rta.bound import UncertaintyBound
@@ -22,7 +21,6 @@ from jaxsafe.rta.delay import ahead_of_delay
 from jaxsafe.rta.filter import (
     NO_CONSTRAINT,
     RTA,
-    Deferral,
     RTAMemory,
     UnderWay,
     admissible,
@@ -45,19 +43,12 @@ from jaxsafe.transition import (
     remember,
 )
 from jaxsafe.types import ConstraintName, Number, Record, RTAInfo, Sim
-from jaxsafe.where_needed import where_needed
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
 
 Margin = Annotated[Number, Unit("the unit of the constraint"), Range(0.0)]
 """A value of h, in the unit of the constraint."""
-
-Flight = tuple[Bool[Array, ""], Sim, Sim, tuple[Any, ...]]
-"""Whether a prediction is needed, and what it starts from.
-
-That is the simulations before and at the state, and what the backup controllers remember.
-"""
 
 Proposal = (
     tuple[Float[Array, " m"], Bool[Array, ""]]
@@ -107,10 +98,6 @@ class CertifiedRTA(RTA):
     the literature work, and it serves to compare. Some of them then need no backup controller. What
     they propose acts, and nothing is certified.
 
-    Where a backup controller is `certain` of a state, nothing is predicted. The prediction is made
-    up for as soon as the filter may have to act. So all decisions are those of a filter that
-    predicts every time.
-
     A change of each control by at most `tolerance`, as a share of its range, is no intervention.
 
     A `bound` says how far the true world may be from the one that the filter predicts with. The
@@ -129,11 +116,6 @@ class CertifiedRTA(RTA):
     tolerance: Annotated[Number, Unit("1"), Range(0.0)] = 0.0
     bound: UncertaintyBound | None = None
 
-    looks_at_backup: ClassVar[bool] = True
-    """Whether what the filter proposes depends on the backup control.
-
-    If it does not, a prediction that the decision does not need is put off.
-    """
     backup_optional: ClassVar[bool] = False
     """Whether what the filter proposes may act by itself, without any backup controller."""
 
@@ -268,30 +250,24 @@ class CertifiedRTA(RTA):
             memory, info = undelayed.begin(env, predicted)
             memory = memory.replace(under_way=UnderWay(controls=controls, certified=certified))
             return memory, info.replace(certified=start_info.certified & jnp.all(certified))
-        certain = self._certain(env, sim, sim, margin=self.margin_to_certify(env))
-        if certain is None:
-            paths = self.follow(env, sim, sim)
-        else:
-            (paths,) = self._follow_where(env, [(~certain, sim, sim, self._fresh(env, sim))])
+        paths = self.follow(env, sim, sim)
         best = self._best(env, paths)
-        certified = paths.values[best] >= self.margin_to_certify(env)
         memory = RTAMemory(
             intervening=jnp.zeros((), bool),
             backup_index=best,
-            certified=certified if certain is None else certified | certain,
+            certified=paths.values[best] >= self.margin_to_certify(env),
             ahead=_selected(paths.ahead, best),
             actuators_ahead=_selected(paths.actuators_ahead, best),
             backups=self._fresh(env, sim),
             backups_ahead=paths.memories_ahead,
             remembered_ahead=_selected(paths.remembered_ahead, best),
-            deferral=() if certain is None else _deferral(certain, sim, sim),
         )
         info = RTAInfo(
             correction=jnp.zeros_like(sim.time),
             feasible=jnp.ones((), bool),
             certified=memory.certified,
             predicted_margin=self.lowest(env, sim, sim),
-            backup_index=_known(best, certain),
+            backup_index=best,
             constraint=NO_CONSTRAINT(),
         )
         return memory, info
@@ -335,29 +311,16 @@ class CertifiedRTA(RTA):
         memories_if_backed_up = self._memories_after(
             env, after_backup, index=memory.backup_index, moved=moved
         )
-        next_sim = _where(certified_before, after_proposal, after_backup)
-        next_memories = _where(certified_before, memories_if_passed, memories_if_backed_up)
-        to_pass = self.margin_to_certify(env, proposal)
-        to_pass += jnp.where(memory.intervening, self.release, 0.0)
-        certain = self._certain(env, sim, after_proposal, margin=to_pass)
-        if certain is None:
-            paths = self.follow(env, sim, next_sim, memories=next_memories)
-        else:
-            certain &= finite & certified_before & ~self._unfinished(env, sim, memory)
-            ahead = (~certain, sim, next_sim, next_memories)
-            memory, paths = self._predict_where_needed(env, sim, memory, ahead)
-            backup, moved = self._backup(
-                env, sim, index=memory.backup_index, memories=memory.backups, later=later
-            )
-            after_backup = advance(env, sim, backup, later=later)
-            memories_if_backed_up = self._memories_after(
-                env, after_backup, index=memory.backup_index, moved=moved
-            )
+        paths = self.follow(
+            env,
+            sim,
+            _where(certified_before, after_proposal, after_backup),
+            memories=_where(certified_before, memories_if_passed, memories_if_backed_up),
+        )
         best = self._best(env, paths)
-        safe = paths.values[best] >= to_pass
-        if certain is not None:
-            safe |= certain
+        to_pass = self.margin_to_certify(env, proposal)
         to_back_up = self.margin_to_certify(env, backup)
+        safe = paths.values[best] >= to_pass + jnp.where(memory.intervening, self.release, 0.0)
         passes = finite & certified_before & (safe if self.enforce else feasible)
         passes = passes & ~self._unfinished(env, sim, memory)
 
@@ -402,7 +365,6 @@ class CertifiedRTA(RTA):
             backups=_where(passes, memories_if_passed, memories_if_backed_up),
             backups_ahead=memories_ahead,
             remembered_ahead=remembered_ahead,
-            deferral=() if certain is None else _deferral(certain, sim, after_proposal),
         )
         info = RTAInfo(
             correction=safe_norm(correction),
@@ -411,74 +373,10 @@ class CertifiedRTA(RTA):
             predicted_margin=jnp.where(
                 passes, self.lowest(env, sim, after_proposal), backup_margin
             ),
-            backup_index=_known(memory.backup_index, certain),
+            backup_index=memory.backup_index,
             constraint=jnp.where(intervening & finite, cause, NO_CONSTRAINT()),
         )
         return actual, memory, info
-
-    def _certain(
-        self, env: Environment, before: Sim, sim: Sim, margin: Number
-    ) -> Bool[Array, ""] | None:
-        """Return whether a state is certified whatever a prediction would say.
-
-        It is None, and every certificate is predicted, if no backup controller can tell.
-
-        Args:
-            env: the environment, with the numbers of this episode.
-            before: the simulation one step before `sim`.
-            sim: the simulation at the state.
-            margin: the h that must be kept.
-        """
-        if self.looks_at_backup or not (self.enforce and self.terminal) or self.bound is not None:
-            return None
-        least = jnp.min(self.compared(env, self.margins(env, before, sim)))
-        found = []
-        for backup in self.backups:
-            certain = backup.certain(env, sim, self, least=least, margin=margin)
-            if certain is not None:
-                found.append(certain & _none(backup.faults(env, sim, self)))
-        if not found:
-            return None
-        faultless = _none(self.terminal.faults(env, sim, self)) & _finite(sim)
-        return jax.lax.stop_gradient(functools.reduce(jnp.logical_or, found) & faultless)
-
-    def _predict_where_needed(
-        self, env: Environment, sim: Sim, memory: RTAMemory, ahead: Flight
-    ) -> tuple[RTAMemory, Paths]:
-        """Return the memory with its certificate predicted, and a prediction of what comes next.
-
-        Both are predicted only where the latter is needed. The former has been before, unless it
-        was put off.
-
-        Args:
-            env: the environment, with the numbers of this episode.
-            sim: the simulation before the step.
-            memory: the memory before the step.
-            ahead: the flight to predict.
-        """
-        deferral = memory.deferral
-        assert isinstance(deferral, Deferral)
-        earlier, now = _platforms_of(deferral, sim)
-        put_off = ahead[0] & deferral.deferred
-        flights = [(put_off, earlier, now, self._fresh(env, now)), ahead]
-        late, paths = self._follow_where(env, flights)
-        best = self._best(env, late)
-        memory = memory.replace(
-            backup_index=jnp.where(put_off, best, memory.backup_index),
-            ahead=_where(put_off, _selected(late.ahead, best), memory.ahead),
-            backups_ahead=_where(put_off, late.memories_ahead, memory.backups_ahead),
-        )
-        return memory, paths
-
-    def _follow_where(self, env: Environment, flights: Sequence[Flight]) -> list[Paths]:
-        """Return the predicted ways of some flights. Those that nobody needs prove nothing."""
-        bare = [
-            (needed, *(sim.replace(regions={}, status={}) for sim in (before, now)), memories)
-            for needed, before, now, memories in flights
-        ]
-        needed, *starts = jax.tree.map(lambda *leaves: jnp.stack(leaves), *bare)
-        paths = where_needed(needed, _follow, (self, env), tuple(starts))
-        return [jax.tree.map(lambda leaf, i=i: leaf[i], paths) for i in range(len(flights))]
 
     def lowest(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, ""]:
         """Return the smallest h of the constraints at `sim`.
@@ -790,25 +688,3 @@ def _where(condition: Bool[Array, ""], this: Any, other: Any) -> Any:
 
 def _selected(ahead: Any, index: Int[Array, ""]) -> Any:
     return jax.lax.stop_gradient(jax.tree.map(lambda leaf: leaf[index], ahead))
-
-
-def _known(index: Int[Array, ""], certain: Bool[Array, ""] | None) -> Int[Array, ""]:
-    """Return the index of a backup controller, or −1 where its prediction was put off."""
-    return index if certain is None else jnp.where(certain, -1, index)
-
-
-def _follow(shared: tuple[CertifiedRTA, Environment], start: tuple[Any, ...]) -> Paths:
-    rta, env = shared
-    return rta.follow(env, *start)
-
-
-def _deferral(certain: Bool[Array, ""], before: Sim, sim: Sim) -> Deferral:
-    numbers = ravel_pytree((before.platforms, sim.platforms))[0]
-    return Deferral(deferred=certain, deferred_platforms=jax.lax.stop_gradient(numbers))
-
-
-def _platforms_of(deferral: Deferral, sim: Sim) -> tuple[Sim, Sim]:
-    """Return the simulations before and at the state of a certificate that was put off."""
-    _, restore = ravel_pytree((sim.platforms, sim.platforms))
-    before, now = restore(deferral.deferred_platforms)
-    return sim.replace(platforms=before), sim.replace(platforms=now)

@@ -71,14 +71,6 @@ class UnderWay(Record):
     certified: Bool[Array, " delay"]  # whether the state after each is known to be safe
 
 
-class Deferral(Record):
-    """A certificate that is certain, so that its prediction is put off until it is needed."""
-
-    deferred: Bool[Array, ""]  # whether the last certificate has not been predicted
-    # All numbers of the platforms at the state that the certificate is about and one step before.
-    deferred_platforms: Float[Array, " numbers"]
-
-
 class RTAMemory(Record):
     """Memory of a filter."""
 
@@ -92,7 +84,6 @@ class RTAMemory(Record):
     backups: tuple[Any, ...] = ()  # what each backup controller remembers
     backups_ahead: tuple[Any, ...] = ()  # the same at the end of the horizon
     under_way: UnderWay | tuple[()] = ()  # empty without a delay
-    deferral: Deferral | tuple[()] = ()  # empty if every certificate is predicted at once
 
 
 def admissible(

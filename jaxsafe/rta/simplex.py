@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import jax
 import jax.numpy as jnp
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 
 class Simplex(CertifiedRTA, type="simplex"):
     """The desired control if it is certified, else the backup control, Eq. (1)."""
-
-    looks_at_backup: ClassVar[bool] = False
 
     def propose(
         self, env: Environment, sim: Sim, desired: Float[Array, " m"], backup: Float[Array, " m"]

@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.agents.agent import Agent, Sequences
 from jaxsafe.agents.networks import Memory, Params, unroll
+from jaxsafe.autoreset import choose
 from jaxsafe.config import override
 from jaxsafe.devices.backend import accelerated, packing, scan_packed
 from jaxsafe.devices.shard import WHOLE, Shard
@@ -39,7 +40,6 @@ from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.train.recent_episodes import Window, empty_window, latest_cost, push
 from jaxsafe.train.shuffle import shuffle
 from jaxsafe.types import Dimensionless, Key, Number, Positive, Record, State, TimeStep
-from jaxsafe.where_needed import choose
 
 Share = Range(0.0, 1.0)
 """Range of a number from 0 to 1."""

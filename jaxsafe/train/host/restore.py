@@ -54,8 +54,6 @@ NEWER = (
     "cost_excess",
     "measured",
     "control_effort",
-    "deferred",
-    "deferred_platforms",
 )
 """Arrays that older checkpoints lack, by the last part of their names.
 

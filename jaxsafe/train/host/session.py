@@ -19,6 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsafe.autoreset import choose
 from jaxsafe.devices import memory, processes
 from jaxsafe.devices.background_compile import CompiledInBackground, without_collection
 from jaxsafe.devices.processes import in_main_thread
@@ -35,7 +36,6 @@ from jaxsafe.train.host.options import TrainConfig, flatten
 from jaxsafe.train.host.restore import made_from, restore, start_params, structure
 from jaxsafe.train.host.sinks import Sink, open_sinks
 from jaxsafe.train.train import STATE, programs
-from jaxsafe.where_needed import choose
 
 
 class Clock:
