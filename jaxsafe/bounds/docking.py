@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from typing import Any, NamedTuple
 
 import jax
@@ -100,10 +101,8 @@ class _Task(NamedTuple):
         known = (
             type(plant) in PLANTS
             and [type(item) for item in env.platforms if item is not plant] == [Anchor]
-            and set(rewards) == set(REWARDS)
-            and len(env.reward) == len(REWARDS)
-            and {type(condition) for condition in env.terminal} == set(ENDS)
-            and len(env.terminal) == len(ENDS)
+            and Counter(map(type, env.reward)) == Counter(REWARDS)
+            and Counter(map(type, env.terminal)) == Counter(ENDS)
             and len(env.regions) == 1
             and len(limits) == 1
             and last is not None
