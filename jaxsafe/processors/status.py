@@ -60,6 +60,13 @@ class Status(Processor):
         """
         return self.process(self.init(sim), sim)
 
+    def vectors(self) -> tuple[tuple[str, str], ...]:
+        """Return the vectors of which this status is a norm, as places and fields.
+
+        If one of their numbers is NaN, so is the status.
+        """
+        return ()
+
 
 class Distance(Status, type="distance"):
     """Distance ‖r_of − r_to‖ between two platforms or centres of regions."""
@@ -69,6 +76,9 @@ class Distance(Status, type="distance"):
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
         return safe_norm(_apart(sim, self.of, self.to))
+
+    def vectors(self) -> tuple[tuple[str, str], ...]:
+        return (self.of, "position"), (self.to, "position")
 
     def on_the_way(self, env: Environment, before: Sim, sim: Sim) -> Float[Array, ""]:
         return _nearest(env, before, sim, self.of, self.to)
@@ -164,6 +174,10 @@ class Speed(Status, type="speed"):
 
     def process(self, memory: Any, sim: Sim) -> Float[Array, ""]:
         return safe_norm(place(sim, self.of).velocity)
+
+    def vectors(self) -> tuple[tuple[str, str], ...]:
+        # The thrust's change of velocity is part of the velocity.
+        return (self.of, "velocity"), (self.of, "delta_v")
 
 
 class VelocityLimit(Status, type="velocity_limit"):
