@@ -157,7 +157,7 @@ def main() -> None:
     until = time.monotonic() + 60.0 * float(options["minutes"])
     options["sizes"] = options["sizes"] or sizes_here().environments
     content: dict[str, Any] = {
-        **about(),
+        **about(__file__),
         "platform": jax.default_backend(),
         "minutes": float(options["minutes"]),
         "parts": {},

@@ -56,7 +56,7 @@ def main() -> None:
     task = options["task"]
     repeats = int(options["repeats"])
     numbers = [int(number) for number in options["envs"].split(",")]
-    here = about()
+    here = about(__file__)
     results = [
         {"envs": number, **measure(peers(task, number), number, repeats)} for number in numbers
     ]

@@ -17,13 +17,13 @@ from typing import Any
 import jax
 import numpy as np
 from isolated import several, words
+from machine import about
 from tables import controllers, controllers_filtered
 
 import jaxsafe
 from jaxsafe.bounds import best_possible
 from jaxsafe.envs import STARTERS, TASKS, find_task
 from jaxsafe.rollout import reset_batch
-from jaxsafe.storage import provenance
 from jaxsafe.storage.files import write_json
 
 OUT = Path(__file__).parent / "results" / "controllers.json"
@@ -83,8 +83,7 @@ def main() -> None:
     results = {
         "command": f"python benchmarks/controllers.py {' '.join(sys.argv[1:])}".strip(),
         "episodes": episodes,
-        "commit": provenance.commit(),
-        "versions": provenance.versions(),
+        **about(__file__),
         "bounds": {task: bounds(task, episodes) for task in tasks},
         "rows": rows,
     }

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from isolated import several, words
+from machine import about
 
 from jaxsafe.dataset import load_dataset
 from jaxsafe.envs import TASKS
-from jaxsafe.storage import provenance
 from jaxsafe.storage.files import write_json
 
 OUT = Path(__file__).parent / "results" / "datasets.json"
@@ -46,8 +46,7 @@ def main() -> None:
         {
             "command": f"python benchmarks/datasets.py tasks={','.join(tasks)} steps={steps}",
             "steps": steps,
-            "commit": provenance.commit(),
-            "versions": provenance.versions(),
+            **about(__file__),
             "rows": [measure(task, kind, steps) for task in tasks for kind in KINDS],
         },
     )

@@ -84,7 +84,7 @@ def main() -> None:
     import tables
     from machine import about
 
-    here = about()
+    here = about(__file__)
     request = [f"{name}={size}" for name, size in sizes.items()]
     runs = []
     for name in names:

@@ -71,7 +71,7 @@ def main() -> None:
     import tables
     from machine import about
 
-    here = about()
+    here = about(__file__)
     python = {
         library: interpreter(library) for library in {name.partition(":")[0] for name in names}
     }

@@ -41,7 +41,7 @@ def main() -> None:
     import tables
     from machine import about
 
-    here = about()
+    here = about(__file__)
     arguments = [f"{name}={options[name]}" for name in ("preset", "seeds", "seed")]
     runs = []
     for _ in range(int(options["repeats"])):

@@ -40,7 +40,7 @@ def main() -> None:
 
     from jaxsafe.envs import TASKS
 
-    here = about()
+    here = about(__file__)
     tasks = several("tasks", options["tasks"], TASKS)
     rows = [
         {

@@ -9,21 +9,26 @@ from pathlib import Path
 from typing import Any
 
 import jax
+from fingerprint import fingerprint
 
 from jaxsafe.devices.seed_mapper import usable_cores
 from jaxsafe.storage.provenance import processor
 
 
-def about() -> dict[str, Any]:
-    """Return commit, versions, device and the number of cores that may be used.
+def about(script: str) -> dict[str, Any]:
+    """Return commit, sources, versions, device and the number of cores that may be used.
 
     Call this before measuring, so that the commit is the one whose code is measured.
+
+    Args:
+        script: the path of the script that measures. `sources` is its `fingerprint`.
     """
     return {
         "commit": _git("rev-parse", "HEAD"),
         "changed": bool(
             _git("status", "--porcelain", "--", "jaxsafe", "benchmarks/*.py", "configs")
         ),
+        "sources": fingerprint(Path(script)),
         "python": platform.python_version(),
         "jax": jax.__version__,
         "jaxlib": version("jaxlib"),

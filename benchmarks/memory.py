@@ -35,7 +35,7 @@ def main() -> None:
     if "probe" in options:
         print(json.dumps(probe(options["probe"], int(options["num_envs"]))))
         return
-    here = about()
+    here = about(__file__)
     tasks = several("tasks", options["tasks"], TASKS)
     sizes = [int(size) for size in options["num_envs"].split(",")]
     rows = []

@@ -26,6 +26,7 @@ import numpy as np
 import optax
 from isolated import several, words
 from jaxtyping import Array, Float
+from machine import about
 from tables import possible
 
 import jaxsafe
@@ -35,7 +36,6 @@ from jaxsafe.envs import STARTERS, TASKS, find_task
 from jaxsafe.envs.rejoin import HOLD
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.rollout import reset_batch
-from jaxsafe.storage import provenance
 from jaxsafe.storage.files import write_json
 from jaxsafe.types import State, TimeStep
 
@@ -353,8 +353,7 @@ def main() -> None:
         "command": f"python benchmarks/possible.py {' '.join(sys.argv[1:])}".strip(),
         "starts": starts,
         "rounds": int(options["rounds"]),
-        "commit": provenance.commit(),
-        "versions": provenance.versions(),
+        **about(__file__),
         "rows": [measure(task, starts, int(options["rounds"])) for task in tasks],
     }
     write_json(OUT, results)

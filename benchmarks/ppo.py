@@ -59,7 +59,7 @@ def main() -> None:
 
     from jaxsafe.devices.seed_mapper import usable_cores
 
-    here = about()
+    here = about(__file__)
     peers = several("peers", options["peers"], PEERS)
     python = {name: interpreter(name) for name in PROBES if name in peers}
     cores = [1, usable_cores()]

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from isolated import words
+from machine import about
 from matplotlib.figure import Figure
 from tables import robustness
 
@@ -31,7 +32,6 @@ from jaxsafe.environment import Environment
 from jaxsafe.evaluate.bounded_worlds import world_at
 from jaxsafe.evaluate.run_adversaries import attack
 from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, save, styled
-from jaxsafe.storage import provenance
 from jaxsafe.storage.files import write_json
 from jaxsafe.transition import bounds
 
@@ -145,8 +145,7 @@ def main() -> None:
     results = {
         "command": f"python benchmarks/robustness.py {' '.join(sys.argv[1:])}".strip(),
         "bound": BOUND,
-        "commit": provenance.commit(),
-        "versions": provenance.versions(),
+        **about(__file__),
         "rows": rows,
     }
     write_json(OUT, results)

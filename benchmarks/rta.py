@@ -61,7 +61,7 @@ def main() -> None:
     chosen = several("parts", options["parts"], parts)
     content = json.loads(OUT.read_text()) if OUT.exists() else {}
     for name in chosen:
-        here = about()
+        here = about(__file__)
         rows = parts[name](repeats)
         content[name] = {**here, "rows": rows}
         print(

@@ -55,7 +55,7 @@ def main() -> None:
 
     from jaxsafe.devices.seed_mapper import usable_cores
 
-    here = about()
+    here = about(__file__)
     cores = 1 << (usable_cores().bit_length() - 1)
     if cores == 1:
         sys.exit("scaling.py: expected two cores or more, found one")

@@ -58,7 +58,7 @@ def main() -> None:
 
     tasks = several("tasks", options["tasks"] or ",".join(TASKS), TASKS)
     chosen = [(task, rta) for rta in options["rta"].split(",") for task in tasks]
-    here = about()
+    here = about(__file__)
     repeats = int(options["repeats"])
     rows = [measured(name, rta, repeats) for name, rta in chosen]
     rows.append(measured("Pendulum-v1", "gymnax", repeats, interpreter("gymnax")))

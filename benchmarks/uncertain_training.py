@@ -108,8 +108,8 @@ def main() -> None:
         counts = (int(options["seeds"]), int(options["episodes"]))
         rows = [row for task in tasks for row in measure(task, place, *counts)]
     import tables
+    from machine import about
 
-    from jaxsafe.storage import provenance
     from jaxsafe.storage.files import write_json
 
     results = {
@@ -118,8 +118,7 @@ def main() -> None:
         "bounds": {task: BOUNDS[task] for task in tasks},
         "seeds": counts[0],
         "episodes": counts[1],
-        "commit": provenance.commit(),
-        "versions": provenance.versions(),
+        **about(__file__),
         "rows": rows,
     }
     write_json(OUT, results)

@@ -22,13 +22,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from isolated import several, words
+from machine import about
 
 import jaxsafe
 from jaxsafe.agents.imported_policy import read_foreign
 from jaxsafe.agents.policy_file import find_policy, read_policy
-from jaxsafe.devices.seed_mapper import usable_cores
 from jaxsafe.envs.docking import DOCKING_RADIUS
-from jaxsafe.storage import provenance
 from jaxsafe.storage.files import read_json, write_json
 from jaxsafe.verify import check
 from jaxsafe.verify.certificate import save_certificate
@@ -136,8 +135,7 @@ def measure(case: Mapping[str, Any], published: str) -> dict[str, Any]:
         "margin": proof.margin if len(proof.proved.low) else None,
         "violation": proof.counterexample and proof.counterexample._asdict(),
         "check_seconds": _checked(proof) if proof.result == "proved" else None,
-        "commit": provenance.commit(),
-        "processor": provenance.versions()["processor"],
+        **about(__file__),
     }
 
 
@@ -159,8 +157,7 @@ def main() -> None:
             rows[name] = measure(CASES[name], options["published"])
         print(json.dumps(rows.get(name) or tubes[name]), flush=True)
         content = {
-            "versions": provenance.versions(),
-            "cores": usable_cores(),
+            **about(__file__),
             "rows": {name: rows[name] for name in CASES if name in rows},
             "tubes": {name: tubes[name] for name in TUBES if name in tubes},
         }

@@ -1,0 +1,162 @@
+"""A result says on which sources and machine it depends, and machines are not mixed."""
+
+import importlib
+import json
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+HERE = {
+    "processor": "a processor",
+    "cores": 2,
+    "python": "3.11.7",
+    "jax": "1",
+    "jaxlib": "1",
+    "sources": "abc",
+    "changed": False,
+}
+
+
+@pytest.fixture
+def fingerprint(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return importlib.import_module("fingerprint")
+
+
+@pytest.fixture
+def everything(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> ModuleType:
+    """`all.py`, with two scripts whose results are current."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    module = importlib.import_module("all")
+    monkeypatch.setattr(module, "RESULTS", tmp_path)
+    monkeypatch.setattr(module, "SCRIPTS", {"first": (), "second": ("repeats=2",)})
+    monkeypatch.setattr(module, "about", lambda script: HERE)
+    for name in ("first", "second"):
+        write(tmp_path / f"{name}.json", HERE)
+    return module
+
+
+def write(path: Path, entry: dict[str, Any]) -> None:
+    path.write_text(json.dumps({"rows": [{"part": entry}]}))
+
+
+def run(module: ModuleType, monkeypatch: pytest.MonkeyPatch, *given: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["all.py", *given])
+    return module.main()
+
+
+def test_texts_do_not_count_and_code_that_is_needed_does(
+    fingerprint: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    files = {
+        "benchmarks/script.py": '"""Text."""\nimport jaxsafe\n\njaxsafe.make(1)\n',
+        "jaxsafe/__init__.py": "from jaxsafe.a import make\nfrom jaxsafe.b import fly\n",
+        "jaxsafe/a.py": "import jaxsafe.c\n\ndef make(x):\n    import jaxsafe.later\n",
+        "jaxsafe/b.py": "fly = 1\n",
+        "jaxsafe/c.py": "if TYPE_CHECKING:\n    import jaxsafe.d\n",
+        "jaxsafe/d.py": "hint = 1\n",
+        "jaxsafe/later.py": "late = 1\n",
+        "configs/recipe.yaml": "steps: 1\n",
+    }
+
+    def changed(name: str = "", text: str = "") -> str:
+        for path, content in (files | ({name: text} if name else {})).items():
+            place = tmp_path / path
+            place.parent.mkdir(exist_ok=True)
+            place.write_text(content)
+        fingerprint._tree.cache_clear()
+        fingerprint._code.cache_clear()
+        return fingerprint.fingerprint(tmp_path / "benchmarks" / "script.py")
+
+    monkeypatch.setattr(fingerprint, "ROOT", tmp_path)
+    monkeypatch.setattr(fingerprint, "BENCHMARKS", tmp_path / "benchmarks")
+    monkeypatch.setattr(fingerprint, "LEFT_OUT", (tmp_path / "jaxsafe" / "__init__.py",))
+    before = changed()
+    same = {
+        "benchmarks/script.py": '"""Another text."""\nimport jaxsafe\njaxsafe.make(1)  # one\n',
+        "jaxsafe/b.py": "fly = 2\n",
+        "jaxsafe/d.py": "hint = 2\n",
+        "jaxsafe/later.py": "late = 2\n",
+    }
+    for name, text in same.items():
+        assert changed(name, text) == before, name
+    other = {
+        "benchmarks/script.py": "import jaxsafe\n\njaxsafe.make(2)\n",
+        "jaxsafe/a.py": "import jaxsafe.c\n\ndef make(x):\n    return 1\n",
+        "jaxsafe/c.py": "number = 1\n",
+        "configs/recipe.yaml": "steps: 2\n",
+    }
+    for name, text in other.items():
+        assert changed(name, text) != before, name
+    assert changed() == before
+
+
+def test_a_script_depends_on_the_environment_and_not_on_figures(fingerprint: ModuleType) -> None:
+    root = BENCHMARKS.parent
+    paths = {
+        str(path.relative_to(root)) for path in fingerprint.sources(BENCHMARKS / "environments.py")
+    }
+    assert {
+        "jaxsafe/environment.py",
+        "jaxsafe/simulation/cwh.py",
+        "benchmarks/isolated.py",
+    } <= paths
+    assert not [path for path in paths if path.startswith(("jaxsafe/plot", "jaxsafe/verify"))]
+
+
+def test_every_script_that_writes_results_is_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    scripts = {
+        path.stem
+        for path in BENCHMARKS.glob("*.py")
+        if "about(__file__)" in path.read_text(encoding="utf-8")
+    }
+    assert {*importlib.import_module("all").SCRIPTS} == scripts - {"accelerator", "all"}
+
+
+@pytest.mark.parametrize("key", ["processor", "cores", "python", "jax", "jaxlib", "sources"])
+def test_a_result_of_another_machine_or_code_is_stale(
+    everything: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    key: str,
+) -> None:
+    assert run(everything, monkeypatch, "measure=false") == 0
+    assert re.findall("current", capsys.readouterr().out) == ["current"] * 2
+    write(tmp_path / "second.json", HERE | {key: "another"})
+    assert run(everything, monkeypatch, "measure=false") == 1
+    assert f"second              {key}: another, here {HERE[key]}" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match=f"^names: second is stale too \\({key}: another"):
+        run(everything, monkeypatch, "names=first")
+
+
+def test_only_what_is_stale_is_measured(
+    everything: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    commands = []
+
+    def record(command: list[Any], check: bool) -> Any:
+        commands.append([Path(command[1]).name, *command[2:]])
+        return type("Finished", (), {"returncode": 0})
+
+    monkeypatch.setattr(everything.subprocess, "run", record)
+    assert run(everything, monkeypatch) == 0
+    assert commands == []
+    (tmp_path / "second.json").unlink()
+    assert everything.reason("second") == "not measured"
+    assert run(everything, monkeypatch) == 0
+    assert commands == [["second.py", "repeats=2"]]
+
+
+def test_code_that_is_not_committed_is_not_measured(
+    everything: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(everything, "about", lambda script: HERE | {"changed": True})
+    with pytest.raises(SystemExit, match="commit it first"):
+        run(everything, monkeypatch)
