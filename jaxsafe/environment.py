@@ -277,6 +277,23 @@ class Environment(Component, Described):
         return conditions | bounds | {DIVERGED: "terminated"}
 
 
+def require_environment(place: str, env: Any) -> None:
+    """Refuse something else where an environment is needed, such as the name of a task.
+
+    Args:
+        place: the function and the argument, for the message.
+        env: the argument.
+
+    Raises:
+        ConfigError: it is no environment.
+    """
+    if not isinstance(env, Environment):
+        example = show(env) if isinstance(env, str) else "'docking2d'"
+        raise ConfigError(
+            f"{place}: expected an environment, such as jaxsafe.make({example}), found {show(env)}"
+        )
+
+
 def require_success(env: Environment) -> None:
     """Refuse an environment in which nothing would count as a success.
 
@@ -383,6 +400,7 @@ def reset(env: Environment, key: Key) -> tuple[State, TimeStep]:
     Raises:
         ConfigError: the key is a plain number.
     """
+    require_environment("reset: env", env)
     require_key("reset: key", key)
     parameters = _draw_parameters(env, key)
     env = drawn(env, parameters)
@@ -421,6 +439,7 @@ def reset_to(
         ConfigError: a platform, field or parameter is unknown, or a random one is missing or has
             another shape, or the key is missing.
     """
+    require_environment("reset_to: env", env)
     parameters = {} if parameters is None else parameters
     for label, argument in {"platforms": start, "parameters": parameters}.items():
         if not isinstance(argument, Mapping):
@@ -463,6 +482,7 @@ def step(env: Environment, state: State, action: Array) -> tuple[State, TimeStep
         ConfigError: the state is something else, or the action has another shape, or is not whole
             numbers where actions are discrete.
     """
+    require_environment("step: env", env)
     if not isinstance(state, State):
         raise ConfigError(
             f"step: state: expected the State that reset or step returned, found {show(state)}"

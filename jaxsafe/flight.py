@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsafe.environment import Environment, reset, reset_to, step
+from jaxsafe.environment import Environment, require_environment, reset, reset_to, step
 from jaxsafe.evaluate.episodes import max_steps
 from jaxsafe.evaluate.evaluator import MAX_RECORDED_STEPS, RECORDED_STEPS_PER_CALL
 from jaxsafe.rollout import (
@@ -260,6 +260,7 @@ def fly(
         ConfigError: the start or the policy does not fit the environment, or the key is a plain
             number.
     """
+    require_environment("fly: env", env)
     require_key("fly: key", key)
     require_hashable(policy)
     key_start, key_act = jax.random.split(jax.random.key(0) if key is None else key)

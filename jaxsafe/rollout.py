@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsafe.autoreset import choose, renew
 from jaxsafe.devices.shard import WHOLE, Shard
-from jaxsafe.environment import Environment, reset, step
+from jaxsafe.environment import Environment, require_environment, reset, step
 from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.types import Key, Record, State, TimeStep, Transition, require_key
 
@@ -181,6 +181,7 @@ def rollout(
             unknown, `start` is not a `RolloutState` or has a batch of another size, the key is a
             plain number, the policy is no function, or the actions have another shape.
     """
+    require_environment("rollout: env", env)
     require_count("rollout: num_steps", num_steps, least=0)
     if num_envs is not None:
         require_count("rollout: num_envs", num_envs, least=1)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 import jaxsafe
 from jaxsafe import ConfigError, Environment
+from jaxsafe.bounds import best_possible
 from jaxsafe.environment import require_success
 from jaxsafe.processors.reward import Reward
 from jaxsafe.processors.status import Status
@@ -566,3 +567,29 @@ def test_a_step_from_what_is_no_state_or_action_is_refused(
     start, timestep = jaxsafe.reset_to(env, START)
     with pytest.raises(ConfigError, match=message):
         jaxsafe.step(env, timestep if state else start, action)
+
+
+NOTHING: Any = None
+CALLS: dict[str, Any] = {
+    "reset": lambda env: jaxsafe.reset(env, jax.random.key(0)),
+    "reset_to": lambda env: jaxsafe.reset_to(env, START),
+    "step": lambda env: jaxsafe.step(env, NOTHING, NOTHING),
+    "rollout": lambda env: jaxsafe.rollout(env, NOTHING, jax.random.key(0), 1),
+    "evaluate": lambda env: jaxsafe.evaluate(env, NOTHING),
+    "fly": lambda env: jaxsafe.fly(env, NOTHING),
+    "verify": lambda env: jaxsafe.verify(env, NOTHING, {}),
+    "override": lambda env: jaxsafe.override(env, {"dt": 2.0}),
+    "dump": jaxsafe.dump,
+    "load_policy": lambda env: jaxsafe.load_policy("controller/lqr", env=env),
+    "best_possible": lambda env: best_possible(env, NOTHING),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+@pytest.mark.parametrize(("given", "example"), [("rejoin2d", "rejoin2d"), (3, "docking2d")])
+def test_the_name_of_a_task_is_no_environment(name: str, given: Any, example: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        CALLS[name](given)
+    assert str(caught.value) == (
+        f"{name}: env: expected an environment, such as jaxsafe.make('{example}'), found {given!r}"
+    )

@@ -25,7 +25,7 @@ from jaxsafe.agents.trained_policy import (
     trained_policy,
 )
 from jaxsafe.control.law import LawPolicy
-from jaxsafe.environment import Environment
+from jaxsafe.environment import Environment, require_environment
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.convert import to_component, to_data
 from jaxsafe.schema.errors import ConfigError, choices_text
@@ -165,6 +165,7 @@ def load_policy(
     if name.startswith(CONTROLLER):
         if env is None:
             raise ConfigError(f"env: missing; the environment in which {name} shall act")
+        require_environment("load_policy: env", env)
         return find_law(name, env).policy(env)
     return trained_policy(*read_policy(find_policy(policy)), deterministic=deterministic)
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxsafe.bounds.docking import docking_bounds
 from jaxsafe.bounds.rejoin import rejoin_bounds
-from jaxsafe.environment import Environment
+from jaxsafe.environment import Environment, require_environment
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.types import State
 
@@ -28,6 +28,7 @@ def best_possible(env: Environment, starts: State) -> dict[str, np.ndarray]:
     Raises:
         ConfigError: the environment has parts for which no bounds are known.
     """
+    require_environment("best_possible: env", env)
     if env.uncertainty or env.randomize or env.decision_period > 1:
         raise ConfigError(
             "bounds: not known for an environment with uncertainty, randomize or decision_period"

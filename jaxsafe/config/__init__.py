@@ -13,7 +13,7 @@ from typing import Any
 from jaxsafe.config.check import check
 from jaxsafe.config.override import override
 from jaxsafe.config.tied import settle
-from jaxsafe.environment import Environment
+from jaxsafe.environment import Environment, require_environment
 from jaxsafe.rta.filter import RTA
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.convert import DIRECTORY, to_component, to_data
@@ -153,6 +153,7 @@ def dump(env: Environment) -> str:
     """Return the complete environment as YAML text, so that `load(dump(env)) == env`."""
     from jaxsafe.schema import yaml12
 
+    require_environment("dump: env", env)
     return yaml12.write(describe(env))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from jaxsafe.config.check import check
 from jaxsafe.config.tied import carry
-from jaxsafe.environment import Environment
+from jaxsafe.environment import Environment, require_environment
 from jaxsafe.schema.errors import ConfigError, show
 from jaxsafe.schema.retype import set_paths
 
@@ -38,6 +38,7 @@ def override(env: Environment, changes: Mapping[str, Any], place: str = "") -> E
     Raises:
         ConfigError: a path leads nowhere, or a value has the wrong type, shape or range.
     """
+    require_environment("override: env", env)
     for path in changes:
         if not isinstance(path, str):
             raise ConfigError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax
 
-from jaxsafe.environment import Environment
+from jaxsafe.environment import Environment, require_environment
 from jaxsafe.evaluate.cases import load_cases
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.metrics import metrics_in
@@ -44,6 +44,7 @@ def evaluate(
             cases do not fit.
     """
     count = num_episodes if episodes is None else episodes
+    require_environment("evaluate: env", env)
     require_count("evaluate: episodes", count, least=1)
     require_key("evaluate: key", key)
     require_hashable(policy)

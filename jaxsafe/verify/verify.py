@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsafe.devices.seed_mapper import usable_cores
-from jaxsafe.environment import Environment, reset_to, step
+from jaxsafe.environment import Environment, require_environment, reset_to, step
 from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.verify.loop import FIELDS, Loop, closed_loop, start_of
@@ -136,6 +136,7 @@ def verify(
     Raises:
         ConfigError: the box is no box of starts, or nothing can be proved of the loop.
     """
+    require_environment("verify: env", env)
     began = time.monotonic()
     if isinstance(policy, RecurrentPolicy):
         raise ConfigError(
