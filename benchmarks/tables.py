@@ -56,10 +56,10 @@ class Facts(NamedTuple):
     actions: int  # number of actuators
 
 
-_REJOIN = "hold the rejoin point behind the lead for 20 s"
-_APART = "come within 100 ft of the lead"
-_DOCK = "reach 0.5 m from the chief"
-_SLOW = "exceed 0.2 m/s + 2n·distance"
+_REJOIN = "hold formation for 20 s"
+_APART = "within 100 ft of the lead"
+_DOCK = "within 0.5 m of the chief"
+_SLOW = "above the speed limit"
 FACTS = {
     "rejoin2d": Facts(goal=_REJOIN, never=_APART, observation=12, actions=2),
     "rejoin3d": Facts(goal=_REJOIN, never=_APART, observation=18, actions=3),
@@ -670,9 +670,8 @@ def readme_tasks(_: Results) -> str:
         after = [run["evaluation"]["deterministic"] for run in (alone, filtered)]
         rows.append(
             [
-                f'<a href="docs/tasks/{task}.md"><img src="docs/baselines/{task}.gif" width="150"'
-                f' alt="{task}"></a>',
-                f"[{task}](docs/tasks/{task}.md)",
+                f'[<img src="docs/baselines/{task}.gif" width="150" alt=""><br>{task}]'
+                f"(docs/tasks/{task}.md)",
                 facts.goal,
                 facts.never,
                 f"{facts.observation} / {facts.actions}",
@@ -684,10 +683,10 @@ def readme_tasks(_: Results) -> str:
             ]
         )
     heads = (
-        "task | to do | never | observation / actions | 80 % after (paper) | success"
-        " | violating steps while training | afterwards"
+        "task | goal | never | observation / actions | 80 % after (paper) | success"
+        " | violating steps | afterwards"
     )
-    return markdown(["", *heads.split(" | ")], rows)
+    return markdown(heads.split(" | "), rows)
 
 
 def reported(_: Results) -> str:
@@ -1176,7 +1175,7 @@ def _interval(metric: Results, factor: float, digits: int) -> str:
 
 
 def _share(metric: Results) -> str:
-    return f"{100 * metric['mean']:.3g}%" if metric["mean"] else "0"
+    return f"{100 * metric['mean']:.3g} %" if metric["mean"] else "0"
 
 
 def _three(value: float) -> str:
