@@ -1,6 +1,6 @@
 """Measure how long it takes until ten seeds of all five tasks are learnt.
 
-Nothing is compiled before. One way is `python -m jaxsafe.train env=all preset=shortest_time` in a
+Nothing is compiled before. One way is `jaxsafe train env=all preset=shortest_time` in a
 process of its own with an empty cache of compiled programs. The other way is the same five
 trainings as five commands, one after another. A task is learnt when 95 % of the last 100 training
 episodes succeeded, on average over seeds. Table 2 of the paper counts 80 % in the same way. Results

@@ -395,11 +395,11 @@ class Report:
         lines = []
         for item, results in self.own:
             run = Path("runs", item.name)
-            lines.append(f"python -m jaxsafe.train {shlex.join(item.words)} out={run}")
+            lines.append(f"jaxsafe train {shlex.join(item.words)} out={run}")
             count = self.episodes[item.name]
             for name, options in item.evaluations.items():
                 best = run / "policy" / f"seed_{best_seed(results)}.npz"
-                command = f"python -m jaxsafe.evaluate run={best if name == SHIPPED else run}"
+                command = f"jaxsafe evaluate run={best if name == SHIPPED else run}"
                 lines.append(f"{command} episodes={count} {shlex.join(options)}")
                 if name == SHIPPED:
                     lines.append(f"{command} {shlex.join(FILM)}")

@@ -99,7 +99,7 @@ Its starts differ from those by which the policy was chosen.
 """
 
 FILM = ("episodes=10", "deterministic=true", "render=gif")
-"""The words after `python -m jaxsafe.evaluate run=…` for the film of the best policy."""
+"""The words after `jaxsafe evaluate run=…` for the film of the best policy."""
 
 
 class Item(NamedTuple):
@@ -107,7 +107,7 @@ class Item(NamedTuple):
 
     task: str
     kind: str
-    words: tuple[str, ...]  # the words after `python -m jaxsafe.train`
+    words: tuple[str, ...]  # the words after `jaxsafe train`
 
     @property
     def name(self) -> str:
@@ -116,7 +116,7 @@ class Item(NamedTuple):
 
     @property
     def evaluations(self) -> dict[str, list[str]]:
-        """The words after `python -m jaxsafe.evaluate run=…`, by the name of the evaluation."""
+        """The words after `jaxsafe evaluate run=…`, by the name of the evaluation."""
         if self.kind == "engineered_features":
             return {**STARTS[self.task], WITH_RTA: ["rta=default"], SHIPPED: ["seed=1"]}
         return {WITHOUT_RTA: ["rta=none"]} if self.kind in ("rta", "rta_no_punishment") else {}

@@ -79,7 +79,7 @@ def evaluate(item: Item, run: Path, episodes: int, render: bool) -> None:
 def answers(options: Sequence[str], results: Mapping[str, Any]) -> bool:
     """Return whether an evaluation had these options, according to its results.
 
-    The options follow `python -m jaxsafe.evaluate run=…`.
+    The options follow `jaxsafe evaluate run=…`.
     """
     asked = Options.parse(["run=RUN", *options])
     return results.get("changes") == asked.changes and (

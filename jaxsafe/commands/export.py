@@ -190,8 +190,7 @@ def single_policy(options: SingleOptions) -> tuple[SavedPolicy | ForeignPolicy, 
         seeds = {int(stem) for stem in stems if stem.isdecimal()}
         if not seeds:
             raise ConfigError(
-                f"run: {run} has no policies yet; "
-                f"finish it with: python -m jaxsafe.train resume={run}"
+                f"run: {run} has no policies yet; finish it with: jaxsafe train resume={run}"
             )
         if seed not in seeds:
             raise ConfigError(

@@ -134,7 +134,7 @@ def main(argv: Sequence[str]) -> int:
     if not env.constraints:
         raise ConfigError(f"env: {options.env} has no safety constraint")
     facts: dict[str, Any] = {
-        "command": f"python -m jaxsafe.rta.falsify {shlex.join(argv)}",
+        "command": f"jaxsafe falsify {shlex.join(argv)}",
         "commit": provenance.commit(),
         "versions": provenance.versions(),
         "env": options.env,

@@ -157,8 +157,7 @@ def _compare(runs: Sequence[Path], options: Options, width: float | None) -> lis
     for path in paths.values():
         if not (path / "results.json").exists():
             raise ConfigError(
-                f"run: {path} has no results.json; "
-                f"finish it with python -m jaxsafe.train resume={path}"
+                f"run: {path} has no results.json; finish it with jaxsafe train resume={path}"
             )
     out = _out(options)
     results = {name: read_results(path / "results.json") for name, path in paths.items()}

@@ -125,7 +125,7 @@ def main(argv: Sequence[str]) -> int:
                 print(f"{name}: {config.rounding}" if len(runs) > 1 else config.rounding)
     try:
         with processes.reporting_lost_process(
-            f"go on with: python -m jaxsafe.train distributed=true resume={path}"
+            f"go on with: jaxsafe train distributed=true resume={path}"
         ):
             try:
                 unfinished = [run for run in runs if not is_complete(run)]
@@ -142,7 +142,7 @@ def main(argv: Sequence[str]) -> int:
                     run_directory.discard_unused(path)
                 raise
     except KeyboardInterrupt:
-        print(f"go on with: python -m jaxsafe.train resume={path}")
+        print(f"go on with: jaxsafe train resume={path}")
         raise
     if not finished:
         return cli.INTERRUPTED

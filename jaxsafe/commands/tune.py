@@ -116,7 +116,7 @@ def main(argv: Sequence[str]) -> int:
     except KeyboardInterrupt:
         print(
             f"stopped with {len(rows)} of {len(points)} settings; "
-            f"go on with: python -m jaxsafe.tune resume={path}"
+            f"go on with: jaxsafe tune resume={path}"
         )
         return cli.INTERRUPTED
     print(results.finish(path, rows, list(sweep), options.rank))

@@ -76,9 +76,8 @@ def make(
     """Return an environment, ready for `reset` and `step`.
 
     Args:
-        task: the name of a task, or the path of a YAML file as printed by
-            `python -m jaxsafe.config`. `MODULE:NAME` first imports the module that registers the
-            task.
+        task: the name of a task, or the path of a YAML file as printed by `jaxsafe config`.
+            `MODULE:NAME` first imports the module that registers the task.
         overrides: new values by dotted path, for instance `{"reward.delta_v.scale": -0.02}`.
         actions: `continuous` for actions in [−1, 1], `discrete` for indices of points, one for each
             actuator, or `mixed` for indices where an actuator has `discrete: true`. None leaves

@@ -5,7 +5,7 @@ A package adds a task of its own with one call:
     register(Task(name="hover", environment=hover))
 
 Then `make("hover")` knows it, Gymnasium knows its id, and
-`python -m jaxsafe.train env=MODULE:hover` imports the module that registers it and trains it.
+`jaxsafe train env=MODULE:hover` imports the module that registers it and trains it.
 """
 
 from __future__ import annotations

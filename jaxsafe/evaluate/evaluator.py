@@ -52,7 +52,7 @@ of its time step.
 EVALUATION_SEED = 0
 """Seed of the evaluations during and after training.
 
-`python -m jaxsafe.evaluate seed=…` chooses others.
+`jaxsafe evaluate seed=…` chooses others.
 """
 
 EVALUATION_KINDS = ("stochastic", "deterministic")

@@ -1,6 +1,6 @@
 """Figures of the states that a filter certifies, on planes through the state space.
 
-The command is `python -m jaxsafe.plot.safe_set env=rejoin2d`.
+The command is `jaxsafe safe_set env=rejoin2d`.
 
 H(x) is the smallest h on the flight of the best backup controller from x. Without a horizon it is
 h(x) itself. A state is certified where H(x) reaches the margin that the filter keeps. A plane for

@@ -91,7 +91,7 @@ def train_run(
     progress: bool = True,
     **options: Any,
 ) -> Run:
-    """Train all seeds of a task as `python -m jaxsafe.train` does, and return the run.
+    """Train all seeds of a task as `jaxsafe train` does, and return the run.
 
     The seeds share the cores if no other program of JAX has run before in this process. After
     Ctrl-C `jaxsafe.train(resume=…)` goes on with the run.
@@ -234,7 +234,7 @@ def train_all(
                 upcoming.prepare()
             if not training.train(progress):
                 call = (
-                    f"python -m jaxsafe.train resume={path}"
+                    f"jaxsafe train resume={path}"
                     if verbose
                     else f"jaxsafe.train(resume={str(path)!r})"
                 )

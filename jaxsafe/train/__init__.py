@@ -1,9 +1,8 @@
 """Training with PPO: one seed as a pure function, or a whole run in a directory.
 
 `jaxsafe.train(env, agent, hyperparameters, key, num_updates)` trains one seed as a pure function,
-see `jaxsafe.train.train.train`. `jaxsafe.train("docking2d", seeds=10)` does what
-`python -m jaxsafe.train` does: it trains all seeds of a run, evaluates them and keeps everything in
-a directory.
+see `jaxsafe.train.train.train`. `jaxsafe.train("docking2d", seeds=10)` does what `jaxsafe train`
+does: it trains all seeds of a run, evaluates them and keeps everything in a directory.
 """
 
 from jaxsafe.schema.callable_package import make_callable

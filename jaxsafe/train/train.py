@@ -55,7 +55,7 @@ def train(
 
     Without a callback this is a pure function of its arguments. `jax.jit` compiles it, and
     `jax.vmap` trains over keys, numbers of the environment, or hyperparameters. With the key
-    `jax.random.key(seed)` it does what `python -m jaxsafe.train` does with the same options.
+    `jax.random.key(seed)` it does what `jaxsafe train` does with the same options.
 
     Args:
         env: the environment.

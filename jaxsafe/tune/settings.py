@@ -1,6 +1,6 @@
 """The settings of a sweep, from grids or random draws of options.
 
-Each setting is a complete command line of `jaxsafe.train`.
+Each setting is a complete command line of `jaxsafe train`.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ def settings(
     """Return every setting of a grid, or some random settings.
 
     Args:
-        arguments: the options that all settings share, as for `jaxsafe.train`.
+        arguments: the options that all settings share, as for `jaxsafe train`.
         sweep: what `pop_sweep` returns.
         samples: how many settings to draw at random. None takes all combinations of the lists.
         draw: seed of the draws.

@@ -93,7 +93,7 @@ def test_a_report_trains_evaluates_and_writes_the_pages_once(calls: list[list[st
     assert f"| docking2d | {best} | {100 * rate['mean']:.2f} % |" in page
     assert len(rate["per_seed"]) == 1
     assert (
-        f"python -m jaxsafe.evaluate run=runs/docking2d-engineered_features/policy/seed_{best}.npz"
+        f"jaxsafe evaluate run=runs/docking2d-engineered_features/policy/seed_{best}.npz"
         f" episodes=6 seed=1\n"
     ) in page
     for file in (

@@ -22,6 +22,7 @@ import pytest
 from default_cases import thorough
 
 import jaxsafe
+from jaxsafe.commands import COMMANDS
 from jaxsafe.commands.catalogue import SECTIONS, title, types_of
 from jaxsafe.config import dump, load
 from jaxsafe.config.arguments import Arguments
@@ -99,7 +100,7 @@ def test_the_reference_has_every_type_and_every_option_of_the_tasks_and_recipes(
 def test_the_file_of_a_task_is_current_and_is_the_task(task: str) -> None:
     file = ROOT / "configs" / "envs" / f"{task}.yaml"
     assert file.read_text(encoding="utf-8") == f"recipe: {task}\n{dump(jaxsafe.make(task))}", (
-        f"python -m jaxsafe.config {task} > {file}"
+        f"jaxsafe config {task} > {file}"
     )
     assert load(file) == jaxsafe.make(task)
 
@@ -283,8 +284,8 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_pa
         elif kind == "yaml":
             assert text in CUSTOM.read_text(encoding="utf-8")
         else:
-            command, output = text.removeprefix("$ python ").split("\n", 1)
-            process = run(shlex.split(command), tmp_path)
+            command, output = text.removeprefix("$ jaxsafe ").split("\n", 1)
+            process = run(["-m", "jaxsafe", *shlex.split(command)], tmp_path)
             assert process.stdout + process.stderr == output
     (tmp_path / "program.py").write_text(program, encoding="utf-8")
     process = run(["program.py"], tmp_path)
@@ -294,8 +295,8 @@ def test_the_code_of_a_page_runs_and_prints_what_the_page_says(page: str, tmp_pa
 
 def trainings_of_the_page_of_constrained_learning() -> list[dict[str, Any]]:
     page = (ROOT / "docs" / "constrained.md").read_text(encoding="utf-8")
-    lines = [line for line in page.splitlines() if line.startswith("python -m jaxsafe.train ")]
-    return [Arguments.parse(shlex.split(line)[3:]).options for line in lines]
+    lines = [line for line in page.splitlines() if line.startswith("jaxsafe train ")]
+    return [Arguments.parse(shlex.split(line)[2:]).options for line in lines]
 
 
 def test_the_trainings_of_the_page_of_constrained_learning_are_some(
@@ -468,14 +469,12 @@ def test_the_code_of_a_first_page_runs(page: str, tmp_path: Path) -> None:
 def test_commands_are_those_of_any_shell(page: Path) -> None:
     """In zsh a word with brackets must be quoted, and a comment behind a command is part of it."""
     text = page.read_text(encoding="utf-8")
-    commands = [
-        line
-        for line in text.splitlines()
-        if "python -m jaxsafe" in line or line.startswith("jaxsafe ")
-    ]
+    typed = re.compile(rf"python -m jaxsafe|\bjaxsafe ({'|'.join(COMMANDS)})\b")
+    commands = [line for line in text.splitlines() if typed.search(line)]
     words = [word for line in commands for word in line.split()]
     assert [word for word in words if re.match(r"[\w.]+=.*[\[*?]", word)] == []
-    assert [line for line in commands if not line.startswith("#") and " # " in line] == []
+    alone = [line for line in commands if not line.startswith("#") and "`" not in line]
+    assert [line for line in alone if " # " in line] == []
     assert re.findall(r"`[\w.]+=\[", text) == []
 
 

@@ -30,7 +30,7 @@ def test_the_numbers_name_the_command_and_the_versions_that_made_them(tmp_path: 
     ]
     assert main(argv) == 0
     results = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))
-    assert results["command"] == f"python -m jaxsafe.rta.falsify {shlex.join(argv)}"
+    assert results["command"] == f"jaxsafe falsify {shlex.join(argv)}"
     assert {"jaxsafe", "jax", "device", "processor"} <= set(results["versions"])
     assert [
         (row["policy"], row["steps"], row["violating_steps"]) for row in results["policies"]

@@ -296,7 +296,7 @@ def test_ctrl_c_stops_after_a_chunk_with_a_checkpoint_and_resumes(
         patch.setattr(Training, "_write_progress", interrupt)
         assert command.main([*TINY, f"out={run}"]) == cli.INTERRUPTED
     assert (
-        f"stopped at step {step:,}; go on with: python -m jaxsafe.train resume={run}"
+        f"stopped at step {step:,}; go on with: jaxsafe train resume={run}"
         in capsys.readouterr().out
     )
     assert command.main([f"resume={run}"]) == 0
@@ -336,7 +336,7 @@ def test_all_tasks_run_one_after_another_and_resume(
     with monkeypatch.context() as patch:
         patch.setattr(Training, "_write_progress", interrupt)
         assert command.main(["env=all", *words, *same, f"out={path}"]) == cli.INTERRUPTED
-    assert f"go on with: python -m jaxsafe.train resume={path}" in capsys.readouterr().out
+    assert f"go on with: jaxsafe train resume={path}" in capsys.readouterr().out
     # All tasks are trained before the first is evaluated.
     assert not list(path.rglob("results.json"))
     with monkeypatch.context() as patch:

@@ -305,8 +305,7 @@ def test_an_interrupted_sweep_says_how_to_go_on(
     assert command.main([*SWEEP, f"out={tmp_path / 'sweep'}"]) == cli.INTERRUPTED
     said = capsys.readouterr().out.splitlines()[-1]
     assert said == (
-        "stopped with 0 of 4 settings; go on with:"
-        f" python -m jaxsafe.tune resume={tmp_path / 'sweep'}"
+        f"stopped with 0 of 4 settings; go on with: jaxsafe tune resume={tmp_path / 'sweep'}"
     )
 
 

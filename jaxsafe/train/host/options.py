@@ -71,7 +71,7 @@ Fewer samples take less time than exchanging their gradients.
 
 
 class TrainConfig(Component):
-    """Options of `python -m jaxsafe.train`. Steps and episodes are counted for each seed."""
+    """Options of `jaxsafe train`. Steps and episodes are counted for each seed."""
 
     preset: str = "engineered_features"
     """The recipe of the task: engineered_features, observation_only, many_envs or shortest_time.
@@ -200,7 +200,7 @@ def resolve_all(options: Mapping[str, Any]) -> list[tuple[TrainConfig, Environme
     """Return what `resolve` returns. With `env=all` return it for each task.
 
     Args:
-        options: the options of `python -m jaxsafe.train`, as `resolve` takes them.
+        options: the options of `jaxsafe train`, as `resolve` takes them.
 
     Raises:
         ConfigError: as `resolve`. Its message begins with the task if the same options do not fit
@@ -224,7 +224,7 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
     options win over those of a run, and no recipe is read.
 
     Args:
-        options: the options of `python -m jaxsafe.train` by name, for instance `{"env":
+        options: the options of `jaxsafe train` by name, for instance `{"env":
             "docking3d", "seeds": 10, "ppo.gamma": 0.99, "env.reward.delta_v.scale": -0.02}`.
 
     Raises:
