@@ -114,7 +114,8 @@ class GymEnv(_Chains, gym.Env[np.ndarray, Any]):
 
     `info` holds:
 
-    - `cost`: 1 on a step that violates a safety constraint, and `costs` by constraint,
+    - `cost`: 1 on a step that violates a safety constraint, or its severity, and `costs` by
+      constraint,
     - `margins`: h of each constraint, which is safe where h ≥ 0,
     - `outcome`: the name of the outcome, `running` until the end,
     - `is_success`, `severity`, `status`, `reward_terms` and `reward_totals`,
