@@ -619,7 +619,7 @@ def filtered_training(_: Results) -> str:
     labels = {
         "engineered_features": "no filter",
         "rta": "`rta=default`",
-        "rta_no_punishment": "and `rta_training=no_punishment`",
+        "rta_no_punishment": "no punishment",
     }
     rows = []
     for task in DOCKING_FIRST:
@@ -633,7 +633,7 @@ def filtered_training(_: Results) -> str:
                     label,
                     _until(own["interaction_efficiency"]["timesteps"]),
                     f"{own['training_cost']['mean']:,.0f}",
-                    f"{100 * mode['success_rate']['mean']:.4g}%",
+                    f"{100 * mode['success_rate']['mean']:.4g} %",
                     _share(mode["episode_safety_violation_rate"]),
                     f"{mode['episode_length']['mean']:.0f}",
                 ]
@@ -644,7 +644,7 @@ def filtered_training(_: Results) -> str:
             alone = record["evaluations"][WITHOUT_RTA]["evaluation"]["deterministic"]
             rows[-1] += [
                 _share(mode["intervention_rate"]),
-                f"{100 * alone['success_rate']['mean']:.4g}%",
+                f"{100 * alone['success_rate']['mean']:.4g} %",
                 _share(alone["episode_safety_violation_rate"]),
             ]
     heads = (

@@ -44,7 +44,7 @@ QUESTIONS = {
 }
 """The question that each other page answers."""
 
-NEEDS = {"results/starts.md": "starts", "results/wall_time.md": "wall"}
+NEEDS = {"results/starts.md": "starts"}
 """The table that a page needs. If the table has no rows, there is no such page."""
 
 Rows = list[list[str]]
@@ -195,8 +195,6 @@ class Report:
                     f"{strict:,}" if strict else "never",
                     f"{sum(reached is not None for reached in per_seed)}/{len(per_seed)}",
                     f"{results['steps']:,}",
-                    f"{results['wall_s']:.0f}",
-                    f"{results['compile_s']:.0f}",
                 ]
             )
         return rows
@@ -204,21 +202,20 @@ class Report:
     def _wall(self) -> Rows:
         rows = []
         for record in self.records:
-            if record.item.kind in ("shortest_time", "many_envs"):
-                reached = wall_to(0.95, record.curves)
-                pace = samples_per_second(record.curves)
-                results = record.results
-                rows.append(
-                    [
-                        record.item.task,
-                        record.item.kind,
-                        f"{results['steps']:,}",
-                        f"{reached:.1f}" if reached is not None else "never",
-                        f"{results['wall_s']:.1f}",
-                        f"{results['compile_s']:.1f}",
-                        f"{pace:,.0f}" if pace is not None else "unknown",
-                    ]
-                )
+            reached = wall_to(0.95, record.curves)
+            pace = samples_per_second(record.curves)
+            results = record.results
+            rows.append(
+                [
+                    record.item.task,
+                    record.item.kind,
+                    f"{results['steps']:,}",
+                    f"{reached:.1f}" if reached is not None else "never",
+                    f"{results['wall_s']:.1f}",
+                    f"{results['compile_s']:.1f}",
+                    f"{pace:,.0f}" if pace is not None else "unknown",
+                ]
+            )
         return rows
 
     def _final(self) -> Rows:
