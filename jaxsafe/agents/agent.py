@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -50,6 +50,8 @@ class Agent(Component):
 
     Their inputs and outputs follow from the spaces of the environment.
     """
+
+    field_word: ClassVar[str] = "option"
 
     actor: Network = MLP()
     """The network that decides the actions: mlp, gru or one of your own."""

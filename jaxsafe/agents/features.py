@@ -7,6 +7,7 @@ with a `type` is chosen by `agent.features=TYPE`.
 from __future__ import annotations
 
 from abc import abstractmethod
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,8 @@ zeros, and that would divide by zero.
 
 class Features(Component):
     """Base of the functions from an environment's observations to the inputs of the networks."""
+
+    field_word: ClassVar[str] = "option"
 
     @abstractmethod
     def __call__(

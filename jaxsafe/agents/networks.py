@@ -59,6 +59,7 @@ class Network(Component):
     A network defines its Flax module. `module` is the only method that it must have.
     """
 
+    field_word: ClassVar[str] = "option"
     recurrent: ClassVar[bool] = False
     """Whether the module is called as `(memory, inputs) -> (memory, outputs)`, step by step."""
 

@@ -13,7 +13,7 @@ import dataclasses
 import functools
 import types
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, dataclass_transform
 
 import jax
@@ -140,6 +140,10 @@ class Component:
     class and not inherited. Type names need to be unique only within a kind."""
     shorthand: ClassVar[str | None] = None
     """Name of a field that lists named parts. Dotted paths may begin with one of their names."""
+    field_word: ClassVar[str] = "field"
+    """What messages call a field of this component: an option, if a user types it as one."""
+    synonyms: ClassVar[Mapping[str, str]] = {}
+    """Paths of fields by the names that they have in other libraries. Only messages use them."""
 
     def __init_subclass__(cls, *, type: str | None = None) -> None:
         dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)

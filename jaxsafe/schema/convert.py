@@ -77,7 +77,10 @@ def to_component(data: Any, base: type[Kind], place: str) -> Kind:
     entries = cls.prepared(entries, label)
     for name in entries:
         if name not in table:
-            raise ConfigError(f"{label}: unknown field {show(name)}{choices_text(name, table)}")
+            raise ConfigError(
+                f"{label}: unknown {cls.field_word} {show(name)}"
+                f"{choices_text(name, table, cls.synonyms.get(name))}"
+            )
     for name, field in table.items():
         if field.required and name not in entries:
             raise ConfigError(f"{label}: field {name!r} is missing; it takes {expects(field)}")

@@ -95,7 +95,7 @@ def _set(
         if meant and "." in meant:
             meant = join(place, meant)  # a path that leads into another part is shown whole
         raise ConfigError(
-            f"{join(place, head)}: unknown field {show(head)}"
+            f"{join(place, head)}: unknown {component.field_word} {show(head)}"
             f"{choices_text(head, [*table, *names], meant)}"
         )
     field_place = join(place, head)
@@ -149,7 +149,8 @@ def _meant(
 ) -> str | None:
     """Return the path that a user probably meant by one that leads nowhere, or None.
 
-    It ends like the given path, or in a name that the given path abbreviates or misspells.
+    It ends like the given path, or in a name that the given path abbreviates or misspells. The
+    component's `synonyms` come first.
 
     Args:
         component: the component at which the path begins.
@@ -157,6 +158,8 @@ def _meant(
         first_names: names with which a path may begin.
         shorthand: the field of the component whose parts may stand at the beginning of a path.
     """
+    if ".".join(path) in component.synonyms:
+        return component.synonyms[".".join(path)]
     ends = {}  # the shortest path to each name
     for other in sorted(_paths(component, shorthand), key=lambda other: other.count(".")):
         if f".{other}".endswith("." + ".".join(path)):

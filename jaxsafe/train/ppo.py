@@ -16,7 +16,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -95,6 +95,15 @@ Only an agent with a critic of the cost has `cost_value_loss`.
 
 class PPO(Component):
     """Hyperparameters of PPO. Their names are those of the literature."""
+
+    field_word: ClassVar[str] = "option"
+    synonyms: ClassVar[Mapping[str, str]] = {
+        "anneal_lr": "learning_rate_decay",
+        "batch_size": "num_minibatches",
+        "discount": "gamma",
+        "lam": "gae_lambda",
+        "lr_schedule": "learning_rate_decay",
+    }
 
     num_envs: Annotated[int, Range(1, largest=MAX_COUNT)] = 16
     """Number of environments, whose episodes run side by side."""

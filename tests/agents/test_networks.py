@@ -212,7 +212,7 @@ def test_a_network_of_a_users_module_is_trained_and_read_in_another_process(
             {"agent.actor": "mpl"},
             r"agent.actor: found 'mpl'. Did you mean 'mlp'\? Choose from mlp, gru",
         ),
-        ({"agent.actor.width": 3}, "agent.actor.width: unknown field 'width'; choose from"),
+        ({"agent.actor.width": 3}, "agent.actor.width: unknown option 'width'; choose from"),
         (
             {"agent.actor.activation": "tan"},
             r"agent.actor.activation: found 'tan'. Did you mean 'tanh'\? Choose from",
@@ -226,7 +226,7 @@ def test_a_network_of_a_users_module_is_trained_and_read_in_another_process(
         ),
         (
             {"agent.hidden": [8]},
-            r"agent.hidden: unknown field 'hidden'. Did you mean 'agent.actor.hidden'\?",
+            r"agent.hidden: unknown option 'hidden'. Did you mean 'agent.actor.hidden'\?",
         ),
     ],
 )

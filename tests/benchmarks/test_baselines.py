@@ -346,7 +346,7 @@ def test_old_runs_do_not_pass_as_new_ones(calls: list[list[str]]) -> None:
         ),
         (["tasks=[]"], "tasks: expected at least one of rejoin2d"),
         (["film=gif"], "film: expected true or false, found 'gif'"),
-        (["sedes=3"], "sedes: unknown field 'sedes'"),
+        (["sedes=3"], "sedes: unknown option 'sedes'"),
     ],
 )
 def test_bad_options_of_report_are_told(words: list[str], message: str) -> None:

@@ -79,12 +79,12 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
         ),
         (["seeds=2"], "env: missing; for instance env=docking3d"),
         (["env="], "env: expected a name or a path, found None"),
-        (["env=docking3d", "sedes=2"], "sedes: unknown field 'sedes'. Did you mean 'seeds'?\n"),
+        (["env=docking3d", "sedes=2"], "sedes: unknown option 'sedes'. Did you mean 'seeds'?\n"),
         (
             ["env=docking3d", "mass=14"],
             "mass: unknown option; a field of the environment is written env.deputy.mass",
         ),
-        (["env=docking3d", "gpu=1"], "gpu: unknown field 'gpu'; choose from preset"),
+        (["env=docking3d", "gpu=1"], "gpu: unknown option 'gpu'; choose from preset"),
         (["env=docking3d", "seeds=0"], "seeds: expected a whole number ≥ 1, found 0"),
         (["env=docking3d", "seeds=ten"], "seeds: expected a whole number ≥ 1, found 'ten'"),
         (["env=docking3d", "seeds=2.5"], "seeds: expected a whole number ≥ 1, found 2.5"),
@@ -96,7 +96,7 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
             "preset: unknown preset 'engineered_featurs'. Did you mean 'engineered_features'? "
             "Choose from engineered_features, observation_only, many_envs, shortest_time\n",
         ),
-        (["env=docking3d", "ppo.gama=0.9"], "ppo.gama: unknown field 'gama'"),
+        (["env=docking3d", "ppo.gama=0.9"], "ppo.gama: unknown option 'gama'"),
         (["env=docking3d", "ppo.gamma=1.5"], "ppo.gamma: expected a number in [0, 1], found 1.5"),
         (
             ["env=docking3d", "ppo.gamma=high"],
@@ -161,11 +161,26 @@ def test_bad_options_of_train_are_told_in_one_line(
 @pytest.mark.parametrize(
     ("word", "message"),
     [
-        ("gamma=0.9", "gamma: unknown field 'gamma'. Did you mean 'ppo.gamma'"),
-        ("lr=1e-3", "lr: unknown field 'lr'. Did you mean 'ppo.learning_rate'"),
-        ("ppo.lr=1e-3", "ppo.lr: unknown field 'lr'. Did you mean 'learning_rate'"),
+        ("gamma=0.9", "gamma: unknown option 'gamma'. Did you mean 'ppo.gamma'"),
+        ("lr=1e-3", "lr: unknown option 'lr'. Did you mean 'ppo.learning_rate'"),
+        ("ppo.lr=1e-3", "ppo.lr: unknown option 'lr'. Did you mean 'learning_rate'"),
         ("ent_coef=0", "Did you mean 'ppo.entropy_coefficient'"),
-        ("epochs=3", "Did you mean 'ppo.num_epochs'"),
+        # names of CleanRL and Stable-Baselines3
+        ("anneal_lr=true", "Did you mean 'ppo.learning_rate_decay'"),
+        ("batch_size=64", "batch_size: unknown option 'batch_size'. Did you mean 'ppo.num_min"),
+        ("ppo.batch_size=64", "Did you mean 'num_minibatches'"),
+        ("clip_coef=0.1", "Did you mean 'ppo.clip'"),
+        ("clip_range=0.1", "Did you mean 'ppo.clip'"),
+        ("gae_lambda=0.9", "Did you mean 'ppo.gae_lambda'"),
+        ("lr_schedule=linear", "Did you mean 'ppo.learning_rate_decay'"),
+        ("max_grad_norm=1", "Did you mean 'ppo.max_grad_norm'"),
+        ("n_epochs=3", "Did you mean 'ppo.num_epochs'"),
+        ("n_steps=64", "Did you mean 'ppo.num_steps'"),
+        ("net_arch=64,64", "Did you mean 'agent.actor.hidden'"),
+        ("num_envs=4", "Did you mean 'ppo.num_envs'"),
+        ("total_timesteps=1000", "Did you mean 'steps'"),
+        ("update_epochs=3", "Did you mean 'ppo.num_epochs'"),
+        ("vf_coef=0.5", "Did you mean 'ppo.value_coefficient'"),
         ("env.obs=position", "Did you mean 'observation'"),
         ("env.mass=14", "env.mass: unknown field 'mass'. Did you mean 'env.deputy.mass'"),
         ("deputy.mass=14", "deputy.mass: unknown option; .* is written env.deputy.mass"),
@@ -335,7 +350,7 @@ def test_a_broken_run_configuration_is_told_in_one_line(
     (tmp_path / "run" / "config.yaml").write_text(
         "env: docking2d\ntraining: {sedes: 3}\nenvironment: {}\n"
     )
-    assert "config.yaml: training: unknown field 'sedes'" in fails(evaluate, "run=run")
+    assert "config.yaml: training: unknown option 'sedes'" in fails(evaluate, "run=run")
     (tmp_path / "run" / "config.yaml").write_text("env: [\n")
     assert "not valid YAML" in fails(train, "resume=run")
     (tmp_path / "run" / "config.yaml").write_text(

@@ -149,8 +149,8 @@ def test_a_run_prints_what_it_is_and_what_came_of_it(run: Any, whole: Path) -> N
     [
         ({"env": "docking2"}, "env: unknown task 'docking2'"),
         ({"env": "all"}, "env: expected one task, found 'all'"),
-        ({"env": "docking2d", "sedes": 2}, "sedes: unknown field 'sedes'"),
-        ({"env": "docking2d", "ppo.gama": 0.9}, "ppo.gama: unknown field 'gama'"),
+        ({"env": "docking2d", "sedes": 2}, "sedes: unknown option 'sedes'"),
+        ({"env": "docking2d", "ppo.gama": 0.9}, "ppo.gama: unknown option 'gama'"),
         (
             {"env": jaxsafe.make("docking2d"), "seeds": 2},
             "train: an environment needs agent, hyper",

@@ -93,7 +93,7 @@ def test_a_recipe_comes_from_a_file(mine: Path) -> None:
     Path("own.yaml").write_text("quick: {stps: 7}\n", encoding="utf-8")
     message = refused(env="below/other.yaml")
     assert message.startswith(
-        "own.yaml: recipes.quick.stps: unknown field 'stps'. Did you mean 'steps'"
+        "own.yaml: recipes.quick.stps: unknown option 'stps'. Did you mean 'steps'"
     )
 
 
@@ -225,7 +225,7 @@ def test_a_run_that_cannot_be_followed_is_told(whole: Path, tmp_path: Path) -> N
     assert "expected the keys env, training and environment" in refused(
         like=str(tmp_path / "broken")
     )
-    with pytest.raises(ConfigError, match="unknown field 'gama'"):
+    with pytest.raises(ConfigError, match="unknown option 'gama'"):
         resolve({"like": like, "ppo.gama": 1})
 
 

@@ -505,7 +505,7 @@ def test_a_recipe_travels_with_the_file_of_an_environment(
     for recipes, place in (
         (
             "{mine: {ppo: {gama: 1}}}",
-            r"mine\.ppo\.gama: unknown field 'gama'\. Did you mean 'gamma'",
+            r"mine\.ppo\.gama: unknown option 'gama'\. Did you mean 'gamma'",
         ),
         ("{a: {steps: 0}, b: {}}", r"a\.steps: expected a whole number ≥ 1, found 0"),
     ):

@@ -96,7 +96,7 @@ def test_settings_that_differ_in_sizes_are_compiled_apart() -> None:
         (["sweep.ppo.gamma=uniform(a,b)"], "sweep.ppo.gamma: expected two numbers in the brackets"),
         (["sweep.ppo.gamma=uniform(0.9,1)"], "sweep.ppo.gamma: a range needs samples=N"),
         (["sweep.ppo.gamma=[0.9,1.5]"], "ppo.gamma: expected a number in [0, 1], found 1.5"),
-        (["sweep.ppo.gama=[0.9]"], "ppo.gama: unknown field 'gama'"),
+        (["sweep.ppo.gama=[0.9]"], "ppo.gama: unknown option 'gama'"),
         (
             ["sweep.seeds=[1,2]"],
             "sweep.seeds: must be the same in all settings; give seeds=… instead",

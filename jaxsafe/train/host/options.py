@@ -8,7 +8,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 from jaxsafe.agents.agent import Agent, check_agent
 from jaxsafe.config import load_recipe_name, load_recipes, override
@@ -72,6 +72,15 @@ Fewer samples take less time than exchanging their gradients.
 
 class TrainConfig(Component):
     """Options of `jaxsafe train`. Steps and episodes are counted for each seed."""
+
+    field_word: ClassVar[str] = "option"
+    synonyms: ClassVar[Mapping[str, str]] = {
+        **{name: f"ppo.{field}" for name, field in PPO.synonyms.items()},
+        "hidden_sizes": "agent.actor.hidden",
+        "net_arch": "agent.actor.hidden",
+        "num_seeds": "seeds",
+        "total_timesteps": "steps",
+    }
 
     preset: str = "engineered_features"
     """The recipe of the task: engineered_features, observation_only, many_envs or shortest_time.
