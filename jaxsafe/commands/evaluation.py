@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,6 +28,9 @@ from jaxsafe.storage.provenance import versions
 from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.results import diverged_seeds, evaluation, over_sound_seeds
 from jaxsafe.types import State, TimeStep
+
+MAX_NAME = 120
+"""Most characters of the name of a new directory. File systems take at most 255."""
 
 
 class Film(NamedTuple):
@@ -58,6 +62,21 @@ class Film(NamedTuple):
             "violating": sums.violating_steps > 0,
         }[which]
         return int(np.argmax(flags)) if flags.any() else None
+
+
+def _name(request: Mapping[str, Any]) -> str:
+    """Return the name of a new directory, for instance `best-1000-seed0-deputy.mass=14`.
+
+    It has the checkpoint, the number of episodes, the cases, the seed and what was changed. Values
+    that are no single number or text are left out.
+    """
+    parts = [request["checkpoint"], request["episodes"]]
+    if "cases" in request:
+        parts.append(Path(request["cases"]).stem)
+    parts.append(f"seed{request['evaluation_seed']}")
+    for name, value in request["changes"].items():
+        parts.append(name if isinstance(value, (list, dict)) else f"{name}={value}")
+    return re.sub(r"[^\w.=+-]+", "_", "-".join(map(str, parts)))[:MAX_NAME]
 
 
 def evaluate(
@@ -96,11 +115,7 @@ def evaluate(
     require_success(env)
     episodes = request["episodes"]
     seed = request["evaluation_seed"]
-    started = "" if cases is None else f"-{Path(request['cases']).stem}"
-    changed = "-changed" * bool(request["changes"])
-    path = run_directory.make(
-        out, subject.place, f"{request['checkpoint']}-{episodes}{started}-seed{seed}{changed}"
-    )
+    path = run_directory.make(out, subject.place, _name(request))
     try:
         evaluator = Evaluator(subject.mapper, env, subject.agent, cases)
         starts = evaluator.starts(episodes, seed)

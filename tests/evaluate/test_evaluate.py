@@ -160,12 +160,14 @@ def test_evaluations_get_directories_of_their_own(whole: Path, tmp_path: Path) -
     before = (run / "results.json").read_bytes()
     for _ in range(2):
         assert main([f"run={run}", "episodes=2", "deterministic=true", "checkpoint=best"]) == 0
-    assert main([f"run={run}", "episodes=2", "checkpoint=640", "env.deputy.mass=24", "seed=3"]) == 0
+    changes = ["env.deputy.mass=24", "env.deputy.start.position.distance=100,110"]
+    assert main([f"run={run}", "episodes=2", "checkpoint=640", *changes, "seed=3"]) == 0
     names = sorted(path.name for path in (run / "evaluations").iterdir())
-    assert names == ["640-2-seed3-changed", "best-2-seed0", "best-2-seed0-2"]
+    changed = "640-2-seed3-deputy.mass=24-deputy.start.position.distance=100_110"
+    assert names == [changed, "best-2-seed0", "best-2-seed0-2"]
     assert (run / "results.json").read_bytes() == before
-    results = json.loads((run / "evaluations" / "640-2-seed3-changed" / "results.json").read_text())
-    assert results["changes"] == {"deputy.mass": 24}
+    results = json.loads((run / "evaluations" / changed / "results.json").read_text())
+    assert results["changes"]["deputy.mass"] == 24
     assert (results["algorithm"], results["rta"]) == ("ppo", "none")
     assert results["steps"] == 640
     with pytest.raises(ConfigError, match="never overwritten"):
