@@ -185,7 +185,7 @@ def regions_so_far(env: Environment, platforms: Container[str]) -> list[Region]:
 
 
 def _in_detail(env: Environment) -> tuple[set[str], set[str], Mapping[str, list[str]]]:
-    """Return the regions of which some part asks for more than position and content.
+    """Return the regions for which some part needs more than position and content.
 
     Returns:
         The regions whose motion, and those whose distances, are named by some part. The last is,

@@ -38,7 +38,7 @@ MAX_NAME_LETTERS = 200
 
 
 class Choice(Protocol):
-    """A distribution over actions of which only the mode is known."""
+    """A distribution over actions. Only its mode is known."""
 
     def mode(self) -> Array:
         """Return the actions."""

@@ -22,10 +22,10 @@ REWARDS = (DistanceChange, WhileIn, FirstTime, Success, Failure)
 ENDS = (Held, TooClose, TooFar, Timeout)
 
 DIRECTIONS = 120
-"""Number of directions of the plane in which the way is bounded. More make the bound tighter."""
+"""Number of directions of the plane in which the path is bounded. More make the bound tighter."""
 
 PARTS_OF_STEP = 4
-"""Number of parts of a step, in each of which the way is bounded by its best values."""
+"""Number of parts of a step. The path in each part is bounded by the best values there."""
 
 SLACK = 0.1
 """Distance [ft] that is left for rounding in float32."""

@@ -124,7 +124,7 @@ class _Policies(NamedTuple):
 
 
 def _policies(options: Options) -> _Policies:
-    """Return the policies of which data are asked for.
+    """Return the policies whose steps are asked for.
 
     Raises:
         ConfigError: the options do not fit each other.

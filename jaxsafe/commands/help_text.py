@@ -92,7 +92,7 @@ def entries(cls: type[Component], start: str = "") -> Iterator[Row]:
     """Yield the description of each option.
 
     Args:
-        cls: the options of a command, or a component of which every field is an option.
+        cls: the options of a command, or a component whose fields are all options.
         start: the prefix of the names of the fields.
     """
     docs = field_docs(cls)

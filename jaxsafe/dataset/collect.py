@@ -125,7 +125,7 @@ def _steps(advance: Callable[..., Any], key: Key, num_steps: int, num_envs: int)
 
 
 def _first(steps: Dataset, count: int) -> Dataset:
-    """Return the first steps, of which the last is truncated if the episode does not end there."""
+    """Return the first steps. The last one is truncated if the episode does not end there."""
     cut = Dataset(*(array[:count] for array in steps))
     cut.truncated[-1] |= ~cut.terminated[-1]
     return cut

@@ -61,7 +61,7 @@ class Status(Processor):
         return self.process(self.init(sim), sim)
 
     def vectors(self) -> tuple[tuple[str, str], ...]:
-        """Return the vectors of which this status is a norm, as places and fields.
+        """Return the vectors whose norm this status is, as places and fields.
 
         If one of their numbers is NaN, so is the status.
         """

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from jaxsafe.environment import Environment
 
 LOST = 1e6
-"""Radius [ft] of a tube of which nothing is known."""
+"""Radius [ft] of a tube that nothing is known about."""
 
 ROUNDING = 1e-4
 """Error [rad] of headings in single precision, with a large reserve."""

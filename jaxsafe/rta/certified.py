@@ -656,7 +656,7 @@ class CertifiedRTA(RTA):
         Args:
             env: the environment.
             sim: the simulation after the step.
-            index: the index of the controller that acted. The others begin anew.
+            index: the index of the controller that acted. The memories of the others start again.
             moved: the memories of all controllers, as if each had acted.
         """
         pairs = zip(moved, self._fresh(env, sim), strict=True)

@@ -619,7 +619,7 @@ def _is(value: Number, expected: float) -> Bool[Array, ""]:
 def _speed_limits(env: Environment, rta: CertifiedRTA) -> list[SpeedLimitFacts] | str:
     """Return the facts of all speed limits of a filter.
 
-    If one of its constraints is no speed limit of which something is proved, return a fault.
+    If one of its constraints is no speed limit, or one that no proof covers, return a fault.
     """
     facts_by_name = {name: speed_limit_facts(env, name) for name in rta.constraints}
     unknown = next((name for name, facts in facts_by_name.items() if facts is None), None)

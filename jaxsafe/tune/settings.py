@@ -134,7 +134,7 @@ def settings(
 
 
 def alike(every: Sequence[Setting], chosen: Sequence[int]) -> list[list[int]]:
-    """Return the chosen indices in groups, each of which is compiled once.
+    """Return the chosen indices in groups. A group is compiled once.
 
     The settings of a group differ in numbers only.
 

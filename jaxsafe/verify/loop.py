@@ -48,7 +48,7 @@ class Plant(NamedTuple):
 
 
 class Loop(NamedTuple):
-    """A closed loop of which something can be proved.
+    """A closed loop that something can be proved about.
 
     Its state is (position, velocity, action). The programs return the next state and the margin h
     that belongs to it.
@@ -75,7 +75,7 @@ def closed_loop(env: Environment, policy: Policy, arithmetic: str = "float32") -
             numbers with the same parameters.
 
     Raises:
-        ConfigError: the loop is random, remembers, or has a part of which nothing can be proved.
+        ConfigError: the loop is random, remembers, or has a part that no proof covers.
     """
     _require_provable(env)
     unit = {"float32": SINGLE, "real": 0.0}[arithmetic]
@@ -131,10 +131,10 @@ def start_of(env: Environment, x: Float[Array, " 2d"]) -> dict[str, dict[str, An
 
 
 def _require_provable(env: Environment) -> None:
-    """Refuse loops of which nothing can be proved.
+    """Refuse loops that nothing can be proved about.
 
     Raises:
-        ConfigError: nothing can be proved of the loop.
+        ConfigError: nothing can be proved about the loop.
     """
     if env.rta is not None:
         raise ConfigError(
