@@ -633,8 +633,8 @@ def filtered_training(_: Results) -> str:
                     label,
                     _until(own["interaction_efficiency"]["timesteps"]),
                     f"{own['training_cost']['mean']:,.0f}",
-                    f"{100 * mode['success_rate']['mean']:.4g} %",
-                    _share(mode["episode_safety_violation_rate"]),
+                    f"{100 * mode['success_rate']['mean']:.4g}",
+                    f"{100 * mode['episode_safety_violation_rate']['mean']:.3g}",
                     f"{mode['episode_length']['mean']:.0f}",
                 ]
             )
@@ -643,17 +643,16 @@ def filtered_training(_: Results) -> str:
                 continue
             alone = record["evaluations"][WITHOUT_RTA]["evaluation"]["deterministic"]
             rows[-1] += [
-                _share(mode["intervention_rate"]),
-                f"{100 * alone['success_rate']['mean']:.4g} %",
-                _share(alone["episode_safety_violation_rate"]),
+                f"{100 * mode['intervention_rate']['mean']:.3g}",
+                f"{100 * alone['success_rate']['mean']:.4g}",
+                f"{100 * alone['episode_safety_violation_rate']['mean']:.3g}",
             ]
     heads = (
-        "task | option | 80 % in training after | violations in training | success |"
-        " violating steps | length [steps]"
+        "task | option | 80 % in training after | violations in training | success [%]"
+        " | violating steps [%] | length [steps] | steps altered [%] | alone: success [%]"
+        " | alone: violating steps [%]"
     )
-    return markdown(
-        f"{heads} | steps altered | alone: success | alone: violating steps".split(" | "), rows
-    )
+    return markdown(heads.split(" | "), rows)
 
 
 def readme_tasks(_: Results) -> str:
