@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated
 
 from jaxsafe.commands import cli
-from jaxsafe.commands.options import CommandOptions, Option
+from jaxsafe.commands.options import CommandOptions, File, Option
 from jaxsafe.schema.errors import ConfigError
 
 
@@ -24,11 +24,14 @@ class Options(CommandOptions):
         ),
     ]
     """A run directory, whose evaluations count too, or a single results.json."""
+    hidden_seed: File | None = None
+    """The file of a hidden seed, to check that the results were measured with it."""
 
 
 def main(argv: Sequence[str]) -> int:
     """Run the command and return its exit code."""
-    from jaxsafe.runs.protocol import findings, read_all
+    from jaxsafe.evaluate.hidden_seed import read_hidden_seed
+    from jaxsafe.runs.protocol import committed, findings, read_all
     from jaxsafe.train.host.log import headline
 
     options = Options.parse(argv)
@@ -37,6 +40,9 @@ def main(argv: Sequence[str]) -> int:
     except ConfigError as error:
         raise ConfigError(f"run: {error}") from None
     found = findings(results, others, options.run if Path(options.run).is_dir() else "RUN")
+    if options.hidden_seed is not None:
+        hidden = read_hidden_seed(Path(options.hidden_seed))
+        found.append(committed([results, *others], hidden))
     width = max(len(finding.what) for finding in found)
     print(f"{headline(results)}\n")
     for what, reported, detail in found:

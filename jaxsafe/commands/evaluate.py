@@ -6,10 +6,11 @@ The results are written into a new directory, and a table of them is printed.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
 from jaxsafe.commands import cli
-from jaxsafe.commands.options import Count, Directory, Option, Seed
+from jaxsafe.commands.options import Count, Directory, File, Option, Seed
 from jaxsafe.commands.policy_options import PolicyOptions, differences
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores
@@ -20,6 +21,9 @@ FORMS = ("gif", "mp4", "png", "jsonl")
 
 EPISODES = ("first", "failing", "violating", "worst")
 """The episodes that can be shown."""
+
+LOGGED = ("failing", "violating", "all")
+"""The episodes whose steps can be logged together."""
 
 MAPS = ("success", "violations", "return", "length", "delta_v")
 """The panels of a map. `jaxsafe.plot.start_map` has their labels."""
@@ -35,11 +39,12 @@ class Options(PolicyOptions):
             "episodes",
             "cases",
             "seed",
+            "hidden_seed",
             "map",
             "bounds",
             "out",
         ),
-        "Films, figures and logs of single episodes.": ("render", "film", "film_seed"),
+        "Films, figures and logs of single episodes.": ("render", "film", "film_seed", "log"),
     }
 
     episodes: Count = 1000
@@ -51,6 +56,12 @@ class Options(PolicyOptions):
     """
     seed: Seed = 0
     """Seed of the starts and of the noise. 0 gives those of the results of the run itself."""
+    hidden_seed: File | None = None
+    """A file with a seed that the results do not name, for a leaderboard.
+
+    If there is no such file, a seed is drawn and written into it. The results have a commitment to
+    the seed, and nothing of single episodes is written.
+    """
     checkpoint: str | None = None
     """The checkpoint of a run: last, best, or its number of steps. By default it is the last.
 
@@ -74,6 +85,11 @@ class Options(PolicyOptions):
     """
     film_seed: Seed | None = None
     """The training seed whose policy is shown. By default it is the first one."""
+    log: Annotated[tuple[str, ...], Option(names=LOGGED, kind="episode")] = ()
+    """Log all steps of all episodes that fail or violate a constraint, or of all episodes.
+
+    The log `episodes.jsonl` has the episodes of all seeds, in the form of the log of a training.
+    """
     out: Directory | None = None
     """Where to write. By default it is a new directory in RUN/evaluations, or in evaluations/."""
 
@@ -87,6 +103,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.commands.policies import load, load_foreign
     from jaxsafe.evaluate.cases import load_cases
     from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
+    from jaxsafe.evaluate.hidden_seed import read_or_draw_hidden_seed
     from jaxsafe.train.host.options import cases_file
     from jaxsafe.train.host.results import table
 
@@ -106,6 +123,9 @@ def main(argv: Sequence[str]) -> int:
         options.refuse_beside(["film", "film_seed"], "without render=gif or another format")
     else:
         film = Film(options.render, options.film, options.film_seed)
+    if options.hidden_seed is not None:
+        shown = ["seed", "map", "render", "log"]
+        options.refuse_beside(shown, "beside hidden_seed, which nothing may show")
     if "mp4" in options.render:
         from jaxsafe.plot.animation import require_ffmpeg
 
@@ -125,10 +145,14 @@ def main(argv: Sequence[str]) -> int:
     if options.cases is not None:
         options.refuse_beside(["episodes"], "beside cases, which say how many there are")
         cases = load_cases(env, cases_file(options.cases))
+    hidden = None
+    if options.hidden_seed is not None:
+        hidden = read_or_draw_hidden_seed(Path(options.hidden_seed))
     request: dict[str, Any] = {
         "run": options.run,
         "episodes": options.episodes if cases is None else cases.size,
-        "evaluation_seed": options.seed,
+        "evaluation_seed": options.seed if hidden is None else None,
+        **({} if hidden is None else {"seed_commitment": hidden.commitment}),
         "checkpoint": options.checkpoint or "last",
         **({} if options.cases is None else {"cases": options.cases}),
         "changes": {
@@ -147,6 +171,8 @@ def main(argv: Sequence[str]) -> int:
         cases=cases,
         panels=options.map,
         bounds=options.bounds,
+        logged=options.log,
+        hidden=hidden,
     )
     print("\n".join([table(results, path), *films]))
     return cli.DIVERGED if "diverged" in results else 0

@@ -22,6 +22,7 @@ from jaxsafe.evaluate.evaluator import (
     given_up,
     step_rows,
 )
+from jaxsafe.evaluate.hidden_seed import HiddenSeed
 from jaxsafe.metrics import Episode
 from jaxsafe.storage.files import append_rows, write_csv, write_json
 from jaxsafe.storage.provenance import versions
@@ -56,12 +57,24 @@ class Film(NamedTuple):
         """
         if which == "worst":
             return int(np.argmin(sums.episode_return))
-        flags = {
-            "first": np.ones(len(sums.outcome), bool),
-            "failing": ~env.succeeded(np.asarray(sums.outcome)),
-            "violating": sums.violating_steps > 0,
-        }[which]
-        return int(np.argmax(flags)) if flags.any() else None
+        numbers = numbers_of("all" if which == "first" else which, sums, env)
+        return numbers[0] if numbers else None
+
+
+def numbers_of(which: str, sums: Episode, env: Environment) -> list[int]:
+    """Return the numbers of the episodes that are `failing` or `violating`, or of `all`.
+
+    Args:
+        which: the name of the episodes.
+        sums: sums over the episodes of a policy, each field [episodes].
+        env: the environment, which says what counts as success.
+    """
+    flags = {
+        "all": np.ones(len(sums.outcome), bool),
+        "failing": ~env.succeeded(np.asarray(sums.outcome)),
+        "violating": sums.violating_steps > 0,
+    }[which]
+    return np.flatnonzero(flags).tolist()
 
 
 def _name(request: Mapping[str, Any]) -> str:
@@ -73,7 +86,8 @@ def _name(request: Mapping[str, Any]) -> str:
     parts = [request["checkpoint"], request["episodes"]]
     if "cases" in request:
         parts.append(Path(request["cases"]).stem)
-    parts.append(f"seed{request['evaluation_seed']}")
+    seed = request["evaluation_seed"]
+    parts.append("hidden_seed" if seed is None else f"seed{seed}")
     for name, value in request["changes"].items():
         parts.append(name if isinstance(value, (list, dict)) else f"{name}={value}")
     return re.sub(r"[^\w.=+-]+", "_", "-".join(map(str, parts)))[:MAX_NAME]
@@ -89,8 +103,12 @@ def evaluate(
     cases: Cases | None = None,
     panels: Sequence[str] = (),
     bounds: bool = False,
+    logged: Sequence[str] = (),
+    hidden: HiddenSeed | None = None,
 ) -> tuple[Path, dict[str, Any], list[str]]:
     """Evaluate every policy and write `results.json`, `eval.jsonl` and `starts.csv`.
+
+    With a hidden seed only `results.json` is written, because the others would give the seed away.
 
     Args:
         subject: the policies.
@@ -104,9 +122,11 @@ def evaluate(
         panels: the panels of a map of the starts, names of `jaxsafe.plot.start_map.PANELS`. If
             there are none, no map is drawn.
         bounds: whether to compare the episodes with what is possible.
+        logged: the episodes to log step by step in `episodes.jsonl`, names that `numbers_of` knows.
+        hidden: the seed of the evaluation if it is hidden. `evaluation_seed` is then None.
 
     Returns:
-        The path of `results.json`, its content, and lines about films and maps.
+        The path of `results.json`, its content, and lines about films, logs and maps.
 
     Raises:
         ConfigError: `out` holds something, no outcome of the environment counts as a success, or no
@@ -114,7 +134,7 @@ def evaluate(
     """
     require_success(env)
     episodes = request["episodes"]
-    seed = request["evaluation_seed"]
+    seed = request["evaluation_seed"] if hidden is None else hidden.seed
     path = run_directory.make(out, subject.place, _name(request))
     try:
         evaluator = Evaluator(subject.mapper, env, subject.agent, cases)
@@ -129,7 +149,7 @@ def evaluate(
         raise
     first = subject.facts["seed"]
     left_out = _not_finite(subject)
-    for kind, of_kind in sums.items():
+    for kind, of_kind in sums.items() if hidden is None else ():
         rows = episode_rows(
             env, of_kind, first, possible, step=subject.facts["steps"], kind=kind, final=True
         )
@@ -137,7 +157,7 @@ def evaluate(
             path / "eval.jsonl", (row for row in rows if row["seed"] - first not in left_out)
         )
     columns = columns_of(env, starts)
-    if columns:
+    if columns and hidden is None:
         cells = zip(*(column.tolist() for column in columns.values()), strict=True)
         write_csv(path / "starts.csv", [dict(zip(columns, row, strict=True)) for row in cells])
     results = {
@@ -156,12 +176,14 @@ def evaluate(
                 for name, values in gaps_per_seed(env, of_kind, possible).items()
             }
     write_json(path / "results.json", results)
-    lines = []
+    lines = [] if hidden is None else [f"commitment to the hidden seed: {hidden.commitment}"]
     for kind, of_kind in sums.items() if panels else ():
         lines.append(_map(subject, env, starts, of_kind, kind, panels, path))
     if film is not None:
         for kind, of_kind in sums.items():
             lines += _render(subject, evaluator, of_kind, seed, kind, film, path)
+    for kind, of_kind in sums.items() if logged else ():
+        lines.append(_log(subject, evaluator, of_kind, seed, kind, logged, left_out, path))
     return path / "results.json", results, lines
 
 
@@ -217,6 +239,54 @@ def _render(
             file = _show(env, episode, path / f"{stem}.{form}", title)
             lines.append(f"{KINDS_OF_FILE[form]} of {whose}, episode {number}: {file}")
     return lines
+
+
+def _log(
+    subject: Subject,
+    evaluator: Evaluator,
+    sums: Episode,
+    seed: int,
+    kind: str,
+    which: Sequence[str],
+    left_out: Sequence[int],
+    path: Path,
+) -> str:
+    """Add every step of some episodes of all seeds to `episodes.jsonl`, and return a line.
+
+    Args:
+        subject: the policies.
+        evaluator: the evaluator that has flown the episodes.
+        sums: sums over the episodes, each field [seeds, episodes].
+        seed: the seed of the evaluation.
+        kind: the kind of evaluation.
+        which: the names of the episodes.
+        left_out: indices of policies that are not logged.
+        path: the directory of the evaluation.
+    """
+    env = evaluator.env
+    params = subject.mapper.gather(subject.params)
+    file = path / "episodes.jsonl"
+    count = 0
+    for index in range(subject.facts["seeds"]):
+        own = jax.tree.map(lambda x, i=index: np.asarray(x)[i], sums)
+        numbers = sorted({number for name in which for number in numbers_of(name, own, env)})
+        numbers = [] if index in left_out else numbers
+        count += len(numbers)
+        facts = {
+            "step": subject.facts["steps"],
+            "seed": subject.facts["seed"] + index,
+            "kind": kind,
+            "final": True,
+        }
+        episodes = evaluator.chosen_episodes(
+            jax.tree.map(lambda x, i=index: x[i], params), numbers, seed, kind == "deterministic"
+        )
+        for number, episode in zip(numbers, episodes, strict=True):
+            rows = step_rows(env, *episode)
+            append_rows(file, ({**facts, "episode": number, **row} for row in rows))
+    whose = " or ".join(which)
+    where = f": {file}" if count else ""
+    return f"log of the {kind} episodes, {whose}: {count:,} of {np.size(sums.outcome):,}{where}"
 
 
 KINDS_OF_FILE = {"gif": "film", "mp4": "film", "png": "figure", "jsonl": "log"}

@@ -192,25 +192,37 @@ class Evaluator:
     ) -> tuple[State, TimeStep]:
         """Return states and time steps, each [steps + 1], of one of the episodes that `run` runs.
 
-        The whole batch of the episode is flown again, because it shares the noise of the actions.
+        The arguments are those of `chosen_episodes`.
+        """
+        [episode] = self.chosen_episodes(params, [number], seed, deterministic)
+        return episode
+
+    def chosen_episodes(
+        self, params: Params, numbers: Sequence[int], seed: int, deterministic: bool
+    ) -> Iterator[tuple[State, TimeStep]]:
+        """Yield states and time steps, each [steps + 1], of some of the episodes that `run` runs.
+
+        The whole batch of an episode is flown again, because it shares the noise of the actions.
 
         Args:
             params: the parameters of one seed's policy.
-            number: the index of the episode.
+            numbers: the indices of the episodes, in ascending order.
             seed: the seed of the evaluation.
             deterministic: whether the policy takes the mode of its actions.
         """
-        batch, index = divmod(number, EPISODES_PER_BATCH)
-        *_, key = batch_keys(seed, batch + 1)
-        [episode] = self._episodes(
-            params,
-            key,
-            deterministic=np.asarray(deterministic),
-            first_case=batch * EPISODES_PER_BATCH,
-            chosen=[index],
-            size=EPISODES_PER_BATCH,
-        )
-        return episode
+        last = max(numbers, default=-1) // EPISODES_PER_BATCH
+        for batch, key in enumerate(batch_keys(seed, last + 1)):
+            first = batch * EPISODES_PER_BATCH
+            chosen = [n - first for n in numbers if first <= n < first + EPISODES_PER_BATCH]
+            if chosen:
+                yield from self._episodes(
+                    params,
+                    key,
+                    deterministic=np.asarray(deterministic),
+                    first_case=first,
+                    chosen=chosen,
+                    size=EPISODES_PER_BATCH,
+                )
 
     def _episodes(
         self,

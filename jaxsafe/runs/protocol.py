@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from jaxsafe.envs.task import default_filter
 from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
+from jaxsafe.evaluate.hidden_seed import HiddenSeed
 from jaxsafe.storage.files import read_json
 from jaxsafe.train.host.results import check_results
 
@@ -128,3 +129,20 @@ def findings(
         ),
         Finding("versions and the machine", bool(versions), ", ".join(machine)),
     ]
+
+
+def committed(results: Sequence[Mapping[str, Any]], hidden: HiddenSeed) -> Finding:
+    """Return whether the results with a hidden seed are committed to this one.
+
+    Args:
+        results: results, of which some may have a commitment.
+        hidden: the seed, which is no longer hidden.
+    """
+    found = [each["seed_commitment"] for each in results if "seed_commitment" in each]
+    wrong = next((each for each in found if each != hidden.commitment), None)
+    detail = f"{hidden.seed}, as committed in {len(found)} of {len(results)} results"
+    if not found:
+        detail = "no result has a commitment; evaluate with hidden_seed=FILE"
+    elif wrong is not None:
+        detail = f"the file has the commitment {hidden.commitment}, a result has {wrong}"
+    return Finding("the hidden seed", bool(found) and wrong is None, detail)

@@ -1,3 +1,4 @@
+import hashlib
 import json
 import shutil
 from pathlib import Path
@@ -129,6 +130,65 @@ def test_starts_figures_logs_maps_and_gaps_of_an_evaluation(tmp_path: Path) -> N
         assert min(gaps) > -1e-3
         assert len(set(gaps)) > 3
     assert metrics["length_gap"]["mean"] < 30.0
+
+
+def test_all_failures_of_all_seeds_are_logged_at_once(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    place = tmp_path / "logged"
+    words = [f"run={whole}", "episodes=6", "deterministic=false", f"out={place}"]
+    assert main([*words, "log=failing,violating"]) == 0
+    rows = {(row["seed"], row["episode"]): row for row in read_rows(place / "eval.jsonl")}
+    chosen = {
+        number for number, row in rows.items() if not row["success"] or row["violating_steps"] > 0
+    }
+    logged: dict[tuple[int, int], list[dict[str, Any]]] = {}
+    for step in read_rows(place / "episodes.jsonl"):
+        assert (step["kind"], step["final"], step["step"]) == ("stochastic", True, 1280)
+        logged.setdefault((step["seed"], step["episode"]), []).append(step)
+    assert {seed for seed, _ in chosen} == {0, 1, 2}
+    assert list(logged) == sorted(chosen)
+    for number, steps in logged.items():
+        assert len(steps) == rows[number]["length"] + 1
+        assert steps[-1]["outcome"] == rows[number]["outcome"]
+        total = sum(step["reward"] for step in steps[1:])
+        assert total == pytest.approx(rows[number]["return"], rel=1e-3)
+    told = capsys.readouterr().out
+    assert f"stochastic episodes, failing or violating: {len(chosen)} of 18: {place}" in told
+
+
+def test_a_hidden_seed_is_shown_nowhere_and_can_be_checked_later(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    secret = tmp_path / "secret.json"
+    words = ["run=controller/pd", "env=docking1d", "episodes=20"]
+    for place in ("hidden", "again"):
+        assert main([*words, f"hidden_seed={secret}", f"out={tmp_path / place}"]) == 0
+    seed, salt = json.loads(secret.read_text()).values()
+    assert secret.stat().st_mode & 0o077 == 0
+    assert [file.name for file in (tmp_path / "hidden").iterdir()] == ["results.json"]
+    results = json.loads((tmp_path / "hidden" / "results.json").read_text())
+    assert results["evaluation_seed"] is None
+    text = f"{seed}:{salt}".encode()
+    assert results["seed_commitment"] == hashlib.sha256(text).hexdigest()
+    assert f"hidden seed: {results['seed_commitment']}" in capsys.readouterr().out
+    again = json.loads((tmp_path / "again" / "results.json").read_text())
+    assert again["evaluation"] == results["evaluation"]
+    # Once the seed is shown, everybody can measure the same numbers.
+    assert main([*words, f"seed={seed}", f"out={tmp_path / 'shown'}"]) == 0
+    shown = json.loads((tmp_path / "shown" / "results.json").read_text())
+    assert shown["evaluation"] == results["evaluation"]
+    other = dict(zip(("seed", "salt"), (seed ^ 1, salt), strict=True))
+    for content, message in (
+        ({**other, "seed": -1}, "seed: expected a whole number from 0 to 2,147,483,647, found -1"),
+        ({**other, "salt": "short"}, "salt: expected at least 32 letters, found 'short'"),
+    ):
+        secret.write_text(json.dumps(content))
+        with pytest.raises(ConfigError, match=f"secret.json: {message}"):
+            main([*words, f"hidden_seed={secret}", f"out={tmp_path / 'wrong'}"])
+    for option in ("seed=1", "map=success", "render=png", "log=all"):
+        with pytest.raises(ConfigError, match="means nothing beside hidden_seed"):
+            main([*words, f"hidden_seed={secret}", option])
 
 
 def test_a_map_has_x_along_the_heading_of_the_other_craft() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from jaxsafe.commands.check import main
+from jaxsafe.evaluate.hidden_seed import read_hidden_seed, read_or_draw_hidden_seed
 from jaxsafe.runs.protocol import findings, read_all
 from jaxsafe.schema.errors import ConfigError
 
@@ -81,3 +82,27 @@ def test_the_command_reads_a_run_and_its_evaluations(
     assert main([f"run={whole / 'results.json'}"]) == 1
     with pytest.raises(ConfigError, match=r"run: .*nothing: cannot be read"):
         main([str(tmp_path / "nothing")])
+
+
+def test_a_commitment_fits_its_seed_alone(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    secret = tmp_path / "secret.json"
+    hidden = read_or_draw_hidden_seed(secret)
+    assert read_hidden_seed(secret) == hidden != read_or_draw_hidden_seed(tmp_path / "other.json")
+    results = tmp_path / "results.json"
+    content = json.loads((whole / "results.json").read_text())
+    told = {}
+    for name, commitment in (
+        ("right", {"seed_commitment": hidden.commitment}),
+        ("wrong", {"seed_commitment": hidden._replace(seed=hidden.seed ^ 1).commitment}),
+        ("none", {}),
+    ):
+        results.write_text(json.dumps(content | commitment))
+        main([f"run={results}", f"hidden_seed={secret}"])
+        told[name] = capsys.readouterr().out
+    assert f"{hidden.seed}, as committed in 1 of 1 results" in told["right"]
+    assert "MISSING   the hidden seed" not in told["right"]
+    assert f"the file has the commitment {hidden.commitment}, a result has" in told["wrong"]
+    assert "MISSING   the hidden seed" in told["wrong"]
+    assert "no result has a commitment; evaluate with hidden_seed=FILE" in told["none"]
