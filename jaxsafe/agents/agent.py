@@ -81,7 +81,8 @@ class Agent(Component):
     cost_names: tuple[str, ...] = ()
     """The constraints whose costs the second critic estimates, one output each.
 
-    Without any it has one output, for the cost of the step. A `cost_limit` with names sets it.
+    Without any it has one output, for the cost of the step. A `cost_limit` or a `ppo.multiplier`
+    with names sets it.
     """
 
     @property

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -55,6 +55,9 @@ Gain = Annotated[Dimensionless, Range(0.0, largest=10.0)]
 
 MULTIPLIERS = (1e-4, 1e2)
 """Smallest and largest multiplier of a cost."""
+
+Multiplier = Annotated[Dimensionless, Range(*MULTIPLIERS)]
+"""What a cost of 1 takes off the reward."""
 
 MAX_COUNT = 2**31 - 1
 """The largest number of environments, steps or minibatches. Programs count in 32 bits."""
@@ -157,8 +160,12 @@ class PPO(Component):
     A mapping has a number for each constraint that is limited, by its name. `jaxsafe train` sets it
     by the option `cost_limit`.
     """
-    multiplier: Annotated[Dimensionless, Range(*MULTIPLIERS)] = 0.01
-    """Multiplier of the cost at the start, in reward per violating step, with PPO-Lagrangian."""
+    multiplier: Multiplier | Mapping[str, Multiplier] = 0.01
+    """Multiplier of the cost at the start, in reward per violating step, with PPO-Lagrangian.
+
+    A mapping has a multiplier for each constraint, by its name. If `cost_limit` has names too, they
+    are the same ones.
+    """
     multiplier_rate: Annotated[Dimensionless, Range(0.0)] = 0.03
     """Largest change of the multiplier's logarithm in an update, with PPO-Lagrangian.
 
@@ -185,6 +192,12 @@ class PPO(Component):
     """
     curriculum_share: Annotated[Dimensionless, Range(0.0, 1.0, open_low=True)] = 0.5
     """Share of the training after which the numbers of the `curriculum` have their own values."""
+
+    @property
+    def cost_names(self) -> tuple[str, ...]:
+        """The constraints that `cost_limit` or `multiplier` names, in the order of the alphabet."""
+        named = [each for each in (self.cost_limit, self.multiplier) if isinstance(each, Mapping)]
+        return tuple(sorted(named[0])) if named else ()
 
     @property
     def batch_size(self) -> int:
@@ -302,7 +315,7 @@ def init(env: Environment, agent: Agent, ppo: PPO, key: Key, shard: Shard = WHOL
     no_excess: Any = ()
     if agent.cost_critic:
         shape = (len(agent.cost_names),) if agent.cost_names else ()
-        multiplier = jnp.broadcast_to(jnp.asarray(ppo.multiplier), shape)
+        multiplier = jnp.broadcast_to(_by_name(ppo.multiplier, agent.cost_names), shape)
         no_excess = jnp.zeros_like(multiplier)
     return TrainState(
         params=params,
@@ -416,24 +429,32 @@ def check_complete_episodes(env: Environment, ppo: PPO) -> None:
 
 
 def check_cost_limit(env: Environment, agent: Agent, ppo: PPO) -> None:
-    """Check that the limits are for constraints of the environment, as the agent's critic is.
+    """Check that limits and multipliers are for constraints of the environment, as the critic is.
 
     Raises:
-        ConfigError: a limit is for something else, or the critic has other outputs.
+        ConfigError: one is for something else, or the critic has other outputs.
     """
     if not agent.cost_critic:
         return
-    limits = ppo.cost_limit if isinstance(ppo.cost_limit, Mapping) else {}
     constraints = [constraint.name for constraint in env.constraints]
-    unknown = [name for name in limits if name not in constraints]
-    if unknown or (not limits and isinstance(ppo.cost_limit, Mapping)):
-        found = f"unknown constraint {show(unknown[0])}" if unknown else "expected a constraint"
-        choices = choices_text(unknown[0] if unknown else "", constraints)
-        raise ConfigError(f"cost_limit: {found}{choices}")
-    if agent.cost_names != tuple(sorted(limits)):
+    names = ppo.cost_names
+    for place, numbers in (("cost_limit", ppo.cost_limit), ("ppo.multiplier", ppo.multiplier)):
+        if not isinstance(numbers, Mapping):
+            continue
+        unknown = [name for name in numbers if name not in constraints]
+        if unknown or not numbers:
+            found = f"unknown constraint {show(unknown[0])}" if unknown else "expected a constraint"
+            choices = choices_text(unknown[0] if unknown else "", constraints)
+            raise ConfigError(f"{place}: {found}{choices}")
+        if tuple(sorted(numbers)) != names:
+            raise ConfigError(
+                f"{place}: expected a number for each of {', '.join(names)}, as cost_limit has,"
+                f" found {', '.join(sorted(numbers))}"
+            )
+    if agent.cost_names != names:
         raise ConfigError(
-            f"agent.cost_names: expected the names in ppo.cost_limit, {show(sorted(limits))},"
-            f" found {show(list(agent.cost_names))}"
+            "agent.cost_names: expected the names in ppo.cost_limit or ppo.multiplier,"
+            f" {show(list(names))}, found {show(list(agent.cost_names))}"
         )
 
 
@@ -529,17 +550,16 @@ def dual_ascent(
 
     Args:
         env: the environment.
-        agent: the agent. Each of its `cost_names` has a limit, or else one number is the limit.
+        agent: the agent. Each of its `cost_names` has a limit, or one number is the limit of all.
         ppo: the hyperparameters.
         state: the state before the update.
         window: the latest finished episodes, including those of this update.
         done: whether episodes ended, by step and environment.
     """
-    limit: Any = ppo.cost_limit
+    limit = _by_name(ppo.cost_limit, agent.cost_names)
     episodes = window.episodes
     costs = episodes.severity_sum if env.cost == "severity" else episodes.violating_steps
     if agent.cost_names:
-        limit = jnp.stack([jnp.asarray(limit[name]) for name in agent.cost_names])
         costs = jnp.stack([episodes.costs[name] for name in agent.cost_names], axis=-1)
     cost = latest_cost(window, costs)
     excess = jnp.clip(cost / limit - 1.0, -1.0, 1.0)
@@ -554,6 +574,13 @@ def dual_ascent(
         multiplier_boost=jnp.where(known, boost, state.multiplier_boost),
         cost_excess=jnp.where(known, excess, state.cost_excess),
     )
+
+
+def _by_name(numbers: Any, names: Sequence[str]) -> Array:
+    """Return the number of each constraint [c] in the order of `names`, or the number of all."""
+    if not isinstance(numbers, Mapping):
+        return jnp.asarray(numbers)
+    return jnp.stack([jnp.asarray(numbers[name]) for name in names])
 
 
 def price(state: TrainState) -> Array:

@@ -406,6 +406,25 @@ def test_a_multiplier_with_a_rate_of_0_is_a_fixed_penalty() -> None:
     assert float(price(state)) == float(fixed.multiplier)
 
 
+def test_each_constraint_has_a_fixed_penalty_of_its_own() -> None:
+    agent = AGENT.replace(cost_critic=True)
+    penalties = {"push": jnp.array(2.0), "hard_push": jnp.array(1e-4)}
+    fixed = SMALL.replace(multiplier=penalties, multiplier_rate=jnp.array(0.0))
+    by_name = agent.replace(cost_names=fixed.cost_names)
+    check_cost_limit(two_limits(), by_name, fixed)
+    state = train(two_limits(), 3, fixed, by_name)
+    assert int(state.window.count) > 0
+    np.testing.assert_allclose(price(state), [1e-4, 2.0], rtol=1e-6)
+    # A penalty on the only constraint is a penalty on the cost.
+    env = probe(Push(name="reward"), steps=3, most=0.2)
+    whole = train(env, 3, fixed.replace(multiplier=jnp.array(0.5)), agent)
+    alone = fixed.replace(multiplier={"push": jnp.array(0.5)})
+    named = train(env, 3, alone, agent.replace(cost_names=("push",)))
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), named.params, whole.params
+    )
+
+
 @pytest.mark.thorough
 def test_each_constraint_has_a_limit_of_its_own_and_others_have_none() -> None:
     agent = AGENT.replace(cost_critic=True)
@@ -448,6 +467,19 @@ def test_the_critic_of_costs_must_be_that_of_the_limits() -> None:
             check_cost_limit(
                 two_limits(), agent.replace(cost_names=names), SMALL.replace(cost_limit=limits)
             )
+    for multiplier, limits, message in (
+        ({"pull": 1.0}, 1.0, "ppo.multiplier: unknown constraint 'pull'. Did you mean 'push'"),
+        ({}, 1.0, "ppo.multiplier: expected a constraint; choose from"),
+        (
+            {"push": 1.0},
+            {"push": 1.0, "hard_push": 0.0},
+            "ppo.multiplier: expected a number for each of hard_push, push, as cost_limit has, "
+            "found push",
+        ),
+    ):
+        ppo = SMALL.replace(multiplier=multiplier, cost_limit=limits)
+        with pytest.raises(ConfigError, match=message):
+            check_cost_limit(two_limits(), agent.replace(cost_names=ppo.cost_names), ppo)
 
 
 def test_a_multiplier_whose_limit_is_0_never_falls() -> None:

@@ -199,6 +199,9 @@ def test_what_follows_from_an_option_of_the_other_run_follows_from_a_new_one(
     penalty = {"algorithm": "ppo_lagrangian", "ppo.multiplier": 0.05, "ppo.multiplier_rate": 0}
     config, _, _ = resolve({"like": run_with("penalty", **penalty)})
     assert (config.cost_limit, config.agent.cost_critic) == (None, True)
+    penalty["ppo.multiplier"] = {"velocity_limit": 0.05}
+    config, _, _ = resolve({"like": run_with("penalties", **penalty)})
+    assert (config.cost_limit, config.agent.cost_names) == (None, ("velocity_limit",))
     by_name = run_with("by_name", algorithm="ppo_lagrangian", cost_limit={"velocity_limit": 5})
     config, _, _ = resolve({"like": by_name})
     assert config.ppo.cost_limit == {"velocity_limit": 5.0}
@@ -208,6 +211,8 @@ def test_what_follows_from_an_option_of_the_other_run_follows_from_a_new_one(
     assert config.agent.cost_names == ("velocity_limit",)
     expected = f"cost_limit: expected one for each of velocity_limit, because {by_name} has that"
     assert refused(**further, cost_limit=2) == expected
+    config, _, _ = resolve({"env": "docking2d", "from": by_name, **penalty})
+    assert config.ppo.multiplier == pytest.approx({"velocity_limit": 0.05})
     config, _, _ = resolve({"like": by_name, "cost_limit": 4})
     assert (float(config.ppo.cost_limit), config.agent.cost_names) == (4.0, ())
 

@@ -876,6 +876,15 @@ def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(
             "agent.cost_names: follows from the algorithm; give cost_limit={NAME: N}",
         ),
         (
+            ["algorithm=ppo_lagrangian", "cost_limit=1", "ppo.multiplier={velocity_limit: 0.1}"],
+            "cost_limit: expected a number for each of velocity_limit, as ppo.multiplier has, "
+            "found 1",
+        ),
+        (
+            ["algorithm=ppo_lagrangian", "ppo.multiplier={velocity_limit: 0}"],
+            r"ppo.multiplier.velocity_limit: expected a number in \[0.0001, 100\], found 0",
+        ),
+        (
             ["algorithm=trpo"],
             "algorithm: found .trpo.. Did you mean 'ppo'. Choose from ppo, ppo_lagrangian",
         ),

@@ -447,8 +447,8 @@ def _inherit_agent(arguments: Arguments, source: str) -> None:
         if given:
             raise ConfigError(f"{given[0]}: the training starts from {source}, which decides it")
         if path == "agent.cost_names":
-            limits = arguments.options.get("cost_limit")
-            names = sorted(limits) if isinstance(limits, Mapping) else []
+            numbers = [arguments.options.get(name) for name in ("cost_limit", "ppo.multiplier")]
+            names = next((sorted(each) for each in numbers if isinstance(each, Mapping)), [])
             if names != value and inherited.get("agent.cost_critic"):
                 kind = f"one for each of {', '.join(value)}" if value else "a number"
                 raise ConfigError(f"cost_limit: expected {kind}, because {source} has that")
@@ -471,7 +471,7 @@ def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfi
     """
     for path, instead in (
         ("agent.cost_critic", "algorithm=ppo_lagrangian"),
-        ("agent.cost_names", "cost_limit={NAME: N}"),
+        ("agent.cost_names", "cost_limit={NAME: N} or ppo.multiplier={NAME: N}"),
         ("ppo.cost_limit", "cost_limit=N"),
     ):
         if path in given:
@@ -498,13 +498,16 @@ def _with_algorithm(config: TrainConfig, given: Mapping[str, Any]) -> TrainConfi
             "ppo.gamma: expected less than 1 with algorithm=ppo_lagrangian, "
             f"found {float(config.ppo.gamma)}"
         )
-    limits = config.cost_limit if isinstance(config.cost_limit, Mapping) else {}
-    return config.replace(
-        agent=config.agent.replace(cost_critic=True, cost_names=tuple(limits)),
-        ppo=config.ppo
-        if config.cost_limit is None
-        else config.ppo.replace(cost_limit=config.cost_limit),
-    )
+    ppo = config.ppo
+    if config.cost_limit is not None:
+        ppo = ppo.replace(cost_limit=config.cost_limit)
+        if isinstance(ppo.multiplier, Mapping) and not isinstance(config.cost_limit, Mapping):
+            raise ConfigError(
+                f"cost_limit: expected a number for each of {', '.join(ppo.cost_names)}, as "
+                f"ppo.multiplier has, found {float(config.cost_limit):g}"
+            )
+    agent = config.agent.replace(cost_critic=True, cost_names=ppo.cost_names)
+    return config.replace(agent=agent, ppo=ppo)
 
 
 def _check_rta(config: TrainConfig, env: Environment) -> None:
