@@ -45,6 +45,9 @@ METRICS = (
 )
 """The names that `summarise` returns."""
 
+COST_OF = "episode_cost/"
+"""Beginning of the names of the costs by constraint, which end in the constraint's name."""
+
 OVER_STEPS = ("mean", "maximum", "minimum", "final")
 """What a metric of one's own takes of a status over the steps of an episode."""
 
@@ -176,6 +179,16 @@ def _measured(
     return jnp.where(length == 0, value, follow[over_steps](before, value))
 
 
+def metrics_of(env: Environment) -> tuple[str, ...]:
+    """Return the names of all metrics of an environment.
+
+    They are `METRICS`, the cost of each safety constraint by its name, and the metrics of one's
+    own.
+    """
+    costs = [f"{COST_OF}{constraint.name}" for constraint in env.constraints]
+    return (*METRICS, *costs, *env.measure)
+
+
 def over_episode(name: str, measured: Any, length: Any) -> Any:
     """Return a metric of one's own over whole episodes: a sum becomes a mean.
 
@@ -244,7 +257,8 @@ def summarise(
             summed.
 
     Returns:
-        A value for every name of `METRICS` and each metric of one's own, which is a mean over
+        A value for every name of `METRICS`, the mean cost `episode_cost/NAME` of an episode for
+        each constraint that was followed, and each metric of one's own, which is a mean over
         episodes. Rates are fractions in [0, 1], Δv is in m/s, length in
         steps. `control_effort` is the mean magnitude of the controls that acted, each as a share of
         its full magnitude, over controls and steps. Severity is a share of the limit. Its mean is
@@ -276,6 +290,10 @@ def summarise(
         "episode_violation_severity_max": float(np.max(episodes.severity_max)),
         "mean_reward": mean["episode_return"] / max(steps, MIN_STEPS),
         "intervention_rate": mean["interventions"] / max(steps, MIN_STEPS),
+        **{
+            f"{COST_OF}{name}": float(np.mean(np.asarray(cost, float)))
+            for name, cost in episodes.costs.items()
+        },
         **{
             name: float(np.mean(over_episode(name, value, np.maximum(episodes.length, 1))))
             for name, value in episodes.measured.items()

@@ -55,7 +55,8 @@ def run_episodes(
     """
     key_start, key_act = jax.random.split(key)
     state, timestep = starts_of(env, key_start, num_episodes, cases)
-    episode = begin(timestep, measure=env.measure)
+    constraints = [constraint.name for constraint in env.constraints]
+    episode = begin(timestep, cost_names=constraints, measure=env.measure)
     full = full_controls(env)
     limit = max_steps(env)
 

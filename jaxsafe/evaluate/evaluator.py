@@ -20,7 +20,7 @@ from jaxsafe.evaluate.episodes import (
     run_episodes,
     starts_of,
 )
-from jaxsafe.metrics import METRICS, Episode, measures, metrics_in, over_episode
+from jaxsafe.metrics import Episode, measures, metrics_in, metrics_of, over_episode
 from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.types import Key, State, TimeStep
 
@@ -388,12 +388,12 @@ def given_up(env: Environment, kinds: Mapping[str, Episode]) -> dict[str, Any]:
 
 
 def metrics_per_seed(env: Environment, episodes: Episode) -> dict[str, list[float | None]]:
-    """Return every metric of Section 5 for each seed, from sums of shape [seeds, episodes]."""
+    """Return every metric of an environment for each seed, from sums of shape [seeds, episodes]."""
     num_seeds = np.asarray(episodes.outcome).shape[0]
     metrics = [
         metrics_in(env, jax.tree.map(lambda x, i=i: x[i], episodes)) for i in range(num_seeds)
     ]
-    return {name: [of_seed[name] for of_seed in metrics] for name in (*METRICS, *env.measure)}
+    return {name: [of_seed[name] for of_seed in metrics] for name in metrics_of(env)}
 
 
 def gaps_per_seed(

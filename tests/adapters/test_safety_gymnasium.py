@@ -7,6 +7,11 @@ import pytest
 
 from jaxsafe.adapters.safety_gymnasium import SafetyEnv
 
+CUSTOM = Path(__file__).parents[2] / "configs" / "custom_env.yaml"
+
+MOVING = {"deputy.start.velocity.share": [1.5, 1.6]}
+"""Every start is too fast."""
+
 FAST = {"start": {"deputy": {"position": [60.0, 0.0], "velocity": [-0.6, 0.0]}}}
 
 
@@ -74,3 +79,22 @@ def test_omnisafe_learns_to_dock_within_the_budget(
     late = rows[-1]
     assert float(late["Metrics/EpRet"]) > float(early["Metrics/EpRet"]) + 3.0
     assert float(late["Metrics/EpCost"]) <= 25.0
+
+
+@pytest.mark.parametrize("num_envs", [None, 2])
+def test_each_constraint_has_its_cost_by_name_in_each_step(num_envs: int | None) -> None:
+    env = SafetyEnv(CUSTOM, num_envs, {"terminal.timeout.limit": 3.0, **MOVING})
+    env.reset(seed=0)
+    action = np.zeros(env.action_space.shape, np.float32)
+    names = {"velocity_limit", "keep_out_speed", "keep_out"}
+    seen = []
+    for _ in range(4):
+        *_, cost, _, _, info = env.step(action)
+        if "final_info" in info:  # the step belongs to the episode that ended
+            assert info["_final_observation"].all()
+            info = info["final_info"]
+        costs = {name: value for name, value in info["costs"].items() if name[0] != "_"}
+        assert {*costs} == names
+        np.testing.assert_array_equal(cost, np.max([*costs.values()], axis=0))
+        seen.append(np.mean(costs["velocity_limit"]))
+    assert seen == [1.0] * 4

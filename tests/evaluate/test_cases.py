@@ -16,7 +16,7 @@ from jaxsafe.commands.evaluate import main
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.cases import column_names, columns_of, load_cases, reset_to_cases
-from jaxsafe.evaluate.evaluator import Evaluator
+from jaxsafe.evaluate.evaluator import Evaluator, metrics_per_seed
 from jaxsafe.rollout import reset_batch
 from jaxsafe.schema.errors import ConfigError
 
@@ -59,6 +59,26 @@ def test_each_case_is_the_start_of_an_episode_in_order(tmp_path: Path) -> None:
     np.testing.assert_allclose(recorded, position, rtol=1e-6)
     states, _ = evaluator.episode({}, 117, seed=0, deterministic=True)
     np.testing.assert_allclose(states.sim.platforms["deputy"].position[0], position[117], rtol=1e-6)
+
+
+def test_the_cost_of_each_constraint_is_a_metric_by_its_name() -> None:
+    # A step may violate both limits, and then costs 1 in all.
+    env = jaxsafe.make(
+        str(CONFIGS.parent / "custom_env.yaml"),
+        {"terminal.timeout.limit": 20.0, "deputy.start.velocity.share": [0.0, 4.0]},
+    )
+    evaluator = Evaluator(SeedMapper(1), env, Idle())
+    sums = evaluator.run({"none": np.zeros(1)}, 30, seed=0, deterministic=True)
+    computed = {name: value for name, [value] in metrics_per_seed(env, sums).items()}
+    flown = [timestep.costs for _, timestep in evaluator.episodes({}, 30, 0)]
+    names = [constraint.name for constraint in env.constraints]
+    by_name = []
+    for name in names:
+        by_name.append(computed[f"episode_cost/{name}"])
+        assert by_name[-1] == pytest.approx(np.mean([costs[name][1:].sum() for costs in flown]))
+    assert len({*by_name}) == len(names) == 3
+    assert computed["episode_cost"] < sum(by_name)
+    assert computed["episode_cost"] == pytest.approx(max(by_name))
 
 
 def test_drawn_numbers_are_columns_too(tmp_path: Path) -> None:

@@ -38,6 +38,10 @@ def test_the_runs_own_results_come_out_again(
     own = json.loads((whole / "results.json").read_text())
     for kind in ("stochastic", "deterministic"):
         assert again["evaluation"][kind] == own["evaluation"][kind]
+        metrics = own["evaluation"][kind]  # docking has one constraint
+        by_name = metrics["episode_cost/velocity_limit"]["per_seed"]
+        assert by_name == pytest.approx(metrics["episode_cost"]["per_seed"])
+        assert max(by_name) > 0.0
     assert "success rate" in capsys.readouterr().out
     rows = [
         json.loads(line) for line in (tmp_path / "again" / "eval.jsonl").read_text().splitlines()

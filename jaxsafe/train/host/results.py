@@ -11,6 +11,7 @@ from jaxsafe.environment import Environment, filter_name
 from jaxsafe.envs.identity import identity
 from jaxsafe.evaluate.evaluator import EVALUATION_KINDS, given_up, metrics_per_seed
 from jaxsafe.metrics import (
+    COST_OF,
     ENOUGH_SEEDS,
     METRICS,
     Episode,
@@ -179,11 +180,11 @@ def table(results: dict[str, Any], path: Path) -> str:
         if all(metrics.get(name, {}).get("mean") is not None for metrics in evaluations.values()):
             rows.append([label, *(_cell(metrics[name], unit) for metrics in evaluations.values())])
     kinds = [*evaluations.values()]
-    own = [
-        name
-        for name in kinds[0]
-        if name not in METRICS and all(of_kind[name]["mean"] is not None for of_kind in kinds)
-    ]
+    own = [name for name in kinds[0] if name not in METRICS]
+    costs = [name for name in own if name.startswith(COST_OF)]
+    # The cost of the only constraint stands in the table already.
+    own = [name for name in own if name not in costs or len(costs) > 1]
+    own = [name for name in own if all(of_kind[name]["mean"] is not None for of_kind in kinds)]
     rows += [[name, *(_cell(of_kind[name], "") for of_kind in kinds)] for name in own]
     worst = [least([metrics["success_rate"]]) for metrics in evaluations.values()]
     rows.append(["worst seed, success rate", *(percent(rate, 1) for rate in worst)])
