@@ -21,7 +21,7 @@ from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
 from jaxsafe.metrics import ENOUGH_EPISODES, stratified_iqm
 from jaxsafe.plot.compare import compare_curves, seed_curves
 from jaxsafe.plot.style import save
-from jaxsafe.storage.files import write_text
+from jaxsafe.storage.files import read_json, write_text
 from jaxsafe.storage.text_table import or_dash
 from jaxsafe.train.host.results import least, mean_text
 from jaxsafe.train.recent_episodes import SIZE as WINDOW
@@ -30,6 +30,9 @@ DIRECTORY = "baselines"
 """The directory beside the first page that holds records, curves, figures and films."""
 
 TEMPLATES = Path(__file__).with_name("pages")
+
+CONTROLLERS = Path(__file__).parents[1] / "results" / "controllers.json"
+"""The results of `python benchmarks/controllers.py`."""
 
 FIRST = "baselines.md"
 """The page that leads to all others."""
@@ -98,6 +101,7 @@ class Report:
         """
         tables = {
             "summary": self._summary(),
+            "controllers": self._controllers(),
             "efficiency": self._efficiency(),
             "wall": self._wall(),
             "final": self._final(),
@@ -173,6 +177,25 @@ class Report:
             cells = [column(results) if results else "–" for column in columns for results in pair]
             rows.append([task, f"{paper:,}" if paper else "–", *cells])
         return rows
+
+    def _controllers(self) -> Rows:
+        """Return a row for each classical controller of the tasks, which flies without a filter."""
+        return [
+            [
+                row["task"],
+                f"`{row['policy']}`",
+                *(
+                    f"{100 * row[name]:.2f}"
+                    for name in ("success_rate", "episode_safety_violation_rate")
+                ),
+                f"{row['average_return']:.2f}",
+                f"{row['episode_length']:.0f}",
+                or_dash(row["control_usage"], ".2f"),
+            ]
+            for task in self.tasks
+            for row in read_json(CONTROLLERS)["rows"]
+            if (row["task"], row["rta"]) == (task, "none") and row["policy"] != "ppo"
+        ]
 
     def _efficiency(self) -> Rows:
         rows = []
