@@ -116,7 +116,9 @@ def main(argv: Sequence[str]) -> int:
         boxes = [f"box.{name}" for name in options.box]
         options.refuse_beside(["steps", *boxes], "without format=vnnlib")
     if options.inputs not in kinds:
-        raise ConfigError(f"inputs: found {options.inputs!r}{choices_text(options.inputs, kinds)}")
+        raise ConfigError(
+            f"inputs: {run} has no network of jaxsafe{choices_text(options.inputs, kinds)}"
+        )
     about = {"policy": stem, "jaxsafe": versions()["jaxsafe"]}
     if form == "vnnlib":
         target = Path(out or f"{stem}_closed_loop.vnnlib")

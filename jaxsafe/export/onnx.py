@@ -8,6 +8,7 @@ graph has fixed shapes, opset 17 and float32, because verifiers and small runtim
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,9 @@ except ImportError as error:
 
 OPSET = 17
 """Version of the ONNX operators. Verifiers and small runtimes understand it."""
+
+MAX_ROUNDS = 1000
+"""Most rounds of a loop. A graph has no loops, so the rounds are written one after another."""
 
 _SAME = {
     "add": "Add",
@@ -152,6 +156,7 @@ class _Graph:
         self.nodes: list[Any] = []
         self.constants: list[Any] = []
         self._count = 0
+        self._signs: set[str] = set()
 
     def node(
         self, kind: str, inputs: Sequence[str], output: str | None = None, **attributes: Any
@@ -218,6 +223,12 @@ class _Graph:
         if kind in _INSIDE:
             inner = params[_INSIDE[kind]]
             return self.inline(inner.jaxpr, inner.consts, inputs)
+        if kind == "bitcast_convert_type" or self._signs.intersection(inputs):
+            return [self._sign_bit(kind, inputs, equation)]
+        if kind == "optimization_barrier":
+            return inputs
+        if kind == "scan":
+            return self._rounds(inputs, params)
         if kind == "and" and equation.outvars[0].aval.dtype != bool:
             return [self._masked(inputs[0], equation.invars[1])]
         if kind in _SAME:
@@ -241,6 +252,58 @@ class _Graph:
             helper.make_node("Split", [whole, self.integers(*sizes)], results, axis=axis)
         )
         return results
+
+    def _rounds(self, inputs: list[str], params: Any) -> list[str]:
+        """Add all rounds of a loop of known length, and return the names of its results.
+
+        Raises:
+            ConfigError: the loop is too long.
+        """
+        length = params["length"]
+        if length > MAX_ROUNDS:
+            raise ConfigError(
+                f"onnx: a loop of {length:,} rounds has no counterpart here, which writes at most"
+                f" {MAX_ROUNDS:,} rounds one after another"
+            )
+        consts = inputs[: params["num_consts"]]
+        carry = inputs[len(consts) : len(consts) + params["num_carry"]]
+        whole = inputs[len(consts) + len(carry) :]
+        rounds = range(length)[::-1] if params["reverse"] else range(length)
+        body = params["jaxpr"]
+        given = {}
+        for index in rounds:
+            ends = (self.integers(index), self.integers(index + 1), self.integers(0))
+            pieces = [self.node("Slice", [name, *ends]) for name in whole]
+            pieces = [self.node("Squeeze", [name, self.integers(0)]) for name in pieces]
+            results = self.inline(body.jaxpr, body.consts, [*consts, *carry, *pieces])
+            carry = results[: len(carry)]
+            given[index] = results[len(carry) :]
+        stacked = [
+            self._stack(list(names), None, None, {})
+            for names in zip(*(given[index] for index in range(length)), strict=True)
+        ]
+        return [*carry, *stacked]
+
+    def _sign_bit(self, kind: str, inputs: list[str], equation: Any) -> str:
+        """Return integers that stand for the bits of floats, or the sign bit of these integers.
+
+        ONNX has no access to bits. JAX's functions only ask for the sign, so the integer is −1 for
+        a negative float and 0 for any other. The sign of −0 is lost.
+
+        Raises:
+            ConfigError: something else than the sign is asked for.
+        """
+        kinds = [str(atom.aval.dtype) for atom in (equation.invars[0], equation.outvars[0])]
+        if kind == "bitcast_convert_type" and kinds == ["float32", "int32"]:
+            negative = self.node("Less", [inputs[0], self.constant(np.float32(0.0))])
+            sign = self.node("Neg", [self.node("Cast", [negative], to=TensorProto.INT32)])
+            self._signs.add(sign)
+            return sign
+        by = equation.invars[-1]
+        shifted = kind == "shift_right_arithmetic" and isinstance(by, core.Literal)
+        if shifted and by.val == 31:
+            return self.node("Identity", inputs[:1])
+        raise ConfigError(f"onnx: {kind!r} of the bits of a number has no counterpart here")
 
     def _masked(self, whole: str, mask: Any) -> str:
         """Return one bit m of integers x as (x mod 2m) − (x mod m).
@@ -337,16 +400,33 @@ class _Graph:
             "Cast", [self.node("ArgMax", inputs, axis=axis, keepdims=0)], to=_TYPES[out.dtype.name]
         )
 
+    def _atan2(self, inputs: list[str], *_: Any) -> str:
+        """Return the angle of (x, y) from the arctangent of y/x, by the signs of both."""
+        y, x = inputs
+        zero = self.constant(np.float32(0.0))
+        right = self.node("Atan", [self.node("Div", [y, x])])
+        half_turn = [self.constant(np.float32(turn)) for turn in (-np.pi, np.pi)]
+        below = self.node("Less", [y, zero])
+        left = self.node("Add", [right, self.node("Where", [below, *half_turn])])
+        upright = self.node("Mul", [self.node("Sign", [y]), self.constant(np.float32(np.pi / 2))])
+        angle = self.node("Where", [self.node("Less", [x, zero]), left, right])
+        return self.node("Where", [self.node("Equal", [x, zero]), upright, angle])
+
     def _dot_general(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
-        (left, right), batch = params["dimension_numbers"]
-        if (
-            any(batch)
-            or tuple(left) != (len(shapes[0]) - 1,)
-            or tuple(right) != (0,)
-            or len(shapes[1]) > 2
-        ):
-            raise ConfigError(
-                f"onnx: a product of shapes {shapes} over axes {left} and {right}"
-                " has no counterpart here"
-            )
-        return self.node("MatMul", inputs)
+        contracted, batch = params["dimension_numbers"]
+        last = len(shapes[0]) - 1
+        plain = (tuple(contracted[0]), tuple(contracted[1])) == ((last,), (0,))
+        if plain and not any(batch) and len(shapes[1]) <= 2:
+            return self.node("MatMul", inputs)
+        matrices = []
+        for side in (0, 1):
+            summed = [*contracted[side]]
+            first = [*batch[side]]
+            free = [axis for axis in range(len(shapes[side])) if axis not in (*summed, *first)]
+            order = [*first, *free, *summed] if side == 0 else [*first, *summed, *free]
+            groups = [free, summed] if side == 0 else [summed, free]
+            sizes = [math.prod(shapes[side][axis] for axis in group) for group in groups]
+            turned = self.node("Transpose", [inputs[side]], perm=[int(axis) for axis in order])
+            shape = self.integers(*(shapes[side][axis] for axis in first), *sizes)
+            matrices.append(self.node("Reshape", [turned, shape]))
+        return self.node("Reshape", [self.node("MatMul", matrices), self.integers(*out.shape)])

@@ -159,7 +159,8 @@ def test_its_closed_loop_goes_to_a_verifier(
         margins.append(timestep.info.margins["velocity_limit"])
     np.testing.assert_allclose(graph.run(None, {"input": start})[0], [margins], atol=1e-5)
     with pytest.raises(
-        ConfigError, match="inputs: found 'network'; choose from observation, state"
+        ConfigError,
+        match=r"inputs: net.onnx has no network of jaxsafe; choose from observation, state",
     ):
         export(["run=net.onnx", "env=docking2d", "inputs=network"])
 

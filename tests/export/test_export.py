@@ -14,6 +14,7 @@ from default_cases import one_of_each_kind
 from test_modes import CHECKED_WHILE_RUNNING, CHECKED_WHILE_TRACING
 
 import jaxsafe
+from jaxsafe.agents.callables import read_callable
 from jaxsafe.agents.imported_policy import ACTIVATIONS
 from jaxsafe.agents.policy_file import SavedPolicy, find_policy, read_policy, save_policy
 from jaxsafe.commands.export import main
@@ -72,6 +73,57 @@ def test_another_runtime_acts_alike(task: str) -> None:
         "Expand",
         "Identity",
     }
+
+
+@pytest.mark.parametrize(
+    ("task", "controller"),
+    one_of_each_kind(
+        [
+            ("docking1d", "pd"),
+            ("docking3d", "lqr"),
+            ("docking2d", "mpc"),
+            ("docking3d", "mpc"),
+            ("docking2d_oriented", "align"),
+            ("rejoin2d", "pursuit"),
+            ("rejoin3d", "pursuit"),
+        ],
+        [("docking2d", "mpc"), ("rejoin3d", "pursuit")],
+    ),
+)
+def test_another_runtime_flies_a_controller_alike(task: str, controller: str) -> None:
+    env = jaxsafe.make(task)
+    policy = read_callable(f"controller/{controller}", env)
+    _, starts = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(0), 300)
+    drawn = np.random.default_rng(0).uniform(-1, 1, (200, env.observation_size))
+    observations = np.concatenate([starts.observation, drawn]).astype(np.float32)
+    act = functions.action(policy).function
+    computed = run(to_onnx(act, observations.shape), observations)
+    # The plan of MPC is the end of 40 rounds, each of which rounds.
+    np.testing.assert_allclose(computed, jax.jit(act)(observations), atol=1e-4)
+    assert np.ptp(computed, axis=0).min() > 0.5
+
+
+@pytest.mark.parametrize(
+    ("function", "shape"),
+    [
+        (lambda x: jnp.arctan2(x[:, 0], x[:, 1]), (400, 2)),
+        (lambda x: jnp.einsum("nij,njk->nik", x, x), (5, 3, 3)),
+        (lambda x: jnp.einsum("ij,kj->ik", x, 2.0 * x), (4, 3)),
+        (lambda x: jnp.einsum("nij,mij->nm", x, x), (4, 3, 2)),
+        (lambda x: jnp.copysign(1.0 + x**2, x), (7,)),
+        (lambda x: jax.lax.scan(lambda c, row: (c * row, c + row), x[0], x)[1], (5, 3)),
+        (lambda x: jax.lax.scan(lambda c, r: (0.5 * c + r, c), x[0], x, reverse=True)[1], (5, 3)),
+        (lambda x: jax.lax.scan(lambda c, _: (c @ x, None), x, None, 3)[0], (3, 3)),
+        (lambda x: jax.lax.optimization_barrier((x, 2.0 * x))[1], (3,)),
+    ],
+)
+def test_a_part_of_a_controller_has_a_counterpart(function: Any, shape: tuple[int, ...]) -> None:
+    inputs = np.random.default_rng(0).uniform(-2.0, 2.0, shape).astype(np.float32)
+    if shape == (400, 2):
+        inputs[:100, 0] = 0.0
+        inputs[50:150, 1] = 0.0
+    computed = run(to_onnx(function, shape), inputs)
+    np.testing.assert_allclose(computed, function(inputs), rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.thorough
@@ -572,5 +624,11 @@ def test_a_large_batch_takes_no_memory() -> None:
 
 
 def test_what_has_no_counterpart_is_named() -> None:
+    long = lambda x: jax.lax.fori_loop(0, 2000, lambda _, y: 0.9 * y, x)  # noqa: E731
+    with pytest.raises(ConfigError, match="onnx: a loop of 2,000 rounds has no counterpart here"):
+        to_onnx(long, (3,))
+    bits = lambda x: x.view(jnp.int32) & 8  # noqa: E731
+    with pytest.raises(ConfigError, match="onnx: 'and' of the bits of a number has no counterpart"):
+        to_onnx(bits, (3,))
     with pytest.raises(ConfigError, match="onnx: 'erf' has no counterpart here"):
         to_onnx(jax.scipy.special.erf, (1, 2))
