@@ -39,6 +39,7 @@ from jaxsafe.simulation.geometry import (
 from jaxsafe.simulation.initializers import (
     AroundAtAltitude,
     AtDistance,
+    AtLogUniformDistance,
     BelowSpeedLimit,
     Cases,
     Direction,
@@ -95,6 +96,7 @@ __all__ = [
     "AroundAtAltitude",
     "Aspect",
     "AtDistance",
+    "AtLogUniformDistance",
     "BelowSpeedLimit",
     "BodyDirection",
     "BodyDisplacement",

@@ -283,6 +283,26 @@ class AtDistance(Initializer, type="at_distance"):
         return place(sim, self.about).position + distance * self.direction.vector(*angles)
 
 
+class AtLogUniformDistance(AtDistance, type="at_log_uniform_distance"):
+    """A position at a log-uniform distance and in a random direction from a platform or region.
+
+    The logarithm of the distance is uniform, so each factor of the distance is as likely as any
+    other: with 100 m to 10 km every second start is within 1 km.
+    """
+
+    def problem(self) -> str | None:
+        low, high = np.asarray(self.distance).tolist()
+        if not 0.0 < low <= high:
+            return f"expected 0 < low ≤ high as the distance, found {[low, high]}"
+        return None
+
+    def draw(self, key: Key, drawn: Mapping[str, Array], sim: Sim) -> Float[Array, " d"]:
+        logarithm, *angles = uniform(key, jnp.log(self.distance), *self.direction.intervals)
+        # The exponential may be rounded across an end.
+        distance = jnp.clip(jnp.exp(logarithm), *self.distance)
+        return place(sim, self.about).position + distance * self.direction.vector(*angles)
+
+
 class AroundAtAltitude(Initializer, type="around_at_altitude"):
     """A position at a random horizontal distance and azimuth from a platform or region.
 

@@ -22,9 +22,11 @@ from jaxsafe.schema.component import normalise
 from jaxsafe.simulation.geometry import direction
 from jaxsafe.simulation.initializers import (
     AroundAtAltitude,
+    AtLogUniformDistance,
     Cases,
     Direction,
     Fixed,
+    Initializer,
     Normal,
     Uniform,
     uniform,
@@ -169,7 +171,7 @@ def test_a_fixed_start_is_its_value_whatever_the_key(value: float | tuple[float,
         )
 
 
-def draw(initializer: Uniform | AroundAtAltitude, sim: Sim = NOWHERE, seed: int = 0) -> np.ndarray:
+def draw(initializer: Initializer, sim: Sim = NOWHERE, seed: int = 0) -> np.ndarray:
     keys = jax.random.split(jax.random.key(seed), NUM_STARTS)
     return np.asarray(
         jax.jit(jax.vmap(lambda key: normalise(initializer).draw(key, {}, sim)))(keys), float
@@ -231,6 +233,24 @@ def test_around_at_altitude_is_uniform_in_horizontal_distance_azimuth_and_altitu
         assert is_uniform(drawn[name], low, high), name
     for first, second in combinations(drawn, 2):
         assert spearmanr(drawn[first], drawn[second]).pvalue > LEVEL, (first, second)
+
+
+def test_log_uniform_distances_are_uniform_in_their_logarithm_in_any_direction() -> None:
+    chief = SimpleNamespace(position=jnp.asarray([30.0, -20.0]))
+    far = AtLogUniformDistance(name="position", about="chief", distance=(100.0, 1e4))
+    sample = draw(far, NOWHERE.replace(platforms={"chief": chief})) - np.array([30.0, -20.0])
+    distance = np.linalg.norm(sample, axis=1)
+    azimuth = np.arctan2(sample[:, 1], sample[:, 0]) % (2 * np.pi)
+    assert is_uniform(np.log10(distance), 2.0, 4.0)
+    assert is_uniform(azimuth, 0.0, 2 * np.pi)
+    assert spearmanr(distance, azimuth).pvalue > LEVEL
+    assert not is_uniform(distance, 100.0, 1e4)
+
+
+@pytest.mark.parametrize("distance", [(0.0, 10.0), (10.0, 5.0)])
+def test_a_log_uniform_distance_begins_above_0(distance: tuple[float, float]) -> None:
+    far = normalise(AtLogUniformDistance(name="position", about="chief", distance=distance))
+    assert far.problem() == f"expected 0 < low ≤ high as the distance, found {[*distance]}"
 
 
 # The rejoin and oriented tasks
