@@ -16,7 +16,7 @@ from jaxsafe.commands import COMMANDS, SUBCOMMANDS
 from jaxsafe.commands.catalogue import SECTIONS, Entry, describe, types_of
 from jaxsafe.commands.help_text import entries, grouped, shown
 from jaxsafe.envs import TASKS
-from jaxsafe.train.host.options import flatten
+from jaxsafe.train.host.options import recipe_paths
 from jaxsafe.train.host.options import recipes as task_recipes
 
 TARGET = Path(__file__).parent / "reference"
@@ -59,12 +59,16 @@ def recipes() -> Iterator[str]:
         " empty cell keeps the default."
     )
     found = {task: task_recipes(task) for task in TASKS}
-    for preset in next(iter(found.values())):
-        values = {task: flatten(presets[preset] or {}) for task, presets in found.items()}
+    for preset in dict.fromkeys(name for presets in found.values() for name in presets):
+        values = {
+            task: recipe_paths(task, preset, presets[preset])
+            for task, presets in found.items()
+            if preset in presets
+        }
         names = dict.fromkeys(name for flat in values.values() for name in flat)
         yield f"### preset={preset}"
         yield table(
-            ("option", *TASKS),
+            ("option", *values),
             (
                 (
                     f"`{name}`",

@@ -24,6 +24,7 @@ from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores, usable_cores
 from jaxsafe.environment import Environment
 from jaxsafe.envs import TASKS, registered
+from jaxsafe.envs.identity import identity
 from jaxsafe.runs.run import Run
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import train as function
@@ -228,6 +229,8 @@ def train_all(
                     f"{training.name}: {seeds} × {training.num_steps:,} steps, "
                     f"{recipe_text(config)}, in {run}"
                 )
+                if changes := identity(training.env)["changes"]:
+                    print(f"the task with other {', '.join(changes)}")
             training.prepare()
             upcoming = following and _open(following, files, time.monotonic())
             if upcoming:

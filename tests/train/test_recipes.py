@@ -16,10 +16,25 @@ from jaxsafe.commands import train as command
 from jaxsafe.envs.task import TASKS, Task
 from jaxsafe.processors.reward import Intervention
 from jaxsafe.runs.training import recipe_text
+from jaxsafe.schema import yaml12
 from jaxsafe.schema.component import normalise
+from jaxsafe.schema.dotted_paths import get_path
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.simulation.initializers import AtLogUniformDistance
 from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.options import TrainConfig, find_recipes, recipe, resolve
+
+FAR = "deputy.start.position.distance"
+
+WIDE = {
+    "env": {
+        "deputy.start.position.type": "at_log_uniform_distance",
+        FAR: [100, 1e4],
+        "terminal.timeout.limit": 6000,
+    },
+    "ppo": {"curriculum": {FAR: [100, 150]}},
+}
+"""A recipe with starts that are farther away than those of the task."""
 
 
 @pytest.fixture
@@ -65,6 +80,55 @@ def test_a_task_takes_the_recipes_of_the_file_of_its_environment(
     monkeypatch.setitem(TASKS, "formation", task)
     expected = {"recipe": "formation", "preset": "careful", "ppo.gamma": 0.9}
     assert recipe("formation", None) == expected
+
+
+def test_a_recipe_changes_the_environment_and_the_command_line_wins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    text = yaml12.write({"wide": WIDE, "plain": {"ppo": {"gamma": 0.5}}})
+    Path("own.yaml").write_text(text, encoding="utf-8")
+    given = {"env": "docking2d", "recipe": "own.yaml"}
+    config, wide, _ = resolve(given)
+    position = wide.agent_platform.start[0]
+    assert isinstance(position, AtLogUniformDistance)
+    assert position.distance.tolist() == [100.0, 1e4]
+    assert [*config.ppo.curriculum] == [FAR]
+    for path in ("terminal.timeout.limit", "reward.success.time_scale"):
+        assert float(get_path(wide, path)) == 6000.0
+    _, env, _ = resolve({**given, f"env.{FAR}": [50, 60]})
+    assert env.agent_platform.start[0].distance.tolist() == [50.0, 60.0]
+    assert resolve({**given, "preset": "plain"})[1] == jaxsafe.make("docking2d")
+    # What it changed is printed, and stays where the recipe is no longer read.
+    words = ["env=docking2d", "recipe=own.yaml", "steps=64", "episodes=1", "out=run"]
+    small = ["ppo.num_envs=4", "ppo.num_steps=16", "agent.actor.hidden=[4]", "eval_episodes=1"]
+    short = ["env.terminal.timeout.limit=3", "eval_every=1e9", "ppo.num_epochs=1"]
+    assert command.main([*words, *small, *short]) == 0
+    told = capsys.readouterr().out
+    assert "the task with other deputy.start.position.distance, deputy.start.position.type" in told
+    Path("own.yaml").unlink()
+    for again in (resolve({"like": "run"})[1], run_directory.read(Path("run"), "run")[1]):
+        assert again.agent_platform.start == wide.agent_platform.start
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ([1], r"own.yaml: recipes.wide.env: expected a mapping from paths to values, found \[1\]"),
+        ({"deputy.mas": 1}, "own.yaml: recipes.wide.env.deputy.mas: unknown field 'mas'"),
+        (
+            {"deputy.start.position.type": "at_log_uniform_distance", FAR: [0, 10]},
+            "expected 0 < low ≤ high as the distance",
+        ),
+    ],
+)
+def test_a_wrong_change_of_a_recipe_is_told_with_its_place(
+    changes: object, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("own.yaml").write_text(yaml12.write({"wide": {"env": changes}}), encoding="utf-8")
+    with pytest.raises(ConfigError, match=message):
+        resolve({"env": "docking2d", "recipe": "own.yaml"})
 
 
 def test_the_recipe_of_the_command_line_wins(mine: Path) -> None:

@@ -6,7 +6,7 @@ The options of the command line are resolved over a recipe from `configs/`, and 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -56,6 +56,9 @@ RENAMED = {
     },
 }
 """Today's names of values by option and earlier name. Commands and old runs may use both."""
+
+MAPPINGS = ("cost_limit", "ppo.cost_limit", "ppo.multiplier", "ppo.curriculum")
+"""Options that take a mapping. In a recipe all other mappings group options."""
 
 NO_RECIPE = "none"
 """Name of the recipe that leaves all options at their defaults."""
@@ -271,15 +274,15 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
             _refuse_fields(task, arguments.options)
         raise
     env, rta_training = _environment(task, config, base, arguments.options)
-    if "starts" in arguments.options and config.starts is not None:
-        env = with_unproved_starts(env, config.starts)
-    env = override(env, overrides, place="env")
-    require_success(env)
     name = base.name if base and task is None else str(task)
     if base:
         config, chosen = normalise(base.config), {}
     else:
-        config, chosen = _with_recipe(name, arguments.options)
+        config, env, chosen = _with_recipe(name, env, arguments.options)
+    if "starts" in arguments.options and config.starts is not None:
+        env = with_unproved_starts(env, config.starts)
+    env = override(env, overrides, place="env")
+    require_success(env)
     config = set_paths(config, {**arguments.options, **chosen})
     config = config.replace(rta_training=rta_training)
     if rta_training == "corrected_action":
@@ -377,19 +380,28 @@ def _environment(
     return env, rta_training
 
 
-def _with_recipe(task: str, given: Mapping[str, Any]) -> tuple[TrainConfig, dict[str, Any]]:
-    """Return the configuration of a recipe, and the options that say which recipe it is.
+def _with_recipe(
+    task: str, env: Environment, given: Mapping[str, Any]
+) -> tuple[TrainConfig, Environment, dict[str, Any]]:
+    """Return the configuration and the environment of a recipe, and the options that name it.
 
     Args:
         task: a task or a file.
+        env: its environment.
         given: the options that the user gave.
     """
     settings = recipe(task, given.get("preset"), given.get("recipe"))
     source = settings["recipe"]
     preset = settings["preset"]
     place = f"{source}: recipes.{preset}" if is_file(source) else ""
+    changes = {
+        path.removeprefix("env."): settings.pop(path)
+        for path in [*settings]
+        if path.startswith("env.")
+    }
+    env = override(env, changes, place=f"{place}.env".removeprefix("."))
     config = set_paths(normalise(TrainConfig()), settings, place)
-    return config, {"recipe": source, "preset": preset}
+    return config, env, {"recipe": source, "preset": preset}
 
 
 class Base(NamedTuple):
@@ -543,7 +555,29 @@ def recipe(task: str, preset: str | None, source: str | None = None) -> dict[str
         name = current_name("preset", name)
     if name not in presets:
         raise ConfigError(f"preset: unknown preset {show(name)}{choices_text(name, presets)}")
-    return {"recipe": available.source, "preset": name, **flatten(presets[name] or {})}
+    options = recipe_paths(available.source, name, presets[name])
+    return {"recipe": available.source, "preset": name, **options}
+
+
+def recipe_paths(source: str, preset: str, options: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the values of a recipe by dotted path. Changes of the environment are `env.PATH`.
+
+    Args:
+        source: the task or the file that has the recipe, for the message.
+        preset: the name of the recipe.
+        options: what stands below this name.
+
+    Raises:
+        ConfigError: `env` is no mapping from paths to values.
+    """
+    rest = dict(options or {})
+    changes = rest.pop("env", None) or {}
+    if not isinstance(changes, Mapping):
+        raise ConfigError(
+            f"{source}: recipes.{preset}.env: expected a mapping from paths to values, "
+            f"found {show(changes)}"
+        )
+    return {**flatten(rest, whole=MAPPINGS), **{f"env.{path}": changes[path] for path in changes}}
 
 
 class Recipes(NamedTuple):
@@ -599,8 +633,9 @@ def recipes(task: str) -> dict[str, Any]:
 
 def recipe_options() -> set[str]:
     """Return the options for which a recipe of some task has a value, by dotted path."""
-    presets = [settings for task in (*TASKS, *STARTERS) for settings in recipes(task).values()]
-    return {"preset", *(path for settings in presets for path in flatten(settings or {}))}
+    found = {task: recipes(task).items() for task in (*TASKS, *STARTERS)}
+    flat = [recipe_paths(task, *preset) for task, presets in found.items() for preset in presets]
+    return {"preset", *(path for settings in flat for path in settings)}
 
 
 def current_name(option: str, value: Any) -> Any:
@@ -643,13 +678,13 @@ def cases_file(name: str) -> str:
     return str(files[name])
 
 
-def flatten(tree: Mapping[str, Any], place: str = "") -> dict[str, Any]:
-    """Return the values of nested mappings by dotted path."""
+def flatten(
+    tree: Mapping[str, Any], place: str = "", whole: Collection[str] = ()
+) -> dict[str, Any]:
+    """Return the values of nested mappings by dotted path. Mappings in `whole` are values too."""
     flat: dict[str, Any] = {}
     for key, value in tree.items():
-        flat |= (
-            flatten(value, f"{place}{key}.")
-            if isinstance(value, Mapping)
-            else {f"{place}{key}": value}
-        )
+        path = f"{place}{key}"
+        nested = isinstance(value, Mapping) and path not in whole
+        flat |= flatten(value, f"{path}.", whole) if nested else {path: value}
     return flat
