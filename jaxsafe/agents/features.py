@@ -83,6 +83,10 @@ class ApproachFeatures(Features, type="approach"):
     The environment must observe position, velocity, speed and speed limit.
     """
 
+    with_observation: bool = True
+    """Whether the observation itself comes first. Without it no feature grows with the distance
+    faster than its logarithm, so networks also learn to fly from kilometres away."""
+
     def __call__(
         self, env: Environment, observation: Float[Array, "*batch o"]
     ) -> Float[Array, "*batch i"]:
@@ -99,9 +103,10 @@ class ApproachFeatures(Features, type="approach"):
         direction = position / (_norm(position) + 1e-3)
         along = jnp.sum(direction * velocity, axis=-1, keepdims=True)
         speed = _elements(env, observation, "speed", "approach") * relative_to_limit
+        docking = DockingFeatures()(env, observation)
         return jnp.concatenate(
             [
-                DockingFeatures()(env, observation),
+                docking if self.with_observation else docking[..., observation.shape[-1] :],
                 velocity,
                 along,
                 velocity - along * direction,

@@ -58,6 +58,8 @@ def test_approach_features_measure_the_velocity_by_its_limit(task: str) -> None:
     velocity = np.array([-0.1, 0.2, *rest]) / (0.2 + 0.002054 * 60.0)
     d = velocity.size
     size = env.observation_size
+    without = ApproachFeatures(with_observation=False)(env, timestep.observation)
+    np.testing.assert_array_equal(without, inputs[size:])
     measured, along, across, speed = np.split(inputs[size + d + 1 :], np.cumsum([d, 1, d]))
     np.testing.assert_allclose(measured, velocity, rtol=1e-5)
     # The direction has length ‖p‖/(‖p‖ + 0.001).

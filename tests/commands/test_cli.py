@@ -94,7 +94,7 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
         (
             ["env=docking3d", "preset=engineered_featurs"],
             "preset: unknown preset 'engineered_featurs'. Did you mean 'engineered_features'? "
-            "Choose from engineered_features, observation_only, many_envs, shortest_time\n",
+            "Choose from engineered_features, observation_only, many_envs, shortest_time, wide\n",
         ),
         (["env=docking3d", "ppo.gama=0.9"], "ppo.gama: unknown option 'gama'"),
         (["env=docking3d", "ppo.gamma=1.5"], "ppo.gamma: expected a number in [0, 1], found 1.5"),

@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from tiny_run import assert_same_end
 
@@ -24,13 +26,15 @@ from jaxsafe.simulation.initializers import AtLogUniformDistance
 from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.options import TrainConfig, find_recipes, recipe, resolve
 
+TIMEOUT = "terminal.timeout.limit"
+
 FAR = "deputy.start.position.distance"
 
 WIDE = {
     "env": {
         "deputy.start.position.type": "at_log_uniform_distance",
         FAR: [100, 1e4],
-        "terminal.timeout.limit": 6000,
+        TIMEOUT: 6000,
     },
     "ppo": {"curriculum": {FAR: [100, 150]}},
 }
@@ -94,7 +98,7 @@ def test_a_recipe_changes_the_environment_and_the_command_line_wins(
     assert isinstance(position, AtLogUniformDistance)
     assert position.distance.tolist() == [100.0, 1e4]
     assert [*config.ppo.curriculum] == [FAR]
-    for path in ("terminal.timeout.limit", "reward.success.time_scale"):
+    for path in (TIMEOUT, "reward.success.time_scale"):
         assert float(get_path(wide, path)) == 6000.0
     _, env, _ = resolve({**given, f"env.{FAR}": [50, 60]})
     assert env.agent_platform.start[0].distance.tolist() == [50.0, 60.0]
@@ -129,6 +133,18 @@ def test_a_wrong_change_of_a_recipe_is_told_with_its_place(
     Path("own.yaml").write_text(yaml12.write({"wide": {"env": changes}}), encoding="utf-8")
     with pytest.raises(ConfigError, match=message):
         resolve({"env": "docking2d", "recipe": "own.yaml"})
+
+
+def test_docking3d_has_a_recipe_for_far_starts() -> None:
+    config, env, _ = resolve({"env": "docking3d", "preset": "wide"})
+    assert get_path(env, FAR).tolist() == [100.0, 1e4]
+    assert config.ppo.curriculum[FAR].tolist() == [100.0, 150.0]
+    assert len(config.agent.inputs(env, jnp.ones(env.observation_size))) == 12
+    # The time at the speed limit from the farthest start, 2,260 s, fits into the timeout.
+    floor, slope = (
+        float(get_path(env, f"status.velocity_limit.{name}")) for name in ("floor", "slope")
+    )
+    assert np.log1p(slope * 1e4 / floor) / slope < 0.5 * float(get_path(env, TIMEOUT))
 
 
 def test_the_recipe_of_the_command_line_wins(mine: Path) -> None:
