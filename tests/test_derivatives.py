@@ -116,6 +116,8 @@ def test_features_are_those_of_the_plain_norm_bit_for_bit(features: Features) ->
     np.testing.assert_array_equal(inputs[:, start + 3 : start + 4], jnp.log(distance + 0.005))
 
 
+loss_and_gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))
+
 OLD_LOG_PROB = [-90.0, -1e30, 0.0, 90.0, 1e30, -25.0, -0.5]
 
 
@@ -134,7 +136,7 @@ def test_the_loss_and_its_gradient_are_finite_however_far_the_policies_are_apart
     batch = Batch(
         jnp.zeros((1, 6)), {}, action, jnp.full(1, old), jnp.full(1, advantage), jnp.zeros(1)
     )
-    computed = jax.value_and_grad(loss, has_aux=True)(params, env, agent, ppo, batch)
+    computed = loss_and_gradient(params, env, agent, ppo, batch)
     assert_finite(computed, f"{old}, {advantage}")
     (_, terms), _ = computed
     assert terms["approx_kl"] >= 0.0
@@ -152,7 +154,7 @@ def test_a_bad_action_that_became_far_likelier_is_still_made_less_likely(old: fl
         return agent.distribution(env, params, jnp.ones((1, 6))).log_prob(action)[0]
 
     batch = Batch(jnp.ones((1, 6)), {}, action, jnp.array([old]), jnp.array([-1.0]), jnp.zeros(1))
-    (value, _), gradient = jax.value_and_grad(loss, has_aux=True)(params, env, agent, ppo, batch)
+    (value, _), gradient = loss_and_gradient(params, env, agent, ppo, batch)
     assert float(value) > 1e8
     towards = jax.grad(log_prob)(params)["actor"]
     product = jax.tree.map(lambda a, b: jnp.sum(a * b), gradient["actor"], towards)
