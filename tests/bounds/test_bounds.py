@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from default_cases import one_of_each_kind
+from default_cases import TASKS_BY_DEFAULT, one_of_each_kind, thorough
 
 import jaxsafe
 from jaxsafe.bounds import best_possible
@@ -20,23 +20,32 @@ ROUNDING = {"length": 0, "return": 1e-3, "delta_v": 1e-3}
 """By how much float32 may carry a flight across a bound."""
 
 
-def noisy(env: jaxsafe.Environment, name: str, scale: float) -> Any:
-    """Return a controller whose actions are disturbed at random."""
-    law: Any = jaxsafe.load_policy(f"controller/{name}", env=env)
+def require_no_flight_beats_the_bounds(
+    env: jaxsafe.Environment, policy: Any, count: int, noise: tuple[float, ...] = (0.0,)
+) -> list[int]:
+    """Fly from many starts, compare with the bounds, and return the numbers of successes.
 
-    def policy(key: jax.Array, observation: jax.Array) -> jax.Array:
-        action = law(key, observation)
-        return jnp.clip(action + scale * jax.random.normal(key, action.shape), -1.0, 1.0)
+    The actions of the policy are disturbed at random, by each size of noise in turn. One program
+    flies with all of them.
+    """
 
-    return policy
+    @jax.jit
+    def fly(env: jaxsafe.Environment, key: jax.Array, scale: jax.Array) -> Any:
+        def disturbed(key: jax.Array, observation: jax.Array) -> jax.Array:
+            action = policy(key, observation)
+            return jnp.clip(action + scale * jax.random.normal(key, action.shape), -1.0, 1.0)
 
+        return run_episodes(env, disturbed, key, count)
 
-def require_no_flight_beats_the_bounds(env: jaxsafe.Environment, policy: Any, count: int) -> int:
-    """Fly from many starts, compare with the bounds, and return the number of successes."""
     key = jax.random.key(5)
     starts, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.split(key)[0], count)
     bounds = best_possible(env, starts)
-    sums = jax.device_get(jax.jit(run_episodes, static_argnums=(1, 3))(env, policy, key, count))
+    flown = [jax.device_get(fly(env, key, jnp.asarray(scale))) for scale in noise]
+    return [successes(env, sums, bounds) for sums in flown]
+
+
+def successes(env: jaxsafe.Environment, sums: Any, bounds: dict[str, np.ndarray]) -> int:
+    """Compare flights with the bounds, and return the number of successes."""
     succeeded = np.asarray(env.succeeded(sums.outcome))
     safe = succeeded & (sums.violating_steps == 0)
     assert (sums.episode_return <= bounds["return"] + ROUNDING["return"]).all()
@@ -50,14 +59,24 @@ def require_no_flight_beats_the_bounds(env: jaxsafe.Environment, policy: Any, co
 def test_no_flight_beats_the_bounds(task: str) -> None:
     env = jaxsafe.make(task)
     name = next(iter(find_task(task).controllers))
-    assert require_no_flight_beats_the_bounds(env, noisy(env, name, 0.0), 100) == 100
-    assert require_no_flight_beats_the_bounds(env, noisy(env, name, 0.1), 100) > 0
-    require_no_flight_beats_the_bounds(env, noisy(env, name, 3.0), 50)
+    law = jaxsafe.load_policy(f"controller/{name}", env=env)
+    exact, disturbed, _ = require_no_flight_beats_the_bounds(env, law, 100, (0.0, 0.1, 3.0))
+    assert exact == 100
+    assert disturbed > 0
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("variant", ["paper", "released"])
-@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize(
+    ("task", "variant"),
+    [
+        *(thorough(task, "paper") for task in TASKS),
+        *(thorough(task, "released") for task in TASKS_BY_DEFAULT),
+        *(
+            pytest.param(task, "released", marks=pytest.mark.slow)
+            for task in TASKS
+            if task not in TASKS_BY_DEFAULT
+        ),
+    ],
+)
 def test_packaged_policies_do_not_beat_the_bounds(task: str, variant: Any) -> None:
     env = jaxsafe.make(task, variant=variant)
     require_no_flight_beats_the_bounds(env, jaxsafe.load_policy(task, env=env), 200)
