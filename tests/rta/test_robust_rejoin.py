@@ -173,19 +173,14 @@ def test_a_tube_holds_every_way_that_is_flown_along_a_backup(near: bool, random:
             assert np.max((apart / radius)[known]) > 0.8
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("world", [*WORLDS[:2], *map(thorough, [WORLDS[2], {"process": 3.3}])])
-def test_the_widened_terminal_set_is_never_left_to_the_lead(world: dict[str, float]) -> None:
-    """A wingman at its edge is pushed towards the lead while the backup acts, for 150 s."""
-    env = robust(world)
+@jax.jit
+def least_distances(env: Any, sims: Sim, shares: jax.Array) -> jax.Array:
+    """Return how near the lead gets while the backup acts, from shares of the terminal set."""
     bound = env.rta.bound
     low, high = bounds(env)
     terminal = env.rta.terminal
     backup = env.rta.backups[0]
-    sims = beside(env, jax.random.key(1), near=True, count=128)
 
-    @jax.jit
-    @jax.vmap
     def least(sim: Sim, share: jax.Array) -> jax.Array:
         lead = sim.platforms["lead"]
         closing = share * 0.99 * terminal.tolerance
@@ -207,7 +202,16 @@ def test_the_widened_terminal_set_is_never_left_to_the_lead(world: dict[str, flo
 
         return jnp.min(jax.lax.scan(one_step, sim, length=150)[1])
 
-    assert np.min(least(sims, jnp.linspace(0.0, 1.0, 128))) >= 101.0
+    return jax.vmap(least)(sims, shares)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("world", [*WORLDS[:2], *map(thorough, [WORLDS[2], {"process": 3.3}])])
+def test_the_widened_terminal_set_is_never_left_to_the_lead(world: dict[str, float]) -> None:
+    """A wingman at its edge is pushed towards the lead while the backup acts, for 150 s."""
+    env = robust(world)
+    sims = beside(env, jax.random.key(1), near=True, count=128)
+    assert np.min(least_distances(env, sims, jnp.linspace(0.0, 1.0, 128))) >= 101.0
 
 
 def pursue(env: Any, sim: Sim, key: jax.Array) -> jax.Array:
@@ -219,18 +223,13 @@ def pursue(env: Any, sim: Sim, key: jax.Array) -> jax.Array:
     return jnp.clip(jnp.stack([turn / env.dt, 1e3]), low, high)
 
 
-def collisions(
-    env: Any, world: dict[str, float], policy: str, num_steps: int = 120
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the distances, whether steps were certified, and whether the starts were."""
+@partial(jax.jit, static_argnames=("policy", "num_steps"))
+def flights(
+    env: Any, bound: UncertaintyBound, keys: jax.Array, policy: str, num_steps: int
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     act = {"pursue": pursue, **ADVERSARIES}[policy]
-    bound = UncertaintyBound(
-        process=world.get("process", 0.0),
-        position=world.get("position", 0.0),
-        velocity=world.get("velocity", 0.0),
-    )
 
-    def episode(env: Any, key: jax.Array) -> Any:
+    def episode(key: jax.Array) -> Any:
         sim = bare(jaxsafe.reset(env.replace(rta=None), key)[0].sim)
         memory, start = env.rta.begin(env, measured(sim, bound, -inward(sim)))
 
@@ -245,8 +244,23 @@ def collisions(
         _, flown = jax.lax.scan(one_step, (sim, memory), jax.random.split(key, num_steps))
         return *flown, start.certified
 
+    return jax.vmap(episode)(keys)
+
+
+def collisions(
+    env: Any, world: dict[str, float], policy: str, num_steps: int = 120
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the distances, whether steps were certified, and whether the starts were.
+
+    All worlds share a program for each policy.
+    """
+    bound = UncertaintyBound(
+        process=jnp.asarray(world.get("process", 0.0)),
+        position=jnp.asarray(world.get("position", 0.0)),
+        velocity=jnp.asarray(world.get("velocity", 0.0)),
+    )
     keys = jax.random.split(jax.random.key(0), 32)
-    distances, certified, starts = jax.jit(jax.vmap(episode, in_axes=(None, 0)))(env, keys)
+    distances, certified, starts = flights(env, bound, keys, policy, num_steps)
     return np.asarray(distances), np.asarray(certified), np.asarray(starts)
 
 
