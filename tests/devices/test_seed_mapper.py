@@ -1,15 +1,14 @@
-import os
-import subprocess
-import sys
+from collections.abc import Callable
 
 import jax
 import numpy as np
 import pytest
 from default_cases import thorough
+from own_process import check_as_compiled_by_commands
 
 import jaxsafe
 from jaxsafe.agents.agent import Agent
-from jaxsafe.agents.features import DockingFeatures
+from jaxsafe.agents.features import ApproachFeatures, DockingFeatures
 from jaxsafe.agents.networks import GRU
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.devices.shard import WHOLE, Shard
@@ -53,40 +52,39 @@ def three() -> TrainState:
     return seeds(0, 3)
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("seed", [thorough(0), 1, thorough(2)])
-def test_a_seed_of_many_is_bit_for_bit_the_seed_alone(three: TrainState, seed: int) -> None:
-    alone = seeds(seed, 1)
-    jax.tree.map(
-        lambda many, single: np.testing.assert_array_equal(many[seed], single[0]), three, alone
-    )
+def check_that_seeds_of_many_are_seeds_alone() -> None:
+    many = seeds(0, 3)
+    for seed in range(3):
+        jax.tree.map(
+            lambda of_many, alone, seed=seed: np.testing.assert_array_equal(
+                of_many[seed], alone[0]
+            ),
+            many,
+            seeds(seed, 1),
+        )
 
 
-STARTS = """
-from jaxsafe.devices.seed_mapper import SeedMapper, claim_cores
-claim_cores()
-import jax, jaxsafe, numpy as np
-from jaxsafe.schema.component import normalise
-from jaxsafe.agents.agent import Agent
-from jaxsafe.agents.features import ApproachFeatures, DockingFeatures
-from jaxsafe.train.train import programs
-from jaxsafe.train.ppo import PPO
-env = jaxsafe.make("docking2d_oriented")
-shared = env, normalise(Agent(features=ApproachFeatures())), normalise(PPO(num_envs=32))
-def starts(count):
-    mapper = SeedMapper(count)
-    return mapper.gather(programs(mapper, 1, 1)[0](mapper.replicate(shared), mapper.keys(0)))
-jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b[0]), starts(3), starts(1))
-"""
+def check_that_oriented_docking_starts_as_the_seed_alone() -> None:
+    env = jaxsafe.make("docking2d_oriented")
+    shared = env, normalise(Agent(features=ApproachFeatures())), normalise(PPO(num_envs=32))
+
+    def starts(count: int) -> TrainState:
+        mapper = SeedMapper(count)
+        return mapper.gather(programs(mapper, 1, 1)[0](mapper.replicate(shared), mapper.keys(0)))
+
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b[0]), starts(3), starts(1))
 
 
 @pytest.mark.thorough
-def test_oriented_docking_starts_bit_for_bit_where_the_seed_alone_starts() -> None:
-    """The program is compiled as the command compiles it.
-
-    The settings of the tests compile it otherwise.
-    """
-    subprocess.run([sys.executable, "-c", STARTS], check=True, env={**os.environ, "XLA_FLAGS": ""})
+@pytest.mark.parametrize(
+    "check",
+    [
+        check_that_seeds_of_many_are_seeds_alone,
+        check_that_oriented_docking_starts_as_the_seed_alone,
+    ],
+)
+def test_a_seed_of_many_is_bit_for_bit_the_seed_alone(check: Callable[[], None]) -> None:
+    check_as_compiled_by_commands(check)
 
 
 @pytest.mark.thorough

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_process import check_as_compiled_by_commands
 from tiny_run import TINY
 
 import jaxsafe
@@ -29,25 +30,31 @@ def recipe() -> Recipe:
     return resolve(Arguments.parse(TINY).options)[:2]
 
 
-@pytest.mark.thorough
-def test_it_trains_bit_for_bit_what_the_command_trains(tmp_path: Path) -> None:
+def check_that_it_trains_what_the_command_trains(directory: str) -> None:
     """Two updates run at a time, as in all but the shortest trainings.
 
     A single one is compiled without a loop.
     """
     longer = {"seeds=3": "seeds=2", "steps=1280": "steps=6400", "eval_every=320": "eval_every=6400"}
     words = [longer.get(word, word) for word in TINY if not word.startswith("checkpoint_every")]
-    assert main([*words, f"out={tmp_path / 'run'}"]) == 0
+    assert main([*words, f"out={directory}"]) == 0
     config, env, _ = resolve(Arguments.parse(words).options)
     arguments = (env, config.agent, config.ppo, jax.random.key(1), config.num_updates)
-    saved = read_policy(tmp_path / "run" / "policy" / "seed_1.npz").params
-    rows = [row for row in read_progress(tmp_path / "run") if row["seed"] == 1]
+    saved = read_policy(Path(directory) / "policy" / "seed_1.npz").params
+    rows = [row for row in read_progress(Path(directory)) if row["seed"] == 1]
     returns = [row["return"] or 0.0 for row in rows]  # null while no episode has ended
     for state, curves in (jax.jit(train, static_argnums=4)(*arguments), train(*arguments)):
         jax.tree.map(np.testing.assert_array_equal, jax.device_get(state.average), saved)
         np.testing.assert_allclose(curves["return"], returns, rtol=1e-4)
         for name in ("value_loss", "approx_kl", "learning_rate"):
             np.testing.assert_allclose(curves[name], [row[name] for row in rows], rtol=1e-4)
+
+
+@pytest.mark.thorough
+def test_it_trains_bit_for_bit_what_the_command_trains(tmp_path: Path) -> None:
+    check_as_compiled_by_commands(
+        check_that_it_trains_what_the_command_trains, str(tmp_path / "run")
+    )
 
 
 @pytest.mark.thorough
