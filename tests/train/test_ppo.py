@@ -1,3 +1,5 @@
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -43,18 +45,20 @@ SMALL = normalise(
 )
 
 
+@partial(jax.jit, static_argnums=4)
+def trained(env: Environment, agent: Agent, ppo: PPO, key: jax.Array, updates: int) -> TrainState:
+    return jax.lax.fori_loop(
+        0,
+        updates,
+        lambda _, state: update(env, agent, ppo, updates, state)[0],
+        init(env, agent, ppo, key),
+    )
+
+
 def train(
     env: Environment, updates: int = 40, ppo: PPO = SMALL, agent: Agent = AGENT
 ) -> TrainState:
-    def run(key: jax.Array) -> TrainState:
-        return jax.lax.fori_loop(
-            0,
-            updates,
-            lambda _, s: update(env, agent, ppo, updates, s)[0],
-            init(env, agent, ppo, key),
-        )
-
-    return jax.jit(run)(jax.random.key(0))
+    return trained(env, agent, ppo, jax.random.key(0), updates)
 
 
 def value(state: TrainState, observation: float) -> float:
