@@ -106,29 +106,18 @@ class Flights(NamedTuple):
     start: Any  # whether the start was certified
 
 
-def fly(
+@partial(jax.jit, static_argnames=("policy", "num_steps", "delay", "known"))
+def flown(
     env: Any,
     bounds: UncertaintyBound,
     worlds: UncertaintyBound,
+    keys: jax.Array,
     policy: Callable[[Sim], jax.Array],
-    num_steps: int = 150,
-    delay: int = 0,
-    known_delay: int | None = None,
+    num_steps: int,
+    delay: int,
+    known: int,
 ) -> Flights:
-    """Fly eight episodes in each of some worlds.
-
-    Args:
-        env: the environment, with a filter.
-        bounds: what the filter is told in each world.
-        worlds: how far each world differs from what the filter knows.
-        policy: what the agent asks for.
-        num_steps: number of steps of an episode. It does not end before.
-        delay: the number of steps after which a control acts.
-        known_delay: what the filter is told of it. None stands for the truth.
-    """
-
     def episode(bound: UncertaintyBound, world: UncertaintyBound, key: jax.Array) -> Flights:
-        known = delay if known_delay is None else known_delay
         rta = env.rta.replace(bound=bound.replace(delay=known))
         sim = jaxsafe.reset(env.replace(rta=None), key)[0].sim.replace(regions={}, status={})
         memory, start = rta.begin(env, measured(env, sim, world))
@@ -148,12 +137,38 @@ def fly(
             return after, (h[-1], h.min(), info.certified)
 
         queue = jnp.zeros((delay, env.action_size))
-        _, flown = jax.lax.scan(one_step, (sim, memory, queue), length=num_steps)
-        return Flights(*flown, start=start.certified)
+        _, steps = jax.lax.scan(one_step, (sim, memory, queue), length=num_steps)
+        return Flights(*steps, start=start.certified)
 
     many = jax.vmap(jax.vmap(episode, in_axes=(None, None, 0)), in_axes=(0, 0, None))
-    flown = jax.jit(many)(bounds, worlds, jax.random.split(jax.random.key(0), 8))
-    return jax.tree.map(np.asarray, flown)
+    return many(bounds, worlds, keys)
+
+
+def fly(
+    env: Any,
+    bounds: UncertaintyBound,
+    worlds: UncertaintyBound,
+    policy: Callable[[Sim], jax.Array],
+    num_steps: int = 150,
+    delay: int = 0,
+    known_delay: int | None = None,
+) -> Flights:
+    """Fly eight episodes in each of some worlds. Environments of one structure share a program.
+
+    Args:
+        env: the environment, with a filter.
+        bounds: what the filter is told in each world.
+        worlds: how far each world differs from what the filter knows.
+        policy: what the agent asks for.
+        num_steps: number of steps of an episode. It does not end before.
+        delay: the number of steps after which a control acts.
+        known_delay: what the filter is told of it. None stands for the truth.
+    """
+    keys = jax.random.split(jax.random.key(0), 8)
+    known = delay if known_delay is None else known_delay
+    return jax.tree.map(
+        np.asarray, flown(env, bounds, worlds, keys, policy, num_steps, delay, known)
+    )
 
 
 @pytest.mark.parametrize(
