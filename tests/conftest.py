@@ -1,11 +1,12 @@
 """Settings for all tests: two devices, one thread each, and compiled programs kept between runs.
 
-Tests compile far more than they run. So LLVM optimises little, which takes a third less time.
-Without any optimisation a seed among many would no longer be the seed alone, bit for bit. XLA's
-older emitter of kernels takes less time too. Only some versions can choose it, and others stop at
-an unknown flag.
+Tests compile far more than they run. So LLVM optimises nothing, which takes up to half of the time
+that compilation takes. What must hold bit for bit of programs that are compiled otherwise is
+checked in a process without these flags (`own_process`). XLA's older emitter of kernels takes less
+time too. Only some versions can choose it, and others stop at an unknown flag.
 """
 
+import gc
 import os
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -18,7 +19,7 @@ from jaxsafe.devices.seed_mapper import accelerator_installed, claim_cores
 emitter = " --xla_cpu_use_fusion_emitters=false" * version("jaxlib").startswith("0.10.")
 os.environ.setdefault(
     "XLA_FLAGS",
-    f"--xla_force_host_platform_device_count=2 --xla_backend_optimization_level=1{emitter}",
+    f"--xla_force_host_platform_device_count=2 --xla_backend_optimization_level=0{emitter}",
 )
 claim_cores()
 
@@ -36,6 +37,12 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.1)
 
 MAX_MAPS = 40_000
 """Memory maps of a process at which its compiled programs are given up. Linux allows 65,530."""
+
+
+def pytest_collection_finish() -> None:
+    """Leave the modules and tests that stay to the end out of every garbage collection."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True, scope="module")
