@@ -65,7 +65,9 @@ def test_a_policy_file_gives_the_results_of_its_seed_and_a_film(
     assert results["seed"] == 2
     assert results["steps"] == 1280
     for name, metric in results["evaluation"]["deterministic"].items():
-        assert metric["per_seed"] == [own[name]["per_seed"][2]]
+        # Two programs: without optimisation they may differ in the last bit.
+        expected = np.array([own[name]["per_seed"][2]], float)
+        np.testing.assert_allclose(np.array(metric["per_seed"], float), expected, rtol=1e-6)
     with Image.open(place / "episode_deterministic.gif") as image:
         assert image.n_frames > 10  # type: ignore[attr-defined]
     with pytest.raises(

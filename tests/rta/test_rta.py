@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from default_cases import one_of_each_kind, thorough
+from own_process import check_as_compiled_by_commands
 from scipy.optimize import minimize
 
 import jaxsafe
@@ -568,6 +569,10 @@ def test_a_batch_of_any_size_is_filtered_alike(task: str) -> None:
 
 @pytest.mark.parametrize("task", one_of_each_kind(DOCKING, ["docking2d"]))
 def test_in_float32_every_projection_is_certified(task: str) -> None:
+    check_as_compiled_by_commands(every_projection_is_certified, task)
+
+
+def every_projection_is_certified(task: str) -> None:
     env = jaxsafe.make(task, rta="discrete_asif")
     size = env.action_size
 

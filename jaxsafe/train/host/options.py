@@ -274,14 +274,15 @@ def resolve(options: Mapping[str, Any]) -> tuple[TrainConfig, Environment, str]:
         if task is not None:
             _refuse_fields(task, arguments.options)
         raise
+    starts = config.starts if "starts" in arguments.options else None
     env, rta_training = _environment(task, config, base, arguments.options)
     name = base.name if base and task is None else str(task)
     if base:
         config, chosen = normalise(base.config), {}
     else:
         config, env, chosen = _with_recipe(name, env, arguments.options)
-    if "starts" in arguments.options and config.starts is not None:
-        env = with_unproved_starts(env, config.starts)
+    if starts is not None:
+        env = with_unproved_starts(env, starts)
     env = override(env, overrides, place="env")
     require_success(env)
     config = set_paths(config, {**arguments.options, **chosen})
