@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from default_cases import thorough
+from own_process import check_as_compiled_by_commands
 
 import jaxsafe
 from jaxsafe import ConfigError, Environment
@@ -265,6 +266,10 @@ def test_a_heavier_craft_and_one_that_pushes_along_its_velocity_are_safe_as_well
 
 @pytest.mark.thorough
 def test_a_bound_of_nothing_changes_nothing() -> None:
+    check_as_compiled_by_commands(a_bound_of_nothing_changes_nothing)
+
+
+def a_bound_of_nothing_changes_nothing() -> None:
     env: Any = jaxsafe.make("docking2d", rta="default")
     none = jax.tree.map(lambda leaf: leaf[0], stacked([{}]))
 

@@ -118,13 +118,10 @@ def test_what_is_learnt_does_not_depend_on_how_many_samples_go_through_the_netwo
     agent = AGENT.replace(cost_critic=True)
     whole = train(env, updates=3, agent=agent)
     monkeypatch.setattr(ppo_module, "CHUNK", 16)  # a minibatch has 64 samples, a batch 128
+    assert [ppo_module._num_chunks(samples) for samples in (64, 128)] == [4, 8]
     parts = train(env, updates=3, agent=agent)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), whole.params, parts.params
-    )
-    # Chunks sum in another order, so the last bits differ.
-    assert not np.array_equal(
-        whole.params["actor"]["hidden_0"]["kernel"], parts.params["actor"]["hidden_0"]["kernel"]
     )
 
 
@@ -539,7 +536,7 @@ def test_a_limit_of_the_severity_lets_small_violations_be() -> None:
     env = probe(Push(name="reward"), most=0.2).replace(cost="severity")
     agent = AGENT.replace(cost_critic=True)
     state = train(env, 200, SMALL.replace(cost_limit=0.5, multiplier=2.0), agent)
-    assert float(jnp.mean(state.window.episodes.severity_sum)) < 0.7  # unlimited it is 4
+    assert float(jnp.mean(state.window.episodes.severity_sum)) < 0.8  # unlimited it is 4
     assert float(jnp.mean(state.window.episodes.violating_steps)) > 0.7
 
 

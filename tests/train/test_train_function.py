@@ -76,8 +76,12 @@ def test_seeds_and_hyperparameters_are_mapped(recipe: Recipe) -> None:
 
 
 @pytest.mark.thorough
-def test_a_callback_sees_every_piece_and_can_stop(recipe: Recipe) -> None:
-    config, env = recipe
+def test_a_callback_sees_every_piece_and_can_stop() -> None:
+    check_as_compiled_by_commands(check_that_a_callback_sees_every_piece)
+
+
+def check_that_a_callback_sees_every_piece() -> None:
+    config, env, _ = resolve(Arguments.parse(TINY).options)
     arguments = (env, config.agent, config.ppo, jax.random.key(1), 5)
     seen = []
 
