@@ -149,6 +149,14 @@ def to_onnx(function: Callable[[Any], Any], shape: Sequence[int]) -> Any:
     return model
 
 
+def _loop_counts(params: Any) -> tuple[int, int]:
+    """Return how many inputs of a loop stay as they are, and how many it carries on."""
+    if "ft_in" in params:  # from JAX 0.12 on
+        consts, carry, _ = params["ft_in"].unpack()
+        return len(consts), len(carry)
+    return params["num_consts"], params["num_carry"]
+
+
 class _Graph:
     """An ONNX graph that is being built. Constants and results of nodes are known by name."""
 
@@ -265,8 +273,9 @@ class _Graph:
                 f"onnx: a loop of {length:,} rounds has no counterpart here, which writes at most"
                 f" {MAX_ROUNDS:,} rounds one after another"
             )
-        consts = inputs[: params["num_consts"]]
-        carry = inputs[len(consts) : len(consts) + params["num_carry"]]
+        num_consts, num_carry = _loop_counts(params)
+        consts = inputs[:num_consts]
+        carry = inputs[num_consts : num_consts + num_carry]
         whole = inputs[len(consts) + len(carry) :]
         rounds = range(length)[::-1] if params["reverse"] else range(length)
         body = params["jaxpr"]
