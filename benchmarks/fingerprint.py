@@ -26,7 +26,8 @@ def fingerprint(script: Path) -> str:
     """
     digest = hashlib.sha256()
     for path in [*sources(script), *sorted((ROOT / "configs").rglob("*.yaml"))]:
-        code = _code(path) if path.suffix == ".py" else path.read_text(encoding="utf-8")
+        python = path.suffix == ".py"
+        code = ast.unparse(_tree(path)) if python else path.read_text(encoding="utf-8")
         digest.update(f"{path.relative_to(ROOT)}\n{code}\n".encode())
     return digest.hexdigest()[:12]
 
@@ -103,12 +104,7 @@ def _modules(name: str) -> Iterator[Path]:
 
 @functools.cache
 def _tree(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
-@functools.cache
-def _code(path: Path) -> str:
-    """Return the code of a module without comments, docstrings and layout."""
+    """Return the code of a module without docstrings."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
         body = getattr(node, "body", None)
@@ -118,4 +114,4 @@ def _code(path: Path) -> str:
                 for item in body
                 if not (isinstance(item, ast.Expr) and isinstance(item.value, ast.Constant))
             ]
-    return ast.unparse(tree)
+    return tree

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxsafe.agents.networks import Params
 from jaxsafe.bounds import best_possible
 from jaxsafe.commands.policies import Subject
 from jaxsafe.environment import Environment, filter_name, require_success
@@ -223,9 +224,8 @@ def _render(
     env = evaluator.env
     first = subject.facts["seed"]
     index = 0 if film.seed is None else film.seed - first
-    own = jax.tree.map(lambda x: np.asarray(x)[index], sums)
+    own, params = _of_seed(index, sums, subject.mapper.gather(subject.params))
     whose = f"seed {first + index}, {kind}"
-    params = jax.tree.map(lambda x: x[index], subject.mapper.gather(subject.params))
     lines = []
     for which in film.which:
         number = film.choose(which, own, env)
@@ -268,7 +268,7 @@ def _log(
     file = path / "episodes.jsonl"
     count = 0
     for index in range(subject.facts["seeds"]):
-        own = jax.tree.map(lambda x, i=index: np.asarray(x)[i], sums)
+        own, policy = _of_seed(index, sums, params)
         numbers = sorted({number for name in which for number in numbers_of(name, own, env)})
         numbers = [] if index in left_out else numbers
         count += len(numbers)
@@ -278,15 +278,19 @@ def _log(
             "kind": kind,
             "final": True,
         }
-        episodes = evaluator.chosen_episodes(
-            jax.tree.map(lambda x, i=index: x[i], params), numbers, seed, kind == "deterministic"
-        )
+        episodes = evaluator.chosen_episodes(policy, numbers, seed, kind == "deterministic")
         for number, episode in zip(numbers, episodes, strict=True):
             rows = step_rows(env, *episode)
             append_rows(file, ({**facts, "episode": number, **row} for row in rows))
     whose = " or ".join(which)
     where = f": {file}" if count else ""
     return f"log of the {kind} episodes, {whose}: {count:,} of {np.size(sums.outcome):,}{where}"
+
+
+def _of_seed(index: int, sums: Episode, params: Params) -> tuple[Episode, Params]:
+    """Return the sums over the episodes of one training seed, and the parameters of its policy."""
+    own = jax.tree.map(lambda x: np.asarray(x)[index], sums)
+    return own, jax.tree.map(lambda x: x[index], params)
 
 
 KINDS_OF_FILE = {"gif": "film", "mp4": "film", "png": "figure", "jsonl": "log"}

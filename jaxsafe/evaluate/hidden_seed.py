@@ -7,7 +7,7 @@ import secrets
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jaxsafe.storage.files import read_json, write_json
+from jaxsafe.storage.files import OWNER, read_json, write_json
 from jaxsafe.storage.forms import Kind
 
 NUM_SEEDS = 2**31
@@ -62,6 +62,5 @@ def read_or_draw_hidden_seed(path: Path) -> HiddenSeed:
     if path.exists():
         return read_hidden_seed(path)
     drawn = HiddenSeed(secrets.randbelow(NUM_SEEDS), secrets.token_hex(SALT_BYTES))
-    write_json(path, drawn._asdict())
-    path.chmod(0o600)
+    write_json(path, drawn._asdict(), OWNER)
     return drawn

@@ -276,7 +276,7 @@ class _Graph:
         num_consts, num_carry = _loop_counts(params)
         consts = inputs[:num_consts]
         carry = inputs[num_consts : num_consts + num_carry]
-        whole = inputs[len(consts) + len(carry) :]
+        whole = inputs[num_consts + num_carry :]
         rounds = range(length)[::-1] if params["reverse"] else range(length)
         body = params["jaxpr"]
         given = {}

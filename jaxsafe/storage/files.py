@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import functools
 import io
 import json
 import math
@@ -18,26 +19,39 @@ from typing import Any
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.forms import ANYTHING, check, is_deep
 
+ANYBODY = 0o666
+"""The mode of a file that anybody may read and write, as far as the system's mask lets them."""
 
-def write_text(path: Path, text: str) -> None:
+OWNER = 0o600
+"""The mode of a file that only its owner may read and write."""
+
+
+def write_text(path: Path, text: str, mode: int = ANYBODY) -> None:
     """Replace a file by a complete new one, or leave it as it was."""
-    write_bytes(path, text.encode())
+    write_bytes(path, text.encode(), mode)
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    """Replace a file by a complete new one of these bytes, or leave it as it was."""
+def write_bytes(path: Path, content: bytes, mode: int = ANYBODY) -> None:
+    """Replace a file by a complete new one of these bytes, or leave it as it was.
+
+    Args:
+        path: the file.
+        content: what to write.
+        mode: who may read and write the new file. The system's mask takes rights away.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.part")
-    with _naming_file(path), open(part, "wb") as file:
+    opener = functools.partial(os.open, mode=mode)
+    with _naming_file(path), open(part, "wb", opener=opener) as file:
         file.write(content)
         file.flush()
         os.fsync(file.fileno())
     os.replace(part, path)
 
 
-def write_json(path: Path, value: Any) -> None:
+def write_json(path: Path, value: Any, mode: int = ANYBODY) -> None:
     """Write an indented JSON file. NaN and infinity become null."""
-    write_text(path, json.dumps(finite(value), indent=2, allow_nan=False) + "\n")
+    write_text(path, json.dumps(finite(value), indent=2, allow_nan=False) + "\n", mode)
 
 
 @contextlib.contextmanager
