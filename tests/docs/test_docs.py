@@ -445,6 +445,14 @@ def test_the_code_of_the_readme_runs(tmp_path: Path) -> None:
     assert (tmp_path / "flight.png").is_file()
 
 
+def test_the_readme_is_short() -> None:
+    """Code, pictures and addresses are not read as words."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    for unread in (r"(?s)```.*?```", r"<img[^>]*>", r"!\[[^\]]*\]\([^)]*\)", r"(?<=\])\([^)]*\)"):
+        text = re.sub(unread, "", text)
+    assert len(re.findall(r"[A-Za-z0-9][\w\-.,/%]*", text)) <= 500
+
+
 def test_the_address_of_the_repository_is_written_in_one_place() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     for page in PAGES:
