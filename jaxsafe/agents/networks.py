@@ -6,6 +6,7 @@ line. Flax is imported when the first network is built, so that `import jaxsafe`
 
 from __future__ import annotations
 
+import functools
 import math
 from abc import abstractmethod
 from collections.abc import Callable
@@ -121,7 +122,7 @@ class MLP(Network, type="mlp"):
         )
 
     def init(self, key: Key, normal: Normal, module: Any, *inputs: Array) -> Params:
-        return orthogonal_params(key, normal, module, *inputs)
+        return orthogonal_params(normal, module, *inputs)
 
 
 class GRU(Network, type="gru"):
@@ -144,25 +145,27 @@ class GRU(Network, type="gru"):
         )
 
     def init(self, key: Key, normal: Normal, module: Any, *inputs: Array) -> Params:
-        return orthogonal_params(key, normal, module, *inputs)
+        return orthogonal_params(normal, module, *inputs)
 
     def memory(self) -> Memory:
         return jnp.zeros(self.units)
 
 
-def orthogonal_params(key: Key, normal: Normal, module: Any, *inputs: Array) -> Params:
+def orthogonal_params(normal: Normal, module: Any, *inputs: Array) -> Params:
     """Return parameters with orthogonal kernels, and zero biases.
 
     The gain of a kernel is √2 in a hidden layer, 1 in a recurrent cell, and the module's
     `output_gain` in the last layer. Scales of normalisations start at 1.
 
     Args:
-        key: a PRNG key, which is needed for the shapes only. It decides no number.
         normal: the source of all random numbers.
-        module: a module whose last layer is called `output` and whose cell is called `cell`.
+        module: a module whose last layer is called `output` and whose cell is called `cell`. Its
+            fields can be hashed.
         *inputs: arguments with which the module can be called.
     """
-    shapes = jax.eval_shape(module.init, key, *inputs)["params"]
+    leaves, structure = jax.tree.flatten(inputs)
+    leaves = [jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves]
+    shapes = _param_shapes(module, structure, *leaves)
     gains = {OUTPUT: module.output_gain, CELL: 1.0}
 
     def start(path: Any, leaf: jax.ShapeDtypeStruct) -> Array:
@@ -172,6 +175,13 @@ def orthogonal_params(key: Key, normal: Normal, module: Any, *inputs: Array) -> 
         return gains.get(path[0].key, 2.0**0.5) * _orthogonal(normal(leaf.shape))
 
     return jax.tree_util.tree_map_with_path(start, shapes)
+
+
+@functools.lru_cache(maxsize=64)
+def _param_shapes(module: Any, structure: Any, *leaves: jax.ShapeDtypeStruct) -> Any:
+    """Return the shapes of a module's parameters. Flax takes long to trace its modules."""
+    inputs = jax.tree.unflatten(structure, leaves)
+    return jax.eval_shape(module.init, jax.random.key(0), *inputs)["params"]
 
 
 def from_one_draw(key: Key, build: Callable[[Normal], Params]) -> Params:
