@@ -531,8 +531,9 @@ def diverged(state: TrainState) -> Bool[Array, ""]:
 
     From then on nothing more is learnt.
     """
-    watched = (state.params, state.window.episodes.episode_return)
-    return ~jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(watched)]))
+    # One vector compiles to fewer loops than an array for each parameter.
+    watched, _ = ravel_pytree((state.params, state.window.episodes.episode_return))
+    return ~jnp.all(jnp.isfinite(watched))
 
 
 def dual_ascent(
@@ -785,40 +786,43 @@ def learn(
         `LOSSES`.
     """
     pack, unpack = packing(state.params)
+    names = [name for name in LOSSES if name != "cost_value_loss" or agent.cost_critic]
 
-    def gradient(params: Params, rows: Array) -> tuple[Params, Diagnostics]:
+    def gradient(params: Params, rows: Array) -> tuple[Params, Array]:
         samples = jax.tree.map(lambda x: x[rows], batch)
-        return jax.grad(loss, has_aux=True)(params, env, agent, ppo, samples)
+        direction, terms = jax.grad(loss, has_aux=True)(params, env, agent, ppo, samples)
+        # One vector compiles to fewer loops than a number for each term.
+        return direction, jnp.stack([terms[name] for name in names if name in terms])
 
-    def mean_gradient(params: Params, rows: Array) -> tuple[Params, Diagnostics]:
+    def mean_gradient(params: Params, rows: Array) -> tuple[Params, Array]:
         parts = 1 if agent.recurrent else _num_chunks(rows.size)
         if parts == 1:
             return gradient(params, rows)
 
-        def add(total: Params, part: Array) -> tuple[Params, Diagnostics]:
+        def add(total: Params, part: Array) -> tuple[Params, Array]:
             summand, losses = gradient(params, part)
             return jax.tree.map(jnp.add, total, summand), losses
 
         zero = jax.tree.map(jnp.zeros_like, params)
         total, losses = jax.lax.scan(add, zero, rows.reshape(parts, -1))
-        return jax.tree.map(lambda x: x / parts, total), jax.tree.map(jnp.mean, losses)
+        return jax.tree.map(lambda x: x / parts, total), jnp.mean(losses, axis=0)
 
     def minibatch_step(
         carry: tuple[Params, optax.OptState], rows: Array
-    ) -> tuple[tuple[Params, optax.OptState], Diagnostics]:
+    ) -> tuple[tuple[Params, optax.OptState], Array]:
         params, optimizer = carry
         gradient, losses = shard.mean(mean_gradient(unpack(params), shard.own(rows)))
         # Adam of optax raises a float to an integer power.
         with jax.numpy_dtype_promotion("standard"):
             step, optimizer = _optimizer(ppo).update(gradient, optimizer)
         # The optimizer takes the norm of the same vector, so XLA computes it once.
-        losses = {**losses, "grad_norm": optax.tree.norm(ravel_pytree(gradient)[0])}
+        losses = jnp.append(losses, optax.tree.norm(ravel_pytree(gradient)[0]))
         params = jax.tree.map(lambda p, s: p - step_size * s, params, pack(step))
         return (params, optimizer), losses
 
     def epoch(
         carry: tuple[Params, optax.OptState], key: Key
-    ) -> tuple[tuple[Params, optax.OptState], Diagnostics]:
+    ) -> tuple[tuple[Params, optax.OptState], Array]:
         rows = shuffle(key, ppo.rows(agent)).reshape(ppo.num_minibatches, -1)
         scan = scan_packed if accelerated() else jax.lax.scan
         return scan(minibatch_step, carry, rows)
@@ -826,7 +830,8 @@ def learn(
     start = (pack(state.params), state.optimizer)
     keys = jax.random.split(key, ppo.num_epochs)
     (params, optimizer), losses = jax.lax.scan(epoch, start, keys)
-    return unpack(params), optimizer, jax.tree.map(jnp.mean, losses)
+    means = jnp.mean(losses, axis=(0, 1))
+    return unpack(params), optimizer, dict(zip(names, means, strict=True))
 
 
 def loss(

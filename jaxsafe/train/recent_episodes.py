@@ -134,29 +134,36 @@ def means(
     episodes = window.episodes
     lengths = jnp.maximum(episodes.length, 1).astype(weight.dtype)
 
-    def mean(values: Array) -> Array:
-        return jnp.sum(weight * values.astype(weight.dtype))
+    def each(values: Array) -> Array:
+        return weight * values.astype(weight.dtype)
 
-    def mean_share_of_steps(steps: Array) -> Array:
-        return jnp.sum(weight * steps.astype(weight.dtype) / lengths)
+    def share_of_steps(steps: Array) -> Array:
+        return weight * steps.astype(weight.dtype) / lengths
 
-    share = {name: mean(episodes.outcome == index) for index, name in enumerate(outcomes) if index}
-    reached = [share[name] for name in successes]
-    return {
-        "success_rate": functools.reduce(operator.add, reached) if reached else jnp.zeros(()),
-        "return": mean(episodes.episode_return),
-        "length": mean(episodes.length),
-        "delta_v": mean(episodes.delta_v),
-        "control_effort": mean_share_of_steps(episodes.control_effort),
-        "violating_share": mean_share_of_steps(episodes.violating_steps),
-        "episode_cost": mean(episodes.violating_steps),
-        **({"episode_severity": mean(episodes.severity_sum)} if severity else {}),
-        "intervention_share": mean_share_of_steps(episodes.interventions),
-        **{f"outcome/{name}": value for name, value in share.items()},
-        **{f"reward/{name}": mean(total) for name, total in episodes.reward_totals.items()},
-        **{f"episode_cost/{name}": mean(total) for name, total in episodes.costs.items()},
+    weighted = {
+        "return": each(episodes.episode_return),
+        "length": each(episodes.length),
+        "delta_v": each(episodes.delta_v),
+        "control_effort": share_of_steps(episodes.control_effort),
+        "violating_share": share_of_steps(episodes.violating_steps),
+        "episode_cost": each(episodes.violating_steps),
+        **({"episode_severity": each(episodes.severity_sum)} if severity else {}),
+        "intervention_share": share_of_steps(episodes.interventions),
         **{
-            f"measured/{name}": mean(over_episode(name, value, lengths))
+            f"outcome/{name}": each(episodes.outcome == index)
+            for index, name in enumerate(outcomes)
+            if index
+        },
+        **{f"reward/{name}": each(total) for name, total in episodes.reward_totals.items()},
+        **{f"episode_cost/{name}": each(total) for name, total in episodes.costs.items()},
+        **{
+            f"measured/{name}": each(over_episode(name, value, lengths))
             for name, value in episodes.measured.items()
         },
     }
+    # One sum over all rows compiles to fewer loops than a sum for each.
+    sums = jnp.sum(jnp.stack(list(weighted.values())), axis=1)
+    columns = dict(zip(weighted, sums, strict=True))
+    reached = [columns[f"outcome/{name}"] for name in successes]
+    success = functools.reduce(operator.add, reached) if reached else jnp.zeros(())
+    return {"success_rate": success, **columns}

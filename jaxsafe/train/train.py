@@ -153,16 +153,20 @@ def chunk(
         state = state.replace(num_updates=jnp.minimum(state.num_updates + 1, limit))
         return state, ppo.no_diagnostics(agent)
 
-    def one_update(state: TrainState, _: None) -> tuple[TrainState, dict[str, jax.Array]]:
-        going = (state.num_updates < limit) & ~ppo.diverged(state)
+    def one_update(
+        carry: tuple[TrainState, jax.Array], _: None
+    ) -> tuple[tuple[TrainState, jax.Array], dict[str, jax.Array]]:
+        state, diverged = carry
+        going = (state.num_updates < limit) & ~diverged
         state, diagnostics = jax.lax.cond(
             going, lambda s: ppo.update(env, agent, hyper, limit, s, shard), leave, state
         )
+        diverged = ppo.diverged(state)
         counts = {
             "update": state.num_updates,
             "count": state.window.count,
             "cost": recent_episodes.total_cost(state.window),
-            "diverged": ppo.diverged(state),
+            "diverged": diverged,
         }
         if agent.cost_names:
             for index, name in enumerate(agent.cost_names):
@@ -172,9 +176,10 @@ def chunk(
         means = recent_episodes.means(
             state.window, env.outcomes, env.successes, severity=env.cost == "severity"
         )
-        return state, {**counts, **means, **diagnostics}
+        return (state, diverged), {**counts, **means, **diagnostics}
 
-    return jax.lax.scan(one_update, state, None, length=length)
+    (state, _), curves = jax.lax.scan(one_update, (state, ppo.diverged(state)), None, length=length)
+    return state, curves
 
 
 # Every call of `isolated` returns a new function, which JAX would compile again.
