@@ -550,7 +550,7 @@ def _world_step(env: Environment, state: State, desired: Array) -> tuple[State, 
         sensors=readings,
     )
     state = State(
-        sim=sim,
+        sim=_for_next_step(sim),
         memory=memory,
         reward_totals=totals,
         num_steps=num_steps,
@@ -737,7 +737,7 @@ def _begin(
         sensors=readings,
     )
     state = State(
-        sim=ended,
+        sim=_for_next_step(sim),
         memory=memory,
         reward_totals=terms,
         num_steps=jnp.zeros((), jnp.int32),
@@ -795,6 +795,11 @@ def _update_ended(env: Environment, sim: Sim) -> Sim:
             ended[condition.name] = reached & ~(diverged if condition.apart else over)
             over = over if condition.apart else over | reached
     return sim.replace(ended={**sim.ended, **ended})
+
+
+def _for_next_step(sim: Sim) -> Sim:
+    """Return the simulation as a state keeps it: without what ended, which no step looks at."""
+    return sim.replace(ended={})
 
 
 def _diverged(env: Environment, sim: Sim) -> Bool[Array, ""]:
@@ -933,6 +938,7 @@ def _info(
             severity[constraint.name] = jnp.where(margin >= 0.0, 0.0, finite_excess)
     return Info(
         outcome=outcome,
+        ended=sim.ended,
         status=sim.status,
         reward_terms=terms,
         reward_totals=totals,

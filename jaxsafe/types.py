@@ -256,8 +256,8 @@ class Sim(Record):
     platforms: Mapping[str, Any]  # by name, each the state record of its kind of platform
     regions: Mapping[str, RegionState]  # by name
     status: Mapping[str, Array]  # by name; while statuses are computed, only the earlier ones
-    # By outcome name, all but `running`. At most one is True, unless one stands apart, see
-    # `Terminal.apart`.
+    # What ended the episode with this step, by outcome, see `Info.ended`. Empty in a state, because
+    # a step never looks at an earlier outcome.
     ended: Mapping[str, Bool[Array, ""]]
     # Whether run time assurance changed the control of the step that led here.
     intervening: Bool[Array, ""]
@@ -351,6 +351,9 @@ class Info(Record):
     """
 
     outcome: Int[Array, ""]  # index into `env.outcomes`, 0 while running
+    # By outcome name, all but `running`. At most one is True, unless one stands apart, see
+    # `Terminal.apart`. Then `outcome` is the first.
+    ended: Mapping[str, Bool[Array, ""]]
     status: Mapping[str, Array]  # by name
     reward_terms: Mapping[str, Float[Array, ""]]  # of this step; their sum is the reward
     reward_totals: Mapping[str, Float[Array, ""]]  # each term summed over the episode so far

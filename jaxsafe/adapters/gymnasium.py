@@ -501,7 +501,7 @@ class Frames:
         if self._scene is None:
             self._scene = Scene(self._env, self._env.agent)
         for sim, info in self._new:
-            self._scene.add(sim, info.margins, info.control_actual)
+            self._scene.add(sim, info)
         self._new.clear()
         return self._scene.draw()
 

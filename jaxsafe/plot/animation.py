@@ -50,7 +50,7 @@ from jaxsafe.plot.style import (
 )
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import write_bytes
-from jaxsafe.types import Sim, State, TimeStep
+from jaxsafe.types import Info, Sim, State, TimeStep
 
 MAX_FRAMES = 80
 """Largest number of frames. In longer episodes steps are left out."""
@@ -108,7 +108,7 @@ def animate(env: Environment, episode: tuple[State, TimeStep], path: Path, title
     last = len(states.sim.time) - 1
     for step in range(last + 1):
         sim, info = jax.tree.map(lambda x, step=step: x[step], (states.sim, timesteps.info))
-        scene.add(sim, info.margins, info.control_actual)
+        scene.add(sim, info)
     steps = np.unique(np.linspace(0, last, min(MAX_FRAMES, last + 1)).round().astype(int))
     frames = (scene.draw(step) for step in steps)
     write_bytes(path, _mp4(frames) if path.suffix == ".mp4" else _gif(frames))
@@ -251,20 +251,18 @@ class Scene:
         self._margins = Ends(0.0, 0.0)
         self._background: Any = None
 
-    def add(self, sim: Sim, margins: Mapping[str, Any], control: Any) -> None:
+    def add(self, sim: Sim, info: Info) -> None:
         """Remember one step.
 
         Args:
             sim: the simulation after the step.
-            margins: h of each constraint.
-            control: the control that acted, in the order of `env.action_names`.
+            info: the facts about the step.
         """
         origin, turn = self._frame(sim)
         directions = {name: in_plane(_direction(state)) for name, state in sim.platforms.items()}
         states = {**sim.regions, **sim.platforms}
         places = {name: turn @ (_place(state) - origin) for name, state in states.items()}
         distance = float(np.linalg.norm(places[self.env.agent]))
-        ended = [name for name, flag in sim.ended.items() if flag]
         self.moments.append(
             Moment(
                 time=float(sim.time),
@@ -272,14 +270,14 @@ class Scene:
                 turn=turn,
                 places=places,
                 directions={name: turn @ direction for name, direction in directions.items()},
-                thrust=self._thrust(np.asarray(control), directions[self.env.agent]),
+                thrust=self._thrust(np.asarray(info.control_actual), directions[self.env.agent]),
                 distance=distance,
-                margins={name: float(margin) for name, margin in margins.items()},
-                outcome=plain(ended[0]) if ended else "running",
+                margins={name: float(margin) for name, margin in info.margins.items()},
+                outcome=plain(self.env.outcomes[int(info.outcome)]),
             )
         )
         self._distances.include(max(distance, MIN_DISTANCE))
-        for margin in margins.values():
+        for margin in info.margins.values():
             self._margins.include(float(margin))
 
     @styled

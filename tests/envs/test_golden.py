@@ -259,9 +259,9 @@ def assert_as_recorded(
     assert_same(timestep.reward[rows], data["reward"][rows], "reward")
     success = data[f"status_success{suffix}"][rows]
     failure = data[f"status_failure{suffix}"][rows]
-    np.testing.assert_array_equal(sim.ended["success"][rows], success)
+    np.testing.assert_array_equal(info.ended["success"][rows], success)
     for code, name in enumerate(FAILURES[kind][1:], start=1):
-        np.testing.assert_array_equal(sim.ended[name][rows], failure == code, err_msg=name)
+        np.testing.assert_array_equal(info.ended[name][rows], failure == code, err_msg=name)
     np.testing.assert_array_equal(timestep.terminated[rows], data["done"][rows])
     outcomes = [
         "success" if won else FAILURES[kind][code]
@@ -391,8 +391,8 @@ def test_every_state_on_a_boundary_is_judged_as_recorded() -> None:
         task = edge["task"]
         status = edge["status_at_reset"]
         data = {f"{name}_state": np.array(values) for name, values in edge["states"].items()}
-        state, timestep = jaxsafe.reset_to(released(task), state_fields(task, data))
-        ended = {name: bool(flag) for name, flag in state.sim.ended.items()}
+        _, timestep = jaxsafe.reset_to(released(task), state_fields(task, data))
+        ended = {name: bool(flag) for name, flag in timestep.info.ended.items()}
         failure = status["failure"] or None
         assert ended == {
             name: name == failure or (name == "success" and status["success"]) for name in ended

@@ -579,8 +579,8 @@ def test_at_most_one_outcome_ends_an_episode(env: Environment, task: str) -> Non
     state, _ = jaxsafe.reset_to(together, inside(env, task), dict.fromkeys(env.randomize, 12.0))
     names = [name for name in env.outcomes[1:] if name not in ("velocity", "diverged")]
     for expected in [name for name in names if name not in ("crash", "keep_out") or task in REJOIN]:
-        stepped, timestep = step(together, state, action(env, 0.0))
-        assert [name for name, ended in stepped.sim.ended.items() if ended] == [expected]
+        _, timestep = step(together, state, action(env, 0.0))
+        assert [name for name, ended in timestep.info.ended.items() if ended] == [expected]
         assert env.outcomes[int(timestep.info.outcome)] == expected
         together = without(together, expected, task)
     assert expected == "timeout"
@@ -906,7 +906,7 @@ def test_an_episode_whose_state_is_not_finite_ends_as_a_violation_and_a_failure(
             assert np.isinf(value)
             continue
         assert outcome == "diverged"
-        assert [name for name, ended in after.sim.ended.items() if ended] == ["diverged"]
+        assert [name for name, ended in timestep.info.ended.items() if ended] == ["diverged"]
         assert timestep.cost == 1.0
         assert all(0.0 <= float(severity) <= 1.0 for severity in timestep.info.severity.values())
         assert not env.succeeded(timestep.info.outcome)

@@ -31,7 +31,7 @@ def scene_of(env: jaxsafe.Environment, steps: int, title: str = "title") -> Scen
     scene = Scene(env, title)
     for step in range(steps + 1):
         sim, info = jax.tree.map(lambda x, step=step: x[step], (states.sim, timesteps.info))
-        scene.add(sim, info.margins, info.control_actual)
+        scene.add(sim, info)
     return scene
 
 
@@ -104,7 +104,7 @@ def test_a_picture_while_the_episode_goes_on_shows_what_that_of_the_whole_episod
     live = Scene(env, "title")
     for step in range(71):
         sim, info = jax.tree.map(lambda x, step=step: x[step], (states.sim, timesteps.info))
-        live.add(sim, info.margins, info.control_actual)
+        live.add(sim, info)
         live.draw()
     whole = scene_of(env, 70)
     whole.draw()

@@ -814,8 +814,8 @@ def test_there_is_at_most_one_outcome_and_it_is_the_flag_that_is_set(
     x: float, speed: float, limit: float, offset: float
 ) -> None:
     env = bounded(offset, **{"tied": {}, "terminal.timeout.limit": limit})
-    state, timestep = step(env, start(env, (x, 0.0), (-speed, 0.0)), jnp.zeros(2))
-    flags = {name: bool(flag) for name, flag in state.sim.ended.items()}
+    _, timestep = step(env, start(env, (x, 0.0), (-speed, 0.0)), jnp.zeros(2))
+    flags = {name: bool(flag) for name, flag in timestep.info.ended.items()}
     assert sum(flags.values()) <= 1
     assert flags == {name: name == outcome(env, timestep) for name in env.outcomes[1:]}
     assert bool(timestep.done) == any(flags.values())

@@ -731,6 +731,25 @@ def test_a_checkpoint_from_before_the_newer_arrays_were_kept_is_read(
     assert checkpoints.restore(2560, like)["state"].env_state.sim.control_desired.all()
 
 
+def test_a_checkpoint_whose_states_kept_what_ended_is_read(tmp_path: Path, whole: Path) -> None:
+    config, env, _ = run_directory.read(whole, "run")
+    flags = dict.fromkeys(env.outcomes[1:], np.ones((config.seeds, config.ppo.num_envs), bool))
+    like = restore.structure(env, config)
+    content = jax.tree.map(lambda leaf: np.ones_like(checkpoint._empty(leaf)), like)
+    older = {**content, "state": restore._with_ended(content["state"], flags)}
+    checkpoints = Checkpoints(tmp_path, create=True)
+    step = 20 * config.ppo.batch_size
+    checkpoints.save(step, older, {"updates": 20, "wall_s": 1.0, "compile_s": 1.0})
+    found, _ = restore.restore(Checkpoints(tmp_path), step, env, config)
+    assert found["state"].env_state.sim.ended == {}
+    for read, written in zip(
+        (found["best"], found["state"].env_state),
+        (content["best"], content["state"].env_state),
+        strict=True,
+    ):
+        jax.tree.map(np.testing.assert_array_equal, read, written)
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("name", ["sha256", "made_from", "updates", "wall_s", None])
 def test_facts_of_a_checkpoint_are_checked_and_those_of_before_are_known(

@@ -182,7 +182,7 @@ class Checkpoints:
                 f"this process computes in {now}"
             )
         abstract = jax.tree.map(_empty, like)
-        absent = [name for name in newer if not self._has(step, name)]
+        absent = [name for name in newer if not self.has(step, name)]
         if absent:
             state = self._read_older(step, abstract, absent)
         else:
@@ -203,7 +203,7 @@ class Checkpoints:
             )
         return jax.tree.map(_as, state, like)
 
-    def _has(self, step: int, name: str) -> bool:
+    def has(self, step: int, name: str) -> bool:
         """Return whether a checkpoint has an array of this name.
 
         It is True as well if the index of the checkpoint cannot be read.

@@ -16,7 +16,7 @@ import numpy as np
 from jaxsafe.agents.networks import Params
 from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
 from jaxsafe.devices.seed_mapper import SeedMapper
-from jaxsafe.environment import Environment
+from jaxsafe.environment import DIVERGED, Environment
 from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.storage.files import finite
 from jaxsafe.storage.forms import AMOUNT, COUNT, check
@@ -126,7 +126,19 @@ def restore(
         raise ConfigError(
             f"{place}: updates: expected those of {step} steps, found {facts['updates']}"
         )
-    return checkpoints.restore(step, structure(env, config), NEWER), facts
+    like = structure(env, config)
+    # In states of older versions each outcome had a flag. No other array has this name.
+    if checkpoints.has(step, DIVERGED):
+        flag = jax.ShapeDtypeStruct((config.seeds, config.ppo.num_envs), bool)
+        like["state"] = _with_ended(like["state"], dict.fromkeys(env.outcomes[1:], flag))
+    restored = checkpoints.restore(step, like, NEWER)
+    return {**restored, "state": _with_ended(restored["state"], {})}, facts
+
+
+def _with_ended(state: ppo.TrainState, flags: dict[str, Any]) -> ppo.TrainState:
+    """Return a training state with flags of what ended, which states of older versions kept."""
+    env_state = state.env_state
+    return state.replace(env_state=env_state.replace(sim=env_state.sim.replace(ended=flags)))
 
 
 def _as_of_today(before: Any) -> Any:
