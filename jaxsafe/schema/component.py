@@ -146,7 +146,8 @@ class Component:
     """Paths of fields by the names that they have in other libraries. Only messages use them."""
 
     def __init_subclass__(cls, *, type: str | None = None) -> None:
-        dataclasses.dataclass(frozen=True, kw_only=True, eq=False)(cls)
+        # One `__repr__` serves all, because writing one for each class takes long.
+        dataclasses.dataclass(frozen=True, kw_only=True, eq=False, repr=False)(cls)
         cls.type_name = None
         if type:
             _refuse_taken(type, cls)
@@ -190,6 +191,10 @@ class Component:
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed. Unlike `jaxsafe.override`, check nothing."""
         return dataclasses.replace(self, **changes)  # type: ignore[type-var]
+
+    def __repr__(self) -> str:
+        values = ", ".join(f"{name}={getattr(self, name)!r}" for name in fields(type(self)))
+        return f"{type(self).__qualname__}({values})"
 
     def __eq__(self, other: object) -> bool:
         left, left_structure = jax.tree.flatten(self)
