@@ -80,7 +80,7 @@ DIVERGED = "diverged"
 """The outcome of an episode whose state is not finite. It comes last in `Environment.outcomes`."""
 
 
-class Environment(Component, Described):
+class Environment(Described, Component):
     """A task: platforms and regions, and the processors that give their state a meaning.
 
     The world moves `dt` seconds a step. The agent acts on every `decision_period`-th of these
@@ -103,7 +103,6 @@ class Environment(Component, Described):
 
     shorthand: ClassVar[str | None] = "platforms"
     _task: ClassVar[str] = ""
-    __repr__ = Described.__repr__
 
     agent: PlatformName
     dt: Annotated[Number, Unit("s"), Range(0.0, open_low=True, smallest=1e-6, largest=1e5)] = 1.0
