@@ -40,7 +40,8 @@ from jaxsafe.evaluate.run_adversaries import attack
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 from jaxsafe.rta.qp import nearest_solution
 from jaxsafe.schema.component import normalise
-from jaxsafe.train.ppo import PPO, init, update
+from jaxsafe.train.hyperparameters import PPO
+from jaxsafe.train.ppo import init, update
 from jaxsafe.transition import bounds
 
 OUT = Path(__file__).parent / "results" / "rta.json"

@@ -18,7 +18,8 @@ from jaxsafe.agents.networks import MLP
 from jaxsafe.agents.policy_file import find_policy, read_policy
 from jaxsafe.envs import TASKS
 from jaxsafe.schema.component import normalise
-from jaxsafe.train.ppo import PPO, Batch, loss
+from jaxsafe.train.hyperparameters import PPO
+from jaxsafe.train.ppo import Batch, loss
 
 DOCKING = {
     "at the chief": {"position": 0.0, "velocity": 0.1},

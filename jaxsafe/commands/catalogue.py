@@ -41,7 +41,7 @@ from jaxsafe.simulation.regions import Offset, Region
 from jaxsafe.simulation.scripted import Command
 from jaxsafe.simulation.uncertainty import Uncertainty
 from jaxsafe.simulation.vectors import Vector
-from jaxsafe.train.ppo import PPO
+from jaxsafe.train.hyperparameters import PPO
 
 
 class Section(NamedTuple):

@@ -32,7 +32,8 @@ from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.options import NO_RECIPE, TrainConfig, resolve
 from jaxsafe.train.host.results import finish, table
 from jaxsafe.train.host.session import Clock, Training
-from jaxsafe.train.ppo import PPO, TrainState
+from jaxsafe.train.hyperparameters import PPO
+from jaxsafe.train.ppo import TrainState
 from jaxsafe.train.train import Callback, Curves
 from jaxsafe.types import Key
 

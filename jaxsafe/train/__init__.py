@@ -12,7 +12,7 @@ make_callable(
     # As in `__main__.py`, the code that trains a whole run stands on a higher floor.
     "jaxsafe.runs.training",
     Agent="jaxsafe.agents.agent",
-    PPO="jaxsafe.train.ppo",
+    PPO="jaxsafe.train.hyperparameters",
     TrainState="jaxsafe.train.ppo",
     resolve="jaxsafe.train.host.options",
 )

@@ -19,7 +19,13 @@ from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.environment import Environment
 from jaxsafe.schema.component import normalise
 from jaxsafe.train import ppo, recent_episodes
-from jaxsafe.train.ppo import PPO, Diagnostics, TrainState
+from jaxsafe.train.hyperparameters import (
+    PPO,
+    check_complete_episodes,
+    check_cost_limit,
+    check_curriculum,
+)
+from jaxsafe.train.ppo import Diagnostics, TrainState
 from jaxsafe.types import Key
 
 STATE = ppo.by_axes(SPLIT_BY_SEED, SPLIT_BY_ENV)
@@ -78,9 +84,9 @@ def train(
         ConfigError: an episode may be longer than the batch with `complete_episodes`, or a limit of
             the cost is for no constraint of the environment, or the curriculum does not fit it.
     """
-    ppo.check_complete_episodes(env, hyperparameters)
-    ppo.check_cost_limit(env, agent, hyperparameters)
-    ppo.check_curriculum(env, hyperparameters)
+    check_complete_episodes(env, hyperparameters)
+    check_cost_limit(env, agent, hyperparameters)
+    check_curriculum(env, hyperparameters)
     shared = (env, normalise(agent), normalise(hyperparameters))
     state = _begin(shared, key)
     if params is not None:

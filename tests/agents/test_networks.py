@@ -21,7 +21,8 @@ from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import ppo as ppo_module
 from jaxsafe.train.host.options import resolve
-from jaxsafe.train.ppo import PPO, collect, init, update
+from jaxsafe.train.hyperparameters import PPO
+from jaxsafe.train.ppo import collect, init, update
 
 KEY = jax.random.key(3)
 RESIDUAL = """

@@ -19,6 +19,7 @@ from jaxsafe.devices.backend import packing, scan_packed
 from jaxsafe.devices.seed_mapper import claim_cores
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 from jaxsafe.train import ppo, shuffle
+from jaxsafe.train.hyperparameters import PPO
 
 
 @pytest.fixture
@@ -90,7 +91,7 @@ def test_an_accelerator_learns_the_same(as_accelerated: Callable[[Any], None]) -
 
     env = jaxsafe.make("docking2d")
     agent = normalise(Agent(actor=MLP(hidden=(8,))))
-    hyper = normalise(ppo.PPO(num_envs=4, num_steps=8, num_epochs=2))
+    hyper = normalise(PPO(num_envs=4, num_steps=8, num_epochs=2))
     start = ppo.init(env, agent, hyper, jax.random.key(0))
     expected = jax.jit(lambda state: ppo.update(env, agent, hyper, 4, state)[0])(start)
     for module in (backend, ppo, shuffle):

@@ -14,7 +14,8 @@ from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
-from jaxsafe.train.ppo import DIAGNOSTICS, PPO, TrainState, init, update
+from jaxsafe.train.hyperparameters import PPO
+from jaxsafe.train.ppo import DIAGNOSTICS, TrainState, init, update
 from jaxsafe.train.train import STATE, programs
 
 ENV = jaxsafe.make("docking2d")

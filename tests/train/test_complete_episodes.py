@@ -15,14 +15,13 @@ from jaxsafe.config import build
 from jaxsafe.environment import Environment
 from jaxsafe.processors.terminal import TooFar
 from jaxsafe.schema.component import normalise
+from jaxsafe.train.hyperparameters import PPO, check_complete_episodes
 from jaxsafe.train.ppo import (
-    PPO,
     Batch,
     TrainState,
     Transition,
     _counts,
     _to_batch,
-    check_complete_episodes,
     collect,
     gae,
     init,

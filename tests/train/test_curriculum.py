@@ -9,7 +9,8 @@ import jaxsafe
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.host.options import resolve
-from jaxsafe.train.ppo import PPO, init, on_the_way, update
+from jaxsafe.train.hyperparameters import PPO, on_the_way
+from jaxsafe.train.ppo import init, update
 
 DISTANCE = "deputy.start.position.distance"
 FAR = {f"env.{DISTANCE}": [100.0, 10_000.0]}

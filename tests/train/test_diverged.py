@@ -29,7 +29,8 @@ from jaxsafe.train.host.checkpoint import Checkpoints
 from jaxsafe.train.host.restore import structure
 from jaxsafe.train.host.results import summary
 from jaxsafe.train.host.session import Training
-from jaxsafe.train.ppo import DIAGNOSTICS, PPO, diverged, init
+from jaxsafe.train.hyperparameters import PPO
+from jaxsafe.train.ppo import DIAGNOSTICS, diverged, init
 
 AT = 384
 """The step after which the networks of a seed are not finite. It lies between two evaluations."""

@@ -20,7 +20,7 @@ from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.controllers import Actuator, Controls, Mixed
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.train.host.options import resolve
-from jaxsafe.train.ppo import PPO
+from jaxsafe.train.hyperparameters import PPO
 from jaxsafe.train.train import train
 from jaxsafe.types import Record, Sim
 

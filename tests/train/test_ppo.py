@@ -15,17 +15,14 @@ from jaxsafe.processors.constraint import SpeedLimit
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import ppo as ppo_module
+from jaxsafe.train.hyperparameters import PPO, check_cost_limit, discount, learning_rate
 from jaxsafe.train.ppo import (
-    PPO,
     TrainState,
-    check_cost_limit,
     collect,
-    discount,
     dual_ascent,
     explained_variance,
     gae,
     init,
-    learning_rate,
     price,
     update,
 )

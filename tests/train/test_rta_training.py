@@ -24,7 +24,8 @@ from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.host import run_directory
 from jaxsafe.train.host.options import TrainConfig, resolve
-from jaxsafe.train.ppo import PPO, Transition, collect, init
+from jaxsafe.train.hyperparameters import PPO
+from jaxsafe.train.ppo import Transition, collect, init
 
 step = jax.jit(jaxsafe.step)
 FAST = {"deputy": {"position": [100.0, 0.0], "velocity": [0.0, 0.405]}}

@@ -24,7 +24,7 @@ from jaxsafe.schema.retype import set_paths
 from jaxsafe.train.host.sinks import LIBRARIES, library
 from jaxsafe.train.host.starts import with_unproved_starts
 from jaxsafe.train.host.warm_start import agent_options
-from jaxsafe.train.ppo import (
+from jaxsafe.train.hyperparameters import (
     MAX_COUNT,
     PPO,
     CostLimit,
