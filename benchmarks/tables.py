@@ -1005,6 +1005,7 @@ def verification(results: Results) -> str:
             policy(row),
             "{:g} to {:g}".format(*row["box"]["position"]),
             f"±{row['box']['velocity'][1]:g}",
+            row.get("property", "safe"),
             str(row["steps"]),
             row["arithmetic"],
             row["result"],
@@ -1016,8 +1017,8 @@ def verification(results: Results) -> str:
         for row in results["rows"].values()
     )
     heads = (
-        "policy | positions [m] | velocities [m/s] | steps | arithmetic | result | proved | "
-        "boxes bounded | seconds | check [s]"
+        "policy | positions [m] | velocities [m/s] | property | steps | arithmetic | result | "
+        "proved | boxes bounded | seconds | check [s]"
     )
     return markdown(heads.split(" | "), rows)
 

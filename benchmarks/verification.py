@@ -48,6 +48,9 @@ RAW = {
 SPACE = {"position": [88.0, 97.0], "velocity": [-0.05, 0.05]}
 """Starts in space, of which there are six numbers."""
 
+NEAR = {"position": [3.0, 7.0], "velocity": [-0.02, 0.02]}
+"""Starts near the chief, almost at rest."""
+
 MAX_SECONDS = 240.0
 """How long a search may take."""
 
@@ -57,6 +60,12 @@ CASES: dict[str, dict[str, Any]] = {
     "docking2d": {"policy": "pretrained/docking2d"},
     "docking2d_heavy": {"policy": "pretrained/docking2d", "mass": 300.0},
     "docking2d_80": {"policy": "pretrained/docking2d", "steps": 80},
+    "docking2d_docks": {
+        "policy": "pretrained/docking2d",
+        "property": "docks",
+        "steps": 60,
+        "box": NEAR,
+    },
     "docking3d": {"policy": "pretrained/docking3d", "steps": 20, "box": SPACE},
 }
 """What is proved, by row: the policy, the mass [kg], and other options of the proof."""
@@ -116,12 +125,19 @@ def controller(policy: str, mass: float, published: str) -> tuple[Any, Any]:
 
 def measure(case: Mapping[str, Any], published: str) -> dict[str, Any]:
     """Return what a row tells."""
-    given = {"mass": 12.0, "steps": 40, "arithmetic": "float32", "box": BOX, **case}
+    given = {
+        "mass": 12.0,
+        "property": "safe",
+        "steps": 40,
+        "arithmetic": "float32",
+        "box": BOX,
+        **case,
+    }
     env, policy = controller(given["policy"], given["mass"], published)
 
     def prove(**limits: Any) -> Verification:
-        steps, arithmetic = given["steps"], given["arithmetic"]
-        return verify(env, policy, given["box"], steps, arithmetic=arithmetic, **limits)
+        options = {name: given[name] for name in ("property", "steps", "arithmetic")}
+        return verify(env, policy, given["box"], **options, **limits)
 
     prove(max_boxes=1)
     proof = prove(seconds=MAX_SECONDS)
@@ -132,6 +148,7 @@ def measure(case: Mapping[str, Any], published: str) -> dict[str, Any]:
         "seconds": proof.seconds,
         "bounded": proof.bounded,
         "boxes": len(proof.proved.low),
+        "last": int(proof.last.max(initial=0)),
         "margin": proof.margin if len(proof.proved.low) else None,
         "violation": proof.counterexample and proof.counterexample._asdict(),
         "check_seconds": _checked(proof) if proof.result == "proved" else None,

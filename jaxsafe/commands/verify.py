@@ -1,8 +1,9 @@
-"""Prove that a policy keeps the speed limit from every start in a box, or find a violation.
+"""Prove that a policy keeps the speed limit, or docks, from every start in a box.
 
 The proof is about the closed loop that `jaxsafe.step` runs, between samples too, and with its
 rounding. The exit code is 0 if the property is proved, 1 if a start violates it, and 3 if it is
-open. A certificate is written, which `jaxsafe/verify/check.py` checks with NumPy alone.
+open. Such a start is printed. A certificate is written, which `jaxsafe/verify/check.py` checks with
+NumPy alone.
 """
 
 from __future__ import annotations
@@ -41,8 +42,11 @@ class Options(SingleOptions):
         "The search.": ("minutes", "boxes", "everything", "resolution", "resume", "out"),
     }
 
-    property: Literal["safe"] = "safe"
-    """What is proved. safe means that the margin of the speed limit is never negative."""
+    property: Literal["safe", "docks"] = "safe"
+    """What is proved. safe means that the margin of the speed limit is never negative.
+
+    docks means that the episode ends with a success within `steps`, and keeps the limit until then.
+    """
     steps: Annotated[int, Range(1, largest=MAX_STEPS)] = 40
     """Number of steps."""
     box: Annotated[
@@ -93,6 +97,7 @@ def main(argv: Sequence[str]) -> int:
         saved.agent.policy(saved.env, saved.params, True),
         {**BOX, **options.box},
         options.steps,
+        property=options.property,
         arithmetic=options.arithmetic,
         seconds=math.inf if options.minutes is None else 60.0 * options.minutes,
         max_boxes=options.boxes,
@@ -132,15 +137,27 @@ def _line(verification: Verification) -> str:
 
 def _reason(verification: Verification) -> str:
     violation = verification.counterexample
+    if violation is not None and violation.undocked:
+        start = json.dumps(violation.start)
+        return (
+            f"not docked after {violation.step} steps, at best {-violation.margin:.4g} m outside, "
+            f"from reset_to {start}"
+        )
     if violation is not None:
         start = json.dumps(violation.start)
         return f"margin {violation.margin:.4g} after {violation.step} steps from reset_to {start}"
     if verification.result == "open":
         return f"{len(verification.open.low):,} boxes are left"
     count = len(verification.proved.low)
+    starts = f"every start in {count:,} box{'es' * (count != 1)}"
+    if verification.loop.property == "docks":
+        return (
+            f"docked after {verification.last.min()} to {verification.last.max()} steps from "
+            f"{starts}, and h ≥ {verification.margin:.3g} m/s until then, between samples too"
+        )
     return (
-        f"h ≥ {verification.margin:.3g} m/s for {verification.steps} steps from every start in "
-        f"{count:,} box{'es' * (count != 1)}, between samples too"
+        f"h ≥ {verification.margin:.3g} m/s for {verification.steps} steps from {starts}, between "
+        "samples too"
     )
 
 

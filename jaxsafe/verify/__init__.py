@@ -1,4 +1,4 @@
-"""Proofs about learned controllers: the closed loop keeps its speed limit from a whole box.
+"""Proofs about learned controllers: from a whole box the closed loop keeps its limit, or docks.
 
 `jaxsafe.verify(env, policy, box)` proves or refutes that. It is `jaxsafe.verify.verify.verify`.
 """

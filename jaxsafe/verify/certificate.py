@@ -44,6 +44,7 @@ def save_certificate(
         for name in BOXES
         for end, x in getattr(verification, name)._asdict().items()
     }
+    arrays["proved/last"] = verification.last
     arrays |= {f"claims/{name}": x for name, x in verification.claims._asdict().items()}
     programs = {}
     for name in PROGRAMS:
@@ -58,7 +59,7 @@ def save_certificate(
     violation = verification.counterexample
     header = {
         "format": CERTIFICATE,
-        "property": "safe",
+        "property": verification.loop.property,
         "result": verification.result,
         "steps": verification.steps,
         "unit": verification.loop.following.unit,
@@ -93,6 +94,7 @@ def load_certificate(path: str | os.PathLike) -> Verification:
         return Verification(
             result=header["result"],
             claims=Claims(*(arrays[f"claims/{name}"] for name in Claims._fields)),
+            last=arrays["proved/last"],
             margin=math.inf if header["margin"] is None else header["margin"],
             counterexample=None if violation is None else Counterexample(**violation),
             loop=Loop(
@@ -100,6 +102,7 @@ def load_certificate(path: str | os.PathLike) -> Verification:
                 dimension=header["dimension"],
                 actions=header["actions"],
                 plant=Plant(**header["plant"]),
+                property=header["property"],
             ),
             steps=header["steps"],
             seconds=header["seconds"],

@@ -190,19 +190,25 @@ def gap(plant, speed, far, near):
 
 
 def follow(head, low, high, claims):
-    """Check the claims of some boxes, and bound h below along all episodes from them."""
+    """Check the claims of some boxes, and bound h below along all episodes from them.
+
+    Also return a lower bound of the last output after the last step.
+    """
     d, m = head["dimension"], head["actions"]
     zeros = np.zeros((len(low), m))
     low, high = (np.concatenate([v, zeros], axis=1) for v in (low, high))
     centre = 0.5 * (low + high)
     wide = up(np.maximum(high - centre, centre - low))[:, :, None] * np.eye(2 * d + m)
     thin, worst, before = 0 * wide, np.full(len(low), np.inf), None
+    deep = worst
     for t, (slope, middle, radius) in enumerate(zip(*claims, strict=True)):
         box = up(np.abs(thin).sum(-1))
         reach = up(np.abs(centre) + np.abs(wide).sum(-1) + box)
         sets = (centre, wide, box, reach)
         program = head["programs"]["following" if t else "first"]
         s, c, r, bottom, top = bound(program, head["unit"], sets, low, high)
+        count = 2 * d + m + 1 + (head["property"] == "docks")
+        need(s.shape[1] == count, "the outputs of the loop are not those of the property")
         x, u = slice(0, 2 * d), slice(2 * d, 2 * d + m)
         off = times(np.abs(s[:, u] - slope), reach) + np.abs(c[:, u] - middle) + r[:, u]
         need(up(off) <= radius, f"the policy leaves its claimed bounds in step {t}")
@@ -221,14 +227,14 @@ def follow(head, low, high, claims):
         )
         far, near = np.maximum(np.abs(low), np.abs(high)), np.maximum(np.maximum(low, -high), 0)
         norms = [np.sqrt((v**2).sum(1)) for v in (far[:, d : 2 * d], far[:, :d], -near[:, :d])]
-        now = (bottom[:, -1], up(norms[0]), up(norms[1]), norms[2] * (1 - E))
+        now = (bottom[:, 2 * d + m], up(norms[0]), up(norms[1]), norms[2] * (1 - E))
         if before is None:
             worst = now[0]
         else:
             top_of = [np.maximum(a, b) for a, b in zip(before[1:], now[1:], strict=True)]
             worst = np.minimum(worst, np.minimum(before[0], now[0]) - gap(head["plant"], *top_of))
-        before = now
-    return worst
+        before, deep = now, bottom[:, -1]
+    return worst, deep
 
 
 def read(path):
@@ -258,7 +264,8 @@ def main(path, *others):
     for other in others:
         a, b = (
             json.dumps(
-                [h["programs"], h["plant"], h["unit"], h["steps"]], default=np.ndarray.tolist
+                [h["programs"], h["plant"], h["unit"], h["steps"], h["property"]],
+                default=np.ndarray.tolist,
             )
             for h in (head, read(other)[0])
         )
@@ -270,13 +277,25 @@ def main(path, *others):
         [len(c) == head["steps"] + 1 and c.shape[1] == len(low) for c in claims],
         "claims are missing",
     )
+    goal, steps = head["property"], head["steps"]
+    last = arrays.get("proved/last", np.zeros(0, int))
+    need(goal in ("safe", "docks"), f"the property {goal!r} is unknown")
+    need(last.shape == (len(low),), "the last steps of boxes are missing")
+    need(
+        (last >= 1) & (last <= steps) if goal == "docks" else last == steps, "a last step is wrong"
+    )
     worst = np.inf
-    for i in range(0, len(low), 32):
-        part = slice(i, i + 32)
-        margins = follow(head, low[part], high[part], [c[:, part] for c in claims])
-        need(margins >= 0, "the margin of a box may be negative")
-        worst = min(worst, margins.min())
-    print(f"proved: {len(low)} boxes fill the box, h >= {worst:.3g} for {head['steps']} steps")
+    for end in np.unique(last):
+        alike = np.flatnonzero(last == end)
+        for part in np.array_split(alike, -(-len(alike) // 32)):
+            kept = [c[: end + 1, part] for c in claims]
+            margins, deep = follow(head, low[part], high[part], kept)
+            need(margins >= 0, "the margin of a box may be negative")
+            if goal == "docks":
+                need(deep >= 0, f"a box may not have docked after {end} steps")
+            worst = min(worst, margins.min())
+    until = "until it docks, within" if goal == "docks" else "for"
+    print(f"proved: {len(low)} boxes fill the box, h >= {worst:.3g} {until} {steps} steps")
 
 
 if __name__ == "__main__":

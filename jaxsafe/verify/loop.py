@@ -6,7 +6,7 @@ is held in the next step. One step of the loop is `jaxsafe.step` followed by the
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,16 +16,24 @@ from jaxtyping import Array, Float
 
 from jaxsafe.environment import Environment, action_bounds, reset_to, step
 from jaxsafe.processors.constraint import SpeedLimit
-from jaxsafe.processors.status import Distance, Speed, VelocityLimit
+from jaxsafe.processors.status import Distance, InRegion, Speed, VelocityLimit
+from jaxsafe.processors.terminal import Crashed, Docked, Timeout, TooFar
 from jaxsafe.rollout import Policy
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.cwh import Anchor, Spacecraft, ThrustedSpacecraft
 from jaxsafe.simulation.double_integrator import DoubleIntegrator
-from jaxsafe.types import State
+from jaxsafe.simulation.regions import Sphere
+from jaxsafe.types import Sim, State
 from jaxsafe.verify.program import Program, trace
 
 FIELDS = ("position", "velocity")
 """The fields of the agent's platform that move."""
+
+ENDS = (Docked, Crashed, TooFar, Timeout)
+"""Ends of episodes that `docks` allows for. docs/verification.md shows that success is first."""
+
+Property = Literal["safe", "docks"]
+"""What can be proved: the limit is kept in all steps, or until the agent has docked."""
 
 SINGLE = 2.0**-24
 """Unit roundoff of single precision."""
@@ -51,7 +59,7 @@ class Loop(NamedTuple):
     """A closed loop that something can be proved about.
 
     Its state is (position, velocity, action). The programs return the next state and the margin h
-    that belongs to it.
+    that belongs to it. With the property `docks` they also return the depth in the docking region.
     """
 
     first: Program
@@ -62,9 +70,12 @@ class Loop(NamedTuple):
     """Number of axes of the position."""
     actions: int
     plant: Plant
+    property: Property = "safe"
 
 
-def closed_loop(env: Environment, policy: Policy, arithmetic: str = "float32") -> Loop:
+def closed_loop(
+    env: Environment, policy: Policy, arithmetic: str = "float32", property: Property = "safe"
+) -> Loop:
     """Return the closed loop of an environment and a policy.
 
     Args:
@@ -73,11 +84,13 @@ def closed_loop(env: Environment, policy: Policy, arithmetic: str = "float32") -
             deterministic.
         arithmetic: `float32` for the loop as it runs in single precision, `real` for that of real
             numbers with the same parameters.
+        property: what is to be proved of it.
 
     Raises:
         ConfigError: the loop is random, remembers, or has a part that no proof covers.
     """
     _require_provable(env)
+    region = docking_region(env) if property == "docks" else None
     unit = {"float32": SINGLE, "real": 0.0}[arithmetic]
     with jax.enable_x64(True):
         env = jax.tree.map(lambda x: jnp.asarray(x, jnp.float64), env)
@@ -96,7 +109,10 @@ def closed_loop(env: Environment, policy: Policy, arithmetic: str = "float32") -
         def outputs(state: State, timestep: Any) -> Array:
             own = state.sim.platforms[env.agent]
             margins = jnp.stack([timestep.info.margins[name] for name in names])
-            return jnp.concatenate([own.position, own.velocity, act(timestep.observation), margins])
+            seen = [own.position, own.velocity, act(timestep.observation), margins]
+            if region is not None:
+                seen.append(depth(env, region, state.sim)[None])
+            return jnp.concatenate(seen)
 
         def first(y: Array) -> Array:
             return outputs(*reset_to(env, start_of(env, y[: 2 * dimension])))
@@ -112,6 +128,7 @@ def closed_loop(env: Environment, policy: Policy, arithmetic: str = "float32") -
             dimension=dimension,
             actions=env.action_size,
             plant=_plant(env),
+            property=property,
         )
 
 
@@ -128,6 +145,55 @@ def start_of(env: Environment, x: Float[Array, " 2d"]) -> dict[str, dict[str, An
     """Return a start for `reset_to` from (position, velocity) of the agent's platform."""
     half = x.shape[0] // 2
     return {env.agent: {"position": x[:half], "velocity": x[half:]}}
+
+
+def docking_region(env: Environment) -> Sphere:
+    """Return the region in which an episode ends with a success if the limit is kept.
+
+    Raises:
+        ConfigError: the environment has no such region, or no proof covers it.
+    """
+    ends = [item for item in env.terminal if isinstance(item, Docked)]
+    if len(ends) != 1:
+        raise ConfigError(
+            f"property: docks needs one end of the type docked, and the environment has {len(ends)}"
+        )
+    for item in env.terminal:
+        if type(item) not in ENDS:
+            kind = item.type_name or type(item).__name__
+            raise ConfigError(
+                f"property: docks has no rule for the end {item.name} of the type {kind}"
+            )
+    [end] = ends
+    [constraint] = env.constraints
+    status = next(item for item in env.status if item.name == end.in_docking)
+    regions = {item.name: item for item in env.regions}
+    region = regions[status.region] if type(status) is InRegion else None
+    anchors = {item.name for item in env.platforms if type(item) is Anchor}
+    if not (
+        isinstance(region, Sphere)
+        and isinstance(status, InRegion)
+        and status.of == env.agent
+        and region.offset is None
+        and region.on in anchors | {None}
+    ):
+        raise ConfigError(
+            f"property: docks needs {end.in_docking} to be about {env.agent} in a circle or a "
+            "sphere around an anchor"
+        )
+    for name in ("speed", "velocity_limit"):
+        if getattr(end, name) != getattr(constraint, name):
+            raise ConfigError(
+                f"property: docks needs one speed limit; terminal.{end.name}.{name} is not that of "
+                f"constraints.{constraint.name}"
+            )
+    return region
+
+
+def depth(env: Environment, region: Sphere, sim: Sim) -> Float[Array, ""]:
+    """Return how deep the agent is in a region [m]. It is outside if that is negative."""
+    centre = sim.regions[region.name].position
+    return -region.signed_distance(sim.platforms[env.agent].position - centre)
 
 
 def _require_provable(env: Environment) -> None:

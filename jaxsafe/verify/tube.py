@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsafe.verify.forms import Bounds, Domain, bound
-from jaxsafe.verify.loop import Loop, Plant
+from jaxsafe.verify.loop import Loop, Plant, Property
 from jaxsafe.verify.program import FINE
 
 ROOM = 2.0**-12
@@ -45,6 +45,25 @@ class Tube(NamedTuple):
     low: Float[Array, "t d"]
     """The lowest state at each sample."""
     high: Float[Array, "t d"]
+    depth: Float[Array, "t g"]
+    """A lower bound of the depth in the docking region at each sample [m].
+
+    g is 1 for a loop with the property `docks`, else 0.
+    """
+
+    def proved_steps(self, property: Property) -> np.ndarray:
+        """Return after how many steps the property is proved of each of a batch of boxes.
+
+        It is -1 where it is not proved. Bounds that are not numbers prove nothing.
+        """
+        margin, depth = np.asarray(self.margin), np.asarray(self.depth)
+        proved = np.logical_and.accumulate(margin >= 0.0, axis=1)
+        if property == "docks":
+            proved &= depth[..., 0] >= 0.0
+            proved[:, 0] = False  # an episode does not end at its start
+        else:
+            proved[:, :-1] = False
+        return np.where(proved.any(axis=1), proved.argmax(axis=1), -1)
 
 
 class _Sample(NamedTuple):
@@ -72,6 +91,7 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
     claims = []
     lows = []
     highs = []
+    depths = []
     for t in range(steps + 1):
         bounds = _with_room(bound(loop.following if t else loop.first, domain), size)
         domain, sample = _following(bounds, domain, size, loop.dimension, t)
@@ -79,12 +99,13 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
         claims.append(Claims(*(x[:, size:total] for x in bounds[:3])))
         lows.append(domain.low)
         highs.append(domain.high)
+        depths.append(bounds.low[:, total + 1 :])
 
     def stack(*x: Array) -> Array:
         return jnp.stack(x, axis=1)
 
     margin = _with_gaps(loop.plant, jax.tree.map(stack, *samples))
-    return Tube(margin, jax.tree.map(stack, *claims), stack(*lows), stack(*highs))
+    return Tube(margin, jax.tree.map(stack, *claims), stack(*lows), stack(*highs), stack(*depths))
 
 
 @jax.jit

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +15,19 @@ from jaxtyping import Array, Float
 
 from jaxsafe.devices.seed_mapper import usable_cores
 from jaxsafe.environment import Environment, require_environment, reset_to, step
+from jaxsafe.processors.terminal import time_limit
 from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.schema.errors import ConfigError, choices_text, show
-from jaxsafe.verify.loop import FIELDS, Loop, closed_loop, start_of
+from jaxsafe.types import State, TimeStep
+from jaxsafe.verify.loop import (
+    FIELDS,
+    Loop,
+    Property,
+    closed_loop,
+    depth,
+    docking_region,
+    start_of,
+)
 from jaxsafe.verify.tube import Claims, tube
 
 BATCH = 64
@@ -26,8 +36,11 @@ BATCH = 64
 FIRST_WIDTHS = (18.0, 0.1)
 """Largest widths of the first boxes, of positions [m] and of velocities [m/s]."""
 
-SCALES = (6.0, 0.047)
-"""Widths that count the same when a box is halved, of positions [m] and of velocities [m/s]."""
+SCALES: Mapping[Property, tuple[float, float]] = {"safe": (6.0, 0.047), "docks": (0.125, 0.02)}
+"""Widths that count the same when a box is halved, of positions [m] and of velocities [m/s].
+
+Near the chief the direction to it changes most with the position.
+"""
 
 RESOLUTION = 2048
 """The default resolution: a box below this part of `FIRST_WIDTHS` is not halved."""
@@ -64,9 +77,14 @@ class Counterexample(NamedTuple):
     start: dict[str, dict[str, list[float]]]
     """For `jaxsafe.reset_to`, in single precision."""
     step: int
-    """The step at whose end the margin is negative first, 0 for the start itself."""
+    """The step at whose end the margin is negative first, 0 for the start itself.
+
+    For a flight that does not dock it is the last step.
+    """
     margin: float
-    """The margin h there."""
+    """The margin h there. For a flight that does not dock it is the largest depth in the region."""
+    undocked: bool = False
+    """Whether the flight keeps the limit and does not dock."""
 
 
 class Verification(NamedTuple):
@@ -79,8 +97,10 @@ class Verification(NamedTuple):
     open: Boxes
     claims: Claims
     """What the proof says of the policy, by proved box, see `jaxsafe.verify.tube.Claims`."""
+    last: np.ndarray
+    """The last step of each proved box that the proof covers: where all its starts have docked."""
     margin: float
-    """A lower bound of h along all episodes from the proved boxes."""
+    """A lower bound of h along all episodes from the proved boxes, up to their last steps."""
     counterexample: Counterexample | None
     box: Boxes
     loop: Loop
@@ -101,6 +121,7 @@ def verify(
     box: Box,
     steps: int = 40,
     *,
+    property: Property = "safe",
     arithmetic: Literal["float32", "real"] = "float32",
     seconds: float = math.inf,
     max_boxes: int = 100_000,
@@ -112,7 +133,8 @@ def verify(
     """Prove that a policy keeps the safety constraint from every start in a box, or refute it.
 
     The proof is about `steps` steps of the environment, whether the episode has ended or not, and
-    about the time between them.
+    about the time between them. With the property `docks` it says that every episode ends with a
+    success after at most `steps` steps, and keeps the constraint until then.
 
     Args:
         env: the environment. Its agent is a point mass that keeps a speed limit.
@@ -121,6 +143,7 @@ def verify(
         box: intervals of the start, such as `{"deputy.position": [[70, 106], [70, 106]],
             "deputy.velocity": [-0.28, 0.28]}` [m, m/s].
         steps: number of steps.
+        property: `safe` or `docks`.
         arithmetic: `float32` proves the loop as it runs in single precision, `real` that of real
             numbers.
         seconds: the time after which to stop [s]. Boxes that are left are then open.
@@ -142,7 +165,10 @@ def verify(
         raise ConfigError(
             "run: the policy remembers; a proof needs one that sees the present alone"
         )
-    loop = closed_loop(env, policy, arithmetic)
+    if property not in get_args(Property):
+        raise ConfigError(f"property: found {show(property)}; choose from safe, docks")
+    loop = closed_loop(env, policy, arithmetic, property)
+    _require_time(env, property, steps)
     whole = corners(env, box)
     search = _Search(env, policy, loop, whole, steps, resolution)
     if resume is not None:
@@ -160,6 +186,20 @@ def verify(
     except KeyboardInterrupt:
         pass
     return search.verification(time.monotonic() - began)
+
+
+def _require_time(env: Environment, property: Property, steps: int) -> None:
+    """Refuse to ask whether the agent docks after the end of the episode.
+
+    Raises:
+        ConfigError: the episode ends before the last step.
+    """
+    limit = time_limit(env)
+    if property == "docks" and limit is not None and steps * float(env.dt) > float(limit):
+        raise ConfigError(
+            f"steps: found {steps}; the episode ends after {float(limit):g} s, and a step "
+            f"takes {float(env.dt):g} s"
+        )
 
 
 def corners(env: Environment, box: Box) -> Boxes:
@@ -201,6 +241,7 @@ def _require_same(known: Verification, loop: Loop, whole: Boxes, steps: int) -> 
         ConfigError: the loop, the box or the number of steps differs.
     """
     same = {
+        "the property": known.loop.property == loop.property,
         "the closed loop": _same_numbers(known.loop, loop),
         "the box": _same_numbers(known.box, whole),
         "steps": known.steps == steps,
@@ -241,7 +282,7 @@ class _Known(NamedTuple):
     waiting: list[_Corners]
     """Boxes to bound, as their lowest and highest corner."""
     proved: list[Any]
-    """Corners and claims of proved boxes, by batch."""
+    """Corners, claims and last steps of proved boxes, by batch."""
     refuted: list[Any]
     stuck: list[Any]
     """Boxes that are too small to halve."""
@@ -269,18 +310,20 @@ class _Search:
         self.whole = whole
         self.steps = steps
         self.resolution = resolution
-        self.scales = np.repeat(SCALES, loop.dimension)
+        self.scales = np.repeat(SCALES[loop.property], loop.dimension)
         self.most = BATCH * usable_cores()
         self.pool = ThreadPoolExecutor(usable_cores())
         self.key = jax.random.key(0)
-        self.fly = jax.jit(jax.vmap(lambda x: _margins(env, policy, steps, x)))
+        self.fly = jax.jit(jax.vmap(lambda x: _flight(env, policy, steps, loop.property, x)))
         self.known = _Known(_cells(whole, loop.dimension), [], [], [])
 
     def go_on(self, earlier: Verification) -> None:
         """Begin with what an earlier search knows."""
         self.known = _Known(
             waiting=[*zip(*earlier.open, strict=True)],
-            proved=[(*earlier.proved, earlier.claims)] if len(earlier.proved.low) else [],
+            proved=[(*earlier.proved, earlier.claims, earlier.last)]
+            if len(earlier.proved.low)
+            else [],
             refuted=[earlier.refuted],
             stuck=[],
             margin=earlier.margin,
@@ -296,8 +339,8 @@ class _Search:
         low, high = (np.stack(ends) for ends in zip(*known.waiting[:count], strict=True))
         parts = [slice(i, i + BATCH) for i in range(0, count, BATCH)]
         bounds = list(self.pool.map(lambda part: self.bound(low[part], high[part]), parts))
-        margin, claims = jax.tree.map(lambda *x: np.concatenate(x), *bounds)
-        done = margin.min(axis=1) >= 0.0  # false where a bound is not a number
+        margin, claims, last = jax.tree.map(lambda *x: np.concatenate(x), *bounds)
+        done = last >= 0
         share = np.zeros(count)
         violation = None
         if not done.all():
@@ -308,7 +351,7 @@ class _Search:
         refuted = ~done & ((share == 1.0) | (small & (share > 0.0)))
         stuck = ~done & small & ~refuted
         wide = np.flatnonzero(~done & ~refuted & ~stuck)
-        proved = [(low[done], high[done], jax.tree.map(lambda x: x[done], claims))]
+        proved = [(low[done], high[done], jax.tree.map(lambda x: x[done], claims), last[done])]
         halves = [half for i in wide for half in self.halves(low[i], high[i])]
         self.known = known._replace(
             waiting=known.waiting[count:] + halves,
@@ -320,14 +363,19 @@ class _Search:
             bounded=known.bounded + count,
         )
 
-    def bound(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, Claims]:
-        """Return a lower bound of h in each step from each box, and the claims."""
+    def bound(self, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, Claims, np.ndarray]:
+        """Return a lower bound of h from each box, the claims, and the steps that are proved."""
         count = len(low)
         full = [_filled(x, BATCH) for x in (low, high)]
         with jax.enable_x64(True):
             tubes = tube(self.loop, self.steps, *map(jnp.asarray, full))
-            margin, claims = jax.device_get((tubes.margin, tubes.claims))
-        return margin[:count], jax.tree.map(lambda x: x[:count], claims)
+            tubes = jax.tree.map(lambda x: x[:count], jax.device_get(tubes))
+        last = tubes.proved_steps(self.loop.property)
+        covered = np.arange(self.steps + 1) <= last[:, None]
+        margin = np.where(covered, tubes.margin, math.inf).min(axis=1)
+        # Nothing is claimed of later steps, whose bounds may be infinite.
+        claims = jax.tree.map(lambda x: _where(covered, x), tubes.claims)
+        return margin, claims, last
 
     def halves(self, low: np.ndarray, high: np.ndarray) -> list[_Corners]:
         """Return both halves of a box. It is cut where it is widest."""
@@ -348,7 +396,8 @@ class _Search:
             number: the number of the random draw.
 
         Returns:
-            The share of the flights from each box that violate the property, and the worst one.
+            The share of the flights from each box that violate the property, and the worst one. A
+            flight that breaks the limit counts as worse than one that does not dock.
         """
         count = len(low)
         full = [_filled(x, self.most)[:, None] for x in (low, high)]
@@ -357,17 +406,21 @@ class _Search:
         lowest, highest = (jnp.asarray(x, jnp.float32) for x in full)
         starts = jnp.clip(lowest + share * (highest - lowest), lowest, highest)
         starts = starts.reshape(-1, starts.shape[-1])
-        margins = np.asarray(self.fly(starts))[: count * SAMPLES]
-        share_violating = (margins.min(axis=1) < 0.0).reshape(count, SAMPLES).mean(axis=1)
+        margins, depths = (np.asarray(x)[: count * SAMPLES] for x in self.fly(starts))
+        least, deepest = margins.min(axis=1), depths.max(axis=1)
+        undocked = (least >= 0.0) & (deepest < 0.0)
+        share_violating = ((least < 0.0) | undocked).reshape(count, SAMPLES).mean(axis=1)
         if not share_violating.any():
             return share_violating, None
-        worst = int(np.argmin(margins.min(axis=1)))
-        when = int(np.argmax(margins[worst] < 0.0))
+        only_undocked = least.min() >= 0.0
+        worst = int(np.argmin(deepest if only_undocked else least))
+        when = self.steps if only_undocked else int(np.argmax(margins[worst] < 0.0))
         start = start_of(self.env, starts[worst])
         violation = Counterexample(
             start=jax.tree.map(lambda x: x.tolist(), start),
             step=when,
-            margin=float(margins[worst, when]),
+            margin=float(deepest[worst] if only_undocked else margins[worst, when]),
+            undocked=bool(only_undocked),
         )
         return share_violating, violation
 
@@ -389,6 +442,7 @@ class _Search:
             refuted=_pile(size, known.refuted),
             open=left,
             claims=jax.tree.map(lambda *x: np.concatenate(x), empty, *claims),
+            last=np.concatenate([np.zeros(0, int), *(item[3] for item in known.proved)]),
             margin=known.margin,
             counterexample=known.counterexample,
             box=self.whole,
@@ -410,18 +464,39 @@ def _pile(size: int, items: Sequence[Any]) -> Boxes:
     return Boxes(*(np.concatenate([empty, *(item[i] for item in items)]) for i in (0, 1)))
 
 
-def _margins(env: Environment, policy: Policy, steps: int, x: Float[Array, " s"]) -> Array:
-    """Return the smallest margin at the start and after each step, flown by the environment."""
+def _where(covered: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Return the entries of covered steps, and 0 for the others."""
+    return np.where(covered.reshape(*covered.shape, *[1] * (x.ndim - 2)), x, 0.0)
+
+
+def _flight(
+    env: Environment, policy: Policy, steps: int, property: Property, x: Float[Array, " s"]
+) -> tuple[Array, Array]:
+    """Fly from a start, and return what decides whether the flight has a property.
+
+    Returns:
+        The smallest margin at the start and after each step, and the depth in the docking region.
+        With the property `docks` the margin is infinite after the step in which the agent docks.
+        With the property `safe` the depth is 0.
+    """
+    region = docking_region(env) if property == "docks" else None
     state, timestep = reset_to(env, start_of(env, x))
 
-    def least(timestep: Any) -> Array:
-        return jnp.min(jnp.stack(list(timestep.info.margins.values())))
+    def seen(state: State, timestep: TimeStep) -> tuple[Array, Array]:
+        margin = jnp.min(jnp.stack(list(timestep.info.margins.values())))
+        return margin, jnp.zeros(()) if region is None else depth(env, region, state.sim)
 
-    def fly(carry: Any, _: None) -> tuple[Any, Array]:
-        state, observation = carry
+    def fly(carry: Any, _: None) -> tuple[Any, tuple[Array, Array]]:
+        state, observation, docked = carry
         action = policy(jax.random.key(0), observation[None])[0]
         state, timestep = step(env, state, action)
-        return (state, timestep.observation), least(timestep)
+        margin, deep = seen(state, timestep)
+        margin = jnp.where(docked, jnp.inf, margin)
+        docked |= (deep >= 0.0) & (region is not None)
+        return (state, timestep.observation, docked), (margin, deep)
 
-    _, later = jax.lax.scan(fly, (state, timestep.observation), None, steps)
-    return jnp.concatenate([least(timestep)[None], later])
+    margin, deep = seen(state, timestep)
+    _, later = jax.lax.scan(fly, (state, timestep.observation, jnp.asarray(False)), None, steps)
+    # An episode does not end at its start, so that the depth there does not count.
+    first = margin, deep if region is None else jnp.full_like(deep, -jnp.inf)
+    return jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), first, later)

@@ -1,5 +1,6 @@
 """Proofs about closed loops: every bound holds, and a certificate that says too much is refused."""
 
+import json
 import os
 import signal
 import subprocess
@@ -30,6 +31,12 @@ from jaxsafe.verify.verify import Boxes, Verification, _Search, verify
 PUBLISHED = Path(os.environ.get("JAXSAFE_PUBLISHED_NETWORK", "docking2d_published.onnx"))
 """The network of the community's docking benchmark, which does not come with this package."""
 
+FAST = {"type": "above", "name": "fast", "status": "speed", "limit": 1.0}
+"""An end of an episode that no proof covers."""
+
+NEAR = {"position": [[1.0, 1.1], [-0.05, 0.05]], "velocity": [-0.005, 0.005]}
+"""Starts beside the docking region, at rest."""
+
 SMALL_BOX = {"position": [[80, 92], [80, 86]], "velocity": [[-0.125, 0.03125], [0.0, 0.0625]]}
 GAINS = np.array([[-0.3, 0.1, -0.9, 0.0, 0.1, 0.0], [0.0, -0.4, 0.1, -0.8, 0.0, -0.1]])
 
@@ -45,6 +52,17 @@ def braking(key: Any, observation: Any) -> Any:
 def speeding(key: Any, observation: Any) -> Any:
     """Return an action that breaks the speed limit."""
     return jnp.ones((*observation.shape[:-1], 2))
+
+
+def approaching(key: Any, observation: Any) -> Any:
+    """Return an action that flies to the chief like a damped spring, with forces in N."""
+    position, velocity = 100.0 * observation[..., :2], 0.5 * observation[..., 2:4]
+    return -0.48 * position - 4.8 * velocity
+
+
+def drifting(key: Any, observation: Any) -> Any:
+    """Return no thrust."""
+    return jnp.zeros((*observation.shape[:-1], 2))
 
 
 def domain(key: int, size: int, width: float) -> Domain:
@@ -215,7 +233,8 @@ def test_a_certificate_is_checked_and_read_again(proof: Verification, tmp_path: 
 
 
 def lost_box(arrays: dict[str, np.ndarray]) -> None:
-    for name in ("proved/low", "proved/high", "claims/slope", "claims/centre", "claims/radius"):
+    claims = ("claims/slope", "claims/centre", "claims/radius")
+    for name in ("proved/low", "proved/high", "proved/last", *claims):
         arrays[name] = arrays[name][1:]
 
 
@@ -242,12 +261,50 @@ def other_network(arrays: dict[str, np.ndarray]) -> None:
             arrays[name] = array * 1.001
 
 
-@pytest.mark.parametrize(
-    "change", [lost_box, moved_bound, larger_box, smaller_radius, wrong_slope, other_network]
-)
+def lost_last_steps(arrays: dict[str, np.ndarray]) -> None:
+    arrays["proved/last"] = arrays["proved/last"][:0]
+
+
+def moved_last_step(arrays: dict[str, np.ndarray]) -> None:
+    arrays["proved/last"] = arrays["proved/last"] - 1
+
+
+def other_property(arrays: dict[str, np.ndarray]) -> None:
+    header = json.loads(str(arrays["header"]))
+    header["property"] = {"safe": "docks", "docks": "safe"}[header["property"]]
+    arrays["header"] = np.array(json.dumps(header))
+
+
+def other_property_for_all_steps(arrays: dict[str, np.ndarray]) -> None:
+    other_property(arrays)
+    steps = json.loads(str(arrays["header"]))["steps"]
+    arrays["proved/last"] = np.full_like(arrays["proved/last"], steps)
+
+
+CHANGES = [
+    lost_box,
+    moved_bound,
+    larger_box,
+    smaller_radius,
+    wrong_slope,
+    other_network,
+    lost_last_steps,
+    moved_last_step,
+    other_property,
+]
+
+
+@pytest.mark.parametrize("change", CHANGES)
 def test_a_certificate_that_says_too_much_is_refused(
     change: Callable[[dict[str, np.ndarray]], None], proof: Verification, tmp_path: Path
 ) -> None:
+    require_refused(change, proof, tmp_path)
+
+
+def require_refused(
+    change: Callable[[dict[str, np.ndarray]], None], proof: Verification, tmp_path: Path
+) -> None:
+    """Check that a changed certificate of a proof is refused."""
     save_certificate(tmp_path / "proof.npz", proof, {})
     with np.load(tmp_path / "proof.npz") as file:
         arrays = dict(file)
@@ -258,6 +315,84 @@ def test_a_certificate_that_says_too_much_is_refused(
     refused = run_check(tmp_path / "wrong.npz")
     assert refused.returncode == 1
     assert refused.stderr.startswith("refused: "), refused.stderr
+
+
+@pytest.fixture(scope="module")
+def arrival() -> Verification:
+    return verify(jaxsafe.make("docking2d"), approaching, NEAR, steps=14, property="docks")
+
+
+def test_all_flights_from_a_box_that_docks_end_with_a_success(arrival: Verification) -> None:
+    assert arrival.result == "proved"
+    assert (arrival.last >= 1).all()
+    assert (arrival.last < 14).all()
+    env = jaxsafe.make("docking2d")
+
+    def fly(x: jax.Array) -> jax.Array:
+        def advance(carry: Any, _: None) -> tuple[Any, jax.Array]:
+            state, timestep = carry
+            carry = jaxsafe.step(env, state, approaching(None, timestep.observation))
+            return carry, carry[1].info.outcome
+
+        return jax.lax.scan(advance, jaxsafe.reset_to(env, start_of(env, x)), None, 14)[1]
+
+    share = np.random.default_rng(0).choice([0.0, 1.0, 0.3], (len(arrival.last), 200, 4))
+    low, high = (x[:, None].astype(np.float32) for x in arrival.proved)
+    outcomes = np.asarray(jax.jit(jax.vmap(jax.vmap(fly)))(low + share * (high - low)))
+    ended = outcomes > 0
+    assert ended.any(axis=2).all()
+    when = ended.argmax(axis=2)
+    first = np.take_along_axis(outcomes, when[..., None], axis=2)
+    assert (first == env.outcomes.index("success")).all()
+    assert (when + 1 <= arrival.last[:, None]).all()
+
+
+def test_a_proof_that_the_agent_docks_is_checked_and_read_again(
+    arrival: Verification, tmp_path: Path
+) -> None:
+    save_certificate(tmp_path / "proof.npz", arrival, {})
+    checked = run_check(tmp_path / "proof.npz")
+    assert checked.returncode == 0, checked.stderr
+    assert checked.stdout.endswith(" until it docks, within 14 steps\n")
+    read = load_certificate(tmp_path / "proof.npz")
+    assert read.loop.property == "docks"
+    np.testing.assert_array_equal(read.last, arrival.last)
+    with pytest.raises(ConfigError, match=r"^resume: the property is not that of the certificate"):
+        verify(jaxsafe.make("docking2d"), approaching, NEAR, steps=14, resume=read)
+
+
+@pytest.mark.parametrize("change", [*CHANGES, other_property_for_all_steps])
+def test_a_certificate_that_docks_too_early_or_not_at_all_is_refused(
+    change: Callable[[dict[str, np.ndarray]], None], arrival: Verification, tmp_path: Path
+) -> None:
+    require_refused(change, arrival, tmp_path)
+
+
+def test_a_flight_that_does_not_dock_is_flown_again_from_its_start() -> None:
+    env = jaxsafe.make("docking2d")
+    found = verify(env, drifting, NEAR, steps=3, property="docks")
+    assert found.result == "refuted"
+    violation = found.counterexample
+    assert violation is not None
+    assert violation.undocked
+    assert violation.step == 3
+    state, timestep = jaxsafe.reset_to(env, violation.start)
+    distances = []
+    for _ in range(3):
+        state, timestep = jaxsafe.step(env, state, drifting(None, timestep.observation))
+        distances.append(float(timestep.info.status["docking_distance"]))
+    assert int(timestep.info.outcome) == env.outcomes.index("running")
+    assert 0.5 - min(distances) == pytest.approx(violation.margin, abs=1e-5)
+
+
+def test_a_flight_that_docks_too_fast_is_a_violation() -> None:
+    env = jaxsafe.make("docking2d")
+    fast = {"position": [[0.7, 0.71], [0, 0]], "velocity": [[-0.23, -0.22], [0, 0]]}
+    violation = verify(env, drifting, fast, steps=3, property="docks").counterexample
+    assert violation is not None
+    assert not violation.undocked
+    assert violation.step == 0
+    assert violation.margin < 0.0
 
 
 def test_the_certificate_of_another_loop_is_refused(proof: Verification, tmp_path: Path) -> None:
@@ -407,7 +542,7 @@ def test_a_map_tells_refuted_boxes_from_proved_ones() -> None:
 
 def test_the_bound_between_two_samples_is_about_the_limit_of_the_constraint() -> None:
     env = jaxsafe.make("docking2d")
-    limit = next(status for status in env.status if status.name == "velocity_limit")
+    limit: Any = next(status for status in env.status if status.name == "velocity_limit")
     flat = limit.replace(name="flat_limit", slope=jnp.zeros_like(limit.slope))
     distance, *others = env.status
     loop = closed_loop(env.replace(status=(distance, flat, *others)), braking)
@@ -465,6 +600,39 @@ def test_nothing_dips_below_the_bound_between_two_samples() -> None:
 def test_loops_of_which_nothing_is_proved_are_refused(change: Any, message: str) -> None:
     with pytest.raises(ConfigError, match="^" + message):
         verify(jaxsafe.make("docking2d", **change), braking, SMALL_BOX)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "options", "message"),
+    [
+        ({}, {"property": "fast"}, "property: found 'fast'; choose from safe, docks"),
+        (
+            {},
+            {"property": "docks", "steps": 2001},
+            "steps: found 2001; the episode ends after 2000 s",
+        ),
+        (
+            {"terminal": ["timeout"], "reward": ["distance_change"]},
+            {"property": "docks"},
+            "property: docks needs one end of the type docked, and the environment has 0",
+        ),
+        (
+            {"reward": ["distance_change"], "terminal": ["success", FAST]},
+            {"property": "docks"},
+            "property: docks has no rule for the end fast of the type above",
+        ),
+        (
+            {"regions.docking_region.offset": {"type": "displacement", "by": [1.0, 0.0]}},
+            {"property": "docks"},
+            "property: docks needs in_docking to be about deputy in a circle or a sphere",
+        ),
+    ],
+)
+def test_what_cannot_be_asked_about_docking_is_refused(
+    overrides: Any, options: Any, message: str
+) -> None:
+    with pytest.raises(ConfigError, match="^" + message):
+        verify(jaxsafe.make("docking2d", overrides), approaching, NEAR, **options)
 
 
 @pytest.mark.parametrize(
@@ -540,8 +708,13 @@ def test_the_command_says_what_is_known_by_its_exit_code(tmp_path: Path, capsys:
         "refuted": [*small, "box.velocity=[0.5,0.6]"],
         "open": ["steps=2", "boxes=1"],
     }
+    docks = ["property=docks", "steps=30", "box.position=[2,2.02]", "box.velocity=[0,0.01]"]
     for result, code in EXIT_CODES.items():
         out = tmp_path / f"{result}.npz"
         assert main(["run=pretrained/docking2d", *words[result], f"out={out}"]) == code
         assert f"\n{result}: " in capsys.readouterr().out
         assert load_certificate(out).result == result
+    for more, said in (([], "proved: docked after "), (["steps=3"], "refuted: not docked after 3")):
+        words = ["run=pretrained/docking2d", *docks, *more, f"out={tmp_path / 'docks.npz'}"]
+        assert main(words) == EXIT_CODES[said.partition(":")[0]]
+        assert f"\n{said}" in capsys.readouterr().out
