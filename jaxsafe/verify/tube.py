@@ -78,6 +78,8 @@ class _Sample(NamedTuple):
 def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n s"]) -> Tube:
     """Return bounds of all ways from the starts between two corners, for a batch of boxes.
 
+    They end early, after a step at which each box has docked or is known to be without a proof.
+
     Args:
         loop: the closed loop.
         steps: number of steps.
@@ -92,6 +94,7 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
     lows = []
     highs = []
     depths = []
+    undecided = np.ones(len(low), bool)
     for t in range(steps + 1):
         bounds = _with_room(bound(loop.following if t else loop.first, domain), size)
         domain, sample = _following(bounds, domain, size, loop.dimension, t)
@@ -100,6 +103,11 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
         lows.append(domain.low)
         highs.append(domain.high)
         depths.append(bounds.low[:, total + 1 :])
+        undecided &= np.asarray(sample.margin >= 0.0)
+        if t and loop.property == "docks":
+            undecided &= ~np.asarray(depths[-1][:, 0] >= 0.0)
+        if not undecided.any():
+            break
 
     def stack(*x: Array) -> Array:
         return jnp.stack(x, axis=1)

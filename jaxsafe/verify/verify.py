@@ -371,10 +371,9 @@ class _Search:
             tubes = tube(self.loop, self.steps, *map(jnp.asarray, full))
             tubes = jax.tree.map(lambda x: x[:count], jax.device_get(tubes))
         last = tubes.proved_steps(self.loop.property)
-        covered = np.arange(self.steps + 1) <= last[:, None]
+        covered = np.arange(tubes.margin.shape[1]) <= last[:, None]
         margin = np.where(covered, tubes.margin, math.inf).min(axis=1)
-        # Nothing is claimed of later steps, whose bounds may be infinite.
-        claims = jax.tree.map(lambda x: _where(covered, x), tubes.claims)
+        claims = jax.tree.map(lambda x: _claimed(x, covered, self.steps + 1), tubes.claims)
         return margin, claims, last
 
     def halves(self, low: np.ndarray, high: np.ndarray) -> list[_Corners]:
@@ -464,9 +463,15 @@ def _pile(size: int, items: Sequence[Any]) -> Boxes:
     return Boxes(*(np.concatenate([empty, *(item[i] for item in items)]) for i in (0, 1)))
 
 
-def _where(covered: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """Return the entries of covered steps, and 0 for the others."""
-    return np.where(covered.reshape(*covered.shape, *[1] * (x.ndim - 2)), x, 0.0)
+def _claimed(x: np.ndarray, covered: np.ndarray, count: int) -> np.ndarray:
+    """Return claims of `count` steps. They are 0 in steps that are not covered.
+
+    Bounds of such steps may be infinite.
+    """
+    own = np.where(covered.reshape(*covered.shape, *[1] * (x.ndim - 2)), x, 0.0)
+    claims = np.zeros((len(x), count, *x.shape[2:]))
+    claims[:, : x.shape[1]] = own
+    return claims
 
 
 def _flight(
