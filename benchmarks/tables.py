@@ -1023,6 +1023,28 @@ def verification(results: Results) -> str:
     return markdown(heads.split(" | "), rows)
 
 
+def verification_starts(results: Results) -> str:
+    """Return the table of boxes around random starts, and for how long they keep the limit."""
+    horizons = sorted(
+        {int(horizon) for row in results["starts"].values() for horizon in row["safe"]}
+    )
+    rows = (
+        [
+            f"`{row['policy']}`",
+            f"{row['widths'][0]:g} m, {row['widths'][1]:g} m/s",
+            str(row["boxes"]),
+            *(
+                f"{row['safe'][str(horizon)]:.0%}" if str(horizon) in row["safe"] else ""
+                for horizon in horizons
+            ),
+            f"{row['boxes_to_fill']:.1e}",
+        ]
+        for row in results["starts"].values()
+    )
+    heads = ["policy", "widths of the box", "boxes", *(f"{horizon} s" for horizon in horizons)]
+    return markdown([*heads, "boxes that fill all starts"], rows)
+
+
 def verification_tubes(results: Results) -> str:
     """Return the table of boxes that were bounded over many steps in one piece."""
     rows = (
@@ -1062,6 +1084,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("robustness", robustness, "docs/safety/attacks.md"),
     ("verification", verification, "docs/verification.md"),
     ("verification", verification_tubes, "docs/verification.md"),
+    ("verification", verification_starts, "docs/verification.md"),
     ("uncertain_training", uncertain_training, "docs/safety/attacks.md"),
     ("datasets", datasets, "docs/dataset.md"),
     ("controllers", controllers, "docs/controllers.md"),

@@ -27,7 +27,7 @@ from machine import about
 import jaxsafe
 from jaxsafe.agents.imported_policy import read_foreign
 from jaxsafe.agents.policy_file import find_policy, read_policy
-from jaxsafe.envs.docking import DOCKING_RADIUS
+from jaxsafe.envs.docking import DOCKING_RADIUS, DOCKING_SPEED, LIMIT_SLOPE
 from jaxsafe.storage.files import read_json, write_json
 from jaxsafe.verify import check
 from jaxsafe.verify.certificate import save_certificate
@@ -48,7 +48,7 @@ RAW = {
 SPACE = {"position": [88.0, 97.0], "velocity": [-0.05, 0.05]}
 """Starts in space, of which there are six numbers."""
 
-NEAR = {"position": [3.0, 7.0], "velocity": [-0.02, 0.02]}
+NEAR = {"position": [3.0, 6.0], "velocity": [-0.02, 0.02]}
 """Starts near the chief, almost at rest."""
 
 MAX_SECONDS = 240.0
@@ -82,6 +82,58 @@ TUBES: dict[str, dict[str, Any]] = {
 
 They have a centre (x, y, ẋ, ẏ) and widths of the position [m] and of the velocity [m/s].
 """
+
+
+STARTS: dict[str, dict[str, Any]] = {
+    "starts2d": {"policy": "pretrained/docking2d", "widths": [4.5, 0.025], "steps": 320},
+    "starts3d": {"policy": "pretrained/docking3d", "widths": [4.5, 0.025], "steps": 160},
+    "starts3d_wide": {"policy": "pretrained/docking3d", "widths": [9.0, 0.05], "steps": 80},
+}
+"""Boxes around random starts of a task that are bounded in one piece over many steps."""
+
+NUM_STARTS = 64
+"""Number of random starts."""
+
+HORIZONS = (40, 80, 160, 240, 320)
+"""Numbers of steps for which the share of the boxes that keep the limit is told."""
+
+
+def spread(case: Mapping[str, Any]) -> dict[str, Any]:
+    """Return for how many boxes around random starts a tube proves the limit, by horizon."""
+    env, policy = controller(case["policy"], 12.0, "")
+    states, _ = jax.vmap(env.reset)(jax.random.split(jax.random.key(0), NUM_STARTS))
+    own = states.sim.platforms[env.agent]
+    centre = np.concatenate([own.position, own.velocity], axis=1).astype(np.float64)
+    dimension = env.agent_platform.dimension
+    widths = np.repeat(case["widths"], dimension)
+    began = time.monotonic()
+    with jax.enable_x64(True):
+        loop = closed_loop(env, policy)
+        ends = (jnp.asarray(centre - 0.5 * widths), jnp.asarray(centre + 0.5 * widths))
+        margin = np.asarray(tube(loop, case["steps"], *ends).margin)
+    holds = np.logical_and.accumulate(margin >= 0.0, axis=1)
+    within = int(holds[:, 0].sum())
+    return {
+        **case,
+        "boxes": within,
+        "safe": {
+            str(horizon): float(holds[:, horizon].sum() / within)
+            for horizon in HORIZONS
+            if horizon <= case["steps"]
+        },
+        "boxes_to_fill": start_volume(dimension) / float(np.prod(widths)),
+        "seconds": time.monotonic() - began,
+        **about(__file__),
+    }
+
+
+def start_volume(dimension: int) -> float:
+    """Return the volume of all starts of docking: a shell of positions, a ball of velocities."""
+    distance = np.linspace(100.0, 150.0, 5001)
+    limit = DOCKING_SPEED + LIMIT_SLOPE * distance
+    shell = 2.0 * np.pi * distance if dimension == 2 else 4.0 * np.pi * distance**2
+    ball = np.pi * limit**2 if dimension == 2 else 4.0 / 3.0 * np.pi * limit**3
+    return float(np.trapezoid(shell * ball, distance))
 
 
 def follow(case: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -159,24 +211,27 @@ def measure(case: Mapping[str, Any], published: str) -> dict[str, Any]:
 def main() -> None:
     """Prove, check and write. Rows that are not asked for stay as they are in the file."""
     options = words(published="", rows="", out="benchmarks/results/verification.json")
-    names = several("rows", options["rows"], [*CASES, *TUBES]) or [
+    names = several("rows", options["rows"], [*CASES, *TUBES, *STARTS]) or [
         name
-        for name in (*CASES, *TUBES)
+        for name in (*CASES, *TUBES, *STARTS)
         if options["published"] or not name.startswith("published")
     ]
     out = Path(options["out"])
     content = read_json(out) if out.exists() else {}
-    rows, tubes = content.get("rows", {}), content.get("tubes", {})
+    rows, tubes, starts = (content.get(name, {}) for name in ("rows", "tubes", "starts"))
     for name in names:
         if name in TUBES:
             tubes[name] = follow(TUBES[name])
+        elif name in STARTS:
+            starts[name] = spread(STARTS[name])
         else:
             rows[name] = measure(CASES[name], options["published"])
-        print(json.dumps(rows.get(name) or tubes[name]), flush=True)
+        print(json.dumps({**rows, **tubes, **starts}[name]), flush=True)
         content = {
             **about(__file__),
             "rows": {name: rows[name] for name in CASES if name in rows},
             "tubes": {name: tubes[name] for name in TUBES if name in tubes},
+            "starts": {name: starts[name] for name in STARTS if name in starts},
         }
         write_json(out, content)
 
