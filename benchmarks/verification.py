@@ -48,7 +48,7 @@ RAW = {
 SPACE = {"position": [88.0, 97.0], "velocity": [-0.05, 0.05]}
 """Starts in space, of which there are six numbers."""
 
-NEAR = {"position": [3.0, 6.0], "velocity": [-0.02, 0.02]}
+NEAR = {"position": [3.0, 5.5], "velocity": [-0.02, 0.02]}
 """Starts near the chief, almost at rest."""
 
 MAX_SECONDS = 240.0

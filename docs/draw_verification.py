@@ -1,10 +1,12 @@
 """Draw the figures of docs/verification.md.
 
     python docs/draw_verification.py maps=runs/prove_and_retrain/round_0.npz,…/round_2.npz
+    python docs/draw_verification.py starts=rest.npz,left.npz,away.npz
 
 The `maps` are certificates of `examples/studies/prove_and_retrain.py`. Each is drawn as a row of
-panels, one for each of some velocities. The tube is that of the docking2d policy which comes with
-the package.
+panels, one for each of some velocities. The `starts` are certificates of one policy from narrow
+boxes of velocities, each drawn as a panel. The tube is that of the docking2d policy which comes
+with the package.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Rectangle
+from matplotlib.patches import Circle, Patch, Rectangle
 
 import jaxsafe
 from jaxsafe.agents.policy_file import find_policy, read_policy
@@ -38,6 +40,9 @@ VELOCITIES = ((-0.19, -0.19), (0.01, 0.01), (0.19, -0.19))
 START = ((88.0, 92.5), (78.0, 82.5), (-0.15, -0.125), (0.05, 0.075))
 """The box of the tube [m, m/s]."""
 
+START_DISTANCES = (100.0, 150.0)
+"""The distances of the starts of docking2d from the chief [m]."""
+
 STEPS = 80
 FLIGHTS = 200
 
@@ -56,6 +61,25 @@ def draw_maps(paths: list[str], target: Path) -> None:
         panel.set_title(f"ẋ = {velocity[0]:g} m/s, ẏ = {velocity[1]:g} m/s")
     for panel in panels[-1]:
         panel.set_xlabel("x [m]")
+    handles = [Patch(facecolor=colour, label=name) for name, colour in COLOURS.items()]
+    figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
+    save(figure, target)
+
+
+@styled
+def draw_starts(paths: list[str], target: Path) -> None:
+    """Draw what is proved, refuted and open over the position, and the ring of a task's starts."""
+    figure = Figure(figsize=(8.2, 3.5), layout="constrained")
+    panels = figure.subplots(1, len(paths), squeeze=False, sharey=True)[0]
+    for path, panel in zip(paths, panels, strict=True):
+        known = load_certificate(path)
+        low, high = known.box.low[0, 2:], known.box.high[0, 2:]
+        _map(known, 0.5 * (low + high), panel)
+        for distance in START_DISTANCES:
+            panel.add_patch(Circle((0.0, 0.0), distance, fill=False, color="black", linewidth=0.8))
+        x, y = 0.5 * (low + high) + 0.0  # −0 becomes 0
+        panel.set(xlabel="x [m]", title=f"ẋ = {x:.3g} m/s, ẏ = {y:.3g} m/s")
+    panels[0].set_ylabel("y [m]")
     handles = [Patch(facecolor=colour, label=name) for name, colour in COLOURS.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles))
     save(figure, target)
@@ -125,10 +149,12 @@ def draw_tube(target: Path) -> None:
 
 
 def main(words: list[str]) -> None:
-    """Draw both figures. The maps are drawn if there are certificates."""
+    """Draw the figures. The maps are drawn if there are certificates."""
     options = dict(word.split("=", 1) for word in words)
     if "maps" in options:
         draw_maps(options["maps"].split(","), HERE / "figures_verification_maps.png")
+    if "starts" in options:
+        draw_starts(options["starts"].split(","), HERE / "figures_verification_starts.png")
     draw_tube(HERE / "figures_verification_tube.png")
 
 
