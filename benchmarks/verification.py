@@ -57,6 +57,7 @@ MAX_SECONDS = 240.0
 CASES: dict[str, dict[str, Any]] = {
     "published": {"policy": "published network"},
     "published_real": {"policy": "published network", "arithmetic": "real"},
+    "published_80": {"policy": "published network", "steps": 80},
     "docking2d": {"policy": "pretrained/docking2d"},
     "docking2d_heavy": {"policy": "pretrained/docking2d", "mass": 300.0},
     "docking2d_80": {"policy": "pretrained/docking2d", "steps": 80},
