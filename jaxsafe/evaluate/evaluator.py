@@ -20,7 +20,7 @@ from jaxsafe.evaluate.episodes import (
     run_episodes,
     starts_of,
 )
-from jaxsafe.metrics import Episode, measures, metrics_in, metrics_of, over_episode
+from jaxsafe.metrics import COST_OF, Episode, measures, metrics_in, metrics_of, over_episode
 from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.types import Key, State, TimeStep
 
@@ -347,6 +347,7 @@ def episode_rows(
     share = np.asarray(episodes.control_effort) / np.maximum(episodes.length, 1)
     columns["control_effort"] = share.tolist()
     unmeasured = {name for name, what in needs.items() if not measured[what]}
+    costs = {f"{COST_OF}{name}": np.asarray(cost).tolist() for name, cost in episodes.costs.items()}
     columns |= {
         name: np.asarray(over_episode(name, value, np.maximum(episodes.length, 1))).tolist()
         for name, value in episodes.measured.items()
@@ -366,6 +367,7 @@ def episode_rows(
                 else _short(column[seed][index])
                 for name, column in columns.items()
             },
+            **{name: _short(column[seed][index]) for name, column in costs.items()},
             **{
                 f"{name}_bound": _short(values[index].item())
                 for name, values in (bounds or {}).items()

@@ -16,7 +16,7 @@ from jaxsafe.commands.evaluate import main
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.cases import column_names, columns_of, load_cases, reset_to_cases
-from jaxsafe.evaluate.evaluator import Evaluator, metrics_per_seed
+from jaxsafe.evaluate.evaluator import Evaluator, episode_rows, metrics_per_seed
 from jaxsafe.rollout import reset_batch
 from jaxsafe.schema.errors import ConfigError
 
@@ -72,10 +72,13 @@ def test_the_cost_of_each_constraint_is_a_metric_by_its_name() -> None:
     computed = {name: value for name, [value] in metrics_per_seed(env, sums).items()}
     flown = [timestep.costs for _, timestep in evaluator.episodes({}, 30, 0)]
     names = [constraint.name for constraint in env.constraints]
+    rows = episode_rows(env, sums, first_seed=0)
     by_name = []
     for name in names:
+        of_episodes = [costs[name][1:].sum() for costs in flown]
+        assert [row[f"episode_cost/{name}"] for row in rows] == pytest.approx(of_episodes)
         by_name.append(computed[f"episode_cost/{name}"])
-        assert by_name[-1] == pytest.approx(np.mean([costs[name][1:].sum() for costs in flown]))
+        assert by_name[-1] == pytest.approx(np.mean(of_episodes))
     assert len({*by_name}) == len(names) == 3
     assert computed["episode_cost"] < sum(by_name)
     assert computed["episode_cost"] == pytest.approx(max(by_name))

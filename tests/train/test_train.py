@@ -194,6 +194,9 @@ def test_a_crashed_run_resumes_to_the_same_end(
 def test_the_first_evaluation_measures_the_policies_before_training_too(whole: Path) -> None:
     rows = [row for row in logs(whole)["eval.jsonl"] if not row["final"]]
     assert list(dict.fromkeys(row["step"] for row in rows)) == [0, 320, 640, 960, 1280]
+    assert [row["episode_cost/velocity_limit"] for row in rows] == [
+        row["violating_steps"] for row in rows
+    ]
     # The episode of step 0 that is logged step by step is one of them.
     [first] = [row for row in rows if (row["step"], row["seed"], row["episode"]) == (0, 0, 0)]
     logged = [row for row in logs(whole)["episodes.jsonl"] if row["step"] == 0]
