@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
 from typing import Any, NamedTuple
 
@@ -43,6 +42,12 @@ at start and end.
 SAMPLES = 60
 """Number of instants at which the search looks at a primer vector."""
 
+FINE = 0.02
+"""Angle of the orbit [rad] between two samples of a primer vector of which a bound is made."""
+
+ROUGH = 0.1
+"""The same angle where a bound only has to rule out a length."""
+
 ROUNDS = 300
 """Number of steps of gradient ascent on a bound. More rounds make it tighter, never wrong."""
 
@@ -55,8 +60,12 @@ def docking_bounds(env: Environment, starts: State) -> dict[str, np.ndarray] | N
     state = starts.sim.platforms[env.agent]
     position = np.asarray(state.position, np.float64)
     velocity = np.asarray(state.velocity, np.float64)
-    length = _least_length(task, np.linalg.norm(position, axis=-1))
+    distance = np.linalg.norm(position, axis=-1)
+    length = _least_length(task, distance)
     delta_v, cost = _least_delta_v(task, np.concatenate([position, velocity], axis=-1), length)
+    # Whoever breaks the limit may be a step faster for `offset`, and needs the least Δv of all.
+    time = (length - 1) * task.dt / task.time_scale
+    cost = np.minimum(cost, task.offset + time + task.delta_v_cost * delta_v)
     bounds = {"length": length, "delta_v": delta_v}
     if task.pays_to_break_the_limit:
         return bounds
@@ -225,58 +234,71 @@ def _least_delta_v(
     primers = np.swapaxes(flows[:, :, size:], 1, 2)  # q(k dt) = primers[k] λ
     first = np.broadcast_to(primers[0], primers.shape)
     costates = np.linalg.pinv(np.concatenate([first, primers], axis=1))  # λ of q(0) and q(k dt)
-    apart = _sampling(task)
     edges = np.unique(np.round(np.geomspace(1, task.last_step + 1, BLOCKS + 1)).astype(int))
+    found = [
+        _ascend(states, flows, costates[after - 1], after - 1, (task.radius, speed))
+        for after in edges[1:]
+    ]
+
+    def bound(count: int, which: np.ndarray, angle: float) -> np.ndarray:
+        """Return the bound on Δv of the starts `which`, for a flight of `count` steps."""
+        block = int(np.searchsorted(edges, count, side="right")) - 1
+        tried = np.stack([found[max(block - 1, 0)][which], found[block][which]])
+        costate = tried @ costates[count].T
+        arrival = costate @ flows[count]
+        target = task.radius * np.linalg.norm(arrival[..., :size], axis=-1)
+        target = target + speed * np.linalg.norm(arrival[..., size:], axis=-1)
+        samples = np.unique([*range(0, count, _apart(task, angle)), count])
+        q = costate @ np.transpose(primers[samples], (1, 2, 0))[:, None]
+        largest = _largest(task, q, samples * task.dt)
+        value = -np.sum(costate * states[which], axis=-1) - target
+        return np.maximum(np.max(value / np.maximum(largest, 1e-300), axis=0), 0.0)
+
+    # Few samples of q already tell that most lengths do not have the least Δv.
     least = np.full(len(states), np.inf)
+    for count in range(task.last_step, 0, -1):
+        rough = bound(count, np.arange(len(states)), ROUGH)
+        which = np.flatnonzero(rough < least)
+        if len(which):
+            least[which] = np.minimum(least[which], bound(count, which, FINE))
     least_cost = np.full(len(states), np.inf)
-    before = None
-    for begin, after in itertools.pairwise(edges):
-        found = _ascend(states, flows, costates[after - 1], after - 1, (task.radius, speed))
-        tried = np.stack([found if before is None else before, found])
-        before = found
-        for count in range(begin, after):
-            costate = tried @ costates[count].T
-            arrival = costate @ flows[count]
-            target = task.radius * np.linalg.norm(arrival[..., :size], axis=-1)
-            target = target + speed * np.linalg.norm(arrival[..., size:], axis=-1)
-            samples = primers[np.unique([*range(0, count, apart), count])]
-            q = costate @ samples.reshape(-1, 2 * size).T
-            largest = _largest(task, q.reshape(*costate.shape[:-1], -1, size), apart)
-            value = -np.sum(costate * states, axis=-1) - target
-            delta_v = np.maximum(np.max(value / np.maximum(largest, 1e-300), axis=0), 0.0)
-            least = np.minimum(least, delta_v)
-            cost = count * task.dt / task.time_scale + task.delta_v_cost * delta_v
-            least_cost = np.where(length <= count, np.minimum(least_cost, cost), least_cost)
-    # Whoever breaks the limit may be a step faster for `offset`, and needs the least Δv of all.
-    too_fast = task.offset + (length - 1) * task.dt / task.time_scale + task.delta_v_cost * least
-    return least, np.minimum(least_cost, too_fast)
+    for count in range(int(length.min()), task.last_step + 1):
+        time = count * task.dt / task.time_scale
+        open_ = time + task.delta_v_cost * least < least_cost
+        if not open_.any():
+            break
+        which = np.flatnonzero(open_ & (length <= count))
+        cost = time + task.delta_v_cost * bound(count, which, FINE)
+        least_cost[which] = np.minimum(least_cost[which], cost)
+    return least, least_cost
 
 
-def _sampling(task: _Task) -> int:
-    """Return the number of steps from one sample of a primer vector to the next."""
+def _apart(task: _Task, angle: float) -> int:
+    """Return the number of steps between two samples of a primer vector, `angle` of an orbit."""
     turn = task.mean_motion * task.dt
-    return max(1, min(100, int(0.02 / turn))) if turn else 100
+    return max(1, min(100, int(angle / turn))) if turn else 100
 
 
-def _largest(task: _Task, q: np.ndarray, apart: int) -> np.ndarray:
-    """Return a bound on the largest ‖q(t)‖, given samples of q that are `apart` steps apart.
+def _largest(task: _Task, q: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Return a bound on the largest ‖q(t)‖ from the first sample of q to the last.
 
     Between two samples q leaves the straight line by h²/8 ‖q̈‖ at most. A primer vector moves like
     the spacecraft, so ‖q̈‖ ≤ 3n²‖q‖ + 2n‖q̇‖, and ‖q̇‖ is at most h/2 ‖q̈‖ above its mean value.
 
     Args:
         task: the task.
-        q: the samples, (…, samples, d).
-        apart: the number of steps from one sample to the next.
+        q: the samples, (d, …, samples).
+        times: their times, (samples,).
     """
     n = task.mean_motion
-    h = apart * task.dt
-    size = np.sqrt(np.max(np.sum(q**2, axis=-1), axis=-1))
-    rate = np.sqrt(np.max(np.sum(np.diff(q, axis=-2) ** 2, axis=-1), axis=-1))
-    # The last sample may be nearer than h, and then its rate is that of one step at least.
-    last = np.linalg.norm(q[..., -1, :] - q[..., -2, :], axis=-1) / task.dt
-    rate = np.maximum(rate / h, last)
-    bend = (3.0 * n**2 * size + 2.0 * n * rate) / (1.0 - 3.0 * n**2 * h**2 / 8.0 - n * h)
+    gaps = np.diff(times)
+    h = np.max(gaps)
+    size = np.sqrt(np.max(np.sum(q**2, axis=0), axis=-1))
+    rate = np.sqrt(np.max(np.sum(np.diff(q, axis=-1) ** 2, axis=0) / gaps**2, axis=-1))
+    part = 1.0 - 3.0 * n**2 * h**2 / 8.0 - n * h
+    if part <= 0.0:  # the samples are too far apart to say anything
+        return np.full_like(size, np.inf)
+    bend = (3.0 * n**2 * size + 2.0 * n * rate) / part
     return size + h**2 / 8.0 * bend
 
 

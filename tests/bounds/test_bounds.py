@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
 from default_cases import TASKS_BY_DEFAULT, one_of_each_kind, thorough
 
 import jaxsafe
-from jaxsafe.bounds import best_possible
+from jaxsafe.bounds import best_possible, docking
 from jaxsafe.envs import STARTERS, TASKS, find_task
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.rollout import reset_batch
@@ -112,6 +113,29 @@ def test_the_bounds_follow_the_numbers_of_the_task() -> None:
     assert shorter["delta_v"][0] > 3.0 * usual["delta_v"][0]
     assert faster["length"][0] < 0.65 * usual["length"][0]
     assert faster["return"][0] > usual["return"][0]
+
+
+def test_a_rough_look_at_a_length_changes_no_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 600.0})
+    starts, _ = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(3), 5)
+    usual = best_possible(env, starts)
+    monkeypatch.setattr(docking, "ROUGH", docking.FINE)
+    for name, values in best_possible(env, starts).items():
+        np.testing.assert_allclose(usual[name], values, rtol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [docking.FINE, docking.ROUGH])
+def test_between_its_samples_a_primer_vector_is_not_larger_than_said(angle: float) -> None:
+    task = docking._Task.of(jaxsafe.make("docking3d"))
+    assert task is not None
+    times = np.append(np.arange(0.0, 1900.0, docking._apart(task, angle) * task.dt), 1900.0)
+    back = [scipy.linalg.expm(-time * docking._motion(task)) for time in range(1901)]
+    costate = np.random.default_rng(0).normal(size=(50, 6))
+    q = np.stack([costate @ flow[:, 3:] for flow in back], axis=-1).swapaxes(0, 1)
+    largest = np.max(np.linalg.norm(q, axis=0), axis=-1)
+    said = docking._largest(task, q[..., times.astype(int)], times)
+    assert (said >= largest).all()
+    assert (said <= 1.02 * largest).all()
 
 
 def test_the_least_length_is_that_of_a_flight_at_the_limit() -> None:
