@@ -60,11 +60,11 @@ def docking_bounds(env: Environment, starts: State) -> dict[str, np.ndarray] | N
     state = starts.sim.platforms[env.agent]
     position = np.asarray(state.position, np.float64)
     velocity = np.asarray(state.velocity, np.float64)
-    distance = np.linalg.norm(position, axis=-1)
-    length = _least_length(task, distance)
+    at_limit = _least_length(task, state, hurried=True)
+    length = _least_length(task, state)
     delta_v, cost = _least_delta_v(task, np.concatenate([position, velocity], axis=-1), length)
     # Whoever breaks the limit may be a step faster for `offset`, and needs the least Δv of all.
-    time = (length - 1) * task.dt / task.time_scale
+    time = (at_limit - 1) * task.dt / task.time_scale
     cost = np.minimum(cost, task.offset + time + task.delta_v_cost * delta_v)
     bounds = {"length": length, "delta_v": delta_v}
     if task.pays_to_break_the_limit:
@@ -72,6 +72,19 @@ def docking_bounds(env: Environment, starts: State) -> dict[str, np.ndarray] | N
     share = 0.5 ** (np.linalg.norm(position, axis=-1) / task.half_distance)
     best = np.maximum(task.success - cost, 0.0)  # a failure pays nothing, or less
     return {**bounds, "return": task.potential * (1.0 - share) + best}
+
+
+class _Axis(NamedTuple):
+    """What a deputy can do that thrusts along its body axis."""
+
+    forwards: float
+    """Largest acceleration along the axis [m/s²]."""
+    backwards: float
+    """Largest acceleration against it [m/s²]."""
+    rate: float
+    """Largest attitude rate [rad/s]."""
+    acceleration: float
+    """Largest attitude acceleration [rad/s²]."""
 
 
 class _Task(NamedTuple):
@@ -82,8 +95,8 @@ class _Task(NamedTuple):
     mean_motion: float
     push: float
     """Largest acceleration by thrust [m/s²]."""
-    spin: float
-    """Largest rate at which the thrust turns within a step [rad/s]."""
+    axis: _Axis | None
+    """The body axis along which the deputy thrusts, if it cannot thrust in every direction."""
     radius: float
     floor: float
     slope: float
@@ -130,9 +143,16 @@ class _Task(NamedTuple):
         largest = np.maximum(-np.asarray(low, float), np.asarray(high, float))
         names = env.action_names
         thrusts = [largest[i] for i, name in enumerate(names) if name.startswith("thrust")]
-        spin = 0.0
+        axis = None
         if isinstance(plant, OrientedSpacecraft):
-            spin = float(np.max(np.abs(np.asarray(plant.attitude_rate_limits))))
+            by_name = dict(zip(names, zip(low.tolist(), high.tolist(), strict=True), strict=True))
+            least, most = by_name.get("thrust", (0.0, 0.0))
+            axis = _Axis(
+                forwards=max(most, 0.0) / float(plant.mass),
+                backwards=max(-least, 0.0) / float(plant.mass),
+                rate=float(np.max(np.abs(np.asarray(plant.attitude_rate_limits)))),
+                acceleration=max(map(abs, by_name.get("attitude_acceleration", (0.0,)))),
+            )
         failures = numbers[Failure].values
         gains = (
             numbers[DistanceChange].scale,
@@ -148,7 +168,7 @@ class _Task(NamedTuple):
             dt=dt,
             mean_motion=float(getattr(plant, "mean_motion", 0.0)),
             push=float(np.linalg.norm(thrusts)) / float(plant.mass),  # type: ignore[attr-defined]
-            spin=spin,
+            axis=axis,
             radius=float(env.regions[0].radius),  # type: ignore[attr-defined]
             floor=float(limits[0].floor),
             slope=float(limits[0].slope),
@@ -167,6 +187,22 @@ class _Task(NamedTuple):
         """Return the speed limit [m/s] at a distance."""
         return self.floor + self.slope * np.maximum(distance - self.constant_to, 0.0)
 
+    def highest_speed(self, distance: Any, first: Any) -> Any:
+        """Return the highest speed in a step that begins at a distance [m/s].
+
+        Within the step the speed may exceed that at its ends by dt²/8 times the largest second
+        derivative of the velocity.
+
+        Args:
+            distance: the distance where the step begins, within the limit there.
+            first: the speed where the step begins if it may be above the limit, else 0.
+        """
+        n = self.mean_motion
+        speed = np.maximum(self.limit(distance), first)
+        spin = 0.0 if self.axis is None else self.axis.rate
+        bend = self.push * (2.0 * n + spin) + 8.0 * n**2 * speed + 6.0 * n**3 * distance
+        return speed + self.dt**2 / 8.0 * bend
+
     @property
     def pays_to_break_the_limit(self) -> bool:
         """Whether a step above the limit may save more time than its penalty is worth.
@@ -178,26 +214,87 @@ class _Task(NamedTuple):
         return worth > self.excess_cost or self.dt / self.time_scale > self.offset
 
 
-def _least_length(task: _Task, distance: np.ndarray) -> np.ndarray:
+def _least_length(task: _Task, start: Any, hurried: bool = False) -> np.ndarray:
     """Return the least number of steps of a success that never exceeds the limit, per start.
 
     In a step the distance falls by at most dt times the highest speed on the way. That is the limit
     at the beginning of the step, and what the speed may bulge in between: dt²/8 times the largest
-    second derivative of the velocity. By induction nothing is nearer than the distance that falls
-    so in every step.
+    second derivative of the velocity.
+
+    At first the deputy is slower, because it must gain speed. With the distance D, the unit vector
+    s to the chief, the approach speed u = s·v and the speed w across s,
+
+        du/dt = s·a − w²/D + s·f ≤ s·a + 3n²D + 2n‖v‖,
+
+    where a is the acceleration by thrust and f that without it. So u is at most what it was at the
+    start and the integral of the right-hand side. `_largest_approach` bounds s·a.
+
+    By induction nothing is nearer than the distance that falls by the lesser of both in each step.
+
+    Args:
+        task: the task.
+        start: the states of the deputy at the start. Every array is [starts, …].
+        hurried: whether to leave out that the deputy must gain speed.
     """
-    n = task.mean_motion
-    steps = np.zeros(distance.shape, int)
-    nearest = distance.astype(float)
-    for _ in range(task.last_step):
+    position = np.asarray(start.position, np.float64)
+    velocity = np.asarray(start.velocity, np.float64)
+    nearest = np.linalg.norm(position, axis=-1)
+    farthest = nearest
+    sight = -position / np.maximum(nearest, 1e-9)[:, None]
+    approach = np.sum(sight * velocity, axis=-1)
+    turned = np.zeros(nearest.shape)  # how far the line of sight can have turned
+    steps = np.zeros(nearest.shape, int)
+    first = np.linalg.norm(velocity, axis=-1)
+    for step in range(task.last_step):
         outside = nearest > task.radius
         if not outside.any():
             break
-        limit = task.limit(nearest)
-        bend = task.push * (2.0 * n + task.spin) + 8.0 * n**2 * limit + 6.0 * n**3 * nearest
-        nearest = nearest - task.dt * (limit + task.dt**2 / 8.0 * bend)
+        fastest = task.highest_speed(nearest, first)
+        fall = fastest
+        if not hurried:
+            # The limit at the end of the step is that of a distance which grows by dt · `highest`.
+            highest = task.highest_speed(farthest, first) / max(1.0 - task.dt * task.slope, 1e-9)
+            farthest = farthest + task.dt * highest
+            turned = turned + task.dt * highest / np.maximum(nearest - task.dt * fastest, 1e-9)
+            drift = 3.0 * task.mean_motion**2 * farthest + 2.0 * task.mean_motion * highest
+            push = _largest_approach(task, start, sight, (step + 1) * task.dt, turned)
+            later = approach + task.dt * (push + drift)
+            fall = np.minimum(fastest, (approach + later) / 2.0)
+            approach = later
+        nearest = nearest - task.dt * fall
+        first = 0.0
         steps += outside
     return steps
+
+
+def _largest_approach(
+    task: _Task, start: Any, sight: np.ndarray, time: float, turned: np.ndarray
+) -> np.ndarray:
+    """Return a bound on the acceleration by thrust towards the chief, up to a time [m/s²].
+
+    Thrust along a body axis pushes towards the chief by its cosine alone. The angle between both is
+    that at the start, less how far the axis and the line of sight can have turned.
+
+    Args:
+        task: the task.
+        start: the states of the deputy at the start, [starts].
+        sight: the unit vectors to the chief at the start, (starts, d).
+        time: the time since the start [s].
+        turned: how far the line of sight can have turned by then [rad], (starts,).
+    """
+    if task.axis is None:
+        return np.full(turned.shape, task.push)
+    attitude = np.asarray(start.attitude, np.float64)
+    rate = np.abs(np.asarray(start.attitude_rate, np.float64))
+    gain = np.maximum(task.axis.rate - rate, 0.0)
+    spent = np.minimum(gain / max(task.axis.acceleration, 1e-12), time)
+    turn = np.minimum(rate, task.axis.rate) * time
+    turn = turn + task.axis.acceleration * spent * (time - spent / 2.0)
+    axis = np.stack([np.cos(attitude), np.sin(attitude)], axis=-1)
+    angle = np.arccos(np.clip(np.sum(axis * sight, axis=-1), -1.0, 1.0))
+    ahead = np.clip(angle - turn - turned, 0.0, np.pi / 2.0)
+    astern = np.clip(np.pi - angle - turn - turned, 0.0, np.pi / 2.0)
+    return np.maximum(task.axis.forwards * np.cos(ahead), task.axis.backwards * np.cos(astern))
 
 
 def _least_delta_v(
@@ -262,7 +359,7 @@ def _least_delta_v(
         if len(which):
             least[which] = np.minimum(least[which], bound(count, which, FINE))
     least_cost = np.full(len(states), np.inf)
-    for count in range(int(length.min()), task.last_step + 1):
+    for count in range(max(int(length.min()), 1), task.last_step + 1):
         time = count * task.dt / task.time_scale
         open_ = time + task.delta_v_cost * least < least_cost
         if not open_.any():

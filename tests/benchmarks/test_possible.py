@@ -26,7 +26,7 @@ def possible(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 def test_one_push_docks_for_little_more_than_the_least_delta_v(possible: ModuleType) -> None:
     env = jaxsafe.make("docking1d")
     starts = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(1), 8)
-    push = possible.pushes(env, starts[0], LENGTH)
+    push = possible.transfers(env, starts[0], LENGTH)
     rest = np.zeros((8, LENGTH + 1 - possible.PUSHED, 1))
     before, after = possible.improve(
         env,
@@ -48,3 +48,18 @@ def test_one_push_docks_for_little_more_than_the_least_delta_v(possible: ModuleT
     # An arrival after 600 s is 0.11 m/s faster than one after 2001 s, the latest one.
     assert (found.delta_v < bounds["delta_v"] + 0.2)[found.succeeded].all()
     assert (found.length >= bounds["length"])[found.succeeded].all()
+
+
+@pytest.mark.thorough
+def test_a_deputy_that_turns_first_docks_for_little_more_too(possible: ModuleType) -> None:
+    env = jaxsafe.make("docking2d_oriented")
+    starts = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(1), 6)
+    push = possible.transfers(env, starts[0], 1600)
+    actions = np.zeros((6, 1601, 2))
+    actions[:, : push.shape[1]] = push
+    fly = jax.vmap(lambda start, own: possible.fly(env, possible.coast, start, own))
+    found = possible.scored(env, jax.jit(fly)(starts, jnp.asarray(actions, jnp.float32)))
+    least = best_possible(env, starts[0])["delta_v"]
+    assert found.succeeded.all()
+    assert (least <= found.delta_v).all()
+    assert (found.delta_v < 1.2 * least).all()

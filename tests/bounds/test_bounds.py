@@ -11,6 +11,7 @@ from default_cases import TASKS_BY_DEFAULT, one_of_each_kind, thorough
 
 import jaxsafe
 from jaxsafe.bounds import best_possible, docking
+from jaxsafe.control import Align
 from jaxsafe.envs import STARTERS, TASKS, find_task
 from jaxsafe.evaluate.episodes import run_episodes
 from jaxsafe.rollout import reset_batch
@@ -129,21 +130,47 @@ def test_between_its_samples_a_primer_vector_is_not_larger_than_said(angle: floa
     task = docking._Task.of(jaxsafe.make("docking3d"))
     assert task is not None
     times = np.append(np.arange(0.0, 1900.0, docking._apart(task, angle) * task.dt), 1900.0)
-    back = [scipy.linalg.expm(-time * docking._motion(task)) for time in range(1901)]
+    back = scipy.linalg.expm(-docking._motion(task))
+    flows = [np.linalg.matrix_power(back, time) for time in range(1901)]
     costate = np.random.default_rng(0).normal(size=(50, 6))
-    q = np.stack([costate @ flow[:, 3:] for flow in back], axis=-1).swapaxes(0, 1)
+    q = np.stack([costate @ flow[:, 3:] for flow in flows], axis=-1).swapaxes(0, 1)
     largest = np.max(np.linalg.norm(q, axis=0), axis=-1)
     said = docking._largest(task, q[..., times.astype(int)], times)
     assert (said >= largest).all()
     assert (said <= 1.02 * largest).all()
 
 
-def test_the_least_length_is_that_of_a_flight_at_the_limit() -> None:
+@pytest.mark.parametrize("away", [0.0, 0.3])
+def test_the_least_length_is_that_of_a_flight_that_speeds_up_to_the_limit(away: float) -> None:
+    """The push is 1/12 m/s² until the limit is reached, and then the speed follows the limit."""
     distance = 140.0
-    slope = 2.0 * 0.001027
-    time = np.log((0.2 + slope * distance) / (0.2 + slope * 0.5)) / slope
-    found = best_possible(jaxsafe.make("docking1d"), on_a_line([distance], [0.0]))["length"][0]
-    assert time - 1.5 <= found <= time + 1.0
+    approach = -away
+    time = 0.0
+    while distance > 0.5:
+        distance -= 0.01 * approach
+        approach = min(approach + 0.01 / 12.0, 0.2 + 2.0 * 0.001027 * distance)
+        time += 0.01
+    found = best_possible(jaxsafe.make("docking1d"), on_a_line([140.0], [away]))["length"][0]
+    assert time - 1.0 <= found <= time + 1.0
+
+
+def test_a_deputy_whose_axis_points_across_must_turn_first() -> None:
+    """From rest nothing pushes it towards the chief before."""
+    env = jaxsafe.make("docking2d_oriented")
+    rest = {"position": jnp.asarray([140.0, 0.0]), "velocity": jnp.zeros(2)}
+    angles = jnp.pi + jnp.asarray([0.0, jnp.pi / 2.0, jnp.pi])
+    starts = jax.vmap(
+        lambda attitude: jaxsafe.reset_to(env, {"deputy": {**rest, "attitude": attitude}})[0]
+    )(angles)
+    ahead, across, astern = best_possible(env, starts)["length"]
+    assert ahead < astern < across - 4
+
+
+@pytest.mark.thorough
+def test_flights_near_the_limit_that_turn_first_do_not_beat_the_bounds() -> None:
+    env = jaxsafe.make("docking2d_oriented")
+    law = Align(share=0.985, approach=0.3).policy(env)
+    assert require_no_flight_beats_the_bounds(env, law, 100) == [100]
 
 
 @pytest.mark.parametrize("turn", [0.0, np.pi])
