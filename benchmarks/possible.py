@@ -26,7 +26,7 @@ import numpy as np
 import optax
 from isolated import several, words
 from jaxtyping import Array, Float
-from machine import about
+from machine import about, with_kept
 from tables import possible
 
 import jaxsafe
@@ -397,18 +397,17 @@ def main() -> None:
     options = words(starts="32", rounds="300", tasks=",".join(known))
     tasks = several("tasks", options["tasks"], known)
     starts = int(options["starts"])
-    kept = {row["task"]: row for row in read_json(OUT)["rows"]} if OUT.exists() else {}
-    results: dict[str, Any] = {}
+    results = {
+        "command": f"python benchmarks/possible.py {' '.join(sys.argv[1:])}".strip(),
+        "starts": starts,
+        "rounds": int(options["rounds"]),
+        **about(__file__),
+        "rows": [],
+    }
     for task in tasks:
-        kept[task] = measure(task, starts, int(options["rounds"]))
-        results = {
-            "command": f"python benchmarks/possible.py {' '.join(sys.argv[1:])}".strip(),
-            "starts": starts,
-            "rounds": int(options["rounds"]),
-            **about(__file__),
-            "rows": [kept[task] for task in known if task in kept],
-        }
-        write_json(OUT, results)
+        results["rows"].append(measure(task, starts, int(options["rounds"])))
+        write_json(OUT, with_kept(OUT, results, same=["task"]))
+    results = read_json(OUT)
     print(possible(results))
 
 

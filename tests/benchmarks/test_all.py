@@ -160,3 +160,22 @@ def test_code_that_is_not_committed_is_not_measured(
     monkeypatch.setattr(everything, "about", lambda script: HERE | {"changed": True})
     with pytest.raises(SystemExit, match="commit it first"):
         run(everything, monkeypatch)
+
+
+def test_rows_that_were_not_measured_again_stay_and_keep_the_results_stale(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    machine = importlib.import_module("machine")
+    out = tmp_path / "results.json"
+    old = {**HERE, "command": "all", "commit": "a", "sources": "old"}
+    new = {**HERE, "command": "one", "commit": "b"}
+    one, two = {"task": "one", "value": 1}, {"task": "two", "value": 2}
+    results = {**new, "rows": [{**two, "value": 3}]}
+    assert machine.with_kept(out, results, same=["task"]) == results
+    out.write_text(json.dumps({**old, "rows": [one, two]}))
+    own = {"command": "one", "commit": "b", "processor": HERE["processor"]}
+    rows = [one, {"task": "two", "value": 3, **own}]
+    assert machine.with_kept(out, results, same=["task"]) == {**old, "rows": rows}
+    results["rows"] += [one]
+    assert machine.with_kept(out, results, same=["task"]) == results
