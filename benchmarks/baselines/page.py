@@ -14,7 +14,16 @@ from string import Template
 from typing import Any
 
 from baselines.measures import failed_seeds, finished, samples_per_second, steps_to, wall_to
-from baselines.plan import CERTIFIED_STARTS, FILM, KINDS, SHIPPED, WITH_RTA, WITHOUT_RTA, best_seed
+from baselines.plan import (
+    CERTIFIED_STARTS,
+    FILM,
+    KINDS,
+    SHIPPED,
+    WITH_RTA,
+    WITHOUT_RTA,
+    Item,
+    best_seed,
+)
 from baselines.record import Record
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
@@ -68,6 +77,7 @@ class Report:
         self.episodes = {
             record.item.name: record.options["training"]["episodes"] for record in records
         }
+        self.controllers = read_json(CONTROLLERS)
         self.kinds = [kind for kind in KINDS if any(record.item.kind == kind for record in records)]
         self.tasks = [task for task in TASKS if any(record.item.task == task for record in records)]
 
@@ -178,24 +188,43 @@ class Report:
             rows.append([task, f"{paper:,}" if paper else "–", *cells])
         return rows
 
-    def _controllers(self) -> Rows:
-        """Return a row for each classical controller of the tasks, which flies without a filter."""
+    def _of_task(self, task: str) -> list[tuple[Item, Mapping[str, Any]]]:
+        """Return the items of a task with their results."""
+        return [(item, results) for item, results in self.own if item.task == task]
+
+    def _of_controllers(self, task: str) -> list[Mapping[str, Any]]:
+        """Return the results of the classical controllers of a task, which fly without a filter."""
         return [
-            [
-                row["task"],
-                f"`{row['policy']}`",
-                *(
-                    f"{100 * row[name]:.2f}"
-                    for name in ("success_rate", "episode_safety_violation_rate")
-                ),
-                f"{row['average_return']:.2f}",
-                f"{row['episode_length']:.0f}",
-                or_dash(row["control_usage"], ".2f"),
-            ]
-            for task in self.tasks
-            for row in read_json(CONTROLLERS)["rows"]
+            row
+            for row in self.controllers["rows"]
             if (row["task"], row["rta"]) == (task, "none") and row["policy"] != "ppo"
         ]
+
+    def _bound(self, item: Item) -> Mapping[str, float]:
+        """Return what is possible from the starts of an item's evaluation, or nothing.
+
+        It is known for the environments of the report, and for some numbers of episodes.
+        """
+        changes = [word for word in item.words if word.startswith(("env.", "variant="))]
+        bounds = self.controllers["report_bounds"].get(" ".join([item.task, *changes]), {})
+        return bounds.get(str(self.episodes[item.name]), {})
+
+    def _controllers(self) -> Rows:
+        """Return a row for each classical controller of the tasks."""
+        rows = []
+        for task in self.tasks:
+            bound = self.controllers["bounds"][task]
+            for row in self._of_controllers(task):
+                rates = [row[name] for name in ("success_rate", "episode_safety_violation_rate")]
+                flown = [task, f"`{row['policy']}`", *(f"{100 * rate:.2f}" for rate in rates)]
+                for name, form in (
+                    ("average_return", ".2f"),
+                    ("episode_length", ".0f"),
+                    ("control_usage", ".2f"),
+                ):
+                    flown += [or_dash(row[name], form), _gap(name, row[name], bound)]
+                rows.append(flown)
+        return rows
 
     def _efficiency(self) -> Rows:
         rows = []
@@ -243,58 +272,96 @@ class Report:
 
     def _final(self) -> Rows:
         rows = []
-        for item, results in self.own:
-            evaluation = results["evaluation"]
-            rates = [evaluation[way]["success_rate"] for way in EVALUATION_KINDS]
-            rows.append(
-                [
-                    item.task,
+        for task in self.tasks:
+            for item, results in self._of_task(task):
+                evaluation = results["evaluation"]
+                rates = [evaluation[way]["success_rate"] for way in EVALUATION_KINDS]
+                flown = [
+                    task,
                     item.kind,
                     *(_percent(rate) for rate in rates),
                     _share(least(rates), 1),
                     ", ".join(map(str, failed_seeds(results))) or "none",
-                    *(
-                        _number(evaluation["deterministic"][name])
-                        for name in ("average_return", "episode_length")
-                    ),
                 ]
-            )
+                for name in ("average_return", "episode_length"):
+                    metric = evaluation["deterministic"][name]
+                    flown += [_number(metric), _gap(name, metric["mean"], self._bound(item))]
+                rows.append(flown)
+            for row in self._of_controllers(task):
+                flown = [task, f"`{row['policy']}`", "–", _share(row["success_rate"]), "–", "–"]
+                for name in ("average_return", "episode_length"):
+                    gap = _gap(name, row[name], self.controllers["bounds"][task])
+                    flown += [f"{row[name]:.2f}", gap]
+                rows.append(flown)
         return rows
 
     def _docking(self) -> Rows:
-        return [
-            [
-                item.task,
-                item.kind,
-                way,
-                _percent(metrics["episode_safety_violation_rate"]),
-                _number(metrics["control_usage_l1"]),
-                _number(metrics["control_usage"]),
-                _number(metrics["episode_length"]),
-            ]
-            for item, results in self.own
-            if item.task.startswith("docking")
-            for way, metrics in results["evaluation"].items()
-        ]
+        rows = []
+        for task in [task for task in self.tasks if task.startswith("docking")]:
+            for item, results in self._of_task(task):
+                for way, metrics in results["evaluation"].items():
+                    usage = metrics["control_usage"]
+                    rows.append(
+                        [
+                            task,
+                            item.kind,
+                            way,
+                            _percent(metrics["episode_safety_violation_rate"]),
+                            _number(metrics["control_usage_l1"]),
+                            _number(usage),
+                            _gap("control_usage", usage["mean"], self._bound(item)),
+                            _number(metrics["episode_length"]),
+                        ]
+                    )
+            for row in self._of_controllers(task):
+                usage = row["control_usage"]
+                rows.append(
+                    [
+                        task,
+                        f"`{row['policy']}`",
+                        "deterministic",
+                        _share(row["episode_safety_violation_rate"]),
+                        f"{row['control_usage_l1']:.2f}",
+                        f"{usage:.2f}",
+                        _gap("control_usage", usage, self.controllers["bounds"][task]),
+                        f"{row['episode_length']:.2f}",
+                    ]
+                )
+        return rows
 
     def _safety(self) -> Rows:
         rows = []
-        for item, results in self.own:
-            cost = results["training_cost"]
-            starts = self.episodes[item.name]
-            for way, metrics in results["evaluation"].items():
+        for task in self.tasks:
+            for item, results in self._of_task(task):
+                cost = results["training_cost"]
+                starts = self.episodes[item.name]
+                for way, metrics in results["evaluation"].items():
+                    rows.append(
+                        [
+                            task,
+                            item.kind,
+                            way,
+                            _rate(metrics["safety_violation_rate"], starts, results["seeds"]),
+                            _percent(metrics["episode_safety_violation_rate"]),
+                            *(
+                                _share(metrics[f"episode_violation_severity_{name}"]["mean"], 1)
+                                for name in ("mean", "max")
+                            ),
+                            _number(cost, 0) if way == "stochastic" else "",
+                        ]
+                    )
+            for row in self._of_controllers(task):
+                violating = {"mean": row["safety_violation_rate"], "ci95": None}
+                severities = [row[f"episode_violation_severity_{name}"] for name in ("mean", "max")]
                 rows.append(
                     [
-                        item.task,
-                        item.kind,
-                        way,
-                        _rate(metrics["safety_violation_rate"], starts, results["seeds"]),
-                        _percent(metrics["episode_safety_violation_rate"]),
-                        *(
-                            _share(metrics[f"episode_violation_severity_{name}"]["mean"], 1)
-                            for name in ("mean", "max")
-                        ),
-                        _number(cost, 0) if way == "stochastic" else "",
+                        task,
+                        f"`{row['policy']}`",
+                        "deterministic",
+                        _rate(violating, self.controllers["episodes"], 1),
+                        _share(row["episode_safety_violation_rate"]),
+                        *(_share(severity, 1) for severity in severities),
+                        "",
                     ]
                 )
         return rows
@@ -456,6 +523,22 @@ def _both(results: Mapping[str, Any], name: str) -> str:
     metrics = results["evaluation"]
     shares = [metrics[actions][name]["mean"] for actions in EVALUATION_KINDS]
     return " / ".join("–" if share is None else f"{100 * share:.2f}" for share in shares)
+
+
+GAPS = {
+    "average_return": ("return", -1.0, ".3f"),
+    "episode_length": ("length", 1.0, ".1f"),
+    "control_usage": ("delta_v", 1.0, ".2f"),
+}
+"""The bound of a metric, the sign of a gap to it, and the format of the gap."""
+
+
+def _gap(name: str, value: float | None, bounds: Mapping[str, float]) -> str:
+    """Return how far a metric is from what is possible, or a dash."""
+    bound, sign, form = GAPS[name]
+    if value is None or bound not in bounds:
+        return "–"
+    return format(sign * (value - bounds[bound]), form)
 
 
 def _markdown(rows: Rows) -> str:

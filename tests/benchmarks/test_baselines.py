@@ -16,7 +16,7 @@ import pytest
 from baselines import __main__ as command
 from baselines import run as running
 from baselines.measures import failed_seeds, finished, samples_per_second, steps_to, wall_to
-from baselines.page import DIRECTORY, Report, _number, _percent, _rate
+from baselines.page import DIRECTORY, Report, _gap, _number, _percent, _rate
 from baselines.plan import KINDS, SHIPPED, Item, best_seed, plan
 from baselines.record import keep, kept
 from tiny_run import TINY
@@ -297,6 +297,10 @@ def test_what_is_not_known_is_a_dash_on_the_page_and_a_seed_without_success_fail
 ) -> None:
     unknown = {"mean": None, "ci95": None, "iqm": None, "per_seed": [None, 1.0, 1.0]}
     assert (_percent(unknown), _number(unknown), _rate(unknown, 100, 3)) == ("–", "–", "–")
+    bound = {"return": 2.95, "length": 400.5}
+    assert _gap("average_return", 2.9, bound) == "0.050"
+    assert _gap("episode_length", 412.0, bound) == "11.5"
+    assert _gap("control_usage", 0.5, bound) == _gap("episode_length", None, bound) == "–"
     results = {
         "seed": 4,
         "evaluation": {way: {"success_rate": unknown} for way in ("stochastic", "deterministic")},
