@@ -46,6 +46,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "datasets": (),
     "robustness": ("episodes=100", "tasks=docking3d"),
     "uncertain_training": (),
+    "constraints": (),
     "verification": (),
 }
 """The options of each script, by its name, in the order in which they run."""

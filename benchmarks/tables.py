@@ -262,6 +262,42 @@ def datasets(results: Results) -> str:
     return markdown(heads, rows)
 
 
+CONSTRAINED = {
+    "reward": "the reward alone",
+    "penalty": "a fixed penalty of 0.05",
+    "lagrangian": "PPO-Lagrangian",
+    "pid_lagrangian": "PID-Lagrangian",
+    "early_termination": "early termination",
+}
+"""What the pages call a way of `constraints.py`, by its name there."""
+
+
+def constraints(results: Results) -> str:
+    """Return the table of ways of training under a constraint that the reward does not know."""
+    rows = []
+    for row in results["rows"]:
+        drawn, mode = (row["evaluation"][kind] for kind in EVALUATION_KINDS)
+        successes = drawn["success_rate"]["per_seed"] + mode["success_rate"]["per_seed"]
+        rows.append(
+            (
+                CONSTRAINED[row["way"]],
+                _interval(drawn["success_rate"], 100.0, 1),
+                f"{100.0 * mode['success_rate']['mean']:.1f}",
+                f"{100.0 * min(successes):.1f}",
+                _interval(drawn["episode_cost"], 1.0, 1),
+                _interval(mode["episode_cost"], 1.0, 1),
+                f"{mode['episode_length']['mean']:.0f}",
+                f"{row['training_cost']['mean']:,.0f}",
+            )
+        )
+    heads = (
+        "docking2d without its penalty, trained by | success, stochastic [%] | deterministic"
+        " | worst seed | violating steps per episode, stochastic | deterministic | length [s]"
+        " | violating steps of the training"
+    )
+    return markdown(heads.split(" | "), rows)
+
+
 def controllers(results: Results) -> str:
     """Return the table of controllers and packaged policies without a filter, and of bounds."""
     rows = []
@@ -1087,6 +1123,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("verification", verification_starts, "docs/verification.md"),
     ("uncertain_training", uncertain_training, "docs/safety/attacks.md"),
     ("datasets", datasets, "docs/dataset.md"),
+    ("constraints", constraints, "docs/constrained.md"),
     ("controllers", controllers, "docs/controllers.md"),
     ("controllers", controllers_filtered, "docs/controllers.md"),
     ("possible", possible, "docs/possible.md"),
