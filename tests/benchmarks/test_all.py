@@ -70,7 +70,6 @@ def test_texts_do_not_count_and_code_that_is_needed_does(
             place.parent.mkdir(exist_ok=True)
             place.write_text(content)
         fingerprint._tree.cache_clear()
-        fingerprint._code.cache_clear()
         return fingerprint.fingerprint(tmp_path / "benchmarks" / "script.py")
 
     monkeypatch.setattr(fingerprint, "ROOT", tmp_path)
