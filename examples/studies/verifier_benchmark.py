@@ -63,10 +63,9 @@ class Options(CommandOptions):
 
     tasks: Annotated[tuple[str, ...], Option(names=tuple(BOXES))] = tuple(BOXES)
     """The tasks, with commas between them."""
-    horizons: Annotated[tuple[float, ...], Range(1.0, 2000.0), Option(takes="numbers of steps")] = (
-        10,
-        40,
-    )
+    horizons: Annotated[
+        tuple[float, ...], Range(1.0, 2000.0), Option(takes="numbers of steps from 1 to 2,000")
+    ] = (10, 40)
     """Numbers of steps, with commas between them."""
     timeout: Count = 1000
     """Time limit of each instance [s]."""

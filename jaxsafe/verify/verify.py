@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from jaxsafe.devices.seed_mapper import usable_cores
 from jaxsafe.environment import Environment, require_environment, reset_to, step
-from jaxsafe.processors.terminal import time_limit
+from jaxsafe.processors.terminal import TooFar, time_limit
 from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.types import State, TimeStep
@@ -231,7 +231,23 @@ def corners(env: Environment, box: Box) -> Boxes:
             )
         ends.append(array)
     low, high = np.concatenate(ends).T
+    _require_near(env, low, high)
     return Boxes(low[None], high[None])
+
+
+def _require_near(env: Environment, low: np.ndarray, high: np.ndarray) -> None:
+    """Refuse a box whose start nearest to the chief is beyond the distance that ends episodes.
+
+    Raises:
+        ConfigError: it is.
+    """
+    _, timestep = reset_to(env, start_of(env, np.clip(0.0, low, high)))
+    for end in env.terminal:
+        if isinstance(end, TooFar) and timestep.info.ended[end.name]:
+            raise ConfigError(
+                f"box.{env.agent}.position: every start is farther than {float(end.limit):,.10g} m,"
+                f" where {end.name} ends the episode"
+            )
 
 
 def _require_same(known: Verification, loop: Loop, whole: Boxes, steps: int) -> None:

@@ -646,6 +646,10 @@ def test_what_cannot_be_asked_about_docking_is_refused(
         ),
         ({**SMALL_BOX, "position": [0, 1e9]}, "box.deputy.position: expected 2 intervals"),
         ({**SMALL_BOX, "position": "far"}, "box.deputy.position: expected 2 intervals"),
+        (
+            {**SMALL_BOX, "position": [[-5, 5], [50_000, 50_001]]},
+            "box.deputy.position: every start is farther than 40,000 m, where distance ends",
+        ),
     ],
 )
 def test_what_is_no_box_of_starts_is_refused(box: Any, message: str) -> None:
