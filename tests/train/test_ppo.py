@@ -11,6 +11,7 @@ from jaxsafe.agents.agent import Agent
 from jaxsafe.agents.networks import GRU, MLP, Network
 from jaxsafe.config import build
 from jaxsafe.environment import Environment
+from jaxsafe.metrics import Episode
 from jaxsafe.processors.constraint import SpeedLimit
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
@@ -56,6 +57,21 @@ def train(
     env: Environment, updates: int = 40, ppo: PPO = SMALL, agent: Agent = AGENT
 ) -> TrainState:
     return trained(env, agent, ppo, jax.random.key(0), updates)
+
+
+@partial(jax.jit, static_argnames="updates")
+def latter_half(env: Environment, agent: Agent, ppo: PPO, updates: int = 200) -> Episode:
+    """Return the mean episode of the latter half of a training.
+
+    With a Lagrangian the cost swings about its limit, so the last update alone says little.
+    """
+
+    def step(state: TrainState, _: None) -> tuple[TrainState, Episode]:
+        state, _ = update(env, agent, ppo, updates, state)
+        return state, state.window.episodes
+
+    _, episodes = jax.lax.scan(step, init(env, agent, ppo, jax.random.key(0)), length=updates)
+    return jax.tree.map(lambda x: jnp.mean(x[updates // 2 :]), episodes)
 
 
 def value(state: TrainState, observation: float) -> float:
@@ -532,9 +548,9 @@ def test_the_cost_of_an_episode_may_be_its_severity() -> None:
 def test_a_limit_of_the_severity_lets_small_violations_be() -> None:
     env = probe(Push(name="reward"), most=0.2).replace(cost="severity")
     agent = AGENT.replace(cost_critic=True)
-    state = train(env, 200, SMALL.replace(cost_limit=0.5, multiplier=2.0), agent)
-    assert float(jnp.mean(state.window.episodes.severity_sum)) < 0.8  # unlimited it is 4
-    assert float(jnp.mean(state.window.episodes.violating_steps)) > 0.7
+    episode = latter_half(env, agent, SMALL.replace(cost_limit=0.5, multiplier=2.0))
+    assert 0.3 < float(episode.severity_sum) < 0.7  # unlimited it is 4
+    assert float(episode.violating_steps) > 0.7
 
 
 def test_the_whole_multiplier_is_the_price_of_the_cost() -> None:
