@@ -65,9 +65,20 @@ def command(name: str, *options: str) -> None:
     subprocess.run([sys.executable, "-m", f"jaxsafe.{name}", *options], check=True)
 
 
-def measure(place: Path, way: str, seeds: int, steps: int, episodes: int) -> dict[str, Any]:
-    """Train by one way, test the policies, and return the row of both."""
-    free, ended = write_worlds(place)
+def measure(
+    way: str, worlds: tuple[Path, Path], place: Path, seeds: int, steps: int, episodes: int
+) -> dict[str, Any]:
+    """Train by one way, test the policies, and return the row of both.
+
+    Args:
+        way: the way, of `WAYS`.
+        worlds: the files that `write_worlds` returned.
+        place: the directory of the runs.
+        seeds: number of seeds.
+        steps: steps of the training of each seed.
+        episodes: episodes of the test of each seed.
+    """
+    free, ended = worlds
     run = place / way
     if not (run / "results.json").exists():
         world = ended if way == "early_termination" else free
@@ -95,7 +106,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(options["out"] or temporary).resolve()
         place.mkdir(parents=True, exist_ok=True)
-        rows = [measure(place, way, **counts) for way in WAYS]
+        worlds = write_worlds(place)
+        rows = [measure(way, worlds, place, **counts) for way in WAYS]
     import tables
     from machine import about
 
