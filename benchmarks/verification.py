@@ -27,7 +27,7 @@ from machine import about
 import jaxsafe
 from jaxsafe.agents.imported_policy import read_foreign
 from jaxsafe.agents.policy_file import find_policy, read_policy
-from jaxsafe.envs.docking import DOCKING_RADIUS, DOCKING_SPEED, LIMIT_SLOPE
+from jaxsafe.envs.docking import DOCKING_RADIUS, DOCKING_SPEED, LIMIT_SLOPE, START_DISTANCES
 from jaxsafe.storage.files import read_json, write_json
 from jaxsafe.verify import check
 from jaxsafe.verify.certificate import save_certificate
@@ -130,7 +130,7 @@ def spread(case: Mapping[str, Any]) -> dict[str, Any]:
 
 def start_volume(dimension: int) -> float:
     """Return the volume of all starts of docking: a shell of positions, a ball of velocities."""
-    distance = np.linspace(100.0, 150.0, 5001)
+    distance = np.linspace(*START_DISTANCES, 5001)
     limit = DOCKING_SPEED + LIMIT_SLOPE * distance
     shell = 2.0 * np.pi * distance if dimension == 2 else 4.0 * np.pi * distance**2
     ball = np.pi * limit**2 if dimension == 2 else 4.0 / 3.0 * np.pi * limit**3

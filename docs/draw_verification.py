@@ -24,6 +24,7 @@ from matplotlib.patches import Circle, Patch, Rectangle
 
 import jaxsafe
 from jaxsafe.agents.policy_file import find_policy, read_policy
+from jaxsafe.envs.docking import START_DISTANCES
 from jaxsafe.plot.style import AMBER, BLUE, GREEN, GREY, ORANGE, save, styled
 from jaxsafe.rollout import RecurrentPolicy
 from jaxsafe.verify.certificate import load_certificate
@@ -39,9 +40,6 @@ VELOCITIES = ((-0.19, -0.19), (0.01, 0.01), (0.19, -0.19))
 
 START = ((88.0, 92.5), (78.0, 82.5), (-0.15, -0.125), (0.05, 0.075))
 """The box of the tube [m, m/s]."""
-
-START_DISTANCES = (100.0, 150.0)
-"""The distances of the starts of docking2d from the chief [m]."""
 
 STEPS = 80
 FLIGHTS = 200

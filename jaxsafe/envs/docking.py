@@ -55,6 +55,9 @@ LIMIT_SLOPE = 2.0 * MEAN_MOTION
 DOCKING_RADIUS = 0.5
 """Radius of the docking region around the chief [m], Section 3."""
 
+START_DISTANCES = (100.0, 150.0)
+"""Smallest and largest distance of a start from the chief [m], Table 4."""
+
 DOCKING_TIES: Ties = {
     "deputy.start.velocity.floor": Tie(to="status.velocity_limit.floor"),
     "deputy.start.velocity.slope": Tie(to="status.velocity_limit.slope"),
@@ -153,7 +156,7 @@ def deputy(dimension: Literal[1, 2, 3]) -> Spacecraft | DoubleIntegrator:
 def deputy_start(direction: Direction) -> tuple[Initializer, ...]:
     """Return the start of Table 4: 100 to 150 m away, at a random velocity within the limit."""
     return (
-        AtDistance(name="position", about="chief", distance=(100.0, 150.0), direction=direction),
+        AtDistance(name="position", about="chief", distance=START_DISTANCES, direction=direction),
         BelowSpeedLimit(
             name="velocity",
             about="chief",
