@@ -5,12 +5,15 @@ from typing import TYPE_CHECKING, Any
 
 import jaxsafe.address_space
 import jaxsafe.quiet  # noqa: F401 before anything imports jaxlib
-from jaxsafe.agents.policy_file import load_policy
-from jaxsafe.config import dump, load, override
-from jaxsafe.environment import Environment, reset, reset_to, step
-from jaxsafe.envs import make
-from jaxsafe.rollout import rollout
-from jaxsafe.schema.errors import ConfigError, choices_text
+from jaxsafe.garbage_collection import without_collection
+
+with without_collection():
+    from jaxsafe.agents.policy_file import load_policy
+    from jaxsafe.config import dump, load, override
+    from jaxsafe.environment import Environment, reset, reset_to, step
+    from jaxsafe.envs import make
+    from jaxsafe.rollout import rollout
+    from jaxsafe.schema.errors import ConfigError, choices_text
 
 if TYPE_CHECKING:
     from jaxsafe.evaluate.evaluate import evaluate
@@ -65,4 +68,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__} - {"Any", "TYPE_CHECKING", "choices_text", "importlib"})
+    return sorted(
+        {*globals(), *__all__}
+        - {"Any", "TYPE_CHECKING", "choices_text", "importlib", "without_collection"}
+    )

@@ -16,6 +16,7 @@ from jaxsafe.commands.environment_options import Overrides
 from jaxsafe.commands.options import CommandOptions, Directory, Option
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores
+from jaxsafe.garbage_collection import without_collection
 from jaxsafe.train.host.options import TrainConfig, recipe, recipe_options, resolve_all
 
 BEGAN = time.monotonic()
@@ -111,7 +112,8 @@ def main(argv: Sequence[str]) -> int:
     resume = options.resume
     if resume is None:
         refuse_run(options.env)
-        resolved = resolve_all(options.without("resume", "distributed"))
+        with without_collection():
+            resolved = resolve_all(options.without("resume", "distributed"))
         path = Path(processes.from_leader(lambda: str(run_directory.create_all(resolved))))
     else:
         options.refuse_others("resume", "distributed", "steps")

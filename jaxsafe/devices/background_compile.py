@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import gc
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -45,16 +42,3 @@ class CompiledInBackground:
 @cache
 def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(NUM_THREADS, "compile")
-
-
-@contextmanager
-def without_collection() -> Iterator[None]:
-    """Suspend garbage collection while programs are traced.
-
-    Tracing leaves no garbage, and looking for it costs a tenth of the time.
-    """
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.enable()

@@ -25,6 +25,7 @@ from jaxsafe.devices.seed_mapper import claim_cores, usable_cores
 from jaxsafe.environment import Environment
 from jaxsafe.envs import TASKS, registered
 from jaxsafe.envs.identity import identity
+from jaxsafe.garbage_collection import without_collection
 from jaxsafe.runs.run import Run
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train import train as function
@@ -277,5 +278,6 @@ def _open(run: Path, files: ExitStack, began: float) -> Training:
         began: the time [s] of `time.monotonic` since which the clock of the run has run.
     """
     own = files.enter_context(processes.own_files(run))
-    config, env, name = run_directory.read(run, "resume")
+    with without_collection():
+        config, env, name = run_directory.read(run, "resume")
     return Training(config, env, name, own, Clock(time.monotonic() - began), run)

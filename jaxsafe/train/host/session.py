@@ -21,11 +21,12 @@ import numpy as np
 
 from jaxsafe.autoreset import choose
 from jaxsafe.devices import memory, processes
-from jaxsafe.devices.background_compile import CompiledInBackground, without_collection
+from jaxsafe.devices.background_compile import CompiledInBackground
 from jaxsafe.devices.processes import in_main_thread
 from jaxsafe.devices.seed_mapper import SeedMapper
 from jaxsafe.environment import Environment
 from jaxsafe.evaluate.evaluator import EVALUATION_KINDS, EVALUATION_SEED, Evaluator, episode_rows
+from jaxsafe.garbage_collection import without_collection
 from jaxsafe.metrics import Episode
 from jaxsafe.schema.convert import to_data
 from jaxsafe.storage.files import append_rows, keep_rows, sync
