@@ -96,26 +96,34 @@ class Evaluator:
         self._run = mapper.map(self._one_seed)
         self._recorders: dict[int, Recorder] = {}
 
-    def prepare(self, params: Params) -> None:
+    def prepare(
+        self,
+        params: Params,
+        after: CompiledInBackground | None = None,
+    ) -> None:
         """Compile the programs while other work goes on. A second call does nothing.
 
         Args:
             params: the parameters that `run` takes, or their shapes from `SeedMapper.like`.
+            after: a program that is needed sooner. It has the cores until it is compiled.
         """
         if isinstance(self._run, CompiledInBackground):
             return
+
         key = jax.random.key(0)
         deterministic = np.asarray(True)
         cases = self._cases(0, EPISODES_PER_BATCH)
         arguments = self._arguments(key, deterministic, cases)
-        self._run = CompiledInBackground(self._run, arguments, params)
+        self._run = CompiledInBackground(self._run, arguments, params, after=after)
         params_of_seed = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), params)
         begin, go_on = self._recorder(MIN_RECORDED_EPISODES)
         cases = self._cases(0, MIN_RECORDED_EPISODES)
         position, _ = jax.eval_shape(begin, params_of_seed, key, cases)
         self._recorders[MIN_RECORDED_EPISODES] = Recorder(
-            begin=CompiledInBackground(begin, params_of_seed, key, cases),
-            go_on=CompiledInBackground(go_on, params_of_seed, key, deterministic, position),
+            begin=CompiledInBackground(begin, params_of_seed, key, cases, after=after),
+            go_on=CompiledInBackground(
+                go_on, params_of_seed, key, deterministic, position, after=after
+            ),
         )
 
     def run(self, params: Params, num_episodes: int, seed: int, deterministic: bool) -> Episode:

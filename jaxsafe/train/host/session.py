@@ -34,7 +34,7 @@ from jaxsafe.storage.forms import COUNT
 from jaxsafe.train.host.checkpoint import Checkpoints
 from jaxsafe.train.host.log import Display, ProgressLog, progress_rows, read_progress
 from jaxsafe.train.host.options import TrainConfig, flatten
-from jaxsafe.train.host.restore import made_from, restore, start_params, structure
+from jaxsafe.train.host.restore import made_from, restore, start_params
 from jaxsafe.train.host.sinks import Sink, open_sinks
 from jaxsafe.train.train import STATE, programs
 
@@ -156,9 +156,8 @@ class Training:
         display = Display(self.num_steps, self.step, progress)
         with self.clock:
             self._await_compiled()
-            if self.updates == 0 and self._early_due():
-                self._record(1, final=False)
         display.start()
+        untrained = self.state.average if self.updates == 0 and self._early_due() else None
         with self.clock, _StopRequest() as stop:
             # All processes agree on this, because a signal may reach only one of them.
             stopping = False
@@ -167,12 +166,15 @@ class Training:
                 self.state, curves = self.advance(self.shared, self.state)
                 self.updates = min(before + self.chunk, self.config.num_updates)
                 self._write_progress(curves, self.updates - before, display)
+                if untrained is not None:
+                    self._record(untrained, 0, num_episodes=1)
+                    untrained = None
                 if self.updates < self.config.num_updates and self._due(
                     before, self.config.eval_every
                 ):
                     self._evaluate()
                 elif self._early_due():
-                    self._record(1, final=False)
+                    self._record(self.state.average, self.step, num_episodes=1)
                 stopping = processes.any_process(stop.requested)
                 if self._due(before, self.config.checkpoint_every) or stopping:
                     self._save()
@@ -184,8 +186,7 @@ class Training:
 
     def params(self) -> list[Any]:
         """Return the networks of each seed, on the host. They are the averaged ones."""
-        stacked = self.mapper.gather(self.state.average)
-        return [jax.tree.map(lambda x, i=i: x[i], stacked) for i in range(self.config.seeds)]
+        return self._by_seed(self.state.average)
 
     def prepare_evaluation(self) -> None:
         """Compile what `evaluate_finally` needs, while other work goes on."""
@@ -207,21 +208,18 @@ class Training:
             episodes[kind] = self._run_episodes(
                 kind, self.config.episodes, self.state.average, self.step, final=True
             )
-        self._record(self.config.episodes, final=True)
+        self._record(self.state.average, self.step, self.config.episodes, final=True)
         return episodes
 
     def _begin(self) -> None:
         """Make the state, fresh or restored, while all programs are compiled side by side."""
-        content = structure(self.env, self.config)
-        state_bytes = (
-            memory.size(content) // self.config.seeds * self.mapper.padded // self.mapper.mesh.size
-        )
-        memory.require(state_bytes, self.mapper.num_local_devices, memory.COMPILE_BYTES)
         begin = time.monotonic()
         keys = self.mapper.keys(self.config.seed)
         fresh, advance = programs(self.mapper, self.chunk, self.config.num_updates)
         like = self.mapper.like(jax.eval_shape(fresh, self.shared, keys), STATE)
-        # The program that takes longest to compile comes first.
+        # The best parameters of each seed are in memory too.
+        state_bytes = memory.size((like, like.average)) // self.mapper.mesh.size
+        memory.require(state_bytes, self.mapper.num_local_devices, memory.COMPILE_BYTES)
         self.advance = CompiledInBackground(advance, self.shared, like)
         if self.checkpoints.steps:
             self._restore()
@@ -234,7 +232,7 @@ class Training:
             self.best = {"params": self.state.average, "success": never}
         # If the only evaluation is at the end, its program can wait until the cores are free.
         if self.config.every(self.config.eval_every) < self.config.num_updates:
-            self.evaluator.prepare(like.average)
+            self.evaluator.prepare(like.average, after=self.advance)
         self.compile_s += time.monotonic() - begin
 
     def _open_sinks(self) -> dict[str, Sink]:
@@ -370,7 +368,7 @@ class Training:
         if self.updates < self.config.num_updates and not self._has_evaluated():
             self._keep_best(self.best["params"], step=0)
         self._keep_best(params, self.step)
-        self._record(self.config.eval_episodes, final=False)
+        self._record(self.state.average, self.step, self.config.eval_episodes)
 
     def _has_evaluated(self) -> bool:
         """Return whether there has been a periodic evaluation."""
@@ -397,17 +395,29 @@ class Training:
         )
         return episodes
 
-    def _record(self, num_episodes: int, final: bool) -> None:
-        """Log some episodes step by step. The first seed that has not diverged flies them."""
+    def _by_seed(self, stacked: Any) -> list[Any]:
+        """Return parts of the state of each seed, on the host."""
+        host = self.mapper.gather(stacked)
+        return [jax.tree.map(lambda x, i=i: x[i], host) for i in range(self.config.seeds)]
+
+    def _record(self, params: Any, step: int, num_episodes: int, final: bool = False) -> None:
+        """Log some episodes step by step. The first seed that has not diverged flies them.
+
+        Args:
+            params: the parameters of all seeds.
+            step: the step at which the seeds had them.
+            num_episodes: number of episodes, of which every `log_every`-th is logged.
+            final: whether the episodes are those of the results.
+        """
         index = next(
             (i for i in range(self.config.seeds) if self.config.seed + i not in self.diverged), None
         )
         if index is None:
             return
         count = -(-num_episodes // self.config.log_every)
-        recorded = self.evaluator.record(self.params()[index], count, EVALUATION_SEED)
+        recorded = self.evaluator.record(self._by_seed(params)[index], count, EVALUATION_SEED)
         facts = {
-            "step": self.step,
+            "step": step,
             "seed": self.config.seed + index,
             "kind": "deterministic",
             "final": final,
