@@ -99,31 +99,36 @@ class Evaluator:
     def prepare(
         self,
         params: Params,
+        made_from: str | None = None,
         after: CompiledInBackground | None = None,
     ) -> None:
         """Compile the programs while other work goes on. A second call does nothing.
 
         Args:
             params: the parameters that `run` takes, or their shapes from `SeedMapper.like`.
+            made_from: a text that describes the environment and the agent with all their numbers.
+                The programs are stored if it is given.
             after: a program that is needed sooner. It has the cores until it is compiled.
         """
         if isinstance(self._run, CompiledInBackground):
             return
 
+        def compile_soon(name: str, function: Any, *arguments: Any) -> CompiledInBackground:
+            text = made_from and f"{name} of {made_from}"
+            return CompiledInBackground(function, *arguments, made_from=text, after=after)
+
         key = jax.random.key(0)
         deterministic = np.asarray(True)
         cases = self._cases(0, EPISODES_PER_BATCH)
         arguments = self._arguments(key, deterministic, cases)
-        self._run = CompiledInBackground(self._run, arguments, params, after=after)
+        self._run = compile_soon("episodes", self._run, arguments, params)
         params_of_seed = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), params)
         begin, go_on = self._recorder(MIN_RECORDED_EPISODES)
         cases = self._cases(0, MIN_RECORDED_EPISODES)
         position, _ = jax.eval_shape(begin, params_of_seed, key, cases)
         self._recorders[MIN_RECORDED_EPISODES] = Recorder(
-            begin=CompiledInBackground(begin, params_of_seed, key, cases, after=after),
-            go_on=CompiledInBackground(
-                go_on, params_of_seed, key, deterministic, position, after=after
-            ),
+            begin=compile_soon("starts", begin, params_of_seed, key, cases),
+            go_on=compile_soon("steps", go_on, params_of_seed, key, deterministic, position),
         )
 
     def run(self, params: Params, num_episodes: int, seed: int, deterministic: bool) -> Episode:

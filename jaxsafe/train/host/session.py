@@ -7,6 +7,7 @@ bit where the uninterrupted one ends, if it has as many processor cores or accel
 
 from __future__ import annotations
 
+import json
 import shutil
 import signal
 import time
@@ -216,11 +217,23 @@ class Training:
         begin = time.monotonic()
         keys = self.mapper.keys(self.config.seed)
         fresh, advance = programs(self.mapper, self.chunk, self.config.num_updates)
-        like = self.mapper.like(jax.eval_shape(fresh, self.shared, keys), STATE)
+        described = json.dumps(made_from(self.env, self.config), sort_keys=True)
+        if self.checkpoints.steps:
+            shapes = jax.eval_shape(fresh, self.shared, keys)
+        else:
+            text = f"start of {described}"
+            fresh = CompiledInBackground(fresh, self.shared, keys, made_from=text)
+            shapes = fresh.result_shapes()
+        like = self.mapper.like(shapes, STATE)
         # The best parameters of each seed are in memory too.
         state_bytes = memory.size((like, like.average)) // self.mapper.mesh.size
         memory.require(state_bytes, self.mapper.num_local_devices, memory.COMPILE_BYTES)
-        self.advance = CompiledInBackground(advance, self.shared, like)
+        self.advance = CompiledInBackground(
+            advance,
+            self.shared,
+            like,
+            made_from=f"{self.chunk} of {self.config.num_updates} updates of {described}",
+        )
         if self.checkpoints.steps:
             self._restore()
         else:
@@ -232,7 +245,7 @@ class Training:
             self.best = {"params": self.state.average, "success": never}
         # If the only evaluation is at the end, its program can wait until the cores are free.
         if self.config.every(self.config.eval_every) < self.config.num_updates:
-            self.evaluator.prepare(like.average, after=self.advance)
+            self.evaluator.prepare(like.average, described, after=self.advance)
         self.compile_s += time.monotonic() - begin
 
     def _open_sinks(self) -> dict[str, Sink]:
