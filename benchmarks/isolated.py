@@ -111,6 +111,18 @@ def versions(names: Iterable[str]) -> dict[str, dict[str, str]]:
     return versions_of
 
 
+def variables(cache: Path | None = None) -> dict[str, str]:
+    """Return the environment variables of a process.
+
+    Args:
+        cache: a directory that keeps every program that JAX compiles, however small. Without it
+            nothing is kept.
+    """
+    given = {key: value for key, value in os.environ.items() if key not in CACHE}
+    kept = dict(zip(CACHE, (str(cache), "0", "-1"), strict=True)) if cache else {}
+    return {**given, **kept}
+
+
 def probe(
     script: str,
     request: Sequence[str],
@@ -125,13 +137,10 @@ def probe(
         request: its words.
         cores: the number of cores that it is pinned to. None stands for all.
         python: the path of Python.
-        cache: a directory that keeps every program that JAX compiles, however small. Without it
-            nothing is kept.
+        cache: the cache of `variables`.
     """
     command = [python, script, *request]
-    environment = {key: value for key, value in os.environ.items() if key not in CACHE}
-    if cache:
-        environment |= dict(zip(CACHE, (str(cache), "0", "-1"), strict=True))
+    environment = variables(cache)
     before = os.sched_getaffinity(0)
     # A child inherits the cores of the thread that starts it.
     os.sched_setaffinity(0, sorted(before)[:cores])

@@ -133,20 +133,22 @@ def settings(task: str, num_envs: int = NUM_ENVS) -> tuple[Any, Any]:
     """Return the configuration of our PPO and the environment."""
     from jaxsafe.train.host.options import resolve
 
-    sizes = {
-        "num_envs": num_envs,
-        "num_steps": NUM_STEPS,
-        "num_epochs": NUM_EPOCHS,
-        "num_minibatches": NUM_MINIBATCHES,
-    }
-    options = {
+    config, env, _ = resolve(options_of(task, num_envs))
+    return config, env
+
+
+def options_of(task: str, num_envs: int = NUM_ENVS) -> dict[str, Any]:
+    """Return the options with which `jaxsafe train` has the settings of this script."""
+    return {
         "env": task,
         "preset": "observation_only",
         "agent.actor.hidden": [*HIDDEN],
         "steps": 10 * UPDATES * num_envs * NUM_STEPS,
+        "ppo.num_envs": num_envs,
+        "ppo.num_steps": NUM_STEPS,
+        "ppo.num_epochs": NUM_EPOCHS,
+        "ppo.num_minibatches": NUM_MINIBATCHES,
     }
-    config, env, _ = resolve({**options, **{f"ppo.{name}": size for name, size in sizes.items()}})
-    return config, env
 
 
 def networks_only(task: str) -> float:

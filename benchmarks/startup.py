@@ -11,9 +11,10 @@ printed:
 - The second is the time from the first import to the first result. One result is a batched reset
   and step, docking3d beside Pendulum-v1 of gymnax. The other is an update of PPO on docking2d with
   the settings of `ppo.py`, beside rejax. rejax has the same task through `jaxsafe.adapters.gymnax`,
-  so it also pays for importing and making ours. Cold is with an empty cache of compiled programs.
-  Warm is with what the process before left there. Peers run in Python environments that this script
-  builds in `benchmarks/peers`.
+  so it also pays for importing and making ours. An update of `jaxsafe train` is there when its row
+  is in the progress log, and the time counts from the start of its process. Cold is with an empty
+  cache of compiled programs. Warm is with what the process before left there. Peers run in Python
+  environments that this script builds in `benchmarks/peers`.
 - The third is what that time goes into, according to JAX's own events and its profiler.
 
 Results are written to `benchmarks/results/startup.json`:
@@ -26,6 +27,7 @@ from __future__ import annotations
 import importlib
 import json
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
@@ -34,7 +36,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from isolated import interpreter, several, versions, words
+from isolated import interpreter, several, variables, versions, words
 from isolated import probe as apart
 
 OUT = Path(__file__).parent / "results" / "startup.json"
@@ -62,7 +64,7 @@ def main() -> None:
     repeats = int(options["repeats"])
     rows = [measured(name, rta, repeats) for name, rta in chosen]
     rows.append(measured("Pendulum-v1", "gymnax", repeats, interpreter("gymnax")))
-    first = [first_result(name, name, repeats) for name in FIRST]
+    first = [first_result(name, name, repeats) for name in (*FIRST, COMMAND)]
     profiles = [
         first_result(name, f"profile {name}", repeats)
         for name in FIRST
@@ -89,8 +91,33 @@ def first_result(name: str, word: str, repeats: int) -> dict[str, Any]:
     for _ in range(repeats):
         with tempfile.TemporaryDirectory() as cache:
             for kind in ("cold", "warm"):
-                result[kind].append(apart(__file__, [f"probe={word}"], None, python, Path(cache)))
+                result[kind].append(
+                    first_row(Path(cache))
+                    if name == COMMAND
+                    else apart(__file__, [f"probe={word}"], None, python, Path(cache))
+                )
     return result
+
+
+def first_row(cache: Path) -> float:
+    """Return the seconds from the start of `jaxsafe train` until its first update is logged."""
+    from ppo import options_of
+
+    options = [f"{name}={value}" for name, value in options_of("docking2d").items()]
+    call = [sys.executable, "-m", "jaxsafe.train", *options, "seeds=1", "out=run"]
+    with tempfile.TemporaryDirectory() as place:
+        log = Path(place) / "run" / "progress.jsonl"
+        start = time.perf_counter()
+        with subprocess.Popen(
+            call, cwd=place, env=variables(cache), stdout=subprocess.DEVNULL
+        ) as process:
+            while process.poll() is None and not (log.exists() and log.stat().st_size):
+                time.sleep(0.005)
+            seconds = time.perf_counter() - start
+        # The command goes on to its end, since it keeps its programs while it trains.
+        if process.returncode:
+            sys.exit(f"{' '.join(call)}: exit code {process.returncode}")
+    return seconds
 
 
 def measured(name: str, rta: str, repeats: int, python: str = sys.executable) -> dict[str, Any]:
@@ -302,6 +329,9 @@ FIRST: dict[str, Callable[[], None]] = {
     "rejax update": rejax_update,
 }
 """Results whose time is measured. The first word is the library."""
+
+COMMAND = "jaxsafe train"
+"""The name of the row whose time is that of the command."""
 
 if __name__ == "__main__":
     main()
