@@ -55,7 +55,8 @@ class Options(SingleOptions):
     ]
     """The starts, for instance box.deputy.velocity=[[-0.1,0.1],[0,0.2]].
 
-    By default the position is within [70, 106] m and the velocity within [-0.28, 0.28] m/s.
+    By default the position of a spacecraft is within [70, 106] m and its velocity within [-0.28,
+    0.28] m/s. Every other number that a start draws must be given.
     """
     arithmetic: Literal["float32", "real"] = "float32"
     """The arithmetic of the loop: single precision as it runs, or real numbers."""
@@ -84,6 +85,7 @@ def main(argv: Sequence[str]) -> int:
     enable_compilation_cache()
     from jaxsafe.storage.provenance import versions
     from jaxsafe.verify.certificate import load_certificate, save_certificate
+    from jaxsafe.verify.loop import CRAFT
     from jaxsafe.verify.verify import verify
 
     options = Options.parse(argv)
@@ -92,10 +94,11 @@ def main(argv: Sequence[str]) -> int:
     out = Path(options.out or f"{stem}_{options.property}.npz")
     if out.suffix != ".npz":
         raise ConfigError(f"out: expected NAME.npz, found {out}")
+    default = BOX if isinstance(saved.env.agent_platform, CRAFT) else {}
     verification = verify(
         saved.env,
         saved.agent.policy(saved.env, saved.params, True),
-        {**BOX, **options.box},
+        {**default, **options.box},
         options.steps,
         property=options.property,
         arithmetic=options.arithmetic,
@@ -150,15 +153,13 @@ def _reason(verification: Verification) -> str:
         return f"{len(verification.open.low):,} boxes are left"
     count = len(verification.proved.low)
     starts = f"every start in {count:,} box{'es' * (count != 1)}"
+    margin = f"h ≥ {verification.margin:.3g} {'ft' if verification.loop.motion else 'm/s'}"
     if verification.loop.property == "docks":
         return (
             f"docked after {verification.last.min()} to {verification.last.max()} steps from "
-            f"{starts}, and h ≥ {verification.margin:.3g} m/s until then, between samples too"
+            f"{starts}, and {margin} until then, between samples too"
         )
-    return (
-        f"h ≥ {verification.margin:.3g} m/s for {verification.steps} steps from {starts}, between "
-        "samples too"
-    )
+    return f"{margin} for {verification.steps} steps from {starts}, between samples too"
 
 
 def command() -> None:

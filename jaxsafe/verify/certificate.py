@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxsafe.storage.archive import CERTIFICATE, open_archive
 from jaxsafe.storage.files import write_bytes
-from jaxsafe.verify.loop import Loop, Plant, columns
+from jaxsafe.verify.loop import Loop, Plant
 from jaxsafe.verify.program import RULED, Constant, Op, Program
 from jaxsafe.verify.tube import Claims
 from jaxsafe.verify.verify import Boxes, Counterexample, Verification
@@ -64,7 +64,9 @@ def save_certificate(
         "steps": verification.steps,
         "unit": verification.loop.following.unit,
         "dimension": verification.loop.dimension,
-        "columns": columns(verification.loop.dimension),
+        "columns": verification.loop.columns,
+        "curved": verification.loop.curved,
+        "motion": verification.loop.motion,
         "actions": verification.loop.actions,
         "plant": verification.loop.plant._asdict(),
         "programs": programs,
@@ -99,9 +101,12 @@ def load_certificate(path: str | os.PathLike) -> Verification:
             counterexample=None if violation is None else Counterexample(**violation),
             loop=Loop(
                 **programs,
+                columns=tuple(header["columns"]),
                 dimension=header["dimension"],
                 actions=header["actions"],
                 plant=Plant(**header["plant"]),
+                curved=header.get("curved", False),
+                motion=header.get("motion", 0),
                 property=header["property"],
             ),
             steps=header["steps"],

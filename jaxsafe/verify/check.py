@@ -12,6 +12,7 @@ import sys
 import numpy as np
 
 E = 2.0**-42  # bounds the relative rounding of sums of up to 1,000 terms in float64
+SAME = ("programs", "plant", "unit", "steps", "property", "columns", "curved", "motion")
 TURNS = {  # the points at which the derivative of a function is k
     "tanh": lambda k: [t := np.arctanh(np.sqrt(np.clip(1 - k, 0, 1))), -t],
     "exp": lambda k: [np.log(k)],
@@ -20,9 +21,19 @@ TURNS = {  # the points at which the derivative of a function is k
     "square": lambda k: [0.5 * k],
     "abs": lambda k: [0 * k],
     "reciprocal": lambda k: [t := 1 / np.sqrt(-k), -t],
+    "inverse": lambda k: [t := 1 / np.sqrt(-k), -t],
+    "atan": lambda k: [t := np.sqrt(np.maximum(1 / k - 1, 0)), -t],
 }
-CALLS = {"reciprocal": lambda x: 1 / x, "max": np.maximum, "min": np.minimum}
-UNITS = {"affine": 0, "max": 0, "min": 0, "abs": 0, "tanh": 16, "exp": 16, "log": 16}
+CALLS = {
+    "reciprocal": lambda x: 1 / x,
+    "inverse": lambda x: 1 / x,
+    "max": np.maximum,
+    "min": np.minimum,
+    "atan": np.arctan,
+}
+EXACT = ("affine", "max", "min", "abs", "select", "floor", "sin", "cos", "atan")
+UNITS = dict.fromkeys(EXACT, 0) | dict.fromkeys(("tanh", "exp", "log"), 16)
+ABSOLUTE = {"sin": 4, "cos": 4, "atan": 4}
 
 
 def need(fact, text):
@@ -99,36 +110,127 @@ def linearise(kind, constants, x, sets):
         slack = up(noise) + np.where(np.isfinite(far), E * far, 0)
         return [m for m, _ in matrices], constants[0][0], up(noise), low - slack, high + slack
     spans = [ends(f, sets) for f in x]
+    if kind == "norm":
+        return norm(x[0], *spans[0], sets)
+    rule = {"mul": mul, "select": select, "floor": floor}.get(kind, curve)
+    return settle(*rule(kind, constants, x, spans, sets))
+
+
+def settle(local, offset, noise, low, high):
+    """Drop the coefficients where the noise is not finite, and take the interval as the noise.
+
+    An infinite interval may become known again, and one that is not a number stays unknown.
+    """
+    known, finite = np.isfinite(noise), np.isfinite(low) & np.isfinite(high)
+    least, most = (np.where(finite, v, 0) for v in (low, high))
+    rest = np.where(finite, up(most - least) / 2 * (1 + E), np.inf)
+    rest = np.where(np.isnan(low) | np.isnan(high), np.nan, rest)
+    local = [np.where(known, a, 0) for a in local]
+    offset = np.where(known, offset, (least + most) / 2)
+    return local, offset, np.where(known, noise, rest), low, high
+
+
+def mul(kind, constants, x, spans, sets):
+    """Multiply: linearise at the middles of both intervals."""
+    (a, b), (p, q) = [(0.5 * (c + d), np.maximum(d - c, 0)) for c, d in spans]
+    pairs = [(c, d) for c in spans[0] for d in spans[1]]
+    corners = np.stack(
+        [np.where((c == 0) & np.isinf(d) | (d == 0) & np.isinf(c), 0, c * d) for c, d in pairs]
+    )
+    return [p, a], -a * p, up(b * q) / 4 * (1 + E), corners.min(0), corners.max(0)
+
+
+def select(kind, constants, x, spans, sets):
+    """Choose the second input where the first is positive, and else the third."""
+    (low, high), (a, b), (p, q) = spans
+    yes, no = low > 0, high <= 0
+    f = [u - v for u, v in zip(x[1][:2], x[2][:2], strict=True)]
+    apart = ends((*f, x[1][2] + x[2][2], -np.inf, np.inf), sets)
+    slack = 4 * E * (terms(x[1], sets) + terms(x[2], sets))
+    half = np.maximum(np.abs(apart[0]), np.abs(apart[1])) + slack
+    half = up(np.minimum(half, np.maximum(b - p, q - a))) / 2
+    share = np.where(yes, 1.0, np.where(no, 0.0, 0.5))
+    least = np.where(yes, a, np.where(no, p, np.minimum(a, p)))
+    most = np.where(yes, b, np.where(no, q, np.maximum(b, q)))
+    return [0 * share, share, 1 - share], 0 * share, np.where(yes | no, 0, half), least, most
+
+
+def floor(kind, constants, x, spans, sets):
+    """Round downwards."""
+    low, high = (np.floor(v) for v in spans[0])
+    one = low == high
+    local = [np.where(one, 0.0, 1.0)]
+    return local, np.where(one, low, -0.5), np.where(one, 0, 0.5), low, high
+
+
+def crossings(angle, low, high):
+    """Return the points of an interval whose cosine is that of an angle, or its ends."""
+    turn = 2 * np.pi
+    near = [a + turn * np.round(((low + high) / 2 - a) / turn) for a in (angle, -angle)]
+    return [np.clip(a + shift, low, high) for a in near for shift in (-turn, 0, turn)]
+
+
+def curve(kind, constants, x, spans, sets):
+    """Bound a function of one number by two parallel lines."""
     low, high = spans[0]
     far = np.maximum(np.abs(low), np.abs(high))
-    if kind == "mul":
-        (a, b), (p, q) = [(0.5 * (c + d), np.maximum(d - c, 0)) for c, d in spans]
-        corners = np.stack([c * d for c in spans[0] for d in spans[1]])
-        return [p, a], -a * p, up(b * q) / 4 * (1 + E), corners.min(0), corners.max(0)
-    if kind == "norm":
-        middle = 0.5 * (low + high)
-        length = np.sqrt((middle**2).sum(-1, keepdims=True))
-        w = np.divide(middle, length, out=np.zeros_like(middle), where=length > 0)
-        split = np.concatenate([w[:, None], np.eye(w.shape[1]) - w[:, :, None] * w[:, None]], 1)
-        radius = times(np.abs(split), x[0][2]) + 4 * E * terms(x[0], sets).sum(-1)[:, None]
-        a, b = ends((split @ x[0][0], times(split, x[0][1]), radius, -np.inf, np.inf), sets)
-        far, near = (np.sqrt((v**2).sum(-1)) for v in (far, np.maximum(np.maximum(low, -high), 0)))
-        rest = (np.maximum(np.abs(a), np.abs(b))[:, 1:] ** 2).sum(-1)
-        gap = np.divide(rest / 2, a[:, 0], out=np.full_like(rest, np.inf), where=a[:, 0] > 0)
-        gap, far = (up(np.minimum(gap, far - a[:, 0])) + 4 * E * far)[:, None], far[:, None]
-        return [w], gap / 2, gap / 2 + 4 * E * far, near[:, None] * (1 - 4 * E), up(up(far))
     fixed = [value for value, _ in constants]
     call = CALLS.get(kind) or getattr(np, kind)
     wide = high - low > 1e-9 * (np.abs(low) + np.abs(high))
+    waves = {"sin": 0, "cos": np.pi / 2}
+    if kind in waves:
+        wide &= high - low < 2 * np.pi
     k = np.where(wide, (call(high, *fixed) - call(low, *fixed)) / np.where(wide, high - low, 1), 0)
-    points = np.stack([low, high, *(np.clip(t, low, high) for t in fixed or TURNS[kind](k))])
-    values = call(points, *fixed)
-    gaps = values - k * points
-    rough = 4 * E * (np.abs(values).max(0) + np.abs(k) * far) + sum(r for _, r in constants)
-    fits = {"log": low > 0, "sqrt": low >= 0, "reciprocal": low * high > 0}.get(kind, True)
-    need(fits, f"{kind} of an interval that leaves its domain")
-    middle, noise = 0.5 * (gaps.max(0) + gaps.min(0)), up(0.5 * (gaps.max(0) - gaps.min(0)))
-    return [k], middle, noise + rough, values.min(0) - rough, values.max(0) + rough
+    extremes = [low, high]
+    if kind in waves:
+        shift = waves[kind]
+        inner, tops = (
+            [np.clip(t - shift, low, high) for t in crossings(angle, low + shift, high + shift)]
+            for angle in (np.arccos(np.clip(k, -1, 1)), np.pi / 2 + 0 * k)
+        )
+        extremes += tops
+    else:
+        inner = [np.clip(t, low, high) for t in fixed or TURNS[kind](k)]
+    points = np.stack([low, high, *inner])
+    values = call(np.stack([*points, *extremes[2:]]), *fixed)
+    gaps = values[: len(points)] - k * points
+    radius = sum(r for _, r in constants)
+    size = np.abs(values).max(0) + np.abs(k) * far + (kind in waves)
+    rough = 4 * E * size + radius
+    middle, noise = 0.5 * (gaps.max(0) + gaps.min(0)), up(0.5 * (gaps.max(0) - gaps.min(0))) + rough
+    least, most = values.min(0), values.max(0)
+    slack = [np.where(np.isfinite(size), rough, 4 * E * np.abs(v) + radius) for v in (least, most)]
+    least, most = least - slack[0], most + slack[1]
+    if kind in waves:
+        whole = high - low >= 2 * np.pi
+        middle, noise = np.where(whole, 0, middle), np.where(whole, 1, noise)
+        least, most = np.where(whole, -1, least), np.where(whole, 1, most)
+    fits = {
+        "log": low > 0,
+        "sqrt": low >= 0,
+        "reciprocal": low * high > 0,
+        "inverse": low * high > 0,
+        **dict.fromkeys(waves, far <= 1e4),
+    }.get(kind, True)
+    worst = np.inf if kind == "inverse" else np.nan
+    noise = np.where(fits, noise, np.nan)
+    return [k], middle, noise, np.where(fits, least, -worst), np.where(fits, most, worst)
+
+
+def norm(f, low, high, sets):
+    """Bound a Euclidean norm by its tangent."""
+    far = np.maximum(np.abs(low), np.abs(high))
+    middle = 0.5 * (low + high)
+    length = np.sqrt((middle**2).sum(-1, keepdims=True))
+    w = np.divide(middle, length, out=np.zeros_like(middle), where=length > 0)
+    split = np.concatenate([w[:, None], np.eye(w.shape[1]) - w[:, :, None] * w[:, None]], 1)
+    radius = times(np.abs(split), f[2]) + 4 * E * terms(f, sets).sum(-1)[:, None]
+    a, b = ends((split @ f[0], times(split, f[1]), radius, -np.inf, np.inf), sets)
+    far, near = (np.sqrt((v**2).sum(-1)) for v in (far, np.maximum(np.maximum(low, -high), 0)))
+    rest = (np.maximum(np.abs(a), np.abs(b))[:, 1:] ** 2).sum(-1)
+    gap = np.divide(rest / 2, a[:, 0], out=np.full_like(rest, np.inf), where=a[:, 0] > 0)
+    gap, far = (up(np.minimum(gap, far - a[:, 0])) + 4 * E * far)[:, None], far[:, None]
+    return [w], gap / 2, gap / 2 + 4 * E * far, near[:, None] * (1 - 4 * E), up(up(far))
 
 
 def act(kind, a, v):
@@ -138,7 +240,9 @@ def act(kind, a, v):
     """
     if kind == "affine":
         return a @ v
-    return (a[..., None] * v).sum(1, keepdims=True) if kind == "norm" else a[..., None] * v
+    a = a[..., None]
+    product = np.where(a == 0, 0, a * v)
+    return product.sum(1, keepdims=True) if kind == "norm" else product
 
 
 def bound(program, unit, sets, low, high):
@@ -157,9 +261,11 @@ def bound(program, unit, sets, low, high):
         fine = 4 * E * (both[..., 0] + np.abs(offset))
         units = (2.1 * x[0][0].shape[1] if kind == "norm" else UNITS.get(kind, 2.1)) * unit
         form = (slope, centre, both[..., 1] + noise, bottom, top)
-        noise = up(noise + fine + units * size(form, sets)) + 2.0**-60
+        own = units * size(form, sets) if units else 0
+        lost = ABSOLUTE.get(kind, 0) * unit + 2.0**-60
+        noise = up(noise + fine + own) + lost
         low, high = (
-            v + s * ((units + 4 * E) * np.abs(v) + 2.0**-60) for v, s in ((bottom, -1), (top, 1))
+            v + s * ((units + 4 * E) * np.abs(v) + lost) for v, s in ((bottom, -1), (top, 1))
         )
         forms[key] = (slope, centre, up(both[..., 1] + noise), low, high)
         tape.append((kind, keys, key, local, noise))
@@ -167,7 +273,7 @@ def bound(program, unit, sets, low, high):
     rows, radius = {program["output"]: np.eye(out[1].shape[1]) + 0 * out[1][..., None]}, 0
     for kind, keys, key, local, noise in reversed(tape):
         row = rows.pop(key)
-        radius = radius + times(np.abs(row), noise)
+        radius = radius + np.where(row == 0, 0, np.abs(row) * noise[:, None]).sum(-1)
         for k, a in zip(keys, local, strict=True):
             rows[k] = rows.get(k, 0) + (row @ a if kind == "affine" else row * a[:, None])
     return (*out[:2], np.minimum(up(radius) + 4 * E * out[2], out[2]), *ends(out, sets))
@@ -184,6 +290,7 @@ def gap(plant, speed, far, near):
     need(share > 0, "a step is too long for the bound between its ends")
     v = (speed + dt / 2 * (a + 3 * n**2 * far)) / share
     jerk = 3 * n**2 * v + 2 * n * (first := a + 2 * n * v + 3 * n**2 * (far + dt / 2 * v))
+    jerk = jerk + plant.get("turn_rate", 0) * a
     chord = np.maximum(near - dt * v, 1e-300)
     lag = np.minimum(2 * dt * v, (dt * v) ** 2 / 2 / chord)
     return 0.25 * (dt**2 / 2 * jerk + plant["slope"] * (dt**2 / 2 * first + lag)) * (1 + 1e-9)
@@ -194,11 +301,13 @@ def follow(head, low, high, claims):
 
     Also return a lower bound of the last output after the last step.
     """
-    d, m = head["dimension"], head["actions"]
+    d, m, size = head["dimension"], head["actions"], len(head["columns"])
+    curved, begin, docks = head.get("curved"), head.get("motion", 0), head["property"] == "docks"
+    total, linear = size + m, 0 if curved else size
     zeros = np.zeros((len(low), m))
     low, high = (np.concatenate([v, zeros], axis=1) for v in (low, high))
     centre = 0.5 * (low + high)
-    wide = up(np.maximum(high - centre, centre - low))[:, :, None] * np.eye(2 * d + m)
+    wide = up(np.maximum(high - centre, centre - low))[:, :, None] * np.eye(total)
     thin, worst, before = 0 * wide, np.full(len(low), np.inf), None
     deep = worst
     for t, (slope, middle, radius) in enumerate(zip(*claims, strict=True)):
@@ -207,33 +316,38 @@ def follow(head, low, high, claims):
         sets = (centre, wide, box, reach)
         program = head["programs"]["following" if t else "first"]
         s, c, r, bottom, top = bound(program, head["unit"], sets, low, high)
-        count = 2 * d + m + 1 + (head["property"] == "docks")
+        count = total + 1 + docks + (2 * d if begin else 0)
+        need(begin in (0, total + 1 + docks), "the place of the motion is wrong")
         need(s.shape[1] == count, "the outputs of the loop are not those of the property")
-        x, u = slice(0, 2 * d), slice(2 * d, 2 * d + m)
-        off = times(np.abs(s[:, u] - slope), reach) + np.abs(c[:, u] - middle) + r[:, u]
+        x, u = slice(0, size), slice(size, total)
+        turn, shift = s[:, u] - slope, c[:, u] - middle
+        half = up(np.abs(turn @ wide).sum(-1) + times(np.abs(turn), box))
+        fine = 4 * E * (times(np.abs(s[:, u]) + np.abs(slope), reach) + np.abs(c[:, u]))
+        off = np.abs(times(turn, centre) + shift) + half + fine + r[:, u]
         need(up(off) <= radius, f"the policy leaves its claimed bounds in step {t}")
         s, c = np.concatenate([s[:, x], slope], 1), np.concatenate([c[:, x], middle], 1)
+        r = np.concatenate([r[:, x], radius], 1)
         fine = 4 * E * (times(np.abs(s), reach) + np.abs(c))
-        fine[:, x] += r[:, x]
+        fine[:, :linear] += r[:, :linear]
         centre = times(s, centre) + c
-        wide = np.concatenate(
-            [s @ wide, np.concatenate([0 * s[:, x, :m], radius[:, :, None] * np.eye(m)], 1)], 2
-        )
-        thin = np.concatenate([s @ thin, fine[:, :, None] * np.eye(2 * d + m)], 2)
+        new = (r[:, :, None] * np.eye(total))[:, :, linear:]
+        wide = np.concatenate([s @ wide, new], 2)
+        thin = np.concatenate([s @ thin, fine[:, :, None] * np.eye(total)], 2)
         half = up(np.abs(wide).sum(-1) + np.abs(thin).sum(-1)) + E * np.abs(centre)
         low, high = (
-            np.maximum(bottom[:, : 2 * d + m], centre - half),
-            np.minimum(top[:, : 2 * d + m], centre + half),
+            np.maximum(bottom[:, :total], centre - half),
+            np.minimum(top[:, :total], centre + half),
         )
-        far, near = np.maximum(np.abs(low), np.abs(high)), np.maximum(np.maximum(low, -high), 0)
+        least, most = (bottom[:, begin:], top[:, begin:]) if begin else (low, high)
+        far, near = np.maximum(np.abs(least), np.abs(most)), np.maximum(np.maximum(least, -most), 0)
         norms = [np.sqrt((v**2).sum(1)) for v in (far[:, d : 2 * d], far[:, :d], -near[:, :d])]
-        now = (bottom[:, 2 * d + m], up(norms[0]), up(norms[1]), norms[2] * (1 - E))
+        now = (bottom[:, total], up(norms[0]), up(norms[1]), norms[2] * (1 - E))
         if before is None:
             worst = now[0]
         else:
             top_of = [np.maximum(a, b) for a, b in zip(before[1:], now[1:], strict=True)]
             worst = np.minimum(worst, np.minimum(before[0], now[0]) - gap(head["plant"], *top_of))
-        before, deep = now, bottom[:, -1]
+        before, deep = now, bottom[:, total + docks]
     return worst, deep
 
 
@@ -264,7 +378,7 @@ def main(path, *others):
     for other in others:
         a, b = (
             json.dumps(
-                [h["programs"], h["plant"], h["unit"], h["steps"], h["property"]],
+                [h.get(key) for key in SAME],
                 default=np.ndarray.tolist,
             )
             for h in (head, read(other)[0])

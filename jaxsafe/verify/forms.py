@@ -19,7 +19,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsafe.verify.program import BASIC, ELEMENTARY, FINE, Constant, Program
+from jaxsafe.verify.program import (
+    ANGULAR,
+    BASIC,
+    ELEMENTARY,
+    FINE,
+    MAX_ANGLE,
+    Constant,
+    Program,
+)
 
 TINY = 2.0**-60
 """A bound on what an operation of the loop loses by underflow in single precision.
@@ -81,6 +89,8 @@ class Linearised(NamedTuple):
     high: Any = jnp.inf
     rounding: float = BASIC
     """The relative error of the loop's own operation, in units."""
+    absolute: float = 0.0
+    """The absolute error of the loop's own operation, in units."""
 
 
 class Bounds(NamedTuple):
@@ -154,8 +164,13 @@ def _apply(kind: str, coefficient: Any, vector: Array) -> Array:
     """Return what an input contributes to the result of an operation."""
     if kind == "affine":
         return coefficient @ vector
-    product = (coefficient if vector.ndim == 1 else coefficient[:, None]) * vector
+    product = _times(coefficient if vector.ndim == 1 else coefficient[:, None], vector)
     return product.sum(0, keepdims=True) if kind == "norm" else product
+
+
+def _times(coefficient: Array, x: Array) -> Array:
+    """Return a product that is 0 where the coefficient is 0, even if x is infinite."""
+    return jnp.where(coefficient == 0.0, 0.0, coefficient * x)
 
 
 def _total(arrays: Iterable[Array]) -> Array:
@@ -177,7 +192,10 @@ def _forwards(
         x: the forms of its inputs.
     """
     rule = RULES[kind]
-    coefficients, offset, noise, low, high, rounding = rule(domain, constants, x)
+    linearised = rule(domain, constants, x)
+    if kind not in ("affine", "norm"):
+        linearised = _with_numbers(linearised)
+    coefficients, offset, noise, low, high, rounding, absolute = linearised
     pairs = list(zip(coefficients, x, strict=True))
     slope = _total(_apply(kind, a, form.slope) for a, form in pairs)
     centre = _total(_apply(kind, a, form.centre) for a, form in pairs) + offset
@@ -189,17 +207,37 @@ def _forwards(
     mass = jnp.abs(slope) @ domain.reach + jnp.abs(centre)
     largest = jnp.maximum(jnp.abs(low), jnp.abs(high))
     exact = jnp.minimum(mass + FINE * fine + carried + noise, largest)
-    noise = noise + FINE * fine + rounding * unit * exact + TINY
+    own = absolute * unit + (rounding * unit * exact if rounding * unit else 0.0)
+    noise = noise + FINE * fine + own + TINY
     share = rounding * unit + FINE
     form = Form(
         slope=slope,
         centre=centre,
         radius=(1.0 + FINE) * (carried + noise),
-        low=jnp.broadcast_to(low - share * jnp.abs(low) - TINY, centre.shape),
-        high=jnp.broadcast_to(high + share * jnp.abs(high) + TINY, centre.shape),
+        low=jnp.broadcast_to(low - share * jnp.abs(low) - absolute * unit - TINY, centre.shape),
+        high=jnp.broadcast_to(high + share * jnp.abs(high) + absolute * unit + TINY, centre.shape),
         mass=(1.0 + FINE) * mass,
     )
     return form, noise, () if kind == "affine" else coefficients
+
+
+def _with_numbers(linearised: Linearised) -> Linearised:
+    """Return an operation without coefficients where its noise is not finite.
+
+    There the noise is what its interval says, and infinite if the interval is. So what is chosen or
+    clipped afterwards is known again. An interval that is not a number stands for a result that may
+    not be one, and stays as it is.
+    """
+    low, high = linearised.low, linearised.high
+    known = jnp.isfinite(linearised.noise)
+    bounded = jnp.isfinite(low) & jnp.isfinite(high)
+    middle, half = _middle(jnp.where(bounded, low, 0.0), jnp.where(bounded, high, 0.0))
+    unknown = jnp.where(jnp.isnan(low) | jnp.isnan(high), jnp.nan, jnp.inf)
+    return linearised._replace(
+        coefficients=[jnp.where(known, a, 0.0) for a in linearised.coefficients],
+        offset=jnp.where(known, linearised.offset, middle),
+        noise=jnp.where(known, linearised.noise, jnp.where(bounded, half, unknown)),
+    )
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -219,7 +257,7 @@ def _backwards(
     Returns:
         The outputs' coefficients of each input, and `together` with the noise of the operation.
     """
-    together = together + (jnp.abs(row) * noise[:, None]).sum(-1)
+    together = together + _times(jnp.abs(row), noise[:, None]).sum(-1)
     moved = []
     for a, rows in zip(coefficients, before, strict=True):
         own = row @ a if kind == "affine" else row * a[:, None]
@@ -252,10 +290,101 @@ def _affine(domain: Domain, constants: Sequence[Constant], x: list[Form]) -> Lin
 def _mul(domain: Domain, constants: Sequence[Constant], x: list[Form]) -> Linearised:
     """Multiply. The product is linearised at the middles of the intervals."""
     first, second = (interval(form, domain) for form in x)
-    corners = jnp.stack([a * b for a in first for b in second])
+    corners = jnp.stack([_corner(a, b) for a in first for b in second])
     (a, half_a), (b, half_b) = _middle(*first), _middle(*second)
     noise = half_a * half_b * (1.0 + FINE)
     return Linearised([b, a], -a * b, noise, corners.min(0), corners.max(0))
+
+
+def _select(domain: Domain, constants: Sequence[Constant], x: list[Form]) -> Linearised:
+    """Choose the second input where the first is above 0, and else the third.
+
+    Where the set has states with both choices, the value is ½(a + b) ± ½(a − b).
+    """
+    decision, yes, no = x
+    low, high = interval(decision, domain)
+    always, never = low > 0.0, high <= 0.0
+    (a, b), (c, d) = interval(yes, domain), interval(no, domain)
+    apart = (yes.slope - no.slope) @ domain.centre + yes.centre - no.centre
+    reach = (1.0 + FINE) * (spread(yes.slope - no.slope, domain) + yes.radius + no.radius)
+    reach = reach + FINE * (yes.mass + no.mass)
+    half = 0.5 * jnp.minimum(jnp.abs(apart) + reach, jnp.maximum(b - c, d - a)) * (1.0 + FINE)
+    decided = always | never
+    share = jnp.where(decided, always, 0.5)
+    return Linearised(
+        [jnp.zeros_like(share), share, 1.0 - share],
+        jnp.zeros_like(share),
+        jnp.where(decided, 0.0, half),
+        jnp.where(always, a, jnp.where(never, c, jnp.minimum(a, c))),
+        jnp.where(always, b, jnp.where(never, d, jnp.maximum(b, d))),
+        rounding=0.0,
+    )
+
+
+def _floor(domain: Domain, constants: Sequence[Constant], x: list[Form]) -> Linearised:
+    """Round downwards: one number, or x − ½ ± ½."""
+    low, high = (jnp.floor(end) for end in interval(x[0], domain))
+    one = low == high
+    slope = jnp.where(one, 0.0, 1.0)
+    return Linearised(
+        [slope],
+        jnp.where(one, low, -0.5),
+        jnp.where(one, 0.0, 0.5),
+        low,
+        high,
+        rounding=0.0,
+    )
+
+
+def _wave(function: Callable[[Array], Array], shift: float) -> Rule:
+    """Return the rule of sin(x + shift).
+
+    Both lines touch its graph at an end, or where its derivative is the slope of the chord. The
+    intervals of more than a turn have the slope 0.
+    """
+    turn = 2.0 * jnp.pi
+
+    def rule(domain: Domain, constants: Sequence[Constant], x: list[Form]) -> Linearised:
+        low, high = interval(x[0], domain)
+        width = high - low
+        wide = (width > 1e-9 * (jnp.abs(low) + jnp.abs(high))) & (width < turn)
+        rise = function(high) - function(low)
+        slope = jnp.where(wide, rise / jnp.where(wide, width, 1.0), 0.0)
+
+        def reached(angle: Array) -> list[Array]:
+            """Return the points whose angle has a cosine, within the interval."""
+            middle = 0.5 * (low + high) + shift
+            points = []
+            for base in (angle, -angle):
+                nearest = base + turn * jnp.round((middle - base) / turn)
+                points += [nearest - turn, nearest, nearest + turn]
+            return [jnp.clip(point - shift, low, high) for point in points]
+
+        touching = jnp.stack([low, high, *reached(jnp.arccos(jnp.clip(slope, -1.0, 1.0)))])
+        gaps = function(touching) - slope * touching
+        extreme = function(jnp.stack([low, high, *reached(jnp.full_like(low, 0.5 * jnp.pi))]))
+        far = jnp.maximum(jnp.abs(low), jnp.abs(high))
+        rough = FINE * (1.0 + jnp.abs(slope) * far)
+        noise = 0.5 * (gaps.max(0) - gaps.min(0)) * (1.0 + FINE) + rough
+        whole = width >= turn
+        known = jnp.where(far <= MAX_ANGLE, 1.0, jnp.nan)
+        return Linearised(
+            [slope],
+            jnp.where(whole, 0.0, 0.5 * (gaps.min(0) + gaps.max(0))),
+            jnp.where(whole, 1.0, noise) * known,
+            jnp.where(whole, -1.0, jnp.maximum(extreme.min(0) - rough, -1.0)) * known,
+            jnp.where(whole, 1.0, jnp.minimum(extreme.max(0) + rough, 1.0)) * known,
+            rounding=0.0,
+            absolute=ANGULAR,
+        )
+
+    return rule
+
+
+def _corner(a: Array, b: Array) -> Array:
+    """Return the product of two ends of intervals. An infinite end times 0 is 0."""
+    empty = ((a == 0.0) & jnp.isinf(b)) | ((b == 0.0) & jnp.isinf(a))
+    return jnp.where(empty, 0.0, a * b)
 
 
 def _middle(low: Array, high: Array) -> tuple[Array, Array]:
@@ -304,6 +433,8 @@ def _univariate(
     rounding: float = BASIC,
     valid: Callable[[Array, Array], Any] | None = None,
     rising: bool = True,
+    absolute: float = 0.0,
+    otherwise: float = jnp.nan,
 ) -> Rule:
     """Return the rule of a function of one number: two parallel lines around its graph.
 
@@ -315,6 +446,9 @@ def _univariate(
         rounding: the relative error of the loop's own function, in units.
         valid: whether the rule holds on an interval, given its ends. None stands for always.
         rising: whether the function rises.
+        absolute: the absolute error of the loop's own function, in units.
+        otherwise: a bound on what the function is where the rule does not hold. NaN stands for a
+            result that may not be a number.
     """
 
     def rule(domain: Domain, constants: Sequence[Constant], x: list[Form]) -> Linearised:
@@ -329,18 +463,22 @@ def _univariate(
         values = function(points, *fixed)
         gaps = values - slope * points
         size = jnp.abs(slope) * jnp.maximum(jnp.abs(low), jnp.abs(high)) + jnp.abs(values).max(0)
-        rough = FINE * size + sum(constant.radius for constant in constants)
+        radius = sum(constant.radius for constant in constants)
+        rough = FINE * size + radius
         noise = 0.5 * (gaps.max(0) - gaps.min(0)) * (1.0 + FINE) + rough
-        if valid is not None:
-            noise = jnp.where(valid(low, high), noise, jnp.nan)
-        bottom, top = ends if rising else ends[::-1]
+        bottom, top = (
+            end + sign * jnp.where(jnp.isfinite(size), rough, FINE * jnp.abs(end) + radius)
+            for end, sign in zip(ends if rising else ends[::-1], (-1.0, 1.0), strict=True)
+        )
+        fits = True if valid is None else valid(low, high)
         return Linearised(
             [slope],
             0.5 * (gaps.min(0) + gaps.max(0)),
-            noise,
-            jnp.maximum(bottom - rough, within[0]),
-            jnp.minimum(top + rough, within[1]),
+            jnp.where(fits, noise, jnp.nan),
+            jnp.where(fits, jnp.maximum(bottom, within[0]), -otherwise),
+            jnp.where(fits, jnp.minimum(top, within[1]), otherwise),
             rounding,
+            absolute,
         )
 
     return rule
@@ -351,9 +489,12 @@ def _even(function: Callable[[Array], Array], turns: Any, rounding: float = BASI
     rule = _univariate(function, turns, rounding=rounding)
 
     def bounded(domain: Domain, constants: Sequence[Constant], x: list[Form]) -> Linearised:
-        largest = jnp.maximum(*map(jnp.abs, interval(x[0], domain)))
-        high = (1.0 + FINE) * function(largest)
-        return rule(domain, constants, x)._replace(low=jnp.zeros_like(high), high=high)
+        low, high = interval(x[0], domain)
+        nearest = jnp.maximum(jnp.maximum(low, -high), 0.0)
+        largest = jnp.maximum(jnp.abs(low), jnp.abs(high))
+        return rule(domain, constants, x)._replace(
+            low=(1.0 - FINE) * function(nearest), high=(1.0 + FINE) * function(largest)
+        )
 
     return bounded
 
@@ -363,9 +504,24 @@ def _tanh_turns(slope: Array) -> list[Array]:
     return [point, -point]
 
 
+def _atan_turns(slope: Array) -> list[Array]:
+    point = jnp.sqrt(jnp.maximum(1.0 / slope - 1.0, 0.0))
+    return [point, -point]
+
+
 def _reciprocal_turns(slope: Array) -> list[Array]:
     point = 1.0 / jnp.sqrt(-slope)
     return [point, -point]
+
+
+def _reciprocal(otherwise: float) -> Rule:
+    return _univariate(
+        lambda x: 1.0 / x,
+        _reciprocal_turns,
+        valid=lambda low, high: low * high > 0.0,
+        rising=False,
+        otherwise=otherwise,
+    )
 
 
 RULES: Mapping[str, Rule] = {
@@ -381,11 +537,15 @@ RULES: Mapping[str, Rule] = {
         valid=lambda low, high: low > 0.0,
     ),
     "sqrt": _univariate(jnp.sqrt, lambda slope: [0.25 / slope**2], valid=lambda low, _: low >= 0.0),
-    "reciprocal": _univariate(
-        lambda x: 1.0 / x, _reciprocal_turns, valid=lambda low, high: low * high > 0.0, rising=False
-    ),
+    "reciprocal": _reciprocal(otherwise=jnp.nan),
+    "inverse": _reciprocal(otherwise=jnp.inf),
     "max": _univariate(jnp.maximum, lambda slope: [], rounding=0.0),
     "min": _univariate(jnp.minimum, lambda slope: [], rounding=0.0),
+    "select": _select,
+    "floor": _floor,
+    "sin": _wave(jnp.sin, 0.0),
+    "cos": _wave(jnp.cos, 0.5 * jnp.pi),
+    "atan": _univariate(jnp.arctan, _atan_turns, rounding=0.0, absolute=ANGULAR),
     "square": _even(jnp.square, lambda slope: [0.5 * slope]),
     "abs": _even(jnp.abs, lambda slope: [jnp.zeros_like(slope)], rounding=0.0),
 }

@@ -27,6 +27,12 @@ Correct rounding gives 1. XLA may multiply by a reciprocal in place of a divisio
 ELEMENTARY = 16.0
 """Largest relative error of tanh, exp and log in the loop, in units of `Program.unit`."""
 
+ANGULAR = 4.0
+"""Largest absolute error of sin, cos and atan in the loop, in units of `Program.unit`."""
+
+MAX_ANGLE = 1e4
+"""Largest angle of which sin and cos are as exact as `ANGULAR` says [rad]."""
+
 FINE = 2.0**-40
 """A bound on the relative error of sums of up to 4,000 terms in double precision."""
 
@@ -56,7 +62,13 @@ _MOVING = [
     "convert_element_type",
 ]
 # Functions of one number that have a rule of their own in `forms`.
-_UNIVARIATE = ("tanh", "exp", "log", "sqrt", "abs", "square")
+_UNIVARIATE = ("tanh", "exp", "log", "sqrt", "abs", "square", "sin", "cos", "atan", "floor")
+# Operations that return their arguments.
+_IDENTITIES = ("stop_gradient", "optimization_barrier")
+
+
+START = 1
+"""The number of the vector that a program starts from."""
 
 
 class Constant(NamedTuple):
@@ -113,7 +125,9 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
     "min": jnp.minimum,
     "norm": lambda x: jnp.sqrt(jnp.sum(x * x, keepdims=True)),
     "reciprocal": lambda x: 1.0 / x,
-    **{name: getattr(jnp, name) for name in _UNIVARIATE},
+    "inverse": lambda x: 1.0 / x,
+    "select": lambda d, yes, no: jnp.where(d > 0.0, yes, no),
+    **{name: getattr(jnp, {"atan": "arctan"}.get(name, name)) for name in _UNIVARIATE},
 }
 """The operations that are not affine. All but `norm` work element by element."""
 
@@ -141,6 +155,30 @@ class _Zero(NamedTuple):
     value: _Affine
 
 
+class _Positive(NamedTuple):
+    """The truth value of `value > 0`, which stands for `larger > smaller`."""
+
+    value: _Affine
+    larger: Any
+    smaller: Any
+
+
+class _Not(NamedTuple):
+    """The truth value of the opposite."""
+
+    condition: Any
+
+
+class _Both(NamedTuple):
+    """The truth value of two conditions."""
+
+    first: Any
+    second: Any
+
+
+_CONDITIONS = (_Positive, _Not, _Both)
+
+
 class _Guarded(NamedTuple):
     """`where(value == 0, 1, value)`."""
 
@@ -166,7 +204,7 @@ def trace(function: Callable[[Array], Array], size: int, unit: float) -> Program
         ConfigError: there is no rule for an operation of the function.
     """
     closed = jax.make_jaxpr(function)(jnp.zeros(size))
-    builder = _Builder(unit)
+    builder = _Builder(unit, size)
     start = builder.base((size,))
     [result] = builder.run(closed.jaxpr, closed.consts, [start])
     if not isinstance(result, _Affine):
@@ -178,18 +216,20 @@ def trace(function: Callable[[Array], Array], size: int, unit: float) -> Program
         if op.output in needed:
             needed.update(op.inputs)
             ops.append(op)
-    # `start` was the first base, so its number is 1.
-    return Program(ops=tuple(reversed(ops)), input=1, output=output, unit=unit)
+    return Program(ops=tuple(reversed(ops)), input=START, output=output, unit=unit)
 
 
 class _Builder:
     """Turns the equations of a jaxpr into operations, and computes those of constants."""
 
-    def __init__(self, unit: float) -> None:
+    def __init__(self, unit: float, size: int) -> None:
         self.unit = unit
+        self.size = size
         self.ops: list[Op] = []
         self.made: dict[int, Op] = {}
         self.vectors: dict[int, tuple[_Affine, int]] = {}
+        self.chosen: dict[int, tuple[Any, ...]] = {}
+        self.quotients: dict[int, tuple[Any, ...]] = {}
         self.count = 0
 
     def base(self, shape: Sequence[int]) -> _Affine:
@@ -227,6 +267,9 @@ class _Builder:
             key: Constant(item.terms[key].reshape(size, -1), item.errors[key].reshape(size, -1))
             for key in item.terms
         }
+        if not keys:
+            keys = [START]
+            flat[START] = Constant(*np.zeros((2, size, self.size)))
         if len(keys) == 1 and None not in flat:
             [(value, radius)] = flat.values()
             if np.array_equal(value, np.eye(size)) and not radius.any():
@@ -279,6 +322,8 @@ class _Builder:
             keys = ("jaxpr", "call_jaxpr", "fun_jaxpr")
             inner = next(eqn.params[key] for key in keys if key in eqn.params)
             return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), x)
+        if name in _IDENTITIES:
+            return x
         if name == "select_n" and isinstance(x[0], Constant) and not isinstance(x[1], Constant):
             return [self._select_n(eqn, *x)]  # what is not chosen may be random
         random = any(jnp.issubdtype(out.aval.dtype, jax.dtypes.prng_key) for out in eqn.outvars)
@@ -297,8 +342,10 @@ class _Builder:
             return [rule(eqn, *x)]
         raise ConfigError(f"verify: no rule for the operation {name!r}")
 
-    def move(self, eqn: Any, x: list[Any]) -> list[_Affine]:
+    def move(self, eqn: Any, x: list[Any]) -> list[Any]:
         """Return the outputs of an operation that leaves numbers as they are."""
+        if len(x) == 1 and isinstance(x[0], _CONDITIONS):
+            return [self.moved_condition(eqn, x[0])]
         if not all(isinstance(item, Constant | _Affine) for item in x):
             raise ConfigError(
                 f"verify: no rule for the operation {eqn.primitive.name!r} of comparisons"
@@ -319,6 +366,12 @@ class _Builder:
                 for out, array in zip(outs, moved if several else [moved], strict=True):
                     getattr(out, which)[key] = np.asarray(array)
         return outs
+
+    def moved_condition(self, eqn: Any, condition: Any) -> Any:
+        """Return a condition of whose elements an operation changes the places."""
+        if isinstance(condition, _Positive):
+            return _Positive(self.move(eqn, [condition.value])[0], None, None)
+        return type(condition)(*(self.moved_condition(eqn, part) for part in condition))
 
     def affine(self, item: Any, shape: Sequence[int]) -> _Affine:
         """Return a value as an array of a shape. A constant has no base."""
@@ -408,8 +461,10 @@ class _Builder:
             return [Constant(item, np.zeros(item.shape)) for item in outs]
         if name not in _ERRORS:
             raise ConfigError(f"verify: no rule for the operation {name!r} of numbers")
-        units = ELEMENTARY if name in ("tanh", "exp", "log", "sin", "cos") else BASIC
-        own = (units * self.unit + FINE) * np.abs(outs[0])
+        own = (_units(name) * self.unit + FINE) * np.abs(outs[0])
+        if name in ("sin", "cos", "atan"):
+            # Up to 1 rad the error is relative.
+            own = np.where(np.abs(x[0].value) <= 1.0, own, ANGULAR * self.unit + FINE)
         error = _ERRORS[name](outs[0], *(part for item in x for part in item), **eqn.params)
         return [Constant(outs[0], (1.0 + FINE) * (error + own))]
 
@@ -437,6 +492,12 @@ class _Builder:
         return self.emit("mul", [self.affine(a, shape), self.affine(b, shape)])
 
     def _div(self, eqn: Any, a: Any, b: Any) -> _Affine:
+        quotient = self.quotient(eqn, a, b)
+        if id(b) in self.chosen:
+            self.quotients[id(quotient)] = quotient, eqn, a, b
+        return quotient
+
+    def quotient(self, eqn: Any, a: Any, b: Any) -> _Affine:
         over = self.reciprocal(b)
         if isinstance(a, Constant) and np.all(a.value == 1.0) and a.shape in ((), over.shape):
             return over
@@ -485,10 +546,37 @@ class _Builder:
             return _Zero(a)
         raise ConfigError("verify: no rule for the operation 'eq'")
 
+    def _gt(self, eqn: Any, a: Any, b: Any) -> _Positive:
+        return _Positive(self.sum(a, b, -1.0), a, b)
+
+    def _lt(self, eqn: Any, a: Any, b: Any) -> _Positive:
+        return self._gt(eqn, b, a)
+
+    def _ge(self, eqn: Any, a: Any, b: Any) -> _Not:
+        return _Not(self._gt(eqn, b, a))
+
+    def _le(self, eqn: Any, a: Any, b: Any) -> _Not:
+        return _Not(self._gt(eqn, a, b))
+
+    def _not(self, eqn: Any, condition: Any) -> _Not:
+        return _Not(self.condition(condition))
+
+    def _and(self, eqn: Any, a: Any, b: Any) -> _Both:
+        return _Both(self.condition(a), self.condition(b))
+
+    def _or(self, eqn: Any, a: Any, b: Any) -> _Not:
+        return _Not(_Both(_Not(self.condition(a)), _Not(self.condition(b))))
+
+    def condition(self, item: Any) -> Any:
+        if isinstance(item, _CONDITIONS):
+            return item
+        raise ConfigError("verify: no rule for a logical operation of these values")
+
     def _select_n(self, eqn: Any, which: Any, otherwise: Any, chosen: Any) -> Any:
         """Return one of two values.
 
-        The choice is a constant, or it guards a root against zero as `safe_norm` does.
+        The choice is a constant or a comparison, or it guards a root against zero as `safe_norm`
+        does.
         """
         if isinstance(which, Constant) and (which.value.all() or not which.value.any()):
             return chosen if which.value.all() else otherwise
@@ -498,7 +586,56 @@ class _Builder:
             guards = isinstance(otherwise, _Root) and otherwise.value is which.value
             if guards and not chosen.value.any():
                 return otherwise.norm
+        if isinstance(which, _CONDITIONS):
+            result = self.choose(which, self.unguarded(which, chosen), otherwise)
+            self.chosen[id(result)] = result, which, chosen
+            return result
         raise ConfigError("verify: no rule for the operation 'select_n'")
+
+    def unguarded(self, which: Any, value: Any) -> Any:
+        """Return a value that is used only where a condition holds.
+
+        The same condition may guard the divisor of a quotient. If it says that the divisor is not
+        0, the guard is not needed here.
+        """
+        if id(value) not in self.quotients:
+            return value
+        _, eqn, dividend, divisor = self.quotients[id(value)]
+        _, guard, inner = self.chosen[id(divisor)]
+        if guard is not which or not self.says_nonzero(which, inner):
+            return value
+        return self._mul(eqn, dividend, self.emit("inverse", [inner]))
+
+    def says_nonzero(self, which: Any, x: Any) -> bool:
+        """Return whether a condition is a·|x| > |z| with a number a > 0, so that x is not 0."""
+        if not isinstance(which, _Positive) or not isinstance(x, _Affine):
+            return False
+        larger, smaller = self.absolute_of(which.larger), self.absolute_of(which.smaller)
+        return larger == self.vector(x) and smaller is not None
+
+    def absolute_of(self, item: Any) -> int | None:
+        """Return the number of the vector of which an array is positive times the absolute value.
+
+        It is None if the array is something else.
+        """
+        if not isinstance(item, _Affine) or len(item.terms) != 1:
+            return None
+        [(key, term)] = item.terms.items()
+        op = self.made.get(key) if key is not None else None
+        if op is None or op.kind != "abs" or int(np.prod(item.shape)) != op.size:
+            return None
+        least = (term - item.errors[key]).reshape(op.size, op.size)
+        positive = np.all(np.diag(least) > 0.0) and not np.any(least - np.diag(np.diag(least)))
+        return op.inputs[0] if positive else None
+
+    def choose(self, which: Any, yes: Any, no: Any) -> _Affine:
+        """Return the first value where a condition holds, and else the second."""
+        if isinstance(which, _Not):
+            return self.choose(which.condition, no, yes)
+        if isinstance(which, _Both):
+            return self.choose(which.first, self.choose(which.second, yes, no), no)
+        shape = np.broadcast_shapes(which.value.shape, yes.shape, no.shape)
+        return self.emit("select", [self.affine(x, shape) for x in (which.value, yes, no)])
 
     def _sqrt(self, eqn: Any, x: Any) -> Any:
         total = x.value if isinstance(x, _Guarded) else x
@@ -544,6 +681,11 @@ class _Builder:
         raise ConfigError("verify: no rule for the operation 'dot_general' of these values")
 
 
+def _units(name: str) -> float:
+    """Return the relative error of an operation of the loop, in units of its roundoff."""
+    return ELEMENTARY if name in ("tanh", "exp", "log", "sin", "cos", "atan") else BASIC
+
+
 def _of_product(value: Any, a: Any, ra: Any, b: Any, rb: Any, **_: Any) -> Any:
     return np.abs(a) * rb + np.abs(b) * ra + ra * rb
 
@@ -574,6 +716,7 @@ _ERRORS: dict[str, Callable[..., Any]] = {
     "integer_pow": _of_power,
     "sin": lambda value, a, ra, **_: ra,
     "cos": lambda value, a, ra, **_: ra,
+    "atan": lambda value, a, ra, **_: ra,
     "sqrt": _monotone(np.sqrt),
     "exp": _monotone(np.exp),
     "log": _monotone(np.log),

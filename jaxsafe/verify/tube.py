@@ -1,7 +1,8 @@
 """Tubes: bounds of the loop's states over many steps from a box of starts.
 
-The set of states is a zonotope. The plant maps it without loss, and the policy adds one generator
-per actuator in every step, as wide as what its linearisation leaves open.
+The set of states is a zonotope. A linear plant maps it without loss, and the policy adds one
+generator per actuator in every step, as wide as what its linearisation leaves open. A plant that is
+not linear adds such a generator for each number of its state.
 """
 
 from __future__ import annotations
@@ -88,7 +89,9 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
     """
     size = low.shape[-1]
     total = size + loop.actions
-    domain = _boxes(low, high, loop.actions, steps)
+    linear = 0 if loop.curved else size
+    domain = _boxes(low, high, loop.actions, steps, linear)
+    end = total + 1 + (loop.property == "docks")
     samples = []
     claims = []
     lows = []
@@ -97,13 +100,14 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
     undecided = np.ones(len(low), bool)
     for t in range(steps + 1):
         bounds = _with_room(bound(loop.following if t else loop.first, domain), size)
-        domain, sample = _following(bounds, domain, size, loop.dimension, t)
-        samples.append(sample)
+        domain = _following(bounds, domain, size, linear, t)
+        motion = bounds if loop.motion else domain
+        samples.append(_sample(motion, bounds.low[:, total], loop.motion, loop.dimension))
         claims.append(Claims(*(x[:, size:total] for x in bounds[:3])))
         lows.append(domain.low)
         highs.append(domain.high)
-        depths.append(bounds.low[:, total + 1 :])
-        undecided &= np.asarray(sample.margin >= 0.0)
+        depths.append(bounds.low[:, total + 1 : end])
+        undecided &= np.asarray(samples[-1].margin >= 0.0)
         if t and loop.property == "docks":
             undecided &= ~np.asarray(depths[-1][:, 0] >= 0.0)
         if not undecided.any():
@@ -120,17 +124,20 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
 def _with_room(bounds: Bounds, size: int) -> Bounds:
     """Widen the bounds of the actions, so that a checker that rounds otherwise confirms them.
 
-    The first `size` outputs are position and velocity, and stay as they are.
+    The first `size` outputs are the state of the platforms, and stay as they are.
     """
     wider = bounds.radius * (1.0 + ROOM) + FINE
     acts = jnp.arange(wider.shape[-1]) >= size
     return bounds._replace(radius=jnp.where(acts, wider, bounds.radius))
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3))
-@functools.partial(jax.vmap, in_axes=(0, 0, None, None))
-def _boxes(low: Array, high: Array, actions: int, steps: int) -> Domain:
-    """Return the set of starts of each box. The actions are 0."""
+@functools.partial(jax.jit, static_argnums=(2, 3, 4))
+@functools.partial(jax.vmap, in_axes=(0, 0, None, None, None))
+def _boxes(low: Array, high: Array, actions: int, steps: int, linear: int) -> Domain:
+    """Return the set of starts of each box. The actions are 0.
+
+    There is room for the generators of all steps: one for each element from `linear` on.
+    """
     size = low.shape[0]
     total = size + actions
     middle = 0.5 * (low + high)
@@ -139,7 +146,7 @@ def _boxes(low: Array, high: Array, actions: int, steps: int) -> Domain:
     def pad(x: Array) -> Array:
         return jnp.concatenate([x, jnp.zeros(actions)])
 
-    generators = jnp.zeros((total, size + actions * (steps + 1)))
+    generators = jnp.zeros((total, size + (total - linear) * (steps + 1)))
     return Domain(
         centre=pad(middle),
         generators=generators.at[:size, :size].set(jnp.diag(half)),
@@ -151,55 +158,64 @@ def _boxes(low: Array, high: Array, actions: int, steps: int) -> Domain:
 
 @functools.partial(jax.jit, static_argnums=(2, 3))
 @functools.partial(jax.vmap, in_axes=(0, 0, None, None, None))
-def _following(
-    bounds: Bounds, domain: Domain, size: int, dimension: int, t: Any
-) -> tuple[Domain, _Sample]:
-    """Return the states after a step, and what the bound between samples needs of them.
+def _following(bounds: Bounds, domain: Domain, size: int, linear: int, t: Any) -> Domain:
+    """Return the states after a step.
 
     Args:
         bounds: bounds of the step's outputs.
         domain: the states before the step.
-        size: number of elements of position and velocity.
-        dimension: number of elements of a position.
+        size: number of elements of the state of the platforms.
+        linear: number of elements that the plant maps without loss. What rounding leaves open of
+            them is no generator of its own.
         t: the number of the step, which has generators of its own.
     """
     total = domain.centre.shape[0]
-    actions = total - size
     slope = bounds.slope[:total]
     radius = bounds.radius[:total]
     fine = FINE * (jnp.abs(slope) @ domain.reach + jnp.abs(bounds.centre[:total]))
-    acts = jnp.arange(total) >= size
-    rounded = jnp.diag((1.0 + FINE) * (jnp.where(acts, 0.0, radius) + fine))
-    new = jnp.diag(radius)[:, size:]
+    curved = jnp.arange(total) >= linear
+    rounded = jnp.diag((1.0 + FINE) * (jnp.where(curved, 0.0, radius) + fine))
+    new = jnp.diag(radius)[:, linear:]
     put = jax.lax.dynamic_update_slice
     following = Domain(
         centre=slope @ domain.centre + bounds.centre[:total],
-        generators=put(slope @ domain.generators, new, (0, size + actions * t)),
+        generators=put(slope @ domain.generators, new, (0, size + (total - linear) * t)),
         rounding=put(slope @ domain.rounding, rounded, (0, total * t)),
         low=bounds.low[:total],
         high=bounds.high[:total],
     )
     half = jnp.abs(following.generators).sum(-1) + following.box
     half = (1.0 + FINE) * half + FINE * jnp.abs(following.centre)
-    following = following._replace(
+    return following._replace(
         low=jnp.maximum(following.low, following.centre - half),
         high=jnp.minimum(following.high, following.centre + half),
     )
-    return following, _sample(following, bounds.low[total], dimension)
 
 
-def _sample(domain: Domain, margin: Array, dimension: int) -> _Sample:
-    far = jnp.maximum(jnp.abs(domain.low), jnp.abs(domain.high))
-    near = jnp.maximum(jnp.maximum(domain.low, -domain.high), 0.0)
+@functools.partial(jax.jit, static_argnums=(2, 3))
+def _sample(motion: Bounds | Domain, margin: Array, begin: int, dimension: int) -> _Sample:
+    """Return what the bound between samples needs to know.
+
+    Args:
+        motion: bounds of vectors that have the position, and then the velocity, from `begin` on.
+        margin: a lower bound of h.
+        begin: the place of the position.
+        dimension: number of elements of a position.
+    """
+    position, velocity = (
+        slice(begin + i * dimension, begin + (i + 1) * dimension) for i in range(2)
+    )
+    far = jnp.maximum(jnp.abs(motion.low), jnp.abs(motion.high))
+    near = jnp.maximum(jnp.maximum(motion.low, -motion.high), 0.0)
 
     def length(x: Array) -> Array:
-        return jnp.sqrt((x**2).sum())
+        return jnp.sqrt((x**2).sum(-1))
 
     return _Sample(
         margin=margin,
-        speed=length(far[dimension : 2 * dimension]) * (1.0 + FINE),
-        distance=length(far[:dimension]) * (1.0 + FINE),
-        nearest=length(near[:dimension]) * (1.0 - FINE),
+        speed=length(far[:, velocity]) * (1.0 + FINE),
+        distance=length(far[:, position]) * (1.0 + FINE),
+        nearest=length(near[:, position]) * (1.0 - FINE),
     )
 
 
@@ -236,7 +252,8 @@ def between(plant: Plant, speed: Array, distance: Array, nearest: Array) -> Arra
     v = (speed + 0.5 * time * (plant.acceleration + 3.0 * n**2 * distance)) / share
     r = distance + 0.5 * time * v
     first = plant.acceleration + 2.0 * n * v + 3.0 * n**2 * r  # ‖r̈‖
-    second = 3.0 * n**2 * v + 2.0 * n * first  # ‖v̈‖
+    turning = plant.turn_rate * plant.acceleration
+    second = 3.0 * n**2 * v + 2.0 * n * first + turning  # ‖v̈‖
     way = time * v
     chord = jnp.maximum(nearest - way, 0.0)
     bend = jnp.where(chord > 0.0, 0.5 * way**2 / jnp.where(chord > 0.0, chord, 1.0), jnp.inf)

@@ -20,12 +20,13 @@ from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.types import State, TimeStep
 from jaxsafe.verify.loop import (
-    FIELDS,
+    CRAFT,
     Loop,
     Property,
     closed_loop,
     depth,
     docking_region,
+    parts,
     start_of,
 )
 from jaxsafe.verify.tube import Claims, tube
@@ -33,11 +34,25 @@ from jaxsafe.verify.tube import Claims, tube
 BATCH = 64
 """Number of boxes that are bounded at once."""
 
-FIRST_WIDTHS = (18.0, 0.1)
-"""Largest widths of the first boxes, of positions [m] and of velocities [m/s]."""
+FIRST_WIDTHS: Mapping[str, float] = {
+    "position": 18.0,
+    "velocity": 0.1,
+    "attitude": 0.2,
+    "attitude_rate": 0.02,
+}
+"""Largest widths of the first boxes of spacecraft, by field [m, m/s, rad, rad/s]."""
 
-SCALES: Mapping[Property, tuple[float, float]] = {"safe": (6.0, 0.047), "docks": (0.125, 0.02)}
-"""Widths that count the same when a box is halved, of positions [m] and of velocities [m/s].
+AIRCRAFT_WIDTHS: Mapping[str, float] = {"position": 200.0, "heading": 0.1, "speed": 20.0}
+"""Largest widths of the first boxes of aircraft, by field [ft, rad, ft/s].
+
+A box is halved where it is widest in units of these.
+"""
+
+SCALES: Mapping[Property, Mapping[str, float]] = {
+    "safe": {**FIRST_WIDTHS, "position": 6.0, "velocity": 0.047},
+    "docks": {**FIRST_WIDTHS, "position": 0.125, "velocity": 0.02},
+}
+"""Widths of spacecraft that count the same when a box is halved, by field [m, m/s, rad, rad/s].
 
 Near the chief the direction to it changes most with the position.
 """
@@ -55,11 +70,14 @@ _Corners = tuple[np.ndarray, np.ndarray]
 """The lowest and the highest corner of a box."""
 
 Box = Mapping[str, Any]
-"""Intervals by field, `deputy.position` or `position`: one for each axis, or one for all axes."""
+"""Intervals by field, `deputy.position` or `position`: one for each axis, or one for all axes.
+
+The fields of platforms other than the agent's have the name of the platform.
+"""
 
 
 class Boxes(NamedTuple):
-    """Boxes of starts, by their corners (position, velocity)."""
+    """Boxes of starts, by their corners. `Loop.columns` says what each number is."""
 
     low: Float[np.ndarray, "n s"]
     high: Float[np.ndarray, "n s"]
@@ -137,7 +155,8 @@ def verify(
     success after at most `steps` steps, and keeps the constraint until then.
 
     Args:
-        env: the environment. Its agent is a point mass that keeps a speed limit.
+        env: the environment. Its agent is a spacecraft that keeps a speed limit, or an aircraft
+            that keeps a distance from another one.
         policy: `policy(key, observation)` returns actions for a batch of observations. It must be
             deterministic.
         box: intervals of the start, such as `{"deputy.position": [[70, 106], [70, 106]],
@@ -208,31 +227,49 @@ def corners(env: Environment, box: Box) -> Boxes:
     Raises:
         ConfigError: a field is missing or unknown, or its value is not made of intervals.
     """
-    names = {f"{env.agent}.{field}": field for field in FIELDS}
+    known = {f"{part.platform}.{part.field}": part for part in parts(env)}
+    short = {part.name for part in known.values()}
     for key in box:
-        if key not in names and key not in FIELDS:
-            raise ConfigError(f"box.{key}: no field of a start{choices_text(key, names)}")
-    dimension = env.agent_platform.dimension
+        if key not in known and key not in short:
+            raise ConfigError(f"box.{key}: no field of a start{choices_text(key, known)}")
+    drawn = {
+        f"{platform.name}.{field}" for platform in env.platforms for field in platform.random_fields
+    }
     ends = []
-    for name, field in names.items():
-        given = box.get(name, box.get(field))
+    for name, part in known.items():
+        # What no start of the task draws is 0 unless it is given.
+        given = box.get(name, box.get(part.name, None if name in drawn else (0.0, 0.0)))
         if given is None:
             raise ConfigError(f"box.{name}: missing; give an interval for each axis")
         try:
             array = np.asarray(given, np.float64)
         except (TypeError, ValueError):
             array = np.zeros(0)
-        array = np.broadcast_to(array, (dimension, 2)) if array.shape == (2,) else array
-        fits = array.shape == (dimension, 2) and np.all(np.abs(array) <= MAX_BOUND)
+        count = part.size or 1
+        array = np.broadcast_to(array, (count, 2)) if array.shape == (2,) else array
+        fits = array.shape == (count, 2) and np.all(np.abs(array) <= MAX_BOUND)
         if not fits or np.any(array[:, 0] > array[:, 1]):
+            wanted = f"{count} intervals" if part.size else "an interval"
             raise ConfigError(
-                f"box.{name}: expected {dimension} intervals [low, high] "
+                f"box.{name}: expected {wanted} [low, high] "
                 f"within ±{MAX_BOUND:.0e}, found {show(given)}"
             )
         ends.append(array)
     low, high = np.concatenate(ends).T
-    _require_near(env, low, high)
+    if isinstance(env.agent_platform, CRAFT):
+        _require_near(env, low, high)
     return Boxes(low[None], high[None])
+
+
+def _widths(env: Environment, by_field: Mapping[str, float]) -> Float[np.ndarray, " s"]:
+    """Return a width for each number of a start."""
+    return np.concatenate([np.full(part.size or 1, by_field[part.field]) for part in parts(env)])
+
+
+def first_widths(env: Environment) -> Float[np.ndarray, " s"]:
+    """Return the largest width of the first boxes, for each number of a start."""
+    craft = isinstance(env.agent_platform, CRAFT)
+    return _widths(env, FIRST_WIDTHS if craft else AIRCRAFT_WIDTHS)
 
 
 def _require_near(env: Environment, low: np.ndarray, high: np.ndarray) -> None:
@@ -274,9 +311,8 @@ def _same_numbers(a: Any, b: Any) -> bool:
     )
 
 
-def _cells(whole: Boxes, dimension: int) -> list[_Corners]:
-    """Return the first boxes, none of them wider than `FIRST_WIDTHS`."""
-    largest = np.repeat(FIRST_WIDTHS, dimension)
+def _cells(whole: Boxes, largest: Float[np.ndarray, " s"]) -> list[_Corners]:
+    """Return the first boxes, none of them wider than the largest widths."""
     counts = np.maximum(1, np.ceil((whole.high[0] - whole.low[0]) / largest)).astype(int)
     edges = [
         np.linspace(low, high, count + 1)
@@ -326,12 +362,14 @@ class _Search:
         self.whole = whole
         self.steps = steps
         self.resolution = resolution
-        self.scales = np.repeat(SCALES[loop.property], loop.dimension)
+        self.widths = first_widths(env)
+        craft = isinstance(env.agent_platform, CRAFT)
+        self.scales = _widths(env, SCALES[loop.property]) if craft else self.widths
         self.most = BATCH * usable_cores()
         self.pool = ThreadPoolExecutor(usable_cores())
         self.key = jax.random.key(0)
         self.fly = jax.jit(jax.vmap(lambda x: _flight(env, policy, steps, loop.property, x)))
-        self.known = _Known(_cells(whole, loop.dimension), [], [], [])
+        self.known = _Known(_cells(whole, self.widths), [], [], [])
 
     def go_on(self, earlier: Verification) -> None:
         """Begin with what an earlier search knows."""
@@ -361,7 +399,7 @@ class _Search:
         violation = None
         if not done.all():
             share[~done], violation = self.flown(low[~done], high[~done], known.bounded)
-        widths = (high - low) / np.repeat(FIRST_WIDTHS, self.loop.dimension)
+        widths = (high - low) / self.widths
         small = widths.max(axis=1) * self.resolution <= 1.0
         # Where all flights violate the property, smaller boxes would say nothing more.
         refuted = ~done & ((share == 1.0) | (small & (share > 0.0)))
