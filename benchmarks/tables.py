@@ -1063,12 +1063,52 @@ def verification(results: Results) -> str:
             "" if row["check_seconds"] is None else f"{row['check_seconds']:.0f}",
         ]
         for row in results["rows"].values()
+        if row["box"].keys() == {"position", "velocity"}
     )
     heads = (
         "policy | positions [m] | velocities [m/s] | property | steps | arithmetic | result | "
         "proved | boxes bounded | seconds | check [s]"
     )
     return markdown(heads.split(" | "), rows)
+
+
+def verification_turning(results: Results) -> str:
+    """Return the table of what was proved of craft that turn."""
+
+    def widths(row: Results, aircraft: bool) -> str:
+        units = {"position": "m", "velocity": "m/s", "attitude": "rad", "attitude_rate": "rad/s"}
+        if aircraft:
+            units = {"position": "ft", "heading": "rad", "speed": "ft/s"}
+        texts = []
+        for name, unit in units.items():
+            ends = row["box"][name]
+            low, high = ends[0] if isinstance(ends[0], list) else ends
+            texts.append(f"{high - low:.3g} {unit}")
+        return ", ".join(texts)
+
+    lines = []
+    for row in results["rows"].values():
+        if row["box"].keys() != {"position", "velocity"}:
+            aircraft = "heading" in row["box"]
+            distance = math.hypot(*(0.5 * (low + high) for low, high in row["box"]["position"]))
+            lines.append(
+                [
+                    f"`{row['policy']}`",
+                    f"{distance:,.0f} {'ft' if aircraft else 'm'}",
+                    widths(row, aircraft),
+                    str(row["steps"]),
+                    row["result"],
+                    f"{row['proved']:.1%}",
+                    f"{row['bounded']:,}",
+                    f"{row['seconds']:.1f}",
+                    "" if row["check_seconds"] is None else f"{row['check_seconds']:.0f}",
+                ]
+            )
+    heads = (
+        "policy | distance | widths of the box | steps | result | proved | boxes bounded | "
+        "seconds | check [s]"
+    )
+    return markdown(heads.split(" | "), lines)
 
 
 def verification_starts(results: Results) -> str:
@@ -1131,6 +1171,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("memory", memory, "docs/scaling.md"),
     ("robustness", robustness, "docs/safety/attacks.md"),
     ("verification", verification, "docs/verification.md"),
+    ("verification", verification_turning, "docs/verification.md"),
     ("verification", verification_tubes, "docs/verification.md"),
     ("verification", verification_starts, "docs/verification.md"),
     ("uncertain_training", uncertain_training, "docs/safety/attacks.md"),

@@ -51,6 +51,24 @@ SPACE = {"position": [88.0, 97.0], "velocity": [-0.05, 0.05]}
 NEAR = {"position": [3.0, 5.5], "velocity": [-0.02, 0.02]}
 """Starts near the chief, almost at rest."""
 
+WINGMAN = {
+    "position": [[-1610.0, -1590.0], [140.0, 160.0]],
+    "heading": [-0.19, -0.17],
+    "speed": [396.0, 400.0],
+    "lead.position": [0.0, 0.0],
+    "lead.heading": [0.0, 0.0],
+    "lead.speed": [300.0, 300.0],
+}
+"""Starts of a wingman behind the lead, on the way to the rejoin point [ft, rad, ft/s]."""
+
+ORIENTED = {
+    "position": [[87.5, 88.5], [69.5, 70.5]],
+    "velocity": [[-0.105, -0.095], [-0.085, -0.075]],
+    "attitude": [0.49, 0.51],
+    "attitude_rate": [-0.001, 0.001],
+}
+"""Starts of a craft that turns, 112 m from the chief [m, m/s, rad, rad/s]."""
+
 MAX_SECONDS = 240.0
 """How long a search may take."""
 
@@ -68,8 +86,10 @@ CASES: dict[str, dict[str, Any]] = {
         "box": NEAR,
     },
     "docking3d": {"policy": "pretrained/docking3d", "steps": 20, "box": SPACE},
+    "rejoin2d": {"policy": "pretrained/rejoin2d", "mass": None, "steps": 10, "box": WINGMAN},
+    "oriented": {"policy": "pretrained/docking2d_oriented", "steps": 10, "box": ORIENTED},
 }
-"""What is proved, by row: the policy, the mass [kg], and other options of the proof."""
+"""What is proved, by row: the policy, the mass [kg] of a spacecraft, and options of the proof."""
 
 TUBES: dict[str, dict[str, Any]] = {
     "far": {"centre": [100.0, 20.0, -0.1, 0.05], "widths": [[9.0, 0.05]], "steps": 120},
@@ -165,14 +185,14 @@ def follow(case: Mapping[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def controller(policy: str, mass: float, published: str) -> tuple[Any, Any]:
+def controller(policy: str, mass: float | None, published: str) -> tuple[Any, Any]:
     """Return the environment and the policy of a row."""
     if policy == "published network":
         env = jaxsafe.make("docking2d", overrides=RAW)
         foreign = read_foreign(Path(published), env)
         return env, foreign.agent.policy(env, foreign.params, True)
     saved = read_policy(find_policy(policy))
-    env = jaxsafe.override(saved.env, {"deputy.mass": mass})
+    env = saved.env if mass is None else jaxsafe.override(saved.env, {"deputy.mass": mass})
     return env, saved.agent.policy(env, saved.params, True)
 
 

@@ -128,7 +128,7 @@ class _Progress:
             return
         self.last = time.monotonic()
         rest = verification.shares()["open"]
-        seconds = verification.seconds * rest / (1.0 - rest) if rest < 1.0 else None
+        seconds = verification.seconds * rest / (1.0 - rest) if rest < 0.9999 else None
         left = "" if seconds is None else f", about {seconds:.0f} s left"
         print(f"{_line(verification)}{left}", flush=True)
 

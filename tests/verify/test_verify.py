@@ -16,16 +16,18 @@ import pytest
 from default_cases import thorough
 
 import jaxsafe
+from jaxsafe import Environment
 from jaxsafe.commands.verify import EXIT_CODES, main
 from jaxsafe.rollout import RecurrentPolicy
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.cwh import cwh_flow
 from jaxsafe.simulation.oriented import wrapped
+from jaxsafe.simulation.trig import arctan, sin_cos
 from jaxsafe.verify import check, forms
 from jaxsafe.verify.certificate import load_certificate, save_certificate
 from jaxsafe.verify.forms import Domain, bound
-from jaxsafe.verify.loop import closed_loop, start_of
-from jaxsafe.verify.program import ELEMENTARY, FUNCTIONS, RULED, trace
+from jaxsafe.verify.loop import closed_loop, parts, start_of
+from jaxsafe.verify.program import ANGULAR, ELEMENTARY, FUNCTIONS, MAX_ANGLE, RULED, trace
 from jaxsafe.verify.tube import between, tube
 from jaxsafe.verify.verify import Boxes, Verification, _Search, verify
 
@@ -39,6 +41,18 @@ NEAR = {"position": [[1.0, 1.1], [-0.05, 0.05]], "velocity": [-0.005, 0.005]}
 """Starts beside the docking region, at rest."""
 
 SMALL_BOX = {"position": [[80, 92], [80, 86]], "velocity": [[-0.125, 0.03125], [0.0, 0.0625]]}
+BEHIND = {
+    "position": [[-1010, -990], [140, 160]],
+    "heading": [-0.26, -0.24],
+    "speed": [300, 310],
+    "lead.position": [0, 0],
+    "lead.heading": [-0.01, 0.0],
+    "lead.speed": [280, 281],
+}
+"""Starts of a wingman behind its lead."""
+
+WINGMAN_GAINS = 0.2 * np.random.default_rng(0).normal(size=(2, 12))
+
 GAINS = np.array([[-0.3, 0.1, -0.9, 0.0, 0.1, 0.0], [0.0, -0.4, 0.1, -0.8, 0.0, -0.1]])
 
 
@@ -147,6 +161,29 @@ def test_no_point_is_outside_of_its_bounds(name: str, width: float) -> None:
                 assert (bounds.radius <= 6.0 * spread + 1e-8).all()
 
 
+@pytest.mark.parametrize("name", ["sin", "cos", "atan", *JUMPING])
+@pytest.mark.parametrize("num", [2_000, thorough(250_000)])
+def test_no_point_is_outside_of_the_bounds_of_a_wide_set(name: str, num: int) -> None:
+    with jax.enable_x64(True):
+        program = trace(COMPOSED[name], 4, 0.0)
+        for key in range(10, 14):
+            states = domain(key, 4, 0.4)
+            y = points(states, num)
+            values = np.asarray(jax.vmap(COMPOSED[name])(y))
+            bounds = jax.tree.map(lambda x: np.asarray(x[0]), bound(program, states))
+            linear = np.asarray(y) @ bounds.slope.T + bounds.centre
+            assert np.isfinite(bounds.radius).all()
+            assert (np.abs(values - linear) <= bounds.radius).all()
+            assert ((values >= bounds.low) & (values <= bounds.high)).all()
+
+
+def test_a_quotient_that_may_be_no_number_has_no_bound() -> None:
+    with jax.enable_x64(True):
+        program = trace(lambda y: jnp.clip(y[:2] / (y[2:] - 1.2), 0.0, 1.0), 4, 0.0)
+        bounds = bound(program, domain(10, 4, 0.4))
+    assert np.isnan(bounds.radius).any()
+
+
 @pytest.mark.thorough
 def test_single_precision_is_inside_of_its_bounds_too() -> None:
     for name, function in COMPOSED.items():
@@ -171,6 +208,22 @@ def test_elementary_functions_are_as_exact_as_the_proofs_take_them_to_be(name: s
     exact = getattr(np, name)(x.astype(np.float64))
     error = np.abs(np.asarray(jax.jit(getattr(jnp, name))(x)) - exact)
     assert (error <= 0.5 * ELEMENTARY * 2.0**-24 * np.abs(exact) + 2.0**-60).all()
+
+
+@pytest.mark.parametrize(("name", "function"), [("sin_cos", sin_cos), ("arctan", arctan)])
+def test_angular_functions_are_as_exact_as_the_proofs_take_them_to_be(
+    name: str, function: Any
+) -> None:
+    x = np.random.default_rng(0).uniform(-1.0, 1.0, 1_000_000)
+    x = np.concatenate([4.0 * x, MAX_ANGLE * x, np.exp(40.0 * x[:100_000] - 20.0)])
+    x = x[np.abs(x) <= MAX_ANGLE].astype(np.float32)
+    found = np.atleast_2d(np.asarray(jax.jit(function)(x), np.float64))
+    exact = x.astype(np.float64)
+    exact = np.stack([np.sin(exact), np.cos(exact)] if name == "sin_cos" else [np.arctan(exact)])
+    assert (np.abs(found - exact) <= 0.9 * ANGULAR * 2.0**-24).all()
+    small = np.abs(x) <= 1.0
+    error = np.abs(found - exact)[:, small]
+    assert (error <= 0.5 * ELEMENTARY * 2.0**-24 * np.abs(exact[:, small]) + 2.0**-60).all()
 
 
 @pytest.mark.thorough
@@ -204,35 +257,48 @@ def proof() -> Verification:
 
 @pytest.mark.thorough
 def test_thousands_of_flights_stay_inside_of_a_tube(proof: Verification) -> None:
-    env = jaxsafe.make("docking2d")
+    require_inside(jaxsafe.make("docking2d"), braking, proof)
+
+
+def require_inside(env: Environment, policy: Any, proof: Verification) -> None:
+    """Fly from thousands of starts in the first boxes of a proof, and check all bounds."""
     assert proof.result == "proved"
+    low, high = proof.proved.low[:2], proof.proved.high[:2]
     with jax.enable_x64(True):
-        low, high = proof.proved.low[:2], proof.proved.high[:2]
-        found = jax.device_get(tube(proof.loop, 6, jnp.asarray(low), jnp.asarray(high)))
+        found = jax.device_get(tube(proof.loop, proof.steps, *map(jnp.asarray, (low, high))))
+    names = [item.name for item in env.constraints]
 
     def fly(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         state, timestep = jaxsafe.reset_to(env, start_of(env, x))
 
         def states(state: Any, timestep: Any) -> jax.Array:
-            own = state.sim.platforms["deputy"]
-            return jnp.concatenate(
-                [own.position, own.velocity, braking(None, timestep.observation)]
-            )
+            moving = [getattr(state.sim.platforms[part.platform], part.field) for part in own]
+            action = jnp.clip(policy(None, timestep.observation), -1.0, 1.0)
+            return jnp.concatenate([*map(jnp.atleast_1d, moving), action])
 
-        rows, margins = [states(state, timestep)], [timestep.info.margins["velocity_limit"]]
-        for _ in range(6):
-            state, timestep = jaxsafe.step(env, state, braking(None, timestep.observation))
+        rows, margins = [states(state, timestep)], [timestep.info.margins[names[0]]]
+        for _ in range(proof.steps):
+            state, timestep = jaxsafe.step(env, state, policy(None, timestep.observation))
             rows.append(states(state, timestep))
-            margins.append(timestep.info.margins["velocity_limit"])
+            margins.append(timestep.info.margins[names[0]])
         return jnp.stack(rows), jnp.stack(margins)
 
-    share = np.random.default_rng(0).choice([0.0, 1.0, 0.3], (2, 3000, 4))
-    starts = low[:, None] + share * (high - low)[:, None]
-    starts = np.clip(starts.astype(np.float32), low[:, None], high[:, None])
+    own = parts(env)
+    share = np.random.default_rng(0).choice([0.0, 1.0, 0.3], (len(low), 3000, low.shape[1]))
+    starts = (low[:, None] + share * (high - low)[:, None]).astype(np.float32)
+    # Only starts in single precision that are in the box.
+    within = ((starts >= low[:, None]) & (starts <= high[:, None])).all(-1)
+    assert within.mean() > 0.1
     ways, margins = jax.jit(jax.vmap(jax.vmap(fly)))(starts)
-    assert (np.asarray(ways) >= found.low[:, None]).all()
-    assert (np.asarray(ways) <= found.high[:, None]).all()
-    assert (np.asarray(margins) >= found.margin[:, None]).all()
+    for row, kept in enumerate(within):
+        assert (np.asarray(ways)[row, kept] >= found.low[row]).all()
+        assert (np.asarray(ways)[row, kept] <= found.high[row]).all()
+        assert (np.asarray(margins)[row, kept] >= found.margin[row]).all()
+
+
+@pytest.mark.thorough
+def test_thousands_of_flights_of_a_wingman_stay_inside_of_a_tube(separation: Verification) -> None:
+    require_inside(jaxsafe.make("rejoin2d"), flown_aircraft, separation)
 
 
 def run_check(*paths: Path) -> subprocess.CompletedProcess:
@@ -256,11 +322,13 @@ def lost_box(arrays: dict[str, np.ndarray]) -> None:
 
 
 def moved_bound(arrays: dict[str, np.ndarray]) -> None:
-    arrays["proved/high"] = arrays["proved/high"] - [0.5, 0, 0, 0]
+    high = arrays["proved/high"]
+    arrays["proved/high"] = high - 0.5 * np.eye(high.shape[1])[0]
 
 
 def larger_box(arrays: dict[str, np.ndarray]) -> None:
-    arrays["box/high"] = arrays["box/high"] + [0, 0, 0, 1e-9]
+    high = arrays["box/high"]
+    arrays["box/high"] = high + 1e-9 * np.eye(high.shape[1])[3]
 
 
 def smaller_radius(arrays: dict[str, np.ndarray]) -> None:
@@ -274,7 +342,8 @@ def wrong_slope(arrays: dict[str, np.ndarray]) -> None:
 
 def other_network(arrays: dict[str, np.ndarray]) -> None:
     for name, array in arrays.items():
-        if name.startswith("following/") and name.endswith("value") and array.shape == (2, 6):
+        gains = array.ndim == 2 and len(array) == 2 and not np.isin(array, (-1.0, 0.0, 1.0)).all()
+        if name.startswith("following/") and name.endswith("value") and gains:
             arrays[name] = array * 1.001
 
 
@@ -316,6 +385,41 @@ def test_a_certificate_that_says_too_much_is_refused(
     change: Callable[[dict[str, np.ndarray]], None], proof: Verification, tmp_path: Path
 ) -> None:
     require_refused(change, proof, tmp_path)
+
+
+def flown_aircraft(key: Any, observation: Any) -> Any:
+    """Return a smooth action of a wingman that turns to the lead and follows its speed."""
+    return jnp.tanh(observation @ WINGMAN_GAINS.T - 0.2)
+
+
+@pytest.fixture(scope="module")
+def separation() -> Verification:
+    return verify(jaxsafe.make("rejoin2d"), flown_aircraft, BEHIND, steps=3)
+
+
+def test_a_proof_about_aircraft_is_checked_and_read_again(
+    separation: Verification, tmp_path: Path
+) -> None:
+    assert separation.result == "proved"
+    save_certificate(tmp_path / "proof.npz", separation, {})
+    read = load_certificate(tmp_path / "proof.npz")
+    assert read.loop.columns == separation.loop.columns
+    assert read.loop.plant == separation.loop.plant
+    checked = run_check(tmp_path / "proof.npz")
+    assert checked.returncode == 0, checked.stderr
+
+
+def motion_of_the_state(arrays: dict[str, np.ndarray]) -> None:
+    header = json.loads(str(arrays["header"]))
+    header["motion"] = 0
+    arrays["header"] = np.array(json.dumps(header))
+
+
+@pytest.mark.parametrize("change", [*CHANGES, motion_of_the_state])
+def test_a_certificate_about_aircraft_that_says_too_much_is_refused(
+    change: Callable[[dict[str, np.ndarray]], None], separation: Verification, tmp_path: Path
+) -> None:
+    require_refused(change, separation, tmp_path)
 
 
 def require_refused(
@@ -594,6 +698,65 @@ def test_nothing_dips_below_the_bound_between_two_samples() -> None:
         drops, allowed = jax.device_get(jax.jit(jax.vmap(drop))(keys))
     assert (drops <= allowed).all()
     assert (drops > 0.5 * allowed).any()  # the bound is not far from what happens
+
+
+def dips(task: str, num: int) -> tuple[np.ndarray, np.ndarray]:
+    """Fly random steps, and return by how much h falls within them, and what the bound allows."""
+    env = jaxsafe.make(task)
+    plant = env.agent_platform
+    aircraft = task == "rejoin2d"
+    bound = closed_loop(env, flown_aircraft if aircraft else drifting).plant
+    low, high = (jnp.stack([getattr(a, end) for a in env.actuators]) for end in ("low", "high"))
+
+    def drop(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        share = jax.random.uniform(key, (10,))
+        control = jnp.where(share[8] > 0.5, jnp.round(share[:2]), share[:2])
+        controls = dict(zip(env.action_names, low + (high - low) * control, strict=True))
+        times = jnp.linspace(0.0, 1.0, 65)
+        middle = {"speed": 200.0 + 200.0 * share[2], "heading": 6.0 * share[3] - 3.0}
+        if aircraft:
+            lead = 200.0 + 200.0 * share[4]
+            own = plant.rest().replace(**middle)
+            way = jax.vmap(lambda t: plant.step(own, controls, t))(times)
+            place = 1000.0 * (share[5:7] - 0.5) * jnp.where(share[9] > 0.5, 1.0, 0.2)
+            position = way.position - place - jnp.stack([lead * times, 0.0 * times], -1)
+            velocity = way.velocity - jnp.stack([lead, 0.0])
+            h = jnp.linalg.norm(position, axis=-1)
+        else:
+            own = plant.rest().replace(
+                position=jnp.where(share[9] > 0.5, 100.0, 1.0) * (share[2:4] - 0.5),
+                velocity=0.6 * (share[4:6] - 0.5),
+                attitude=6.0 * share[6] - 3.0,
+                attitude_rate=0.08 * (share[7] - 0.5),
+            )
+            way = jax.vmap(lambda t: plant.step(own, controls, t))(times)
+            position, velocity = way.position, way.velocity
+            speed = jnp.linalg.norm(velocity, axis=-1)
+            h = bound.slope * jnp.linalg.norm(position, axis=-1) - speed
+        distance = jnp.linalg.norm(position, axis=-1)
+        ends = jnp.array([0, -1])
+        allowed = between(
+            bound,
+            speed=jnp.linalg.norm(velocity, axis=-1)[ends].max(),
+            distance=distance[ends].max(),
+            nearest=distance[ends].max(),
+        )
+        return h[ends].min() - h.min(), allowed
+
+    with jax.enable_x64(True):
+        keys = jax.random.split(jax.random.key(0), num)
+        return jax.device_get(jax.jit(jax.vmap(drop))(keys))
+
+
+@pytest.mark.parametrize(
+    ("task", "share"), [("rejoin2d", 0.5), thorough("docking2d_oriented", 0.04)]
+)
+def test_nothing_dips_below_the_bound_between_two_samples_of_craft_that_turn(
+    task: str, share: float
+) -> None:
+    drops, allowed = dips(task, 20_000)
+    assert (drops <= allowed).all()
+    assert (drops > share * allowed).any()
 
 
 @pytest.mark.thorough
