@@ -1,4 +1,4 @@
-"""Prove that a policy keeps the speed limit, or docks, from every start in a box.
+"""Prove that a policy keeps its safety constraint, or docks, from every start in a box.
 
 The proof is about the closed loop that `jaxsafe.step` runs, between samples too, and with its
 rounding. The exit code is 0 if the property is proved, 1 if a start violates it, and 3 if it is
@@ -43,7 +43,7 @@ class Options(SingleOptions):
     }
 
     property: Literal["safe", "docks"] = "safe"
-    """What is proved. safe means that the margin of the speed limit is never negative.
+    """What is proved. safe means that the margin h is never negative.
 
     docks means that the episode ends with a success within `steps`, and keeps the limit until then.
     """
