@@ -398,7 +398,11 @@ def reset_batch(
 
 
 def draw_starts(
-    env: Environment, key: Key, indices: Int[Array, " n"], axis: Literal[0, -1] = 0
+    env: Environment,
+    key: Key,
+    indices: Int[Array, " n"],
+    axis: Literal[0, -1] = 0,
+    start: Callable[[Environment, Key], tuple[State, TimeStep]] = reset,
 ) -> tuple[State, TimeStep]:
     """Draw the starts of some environments of a batch, each from a key of its own.
 
@@ -407,12 +411,13 @@ def draw_starts(
         key: a typed PRNG key of the batch.
         indices: the indices of the environments.
         axis: the axis of the environments in all leaves, the first or the last.
+        start: what draws a start, as `reset` does.
 
     Returns:
         What `reset` returns, for each environment.
     """
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, indices)
-    return jax.vmap(reset, in_axes=(None, 0), out_axes=axis)(env, keys)
+    return jax.vmap(start, in_axes=(None, 0), out_axes=axis)(env, keys)
 
 
 def step_or_reset_batch(

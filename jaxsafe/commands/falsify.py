@@ -23,6 +23,7 @@ from jaxsafe.config.arguments import MAX_COUNT
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.evaluate.adversaries import ADVERSARIES
 from jaxsafe.evaluate.bounded_worlds import world_at
+from jaxsafe.evaluate.edge_starts import STARTS
 from jaxsafe.evaluate.run_adversaries import SEARCH, attack, longest_episode
 from jaxsafe.schema.component import Range
 from jaxsafe.schema.errors import ConfigError
@@ -44,7 +45,7 @@ class Options(TaskOptions):
 
     groups: ClassVar = {
         "The filter and its environment.": ("env", "env.PATH", "actions", "variant", "rta"),
-        "The attack.": ("policies", "levels", "num_envs", "steps", "seed", "out"),
+        "The attack.": ("policies", "starts", "levels", "num_envs", "steps", "seed", "out"),
     }
 
     env: Annotated[str, Option(first=True, examples=("env=docking3d",))]
@@ -63,6 +64,12 @@ class Options(TaskOptions):
     """
     policies: Annotated[tuple[str, ...], Option(kind="policy", names=POLICIES)] | None = None
     """The adversaries, with commas between them. By default all of them act in turn."""
+    starts: Annotated[str, Option(names=tuple(STARTS))] = "task"
+    """Where episodes begin. `task` are the starts of the task.
+
+    `edges` are starts at the edge of what the filter certifies: as close to the other platform, as
+    far away, as slow or as fast as it allows.
+    """
     levels: (
         Annotated[tuple[float, ...], Range(0.0, high=1e6), Option(takes="numbers from 0 to 1e6")]
         | None
@@ -142,6 +149,7 @@ def main(argv: Sequence[str]) -> int:
         "variant": options.variant,
         "actions": options.actions,
         "seed": options.seed,
+        "starts": options.starts,
     }
     length = (
         min(longest_episode(env), max(1, MOST_STEPS // options.num_envs))
@@ -153,7 +161,14 @@ def main(argv: Sequence[str]) -> int:
         of_level: list[dict[str, Any]] = []
         for name in options.policies or POLICIES:
             world = env if level is None else world_at(env, level, searched=name == SEARCH)
-            row = attack(world, name, length, options.num_envs, jax.random.key(options.seed))
+            row = attack(
+                world,
+                name,
+                length,
+                options.num_envs,
+                jax.random.key(options.seed),
+                starts=options.starts,
+            )
             of_level.append(row if level is None else {"level": level, **row})
             if len(of_level) == 1:
                 print(HEADING if level is None else f"{level:g} times the bound\n{HEADING}")

@@ -82,7 +82,7 @@ def intercept(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     The agent is taken to keep its speed, and the other platform its velocity.
     """
     own = sim.platforms[env.agent]
-    other = _target(env, sim)
+    other = other_platform(env, sim)
     ahead = other.position - own.position
     speed = jnp.maximum(safe_norm(own.velocity), 1e-3)
     time = safe_norm(ahead) / speed
@@ -97,7 +97,7 @@ def head_on(env: Environment, sim: Sim, key: Key) -> Float[Array, " m"]:
     The agent turns back once it is 1500 ft or m ahead.
     """
     own = sim.platforms[env.agent]
-    other = _target(env, sim)
+    other = other_platform(env, sim)
     course = other.velocity / jnp.maximum(safe_norm(other.velocity), 1e-3)
     ahead = jnp.sum((own.position - other.position) * course)
     aim = jnp.where(ahead > 1500.0, 0.0, 2500.0) * course + other.position
@@ -159,18 +159,19 @@ ADVERSARIES: dict[str, Adversary] = {
 """All adversaries by name."""
 
 
+def other_platform(env: Environment, sim: Sim) -> Any:
+    """Return the state of the first platform that is not the agent."""
+    others = [platform.name for platform in env.platforms if platform.name != env.agent]
+    return sim.platforms[others[0]]
+
+
 def _random_bounds(env: Environment, key: Key) -> Float[Array, " m"]:
     low, high = bounds(env)
     return jnp.where(jax.random.bernoulli(key, shape=low.shape), low, high)
 
 
-def _target(env: Environment, sim: Sim) -> Any:
-    others = [platform.name for platform in env.platforms if platform.name != env.agent]
-    return sim.platforms[others[0]]
-
-
 def _to_target(env: Environment, sim: Sim) -> Float[Array, " d"]:
-    return _target(env, sim).position - sim.platforms[env.agent].position
+    return other_platform(env, sim).position - sim.platforms[env.agent].position
 
 
 def _towards(env: Environment, sim: Sim, aim: Float[Array, " d"], key: Key) -> Float[Array, " m"]:

@@ -24,7 +24,8 @@ from jaxsafe.autoreset import renew
 from jaxsafe.config.arguments import MAX_COUNT
 from jaxsafe.environment import Environment, drawn, step
 from jaxsafe.evaluate.adversaries import ADVERSARIES
-from jaxsafe.rollout import draw_starts, reset_batch
+from jaxsafe.evaluate.edge_starts import STARTS, unsafe
+from jaxsafe.rollout import draw_starts
 from jaxsafe.schema.dotted_paths import set_path
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.controllers import Continuous
@@ -37,7 +38,7 @@ from jaxsafe.transition import (
     undirected,
     with_memory,
 )
-from jaxsafe.types import Key, Number, Sim, State, TimeStep
+from jaxsafe.types import Key, Number, Sim, State
 from jaxsafe.uncertain import arriving, disturbed
 
 INSTANTS_PER_STEP = 8
@@ -61,7 +62,14 @@ SEARCH_ELITE = 8
 SEARCH_ROUNDS = 8
 """Number of rounds of the search from each start."""
 
-_EVENTS = ("violating", "violating_inside", "intervening", "uncertified", "infeasible")
+_EVENTS = (
+    "violating",
+    "violating_inside",
+    "violating_certified",
+    "intervening",
+    "uncertified",
+    "infeasible",
+)
 _SUMMED = (*_EVENTS, "steps", "begun", "ended", "correction", "unsafe_starts")
 _LOWEST = ("lowest", "lowest_inside")
 
@@ -69,7 +77,9 @@ Counts = dict[str, Float[Array, " n"]]
 """Sums over the steps and lowest margins, for each environment of a batch."""
 
 
-def attack(env: Environment, name: str, num_steps: int, num_envs: int, key: Key) -> dict[str, Any]:
+def attack(
+    env: Environment, name: str, num_steps: int, num_envs: int, key: Key, starts: str = "task"
+) -> dict[str, Any]:
     """Let one adversary act and return what was counted.
 
     Args:
@@ -83,25 +93,31 @@ def attack(env: Environment, name: str, num_steps: int, num_envs: int, key: Key)
             The search divides all steps into its sequences.
         num_envs: the number of environments that run side by side.
         key: a typed PRNG key.
+        starts: where episodes begin, one of `edge_starts.STARTS`.
 
     Returns:
         Plain numbers: steps, episodes, violations, worst margins, interventions, mean correction
-        and unsafe starts. Only episodes that ended count. But if some environment has no such
-        episode, each environment counts as one unfinished episode instead. If nothing was violated,
-        the share of episodes with a violation is below `violation_bound` with 95 % confidence, by
-        the rule of three. The bound is None after a violation. It is also None for the search,
-        whose episodes do not depend on chance alone.
+        and unsafe starts. `violating_certified_steps` are those after which a constraint is
+        violated, at the sample or inside, although the filter has certified them.
+
+        Only episodes that ended count. But if some environment has no such episode, each
+        environment counts as one unfinished episode instead. If nothing was violated, the share of
+        episodes with a violation is below `violation_bound` with 95 % confidence, by the rule of
+        three. The bound is None after a violation. It is also None for the search, whose episodes
+        do not depend on chance alone.
     """
     physical = _with_physical_actions(env)
     if name == SEARCH:
         steps_per_sequence = SEARCH_CONTROLS * SEARCH_HOLD_STEPS
         sequences_per_start = SEARCH_POPULATION * SEARCH_ROUNDS
-        starts = max(1, round(num_steps * num_envs / (steps_per_sequence * sequences_per_start)))
-        counts = _search(physical, starts, key)
-        episodes = starts * sequences_per_start
+        num_starts = max(
+            1, round(num_steps * num_envs / (steps_per_sequence * sequences_per_start))
+        )
+        counts = _search(physical, num_starts, starts, key)
+        episodes = num_starts * sequences_per_start
         whole = False
     else:
-        counts = _follow(physical, name, num_steps, num_envs, key)
+        counts = _follow(physical, name, num_steps, num_envs, starts, key)
         ended = int(np.sum(counts["ended"]))
         whole = bool(np.all(counts["ended"] > 0))
         episodes = ended if whole else num_envs
@@ -115,6 +131,7 @@ def attack(env: Environment, name: str, num_steps: int, num_envs: int, key: Key)
         "episodes": episodes,
         "violating_steps": int(total["violating"]),
         "violating_steps_inside": int(total["violating_inside"]),
+        "violating_certified_steps": int(total["violating_certified"]),
         "worst_margin": _finite_or_none(values["lowest"].min()),
         "worst_margin_inside": _finite_or_none(values["lowest_inside"].min()),
         "intervention_rate": float(total["intervening"] / steps),
@@ -143,9 +160,11 @@ def longest_episode(env: Environment) -> int:
     return int(min(float(steps), MAX_COUNT))  # single precision may give ∞
 
 
-@functools.partial(jax.jit, static_argnums=(1, 2, 3))
-def _follow(env: Environment, name: str, num_steps: int, num_envs: int, key: Key) -> Counts:
-    """Run an adversary from the task's own starts. A new episode begins where one ends."""
+@functools.partial(jax.jit, static_argnums=(1, 2, 3, 4))
+def _follow(
+    env: Environment, name: str, num_steps: int, num_envs: int, starts: str, key: Key
+) -> Counts:
+    """Run an adversary. A new episode begins where one ends."""
     adversary = ADVERSARIES[name]
 
     def act(state: State, key: Key) -> Float[Array, " m"]:
@@ -153,20 +172,22 @@ def _follow(env: Environment, name: str, num_steps: int, num_envs: int, key: Key
 
     @jax.jit
     def draw(parameters: tuple[Environment, Key], indices: Array) -> tuple[State, Array]:
-        state, first = draw_starts(*parameters, indices)
-        return state, _unsafe(first)
+        state, first = draw_starts(*parameters, indices, start=STARTS[starts])
+        return state, unsafe(first)
 
     def one_step(
         carry: tuple[State, Array, Counts], keys: tuple[Key, Key]
     ) -> tuple[tuple[State, Array, Counts], None]:
         state, begun, counts = carry
         key_start, key_act = keys
-        state, unsafe = renew(begun, draw, (env, key_start), (state, jnp.zeros(num_envs, bool)))
+        state, unsafe_starts = renew(
+            begun, draw, (env, key_start), (state, jnp.zeros(num_envs, bool))
+        )
         controls = jax.vmap(act)(state, jax.random.split(key_act, num_envs))
         state, ended, step_counts = _step(env, state, controls)
         step_counts |= {
             "begun": begun.astype(jnp.float32),
-            "unsafe_starts": unsafe.astype(jnp.float32),
+            "unsafe_starts": unsafe_starts.astype(jnp.float32),
         }
         return (state, ended, _add(counts, step_counts)), None
 
@@ -188,8 +209,8 @@ def _blank(key: Key, leaf: jax.ShapeDtypeStruct) -> Array:
     return jnp.zeros(leaf.shape, leaf.dtype)
 
 
-@functools.partial(jax.jit, static_argnums=1)
-def _search(env: Environment, num_starts: int, key: Key) -> Counts:
+@functools.partial(jax.jit, static_argnums=(1, 2))
+def _search(env: Environment, num_starts: int, starts: str, key: Key) -> Counts:
     """Search by the cross-entropy method from one start after another.
 
     Steps after the end of an episode are not counted.
@@ -246,7 +267,8 @@ def _search(env: Environment, num_starts: int, key: Key) -> Counts:
 
     def search_from_start(key: Key) -> Counts:
         key_start, key_search = jax.random.split(key)
-        state, first = jax.tree.map(lambda leaf: leaf[0], reset_batch(env, key_start, 1))
+        state, first = draw_starts(env, key_start, jnp.arange(1), start=STARTS[starts])
+        state, first = jax.tree.map(lambda leaf: leaf[0], (state, first))
         shape = (SEARCH_CONTROLS, low.shape[0] + sum(sizes))
         begin = (jnp.zeros(shape), jnp.full(shape, 2.0))
         keys = jax.random.split(key_search, SEARCH_ROUNDS)
@@ -256,7 +278,7 @@ def _search(env: Environment, num_starts: int, key: Key) -> Counts:
             for name, value in counts.items()
         }
         begun = float(SEARCH_POPULATION * SEARCH_ROUNDS)
-        return counts | {"begun": begun, "unsafe_starts": _unsafe(first) * begun}
+        return counts | {"begun": begun, "unsafe_starts": unsafe(first) * begun}
 
     return jax.lax.map(search_from_start, jax.random.split(key, num_starts))
 
@@ -294,10 +316,14 @@ def _step(
     finite = jax.vmap(_finite)(after)
     lowest = jnp.where(jnp.isnan(lowest), -jnp.inf, lowest)
     inside = jnp.where(jnp.isnan(inside), -jnp.inf, inside)
+    violating = ~(lowest >= 0.0) | ~finite
+    violating_inside = ~(inside >= 0.0) | ~finite
+    certified = jnp.zeros_like(finite) if info.rta is None else info.rta.certified
     values = {
         "steps": zero + 1.0,
-        "violating": ~(lowest >= 0.0) | ~finite,
-        "violating_inside": ~(inside >= 0.0) | ~finite,
+        "violating": violating,
+        "violating_inside": violating_inside,
+        "violating_certified": (violating | violating_inside) & certified,
         "ended": timestep.done,
         "intervening": info.intervening,
         "correction": zero if info.rta is None else info.rta.correction,
@@ -385,17 +411,6 @@ def _add(counts: Counts, more: Counts) -> Counts:
         name: jnp.minimum(value, more[name]) if name in _LOWEST else value + more[name]
         for name, value in counts.items()
     }
-
-
-def _unsafe(first: TimeStep) -> Array:
-    """Return which starts are outside the safe set.
-
-    With a filter these are the starts that it does not certify, and otherwise those that violate a
-    constraint.
-    """
-    if first.info.rta is not None:
-        return ~first.info.rta.certified
-    return ~(jnp.min(jnp.stack(list(first.info.margins.values())), axis=0) >= 0.0)
 
 
 def _with_physical_actions(env: Environment) -> Environment:
