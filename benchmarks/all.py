@@ -44,7 +44,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "controllers": (),
     "possible": (),
     "datasets": (),
-    "robustness": ("episodes=100", "tasks=docking3d"),
+    "robustness": ("episodes=100",),
     "uncertain_training": (),
     "constraints": (),
     "verification": (),

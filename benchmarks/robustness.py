@@ -1,14 +1,14 @@
 """Measure what a bound on the uncertainty costs, and what the world does to a filter without one.
 
-The filter `robust` has the bound `BOUND`. A world at some level has uncertainty of that level times
-the bound (`jaxsafe.evaluate.bounded_worlds.world_at`). The policies that come with the package fly
-in these worlds, and so does an adversary that pushes towards the chief. They fly without a filter,
-with the `default` filter, which has no bound, and with `robust`.
+The filter `robust` has the bound of the task in `BOUNDS`. A world at some level has uncertainty of
+that level times the bound (`jaxsafe.evaluate.bounded_worlds.world_at`). The policies that come with
+the package fly in these worlds, and so does an adversary of `ADVERSARIES`. They fly without a
+filter, with the `default` filter, which has no bound, and with `robust`.
 
 Results are written to `benchmarks/results/robustness.json`, the figure to
 `docs/figures_robust.png`, and the table of docs/safety/attacks.md is printed:
 
-    python benchmarks/robustness.py [episodes=200] [levels=0,0.5,1] [tasks=docking2d,docking3d]
+    python benchmarks/robustness.py [episodes=200] [levels=0,0.5,1] [tasks=docking3d,rejoin2d]
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from isolated import words
+from isolated import several, words
 from machine import about
 from matplotlib.figure import Figure
 from tables import robustness
@@ -45,8 +45,27 @@ LOOKS: dict[str, dict[str, Any]] = {
 }
 """Look of the line of each filter. Lines on top of each other stay visible."""
 
-BOUND = {"process": 0.01, "mass": 0.05, "misalignment": 0.05, "position": 1.0, "velocity": 0.01}
-"""A push of 1 cm/s a step, 5 % of the mass, 3° of the thrust, and errors of 1 m and 1 cm/s."""
+_DOCKING = {"process": 0.01, "mass": 0.05, "misalignment": 0.05, "position": 1.0, "velocity": 0.01}
+BOUNDS: dict[str, dict[str, float]] = {
+    "docking2d": _DOCKING,
+    "docking3d": _DOCKING,
+    "rejoin2d": {"process": 1.0, "position": 5.0},
+    "rejoin3d": {"process": 0.3},
+}
+"""The bound of each task.
+
+In docking it allows for a push of 1 cm/s a step, 5 % of the mass, 3° of the thrust, and errors of
+1 m and 1 cm/s. In rejoin it allows for pushes of 1 or 0.3 ft/s², and in the plane for errors of
+5 ft.
+"""
+
+ADVERSARIES = {
+    "docking2d": "inward",
+    "docking3d": "inward",
+    "rejoin2d": "intercept",
+    "rejoin3d": "intercept",
+}
+"""The adversary of each task. It flies towards the chief, or to where it can meet the lead."""
 
 ATTACK_STEPS = 400
 """Number of steps of the adversary in each episode."""
@@ -61,9 +80,9 @@ def world(task: str, rta: str, level: float) -> Environment:
     Args:
         task: the task.
         rta: the filter, one of `FILTERS`.
-        level: the uncertainty, as a multiple of `BOUND`.
+        level: the uncertainty, as a multiple of the bound in `BOUNDS`.
     """
-    robust = world_at(jaxsafe.make(task, {"rta.bound": BOUND}, rta="robust"), level)
+    robust = world_at(jaxsafe.make(task, {"rta.bound": BOUNDS[task]}, rta="robust"), level)
     if rta == "robust":
         return robust
     if rta == "none":
@@ -74,13 +93,23 @@ def world(task: str, rta: str, level: float) -> Environment:
     return override(robust, {"rta": nominal.rta, **model})
 
 
-def chatter(env: Environment, policy: Any, episodes: int) -> float:
-    """Return the mean change of a control from step to step, as a share of its range."""
+def chatter(env: Environment, policy: Any, episodes: int) -> dict[str, float]:
+    """Return how much the controls, and the filter, change from step to step.
+
+    Returns:
+        The mean change of a control as a share of its range, and the share of the steps at which
+        the filter begins or ceases to intervene.
+    """
     low, high = bounds(env)
     steps = jaxsafe.rollout(env, policy, jax.random.key(1), CHATTER_STEPS, num_envs=episodes)
-    control = steps.info.control_actual
-    change = jnp.mean(jnp.abs(control[1:] - control[:-1]) / (high - low), axis=-1)
-    return float(jnp.sum(jnp.where(steps.done[:-1], 0.0, change)) / jnp.sum(~steps.done[:-1]))
+    info = steps.info
+    change = jnp.abs(info.control_actual[1:] - info.control_actual[:-1]) / (high - low)
+    switched = info.intervening[1:] != info.intervening[:-1]
+    within = ~steps.done[:-1]  # both steps belong to one episode
+    return {
+        "chatter": float(jnp.mean(jnp.mean(change, axis=-1), where=within)),
+        "switches": float(jnp.mean(switched, where=within)),
+    }
 
 
 def measure(task: str, rta: str, level: float, episodes: int) -> dict[str, Any]:
@@ -91,6 +120,7 @@ def measure(task: str, rta: str, level: float, episodes: int) -> dict[str, Any]:
     names = (
         "success_rate",
         "control_usage",
+        "control_effort",
         "episode_length",
         "safety_violation_rate",
         "episode_safety_violation_rate",
@@ -98,9 +128,11 @@ def measure(task: str, rta: str, level: float, episodes: int) -> dict[str, Any]:
         "intervention_rate",
     )
     row = {"task": task, "rta": rta, "level": level, "episodes": episodes}
-    row |= {name: metrics[name] for name in names} | {"chatter": chatter(env, policy, episodes)}
-    pushed = attack(env, "inward", ATTACK_STEPS, episodes, jax.random.key(2))
+    row |= {name: metrics[name] for name in names} | chatter(env, policy, episodes)
+    pushed = attack(env, ADVERSARIES[task], ATTACK_STEPS, episodes, jax.random.key(2))
+    row["adversary"] = pushed["policy"]
     row["attacked"] = pushed["violating_steps"] / pushed["steps"]
+    row["attacked_certified"] = pushed["violating_certified_steps"] / pushed["steps"]
     row["attacked_worst_margin"] = pushed["worst_margin_inside"]
     print(json.dumps(row), flush=True)
     return row
@@ -108,14 +140,14 @@ def measure(task: str, rta: str, level: float, episodes: int) -> dict[str, Any]:
 
 @styled
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draw violations, success and control usage against the level, in a row of panels per task."""
+    """Draw violations, success and control effort against the level, in a row per task."""
     tasks = list(dict.fromkeys(row["task"] for row in rows))
     figure = Figure(figsize=(9.6, 2.9 * len(tasks)), layout="constrained")
     panels = np.atleast_2d(figure.subplots(len(tasks), 3))
     quantities = {
         "attacked": ("violating steps under attack [%]", 100.0),
         "success_rate": ("success rate [%]", 100.0),
-        "control_usage": ("control usage Δv [m/s]", 1.0),
+        "control_effort": ("share of full control [%]", 100.0),
     }
     for task, line in zip(tasks, panels, strict=True):
         for (name, (label, unit)), panel in zip(quantities.items(), line, strict=True):
@@ -134,17 +166,17 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
 
 def main() -> None:
     """Run the command."""
-    options = words(episodes="200", levels="0,0.5,1,1.5,2", tasks="docking2d,docking3d")
+    options = words(episodes="200", levels="0,0.5,1,1.5,2", tasks=",".join(BOUNDS))
     episodes = int(options["episodes"])
     rows = [
         measure(task, rta, level, episodes)
-        for task in options["tasks"].split(",")
+        for task in several("tasks", options["tasks"], BOUNDS)
         for rta in FILTERS
         for level in map(float, options["levels"].split(","))
     ]
     results = {
         "command": f"python benchmarks/robustness.py {' '.join(sys.argv[1:])}".strip(),
-        "bound": BOUND,
+        "bounds": BOUNDS,
         **about(__file__),
         "rows": rows,
     }

@@ -23,14 +23,11 @@ from pathlib import Path
 from typing import Any
 
 from isolated import several, words
-from robustness import BOUND
+from robustness import BOUNDS
 
 OUT = Path(__file__).parent / "results" / "uncertain_training.json"
-BOUNDS: dict[str, dict[str, float]] = {
-    "docking3d": BOUND,
-    "rejoin2d": {"process": 1.0, "position": 5.0},
-}
-"""The bound of each task. That of rejoin2d allows pushes of 1 ft/s² and errors of 5 ft."""
+TASKS = ("docking3d", "rejoin2d")
+"""The tasks that are trained."""
 
 WAYS = ("perfect", "uncertain", "robust")
 """Where a policy was trained.
@@ -100,8 +97,8 @@ def measure(task: str, place: Path, seeds: int, episodes: int) -> list[dict[str,
 
 def main() -> None:
     """Run the command."""
-    options = words(tasks=",".join(BOUNDS), seeds="10", episodes="1000", out="")
-    tasks = several("tasks", options["tasks"], BOUNDS)
+    options = words(tasks=",".join(TASKS), seeds="10", episodes="1000", out="")
+    tasks = several("tasks", options["tasks"], TASKS)
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(options["out"] or temporary).resolve()
         place.mkdir(parents=True, exist_ok=True)
