@@ -31,6 +31,12 @@ LARGEST_LATERAL = 4.0
 LARGEST_ASTRAY = 5.43
 """Largest difference of the relative velocity from the one aimed at, in units of `tolerance`."""
 
+LARGEST_PULL = 5.5
+"""Largest speed away from the lead that is aimed at in the set, in units of `tolerance`."""
+
+LONGEST_AWAY_TIME = 25.0
+"""Largest `away_time` [s] of `match_velocity` for which Proposition 15 is proved."""
+
 CLOSE = 1.001
 """Numbers of this ratio count as equal in a proof, because every proof has more reserve."""
 
@@ -114,8 +120,15 @@ def formation_faults(
         "rta.bound is larger than tolerance of velocity_matched allows": ~(
             (needed <= CLOSE * tolerance) & (bound.position < 0.5 * lowest)
         ),
-        "rta.bound: clearance of match_velocity is too small for tolerance of velocity_matched": ~(
-            jnp.min(gain * missing) * CLOSE >= astray
+        (
+            "rta.bound: clearance of match_velocity is too small or too large"
+            " for tolerance of velocity_matched"
+        ): ~(
+            (jnp.min(gain * missing) * CLOSE >= astray)
+            & (jnp.max(gain * missing) <= CLOSE * LARGEST_PULL * tolerance)
+        ),
+        "rta.bound in space is proved for an away_time of at most 25 s": ~(
+            jnp.min(gain) * CLOSE >= 1.0 / LONGEST_AWAY_TIME
         ),
         "rta.bound: clearance of velocity_matched is below that of match_velocity": ~(
             terminal.clearance * CLOSE >= jnp.max(outer)
@@ -124,7 +137,7 @@ def formation_faults(
             (state.speed - relative_speed >= slowest) & (state.speed + relative_speed <= fastest)
         ),
         "rta.bound: tolerance of velocity_matched is too large for the speed of the aircraft": ~(
-            relative_speed <= 0.042 * state.speed
+            relative_speed <= 0.033 * state.speed
         ),
         f"rta.bound: {name!r} climbs or dives too steeply": ~(
             jnp.abs(state.flight_path_angle) + 1.1 * relative_speed / slowest <= steep

@@ -355,6 +355,17 @@ def test_a_bound_that_is_not_proved_is_refused(overrides: dict[str, Any], messag
         jaxsafe.make("rejoin2d", overrides, rta="robust")
 
 
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("delay", "process"), [(1, 1.6), (2, 0.86), (3, 0.49), (4, 0.29), (5, 0.18), (6, 0.11)]
+)
+def test_the_largest_push_with_a_delay_is_what_the_page_says(delay: int, process: float) -> None:
+    numbers = {"rta.bound.process": process, "rta.bound.delay": delay}
+    assert jaxsafe.make("rejoin2d", numbers, rta="robust").rta is not None
+    with pytest.raises(ConfigError, match=r"rta\.bound is larger than velocity_matched is proved"):
+        jaxsafe.make("rejoin2d", numbers | {"rta.bound.process": 1.1 * process}, rta="robust")
+
+
 def test_a_certificate_with_a_bound_is_not_renewed() -> None:
     env = jaxsafe.make("rejoin2d", rta="robust")
     state, timestep = jaxsafe.reset(env, jax.random.key(0))

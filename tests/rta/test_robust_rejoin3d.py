@@ -254,6 +254,15 @@ def test_a_start_of_the_task_is_certified_within_the_bound() -> None:
                 ({"rta.bound.misalignment": 0.1}, "rta.bound.misalignment is not proved for"),
                 ({"rta.bound.delay": 1}, "rta.bound.delay is not proved for aircraft in space"),
                 ({"rta.backups.left_up.clearance": 190}, "rta.bound: clearance of match_velocity"),
+                ({"rta.backups.left_up.clearance": 210}, "rta.bound: clearance of match_velocity"),
+                (
+                    {
+                        "rta.backups.left_up.away_time": 26,
+                        "rta.backups.left_up.clearance": 209,
+                        "rta.terminal.clearance": 209,
+                    },
+                    "rta.bound in space is proved for an away_time of at most 25 s",
+                ),
                 ({"rta.backups.left_up.dead_zone": 0.01}, "rta.bound: dead_zone of match_veloc"),
                 ({"rta.terminal.clearance": 190}, "rta.bound: clearance of velocity_matched is"),
                 (
