@@ -30,6 +30,7 @@ from jaxsafe.processors.status import DeltaV, Distance, InRegion, Speed, Status,
 from jaxsafe.processors.terminal import Crashed, Docked, Terminal, Timeout, TooFar
 from jaxsafe.rta.asif import DiscreteASIF, ExplicitASIF, ImplicitASIF, Polynomial
 from jaxsafe.rta.backups import AlignAndBrake, AlignedOrSlow, Brake, Slow
+from jaxsafe.rta.backups_with_memory import Rehearsed
 from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.simplex import Simplex
 from jaxsafe.schema.ties import Tie, Ties
@@ -303,6 +304,13 @@ TURN: dict[str, Any] = {
 }
 """Filters of the oriented spacecraft, which must turn before it can brake."""
 
+ROBUST_TURN: dict[str, Any] = TURN | {
+    "backups": (Rehearsed(name="rehearsed", backup=TURN["backups"][0]),),
+    "terminal": AlignedOrSlow(angle=math.radians(75.0), speed=0.125),
+    "bound": UncertaintyBound(process=1e-4),  # [m/s²]
+}
+"""The same within an uncertainty bound. What is slow suffices for the largest one allowed."""
+
 _ALPHA = Polynomial(linear=0.05, cubic=0.1)
 """Strengthening function of the filters from the literature, Eq. (3)."""
 
@@ -329,6 +337,7 @@ FILTERS: Filters = {
 
 FILTERS_ORIENTED: Filters = {
     "default": lambda: Simplex(**TURN),
+    "robust": lambda: Simplex(**ROBUST_TURN),
     "implicit_simplex": lambda: Simplex(**TURN),
     "implicit_asif": lambda: ImplicitASIF(**TURN),
     "explicit_asif": lambda: _explicit_asif(TURN["backups"][0]),

@@ -14,7 +14,7 @@ from jaxsafe.rta.backups import (
     Slow,
     VelocityMatched,
 )
-from jaxsafe.rta.backups_with_memory import HoldPosition, Latched
+from jaxsafe.rta.backups_with_memory import HoldPosition, Latched, Rehearsed
 from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.cascade import Cascade, Stage
 from jaxsafe.rta.certificate import BackupController, TerminalSet
@@ -45,6 +45,7 @@ __all__ = [
     "Plant",
     "Polynomial",
     "RTAMemory",
+    "Rehearsed",
     "Simplex",
     "Slow",
     "Stage",

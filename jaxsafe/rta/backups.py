@@ -26,7 +26,7 @@ from jaxsafe.rta.proofs import (
     slow_faults,
     velocity_matched_faults,
 )
-from jaxsafe.rta.speed_limit import speed_limit_facts
+from jaxsafe.rta.speed_limit import distance_and_speed, speed_limit_facts
 from jaxsafe.rta.tube import Tube, after_step, largest_turn, measured
 from jaxsafe.rta.tube_in_space import (
     TURN_GAIN,
@@ -46,6 +46,9 @@ from jaxsafe.types import ConstraintName, Length, Number, PlatformName, Positive
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
+
+SLOW_SHARE = 0.7
+"""Share of the speed limit up to which any angle of the thrust axis leaves time to turn."""
 
 LOST = 1e6
 """Radius [ft] of a tube that nothing is known about."""
@@ -142,6 +145,22 @@ class AlignAndBrake(BackupController, type="align_and_brake"):
     def duration(self, env: Environment) -> Number:
         """Return 12 s: a reversal of the spin and the turn out of the angles beyond 75°."""
         return 12.0 + jnp.zeros_like(env.dt)
+
+    def keeps_from(self, env: Environment, sim: Sim) -> Bool[Array, ""]:
+        """Return whether Proposition 8 holds from a state.
+
+        h must be at least what the controller holds. The axis must be within `steep` of the
+        velocity, or the speed well below the limit.
+        """
+        facts = speed_limit_facts(env, self.constraint)
+        if facts is None:
+            return jnp.zeros((), bool)
+        distance, speed = distance_and_speed(env, sim)
+        limit = facts.limit(distance)
+        aligned = jnp.abs(misalignment(sim.platforms[env.agent])) <= self.steep
+        return (speed <= limit - 2.0 * self.least_kept(env)) & (
+            aligned | (speed <= SLOW_SHARE * limit)
+        )
 
     def least_kept(self, env: Environment) -> Number:
         """Return `margin`, or more if the speed limit needs more near the chief [m/s]."""

@@ -1,17 +1,20 @@
-"""Backup controllers with memory: one that finishes what it began, and one that holds a place."""
+"""Backup controllers with memory: they finish what they began, rehearse it, or hold a place."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxsafe.rta.backups import AlignAndBrake
 from jaxsafe.rta.certificate import BackupController, Faults
 from jaxsafe.rta.certified import CertifiedRTA
+from jaxsafe.rta.proofs import STEPS_TO_ALIGN, rehearsed_faults
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.cwh import Spacecraft
-from jaxsafe.transition import Others, bounds
+from jaxsafe.transition import Others, advance, bounds
 from jaxsafe.types import Number, Positive, Record, Seconds, Sim
 
 if TYPE_CHECKING:
@@ -57,6 +60,50 @@ class Latched(BackupController, type="latched"):
 
     def duration(self, env: Environment) -> Number:
         return self.backup.duration(env)
+
+
+class Rehearsed(BackupController, type="rehearsed"):
+    """Another backup controller that flies as it would without disturbances and errors.
+
+    It remembers the state that the agent would have then, and gives the controls of that state. So
+    the true way leaves the remembered one by no more than disturbances and errors add up to. The
+    other controller never decides otherwise on the true way, where a small difference may be enough
+    to turn the other way round. The memory begins anew where the agent is, as soon as the other
+    controller is proved to keep the constraint from there (`keeps_from`).
+
+    It serves for filters with a `bound`.
+    """
+
+    backup: BackupController
+
+    @property
+    def proved(self) -> BackupController:
+        return self.backup.proved
+
+    def init(self, env: Environment, sim: Sim) -> Any:
+        return sim.platforms[env.agent]
+
+    def act(
+        self, env: Environment, sim: Sim, later: Others, memory: Any
+    ) -> tuple[Float[Array, " m"], Any]:
+        own = sim.platforms[env.agent]
+        anew = self.backup.keeps_from(env, sim)
+        start = jax.tree.map(lambda now, then: jnp.where(anew, now, then), own, memory)
+        platforms = {**sim.platforms, env.agent: start}
+        rehearsal = sim.replace(platforms=platforms, regions={}, status={})
+        control = jnp.clip(self.backup.control(env, rehearsal, later), *bounds(env))
+        return control, advance(env, rehearsal, control, later=later).platforms[env.agent]
+
+    def faults(self, env: Environment, sim: Sim, rta: CertifiedRTA) -> Faults:
+        own = rehearsed_faults(env, rta, self.backup, keeper=AlignAndBrake)
+        return own | self.backup.faults(env, sim, rta)
+
+    def duration(self, env: Environment) -> Number:
+        return self.backup.duration(env)
+
+    def most_rehearsed_steps(self, horizon: int) -> int:
+        # A step of the agent's control, a turn along the velocity, and a step of braking.
+        return horizon + int(STEPS_TO_ALIGN) + 2
 
 
 class HoldMemory(Record):

@@ -7,8 +7,9 @@ aircraft, `jaxsafe.rta.tube` has tubes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -97,6 +98,28 @@ class UncertaintyBound(Component):
         errors = self.errors(facts)
         if acceleration is not None:
             errors = self.errors_after(facts, errors, acceleration)
+        slopes = jnp.stack([jnp.abs(limit.slope) for limit in speed_limits])
+        return errors.velocity + jnp.max(slopes) * errors.position
+
+    def lost_by_drifting(
+        self, speed_limits: Sequence[SpeedLimitFacts], num_steps: int
+    ) -> Float[Array, ""]:
+        """Return how far the true h may be below the predicted one after some steps [m/s].
+
+        The true and the predicted way have the same controls, so only the process and the errors of
+        the measured state let them drift apart.
+
+        Args:
+            speed_limits: the facts of the limits. The largest answer counts.
+            num_steps: the number of steps.
+        """
+        facts = speed_limits[0]
+
+        def one_step(_: Any, errors: Errors) -> Errors:
+            return self.errors_after(facts, errors, jnp.zeros_like(facts.dt))
+
+        start = jax.tree.map(lambda error: error + jnp.zeros_like(facts.dt), self.measured)
+        errors = jax.lax.fori_loop(0, num_steps, one_step, start)
         slopes = jnp.stack([jnp.abs(limit.slope) for limit in speed_limits])
         return errors.velocity + jnp.max(slopes) * errors.position
 

@@ -84,6 +84,23 @@ class BackupController(Component):
         """Return the longest time [s] to the terminal set, 0 where that is not known."""
         return jnp.zeros_like(env.dt)
 
+    def keeps_from(self, env: Environment, sim: Sim) -> Bool[Array, ""]:
+        """Return whether it is proved to keep the constraints for ever from a state.
+
+        The proof needs no prediction, and no disturbance. The filter looks at `faults` besides.
+        """
+        return jnp.zeros((), bool)
+
+    def most_rehearsed_steps(self, horizon: int) -> int:
+        """Return the most steps for which it flies by memory, without looking at the agent.
+
+        It is 0 for a controller that always looks at the agent.
+
+        Args:
+            horizon: the horizon of the filter.
+        """
+        return 0
+
     @property
     def has_tubes(self) -> bool:
         """Whether it has tubes. Without them it is not proved with a `bound` and a horizon."""

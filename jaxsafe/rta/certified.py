@@ -28,7 +28,7 @@ from jaxsafe.rta.filter import (
     repeated,
 )
 from jaxsafe.rta.prediction import others_react, repeat
-from jaxsafe.rta.speed_limit import speed_limit_facts
+from jaxsafe.rta.speed_limit import lowered, speed_limit_facts
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.transition import (
@@ -102,8 +102,9 @@ class CertifiedRTA(RTA):
 
     A `bound` says how far the true world may be from the one that the filter predicts with. The
     filter then keeps a larger margin of a speed limit, so that its certificates hold in the true
-    world. With a horizon it predicts a tube that holds all ways of the true world. Such a
-    certificate is true for as long as its backup controller acts, so it is not renewed.
+    world. With a horizon it predicts a tube that holds all ways of the true world, or its backup
+    controllers are `rehearsed`. Such a certificate is true for as long as its backup controller
+    acts, so it is not renewed.
     """
 
     constraints: tuple[ConstraintName, ...]
@@ -200,13 +201,36 @@ class CertifiedRTA(RTA):
         speed_limits = [limit for limit in facts if limit]
         if len(speed_limits) < len(facts) or not self._bound_is_proved:
             return jnp.full_like(env.dt, jnp.inf)
+        if self._rehearsed_steps:
+            return self.bound.lost_by_drifting(speed_limits, self._rehearsed_steps)
         acceleration = None if control is None else safe_norm(control) / speed_limits[0].mass
         return self.bound.lost(speed_limits, acceleration)
 
     @property
     def _bound_is_proved(self) -> bool:
         all_know_bound = all(backup.proved.knows_bound for backup in self.backups)
-        return self.has_tubes or (not self.horizon and all_know_bound)
+        proved_without_horizon = not self.horizon and all_know_bound
+        return self.has_tubes or proved_without_horizon or self._rehearsed_steps > 0
+
+    @property
+    def _rehearsed_steps(self) -> int:
+        """The most steps for which a backup controller flies by memory within a bound, or 0."""
+        if self.bound is None or not self.horizon:
+            return 0
+        return min(backup.most_rehearsed_steps(self.horizon) for backup in self.backups)
+
+    def _within_bound(self, env: Environment) -> Environment:
+        """Return the environment for whose constraints the backup controllers fly.
+
+        A backup controller that flies by memory keeps a limit that is lower by all that the bound
+        may cost meanwhile.
+        """
+        if not self._rehearsed_steps:
+            return env
+        lost = self.lost(env)
+        for name in self.constraints:
+            env = lowered(env, name, lost)
+        return env
 
     @property
     def has_tubes(self) -> bool:
@@ -221,12 +245,13 @@ class CertifiedRTA(RTA):
         faults = {}
         if self.bound is not None and not self._bound_is_proved:
             faults[
-                "rta.bound is proved for brake without a horizon and for match_velocity alone"
+                "rta.bound is proved for brake without a horizon, for match_velocity and rehearsed"
             ] = jnp.ones((), bool)
+        strict = self._within_bound(env)
         if self.terminal:
-            faults |= self.terminal.faults(env, sim, self)
+            faults |= self.terminal.faults(strict, sim, self)
         for backup in self.backups:
-            faults |= backup.faults(env, sim, self)
+            faults |= backup.faults(strict, sim, self)
             if self.horizon:
                 too_short = (
                     f"{self.horizon} steps of the horizon are too short"
@@ -294,8 +319,11 @@ class CertifiedRTA(RTA):
             return control, memory.replace(under_way=under_way), info
         wanted, finite = admissible(env, desired)
         later = others_later(env, sim)
+        memories = memory.backups
+        if self._rehearsed_steps:  # nothing is rehearsed before there is a certificate
+            memories = _where(memory.certified, memories, self._fresh(env, sim))
         backup, moved = self._backup(
-            env, sim, index=memory.backup_index, memories=memory.backups, later=later
+            env, sim, index=memory.backup_index, memories=memories, later=later
         )
         proposal, feasible, *changed_for = self.propose(env, sim, wanted, backup)
         if not self.backups:
@@ -326,11 +354,16 @@ class CertifiedRTA(RTA):
 
         backup_margin = self.lowest(env, sim, after_backup)
         new_certificate = passes | ~certified_before
-        ends = ({}, {}, {})  # nothing is renewed with tubes or without a horizon
+        ends = ({}, {}, {})  # nothing is renewed with a bound or without a horizon
         memories_ahead = paths.memories_ahead
-        if self.has_tubes:
+        if self.horizon and self.bound is not None:
+            still_certified = _finite(after_backup)
+            if self._rehearsed_steps and self.terminal:  # a rehearsal may begin at this state
+                still_certified &= _none(self.terminal.faults(self._within_bound(env), sim, self))
+                for each in self.backups:
+                    still_certified &= _none(each.faults(env, sim, self))
             backup_certified = jnp.where(
-                certified_before, _finite(after_backup), paths.values[best] >= to_back_up
+                certified_before, still_certified, paths.values[best] >= to_back_up
             )
         elif self.horizon:
             backup_certified, end, memories_ahead = self._renew(
@@ -430,7 +463,8 @@ class CertifiedRTA(RTA):
         """
         memories = self._fresh(env, sim) if memories is None else memories
         first = self.margins(env, before, sim)
-        faultless = [_none(backup.faults(env, sim, self)) for backup in self.backups]
+        strict = self._within_bound(env)
+        faultless = [_none(backup.faults(strict, sim, self)) for backup in self.backups]
         proved = jnp.stack(faultless or [jnp.zeros((), bool)]) & _finite(sim)
         if self.terminal is None:
             least = jnp.min(self.compared(env, first))
@@ -454,7 +488,7 @@ class CertifiedRTA(RTA):
         arrived = itertools.chain(*group_arrived)
         reached = jnp.stack([self._may_end(env, *pair) for pair in zip(ends, arrived, strict=True)])
         states = [(end.platforms, end.actuators, end.remembered) for end in ends]
-        if self.has_tubes:  # nothing is renewed
+        if self.bound is not None:  # nothing is renewed
             states = [({}, {}, {})]
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
         ahead, actuators_ahead, remembered_ahead = stacked
@@ -493,6 +527,7 @@ class CertifiedRTA(RTA):
         assert self.terminal is not None
         terminal = self.terminal
         bound = self.bound if self.has_tubes else None
+        strict = self._within_bound(env)
         low, high = bounds(env)
         plant = env.agent_platform
 
@@ -513,7 +548,7 @@ class CertifiedRTA(RTA):
             after = later_sim(env, sim, {**later, env.agent: agents[0][0]})
             for i, (backup, _) in enumerate(backups):
                 before = with_agent(sim, agents[i])
-                control, memories[i] = backup.act(env, before, later, memories[i])
+                control, memories[i] = backup.act(strict, before, later, memories[i])
                 control = jnp.clip(control, low, high)
                 move = plant.step_within_limits if backup.within_limits else plant.step
                 controls, actuators = driven(env, before, control)
@@ -558,8 +593,9 @@ class CertifiedRTA(RTA):
             arrived: whether the tube was in the terminal set on the way. None without tubes.
         """
         assert self.terminal is not None
-        inside = self.terminal.contains(env, end) if arrived is None else arrived
-        return inside & _none(self.terminal.faults(env, end, self)) & _finite(end)
+        strict = self._within_bound(env)
+        inside = self.terminal.contains(strict, end) if arrived is None else arrived
+        return inside & _none(self.terminal.faults(strict, end, self)) & _finite(end)
 
     def _renew(
         self,
@@ -636,8 +672,9 @@ class CertifiedRTA(RTA):
         """
         if not self.backups:
             return jnp.zeros(env.action_size, env.dt.dtype), ()
+        strict = self._within_bound(env)
         acts = [
-            backup.act(env, sim, later, memory)
+            backup.act(strict, sim, later, memory)
             for backup, memory in zip(self.backups, memories, strict=True)
         ]
         controls = jnp.stack([control for control, _ in acts])

@@ -80,11 +80,14 @@ PROVED_WHEEL = math.pi / 180.0
 PROVED_SPIN = math.pi / 90.0
 """Highest turn rate of the body [rad/s]."""
 
-PROVED_THRUST = (2.0 / 12.0) / 0.2
+PROVED_THRUST = (2.0 / 12.0) / 0.17
 """Largest acceleration by thrust, as a share of the speed limit at the chief [1/s]."""
 
-PROVED_MARGIN = 2.5e-4 / 0.2
+PROVED_MARGIN = 2.5e-4 / 0.17
 """Margin that the first step of a certificate must gain, as a share of that speed limit."""
+
+MOST_LOST = 0.03
+"""Largest h [m/s] that a `bound` may cost while `align_and_brake` is rehearsed."""
 
 PLANAR_AWAY_TIME = 10
 """The `away_time` [s] of `match_velocity` for which Proposition 13 is proved."""
@@ -194,6 +197,34 @@ def align_and_brake_faults(
         ),
         "margin is too small for what the limit changes within a step": ~(
             rta.lowest(env, sim, sim) >= facts.needed_margin(distance)
+        ),
+    }
+
+
+def rehearsed_faults(
+    env: Environment, rta: CertifiedRTA, backup: BackupController, keeper: type[BackupController]
+) -> Faults:
+    """Return what is missing for Proposition 16: a limit within a bound on what is not known.
+
+    Args:
+        env: the environment, with the limit that is lower by what the bound may cost.
+        rta: the filter.
+        backup: the backup controller that is rehearsed.
+        keeper: the class of backup controllers for which it is proved.
+    """
+    if type(backup) is not keeper:
+        return {"rehearsed is proved for align_and_brake alone": _true()}
+    bound = rta.bound
+    if bound is None:
+        return {}
+    if bound.delay:
+        return {"rta.bound.delay is not proved for rehearsed": _true()}
+    return {
+        "rta.bound.mass and misalignment are not proved for rehearsed": (
+            (bound.mass > 0.0) | (bound.misalignment > 0.0)
+        ),
+        f"rta.bound costs more than {MOST_LOST:g} m/s of the speed limit": ~(
+            rta.lost(env) <= MOST_LOST
         ),
     }
 

@@ -178,6 +178,25 @@ def speed_limit_facts(env: Environment, name: str) -> SpeedLimitFacts | None:
     )
 
 
+def lowered(env: Environment, name: str, by: Number) -> Environment:
+    """Return the environment with a lower speed limit.
+
+    Args:
+        env: the environment.
+        name: the name of the constraint.
+        by: what is subtracted from the limit [m/s].
+    """
+    limited = constraint(env, name)
+    assert isinstance(limited, SpeedLimit)
+    statuses = tuple(
+        status.replace(floor=status.floor - by)
+        if isinstance(status, VelocityLimit) and status.name == limited.velocity_limit
+        else status
+        for status in env.status
+    )
+    return env.replace(status=statuses)
+
+
 def chief(env: Environment, distance: Distance) -> str | None:
     """Return the name of the anchor that a distance of the agent is measured from, or None."""
     others = {distance.of, distance.to} - {env.agent}

@@ -298,7 +298,7 @@ def a_bound_of_nothing_changes_nothing() -> None:
         ("default", {"process": -1}, r"rta\.bound\.process: expected a number .*≥ 0, found -1"),
         ("default", {"mass": 1}, r"rta\.bound\.mass: expected a number in \[0, 1\), found 1"),
         ("default", {"proces": 1}, r"rta\.bound: unknown field 'proces'.*Did you mean 'process'"),
-        ("implicit_simplex", {}, r"rta\.bound is proved for brake without a horizon and for"),
+        ("implicit_simplex", {}, r"rta\.bound is proved for brake without a horizon, for"),
         ("explicit_asif", {}, r"rta: a bound needs enforce: true"),
     ],
 )
