@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from isolated import several, words
-from machine import about
+from machine import about, with_kept
 from matplotlib.figure import Figure
 from tables import robustness
 
@@ -32,7 +32,7 @@ from jaxsafe.environment import Environment
 from jaxsafe.evaluate.bounded_worlds import world_at
 from jaxsafe.evaluate.run_adversaries import attack
 from jaxsafe.plot.style import BLUE, GREEN, GREY, ORANGE, save, styled
-from jaxsafe.storage.files import write_json
+from jaxsafe.storage.files import read_json, write_json
 from jaxsafe.transition import bounds
 
 OUT = Path(__file__).parent / "results" / "robustness.json"
@@ -49,23 +49,28 @@ _DOCKING = {"process": 0.01, "mass": 0.05, "misalignment": 0.05, "position": 1.0
 BOUNDS: dict[str, dict[str, float]] = {
     "docking2d": _DOCKING,
     "docking3d": _DOCKING,
+    "docking2d_oriented": {"process": 1e-4},
     "rejoin2d": {"process": 1.0, "position": 5.0},
     "rejoin3d": {"process": 0.3},
 }
 """The bound of each task.
 
 In docking it allows for a push of 1 cm/s a step, 5 % of the mass, 3° of the thrust, and errors of
-1 m and 1 cm/s. In rejoin it allows for pushes of 1 or 0.3 ft/s², and in the plane for errors of
-5 ft.
+1 m and 1 cm/s. In oriented docking it allows for a push of 0.1 mm/s a step. In rejoin it allows for
+pushes of 1 or 0.3 ft/s², and in the plane for errors of 5 ft.
 """
 
 ADVERSARIES = {
     "docking2d": "inward",
     "docking3d": "inward",
+    "docking2d_oriented": "greedy",
     "rejoin2d": "intercept",
     "rejoin3d": "intercept",
 }
-"""The adversary of each task. It flies towards the chief, or to where it can meet the lead."""
+"""The adversary of each task.
+
+It flies towards the chief, or to where it can meet the lead. In oriented docking it lowers h.
+"""
 
 ATTACK_STEPS = 400
 """Number of steps of the adversary in each episode."""
@@ -180,8 +185,10 @@ def main() -> None:
         **about(__file__),
         "rows": rows,
     }
-    write_json(OUT, results)
-    draw(rows, FIGURE)
+    kept = with_kept(OUT, results, same=["task", "rta", "level"])
+    write_json(OUT, kept | {"bounds": BOUNDS})
+    results = read_json(OUT)
+    draw(results["rows"], FIGURE)
     print(robustness(results))
 
 
