@@ -287,10 +287,11 @@ def require_inside(env: Environment, policy: Any, proof: Verification) -> None:
     share = np.random.default_rng(0).choice([0.0, 1.0, 0.3], (len(low), 3000, low.shape[1]))
     starts = (low[:, None] + share * (high - low)[:, None]).astype(np.float32)
     # Only starts in single precision that are in the box.
-    within = ((starts >= low[:, None]) & (starts <= high[:, None])).all(-1)
+    within = np.all((starts >= low[:, None]) & (starts <= high[:, None]), axis=-1)
     assert within.mean() > 0.1
     ways, margins = jax.jit(jax.vmap(jax.vmap(fly)))(starts)
-    for row, kept in enumerate(within):
+    for row in range(len(low)):
+        kept = within[row]
         assert (np.asarray(ways)[row, kept] >= found.low[row]).all()
         assert (np.asarray(ways)[row, kept] <= found.high[row]).all()
         assert (np.asarray(margins)[row, kept] >= found.margin[row]).all()
