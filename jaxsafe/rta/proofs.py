@@ -223,7 +223,7 @@ def rehearsed_faults(
         "rta.bound.mass and misalignment are not proved for rehearsed": (
             (bound.mass > 0.0) | (bound.misalignment > 0.0)
         ),
-        f"rta.bound costs more than {MOST_LOST:g} m/s of the speed limit": ~(
+        f"bound costs more than {MOST_LOST:g} m/s of the speed limit": ~(
             rta.lost(env) <= MOST_LOST
         ),
     }

@@ -89,7 +89,7 @@ def test_without_a_bound_such_pushes_break_certified_steps() -> None:
 @pytest.mark.parametrize(
     ("bound", "message"),
     [
-        ({"process": 3e-4}, r"rta\.bound costs more than 0\.03 m/s of the speed limit"),
+        ({"process": 3e-4}, r"rta: bound costs more than 0\.03 m/s of the speed limit"),
         ({"mass": 0.01}, r"rta\.bound\.mass and misalignment are not proved for rehearsed"),
         ({"delay": 1}, r"rta\.bound\.delay is not proved for rehearsed"),
     ],
