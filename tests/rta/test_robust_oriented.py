@@ -46,6 +46,10 @@ def flown(env: Any, key: jax.Array, num_steps: int) -> Any:
     return jax.lax.scan(one_step, state, jax.random.split(key, num_steps))[1]
 
 
+slow = partial(pytest.param, marks=pytest.mark.slow)
+"""A case that takes minutes."""
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize(
     "bound", [{"process": LARGEST}, thorough({"process": 1e-4, "position": 1.0, "velocity": 4e-3})]
@@ -66,9 +70,8 @@ def test_the_true_way_stays_as_near_to_the_rehearsal_as_the_bound_says(
     assert np.all(timestep.info.margins["velocity_limit"][certified] >= 0.0)
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("starts", ["task", "edges"])
-@pytest.mark.parametrize("policy", ["greedy", "inward", "search"])
+@pytest.mark.parametrize("policy", [thorough("greedy"), slow("inward"), slow("search")])
 def test_no_adversary_breaks_the_limit_within_the_bound(policy: str, starts: str) -> None:
     world = world_at(robust(process=LARGEST), 1.0, searched=policy == "search")
     counts = attack(world, policy, 1000, 32, jax.random.key(1), starts=starts)
@@ -76,7 +79,7 @@ def test_no_adversary_breaks_the_limit_within_the_bound(policy: str, starts: str
     assert starts == "task" or counts["violating_steps_inside"] == 0
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_without_a_bound_such_pushes_break_certified_steps() -> None:
     world = world_at(robust(process=LARGEST), 1.0)
     nominal = jaxsafe.config.override(
