@@ -33,8 +33,8 @@ from jaxsafe.storage.files import write_bytes
 MAX_PROGRAMS = 64
 """Number of programs that are kept. The one that was used longest ago goes first."""
 
-INSTALLED = ("site-packages", "dist-packages")
-"""Names of the directories in which packages are installed."""
+INSTALLED = tuple(f"{os.sep}{name}{os.sep}" for name in ("site-packages", "dist-packages"))
+"""Parts of the paths of installed packages."""
 
 REQUEST = "/jax/compilation_cache/compile_requests_use_cache"
 """The event with which JAX tells that it looks for a program in its cache."""
@@ -49,6 +49,9 @@ LAPACK = "lapack_"
 """How the names of LAPACK's functions begin."""
 
 PACKAGE = Path(__file__).resolve().parent.parent
+
+OWN = os.path.join(PACKAGE, "")
+"""How the paths of jaxsafe's own modules begin. Those of its neighbours, `jaxsafe_mine`, do not."""
 
 
 def program_file(made_from: str, arguments: Any) -> Path | None:
@@ -153,7 +156,7 @@ def only_installed_code() -> bool:
     if not hasattr(sys.modules["__main__"], "__file__"):
         return False
     names = ("stdlib", "platstdlib", "scripts")
-    places = (str(PACKAGE), *(sysconfig.get_path(name) for name in names))
+    places = (OWN, *(os.path.join(sysconfig.get_path(name), "") for name in names))
     return all(
         path.startswith(places) or any(name in path for name in INSTALLED)
         for path in _loaded_files()
@@ -182,7 +185,7 @@ def _surroundings() -> str:
     for path in sorted(PACKAGE.rglob("*.py")):
         digest.update(f"{path.relative_to(PACKAGE)}\n".encode() + path.read_bytes())
     for path in _loaded_files():
-        if not path.startswith(str(PACKAGE)):
+        if not path.startswith(OWN):
             stat = os.stat(path)
             digest.update(f"{path} {stat.st_size} {stat.st_mtime_ns}\n".encode())
     facts = (

@@ -108,11 +108,12 @@ def test_a_module_of_the_user_keeps_programs_from_being_stored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     own = ModuleType("my_parts")
-    own.__file__ = str(tmp_path / "my_parts.py")
     monkeypatch.setattr(sys, "modules", {"__main__": sys.modules["jaxsafe"], "numpy": np})
     assert only_installed_code()
     monkeypatch.setitem(sys.modules, "my_parts", own)
-    assert not only_installed_code()
+    for place in (tmp_path / "my_parts.py", PACKAGE.with_name("jaxsafe_mine.py")):
+        own.__file__ = str(place)
+        assert not only_installed_code()
     monkeypatch.setattr(sys, "modules", {"__main__": ModuleType("__main__")})
     assert not only_installed_code()
 
