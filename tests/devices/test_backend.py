@@ -117,13 +117,19 @@ def test_llvm_keeps_its_expensive_passes_for_an_accelerator(
     assert ("disable_expensive_passes" in os.environ["XLA_FLAGS"]) == disabled
 
 
-def test_a_cached_program_loads_without_a_word_even_if_jax_came_first(tmp_path: Path) -> None:
+@pytest.mark.parametrize("started", ["by itself", "by a process that imported jax first"])
+def test_a_cached_program_loads_without_a_word_even_if_jax_came_first(
+    started: str, tmp_path: Path
+) -> None:
     code = (
         "import jax, jaxsafe\n"
         "from jaxsafe.devices.compilation_cache import enable_compilation_cache\n"
         "enable_compilation_cache()\n"
         "print(jax.jit(lambda x: x + 1)(2))"
     )
+    if started != "by itself":
+        command = [sys.executable, "-c", code.replace("import jax, jaxsafe", "import jaxsafe, jax")]
+        code = f"import jax, jaxsafe, subprocess\nsubprocess.run({command}, check=True)"
     kept = {"JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL"}
     own = {name: value for name, value in os.environ.items() if name not in kept}
     for _ in range(2):
