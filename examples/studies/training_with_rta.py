@@ -8,24 +8,26 @@ seeds of a way are then tested without a filter and with the one that they were 
     python examples/studies/training_with_rta.py tasks=docking2d,docking3d seeds=10
 
 Runs are kept in `runs`, and what is complete is not done again. The results are written to
-`out`/training_with_rta.json.
+`out`/training_with_rta.json, and drawn in `out`/training_with_rta.png.
 """
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+from dot_chart import Dot, dot, dot_chart
+
 import jaxsafe
 from jaxsafe.commands import cli
 from jaxsafe.commands.options import CommandOptions, Count, Directory, Option
 from jaxsafe.metrics import stratified_iqm
+from jaxsafe.plot.style import BLUE, ORANGE
 from jaxsafe.processors.reward import VelocityConstraint
 from jaxsafe.storage import provenance
-from jaxsafe.storage.files import write_json, write_text
+from jaxsafe.storage.files import read_json, write_json, write_text
 
 TASKS = ("docking2d", "docking3d")
 FILTERS = ("explicit_simplex", "implicit_simplex", "explicit_asif", "implicit_asif")
@@ -47,6 +49,14 @@ KEPT = (
     "intervention_rate",
 )
 """Metrics of the tests that are kept, each with the value of every seed."""
+
+SHOWN = {
+    "success_rate": ("success [%]", 100.0),
+    "episode_safety_violation_rate": ("violating steps [%]", 100.0),
+    "control_effort": ("share of full control [%]", 100.0),
+    "episode_length": ("length [s]", 1.0),
+}
+"""The label and the unit of each metric of the figure."""
 
 
 class Way(NamedTuple):
@@ -139,8 +149,7 @@ def test(task: str, way: Way, rta: str, options: Options) -> dict[str, Any]:
         words = (f"episodes={options.episodes}", "deterministic=true", f"out={out}")
         # All ways are tested in the task itself, without the terms that were added for training.
         call("evaluate", f"run={run}", f"env={task}", f"rta={rta}", *words)
-    results = json.loads((out / "results.json").read_text(encoding="utf-8"))
-    metrics = results["evaluation"]["deterministic"]
+    metrics = read_json(out / "results.json")["evaluation"]["deterministic"]
     return {name: metrics[name] for name in KEPT if name in metrics}
 
 
@@ -151,8 +160,7 @@ def row(task: str, way: Way, options: Options) -> dict[str, Any]:
         "without": test(task, way, "none", options),
         "with": test(task, way, tested, options),
     }
-    path = Path(options.runs) / task / way.name / "results.json"
-    training = json.loads(path.read_text(encoding="utf-8"))
+    training = read_json(Path(options.runs) / task / way.name / "results.json")
     return {
         "task": task,
         "filter": way.filter,
@@ -168,6 +176,35 @@ def row(task: str, way: Way, options: Options) -> dict[str, Any]:
     }
 
 
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Draw what the policies of each way do, with and without their filter.
+
+    Args:
+        rows: the rows of the results.
+        path: the file of the figure.
+    """
+    found = {(row["task"], Way(row["filter"], row["treatment"])): row for row in rows}
+    ways = [way for way in WAYS if any(way == known for _, known in found)]
+    looks = {}
+    panels: dict[str, dict[str, Any]] = {label: {} for label, _ in SHOWN.values()}
+    for task, colour in zip(TASKS, (BLUE, ORANGE), strict=True):
+        of_task = [found.get((task, way)) for way in ways]
+        for tested, filled in (("with", colour), ("without", "white")):
+            name = f"{task}, tested {tested} a filter"
+            looks[name] = {"color": colour, "markerfacecolor": filled}
+            for metric, (label, unit) in SHOWN.items():
+                panels[label][name] = [row and _dot(row, metric, tested, unit) for row in of_task]
+    first = [line for line, way in enumerate(ways) if line and way.filter != ways[line - 1].filter]
+    dot_chart(path, [f"{way.filter}: {way.treatment}" for way in ways], panels, looks, first)
+
+
+def _dot(row: dict[str, Any], metric: str, tested: str, unit: float) -> Dot:
+    """Return a metric of a row. It is the mean over the seeds, and the IQM of the successes."""
+    if metric == "success_rate":
+        return dot(row["success_iqm"][tested], unit)
+    return dot(row["tests"][tested][metric], unit)
+
+
 def main(argv: list[str]) -> int:
     """Run the study and return the exit code."""
     options = Options.parse(argv)
@@ -177,8 +214,10 @@ def main(argv: list[str]) -> int:
         for way in WAYS
         if way.filter in options.filters
     ]
+    out = Path(options.out)
+    draw(rows, out / "training_with_rta.png")
     write_json(
-        Path(options.out) / "training_with_rta.json",
+        out / "training_with_rta.json",
         {
             "command": f"{Options.program} {' '.join(argv)}".rstrip(),
             "seeds": options.seeds,

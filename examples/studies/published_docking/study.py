@@ -9,7 +9,7 @@ from random starts, and from the ten test points of the study.
     python study.py seeds=5 steps=20000000
 
 Runs are kept in `runs`, and what is complete is not done again. The results are written to
-`out`/published_docking.json.
+`out`/published_docking.json, and drawn in `out`/published_docking.png.
 """
 
 from __future__ import annotations
@@ -22,15 +22,21 @@ from typing import Annotated, Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import jaxsafe
 from jaxsafe.commands import cli
 from jaxsafe.commands.options import CommandOptions, Count, Directory, Option
+from jaxsafe.metrics import over_seeds
+from jaxsafe.plot.style import BLUE, GREEN
 from jaxsafe.runs import Run
 from jaxsafe.storage import provenance
 from jaxsafe.storage.files import read_json, write_json
 
 HERE = Path(__file__).resolve().parent
+sys.path.append(str(HERE.parent))
+from dot_chart import dot, dot_chart  # noqa: E402
+
 TASK = HERE / "published_docking.yaml"
 
 BRAKING = "constraints: [velocity_limit], margin: 0.00025, backups: [{type: brake, name: brake}]"
@@ -79,6 +85,14 @@ KEPT = (
     "episode_violation_severity_max",
     "intervention_rate",
 )
+
+SHOWN = {
+    "success_rate": ("docked [%]", 100.0),
+    "episode_safety_violation_rate": ("violating steps [%]", 100.0),
+    "episode_length": ("length [s]", 1.0),
+    "control_usage_l1": ("Δv [m/s]", 1.0),
+}
+"""The label and the unit of each metric that is drawn."""
 
 
 class Options(CommandOptions):
@@ -156,17 +170,17 @@ def test_points(run: Run, filtered: bool) -> dict[str, Any]:
         def flight(env: Any, position: jax.Array, velocity: jax.Array) -> dict[str, jax.Array]:
             start = {"deputy": {"position": position, "velocity": velocity}}
             state, timestep = jaxsafe.reset_to(env, start)
-            nothing = {"steps": 0, "violating": 0, "fuel": 0.0, "outcome": 0, "ended": False}
+            nothing = {"steps": 0, "violating": 0, "delta_v": 0.0, "outcome": 0, "ended": False}
 
             def one_step(carry: Any, _: None) -> tuple[Any, None]:
                 state, timestep, seen = carry
                 state, timestep = jaxsafe.step(env, state, policy(key, timestep.observation))
                 flying = ~seen["ended"]
-                used = mass * timestep.info.status["delta_v"]
+                used = timestep.info.status["delta_v"]
                 seen = {
                     "steps": seen["steps"] + flying,
                     "violating": seen["violating"] + (flying & (timestep.cost > 0.0)),
-                    "fuel": seen["fuel"] + jnp.where(flying, used, 0.0),
+                    "delta_v": seen["delta_v"] + jnp.where(flying, used, 0.0),
                     "outcome": jnp.where(flying, timestep.info.outcome, seen["outcome"]),
                     "ended": seen["ended"] | timestep.terminated | timestep.truncated,
                 }
@@ -183,8 +197,23 @@ def test_points(run: Run, filtered: bool) -> dict[str, Any]:
         "success": [env.succeeded(one["outcome"]).tolist() for one in found],
         "violating_steps": [one["violating"].tolist() for one in found],
         "steps": [one["steps"].tolist() for one in found],
-        "fuel": [one["fuel"].tolist() for one in found],
+        "delta_v": [one["delta_v"].tolist() for one in found],
     }
+
+
+def over_points(points: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the metrics of the flights from the test points, with a value for each seed."""
+    success, violating, steps, delta_v = (
+        np.asarray(points[name], float)
+        for name in ("success", "violating_steps", "steps", "delta_v")
+    )
+    per_seed = {
+        "success_rate": success.mean(axis=1),
+        "episode_safety_violation_rate": (violating / steps).mean(axis=1),
+        "episode_length": steps.mean(axis=1),
+        "control_usage_l1": delta_v.mean(axis=1),
+    }
+    return {name: over_seeds(values.tolist()) for name, values in per_seed.items()}
 
 
 def row(name: str, options: Options) -> dict[str, Any]:
@@ -192,6 +221,7 @@ def row(name: str, options: Options) -> dict[str, Any]:
     path = train(name, options)
     run = jaxsafe.open_run(path)
     filtered = {"without": False} | ({"with": True} if name in FILTERS else {})
+    points = {key: test_points(run, value) for key, value in filtered.items()}
     return {
         "configuration": name,
         "steps": run.results["steps"],
@@ -199,8 +229,36 @@ def row(name: str, options: Options) -> dict[str, Any]:
         "steps_to_80": run.results["interaction_efficiency"],
         "training_cost": run.results["training_cost"],
         "tests": {key: test(path, value, options) for key, value in filtered.items()},
-        "points": {key: test_points(run, value) for key, value in filtered.items()},
+        "test_points": {key: over_points(found) for key, found in points.items()},
+        "each_point": points,
     }
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Draw what the policies of each configuration do, with and without their filter.
+
+    Args:
+        rows: the rows of the results.
+        path: the file of the figure.
+    """
+    looks = {
+        "tested with the filter": {"color": BLUE},
+        "tested without a filter": {"color": BLUE, "markerfacecolor": "white"},
+        "from the ten test points, with the filter": {"color": GREEN, "marker": "s"},
+        "from the ten test points, without a filter": {
+            "color": GREEN,
+            "marker": "s",
+            "markerfacecolor": "white",
+        },
+    }
+    panels: dict[str, dict[str, Any]] = {label: {} for label, _ in SHOWN.values()}
+    series = [(source, key) for source in ("tests", "test_points") for key in ("with", "without")]
+    for name, (source, key) in zip(looks, series, strict=True):
+        for metric, (label, unit) in SHOWN.items():
+            panels[label][name] = [
+                dot(row[source][key][metric], unit) if key in row[source] else None for row in rows
+            ]
+    dot_chart(path, [row["configuration"] for row in rows], panels, looks)
 
 
 def main(argv: list[str]) -> int:
@@ -215,6 +273,7 @@ def main(argv: list[str]) -> int:
         "versions": provenance.versions(),
         "rows": [row(name, options) for name in options.configurations],
     }
+    draw(results["rows"], Path(options.out) / "published_docking.png")
     write_json(Path(options.out) / "published_docking.json", results)
     return 0
 
