@@ -60,8 +60,8 @@ HIGHER_PENALTY = (
     "env.reward.near_rest.value=-0.00375",
 )
 CONFIGURATIONS: Mapping[str, tuple[str, ...]] = {
-    "none": ("env.reward.near_rest.value=0",),
-    "none, higher penalty": HIGHER_PENALTY,
+    "no filter": ("env.reward.near_rest.value=0",),
+    "no filter and a higher penalty": HIGHER_PENALTY,
     **FILTERS,
 }
 """The options of each training. The task as written has the penalties of the filters."""
@@ -125,7 +125,7 @@ def call(command: str, *words: str) -> None:
 
 def train(name: str, options: Options) -> Path:
     """Train all seeds of a configuration, and return the run directory."""
-    run = (Path(options.runs) / name.replace(", ", "_").replace(" ", "_")).resolve()
+    run = (Path(options.runs) / name.replace(" ", "_")).resolve()
     if (run / "results.json").exists():
         return run
     if (run / "config.yaml").exists():
