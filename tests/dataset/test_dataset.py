@@ -141,6 +141,24 @@ def test_minari_reads_every_episode(
         main(words)
 
 
+@pytest.mark.peer
+@pytest.mark.slow
+@pytest.mark.filterwarnings("default")
+def test_a_learner_of_another_library_docks(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pytest.importorskip("d3rlpy")
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
+    import d3rlpy_docking2d as example  # pyright: ignore[reportMissingImports]
+
+    path = tmp_path / "expert.npz"
+    assert main(["run=pretrained/docking2d", "steps=50_000", f"out={path}"]) == 0
+    policy = example.as_policy(example.learn(load_dataset(path)[0]))
+    results = jaxsafe.evaluate(jaxsafe.make("docking2d"), policy, episodes=100)
+    assert results["success_rate"] >= 0.9
+    assert results["episode_cost"] <= 1.0
+
+
 def test_without_minari_nothing_is_collected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "minari", None)
     with pytest.raises(ConfigError, match="format: minari is not installed; pip install"):
