@@ -159,7 +159,8 @@ def main(argv: Sequence[str]) -> int:
     rows: list[dict[str, Any]] = []
     for level in options.levels or (None,):
         of_level: list[dict[str, Any]] = []
-        for name in options.policies or POLICIES:
+        names = tuple(options.policies or POLICIES)
+        for name in names:
             world = env if level is None else world_at(env, level, searched=name == SEARCH)
             row = attack(
                 world,
@@ -168,6 +169,7 @@ def main(argv: Sequence[str]) -> int:
                 options.num_envs,
                 jax.random.key(options.seed),
                 starts=options.starts,
+                among=names,
             )
             of_level.append(row if level is None else {"level": level, **row})
             if len(of_level) == 1:

@@ -11,13 +11,13 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxsafe import environment
 from jaxsafe.autoreset import renew
@@ -78,7 +78,13 @@ Counts = dict[str, Float[Array, " n"]]
 
 
 def attack(
-    env: Environment, name: str, num_steps: int, num_envs: int, key: Key, starts: str = "task"
+    env: Environment,
+    name: str,
+    num_steps: int,
+    num_envs: int,
+    key: Key,
+    starts: str = "task",
+    among: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Let one adversary act and return what was counted.
 
@@ -94,6 +100,8 @@ def attack(
         num_envs: the number of environments that run side by side.
         key: a typed PRNG key.
         starts: where episodes begin, one of `edge_starts.STARTS`.
+        among: names of adversaries that attack the same environment, one after the other. All but
+            the search share a program, which is compiled at the first attack.
 
     Returns:
         Plain numbers: steps, episodes, violations, worst margins, interventions, mean correction
@@ -117,7 +125,10 @@ def attack(
         episodes = num_starts * sequences_per_start
         whole = False
     else:
-        counts = _follow(physical, name, num_steps, num_envs, starts, key)
+        names = tuple(other for other in among if other != SEARCH)
+        names = names if name in names else (name,)
+        index = jnp.array(names.index(name))
+        counts = _follow(physical, names, num_steps, num_envs, starts, index, key)
         ended = int(np.sum(counts["ended"]))
         whole = bool(np.all(counts["ended"] > 0))
         episodes = ended if whole else num_envs
@@ -162,13 +173,20 @@ def longest_episode(env: Environment) -> int:
 
 @functools.partial(jax.jit, static_argnums=(1, 2, 3, 4))
 def _follow(
-    env: Environment, name: str, num_steps: int, num_envs: int, starts: str, key: Key
+    env: Environment,
+    names: tuple[str, ...],
+    num_steps: int,
+    num_envs: int,
+    starts: str,
+    index: Int[Array, ""],
+    key: Key,
 ) -> Counts:
-    """Run an adversary. A new episode begins where one ends."""
-    adversary = ADVERSARIES[name]
+    """Run the adversary that an index chooses from `names`. A new episode begins where one ends."""
+    adversaries = [ADVERSARIES[name] for name in names]
 
     def act(state: State, key: Key) -> Float[Array, " m"]:
-        return adversary(drawn(env, state.parameters), _remembering(env, state), key)
+        seen = (drawn(env, state.parameters), _remembering(env, state), key)
+        return jax.lax.switch(index, adversaries, *seen)
 
     @jax.jit
     def draw(parameters: tuple[Environment, Key], indices: Array) -> tuple[State, Array]:

@@ -14,6 +14,7 @@ import jaxsafe
 from jaxsafe.commands import falsify
 from jaxsafe.commands.falsify import confidence, line, main
 from jaxsafe.environment import drawn
+from jaxsafe.evaluate import run_adversaries
 from jaxsafe.evaluate.adversaries import ADVERSARIES
 from jaxsafe.evaluate.run_adversaries import attack, longest_episode
 from jaxsafe.processors.terminal import Timeout, time_limit
@@ -35,6 +36,24 @@ def test_the_numbers_name_the_command_and_the_versions_that_made_them(tmp_path: 
     assert [
         (row["policy"], row["steps"], row["violating_steps"]) for row in results["policies"]
     ] == [("uniform", 40, 0)]
+
+
+def test_adversaries_that_share_a_program_do_what_each_does_alone() -> None:
+    env = jaxsafe.make("docking2d", {"terminal.timeout.limit": 20.0})
+    names = ("bang_bang", "outward")
+
+    def run(name: str, among: tuple[str, ...]) -> Any:
+        return attack(env, name, 20, 4, jax.random.key(0), among=among)
+
+    before = run_adversaries._follow._cache_size()
+    together = [run(name, among=names) for name in names]
+    assert run_adversaries._follow._cache_size() == before + 1
+    for name, row in zip(names, together, strict=True):
+        alone = run(name, among=())
+        for entry in ("policy", "violation_bound"):
+            assert alone.pop(entry) == row.pop(entry)
+        assert alone == pytest.approx(row, rel=1e-5)
+    assert together[0]["worst_margin"] != together[1]["worst_margin"]
 
 
 def test_a_violation_is_the_exit_code_and_bounds_nothing(tmp_path: Path) -> None:
