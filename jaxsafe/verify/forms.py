@@ -40,24 +40,22 @@ MAX_INTERVALS = 1024
 
 
 class Domain(NamedTuple):
-    """A set of states: centre + generators·e + rounding·f, |e|, |f| ≤ 1, between low and high."""
+    """A set of states: centre + generators·e + box·f, |e|, |f| ≤ 1, between low and high."""
 
     centre: Float[Array, " d"]
     generators: Float[Array, "d k"]
-    rounding: Float[Array, "d l"]
-    """Generators that are so short that only the box around them counts."""
+    box: Float[Array, " d"]
+    """Half the box around all that is too small for a generator of its own."""
     low: Float[Array, " d"]
     high: Float[Array, " d"]
+    reach: Float[Array, " d"]
+    """A bound on the size of the terms of each element."""
 
-    @property
-    def box(self) -> Float[Array, " d"]:
-        """Half the box around the rounding."""
-        return (1.0 + FINE) * jnp.abs(self.rounding).sum(-1)
-
-    @property
-    def reach(self) -> Float[Array, " d"]:
-        """A bound on the size of the terms of each element."""
-        return jnp.abs(self.centre) + jnp.abs(self.generators).sum(-1) + self.box
+    @classmethod
+    def of(cls, centre: Array, generators: Array, box: Array, low: Array, high: Array) -> Domain:
+        """Return a set of states, or a batch of them, from all but `reach`."""
+        reach = jnp.abs(centre) + jnp.abs(generators).sum(-1) + box
+        return cls(centre, generators, box, low, high, reach)
 
 
 class Form(NamedTuple):

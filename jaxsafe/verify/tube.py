@@ -90,7 +90,7 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
     size = low.shape[-1]
     total = size + loop.actions
     linear = 0 if loop.curved else size
-    domain = _boxes(low, high, loop.actions, steps, linear)
+    domain, rounding = _boxes(low, high, loop.actions, steps, linear)
     end = total + 1 + (loop.property == "docks")
     samples = []
     claims = []
@@ -100,7 +100,7 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
     undecided = np.ones(len(low), bool)
     for t in range(steps + 1):
         bounds = _with_room(bound(loop.following if t else loop.first, domain), size)
-        domain = _following(bounds, domain, size, linear, t)
+        domain, rounding = _following(bounds, domain, rounding, size, linear, t)
         motion = bounds if loop.motion else domain
         samples.append(_sample(motion, bounds.low[:, total], loop.motion, loop.dimension))
         claims.append(Claims(*(x[:, size:total] for x in bounds[:3])))
@@ -133,8 +133,8 @@ def _with_room(bounds: Bounds, size: int) -> Bounds:
 
 @functools.partial(jax.jit, static_argnums=(2, 3, 4))
 @functools.partial(jax.vmap, in_axes=(0, 0, None, None, None))
-def _boxes(low: Array, high: Array, actions: int, steps: int, linear: int) -> Domain:
-    """Return the set of starts of each box. The actions are 0.
+def _boxes(low: Array, high: Array, actions: int, steps: int, linear: int) -> tuple[Domain, Array]:
+    """Return the set of starts of each box, and the generators of its rounding. The actions are 0.
 
     There is room for the generators of all steps: one for each element from `linear` on.
     """
@@ -147,23 +147,27 @@ def _boxes(low: Array, high: Array, actions: int, steps: int, linear: int) -> Do
         return jnp.concatenate([x, jnp.zeros(actions)])
 
     generators = jnp.zeros((total, size + (total - linear) * (steps + 1)))
-    return Domain(
+    domain = Domain.of(
         centre=pad(middle),
         generators=generators.at[:size, :size].set(jnp.diag(half)),
-        rounding=jnp.zeros((total, total * (steps + 1))),
+        box=jnp.zeros(total),
         low=pad(low),
         high=pad(high),
     )
+    return domain, jnp.zeros((total, total * (steps + 1)))
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3))
-@functools.partial(jax.vmap, in_axes=(0, 0, None, None, None))
-def _following(bounds: Bounds, domain: Domain, size: int, linear: int, t: Any) -> Domain:
-    """Return the states after a step.
+@functools.partial(jax.jit, static_argnums=(3, 4))
+@functools.partial(jax.vmap, in_axes=(0, 0, 0, None, None, None))
+def _following(
+    bounds: Bounds, domain: Domain, rounding: Array, size: int, linear: int, t: Any
+) -> tuple[Domain, Array]:
+    """Return the states after a step, and the generators of their rounding.
 
     Args:
         bounds: bounds of the step's outputs.
         domain: the states before the step.
+        rounding: generators that are so short that only the box around them counts.
         size: number of elements of the state of the platforms.
         linear: number of elements that the plant maps without loss. What rounding leaves open of
             them is no generator of its own.
@@ -177,19 +181,20 @@ def _following(bounds: Bounds, domain: Domain, size: int, linear: int, t: Any) -
     rounded = jnp.diag((1.0 + FINE) * (jnp.where(curved, 0.0, radius) + fine))
     new = jnp.diag(radius)[:, linear:]
     put = jax.lax.dynamic_update_slice
-    following = Domain(
-        centre=slope @ domain.centre + bounds.centre[:total],
-        generators=put(slope @ domain.generators, new, (0, size + (total - linear) * t)),
-        rounding=put(slope @ domain.rounding, rounded, (0, total * t)),
-        low=bounds.low[:total],
-        high=bounds.high[:total],
+    centre = slope @ domain.centre + bounds.centre[:total]
+    generators = put(slope @ domain.generators, new, (0, size + (total - linear) * t))
+    rounding = put(slope @ rounding, rounded, (0, total * t))
+    box = (1.0 + FINE) * jnp.abs(rounding).sum(-1)
+    half = jnp.abs(generators).sum(-1) + box
+    half = (1.0 + FINE) * half + FINE * jnp.abs(centre)
+    following = Domain.of(
+        centre=centre,
+        generators=generators,
+        box=box,
+        low=jnp.maximum(bounds.low[:total], centre - half),
+        high=jnp.minimum(bounds.high[:total], centre + half),
     )
-    half = jnp.abs(following.generators).sum(-1) + following.box
-    half = (1.0 + FINE) * half + FINE * jnp.abs(following.centre)
-    return following._replace(
-        low=jnp.maximum(following.low, following.centre - half),
-        high=jnp.minimum(following.high, following.centre + half),
-    )
+    return following, rounding
 
 
 @functools.partial(jax.jit, static_argnums=(2, 3))

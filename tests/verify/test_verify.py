@@ -84,14 +84,10 @@ def domain(key: int, size: int, width: float) -> Domain:
     rng = np.random.default_rng(key)
     centre = rng.uniform(0.5, 2.0, size)
     generators = width * rng.normal(size=(size, 4))
-    rounding = 1e-9 * rng.normal(size=(size, 2))
-    half = np.abs(generators).sum(1) + np.abs(rounding).sum(1)
-    return Domain(
-        *(
-            jnp.asarray(x)[None]
-            for x in (centre, generators, rounding, centre - half, centre + half)
-        )
-    )
+    box = np.abs(1e-9 * rng.normal(size=size))
+    half = np.abs(generators).sum(1) + box
+    ends = (centre - half, centre + half)
+    return Domain.of(*(jnp.asarray(x)[None] for x in (centre, generators, box, *ends)))
 
 
 def points(domain: Domain, num: int) -> jax.Array:
@@ -99,8 +95,8 @@ def points(domain: Domain, num: int) -> jax.Array:
     own = jax.tree.map(lambda x: x[0], domain)
     # Many coefficients are at their limits, where bounds are tight.
     e = np.clip(rng.normal(size=(num, 4), scale=2.0), -1, 1)
-    f = np.clip(rng.normal(size=(num, 2), scale=2.0), -1, 1)
-    return own.centre + e @ own.generators.T + f @ own.rounding.T
+    f = np.clip(rng.normal(size=(num, len(own.box)), scale=2.0), -1, 1)
+    return own.centre + e @ own.generators.T + f * own.box
 
 
 def _stopped(speed: Any, rate: Any) -> Any:
@@ -191,9 +187,8 @@ def test_single_precision_is_inside_of_its_bounds_too() -> None:
             states = domain(1, 4, 1e-9)
             y = np.asarray(points(states, 2_000)).astype(np.float32)
             half = np.abs(y - states.centre[0]).max(0)
-            states = states._replace(
-                rounding=jnp.diag(half)[None], low=states.centre - half, high=states.centre + half
-            )
+            ends = (states.centre - half, states.centre + half)
+            states = Domain.of(states.centre, states.generators, half[None], *ends)
             bounds = jax.tree.map(lambda x: np.asarray(x[0]), bound(program, states))
         for values in (jax.jit(jax.vmap(function))(y), jax.vmap(function)(y)):
             linear = y.astype(np.float64) @ bounds.slope.T + bounds.centre
