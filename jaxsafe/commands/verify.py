@@ -39,7 +39,7 @@ class Options(SingleOptions):
         "The policy.": ("run", "seed", "activation"),
         "The environment in which it acts.": ("env", "env.PATH", "actions", "variant", "rta"),
         "What is proved.": ("property", "steps", "box.FIELD", "arithmetic"),
-        "The search.": ("minutes", "boxes", "everything", "resolution", "resume", "out"),
+        "The search.": ("minutes", "boxes", "everything", "resolution", "order", "resume", "out"),
     }
 
     property: Literal["safe", "docks"] = "safe"
@@ -74,6 +74,11 @@ class Options(SingleOptions):
 
     A map needs no more than 4.
     """
+    order: Annotated[int, Range(0, largest=100)] = 0
+    """To how many generators per number of the state a set of states is reduced after 40 steps.
+
+    With 0 all are kept. With 4 a proof over hundreds of steps is faster, and its bounds are wider.
+    """
     resume: File | None = None
     """A certificate of the same loop and box to go on from."""
     out: File | None = None
@@ -106,6 +111,7 @@ def main(argv: Sequence[str]) -> int:
         max_boxes=options.boxes,
         everything=options.everything,
         resolution=options.resolution,
+        order=options.order,
         resume=earlier,
         progress=_Progress(),
     )

@@ -19,7 +19,7 @@ from jaxsafe.storage.archive import CERTIFICATE, open_archive
 from jaxsafe.storage.files import write_bytes
 from jaxsafe.verify.loop import Loop, Plant
 from jaxsafe.verify.program import RULED, Constant, Op, Program
-from jaxsafe.verify.tube import Claims
+from jaxsafe.verify.tube import EVERY, Claims
 from jaxsafe.verify.verify import Boxes, Counterexample, Verification
 
 PROGRAMS = ("first", "following")
@@ -62,6 +62,8 @@ def save_certificate(
         "property": verification.loop.property,
         "result": verification.result,
         "steps": verification.steps,
+        "order": verification.order,
+        "every": EVERY,
         "unit": verification.loop.following.unit,
         "dimension": verification.loop.dimension,
         "columns": verification.loop.columns,
@@ -110,6 +112,7 @@ def load_certificate(path: str | os.PathLike) -> Verification:
                 property=header["property"],
             ),
             steps=header["steps"],
+            order=header.get("order", 0),
             seconds=header["seconds"],
             bounded=header["bounded"],
             **boxes,

@@ -279,6 +279,30 @@ def bound(program, unit, sets, low, high):
     return (*out[:2], np.minimum(up(radius) + 4 * E * out[2], out[2]), *ends(out, sets))
 
 
+def reduced(wide, thin, order):
+    """Put a parallelotope around all generators of sets but those whose box would be widest.
+
+    Return the generators, and what rounding leaves open. Each row is freed of the rows above it.
+    """
+    total, count = wide.shape[1:]
+    rows = np.concatenate([wide, thin], 2)
+    squares, shear = (rows**2).sum(-1), np.eye(total) + np.zeros((len(wide), 1, 1))
+    for i in range(total - 1):
+        square, part = (rows[:, i] ** 2).sum(-1)[:, None], times(rows[:, i + 1 :], rows[:, i])
+        part = np.divide(part, square, out=0 * part, where=square > 1e-20 * squares[:, i, None])
+        rows[:, i + 1 :] -= part[..., None] * rows[:, i, None]
+        shear[:, i + 1 :, i] = part
+    rows = np.abs(rows)
+    share = rows / np.maximum(rows.sum(-1, keepdims=True), 1e-300)
+    cost = (share.max(1) - share.sum(1))[:, :count]
+    best = np.argsort(cost, axis=1)[:, None, : (order - 1) * total]
+    np.put_along_axis(rows, best, 0, 2)
+    half = up(rows.sum(-1))
+    fine = up(4 * E * times(np.abs(shear), half))
+    kept = np.take_along_axis(wide, best, 2)
+    return np.concatenate([kept, shear * half[:, None]], 2), fine[..., None] * np.eye(total)
+
+
 def gap(plant, speed, far, near):
     """Return by how much h may fall inside a step below its values at both ends.
 
@@ -309,8 +333,11 @@ def follow(head, low, high, claims):
     centre = 0.5 * (low + high)
     wide = up(np.maximum(high - centre, centre - low))[:, :, None] * np.eye(total)
     thin, worst, before = 0 * wide, np.full(len(low), np.inf), None
-    deep = worst
+    deep, order, every = worst, head.get("order", 0), head.get("every", 1)
+    need(order >= 0 and every >= 1, "the order of the sets is wrong")
     for t, (slope, middle, radius) in enumerate(zip(*claims, strict=True)):
+        if order and t and t % every == 0:
+            wide, thin = reduced(wide, thin, order)
         box = up(np.abs(thin).sum(-1))
         reach = up(np.abs(centre) + np.abs(wide).sum(-1) + box)
         sets = (centre, wide, box, reach)

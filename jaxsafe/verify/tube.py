@@ -2,7 +2,8 @@
 
 The set of states is a zonotope. A linear plant maps it without loss, and the policy adds one
 generator per actuator in every step, as wide as what its linearisation leaves open. A plant that is
-not linear adds such a generator for each number of its state.
+not linear adds such a generator for each number of its state. From time to time the generators that
+matter least are replaced by a parallelotope around them.
 """
 
 from __future__ import annotations
@@ -24,6 +25,16 @@ ROOM = 2.0**-12
 
 Chords over short intervals have slopes that roundings change, by up to 4e-6 of a radius.
 """
+
+
+EVERY = 41
+"""Number of samples between two reductions of a zonotope.
+
+A proof over 40 steps has 41 samples with the start, and so it needs no reduction.
+"""
+
+FLAT = 1e-20
+"""A row of generators counts as 0 if its square falls below this part as others are subtracted."""
 
 
 class Claims(NamedTuple):
@@ -76,7 +87,13 @@ class _Sample(NamedTuple):
     nearest: Array
 
 
-def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n s"]) -> Tube:
+def tube(
+    loop: Loop,
+    steps: int,
+    low: Float[Array, "n s"],
+    high: Float[Array, "n s"],
+    order: int = 0,
+) -> Tube:
     """Return bounds of all ways from the starts between two corners, for a batch of boxes.
 
     They end early, after a step at which each box has docked or is known to be without a proof.
@@ -86,11 +103,14 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
         steps: number of steps.
         low: the lowest (position, velocity) of each box.
         high: the highest (position, velocity) of each box.
+        order: number of generators per number of the state that a reduction leaves, 0 to keep all.
     """
     size = low.shape[-1]
     total = size + loop.actions
     linear = 0 if loop.curved else size
-    domain, rounding = _boxes(low, high, loop.actions, steps, linear)
+    slots = min(EVERY, steps + 1) if order else steps + 1
+    first = order * total if slots <= steps else size
+    domain, rounding = _boxes(low, high, loop.actions, first, slots, linear)
     end = total + 1 + (loop.property == "docks")
     samples = []
     claims = []
@@ -99,8 +119,11 @@ def tube(loop: Loop, steps: int, low: Float[Array, "n s"], high: Float[Array, "n
     depths = []
     undecided = np.ones(len(low), bool)
     for t in range(steps + 1):
+        slot = t % slots
+        if t and not slot:
+            domain, rounding = _reduced(domain, rounding, order)
         bounds = _with_room(bound(loop.following if t else loop.first, domain), size)
-        domain, rounding = _following(bounds, domain, rounding, size, linear, t)
+        domain, rounding = _following(bounds, domain, rounding, linear, first, slot)
         motion = bounds if loop.motion else domain
         samples.append(_sample(motion, bounds.low[:, total], loop.motion, loop.dimension))
         claims.append(Claims(*(x[:, size:total] for x in bounds[:3])))
@@ -131,12 +154,15 @@ def _with_room(bounds: Bounds, size: int) -> Bounds:
     return bounds._replace(radius=jnp.where(acts, wider, bounds.radius))
 
 
-@functools.partial(jax.jit, static_argnums=(2, 3, 4))
-@functools.partial(jax.vmap, in_axes=(0, 0, None, None, None))
-def _boxes(low: Array, high: Array, actions: int, steps: int, linear: int) -> tuple[Domain, Array]:
+@functools.partial(jax.jit, static_argnums=(2, 3, 4, 5))
+@functools.partial(jax.vmap, in_axes=(0, 0, None, None, None, None))
+def _boxes(
+    low: Array, high: Array, actions: int, first: int, slots: int, linear: int
+) -> tuple[Domain, Array]:
     """Return the set of starts of each box, and the generators of its rounding. The actions are 0.
 
-    There is room for the generators of all steps: one for each element from `linear` on.
+    There is room for `first` generators, and for those of `slots` steps: one for each element from
+    `linear` on.
     """
     size = low.shape[0]
     total = size + actions
@@ -146,7 +172,7 @@ def _boxes(low: Array, high: Array, actions: int, steps: int, linear: int) -> tu
     def pad(x: Array) -> Array:
         return jnp.concatenate([x, jnp.zeros(actions)])
 
-    generators = jnp.zeros((total, size + (total - linear) * (steps + 1)))
+    generators = jnp.zeros((total, first + (total - linear) * slots))
     domain = Domain.of(
         centre=pad(middle),
         generators=generators.at[:size, :size].set(jnp.diag(half)),
@@ -154,13 +180,61 @@ def _boxes(low: Array, high: Array, actions: int, steps: int, linear: int) -> tu
         low=pad(low),
         high=pad(high),
     )
-    return domain, jnp.zeros((total, total * (steps + 1)))
+    return domain, jnp.zeros((total, total * (slots + 1)))
 
 
-@functools.partial(jax.jit, static_argnums=(3, 4))
+@functools.partial(jax.jit, static_argnums=2)
+@functools.partial(jax.vmap, in_axes=(0, 0, None))
+def _reduced(domain: Domain, rounding: Array, order: int) -> tuple[Domain, Array]:
+    """Return a set with fewer generators around a set, and the generators of its rounding.
+
+    This is the reduction of Girard: Reachability of Uncertain Linear Systems Using Zonotopes (HSCC
+    2005), in coordinates in which the generators are not correlated. The generators whose box would
+    be the least tight are kept. There is a box around the others in these coordinates.
+
+    Args:
+        domain: the states.
+        rounding: generators that are so short that only the box around them counts.
+        order: number of generators per element that are left.
+    """
+    total, count = domain.generators.shape
+    kept = (order - 1) * total
+    shear, rows = _uncorrelated(jnp.concatenate([domain.generators, rounding], axis=1))
+    lengths = jnp.abs(rows)
+    width = lengths.sum(-1, keepdims=True)
+    share = lengths[:, :count] / jnp.where(width > 0.0, width, 1.0)
+    longest = jnp.argsort(share.max(0) - share.sum(0))[:kept]
+    half = (1.0 + FINE) * lengths.at[:, longest].set(0.0).sum(-1)
+    left = jnp.zeros((total, count - kept - total))
+    generators = jnp.concatenate([domain.generators[:, longest], shear * half, left], axis=1)
+    fine = FINE * (jnp.abs(shear) @ half)
+    rounding = jnp.zeros_like(rounding).at[:, :total].set(jnp.diag(fine))
+    box = (1.0 + FINE) * fine
+    return Domain.of(domain.centre, generators, box, domain.low, domain.high), rounding
+
+
+def _uncorrelated(rows: Float[Array, "d k"]) -> tuple[Float[Array, "d d"], Float[Array, "d k"]]:
+    """Return a unit lower triangular matrix and orthogonal rows whose product are the given rows.
+
+    So the position comes first, the velocity is what the position does not tell of it, and the
+    action what both do not tell.
+    """
+    total = len(rows)
+    squares = (rows**2).sum(-1)
+    shear = jnp.eye(total)
+    for i in range(total - 1):
+        square = rows[i] @ rows[i]
+        counts = square > FLAT * squares[i]
+        share = jnp.where(counts, rows[i + 1 :] @ rows[i] / jnp.where(counts, square, 1.0), 0.0)
+        rows = rows.at[i + 1 :].add(-share[:, None] * rows[i])
+        shear = shear.at[i + 1 :, i].set(share)
+    return shear, rows
+
+
+@functools.partial(jax.jit, static_argnums=3)
 @functools.partial(jax.vmap, in_axes=(0, 0, 0, None, None, None))
 def _following(
-    bounds: Bounds, domain: Domain, rounding: Array, size: int, linear: int, t: Any
+    bounds: Bounds, domain: Domain, rounding: Array, linear: int, first: Any, slot: Any
 ) -> tuple[Domain, Array]:
     """Return the states after a step, and the generators of their rounding.
 
@@ -168,10 +242,10 @@ def _following(
         bounds: bounds of the step's outputs.
         domain: the states before the step.
         rounding: generators that are so short that only the box around them counts.
-        size: number of elements of the state of the platforms.
         linear: number of elements that the plant maps without loss. What rounding leaves open of
             them is no generator of its own.
-        t: the number of the step, which has generators of its own.
+        first: number of generators before those of the first slot.
+        slot: the slot for the generators of this step.
     """
     total = domain.centre.shape[0]
     slope = bounds.slope[:total]
@@ -182,8 +256,8 @@ def _following(
     new = jnp.diag(radius)[:, linear:]
     put = jax.lax.dynamic_update_slice
     centre = slope @ domain.centre + bounds.centre[:total]
-    generators = put(slope @ domain.generators, new, (0, size + (total - linear) * t))
-    rounding = put(slope @ rounding, rounded, (0, total * t))
+    generators = put(slope @ domain.generators, new, (0, first + (total - linear) * slot))
+    rounding = put(slope @ rounding, rounded, (0, total * (slot + 1)))
     box = (1.0 + FINE) * jnp.abs(rounding).sum(-1)
     half = jnp.abs(generators).sum(-1) + box
     half = (1.0 + FINE) * half + FINE * jnp.abs(centre)

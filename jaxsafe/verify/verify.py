@@ -123,6 +123,8 @@ class Verification(NamedTuple):
     box: Boxes
     loop: Loop
     steps: int
+    order: int
+    """Number of generators per number of the state that a reduction left, 0 without one."""
     seconds: float
     bounded: int
     """Number of boxes that were bounded, before `resume` too."""
@@ -145,6 +147,7 @@ def verify(
     max_boxes: int = 100_000,
     everything: bool = False,
     resolution: int = RESOLUTION,
+    order: int = 0,
     resume: Verification | None = None,
     progress: Callable[[Verification], None] = lambda _: None,
 ) -> Verification:
@@ -169,6 +172,8 @@ def verify(
         max_boxes: the largest number of boxes to bound. Those before `resume` do not count.
         everything: whether to go on after a counterexample, for a map of the box.
         resolution: a box is not halved if all its widths are at most this part of `FIRST_WIDTHS`.
+        order: number of generators per number of the state to which the sets of states are reduced
+            from time to time, 0 to keep all generators.
         resume: a verification of the same loop and box to go on from.
         progress: a function that is called after each batch of boxes.
 
@@ -189,9 +194,11 @@ def verify(
     loop = closed_loop(env, policy, arithmetic, property)
     _require_time(env, property, steps)
     whole = corners(env, box)
-    search = _Search(env, policy, loop, whole, steps, resolution)
+    if order < 0:
+        raise ConfigError(f"order: found {order}; expected 0 or more")
+    search = _Search(env, policy, loop, whole, steps, resolution, order)
     if resume is not None:
-        _require_same(resume, loop, whole, steps)
+        _require_same(resume, loop, whole, steps, order)
         search.go_on(resume)
     most = search.known.bounded + max_boxes
     try:
@@ -287,17 +294,18 @@ def _require_near(env: Environment, low: np.ndarray, high: np.ndarray) -> None:
             )
 
 
-def _require_same(known: Verification, loop: Loop, whole: Boxes, steps: int) -> None:
+def _require_same(known: Verification, loop: Loop, whole: Boxes, steps: int, order: int) -> None:
     """Refuse to go on from a verification of something else.
 
     Raises:
-        ConfigError: the loop, the box or the number of steps differs.
+        ConfigError: the loop, the box, the number of steps or the order differs.
     """
     same = {
         "the property": known.loop.property == loop.property,
         "the closed loop": _same_numbers(known.loop, loop),
         "the box": _same_numbers(known.box, whole),
         "steps": known.steps == steps,
+        "order": known.order == order,
     }
     for what, fits in same.items():
         if not fits:
@@ -356,12 +364,14 @@ class _Search:
         whole: Boxes,
         steps: int,
         resolution: int,
+        order: int = 0,
     ) -> None:
         self.env = env
         self.loop = loop
         self.whole = whole
         self.steps = steps
         self.resolution = resolution
+        self.order = order
         self.widths = first_widths(env)
         craft = isinstance(env.agent_platform, CRAFT)
         self.scales = _widths(env, SCALES[loop.property]) if craft else self.widths
@@ -422,7 +432,7 @@ class _Search:
         count = len(low)
         full = [_filled(x, BATCH) for x in (low, high)]
         with jax.enable_x64(True):
-            tubes = tube(self.loop, self.steps, *map(jnp.asarray, full))
+            tubes = tube(self.loop, self.steps, *map(jnp.asarray, full), order=self.order)
             tubes = jax.tree.map(lambda x: x[:count], jax.device_get(tubes))
         last = tubes.proved_steps(self.loop.property)
         covered = np.arange(tubes.margin.shape[1]) <= last[:, None]
@@ -501,6 +511,7 @@ class _Search:
             box=self.whole,
             loop=self.loop,
             steps=self.steps,
+            order=self.order,
             seconds=known.seconds + seconds,
             bounded=known.bounded,
         )

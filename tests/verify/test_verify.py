@@ -28,7 +28,7 @@ from jaxsafe.verify.certificate import load_certificate, save_certificate
 from jaxsafe.verify.forms import Domain, bound
 from jaxsafe.verify.loop import closed_loop, parts, start_of
 from jaxsafe.verify.program import ANGULAR, ELEMENTARY, FUNCTIONS, MAX_ANGLE, RULED, trace
-from jaxsafe.verify.tube import between, tube
+from jaxsafe.verify.tube import EVERY, _reduced, between, tube
 from jaxsafe.verify.verify import Boxes, Verification, _Search, verify
 
 PUBLISHED = Path(os.environ.get("JAXSAFE_PUBLISHED_NETWORK", "docking2d_published.onnx"))
@@ -259,23 +259,25 @@ def require_inside(env: Environment, policy: Any, proof: Verification) -> None:
     assert proof.result == "proved"
     low, high = proof.proved.low[:2], proof.proved.high[:2]
     with jax.enable_x64(True):
-        found = jax.device_get(tube(proof.loop, proof.steps, *map(jnp.asarray, (low, high))))
+        ends = map(jnp.asarray, (low, high))
+        found = jax.device_get(tube(proof.loop, proof.steps, *ends, order=proof.order))
     names = [item.name for item in env.constraints]
 
     def fly(x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        state, timestep = jaxsafe.reset_to(env, start_of(env, x))
-
-        def states(state: Any, timestep: Any) -> jax.Array:
+        def seen(state: Any, timestep: Any) -> tuple[jax.Array, jax.Array]:
             moving = [getattr(state.sim.platforms[part.platform], part.field) for part in own]
             action = jnp.clip(policy(None, timestep.observation), -1.0, 1.0)
-            return jnp.concatenate([*map(jnp.atleast_1d, moving), action])
+            margin = timestep.info.margins[names[0]]
+            return jnp.concatenate([*map(jnp.atleast_1d, moving), action]), margin
 
-        rows, margins = [states(state, timestep)], [timestep.info.margins[names[0]]]
-        for _ in range(proof.steps):
-            state, timestep = jaxsafe.step(env, state, policy(None, timestep.observation))
-            rows.append(states(state, timestep))
-            margins.append(timestep.info.margins[names[0]])
-        return jnp.stack(rows), jnp.stack(margins)
+        def advance(carry: Any, _: None) -> tuple[Any, Any]:
+            state, timestep = carry
+            carry = jaxsafe.step(env, state, policy(None, timestep.observation))
+            return carry, seen(*carry)
+
+        start = jaxsafe.reset_to(env, start_of(env, x))
+        later = jax.lax.scan(advance, start, None, proof.steps)[1]
+        return jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), seen(*start), later)
 
     own = parts(env)
     share = np.random.default_rng(0).choice([0.0, 1.0, 0.3], (len(low), 3000, low.shape[1]))
@@ -294,6 +296,67 @@ def require_inside(env: Environment, policy: Any, proof: Verification) -> None:
 @pytest.mark.thorough
 def test_thousands_of_flights_of_a_wingman_stay_inside_of_a_tube(separation: Verification) -> None:
     require_inside(jaxsafe.make("rejoin2d"), flown_aircraft, separation)
+
+
+def support(directions: np.ndarray, *generators: Any) -> np.ndarray:
+    """Return how far zonotopes reach in some directions."""
+    moved = np.concatenate([np.asarray(g) for g in generators], axis=-1)
+    return np.abs(np.einsum("ld,ndk->nlk", directions, moved)).sum(-1)
+
+
+@pytest.mark.parametrize("order", [thorough(1), 3])
+def test_a_reduced_set_holds_the_set(order: int) -> None:
+    rng = np.random.default_rng(0)
+    size, first = 5, order * 5
+    generators = np.zeros((8, size, first + 40))
+    common = rng.normal(size=(8, size, 2)) @ rng.normal(size=(8, 2, first + 30))
+    generators[..., : first + 30] = common + 0.02 * rng.normal(size=common.shape)
+    generators[:, 3] = 0.0  # an element of which all states have the same value
+    rounding = 1e-3 * rng.normal(size=(8, size, 4 * size))
+    directions = np.concatenate([rng.normal(size=(20_000, size)), np.eye(size)])
+    before = support(directions, generators, rounding)
+    with jax.enable_x64(True):
+        centre, far = jnp.zeros((8, size)), jnp.full((8, size), np.inf)
+        box = jnp.abs(jnp.asarray(rounding)).sum(-1)
+        states = Domain.of(centre, jnp.asarray(generators), box, -far, far)
+        fewer, rest = _reduced(states, jnp.asarray(rounding), order)
+        assert (fewer.box >= jnp.abs(rest).sum(-1)).all()
+        after = support(directions, fewer.generators, rest)
+    used = np.any(np.asarray(fewer.generators) != 0.0, axis=1)
+    assert (used.sum(axis=1) <= first).all()
+    assert (after >= before).all()
+    assert np.median(after / before) < 2.0
+    checked = support(directions, *check.reduced(generators, rounding, order))
+    np.testing.assert_allclose(checked, after, rtol=1e-9)
+    assert (checked >= before).all()
+
+
+@pytest.fixture(scope="module")
+def long_proof() -> Verification:
+    box = {"position": [[80, 82], [80, 82]], "velocity": [[-0.1, -0.09], [0.0, 0.01]]}
+    return verify(jaxsafe.make("docking2d"), braking, box, steps=EVERY + 3, order=2)
+
+
+@pytest.mark.thorough
+def test_flights_stay_inside_of_a_tube_whose_sets_are_reduced(long_proof: Verification) -> None:
+    require_inside(jaxsafe.make("docking2d"), braking, long_proof)
+
+
+@pytest.mark.thorough
+def test_a_proof_with_reduced_sets_is_checked_and_read_again(
+    long_proof: Verification, tmp_path: Path
+) -> None:
+    save_certificate(tmp_path / "proof.npz", long_proof, {})
+    checked = run_check(tmp_path / "proof.npz")
+    assert checked.returncode == 0, checked.stderr
+    read = load_certificate(tmp_path / "proof.npz")
+    assert read.order == 2
+    wide = {"position": [80, 82], "velocity": [[-0.1, -0.09], [0.0, 0.01]]}
+    message = r"^resume: order is not that of the certificate"
+    with pytest.raises(ConfigError, match=message):
+        verify(jaxsafe.make("docking2d"), braking, wide, steps=EVERY + 3, order=3, resume=read)
+    with pytest.raises(ConfigError, match=r"^order: found -1; expected 0 or more"):
+        verify(jaxsafe.make("docking2d"), braking, wide, order=-1)
 
 
 def run_check(*paths: Path) -> subprocess.CompletedProcess:
@@ -380,6 +443,20 @@ def test_a_certificate_that_says_too_much_is_refused(
     change: Callable[[dict[str, np.ndarray]], None], proof: Verification, tmp_path: Path
 ) -> None:
     require_refused(change, proof, tmp_path)
+
+
+def larger_set(arrays: dict[str, np.ndarray]) -> None:
+    header = json.loads(str(arrays["header"]))
+    header["order"] = 1
+    arrays["header"] = np.array(json.dumps(header))
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("change", [*CHANGES, larger_set])
+def test_a_certificate_with_reduced_sets_that_says_too_much_is_refused(
+    change: Callable[[dict[str, np.ndarray]], None], long_proof: Verification, tmp_path: Path
+) -> None:
+    require_refused(change, long_proof, tmp_path)
 
 
 def flown_aircraft(key: Any, observation: Any) -> Any:
