@@ -77,7 +77,7 @@ class Options(SingleOptions):
     order: Annotated[int, Range(0, largest=100)] = 0
     """To how many generators per number of the state a set of states is reduced after 40 steps.
 
-    With 0 all are kept. With 4 a proof over hundreds of steps is faster, and its bounds are wider.
+    With 0 all are kept. With 8 a proof over hundreds of steps is faster, and its bounds are wider.
     """
     resume: File | None = None
     """A certificate of the same loop and box to go on from."""
