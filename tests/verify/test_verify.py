@@ -395,7 +395,7 @@ def smaller_radius(arrays: dict[str, np.ndarray]) -> None:
 
 def wrong_slope(arrays: dict[str, np.ndarray]) -> None:
     arrays["claims/slope"] = arrays["claims/slope"].copy()
-    arrays["claims/slope"][0, 3, 0, 0] += 1e-3
+    arrays["claims/slope"][0, 2, 0, 0] += 1e-3
 
 
 def other_network(arrays: dict[str, np.ndarray]) -> None:
@@ -457,6 +457,38 @@ def test_a_certificate_with_reduced_sets_that_says_too_much_is_refused(
     change: Callable[[dict[str, np.ndarray]], None], long_proof: Verification, tmp_path: Path
 ) -> None:
     require_refused(change, long_proof, tmp_path)
+
+
+TURNING = {
+    "position": [[87, 89], [69, 71]],
+    "velocity": [[-0.11, -0.09], [-0.09, -0.07]],
+    "attitude": [0.48, 0.52],
+    "attitude_rate": [-0.002, 0.002],
+}
+"""Starts of a craft that turns."""
+
+
+def turning(key: Any, observation: Any) -> Any:
+    """Return a smooth action of a craft that turns."""
+    gains = 0.2 * np.random.default_rng(1).normal(size=(2, observation.shape[-1]))
+    return jnp.tanh(observation @ gains.T)
+
+
+@pytest.fixture(scope="module")
+def turned() -> Verification:
+    return verify(jaxsafe.make("docking2d_oriented"), turning, TURNING, steps=2)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("change", CHANGES)
+def test_a_certificate_about_a_craft_that_turns_that_says_too_much_is_refused(
+    change: Callable[[dict[str, np.ndarray]], None], turned: Verification, tmp_path: Path
+) -> None:
+    assert turned.result == "proved"
+    save_certificate(tmp_path / "right.npz", turned, {})
+    checked = run_check(tmp_path / "right.npz")
+    assert checked.returncode == 0, checked.stderr
+    require_refused(change, turned, tmp_path)
 
 
 def flown_aircraft(key: Any, observation: Any) -> Any:
