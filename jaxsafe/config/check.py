@@ -416,21 +416,19 @@ def _check_suited(env: Environment) -> None:
         return
     # Inside a trace, constants would be traced too.
     with jax.ensure_compile_time_eval():
-        known = _known_faults(*_shapes(env), jnp.result_type(float))
-        if not known:
+        if not _can_report(*_shapes(env), jnp.result_type(float)):
             return
-        present = _faults_of_starts(env, jax.random.split(jax.random.key(0), 8))
-        for fault in known:
-            if present[fault].all():
+        faults = _faults_of_starts(env, jax.random.split(jax.random.key(0), 8))
+        for fault, present in faults.items():
+            if present.all():
                 raise ConfigError(fault if fault.startswith("rta.") else f"rta: {fault}")
 
 
 @lru_cache(maxsize=256)
-def _known_faults(structure: Any, shapes: tuple, precision: Any) -> tuple[str, ...]:
-    """Return the faults that a filter can report, in its own order: causes before consequences.
+def _can_report(structure: Any, shapes: tuple, precision: Any) -> bool:
+    """Return whether a filter can report any fault.
 
-    JAX returns mappings in alphabetical order instead. Finding out traces a start, which is done
-    once for each structure.
+    Finding out traces a start, which is done once for each structure.
 
     Args:
         structure: the tree structure of the environment.
@@ -438,9 +436,7 @@ def _known_faults(structure: Any, shapes: tuple, precision: Any) -> tuple[str, .
         precision: the dtype of a new number. It is part of the cache's key.
     """
     env = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
-    known: list[str] = []
-    jax.eval_shape(lambda *start: known.extend(_faults(*start)), env, jax.random.key(0))
-    return tuple(known)
+    return bool(jax.eval_shape(_faults, env, jax.random.key(0)))
 
 
 def _faults(env: Environment, key: jax.Array) -> Mapping[str, jax.Array]:

@@ -355,20 +355,6 @@ class Calm(Slow, type="of_tests_calm"):
         return {}
 
 
-class Doubtful(Calm, type="of_tests_doubtful"):
-    """A terminal set of the tests with a fault that has another one as its consequence."""
-
-    def faults(self, env: Any, sim: Any, rta: Any) -> Any:
-        return {"the cause": jnp.ones((), bool), "a consequence": jnp.ones((), bool)}
-
-
-def test_of_two_faults_the_first_is_named() -> None:
-    rta = holding().rta
-    assert isinstance(rta, Simplex)
-    with pytest.raises(ConfigError, match=r"^rta: the cause$"):
-        jaxsafe.make("docking2d", rta=rta.replace(terminal=Doubtful(speed=0.35)))
-
-
 def holding() -> jaxsafe.Environment:
     """Return docking2d with a filter that holds the position."""
     rta = Simplex(
