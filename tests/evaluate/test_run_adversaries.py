@@ -111,7 +111,7 @@ def test_a_time_limit_that_means_none_leaves_episodes_that_are_cut(
     class AttackError(Exception):
         pass
 
-    def attack(env: Any, name: str, num_steps: int, num_envs: int, key: Any, starts: str) -> Any:
+    def attack(env: Any, name: str, num_steps: int, num_envs: int, key: Any, **_: Any) -> Any:
         raise AttackError(num_steps, num_envs)
 
     monkeypatch.setattr(falsify, "attack", attack)
