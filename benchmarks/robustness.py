@@ -161,6 +161,10 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
                 levels = [row["level"] for row in of_filter]
                 values = [unit * row[name] for row in of_filter]
                 panel.plot(levels, values, marker="o", markersize=3, label=rta, **LOOKS[rta])
+            if name == "success_rate":
+                panel.set_ylim(-5.0, 105.0)
+            if name == "control_effort":
+                panel.set_ylim(0.0, 1.05 * panel.get_ylim()[1])
             panel.axvline(1.0, color=GREY, linewidth=0.8, linestyle=":")
             panel.set_xlabel("uncertainty, as a multiple of the bound")
             panel.set_ylabel(label)
