@@ -57,11 +57,11 @@ def dot_chart(
                     [dot.value - dot.low for _, dot in known],
                     [dot.high - dot.value for _, dot in known],
                 ],
-                fmt="o",
+                linestyle="none",
                 markersize=4,
-                linewidth=0.8,
+                elinewidth=0.8,
                 label=name,
-                **looks[name],
+                **{"marker": "o", **looks[name]},
             )
         for line in above:
             panel.axhline(line - 0.5, color=GREY, linewidth=0.5)

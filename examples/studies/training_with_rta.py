@@ -215,7 +215,6 @@ def main(argv: list[str]) -> int:
         if way.filter in options.filters
     ]
     out = Path(options.out)
-    draw(rows, out / "training_with_rta.png")
     write_json(
         out / "training_with_rta.json",
         {
@@ -227,6 +226,7 @@ def main(argv: list[str]) -> int:
             "rows": rows,
         },
     )
+    draw(rows, out / "training_with_rta.png")
     return 0
 
 

@@ -273,8 +273,8 @@ def main(argv: list[str]) -> int:
         "versions": provenance.versions(),
         "rows": [row(name, options) for name in options.configurations],
     }
-    draw(results["rows"], Path(options.out) / "published_docking.png")
     write_json(Path(options.out) / "published_docking.json", results)
+    draw(results["rows"], Path(options.out) / "published_docking.png")
     return 0
 
 
