@@ -6,16 +6,19 @@ not contain the length of a step.
 
 from __future__ import annotations
 
+import functools
+import itertools
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, cast
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.tube import Tube, largest_turn, measured
 from jaxsafe.simulation.dubins import Dubins3D
 from jaxsafe.simulation.geometry import safe_norm
-from jaxsafe.simulation.trig import arctan
+from jaxsafe.simulation.trig import arctan, sin_cos_acute
 from jaxsafe.types import Number, Record
 
 if TYPE_CHECKING:
@@ -120,12 +123,12 @@ def next_in_space(
     noise = (before.speed + speed_error) * wrong_heading
     noise = TURN_GAIN * (noise + speed_error * (jnp.abs(pursuit.error) + tube.heading))
     change = noise + TURN_GAIN * before.speed * tube.heading
-    lowest, highest = g * jnp.tan(plant.roll_limits[0]), g * jnp.tan(plant.roll_limits[1])
+    lowest, highest = g * _tan(plant.roll_limits[0]), g * _tan(plant.roll_limits[1])
     least_asked = jnp.clip(asked - change, lowest, highest)
     most_asked = jnp.clip(asked + change, lowest, highest)
     asked_kept = jnp.clip(asked, lowest, highest)
     change_kept = jnp.maximum(most_asked - asked_kept, asked_kept - least_asked)
-    now = g * jnp.tan(before.roll)
+    now = g * _tan(before.roll)
     least_roll = arctan(jnp.maximum(now - tube.sideways, lowest) / g)
     most_roll = arctan(jnp.minimum(now + tube.sideways, highest) / g)
 
@@ -145,43 +148,45 @@ def next_in_space(
     may_rest = may_rest & ~(only_down | only_up)
     downwards = _stretches(plant, least_roll, most_roll, down)
     upwards = _stretches(plant, least_roll, most_roll, up)
-    # The true bank change is a mixture of those kinds. Each row is a corner of the mixtures: the
-    # share of what is asked for, ϑ, and the share of the bank before the step, μ.
-    follows = jnp.stack([1.0 + 0.0 * g, *[0.0 * g] * 5])
-    stays = jnp.stack([0.0 * g, 0.0 * g, *downwards, *upwards])
-    allowed = jnp.stack([may_follow, may_rest, may_down, may_down, may_up, may_up])
-    first = jnp.argmax(allowed)
-    follows = jnp.where(allowed, follows, follows[first])
-    stays = jnp.where(allowed, stays, stays[first])
+    # The true bank change is a mixture of those kinds. The first has the share ϑ = 1 of what is
+    # asked for. The others have ϑ = 0 and a share μ of the bank before the step.
+    kinds = [(jnp.zeros_like(now), may_rest)]
+    kinds += [(share, may_down) for share in downwards] + [(share, may_up) for share in upwards]
+    stays = may_rest | may_down | may_up
+    follows = may_follow | ~stays
+    most_share = functools.reduce(jnp.maximum, [jnp.where(may, share, 0.0) for share, may in kinds])
+    least_share = functools.reduce(
+        jnp.minimum, [jnp.where(may, share, most_share) for share, may in kinds]
+    )
 
     # ψ after the step is ψ + a δ₀ + b δ₁, with the turn rates δ = g tan φ/v at its ends.
-    widest = jnp.maximum(jnp.where(may_follow, change_kept, 0.0), jnp.max(stays) * tube.sideways)
+    widest = jnp.maximum(jnp.where(may_follow, change_kept, 0.0), most_share * tube.sideways)
     bank = jnp.maximum(jnp.abs(least_roll), jnp.abs(most_roll))
-    bank = jnp.maximum(bank, arctan((g * jnp.tan(jnp.abs(after.roll)) + widest) / g))
+    bank = jnp.maximum(bank, arctan((g * _tan(jnp.abs(after.roll)) + widest) / g))
     bank = jnp.minimum(bank, jnp.maximum(plant.roll_limits[1], -plant.roll_limits[0]))
     rolled = jnp.abs(after.roll - before.roll) + (tube.sideways + widest) / g
     rolled = jnp.minimum(rolled, jnp.maximum(up, -down))
-    stretch = (jnp.cos(jnp.maximum(bank - rolled, 0.0)) / jnp.cos(bank)) ** 2
+    stretch = (_cos(jnp.maximum(bank - rolled, 0.0)) / _cos(bank)) ** 2
     slow = jnp.minimum(before.speed, after.speed)
     fast = jnp.maximum(before.speed, after.speed)
-    least = (0.5 - rolled * jnp.tan(bank) / 3.0) * after.speed / fast
+    least = (0.5 - rolled * _tan(bank) / 3.0) * after.speed / fast
     most = (0.5 + (stretch - 1.0) / 6.0) * after.speed / slow
-    ratio = before.speed / after.speed
 
-    # The axes are g tan φ, ψ and the two mixtures of ψ and δ, then the corners of a and b, then the
-    # kinds of bank change.
-    of_psi = jnp.array([0.0, 1.0, 1.0, 1.0])
-    of_delta = jnp.array([1.0, 0.0, SLOW_MODE, FAST_MODE])
-    of_last = of_psi[:, None] * jnp.stack([least, most, least, most]) + of_delta[:, None]
-    of_first = of_psi[:, None] * jnp.stack([least, least, most, most])
-    by_tube = _combined(
+    largest = functools.partial(
+        largest_mixture,
         tube,
         before.speed,
-        of_heading=of_psi[:, None, None] - TURN_GAIN * ratio * of_last[..., None] * follows,
-        of_turn=ratio * (of_first[..., None] + of_last[..., None] * stays),
+        ratio=before.speed / after.speed,
+        weights=(least, most),
+        shares=(least_share, most_share),
+        follows=follows,
+        stays=stays,
     )
-    by_noise = jnp.max(follows) * (of_psi * most + of_delta) * noise / after.speed
-    turn_rate, heading, slow_mode, fast_mode = by_tube + by_noise
+    by_noise = jnp.where(follows, noise / after.speed, 0.0)
+    turn_rate = largest(0.0, 1.0) + by_noise
+    heading = largest(1.0, 0.0) + most * by_noise
+    slow_mode = largest(1.0, SLOW_MODE) + (most + SLOW_MODE) * by_noise
+    fast_mode = largest(1.0, FAST_MODE) + (most + FAST_MODE) * by_noise
 
     sideways = jnp.minimum(widest, after.speed * turn_rate)
     by_speed = _turn_by_speed(
@@ -203,33 +208,81 @@ def next_in_space(
     return _moved(env, bound, tube=tube, kept=kept, turn=turn, before=before, after=after)
 
 
-def _combined(
+def largest_mixture(
     tube: TubeInSpace,
     speed: Number,
-    of_heading: Float[Array, "k corners ways"],
-    of_turn: Float[Array, "k corners ways"],
-) -> Float[Array, " k"]:
-    """Return the largest weighted sums of heading and turn rate in a tube.
+    of_heading: float,
+    of_turn: float,
+    ratio: Number,
+    weights: tuple[Number, Number],
+    shares: tuple[Number, Number],
+    follows: Bool[Array, ""],
+    stays: Bool[Array, ""],
+) -> Any:
+    """Return a bound on x ψ + y δ after a step without noise, for the turn rate δ = g tan φ/v̄.
+
+    It is a weighted sum of the heading and the turn rate before the step, whose weights are linear
+    in each of a, b, ϑ and μ. So it is largest where these are at a corner.
+
+    Args:
+        tube: the tube before the step.
+        speed: the predicted speed before the step [ft/s].
+        of_heading: x.
+        of_turn: y [s].
+        ratio: the predicted speed before the step over that after it.
+        weights: the least and the largest value of a and b.
+        shares: the least and the largest μ.
+        follows: whether the bank may follow what is asked for, so that ϑ = 1 and μ = 0.
+        stays: whether the bank may follow anything else, so that ϑ = 0.
+    """
+    a = [of_heading * weight for weight in weights]
+    b = [of_heading * weight + of_turn for weight in weights]
+    zero = jnp.zeros_like(tube.heading)
+    sums = [
+        (
+            jnp.where(follows, of_heading - TURN_GAIN * ratio * of_last, zero),
+            jnp.where(follows, ratio * of_first, zero),
+        )
+        for of_first, of_last in itertools.product(a, b)
+    ]
+    least = a[0] + jnp.minimum(b[0] * shares[0], b[0] * shares[1])
+    sums += [
+        (jnp.where(stays, of_heading, zero), jnp.where(stays, ratio * turn, zero))
+        for turn in (least, a[1] + b[1] * shares[1])
+    ]
+    return _largest_sum(tube, tube.sideways / speed, sums)
+
+
+def _largest_sum(tube: TubeInSpace, turn: Number, sums: Sequence[tuple[Array, Array]]) -> Any:
+    """Return a bound on all weighted sums of the heading and the turn rate in a tube.
 
     A tube bounds the heading, the turn rate and two mixtures of both. Any two of these four bounds
-    bound such a sum, and the best pair counts.
+    bound a sum, and the best pair counts.
 
     Args:
         tube: the tube.
-        speed: the predicted speed [ft/s].
-        of_heading: the weight of the heading in each of k sums, at each corner.
-        of_turn: the weight of the turn rate.
+        turn: the largest turn rate in the tube [rad/s].
+        sums: the weights of the heading and of the turn rate [s] in each sum.
     """
-    widths_and_times = ((tube.heading, 0.0), (tube.slow, SLOW_MODE), (tube.fast, FAST_MODE))
-    turn = tube.sideways / speed
-    largest = []
-    for i, (width, time) in enumerate(widths_and_times):
-        rest = of_turn - time * of_heading
-        largest.append(jnp.abs(of_heading) * width + jnp.abs(rest) * turn)
-        for other_width, other_time in widths_and_times[i + 1 :]:
-            of_other = rest / (other_time - time)
-            largest.append(jnp.abs(of_heading - of_other) * width + jnp.abs(of_other) * other_width)
-    return jnp.min(jnp.max(jnp.stack(largest), axis=(-2, -1)), axis=0)
+    # A sum is x ψ + y δ. In the other pairs of axes its weights are x, y and these two differences.
+    apart = FAST_MODE - SLOW_MODE
+    pairs = []
+    for of_heading, of_turn in sums:
+        x, y = jnp.abs(of_heading), jnp.abs(of_turn)
+        slow = jnp.abs(of_turn - SLOW_MODE * of_heading)
+        fast = jnp.abs(of_turn - FAST_MODE * of_heading)
+        pairs.append(
+            (
+                x * tube.heading + y * turn,
+                x * tube.slow + slow * turn,
+                x * tube.fast + fast * turn,
+                (slow * tube.heading + y * tube.slow) / SLOW_MODE,
+                (fast * tube.heading + y * tube.fast) / FAST_MODE,
+                (fast * tube.slow + slow * tube.fast) / apart,
+            )
+        )
+    bounds = [functools.reduce(jnp.maximum, pair) for pair in zip(*pairs, strict=True)]
+    return functools.reduce(jnp.minimum, bounds)
 
 
 def _stretches(plant: Dubins3D, low: Number, high: Number, step: Number) -> tuple[Any, Any]:
@@ -246,7 +299,7 @@ def _stretches(plant: Dubins3D, low: Number, high: Number, step: Number) -> tupl
         jnp.clip(bank, limits[0] - jnp.minimum(step, 0.0), limits[1] - jnp.maximum(step, 0.0))
         for bank in (low, high)
     ]
-    ratios = [(jnp.cos(end) / jnp.cos(end + step)) ** 2 for end in ends]
+    ratios = [(_cos(end) / _cos(end + step)) ** 2 for end in ends]
     return jnp.minimum(*ratios), jnp.maximum(*ratios)
 
 
@@ -308,7 +361,7 @@ def _level(plant: Dubins3D, state: Any, climb: Number) -> Any:
     """Return the least cosine of a flight path angle in a tube."""
     limits = plant.flight_path_angle_limits
     steepest = jnp.maximum(limits[1], -limits[0])
-    return jnp.cos(jnp.minimum(jnp.abs(state.flight_path_angle) + climb, steepest))
+    return _cos(jnp.minimum(jnp.abs(state.flight_path_angle) + climb, steepest))
 
 
 def _turn_by_speed(
@@ -325,5 +378,16 @@ def _turn_by_speed(
     """
     slow = jnp.minimum(before.speed, after.speed)
     bank = jnp.maximum(jnp.abs(before.roll), jnp.abs(after.roll))
-    acceleration = plant.gravity * jnp.tan(bank) + sideways
+    acceleration = plant.gravity * _tan(bank) + sideways
     return acceleration * speed / (slow * jnp.maximum(slow - speed, plant.speed_limits[0]))
+
+
+def _tan(angle: Number) -> Any:
+    """Return the tangent of a bank or climb, which is an acute angle."""
+    sine, cosine = sin_cos_acute(jnp.asarray(angle))
+    return sine / cosine
+
+
+def _cos(angle: Number) -> Any:
+    """Return the cosine of a bank or climb, which is an acute angle."""
+    return sin_cos_acute(jnp.asarray(angle))[1]

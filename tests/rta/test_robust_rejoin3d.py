@@ -15,7 +15,13 @@ from jaxsafe.config import override
 from jaxsafe.evaluate.bounded_worlds import world_at
 from jaxsafe.evaluate.run_adversaries import attack
 from jaxsafe.rta import UncertaintyBound
-from jaxsafe.rta.tube_in_space import FAST_MODE, SLOW_MODE, TubeInSpace
+from jaxsafe.rta.tube_in_space import (
+    FAST_MODE,
+    SLOW_MODE,
+    TURN_GAIN,
+    TubeInSpace,
+    largest_mixture,
+)
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.transition import advance, bounds, others_later
 from jaxsafe.types import Sim
@@ -151,6 +157,53 @@ def ways(
         return jax.lax.scan(one_step, start, jax.random.split(key, 60))[1]
 
     return jax.vmap(episode)(sims, controls, keys)
+
+
+@pytest.mark.parametrize("of_heading", [0.0, 1.0])
+@pytest.mark.parametrize("of_turn", [0.0, SLOW_MODE, FAST_MODE])
+def test_no_step_of_a_tube_turns_further_than_its_bound(of_heading: float, of_turn: float) -> None:
+    random = np.random.default_rng(0)
+    n = 2000
+    psi, delta = random.normal(size=(2, n))
+    speed, ratio = random.uniform(300.0, 500.0, n), random.uniform(0.9, 1.1, n)
+    room = random.uniform(1.0, 3.0, (4, n))
+    tube = TubeInSpace(
+        position=jnp.zeros(n),
+        speed=jnp.zeros(n),
+        climb=jnp.zeros(n),
+        heading=room[0] * np.abs(psi),
+        sideways=room[1] * np.abs(delta) * speed,
+        slow=room[2] * np.abs(psi + SLOW_MODE * delta),
+        fast=room[3] * np.abs(psi + FAST_MODE * delta),
+    )
+    weights = np.sort(random.uniform(0.3, 0.8, (2, n)), axis=0)
+    shares = np.sort(random.uniform(0.0, 2.0, (2, n)), axis=0)
+    follows = random.random(n) < 0.7
+    stays = ~follows | (random.random(n) < 0.7)
+    bound = largest_mixture(
+        tube, speed, of_heading, of_turn, ratio, (*weights,), (*shares,), follows, stays
+    )
+
+    for _ in range(100):
+        a, b, mu = (
+            low + (high - low) * random.random(n) for low, high in (weights, weights, shares)
+        )
+        theta = np.where(follows, np.where(stays, random.random(n), 1.0), 0.0)
+        delta_after = ratio * ((1.0 - theta) * mu * delta - theta * TURN_GAIN * psi)
+        psi_after = psi + a * ratio * delta + b * delta_after
+        assert np.all(np.abs(of_heading * psi_after + of_turn * delta_after) <= bound * 1.00001)
+    alone = largest_mixture(
+        tube.replace(sideways=jnp.zeros(n)),
+        speed,
+        0.0,
+        1.0,
+        ratio,
+        (*weights,),
+        (*shares,),
+        np.ones(n, bool),
+        np.zeros(n, bool),
+    )
+    assert np.all(alone <= TURN_GAIN * ratio * tube.heading * 1.00001)
 
 
 @pytest.mark.thorough
