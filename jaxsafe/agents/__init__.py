@@ -5,6 +5,7 @@ from jaxsafe.agents.distributions import Categorical, Gaussian, Joint
 from jaxsafe.agents.features import (
     ApproachFeatures,
     DockingFeatures,
+    FarApproachFeatures,
     Features,
     PlainFeatures,
     RejoinFeatures,
@@ -21,6 +22,7 @@ __all__ = [
     "ApproachFeatures",
     "Categorical",
     "DockingFeatures",
+    "FarApproachFeatures",
     "Features",
     "Gaussian",
     "Joint",

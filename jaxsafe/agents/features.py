@@ -6,6 +6,7 @@ with a `type` is chosen by `agent.features=TYPE`.
 
 from __future__ import annotations
 
+import functools
 from abc import abstractmethod
 from typing import ClassVar
 
@@ -14,9 +15,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.environment import Environment
+from jaxsafe.processors.status import VelocityLimit
 from jaxsafe.schema.component import Component
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.simulation.cwh import ThrustedSpacecraft
 from jaxsafe.simulation.geometry import rotation, safe_norm
+from jaxsafe.transition import bounds
 from jaxsafe.types import Number
 
 SMALLEST_LIMIT = 1e-6
@@ -72,11 +76,11 @@ class DockingFeatures(Features, type="docking"):
 class ApproachFeatures(Features, type="approach"):
     """The features of `docking`, and the velocity as a share of the speed limit.
 
-    With p the direction of the chief and v the velocity, both in the frame of the observation,
-    these are:
+    With p the direction of the observed position and v the velocity, both in the frame of the
+    observation, these are:
 
     - v/limit.
-    - p·v/limit, the part of v/limit in the direction of the chief.
+    - p·v/limit, the part of v/limit along p.
     - The remaining part of v/limit, which is across p.
     - ‖v‖/limit, which is 1 at the limit.
 
@@ -114,6 +118,85 @@ class ApproachFeatures(Features, type="approach"):
             ],
             axis=-1,
         )
+
+
+class FarApproachFeatures(Features, type="far_approach"):
+    """The features of `approach` without the observation, and the thrust that the approach takes.
+
+    Kilometres away a speed of 1 % of the limit is many steps of full thrust, and gravity takes up
+    most of the thrust. Near the chief it is the other way round. So these features measure
+    velocities by the change Δ that full thrust makes in a step, and accelerations by that of full
+    thrust. With p the direction away from the chief and v the velocity they are:
+
+    - asinh(e) and asinh(e) p, with e = (limit + p·v)/Δ, the speed towards the chief that is missing
+      to the limit.
+    - The part of v/Δ across p, its size compressed by asinh.
+    - The acceleration by thrust that keeps v at the limit while the distance falls. It is ν₁ times
+      the speed towards the chief, along p, less the relative acceleration of Eqs. (12), (16). ν₁ is
+      the slope of the limit.
+
+    The environment must observe position, velocity, speed and speed limit of a point mass, in the
+    axes of its thrusters.
+    """
+
+    def __call__(
+        self, env: Environment, observation: Float[Array, "*batch o"]
+    ) -> Float[Array, "*batch i"]:
+        name = "far_approach"
+        approach = ApproachFeatures(with_observation=False)(env, observation)
+        position, velocity = (
+            _scale(env, what) * _vector(env, observation, what, name)
+            for what in ("position", "velocity")
+        )
+        limit = _scale(env, "velocity_limit") * _elements(env, observation, "velocity_limit", name)
+        plant, slope = self._plant_and_slope(env)
+        low, high = bounds(env)
+        full_thrust = jnp.min(jnp.maximum(-low, high)) / plant.mass
+        by_step = full_thrust * env.dt
+
+        away = position / (_norm(position) + 1e-3)
+        inwards = -jnp.sum(away * velocity, axis=-1, keepdims=True)
+        missing = jnp.arcsinh((limit - inwards) / by_step)
+        across = (velocity + inwards * away) / by_step
+        size = _norm(across)
+        still = plant.rest()
+
+        @functools.partial(jnp.vectorize, signature="(d),(d)->(d)")
+        def drift(position: Float[Array, " d"], velocity: Float[Array, " d"]) -> Array:
+            return plant.derivative(
+                still.replace(position=position, velocity=velocity), {}
+            ).velocity
+
+        held = slope * inwards * away - drift(position, velocity)
+        return jnp.concatenate(
+            [
+                approach,
+                missing,
+                missing * away,
+                across * jnp.arcsinh(size) / (size + 1e-3),
+                held / full_thrust,
+            ],
+            axis=-1,
+        )
+
+    def _plant_and_slope(self, env: Environment) -> tuple[ThrustedSpacecraft, Number]:
+        """Return the agent and the slope of its speed limit [1/s].
+
+        Raises:
+            ConfigError: the agent has no thruster along each axis, or there is no speed limit.
+        """
+        plant = env.agent_platform
+        limits = [status for status in env.status if isinstance(status, VelocityLimit)]
+        if not isinstance(plant, ThrustedSpacecraft) or env.action_names != plant.inputs:
+            raise ConfigError(
+                "agent.features: 'far_approach' needs a point mass with a thruster along each axis;"
+                " choose approach"
+            )
+        if not limits:
+            raise ConfigError(
+                "agent.features: 'far_approach' needs a status of type velocity_limit; choose none"
+            )
+        return plant, limits[0].slope
 
 
 class RejoinFeatures(Features, type="rejoin"):

@@ -8,6 +8,7 @@ from jaxsafe.agents.agent import Agent
 from jaxsafe.agents.features import (
     ApproachFeatures,
     DockingFeatures,
+    FarApproachFeatures,
     Features,
     PlainFeatures,
     RejoinFeatures,
@@ -69,6 +70,36 @@ def test_approach_features_measure_the_velocity_by_its_limit(task: str) -> None:
     np.testing.assert_array_equal(
         inputs[: size + d + 1], Agent(features=DockingFeatures()).inputs(env, timestep.observation)
     )
+
+
+@pytest.mark.parametrize("task", ["docking2d", "docking3d"])
+@pytest.mark.parametrize("distance", [100.0, 10_000.0])
+def test_far_approach_features_measure_by_full_thrust(task: str, distance: float) -> None:
+    env = jaxsafe.make(task)
+    rest = [0.0] * env.observation_names.count("position.z")
+    n, full_thrust = 0.001027, 1.0 / 12.0
+    limit = 0.2 + 2.0 * n * distance
+    deputy = {"position": [distance, 0.0, *rest], "velocity": [-0.8 * limit, 0.3, *rest]}
+    _, timestep = jaxsafe.reset_to(env, {"deputy": deputy})
+    inputs = np.asarray(FarApproachFeatures()(env, timestep.observation))
+    approach = ApproachFeatures(with_observation=False)(env, timestep.observation)
+    np.testing.assert_array_equal(inputs[: approach.size], approach)
+    d = 2 + len(rest)
+    missing, along, across, held = np.split(inputs[approach.size :], [1, 1 + d, 1 + 2 * d])
+    np.testing.assert_allclose(missing, np.arcsinh(0.2 * limit / full_thrust), rtol=1e-3)
+    np.testing.assert_allclose(along, [missing[0], 0.0, *rest], rtol=1e-3)
+    np.testing.assert_allclose(across, [0.0, np.arcsinh(0.3 / full_thrust), *rest], atol=0.02)
+    # ẍ = 2nẏ + 3n²x, ÿ = −2nẋ, and the limit falls by 2n times the speed.
+    falls = 2.0 * n * 0.8 * limit
+    needed = [falls - 2.0 * n * 0.3 - 3.0 * n**2 * distance, -2.0 * n * 0.8 * limit]
+    np.testing.assert_allclose(held, np.array([*needed, *rest]) / full_thrust, rtol=2e-3, atol=1e-6)
+
+
+def test_far_approach_features_need_a_point_mass() -> None:
+    env = jaxsafe.make("docking2d_oriented")
+    _, timestep = env.reset(KEY)
+    with pytest.raises(ConfigError, match=r"'far_approach' needs a point mass .* choose approach"):
+        FarApproachFeatures()(env, timestep.observation)
 
 
 def test_plain_agents_see_the_observation_and_nothing_else() -> None:
