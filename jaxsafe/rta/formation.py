@@ -15,7 +15,7 @@ from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.certificate import Faults
 from jaxsafe.rta.tube_in_space import SLOW_MODE, TubeInSpace
 from jaxsafe.simulation.dubins import Dubins3D
-from jaxsafe.simulation.trig import wrap
+from jaxsafe.simulation.trig import cos_acute, tan_acute, wrap
 from jaxsafe.types import Number
 
 if TYPE_CHECKING:
@@ -54,9 +54,9 @@ def in_formation(
         tube: the tube about the agent's state.
         tolerance: F, the size of the set [ft/s].
     """
-    level_speed = lead.speed * jnp.cos(lead.flight_path_angle)
+    level_speed = lead.speed * cos_acute(lead.flight_path_angle)
     heading_error = wrap(own.heading - lead.heading, -jnp.pi, 2.0 * jnp.pi)
-    sideways = gravity * jnp.tan(own.roll)
+    sideways = gravity * tan_acute(own.roll)
     own_speed = jnp.maximum(own.speed - tube.speed, slowest)
     strongest = (jnp.abs(sideways) + tube.sideways) / own_speed
     mixed = jnp.abs(heading_error + SLOW_MODE * sideways / own.speed) + tube.slow

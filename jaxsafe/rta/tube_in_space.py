@@ -18,7 +18,7 @@ from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.tube import Tube, largest_turn, measured
 from jaxsafe.simulation.dubins import Dubins3D
 from jaxsafe.simulation.geometry import safe_norm
-from jaxsafe.simulation.trig import arctan, sin_cos_acute
+from jaxsafe.simulation.trig import arctan, cos_acute, tan_acute
 from jaxsafe.types import Number, Record
 
 if TYPE_CHECKING:
@@ -123,12 +123,12 @@ def next_in_space(
     noise = (before.speed + speed_error) * wrong_heading
     noise = TURN_GAIN * (noise + speed_error * (jnp.abs(pursuit.error) + tube.heading))
     change = noise + TURN_GAIN * before.speed * tube.heading
-    lowest, highest = g * _tan(plant.roll_limits[0]), g * _tan(plant.roll_limits[1])
+    lowest, highest = g * tan_acute(plant.roll_limits[0]), g * tan_acute(plant.roll_limits[1])
     least_asked = jnp.clip(asked - change, lowest, highest)
     most_asked = jnp.clip(asked + change, lowest, highest)
     asked_kept = jnp.clip(asked, lowest, highest)
     change_kept = jnp.maximum(most_asked - asked_kept, asked_kept - least_asked)
-    now = g * _tan(before.roll)
+    now = g * tan_acute(before.roll)
     least_roll = arctan(jnp.maximum(now - tube.sideways, lowest) / g)
     most_roll = arctan(jnp.minimum(now + tube.sideways, highest) / g)
 
@@ -162,14 +162,14 @@ def next_in_space(
     # ψ after the step is ψ + a δ₀ + b δ₁, with the turn rates δ = g tan φ/v at its ends.
     widest = jnp.maximum(jnp.where(may_follow, change_kept, 0.0), most_share * tube.sideways)
     bank = jnp.maximum(jnp.abs(least_roll), jnp.abs(most_roll))
-    bank = jnp.maximum(bank, arctan((g * _tan(jnp.abs(after.roll)) + widest) / g))
+    bank = jnp.maximum(bank, arctan((g * tan_acute(jnp.abs(after.roll)) + widest) / g))
     bank = jnp.minimum(bank, jnp.maximum(plant.roll_limits[1], -plant.roll_limits[0]))
     rolled = jnp.abs(after.roll - before.roll) + (tube.sideways + widest) / g
     rolled = jnp.minimum(rolled, jnp.maximum(up, -down))
-    stretch = (_cos(jnp.maximum(bank - rolled, 0.0)) / _cos(bank)) ** 2
+    stretch = (cos_acute(jnp.maximum(bank - rolled, 0.0)) / cos_acute(bank)) ** 2
     slow = jnp.minimum(before.speed, after.speed)
     fast = jnp.maximum(before.speed, after.speed)
-    least = (0.5 - rolled * _tan(bank) / 3.0) * after.speed / fast
+    least = (0.5 - rolled * tan_acute(bank) / 3.0) * after.speed / fast
     most = (0.5 + (stretch - 1.0) / 6.0) * after.speed / slow
 
     largest = functools.partial(
@@ -299,7 +299,7 @@ def _stretches(plant: Dubins3D, low: Number, high: Number, step: Number) -> tupl
         jnp.clip(bank, limits[0] - jnp.minimum(step, 0.0), limits[1] - jnp.maximum(step, 0.0))
         for bank in (low, high)
     ]
-    ratios = [(_cos(end) / _cos(end + step)) ** 2 for end in ends]
+    ratios = [(cos_acute(end) / cos_acute(end + step)) ** 2 for end in ends]
     return jnp.minimum(*ratios), jnp.maximum(*ratios)
 
 
@@ -361,7 +361,7 @@ def _level(plant: Dubins3D, state: Any, climb: Number) -> Any:
     """Return the least cosine of a flight path angle in a tube."""
     limits = plant.flight_path_angle_limits
     steepest = jnp.maximum(limits[1], -limits[0])
-    return _cos(jnp.minimum(jnp.abs(state.flight_path_angle) + climb, steepest))
+    return cos_acute(jnp.minimum(jnp.abs(state.flight_path_angle) + climb, steepest))
 
 
 def _turn_by_speed(
@@ -378,16 +378,5 @@ def _turn_by_speed(
     """
     slow = jnp.minimum(before.speed, after.speed)
     bank = jnp.maximum(jnp.abs(before.roll), jnp.abs(after.roll))
-    acceleration = plant.gravity * _tan(bank) + sideways
+    acceleration = plant.gravity * tan_acute(bank) + sideways
     return acceleration * speed / (slow * jnp.maximum(slow - speed, plant.speed_limits[0]))
-
-
-def _tan(angle: Number) -> Any:
-    """Return the tangent of a bank or climb, which is an acute angle."""
-    sine, cosine = sin_cos_acute(jnp.asarray(angle))
-    return sine / cosine
-
-
-def _cos(angle: Number) -> Any:
-    """Return the cosine of a bank or climb, which is an acute angle."""
-    return sin_cos_acute(jnp.asarray(angle))[1]

@@ -27,7 +27,7 @@ from jaxsafe.simulation.integrate import (
     time_to_limit,
 )
 from jaxsafe.simulation.platform import Platform
-from jaxsafe.simulation.trig import arctan, sin_cos, sin_cos_acute
+from jaxsafe.simulation.trig import arctan, cos_acute, sin_cos, sin_cos_acute, tan_acute
 from jaxsafe.types import Number, Record, Seconds
 
 GRAVITY = 32.17
@@ -334,7 +334,7 @@ class Dubins3D(Platform, type="dubins3d"):
         of the mean acceleration by ‖Δa‖Δt²/54 at most.
         """
         across = [
-            self.gravity * jnp.tan(state.roll) * jnp.cos(state.flight_path_angle)
+            self.gravity * tan_acute(state.roll) * cos_acute(state.flight_path_angle)
             for state in (before, after)
         ]
         return super().bend(before, after, dt) + jnp.abs(across[1] - across[0]) * dt**2 / 54.0

@@ -123,6 +123,17 @@ def _sin_cos_acute_derivative(primals: tuple[Any], tangents: tuple[Any]) -> tupl
     return (sine, cosine), (cosine * tangents[0], -sine * tangents[0])
 
 
+def tan_acute(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Return tan x for |x| < π/2, with an error of at most 4e-7/cos x of it in float32."""
+    sine, cosine = sin_cos_acute(x)
+    return sine / cosine
+
+
+def cos_acute(x: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """Return cos x for |x| ≤ π/2, within 1.2e-7 in float32."""
+    return sin_cos_acute(x)[1]
+
+
 def _polynomial(coefficients: Sequence[float], z: Array) -> Array:
     """Return the value of a polynomial at z by Horner's rule. The highest power comes first."""
     highest = jnp.asarray(coefficients[0], z.dtype)

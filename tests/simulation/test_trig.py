@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsafe.simulation.trig import arctan, sin_cos, sin_cos_acute, wrap
+from jaxsafe.simulation.trig import arctan, cos_acute, sin_cos, sin_cos_acute, tan_acute, wrap
 
 
 @pytest.mark.parametrize("span", [1.0, 10.0, 200.0, 1e4])
@@ -55,6 +55,11 @@ def test_acute_angles_need_no_reduction() -> None:
     assert sine.dtype == cosine.dtype == jnp.float32
     assert np.abs(np.asarray(sine, float) - np.sin(x.astype(float))).max() < 1.2e-7
     assert np.abs(np.asarray(cosine, float) - np.cos(x.astype(float))).max() < 1.2e-7
+    np.testing.assert_array_equal(cos_acute(x), cosine)
+    exact = np.tan(x.astype(float))
+    inside = np.abs(x) < 1.57
+    error = np.abs(np.asarray(tan_acute(x), float) - exact)[inside]
+    assert np.all(error <= 4e-7 / np.cos(x[inside].astype(float)) * np.abs(exact[inside]))
     zero = sin_cos_acute(jnp.float32(0.0))
     assert (float(zero[0]), float(zero[1])) == (0.0, 1.0)
     for derivative in (jax.grad, jax.jacfwd):
