@@ -729,6 +729,35 @@ def filtered_training(_: Results) -> str:
     return markdown(heads.split(" | "), rows)
 
 
+def studied_training(results: Results) -> str:
+    """Return the table of the study of filters in training, with a row for each way of training."""
+    rows = []
+    for row in results["rows"]:
+        own, alone = row["tests"]["with"], row["tests"]["without"]
+        iqm = row["success_iqm"]
+        rows.append(
+            (
+                row["task"],
+                f"`{row['filter']}`" if row["filter"] != "none" else "none",
+                row["treatment"],
+                _until(row["steps_to_80"]["timesteps"]),
+                f"{row['training_cost']['mean']:,.0f}",
+                f"{100 * iqm['with']['iqm']:.4g}",
+                f"{own['episode_length']['mean']:.0f}",
+                f"{100 * own['intervention_rate']['mean']:.3g}",
+                f"{100 * iqm['without']['iqm']:.4g}",
+                f"{100 * alone['episode_safety_violation_rate']['mean']:.3g}",
+                f"{alone['episode_length']['mean']:.0f}",
+            )
+        )
+    heads = (
+        "task | trained with | and | 80 % in training after | violations in training"
+        " | success, IQM [%] | length [s] | steps altered [%] | alone: success, IQM [%]"
+        " | alone: violating steps [%] | alone: length [s]"
+    )
+    return markdown(heads.split(" | "), rows)
+
+
 def readme_tasks(_: Results) -> str:
     """Return the table of the tasks, with their results from the records of the report.
 
@@ -1225,6 +1254,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("", bounded_attacks, "docs/safety/attacks.md"),
     ("", adversaries, "docs/safety/attacks.md"),
     ("", filtered_training, "docs/safety/cost.md"),
+    ("training_with_rta", studied_training, "docs/studies.md"),
     ("", readme_tasks, "README.md"),
     ("", reported, "docs/protocol.md"),
 )

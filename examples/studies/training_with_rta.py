@@ -189,6 +189,8 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     panels: dict[str, dict[str, Any]] = {label: {} for label, _ in SHOWN.values()}
     for task, colour in zip(TASKS, (BLUE, ORANGE), strict=True):
         of_task = [found.get((task, way)) for way in ways]
+        if not any(of_task):
+            continue
         for tested, filled in (("with", colour), ("without", "white")):
             name = f"{task}, tested {tested} a filter"
             looks[name] = {"color": colour, "markerfacecolor": filled}
