@@ -6,7 +6,7 @@ are trained in the task of `published_docking.yaml`, and tested with their filte
 from random starts, and from the ten test points of the study.
 
     cd examples/studies/published_docking
-    python study.py seeds=5 steps=20000000
+    python study.py seeds=5
 
 Runs are kept in `runs`, and what is complete is not done again. The results are written to
 `out`/published_docking.json, and drawn in `out`/published_docking.png.
@@ -106,7 +106,7 @@ class Options(CommandOptions):
     """The configurations, with commas between them."""
     seeds: Count = 5
     """Number of seeds of each training."""
-    preset: Annotated[str, Option(names=("published", "features"))] = "published"
+    preset: Annotated[str, Option(names=("features", "published"))] = "features"
     """The recipe of the training."""
     steps: Count | None = None
     """Number of environment steps of each seed. By default it is what the recipe says."""
