@@ -5,6 +5,7 @@ The reward of a step is the sum of its terms. At reset all terms are 0.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Annotated, Any
 
@@ -102,21 +103,16 @@ class ThresholdReward(ConditionalReward, type="threshold"):
 
 
 class Potential(Record):
-    """Memory of `DistanceChange`."""
+    """Memory of `PotentialChange`."""
 
     current: Float[Array, ""]
     change: Float[Array, ""]
 
 
-class DistanceChange(Reward, type="distance_change"):
-    """Change of an exponential potential of a distance d over a step.
-
-    It is scale·(e^(−a d_t) − e^(−a d_(t−1))) with a = ln 2 / half_distance.
-    """
+class PotentialChange(Reward):
+    """Change of a potential of a distance over a step. A subclass has the potential."""
 
     distance: StatusName
-    half_distance: Annotated[Length, Extent]
-    scale: Pay = 2.0
 
     def init(self, sim: Sim) -> Potential:
         current = self._potential(sim)
@@ -129,8 +125,37 @@ class DistanceChange(Reward, type="distance_change"):
     def process(self, memory: Potential, sim: Sim) -> Float[Array, ""]:
         return memory.change
 
+    @abstractmethod
+    def _potential(self, sim: Sim) -> Float[Array, ""]:
+        """Return the potential at the distance of now."""
+
+
+class DistanceChange(PotentialChange, type="distance_change"):
+    """Change of an exponential potential of a distance d over a step.
+
+    It is scale·(e^(−a d_t) − e^(−a d_(t−1))) with a = ln 2 / half_distance.
+    """
+
+    half_distance: Annotated[Length, Extent]
+    scale: Pay = 2.0
+
     def _potential(self, sim: Sim) -> Float[Array, ""]:
         return self.scale * jnp.exp(-jnp.log(2.0) / self.half_distance * sim.status[self.distance])
+
+
+class LogDistanceChange(PotentialChange, type="log_distance_change"):
+    """Change of a logarithmic potential of a distance d over a step.
+
+    It is scale·ln((d_(t−1) + offset)/(d_t + offset)), so halving the distance pays the same from
+    anywhere far away. Below a speed limit ν₀ + ν₁d, with an offset of ν₀/ν₁, a second of flight at
+    the limit pays scale·ν₁ whatever the distance.
+    """
+
+    offset: Annotated[Length, Extent]
+    scale: Pay = 1.0
+
+    def _potential(self, sim: Sim) -> Float[Array, ""]:
+        return -self.scale * jnp.log(sim.status[self.distance] + self.offset)
 
 
 class Stay(Record):

@@ -28,6 +28,7 @@ from jaxsafe.processors.reward import (
     DistanceChange,
     Failure,
     FirstTime,
+    LogDistanceChange,
     Success,
     VelocityConstraint,
     WhileIn,
@@ -282,6 +283,18 @@ def test_the_distance_reward_is_twice_the_change_of_the_exponential_potential() 
     assert float(reward.process(memory, world(d=0.0))) == pytest.approx(2 * (1.0 - 0.5))
     memory = reward.increment(memory, world(d=300.0), 1.0)
     assert float(reward.process(memory, world(d=300.0))) == pytest.approx(2 * (0.125 - 1.0))
+
+
+def test_the_logarithmic_reward_pays_the_same_per_second_at_the_limit_from_anywhere() -> None:
+    floor, slope = 0.2, 0.002054
+    reward = normalise(LogDistanceChange(name="x", distance="d", offset=floor / slope, scale=2.0))
+    for distance in (50.0, 1000.0, 10_000.0):
+        memory = reward.init(world(d=distance))
+        assert reward.process(memory, world(d=distance)) == 0.0
+        nearer = world(d=distance - 20.0 * (floor + slope * distance))
+        memory = reward.increment(memory, nearer, 20.0)
+        expected = -2.0 * np.log(1.0 - 20.0 * slope)
+        assert float(reward.process(memory, nearer)) == pytest.approx(expected, rel=1e-4)
 
 
 @settings(deadline=None, max_examples=30)
