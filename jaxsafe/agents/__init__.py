@@ -6,11 +6,12 @@ from jaxsafe.agents.features import (
     ApproachFeatures,
     DockingFeatures,
     FarApproachFeatures,
+    FarOrientedFeatures,
     Features,
     PlainFeatures,
     RejoinFeatures,
 )
-from jaxsafe.agents.networks import GRU, MLP, Network
+from jaxsafe.agents.networks import GRU, MLP, Directional, Network
 from jaxsafe.agents.pilot import Pilot
 from jaxsafe.agents.policy_file import SavedPolicy, load_policy, read_policy, save_policy
 from jaxsafe.agents.trained_policy import TrainedPolicy, TrainedRecurrentPolicy
@@ -21,8 +22,10 @@ __all__ = [
     "Agent",
     "ApproachFeatures",
     "Categorical",
+    "Directional",
     "DockingFeatures",
     "FarApproachFeatures",
+    "FarOrientedFeatures",
     "Features",
     "Gaussian",
     "Joint",

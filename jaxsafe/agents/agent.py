@@ -21,6 +21,7 @@ from jaxsafe.agents.distributions import Categorical, Distribution, action_distr
 from jaxsafe.agents.features import Features, PlainFeatures
 from jaxsafe.agents.networks import (
     MLP,
+    Directional,
     Memory,
     Network,
     Normal,
@@ -31,7 +32,7 @@ from jaxsafe.agents.networks import (
 from jaxsafe.environment import Environment
 from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.schema.component import ANY, Component, Range, Unit
-from jaxsafe.schema.errors import ConfigError, summarise_error
+from jaxsafe.schema.errors import ConfigError, show, summarise_error
 from jaxsafe.schema.user_modules import modules
 from jaxsafe.types import Dimensionless, Key, Number
 
@@ -54,7 +55,7 @@ class Agent(Component):
     field_word: ClassVar[str] = "option"
 
     actor: Network = MLP()
-    """The network that decides the actions: mlp, gru or one of your own."""
+    """The network that decides the actions: mlp, directional, gru or one of your own."""
     critic: Network | None = None
     """The network of each critic. None stands for one like the actor's."""
     features: Features = PlainFeatures()
@@ -88,7 +89,7 @@ class Agent(Component):
     @property
     def networks(self) -> dict[str, Network]:
         """The networks by name: `actor`, `critic`, and `cost_critic` if there is one."""
-        critic = self.actor if self.critic is None else self.critic
+        critic = self.actor.like_critic if self.critic is None else self.critic
         networks = {"actor": self.actor, "critic": critic}
         return {**networks, "cost_critic": critic} if self.cost_critic else networks
 
@@ -366,6 +367,19 @@ def check_agent(agent: Agent, env: Environment, place: str = "agent") -> None:
         problem = network and network.problem()
         if problem:
             raise ConfigError(f"{place}.{name}.{problem}")
+    if isinstance(agent.critic, Directional):
+        raise ConfigError(f"{place}.critic: 'directional' is for an actor; choose mlp")
+    if isinstance(agent.actor, Directional):
+        if env.action_kind != "continuous":
+            raise ConfigError(
+                f"{place}.actor: 'directional' needs continuous actions, found"
+                f" {env.action_kind} ones; choose mlp"
+            )
+        if agent.actor.vectors != agent.features.num_vectors:
+            raise ConfigError(
+                f"{place}.actor: 'directional' needs features with {agent.actor.vectors} vectors,"
+                f" found {show(agent.features.type_name)} with {agent.features.num_vectors}"
+            )
     count = jnp.size(agent.log_std)
     if count not in (1, env.action_size):
         raise ConfigError(

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import functools
 from abc import abstractmethod
-from typing import ClassVar
+from collections.abc import Callable
+from typing import ClassVar, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,7 @@ from jaxsafe.schema.component import Component
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.cwh import ThrustedSpacecraft
 from jaxsafe.simulation.geometry import rotation, safe_norm
+from jaxsafe.simulation.oriented import OrientedSpacecraft
 from jaxsafe.transition import bounds
 from jaxsafe.types import Number
 
@@ -35,6 +37,8 @@ class Features(Component):
     """Base of the functions from an environment's observations to the inputs of the networks."""
 
     field_word: ClassVar[str] = "option"
+    num_vectors: ClassVar[int] = 0
+    """Number of vectors that the inputs end with, each as long as the control."""
 
     @abstractmethod
     def __call__(
@@ -121,44 +125,174 @@ class ApproachFeatures(Features, type="approach"):
 
 
 class FarApproachFeatures(Features, type="far_approach"):
-    """The features of `approach` without the observation, and the thrust that the approach takes.
+    """Features for starts from 100 m to 10 km: what turning the scene leaves alone, and vectors.
 
     Kilometres away a speed of 1 % of the limit is many steps of full thrust, and gravity takes up
-    most of the thrust. Near the chief it is the other way round. So these features measure
-    velocities by the change Δ that full thrust makes in a step, and accelerations by that of full
-    thrust. With p the direction away from the chief and v the velocity they are:
+    most of the thrust. Near the chief it is the other way round. So velocities are measured both by
+    the limit and by the change Δ that full thrust makes in a step, and accelerations by that of
+    full thrust. With p the direction away from the chief, v the velocity and w its part across p,
+    the numbers are:
 
-    - asinh(e) and asinh(e) p, with e = (limit + p·v)/Δ, the speed towards the chief that is missing
-      to the limit.
-    - The part of v/Δ across p, its size compressed by asinh.
-    - The acceleration by thrust that keeps v at the limit while the distance falls. It is ν₁ times
-      the speed towards the chief, along p, less the relative acceleration of Eqs. (12), (16). ν₁ is
-      the slope of the limit.
+    - log(‖r‖ + 0.005), with the distance ‖r‖ as the environment observes it.
+    - −p·v, ‖w‖ and ‖v‖ as shares of the limit.
+    - (limit + p·v)/Δ, ‖w‖/Δ and (limit − ‖v‖)/Δ. Each such x is compressed to sign(x) ln(1 + |x|).
+    - How fast the limit falls below the speed without thrust: ν₁ times the speed towards the chief,
+      plus the relative acceleration of Eqs. (12), (16) along v. ν₁ is the slope of the limit.
+    - a·p, a·w/‖w‖ and ‖a‖. Here a is the acceleration by thrust that keeps v at the limit while the
+      distance falls: ν₁ times the speed towards the chief, along p, less the relative acceleration.
 
-    The environment must observe position, velocity, speed and speed limit of a point mass, in the
-    axes of its thrusters.
+    The vectors are p, w/‖w‖ and a. With `agent.actor=directional` the thrust is a plus a weighted
+    sum of the other two. The environment must observe position, velocity, speed and speed limit of
+    a point mass, in the axes of its thrusters.
     """
+
+    num_vectors: ClassVar[int] = 3
 
     def __call__(
         self, env: Environment, observation: Float[Array, "*batch o"]
     ) -> Float[Array, "*batch i"]:
         name = "far_approach"
-        approach = ApproachFeatures(with_observation=False)(env, observation)
-        position, velocity = (
-            _scale(env, what) * _vector(env, observation, what, name)
-            for what in ("position", "velocity")
-        )
-        limit = _scale(env, "velocity_limit") * _elements(env, observation, "velocity_limit", name)
-        plant, slope = self._plant_and_slope(env)
+        plant = env.agent_platform
+        if not isinstance(plant, ThrustedSpacecraft) or env.action_names != plant.inputs:
+            raise ConfigError(
+                f"agent.features: {name!r} needs a point mass with a thruster along each axis;"
+                " choose approach"
+            )
+        for item in env.observation:
+            if item.name in ("position", "velocity") and getattr(item, "frame", None) is not None:
+                raise ConfigError(
+                    f"agent.features: {name!r} needs the observation {item.name!r} in the axes of"
+                    f" the thrusters, found it in the frame of {item.frame!r}; choose approach"
+                )
         low, high = bounds(env)
         full_thrust = jnp.min(jnp.maximum(-low, high)) / plant.mass
-        by_step = full_thrust * env.dt
+        flight = _Flight.seen(env, observation, name, full_thrust, lambda vector, _: vector)
+        held = flight.held
+        return jnp.concatenate(
+            [
+                *flight.numbers,
+                _dot(held, flight.away),
+                _dot(held, flight.aside),
+                _norm(held),
+                flight.away,
+                flight.aside,
+                held,
+            ],
+            axis=-1,
+        )
 
-        away = position / (_norm(position) + 1e-3)
-        inwards = -jnp.sum(away * velocity, axis=-1, keepdims=True)
-        missing = jnp.arcsinh((limit - inwards) / by_step)
-        across = (velocity + inwards * away) / by_step
-        size = _norm(across)
+
+class FarOrientedFeatures(Features, type="far_oriented"):
+    """The features of `far_approach` for a spacecraft that thrusts along its body.
+
+    All vectors are in the body frame, and Δ is the change by full thrust ahead. The numbers are the
+    first eight of `far_approach`, then the attitude rate, the vectors p, w/‖w‖ and a, and three
+    more of q: q/‖q‖, and ‖q‖ and both parts of q compressed. Here q is the acceleration by thrust
+    that brings v towards the chief at 95 % of the limit within 8 s, or at ‖r‖/10 s if that is less.
+    A pilot turns the body along it.
+
+    The environment must observe the chief's position and the velocity, both in the body frame, and
+    attitude, attitude rate, speed and speed limit of an oriented spacecraft.
+    """
+
+    def __call__(
+        self, env: Environment, observation: Float[Array, "*batch o"]
+    ) -> Float[Array, "*batch i"]:
+        name = "far_oriented"
+        plant = env.agent_platform
+        if not isinstance(plant, OrientedSpacecraft) or "thrust" not in env.action_names:
+            raise ConfigError(
+                f"agent.features: {name!r} needs an oriented_spacecraft with the control 'thrust';"
+                " choose approach"
+            )
+        for item in env.observation:
+            if item.name in ("position", "velocity") and getattr(item, "frame", None) != env.agent:
+                raise ConfigError(
+                    f"agent.features: {name!r} needs the observation {item.name!r} in the frame of"
+                    f" {env.agent!r}; choose approach"
+                )
+        cosine, sine = (
+            _scale(env, "attitude") * _elements(env, observation, f"attitude.{part}", name)
+            for part in ("cos", "sin")
+        )
+
+        def turned(vector: Float[Array, "*batch 2"], sign: float) -> Float[Array, "*batch 2"]:
+            x, y = vector[..., :1], vector[..., 1:]
+            s = sign * sine
+            return jnp.concatenate([cosine * x - s * y, s * x + cosine * y], axis=-1)
+
+        full_thrust = bounds(env)[1][env.action_names.index("thrust")] / plant.mass
+        flight = _Flight.seen(env, observation, name, full_thrust, turned)
+        speed = jnp.minimum(0.95 * flight.limit, 0.1 * flight.distance)
+        push = flight.held - (speed * flight.away + flight.velocity) / (8.0 * full_thrust)
+        size = _norm(push)
+        return jnp.concatenate(
+            [
+                *flight.numbers,
+                _elements(env, observation, "attitude_rate", name),
+                flight.away,
+                flight.aside,
+                flight.held,
+                push / (size + 0.05),
+                _compressed(4.0 * size),
+                _compressed(4.0 * push),
+            ],
+            axis=-1,
+        )
+
+
+class _Flight(NamedTuple):
+    """What the features for far starts compute of an observation, see `FarApproachFeatures`."""
+
+    numbers: list[Float[Array, "*batch 1"]]
+    """The first eight numbers."""
+    distance: Float[Array, "*batch 1"]  # [m]
+    velocity: Float[Array, "*batch d"]  # [m/s], like the vectors below in the axes of the thrusters
+    limit: Float[Array, "*batch 1"]  # [m/s]
+    away: Float[Array, "*batch d"]  # p
+    aside: Float[Array, "*batch d"]  # w/‖w‖
+    held: Float[Array, "*batch d"]  # a, in units of full thrust
+
+    @classmethod
+    def seen(
+        cls,
+        env: Environment,
+        observation: Float[Array, "*batch o"],
+        name: str,
+        full_thrust: Number,
+        turned: Callable[[Array, float], Array],
+    ) -> _Flight:
+        """Return what an observation shows.
+
+        Args:
+            env: the environment.
+            observation: observations `[*batch, o]`.
+            name: name of the features, for messages.
+            full_thrust: acceleration by full thrust [m/s²].
+            turned: a function that turns a vector from the axes of the thrusters to Hill's frame,
+                or back if its second argument is −1 instead of 1.
+
+        Raises:
+            ConfigError: the environment does not observe what is needed, or has no speed limit.
+        """
+        limits = [status for status in env.status if isinstance(status, VelocityLimit)]
+        if not limits:
+            raise ConfigError(
+                f"agent.features: {name!r} needs a status of type velocity_limit; choose none"
+            )
+        slope = limits[0].slope
+        place = next((item for item in env.observation if item.name == "position"), None)
+        # A position relative to the agent points to the chief.
+        sign = -1.0 if getattr(place, "relative_to", None) == env.agent else 1.0
+        observed = sign * _vector(env, observation, "position", name)
+        position = _scale(env, "position") * observed
+        velocity = _scale(env, "velocity") * _vector(env, observation, "velocity", name)
+        limit = jnp.maximum(
+            _scale(env, "velocity_limit") * _elements(env, observation, "velocity_limit", name),
+            SMALLEST_LIMIT,
+        )
+        by_step = full_thrust * env.dt
+        plant = env.agent_platform
         still = plant.rest()
 
         @functools.partial(jnp.vectorize, signature="(d),(d)->(d)")
@@ -167,36 +301,31 @@ class FarApproachFeatures(Features, type="far_approach"):
                 still.replace(position=position, velocity=velocity), {}
             ).velocity
 
-        held = slope * inwards * away - drift(position, velocity)
-        return jnp.concatenate(
-            [
-                approach,
-                missing,
-                missing * away,
-                across * jnp.arcsinh(size) / (size + 1e-3),
-                held / full_thrust,
+        distance, speed = _norm(position), _norm(velocity)
+        away = position / (distance + 1e-3)
+        inwards = -_dot(away, velocity)
+        across = velocity + inwards * away
+        sideways = _norm(across)
+        pulled = turned(drift(turned(position, 1.0), turned(velocity, 1.0)), -1.0) / full_thrust
+        closing = slope * inwards / full_thrust
+        return cls(
+            numbers=[
+                jnp.log(_norm(observed) + 0.005),
+                inwards / limit,
+                sideways / limit,
+                speed / limit,
+                _compressed((limit - inwards) / by_step),
+                _compressed(sideways / by_step),
+                _compressed((limit - speed) / by_step),
+                closing + _dot(velocity / (speed + 1e-3), pulled),
             ],
-            axis=-1,
+            distance=distance,
+            velocity=velocity,
+            limit=limit,
+            away=away,
+            aside=across / (sideways + 0.1 * by_step),
+            held=closing * away - pulled,
         )
-
-    def _plant_and_slope(self, env: Environment) -> tuple[ThrustedSpacecraft, Number]:
-        """Return the agent and the slope of its speed limit [1/s].
-
-        Raises:
-            ConfigError: the agent has no thruster along each axis, or there is no speed limit.
-        """
-        plant = env.agent_platform
-        limits = [status for status in env.status if isinstance(status, VelocityLimit)]
-        if not isinstance(plant, ThrustedSpacecraft) or env.action_names != plant.inputs:
-            raise ConfigError(
-                "agent.features: 'far_approach' needs a point mass with a thruster along each axis;"
-                " choose approach"
-            )
-        if not limits:
-            raise ConfigError(
-                "agent.features: 'far_approach' needs a status of type velocity_limit; choose none"
-            )
-        return plant, limits[0].slope
 
 
 class RejoinFeatures(Features, type="rejoin"):
@@ -257,6 +386,15 @@ class RejoinFeatures(Features, type="rejoin"):
 @jax.jit
 def _norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch 1"]:
     return safe_norm(vector)[..., None]
+
+
+def _compressed(x: Float[Array, "*batch 1"]) -> Float[Array, "*batch 1"]:
+    """Return sign(x) ln(1 + abs(x)), in functions that other runtimes and proofs know."""
+    return jnp.log(1.0 + jnp.maximum(x, 0.0)) - jnp.log(1.0 + jnp.maximum(-x, 0.0))
+
+
+def _dot(a: Float[Array, "*batch d"], b: Float[Array, "*batch d"]) -> Float[Array, "*batch 1"]:
+    return jnp.sum(a * b, axis=-1, keepdims=True)
 
 
 def _magnitude_and_direction(

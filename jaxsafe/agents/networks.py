@@ -64,6 +64,11 @@ class Network(Component):
     recurrent: ClassVar[bool] = False
     """Whether the module is called as `(memory, inputs) -> (memory, outputs)`, step by step."""
 
+    @property
+    def like_critic(self) -> Network:
+        """The network of a critic beside an actor like this one."""
+        return self
+
     @abstractmethod
     def module(self, num_outputs: int, output_gain: float) -> linen.Module:
         """Return the module that computes outputs `[*batch, num_outputs]` of inputs `[*batch, i]`.
@@ -117,6 +122,40 @@ class MLP(Network, type="mlp"):
             hidden=self.hidden,
             activation=self.activation,
             layer_norm=self.layer_norm,
+            num_outputs=num_outputs,
+            output_gain=output_gain,
+        )
+
+    def init(self, key: Key, normal: Normal, module: Any, *inputs: Array) -> Params:
+        return orthogonal_params(normal, module, *inputs)
+
+
+class Directional(Network, type="directional"):
+    """A perceptron that weighs vectors. The control is their sum and one vector more.
+
+    The vectors are the last of the inputs, so the features must end with some, as `far_approach`
+    does. The last of them counts as it is, and each of the others has a weight from −2 to 2. The
+    perceptron, whose layers have tanh, sees the inputs before the vectors. If those do not change
+    when the scene is turned, the control turns with it, and what is learnt in one direction holds
+    in all.
+    """
+
+    hidden: Hidden = (64, 64)
+    """Numbers of units of the hidden layers."""
+    vectors: Annotated[int, Range(2, largest=2**16)] = 3
+    """Number of vectors, each as long as the control."""
+
+    @property
+    def like_critic(self) -> Network:
+        """A perceptron of the same size. A value has no direction."""
+        return MLP(hidden=self.hidden)
+
+    def module(self, num_outputs: int, output_gain: float) -> linen.Module:
+        from jaxsafe.agents.flax_modules import WeightedVectors
+
+        return WeightedVectors(
+            hidden=self.hidden,
+            vectors=self.vectors,
             num_outputs=num_outputs,
             output_gain=output_gain,
         )

@@ -1,18 +1,22 @@
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxsafe
-from jaxsafe.agents.agent import Agent
+from jaxsafe.agents.agent import Agent, check_agent
 from jaxsafe.agents.features import (
     ApproachFeatures,
     DockingFeatures,
     FarApproachFeatures,
+    FarOrientedFeatures,
     Features,
     PlainFeatures,
     RejoinFeatures,
 )
+from jaxsafe.agents.networks import MLP, Directional
 from jaxsafe.schema.errors import ConfigError
 
 KEY = jax.random.key(3)
@@ -82,17 +86,113 @@ def test_far_approach_features_measure_by_full_thrust(task: str, distance: float
     deputy = {"position": [distance, 0.0, *rest], "velocity": [-0.8 * limit, 0.3, *rest]}
     _, timestep = jaxsafe.reset_to(env, {"deputy": deputy})
     inputs = np.asarray(FarApproachFeatures()(env, timestep.observation))
-    approach = ApproachFeatures(with_observation=False)(env, timestep.observation)
-    np.testing.assert_array_equal(inputs[: approach.size], approach)
     d = 2 + len(rest)
-    missing, along, across, held = np.split(inputs[approach.size :], [1, 1 + d, 1 + 2 * d])
-    np.testing.assert_allclose(missing, np.arcsinh(0.2 * limit / full_thrust), rtol=1e-3)
-    np.testing.assert_allclose(along, [missing[0], 0.0, *rest], rtol=1e-3)
-    np.testing.assert_allclose(across, [0.0, np.arcsinh(0.3 / full_thrust), *rest], atol=0.02)
-    # ẍ = 2nẏ + 3n²x, ÿ = −2nẋ, and the limit falls by 2n times the speed.
-    falls = 2.0 * n * 0.8 * limit
-    needed = [falls - 2.0 * n * 0.3 - 3.0 * n**2 * distance, -2.0 * n * 0.8 * limit]
-    np.testing.assert_allclose(held, np.array([*needed, *rest]) / full_thrust, rtol=2e-3, atol=1e-6)
+    numbers, away, aside, held = np.split(inputs, [11, 11 + d, 11 + 2 * d])
+    speed = np.hypot(0.8 * limit, 0.3)
+    # ẍ = 2nẏ + 3n²x, ÿ = −2nẋ, and the limit falls by 2n times the speed towards the chief.
+    falls = 2.0 * n * 0.8 * limit / full_thrust
+    pulled = np.array([0.6 * n + 3.0 * n**2 * distance, 1.6 * n * limit]) / full_thrust
+    needed = [falls - pulled[0], -pulled[1]]
+    expected = [
+        np.log(distance / 100.0 + 0.005),
+        0.8,
+        0.3 / limit,
+        speed / limit,
+        np.log1p(0.2 * limit / full_thrust),
+        np.log1p(0.3 / full_thrust),
+        -np.log1p((speed - limit) / full_thrust)
+        if speed > limit
+        else np.log1p((limit - speed) / full_thrust),
+        falls + (-0.8 * limit * pulled[0] + 0.3 * pulled[1]) / speed,
+        needed[0],
+        needed[1],
+        np.hypot(*needed),
+    ]
+    # Directions have a length of ‖w‖/(‖w‖ + Δ/10), and of that less a thousandth of a unit.
+    np.testing.assert_allclose(numbers, expected, rtol=0.04, atol=1e-3)
+    np.testing.assert_allclose(away, [1.0, 0.0, *rest], atol=2e-3)
+    np.testing.assert_allclose(aside, [0.0, 1.0, *rest], atol=0.03)
+    np.testing.assert_allclose(held, [*needed, *rest], rtol=2e-3, atol=1e-6)
+
+
+def test_far_oriented_features_turn_with_the_body_alone() -> None:
+    env = jaxsafe.make("docking2d_oriented")
+    start = {"position": [3000.0, -4000.0], "velocity": [-5.0, 2.0]}
+    seen = []
+    for attitude in (0.0, 1.2):
+        deputy = {**start, "attitude": attitude, "attitude_rate": 0.01}
+        _, timestep = jaxsafe.reset_to(env, {"deputy": deputy})
+        seen.append(np.asarray(FarOrientedFeatures()(env, timestep.observation)))
+    straight, turned = seen
+    np.testing.assert_allclose(turned[:9], straight[:9], rtol=1e-4, atol=1e-5)
+    assert straight[8] == pytest.approx(0.01 / (np.pi / 90), rel=1e-5)
+    to_body = np.array([[np.cos(1.2), np.sin(1.2)], [-np.sin(1.2), np.cos(1.2)]])
+    for first in (9, 11, 13, 15):
+        part = slice(first, first + 2)
+        np.testing.assert_allclose(turned[part], to_body @ straight[part], atol=1e-5)
+    # Without a turn the body frame is Hill's, so these are the features of a point mass, whose
+    # full thrust is that of the body ahead.
+    np.testing.assert_allclose(straight[9:11], [0.6, -0.8], atol=1e-5)
+    n, full_thrust = 0.001027, 2.0 / 12.0
+    closing = 2.0 * n * (5.0 * 0.6 + 2.0 * 0.8)
+    pulled = np.array([4.0 * n + 3.0 * n**2 * 3000.0, 10.0 * n])
+    held = (closing * np.array([0.6, -0.8]) - pulled) / full_thrust
+    np.testing.assert_allclose(straight[13:15], held, rtol=1e-4)
+    aim = -0.95 * (0.2 + 2.0 * n * 5000.0) * np.array([0.6, -0.8])
+    push = held + (aim - start["velocity"]) / (8.0 * full_thrust)
+    size = np.hypot(*push)
+    np.testing.assert_allclose(straight[15:17], push / (size + 0.05), rtol=1e-4)
+    compressed = [np.log1p(4.0 * size), *(np.sign(push) * np.log1p(4.0 * np.abs(push)))]
+    np.testing.assert_allclose(straight[17:], compressed, rtol=1e-4)
+
+
+@pytest.mark.parametrize("task", ["docking2d", "docking3d"])
+def test_a_directional_actor_turns_its_control_with_the_vectors(task: str) -> None:
+    env = jaxsafe.make(task)
+    agent = Agent(features=FarApproachFeatures(), actor=Directional(hidden=(16,)))
+    params = agent.init(KEY, env)
+    _, timestep = env.reset(KEY)
+    inputs = agent.inputs(env, timestep.observation)
+    d = env.action_size
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(d, d)))[0]
+    vectors = np.asarray(inputs[11:]).reshape(3, d)
+    turned = np.concatenate([inputs[:11], (vectors @ turn).ravel()])
+    control, also_turned = (
+        np.asarray(agent.distribution(env, params, jnp.asarray(seen)).mode())
+        for seen in (inputs, turned)
+    )
+    assert np.abs(control).max() > 1e-4
+    np.testing.assert_allclose(also_turned, control @ turn, atol=1e-6)
+    assert agent.networks["critic"] == MLP(hidden=(16,))
+
+
+@pytest.mark.parametrize(
+    ("changes", "agent", "message"),
+    [
+        (
+            {},
+            {"actor": Directional()},
+            "agent.actor: 'directional' needs features with 3 vectors, found 'none' with 0",
+        ),
+        (
+            {"actions": "discrete"},
+            {"features": FarApproachFeatures(), "actor": Directional()},
+            "agent.actor: 'directional' needs continuous actions, found discrete ones; choose mlp",
+        ),
+        (
+            {},
+            {"critic": Directional()},
+            "agent.critic: 'directional' is for an actor; choose mlp",
+        ),
+    ],
+)
+def test_what_a_directional_actor_needs(
+    changes: dict[str, Any], agent: dict[str, Any], message: str
+) -> None:
+    env = jaxsafe.make("docking2d", **changes)
+    with pytest.raises(ConfigError) as error:
+        check_agent(Agent(**agent), env)
+    assert str(error.value) == message
 
 
 def test_far_approach_features_need_a_point_mass() -> None:
@@ -100,6 +200,26 @@ def test_far_approach_features_need_a_point_mass() -> None:
     _, timestep = env.reset(KEY)
     with pytest.raises(ConfigError, match=r"'far_approach' needs a point mass .* choose approach"):
         FarApproachFeatures()(env, timestep.observation)
+
+
+def test_far_approach_features_need_the_axes_of_the_thrusters() -> None:
+    env = jaxsafe.make("docking2d")
+    position, *others = env.observation
+    env = env.replace(observation=(position.replace(frame="deputy"), *others))
+    message = "needs the observation 'position' in the axes of the thrusters, found it in the frame"
+    with pytest.raises(ConfigError, match=message):
+        FarApproachFeatures()(env, jnp.zeros(env.observation_size))
+
+
+def test_far_oriented_features_need_a_body_that_is_observed_in_its_frame() -> None:
+    env = jaxsafe.make("docking2d")
+    with pytest.raises(ConfigError, match="'far_oriented' needs an oriented_spacecraft"):
+        FarOrientedFeatures()(env, jnp.zeros(env.observation_size))
+    env = jaxsafe.make("docking2d_oriented")
+    position, *others = env.observation
+    env = env.replace(observation=(position.replace(frame=None), *others))
+    with pytest.raises(ConfigError, match="needs the observation 'position' in the frame of"):
+        FarOrientedFeatures()(env, jnp.zeros(env.observation_size))
 
 
 def test_plain_agents_see_the_observation_and_nothing_else() -> None:

@@ -211,7 +211,7 @@ def test_a_network_of_a_users_module_is_trained_and_read_in_another_process(
     [
         (
             {"agent.actor": "mpl"},
-            r"agent.actor: found 'mpl'. Did you mean 'mlp'\? Choose from mlp, gru",
+            r"agent.actor: found 'mpl'. Did you mean 'mlp'\? Choose from mlp, directional, gru",
         ),
         ({"agent.actor.width": 3}, "agent.actor.width: unknown option 'width'; choose from"),
         (
