@@ -176,7 +176,7 @@ def test_points(run: Run, filtered: bool) -> dict[str, Any]:
                 state, timestep, seen = carry
                 state, timestep = jaxsafe.step(env, state, policy(key, timestep.observation))
                 flying = ~seen["ended"]
-                used = timestep.info.status["delta_v"]
+                used = timestep.info.status["delta_v_l1"]
                 seen = {
                     "steps": seen["steps"] + flying,
                     "violating": seen["violating"] + (flying & (timestep.cost > 0.0)),
