@@ -19,9 +19,14 @@ class Dot(NamedTuple):
     high: float
 
 
-def dot(metric: Mapping[str, Any], unit: float) -> Dot:
-    """Return a metric of `results.json` in a unit, with its interval if it has one."""
+def dot(metric: Mapping[str, Any], unit: float) -> Dot | None:
+    """Return a metric of `results.json` in a unit, with its interval if it has one.
+
+    Return None if the metric is not known there.
+    """
     value = metric["mean"] if "mean" in metric else metric["iqm"]
+    if value is None:
+        return None
     low, high = metric["ci95"] or (value, value)
     return Dot(unit * value, unit * low, unit * high)
 

@@ -200,7 +200,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     dot_chart(path, [f"{way.filter}: {way.treatment}" for way in ways], panels, looks, first)
 
 
-def _dot(row: dict[str, Any], metric: str, tested: str, unit: float) -> Dot:
+def _dot(row: dict[str, Any], metric: str, tested: str, unit: float) -> Dot | None:
     """Return a metric of a row. It is the mean over the seeds, and the IQM of the successes."""
     if metric == "success_rate":
         return dot(row["success_iqm"][tested], unit)
