@@ -165,7 +165,7 @@ class FarApproachFeatures(Features, type="far_approach"):
                     f" the thrusters, found it in the frame of {item.frame!r}; choose approach"
                 )
         low, high = bounds(env)
-        full_thrust = jnp.min(jnp.maximum(-low, high)) / plant.mass
+        full_thrust = functools.reduce(jnp.minimum, jnp.maximum(-low, high)) / plant.mass
         flight = _Flight.seen(env, observation, name, full_thrust, lambda vector, _: vector)
         held = flight.held
         return jnp.concatenate(

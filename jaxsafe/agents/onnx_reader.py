@@ -311,9 +311,6 @@ _OPERATORS: Mapping[str, Callable[[list[Any], Mapping[str, Any]], Any]] = {
     "ReduceMax": lambda x, a: jnp.max(
         x[0], axis=_reduced(x, a), keepdims=bool(a.get("keepdims", 1))
     ),
-    "ReduceMin": lambda x, a: jnp.min(
-        x[0], axis=_reduced(x, a), keepdims=bool(a.get("keepdims", 1))
-    ),
     "ArgMax": lambda x, a: jnp.argmax(
         x[0], axis=a.get("axis", 0), keepdims=bool(a.get("keepdims", 1))
     ),
@@ -337,7 +334,6 @@ _ATTRIBUTES: Mapping[str, str] = {
     "Cast": "to saturate round_mode",
     "ReduceSum": "axes keepdims",
     "ReduceMax": "axes keepdims",
-    "ReduceMin": "axes keepdims",
     "ArgMax": "axis keepdims",
     "Mod": "fmod",
 }

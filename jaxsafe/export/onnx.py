@@ -403,9 +403,6 @@ class _Graph:
     def _reduce_max(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
         return self.node("ReduceMax", inputs, axes=list(params["axes"]), keepdims=0)
 
-    def _reduce_min(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
-        return self.node("ReduceMin", inputs, axes=list(params["axes"]), keepdims=0)
-
     def _argmax(self, inputs: list[str], shapes: Any, out: Any, params: Any) -> str:
         [axis] = params["axes"]
         return self.node(

@@ -442,7 +442,14 @@ class _Builder:
     def fold(self, eqn: Any, x: list[Constant]) -> list[Constant]:
         """Return the outputs of an operation on constants, with the errors of the loop as radii."""
         name, several = eqn.primitive.name, eqn.primitive.multiple_results
-        out = eqn.primitive.bind(*(jnp.asarray(item.value) for item in x), **eqn.params)
+        # Some constants are known more precisely than the loop computes. All are taken so.
+        precise = np.result_type(
+            np.float32, *(item.value.dtype for item in x if item.value.dtype.kind == "f")
+        )
+        values = (
+            jnp.asarray(item.value, precise if item.value.dtype.kind == "f" else None) for item in x
+        )
+        out = eqn.primitive.bind(*values, **eqn.params)
         outs = [np.asarray(item) for item in (out if several else [out])]
         exact = not any(np.any(item.radius) for item in x)
         if outs[0].dtype.kind != "f":

@@ -17,8 +17,10 @@ from default_cases import thorough
 
 import jaxsafe
 from jaxsafe import Environment
+from jaxsafe.agents import Agent, Directional, FarApproachFeatures
 from jaxsafe.commands.verify import EXIT_CODES, main
 from jaxsafe.rollout import RecurrentPolicy
+from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.cwh import cwh_flow
 from jaxsafe.simulation.oriented import wrapped
@@ -52,6 +54,9 @@ BEHIND = {
 """Starts of a wingman behind its lead."""
 
 WINGMAN_GAINS = 0.2 * np.random.default_rng(0).normal(size=(2, 12))
+
+KEY = jax.random.key(0)
+"""A key for policies that do not draw."""
 
 GAINS = np.array([[-0.3, 0.1, -0.9, 0.0, 0.1, 0.0], [0.0, -0.4, 0.1, -0.8, 0.0, -0.1]])
 
@@ -220,19 +225,26 @@ def test_angular_functions_are_as_exact_as_the_proofs_take_them_to_be(
     assert (error <= 0.5 * ELEMENTARY * 2.0**-24 * np.abs(exact[:, small]) + 2.0**-60).all()
 
 
-@pytest.mark.thorough
-def test_the_program_is_the_loop_that_runs() -> None:
+def directional() -> Any:
+    """Return the policy of an untrained actor that weighs directions."""
     env = jaxsafe.make("docking2d")
-    loop = closed_loop(env, braking)
+    agent = normalise(Agent(actor=Directional(hidden=(8,)), features=FarApproachFeatures()))
+    return agent.policy(env, agent.init(KEY, env), deterministic=True)
+
+
+@pytest.mark.parametrize("policy", [thorough(braking), directional()], ids=["own", "directional"])
+def test_the_program_is_the_loop_that_runs(policy: Any) -> None:
+    env = jaxsafe.make("docking2d")
+    loop = closed_loop(env, policy)
     x = np.random.default_rng(0).uniform([-90, 60, -0.3, -0.3], [90, 120, 0.3, 0.3], (2000, 4))
 
     def two_steps(x: jax.Array) -> jax.Array:
         state, timestep = jaxsafe.reset_to(env, start_of(env, x))
         for _ in range(2):
-            state, timestep = jaxsafe.step(env, state, braking(None, timestep.observation))
+            state, timestep = jaxsafe.step(env, state, policy(KEY, timestep.observation))
         own = state.sim.platforms["deputy"]
         margin = timestep.info.margins["velocity_limit"][None]
-        action = braking(None, timestep.observation)
+        action = policy(KEY, timestep.observation)
         return jnp.concatenate([own.position, own.velocity, action, margin])
 
     flown = np.asarray(jax.jit(jax.vmap(two_steps))(jnp.asarray(x, jnp.float32)))
@@ -266,13 +278,13 @@ def require_inside(env: Environment, policy: Any, proof: Verification) -> None:
     def fly(x: jax.Array) -> tuple[jax.Array, jax.Array]:
         def seen(state: Any, timestep: Any) -> tuple[jax.Array, jax.Array]:
             moving = [getattr(state.sim.platforms[part.platform], part.field) for part in own]
-            action = jnp.clip(policy(None, timestep.observation), -1.0, 1.0)
+            action = jnp.clip(policy(KEY, timestep.observation), -1.0, 1.0)
             margin = timestep.info.margins[names[0]]
             return jnp.concatenate([*map(jnp.atleast_1d, moving), action]), margin
 
         def advance(carry: Any, _: None) -> tuple[Any, Any]:
             state, timestep = carry
-            carry = jaxsafe.step(env, state, policy(None, timestep.observation))
+            carry = jaxsafe.step(env, state, policy(KEY, timestep.observation))
             return carry, seen(*carry)
 
         start = jaxsafe.reset_to(env, start_of(env, x))
