@@ -47,6 +47,7 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "robustness": ("episodes=100",),
     "uncertain_training": (),
     "constraints": (),
+    "far_starts": (),
     "verification": (),
 }
 """The options of each script, by its name, in the order in which they run."""

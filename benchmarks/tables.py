@@ -305,6 +305,32 @@ def constraints(results: Results) -> str:
     return markdown(heads.split(" | "), rows)
 
 
+def far_starts(results: Results) -> str:
+    """Return the table of policies that learn to dock from far away."""
+    rows = []
+    for row in results["rows"]:
+        drawn, mode = (row["evaluation"][kind] for kind in EVALUATION_KINDS)
+        successes = drawn["success_rate"]["per_seed"] + mode["success_rate"]["per_seed"]
+        rows.append(
+            (
+                row["task"],
+                row["start"],
+                _interval(drawn["success_rate"], 100.0, 2),
+                _interval(mode["success_rate"], 100.0, 2),
+                f"{100.0 * min(successes):.1f}",
+                f"{100.0 * mode['episode_safety_violation_rate']['mean']:.2g}",
+                _interval(mode["average_return"], 1.0, 2),
+                f"{mode['control_usage_l1']['mean']:.1f}",
+                f"{mode['episode_length']['mean']:,.0f}",
+            )
+        )
+    heads = (
+        "task | from | success, stochastic [%] | deterministic | worst seed | violating steps [%]"
+        " | return | Δv, L1 [m/s] | length [s]"
+    )
+    return markdown(heads.split(" | "), rows)
+
+
 def controllers(results: Results) -> str:
     """Return the table of controllers and packaged policies without a filter, and of bounds."""
     rows = []
@@ -754,6 +780,45 @@ def studied_training(results: Results) -> str:
         "task | trained with | and | 80 % in training after | violations in training"
         " | success, IQM [%] | length [s] | steps altered [%] | alone: success, IQM [%]"
         " | alone: violating steps [%] | alone: length [s]"
+    )
+    return markdown(heads.split(" | "), rows)
+
+
+def studied_filters(results: Results) -> str:
+    """Return the table of the published study of filters, with a row for each training and test.
+
+    A cell has the result from random starts and, after a stroke, that from the ten test points.
+    """
+    rows = []
+    for row in results["rows"]:
+        first = (
+            row["configuration"],
+            _until(row["steps_to_80"]["timesteps"]),
+            f"{row['training_cost']['mean']:,.0f}",
+        )
+        for key in ("with", "without"):
+            if key not in row["tests"]:
+                continue
+            flown = (row["tests"][key], row["test_points"][key])
+            cells = (
+                ("success_rate", 100, ".4g"),
+                ("episode_safety_violation_rate", 100, ".3g"),
+                ("episode_length", 1, ",.0f"),
+                ("control_usage_l1", 1, ".3g"),
+            )
+            rows.append(
+                (
+                    *(first if key == "with" or "with" not in row["tests"] else ("", "", "")),
+                    "yes" if key == "with" else "no",
+                    *(
+                        " / ".join(f"{unit * one[metric]['mean']:{form}}" for one in flown)
+                        for metric, unit, form in cells
+                    ),
+                )
+            )
+    heads = (
+        "trained with | 80 % in training after | violations in training | filter in the test"
+        " | success [%] | violating steps [%] | length [s] | Δv, L1 [m/s]"
     )
     return markdown(heads.split(" | "), rows)
 
@@ -1242,6 +1307,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("uncertain_training", uncertain_training, "docs/safety/attacks.md"),
     ("datasets", datasets, "docs/dataset.md"),
     ("constraints", constraints, "docs/constrained.md"),
+    ("far_starts", far_starts, "docs/far_starts.md"),
     ("controllers", controllers, "docs/controllers.md"),
     ("controllers", controllers_filtered, "docs/controllers.md"),
     ("possible", possible, "docs/possible.md"),
@@ -1255,6 +1321,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("", adversaries, "docs/safety/attacks.md"),
     ("", filtered_training, "docs/safety/cost.md"),
     ("training_with_rta", studied_training, "docs/studies.md"),
+    ("published_docking", studied_filters, "docs/studies.md"),
     ("", readme_tasks, "README.md"),
     ("", reported, "docs/protocol.md"),
 )

@@ -8,7 +8,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from tiny_run import assert_same_end
@@ -136,16 +135,21 @@ def test_a_wrong_change_of_a_recipe_is_told_with_its_place(
         resolve({"env": "docking2d", "recipe": "own.yaml"})
 
 
-def test_docking3d_has_a_recipe_for_far_starts() -> None:
-    config, env, _ = resolve({"env": "docking3d", "preset": "wide"})
+@pytest.mark.parametrize("task", ["docking2d", "docking3d", "docking2d_oriented"])
+def test_each_docking_task_has_a_recipe_for_far_starts(task: str) -> None:
+    config, env, _ = resolve({"env": task, "preset": "wide"})
     assert get_path(env, FAR).tolist() == [100.0, 1e4]
     assert config.ppo.curriculum[FAR].tolist() == [100.0, 150.0]
-    assert len(config.agent.inputs(env, jnp.ones(env.observation_size))) == 12
     # The time at the speed limit from the farthest start, 2,260 s, fits into the timeout.
     floor, slope = (
         float(get_path(env, f"status.velocity_limit.{name}")) for name in ("floor", "slope")
     )
     assert np.log1p(slope * 1e4 / floor) / slope < 0.5 * float(get_path(env, TIMEOUT))
+    # The task's own terms are all there, and one more.
+    *own, added = env.reward
+    assert [term.name for term in own] == [term.name for term in jaxsafe.make(task).reward]
+    assert float(added.offset) == pytest.approx(floor / slope, rel=0.01)
+    assert float(get_path(env, "reward.failure.values.velocity")) == -2.0
 
 
 def test_the_recipe_of_the_command_line_wins(mine: Path) -> None:
