@@ -167,29 +167,21 @@ class FarApproachFeatures(Features, type="far_approach"):
         low, high = bounds(env)
         full_thrust = functools.reduce(jnp.minimum, jnp.maximum(-low, high)) / plant.mass
         flight = _Flight.seen(env, observation, name, full_thrust, lambda vector, _: vector)
-        held = flight.held
-        return jnp.concatenate(
-            [
-                *flight.numbers,
-                _dot(held, flight.away),
-                _dot(held, flight.aside),
-                _norm(held),
-                flight.away,
-                flight.aside,
-                held,
-            ],
-            axis=-1,
-        )
+        return jnp.concatenate([*flight.numbers, flight.away, flight.aside, flight.held], axis=-1)
 
 
 class FarOrientedFeatures(Features, type="far_oriented"):
     """The features of `far_approach` for a spacecraft that thrusts along its body.
 
-    All vectors are in the body frame, and Δ is the change by full thrust ahead. The numbers are the
-    first eight of `far_approach`, then the attitude rate, the vectors p, w/‖w‖ and a, and three
-    more of q: q/‖q‖, and ‖q‖ and both parts of q compressed. Here q is the acceleration by thrust
-    that brings v towards the chief at 95 % of the limit within 8 s, or at ‖r‖/10 s if that is less.
-    A pilot turns the body along it.
+    They are the numbers of `far_approach`, where Δ is the change by full thrust ahead, the attitude
+    rate, and in the body frame:
+
+    - p · 10 m/(10 m + ‖r‖), which only shows near the chief.
+    - q/‖q‖, and ‖q‖ and both parts of q compressed. Here q is the acceleration by thrust that
+      brings v towards the chief at 95 % of the limit within 8 s, or at ‖r‖/10 s if that is less.
+      A pilot turns the body along it.
+
+    Far away q alone has a direction, so what is learnt in one direction holds in all.
 
     The environment must observe the chief's position and the velocity, both in the body frame, and
     attitude, attitude rate, speed and speed limit of an oriented spacecraft.
@@ -230,9 +222,7 @@ class FarOrientedFeatures(Features, type="far_oriented"):
             [
                 *flight.numbers,
                 _elements(env, observation, "attitude_rate", name),
-                flight.away,
-                flight.aside,
-                flight.held,
+                flight.away * (10.0 / (10.0 + flight.distance)),
                 push / (size + 0.05),
                 _compressed(4.0 * size),
                 _compressed(4.0 * push),
@@ -245,7 +235,7 @@ class _Flight(NamedTuple):
     """What the features for far starts compute of an observation, see `FarApproachFeatures`."""
 
     numbers: list[Float[Array, "*batch 1"]]
-    """The first eight numbers."""
+    """The numbers, which do not change when the scene is turned."""
     distance: Float[Array, "*batch 1"]  # [m]
     velocity: Float[Array, "*batch d"]  # [m/s], like the vectors below in the axes of the thrusters
     limit: Float[Array, "*batch 1"]  # [m/s]
@@ -308,6 +298,8 @@ class _Flight(NamedTuple):
         sideways = _norm(across)
         pulled = turned(drift(turned(position, 1.0), turned(velocity, 1.0)), -1.0) / full_thrust
         closing = slope * inwards / full_thrust
+        aside = across / (sideways + 0.1 * by_step)
+        held = closing * away - pulled
         return cls(
             numbers=[
                 jnp.log(_norm(observed) + 0.005),
@@ -318,13 +310,16 @@ class _Flight(NamedTuple):
                 _compressed(sideways / by_step),
                 _compressed((limit - speed) / by_step),
                 closing + _dot(velocity / (speed + 1e-3), pulled),
+                _dot(held, away),
+                _dot(held, aside),
+                _norm(held),
             ],
             distance=distance,
             velocity=velocity,
             limit=limit,
             away=away,
-            aside=across / (sideways + 0.1 * by_step),
-            held=closing * away - pulled,
+            aside=aside,
+            held=held,
         )
 
 

@@ -124,26 +124,26 @@ def test_far_oriented_features_turn_with_the_body_alone() -> None:
         _, timestep = jaxsafe.reset_to(env, {"deputy": deputy})
         seen.append(np.asarray(FarOrientedFeatures()(env, timestep.observation)))
     straight, turned = seen
-    np.testing.assert_allclose(turned[:9], straight[:9], rtol=1e-4, atol=1e-5)
-    assert straight[8] == pytest.approx(0.01 / (np.pi / 90), rel=1e-5)
+    np.testing.assert_allclose(turned[:12], straight[:12], rtol=1e-4, atol=1e-5)
+    assert straight[11] == pytest.approx(0.01 / (np.pi / 90), rel=1e-5)
     to_body = np.array([[np.cos(1.2), np.sin(1.2)], [-np.sin(1.2), np.cos(1.2)]])
-    for first in (9, 11, 13, 15):
+    for first in (12, 14):
         part = slice(first, first + 2)
         np.testing.assert_allclose(turned[part], to_body @ straight[part], atol=1e-5)
-    # Without a turn the body frame is Hill's, so these are the features of a point mass, whose
-    # full thrust is that of the body ahead.
-    np.testing.assert_allclose(straight[9:11], [0.6, -0.8], atol=1e-5)
+    # Without a turn the body frame is Hill's.
+    away = np.array([0.6, -0.8])
+    np.testing.assert_allclose(straight[12:14], away * 10.0 / 5010.0, rtol=1e-4)
     n, full_thrust = 0.001027, 2.0 / 12.0
     closing = 2.0 * n * (5.0 * 0.6 + 2.0 * 0.8)
     pulled = np.array([4.0 * n + 3.0 * n**2 * 3000.0, 10.0 * n])
-    held = (closing * np.array([0.6, -0.8]) - pulled) / full_thrust
-    np.testing.assert_allclose(straight[13:15], held, rtol=1e-4)
-    aim = -0.95 * (0.2 + 2.0 * n * 5000.0) * np.array([0.6, -0.8])
+    held = (closing * away - pulled) / full_thrust
+    np.testing.assert_allclose(straight[[8, 10]], [held @ away, np.hypot(*held)], rtol=1e-4)
+    aim = -0.95 * (0.2 + 2.0 * n * 5000.0) * away
     push = held + (aim - start["velocity"]) / (8.0 * full_thrust)
     size = np.hypot(*push)
-    np.testing.assert_allclose(straight[15:17], push / (size + 0.05), rtol=1e-4)
+    np.testing.assert_allclose(straight[14:16], push / (size + 0.05), rtol=1e-4)
     compressed = [np.log1p(4.0 * size), *(np.sign(push) * np.log1p(4.0 * np.abs(push)))]
-    np.testing.assert_allclose(straight[17:], compressed, rtol=1e-4)
+    np.testing.assert_allclose(straight[16:], compressed, rtol=1e-4)
 
 
 @pytest.mark.parametrize("task", ["docking2d", "docking3d"])
