@@ -125,13 +125,63 @@ class ApproachFeatures(Features, type="approach"):
 
 
 class FarApproachFeatures(Features, type="far_approach"):
-    """Features for starts from 100 m to 10 km: what turning the scene leaves alone, and vectors.
+    """The features of `approach` without the observation, and the thrust that the approach takes.
 
     Kilometres away a speed of 1 % of the limit is many steps of full thrust, and gravity takes up
-    most of the thrust. Near the chief it is the other way round. So velocities are measured both by
-    the limit and by the change Δ that full thrust makes in a step, and accelerations by that of
-    full thrust. With p the direction away from the chief, v the velocity and w its part across p,
-    the numbers are:
+    most of the thrust. Near the chief it is the other way round. So these features measure
+    velocities by the change Δ that full thrust makes in a step, and accelerations by that of full
+    thrust. With p the direction away from the chief and v the velocity they are:
+
+    - asinh(e) and asinh(e) p, with e = (limit + p·v)/Δ, the speed towards the chief that is missing
+      to the limit.
+    - The part of v/Δ across p, its size compressed by asinh.
+    - The acceleration by thrust that keeps v at the limit while the distance falls. It is ν₁ times
+      the speed towards the chief, along p, less the relative acceleration of Eqs. (12), (16). ν₁ is
+      the slope of the limit.
+
+    The environment must observe position, velocity, speed and speed limit of a point mass, in the
+    axes of its thrusters.
+    """
+
+    def __call__(
+        self, env: Environment, observation: Float[Array, "*batch o"]
+    ) -> Float[Array, "*batch i"]:
+        name = "far_approach"
+        approach = ApproachFeatures(with_observation=False)(env, observation)
+        position, velocity = (
+            _scale(env, what) * _vector(env, observation, what, name)
+            for what in ("position", "velocity")
+        )
+        limit = _scale(env, "velocity_limit") * _elements(env, observation, "velocity_limit", name)
+        _check_point_mass(env, name)
+        slope = _slope_of_limit(env, name)
+        full_thrust = _full_thrust(env)
+        by_step = full_thrust * env.dt
+
+        away = position / (_norm(position) + 1e-3)
+        inwards = -jnp.sum(away * velocity, axis=-1, keepdims=True)
+        missing = jnp.arcsinh((limit - inwards) / by_step)
+        across = (velocity + inwards * away) / by_step
+        size = _norm(across)
+        held = slope * inwards * away - _drift(env, position, velocity)
+        return jnp.concatenate(
+            [
+                approach,
+                missing,
+                missing * away,
+                across * jnp.arcsinh(size) / (size + 1e-3),
+                held / full_thrust,
+            ],
+            axis=-1,
+        )
+
+
+class FarDirectionsFeatures(Features, type="far_directions"):
+    """Numbers that do not change when the scene is turned, and vectors, for far starts.
+
+    As in `far_approach`, Δ is the change by full thrust in a step, and accelerations are in units
+    of that by full thrust. With p the direction away from the chief, v the velocity and w its part
+    across p, the numbers are:
 
     - log(‖r‖ + 0.005), with the distance ‖r‖ as the environment observes it.
     - −p·v, ‖w‖ and ‖v‖ as shares of the limit.
@@ -151,30 +201,18 @@ class FarApproachFeatures(Features, type="far_approach"):
     def __call__(
         self, env: Environment, observation: Float[Array, "*batch o"]
     ) -> Float[Array, "*batch i"]:
-        name = "far_approach"
-        plant = env.agent_platform
-        if not isinstance(plant, ThrustedSpacecraft) or env.action_names != plant.inputs:
-            raise ConfigError(
-                f"agent.features: {name!r} needs a point mass with a thruster along each axis;"
-                " choose approach"
-            )
-        for item in env.observation:
-            if item.name in ("position", "velocity") and getattr(item, "frame", None) is not None:
-                raise ConfigError(
-                    f"agent.features: {name!r} needs the observation {item.name!r} in the axes of"
-                    f" the thrusters, found it in the frame of {item.frame!r}; choose approach"
-                )
-        low, high = bounds(env)
-        full_thrust = functools.reduce(jnp.minimum, jnp.maximum(-low, high)) / plant.mass
+        name = "far_directions"
+        _check_point_mass(env, name)
+        full_thrust = _full_thrust(env)
         flight = _Flight.seen(env, observation, name, full_thrust, lambda vector, _: vector)
         return jnp.concatenate([*flight.numbers, flight.away, flight.aside, flight.held], axis=-1)
 
 
 class FarOrientedFeatures(Features, type="far_oriented"):
-    """The features of `far_approach` for a spacecraft that thrusts along its body.
+    """The features of `far_directions` for a spacecraft that thrusts along its body.
 
-    They are the numbers of `far_approach`, where Δ is the change by full thrust ahead, the attitude
-    rate, and in the body frame:
+    They are the numbers of `far_directions`, where Δ is the change by full thrust ahead, the
+    attitude rate, and in the body frame:
 
     - p · 10 m/(10 m + ‖r‖), which only shows near the chief.
     - q/‖q‖, and ‖q‖ and both parts of q compressed. Here q is the acceleration by thrust that
@@ -232,7 +270,7 @@ class FarOrientedFeatures(Features, type="far_oriented"):
 
 
 class _Flight(NamedTuple):
-    """What the features for far starts compute of an observation, see `FarApproachFeatures`."""
+    """What the features for far starts compute of an observation, see `FarDirectionsFeatures`."""
 
     numbers: list[Float[Array, "*batch 1"]]
     """The numbers, which do not change when the scene is turned."""
@@ -265,12 +303,7 @@ class _Flight(NamedTuple):
         Raises:
             ConfigError: the environment does not observe what is needed, or has no speed limit.
         """
-        limits = [status for status in env.status if isinstance(status, VelocityLimit)]
-        if not limits:
-            raise ConfigError(
-                f"agent.features: {name!r} needs a status of type velocity_limit; choose none"
-            )
-        slope = limits[0].slope
+        slope = _slope_of_limit(env, name)
         place = next((item for item in env.observation if item.name == "position"), None)
         # A position relative to the agent points to the chief.
         sign = -1.0 if getattr(place, "relative_to", None) == env.agent else 1.0
@@ -282,21 +315,13 @@ class _Flight(NamedTuple):
             SMALLEST_LIMIT,
         )
         by_step = full_thrust * env.dt
-        plant = env.agent_platform
-        still = plant.rest()
-
-        @functools.partial(jnp.vectorize, signature="(d),(d)->(d)")
-        def drift(position: Float[Array, " d"], velocity: Float[Array, " d"]) -> Array:
-            return plant.derivative(
-                still.replace(position=position, velocity=velocity), {}
-            ).velocity
-
         distance, speed = _norm(position), _norm(velocity)
         away = position / (distance + 1e-3)
         inwards = -_dot(away, velocity)
         across = velocity + inwards * away
         sideways = _norm(across)
-        pulled = turned(drift(turned(position, 1.0), turned(velocity, 1.0)), -1.0) / full_thrust
+        drift = _drift(env, turned(position, 1.0), turned(velocity, 1.0))
+        pulled = turned(drift, -1.0) / full_thrust
         closing = slope * inwards / full_thrust
         aside = across / (sideways + 0.1 * by_step)
         held = closing * away - pulled
@@ -381,6 +406,61 @@ class RejoinFeatures(Features, type="rejoin"):
 @jax.jit
 def _norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch 1"]:
     return safe_norm(vector)[..., None]
+
+
+def _check_point_mass(env: Environment, name: str) -> None:
+    """Check that the agent thrusts along each axis, and is observed in these axes.
+
+    Raises:
+        ConfigError: it does not, or is not. The message names the features.
+    """
+    plant = env.agent_platform
+    if not isinstance(plant, ThrustedSpacecraft) or env.action_names != plant.inputs:
+        raise ConfigError(
+            f"agent.features: {name!r} needs a point mass with a thruster along each axis;"
+            " choose approach"
+        )
+    for item in env.observation:
+        frame = getattr(item, "frame", None)
+        if item.name in ("position", "velocity") and frame is not None:
+            raise ConfigError(
+                f"agent.features: {name!r} needs the observation {item.name!r} in the axes of the"
+                f" thrusters, found it in the frame of {frame!r}; choose approach"
+            )
+
+
+def _full_thrust(env: Environment) -> Array:
+    """Return the acceleration by full thrust of a point mass along its weakest axis [m/s²]."""
+    low, high = bounds(env)
+    return functools.reduce(jnp.minimum, jnp.maximum(-low, high)) / env.agent_platform.mass
+
+
+def _drift(
+    env: Environment, position: Float[Array, "*batch d"], velocity: Float[Array, "*batch d"]
+) -> Float[Array, "*batch d"]:
+    """Return the acceleration of the agent without thrust [m/s²], in Hill's frame."""
+    plant = env.agent_platform
+    still = plant.rest()
+
+    @functools.partial(jnp.vectorize, signature="(d),(d)->(d)")
+    def drift(position: Float[Array, " d"], velocity: Float[Array, " d"]) -> Array:
+        return plant.derivative(still.replace(position=position, velocity=velocity), {}).velocity
+
+    return drift(position, velocity)
+
+
+def _slope_of_limit(env: Environment, name: str) -> Number:
+    """Return the slope of the speed limit [1/s].
+
+    Raises:
+        ConfigError: there is no speed limit. The message names the features.
+    """
+    limits = [status for status in env.status if isinstance(status, VelocityLimit)]
+    if not limits:
+        raise ConfigError(
+            f"agent.features: {name!r} needs a status of type velocity_limit; choose none"
+        )
+    return limits[0].slope
 
 
 def _compressed(x: Float[Array, "*batch 1"]) -> Float[Array, "*batch 1"]:

@@ -133,7 +133,7 @@ class MLP(Network, type="mlp"):
 class Directional(Network, type="directional"):
     """A perceptron that weighs vectors. The control is their sum and one vector more.
 
-    The vectors are the last of the inputs, so the features must end with some, as `far_approach`
+    The vectors are the last of the inputs, so the features must end with some, as `far_directions`
     does. The last of them counts as it is, and each of the others has a weight from −2 to 2. The
     perceptron, whose layers have tanh, sees the inputs before the vectors. If those do not change
     when the scene is turned, the control turns with it, and what is learnt in one direction holds

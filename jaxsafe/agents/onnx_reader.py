@@ -268,6 +268,7 @@ _ELEMENTWISE = {
     "Sin": jnp.sin,
     "Cos": jnp.cos,
     "Atan": jnp.arctan,
+    "Asinh": jnp.arcsinh,
     "Relu": jax.nn.relu,
     "Sigmoid": jax.nn.sigmoid,
     "Softplus": jax.nn.softplus,

@@ -50,6 +50,7 @@ _SAME = {
     "sin": "Sin",
     "cos": "Cos",
     "atan": "Atan",
+    "asinh": "Asinh",
     "sign": "Sign",
     "floor": "Floor",
     "round": "Round",

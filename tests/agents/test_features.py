@@ -11,6 +11,7 @@ from jaxsafe.agents.features import (
     ApproachFeatures,
     DockingFeatures,
     FarApproachFeatures,
+    FarDirectionsFeatures,
     FarOrientedFeatures,
     Features,
     PlainFeatures,
@@ -86,6 +87,29 @@ def test_far_approach_features_measure_by_full_thrust(task: str, distance: float
     deputy = {"position": [distance, 0.0, *rest], "velocity": [-0.8 * limit, 0.3, *rest]}
     _, timestep = jaxsafe.reset_to(env, {"deputy": deputy})
     inputs = np.asarray(FarApproachFeatures()(env, timestep.observation))
+    approach = ApproachFeatures(with_observation=False)(env, timestep.observation)
+    np.testing.assert_array_equal(inputs[: approach.size], approach)
+    d = 2 + len(rest)
+    missing, along, across, held = np.split(inputs[approach.size :], [1, 1 + d, 1 + 2 * d])
+    np.testing.assert_allclose(missing, np.arcsinh(0.2 * limit / full_thrust), rtol=1e-3)
+    np.testing.assert_allclose(along, [missing[0], 0.0, *rest], rtol=1e-3)
+    np.testing.assert_allclose(across, [0.0, np.arcsinh(0.3 / full_thrust), *rest], atol=0.02)
+    # ẍ = 2nẏ + 3n²x, ÿ = −2nẋ, and the limit falls by 2n times the speed.
+    falls = 2.0 * n * 0.8 * limit
+    needed = [falls - 2.0 * n * 0.3 - 3.0 * n**2 * distance, -2.0 * n * 0.8 * limit]
+    np.testing.assert_allclose(held, np.array([*needed, *rest]) / full_thrust, rtol=2e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("task", ["docking2d", "docking3d"])
+@pytest.mark.parametrize("distance", [100.0, 10_000.0])
+def test_far_directions_features_measure_by_full_thrust(task: str, distance: float) -> None:
+    env = jaxsafe.make(task)
+    rest = [0.0] * env.observation_names.count("position.z")
+    n, full_thrust = 0.001027, 1.0 / 12.0
+    limit = 0.2 + 2.0 * n * distance
+    deputy = {"position": [distance, 0.0, *rest], "velocity": [-0.8 * limit, 0.3, *rest]}
+    _, timestep = jaxsafe.reset_to(env, {"deputy": deputy})
+    inputs = np.asarray(FarDirectionsFeatures()(env, timestep.observation))
     d = 2 + len(rest)
     numbers, away, aside, held = np.split(inputs, [11, 11 + d, 11 + 2 * d])
     speed = np.hypot(0.8 * limit, 0.3)
@@ -149,7 +173,7 @@ def test_far_oriented_features_turn_with_the_body_alone() -> None:
 @pytest.mark.parametrize("task", ["docking2d", "docking3d"])
 def test_a_directional_actor_turns_its_control_with_the_vectors(task: str) -> None:
     env = jaxsafe.make(task)
-    agent = Agent(features=FarApproachFeatures(), actor=Directional(hidden=(16,)))
+    agent = Agent(features=FarDirectionsFeatures(), actor=Directional(hidden=(16,)))
     params = agent.init(KEY, env)
     _, timestep = env.reset(KEY)
     inputs = agent.inputs(env, timestep.observation)
@@ -176,7 +200,7 @@ def test_a_directional_actor_turns_its_control_with_the_vectors(task: str) -> No
         ),
         (
             {"actions": "discrete"},
-            {"features": FarApproachFeatures(), "actor": Directional()},
+            {"features": FarDirectionsFeatures(), "actor": Directional()},
             "agent.actor: 'directional' needs continuous actions, found discrete ones; choose mlp",
         ),
         (
@@ -195,20 +219,22 @@ def test_what_a_directional_actor_needs(
     assert str(error.value) == message
 
 
-def test_far_approach_features_need_a_point_mass() -> None:
+def test_features_of_far_starts_need_a_point_mass() -> None:
     env = jaxsafe.make("docking2d_oriented")
     _, timestep = env.reset(KEY)
-    with pytest.raises(ConfigError, match=r"'far_approach' needs a point mass .* choose approach"):
-        FarApproachFeatures()(env, timestep.observation)
+    for features in (FarApproachFeatures(), FarDirectionsFeatures()):
+        with pytest.raises(ConfigError, match="needs a point mass .* choose approach"):
+            features(env, timestep.observation)
 
 
-def test_far_approach_features_need_the_axes_of_the_thrusters() -> None:
+def test_features_of_far_starts_need_the_axes_of_the_thrusters() -> None:
     env = jaxsafe.make("docking2d")
     position, *others = env.observation
     env = env.replace(observation=(position.replace(frame="deputy"), *others))
     message = "needs the observation 'position' in the axes of the thrusters, found it in the frame"
-    with pytest.raises(ConfigError, match=message):
-        FarApproachFeatures()(env, jnp.zeros(env.observation_size))
+    for features in (FarApproachFeatures(), FarDirectionsFeatures()):
+        with pytest.raises(ConfigError, match=message):
+            features(env, jnp.zeros(env.observation_size))
 
 
 def test_far_oriented_features_need_a_body_that_is_observed_in_its_frame() -> None:

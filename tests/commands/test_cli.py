@@ -126,7 +126,8 @@ def test_a_path_that_looks_like_a_number_stays_as_typed() -> None:
         (
             ["env=docking3d", "agent.features=dock"],
             "agent.features: found 'dock'. Did you mean 'docking'? "
-            "Choose from none, docking, approach, far_approach, far_oriented, rejoin\n",
+            "Choose from none, docking, approach, far_approach, far_directions, far_oriented,"
+            " rejoin\n",
         ),
         (["env=docking3d", "actions=discret"], "Did you mean 'discrete'?"),
         (

@@ -17,7 +17,7 @@ from default_cases import thorough
 
 import jaxsafe
 from jaxsafe import Environment
-from jaxsafe.agents import Agent, Directional, FarApproachFeatures
+from jaxsafe.agents import Agent, Directional, FarDirectionsFeatures
 from jaxsafe.commands.verify import EXIT_CODES, main
 from jaxsafe.rollout import RecurrentPolicy
 from jaxsafe.schema.component import normalise
@@ -228,7 +228,7 @@ def test_angular_functions_are_as_exact_as_the_proofs_take_them_to_be(
 def directional() -> Any:
     """Return the policy of an untrained actor that weighs directions."""
     env = jaxsafe.make("docking2d")
-    agent = normalise(Agent(actor=Directional(hidden=(8,)), features=FarApproachFeatures()))
+    agent = normalise(Agent(actor=Directional(hidden=(8,)), features=FarDirectionsFeatures()))
     return agent.policy(env, agent.init(KEY, env), deterministic=True)
 
 
