@@ -21,6 +21,7 @@ from baselines.plan import WITHOUT_RTA
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
 from jaxsafe.storage.files import read_json, write_text
+from jaxsafe.storage.text_table import or_dash
 from jaxsafe.train.host.results import mean_text
 
 ROOT = Path(__file__).parent.parent
@@ -812,7 +813,10 @@ def studied_filters(results: Results) -> str:
                     *(first if key == "with" or "with" not in row["tests"] else ("", "", "")),
                     "yes" if key == "with" else "no",
                     *(
-                        " / ".join(f"{unit * one[metric]['mean']:{form}}" for one in flown)
+                        " / ".join(
+                            or_dash(mean and unit * mean, form)
+                            for mean in (one[metric]["mean"] for one in flown)
+                        )
                         for metric, unit, form in cells
                     ),
                 )

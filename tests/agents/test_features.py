@@ -223,7 +223,7 @@ def test_features_of_far_starts_need_a_point_mass() -> None:
     env = jaxsafe.make("docking2d_oriented")
     _, timestep = env.reset(KEY)
     for features in (FarApproachFeatures(), FarDirectionsFeatures()):
-        with pytest.raises(ConfigError, match="needs a point mass .* choose approach"):
+        with pytest.raises(ConfigError, match=r"needs a point mass .* choose approach"):
             features(env, timestep.observation)
 
 
