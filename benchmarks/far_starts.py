@@ -24,6 +24,7 @@ from typing import Any
 from isolated import several, words
 
 import jaxsafe
+from jaxsafe.schema.dotted_paths import get_path
 from jaxsafe.storage.files import read_json, write_json
 
 OUT = Path(__file__).parent / "results" / "far_starts.json"
@@ -67,8 +68,7 @@ def measure(task: str, place: Path, seeds: int, episodes: int) -> list[dict[str,
         rest = ("eval_every=100000000", "episodes=1", f"out={run}")
         command("train", f"env={task}", "preset=wide", f"seeds={seeds}", *rest)
     training = read_json(run / "results.json")
-    env = jaxsafe.make(task)
-    [own] = [float(end.limit) for end in env.terminal if end.name == "timeout"]
+    own = float(get_path(jaxsafe.make(task), "terminal.timeout.limit"))
     rows = []
     for name, (low, high) in DISTANCES.items():
         tested = place / f"{task}_from_{high:.0f}_m"

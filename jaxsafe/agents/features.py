@@ -153,9 +153,8 @@ class FarApproachFeatures(Features, type="far_approach"):
             for what in ("position", "velocity")
         )
         limit = _scale(env, "velocity_limit") * _elements(env, observation, "velocity_limit", name)
-        _check_point_mass(env, name)
         slope = _slope_of_limit(env, name)
-        full_thrust = _full_thrust(env)
+        full_thrust = _full_thrust(env, _point_mass(env, name))
         by_step = full_thrust * env.dt
 
         away = position / (_norm(position) + 1e-3)
@@ -202,8 +201,7 @@ class FarDirectionsFeatures(Features, type="far_directions"):
         self, env: Environment, observation: Float[Array, "*batch o"]
     ) -> Float[Array, "*batch i"]:
         name = "far_directions"
-        _check_point_mass(env, name)
-        full_thrust = _full_thrust(env)
+        full_thrust = _full_thrust(env, _point_mass(env, name))
         flight = _Flight.seen(env, observation, name, full_thrust, lambda vector, _: vector)
         return jnp.concatenate([*flight.numbers, flight.away, flight.aside, flight.held], axis=-1)
 
@@ -408,8 +406,8 @@ def _norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch 1"]:
     return safe_norm(vector)[..., None]
 
 
-def _check_point_mass(env: Environment, name: str) -> None:
-    """Check that the agent thrusts along each axis, and is observed in these axes.
+def _point_mass(env: Environment, name: str) -> ThrustedSpacecraft:
+    """Return the agent, which thrusts along each axis and is observed in these axes.
 
     Raises:
         ConfigError: it does not, or is not. The message names the features.
@@ -427,12 +425,13 @@ def _check_point_mass(env: Environment, name: str) -> None:
                 f"agent.features: {name!r} needs the observation {item.name!r} in the axes of the"
                 f" thrusters, found it in the frame of {frame!r}; choose approach"
             )
+    return plant
 
 
-def _full_thrust(env: Environment) -> Array:
+def _full_thrust(env: Environment, plant: ThrustedSpacecraft) -> Array:
     """Return the acceleration by full thrust of a point mass along its weakest axis [m/s²]."""
     low, high = bounds(env)
-    return functools.reduce(jnp.minimum, jnp.maximum(-low, high)) / env.agent_platform.mass
+    return functools.reduce(jnp.minimum, jnp.maximum(-low, high)) / plant.mass
 
 
 def _drift(
