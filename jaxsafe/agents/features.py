@@ -184,7 +184,8 @@ class FarDirectionsFeatures(Features, type="far_directions"):
 
     - log(‖r‖ + 0.005), with the distance ‖r‖ as the environment observes it.
     - −p·v, ‖w‖ and ‖v‖ as shares of the limit.
-    - (limit + p·v)/Δ, ‖w‖/Δ and (limit − ‖v‖)/Δ. Each such x is compressed to sign(x) ln(1 + |x|).
+    - (limit + p·v)/Δ, ‖w‖/Δ and (limit − ‖v‖)/Δ. Each such x is compressed to
+      sign(x) ln(1 + abs(x)).
     - How fast the limit falls below the speed without thrust: ν₁ times the speed towards the chief,
       plus the relative acceleration of Eqs. (12), (16) along v. ν₁ is the slope of the limit.
     - a·p, a·w/‖w‖ and ‖a‖. Here a is the acceleration by thrust that keeps v at the limit while the
