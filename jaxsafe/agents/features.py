@@ -234,12 +234,7 @@ class FarOrientedFeatures(Features, type="far_oriented"):
                 f"agent.features: {name!r} needs an oriented_spacecraft with the control 'thrust';"
                 " choose approach"
             )
-        for item in env.observation:
-            if item.name in ("position", "velocity") and getattr(item, "frame", None) != env.agent:
-                raise ConfigError(
-                    f"agent.features: {name!r} needs the observation {item.name!r} in the frame of"
-                    f" {env.agent!r}; choose approach"
-                )
+        _check_frame(env, name, env.agent, f"the frame of {env.agent!r}")
         cosine, sine = (
             _scale(env, "attitude") * _elements(env, observation, f"attitude.{part}", name)
             for part in ("cos", "sin")
@@ -419,14 +414,24 @@ def _point_mass(env: Environment, name: str) -> ThrustedSpacecraft:
             f"agent.features: {name!r} needs a point mass with a thruster along each axis;"
             " choose approach"
         )
-    for item in env.observation:
-        frame = getattr(item, "frame", None)
-        if item.name in ("position", "velocity") and frame is not None:
-            raise ConfigError(
-                f"agent.features: {name!r} needs the observation {item.name!r} in the axes of the"
-                f" thrusters, found it in the frame of {frame!r}; choose approach"
-            )
+    _check_frame(env, name, None, "the axes of the thrusters")
     return plant
+
+
+def _check_frame(env: Environment, name: str, frame: str | None, wanted: str) -> None:
+    """Check that position and velocity are observed in a frame. None is Hill's.
+
+    Raises:
+        ConfigError: one is observed in another. The message names the features, and says `wanted`.
+    """
+    for item in env.observation:
+        own = getattr(item, "frame", None)
+        if item.name in ("position", "velocity") and own != frame:
+            found = "Hill's frame" if own is None else f"the frame of {own!r}"
+            raise ConfigError(
+                f"agent.features: {name!r} needs the observation {item.name!r} in {wanted}, found"
+                f" it in {found}; choose approach"
+            )
 
 
 def _full_thrust(env: Environment, plant: ThrustedSpacecraft) -> Array:
