@@ -15,13 +15,11 @@ With `out` the runs are kept, and what is there already is not trained or tested
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
-from isolated import words
+from isolated import command, words
 
 OUT = Path(__file__).parent / "results" / "constraints.json"
 TASK = "docking2d"
@@ -58,11 +56,6 @@ def write_worlds(place: Path) -> tuple[Path, Path]:
     for path, env in zip(paths, (free, ended), strict=True):
         path.write_text(jaxsafe.dump(env), encoding="utf-8")
     return paths
-
-
-def command(name: str, *options: str) -> None:
-    """Run a command of jaxsafe, which stops this program if it fails."""
-    subprocess.run([sys.executable, "-m", f"jaxsafe.{name}", *options], check=True)
 
 
 def measure(

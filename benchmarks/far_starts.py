@@ -15,13 +15,11 @@ With `out` the runs are kept, and what is there already is not trained or tested
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
-from isolated import several, words
+from isolated import command, several, words
 
 import jaxsafe
 from jaxsafe.schema.dotted_paths import get_path
@@ -47,11 +45,6 @@ KEPT = (
     "safety_violation_rate",
     "episode_safety_violation_rate",
 )
-
-
-def command(name: str, *options: str) -> None:
-    """Run a command of jaxsafe, which stops this program if it fails."""
-    subprocess.run([sys.executable, "-m", f"jaxsafe.{name}", *options], check=True)
 
 
 def measure(task: str, place: Path, seeds: int, episodes: int) -> list[dict[str, Any]]:

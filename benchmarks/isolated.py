@@ -59,6 +59,11 @@ def several(option: str, value: str, known: Iterable[str]) -> list[str]:
     return names
 
 
+def command(name: str, *options: str) -> None:
+    """Run a command of jaxsafe, which stops this program if it fails."""
+    subprocess.run([sys.executable, "-m", f"jaxsafe.{name}", *options], check=True)
+
+
 def interpreter(name: str) -> str:
     """Return the path of a Python that has a peer beside jaxsafe.
 

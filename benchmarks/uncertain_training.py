@@ -16,13 +16,11 @@ With `out` the runs are kept, and what is there already is not trained or tested
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
-from isolated import several, words
+from isolated import command, several, words
 from robustness import BOUNDS
 
 OUT = Path(__file__).parent / "results" / "uncertain_training.json"
@@ -66,11 +64,6 @@ def write_worlds(task: str, place: Path) -> dict[str, Path]:
     for way, env in envs.items():
         paths[way].write_text(jaxsafe.dump(env), encoding="utf-8")
     return paths
-
-
-def command(name: str, *options: str) -> None:
-    """Run a command of jaxsafe, which stops this program if it fails."""
-    subprocess.run([sys.executable, "-m", f"jaxsafe.{name}", *options], check=True)
 
 
 def measure(task: str, place: Path, seeds: int, episodes: int) -> list[dict[str, Any]]:
