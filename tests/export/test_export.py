@@ -14,6 +14,13 @@ from default_cases import one_of_each_kind
 from test_modes import CHECKED_WHILE_RUNNING, CHECKED_WHILE_TRACING
 
 import jaxsafe
+from jaxsafe.agents import (
+    Agent,
+    Directional,
+    FarApproachFeatures,
+    FarDirectionsFeatures,
+    FarOrientedFeatures,
+)
 from jaxsafe.agents.callables import read_callable
 from jaxsafe.agents.imported_policy import ACTIVATIONS
 from jaxsafe.agents.policy_file import SavedPolicy, find_policy, read_policy, save_policy
@@ -22,6 +29,7 @@ from jaxsafe.export import functions
 from jaxsafe.export.onnx import to_onnx
 from jaxsafe.export.vnnlib import search, write_vnnlib
 from jaxsafe.rollout import reset_batch
+from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
 
 
@@ -124,6 +132,26 @@ def test_a_part_of_a_controller_has_a_counterpart(function: Any, shape: tuple[in
         inputs[50:150, 1] = 0.0
     computed = run(to_onnx(function, shape), inputs)
     np.testing.assert_allclose(computed, function(inputs), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("task", "agent"),
+    [
+        ("docking2d", Agent(features=FarApproachFeatures())),
+        ("docking2d", Agent(features=FarDirectionsFeatures(), actor=Directional())),
+        ("docking2d_oriented", Agent(features=FarOrientedFeatures())),
+    ],
+    ids=["far_approach", "directional", "far_oriented"],
+)
+def test_another_runtime_flies_from_far_alike(task: str, agent: Agent) -> None:
+    env = jaxsafe.make(task, {"deputy.start.position.distance": [100.0, 10_000.0]})
+    agent = normalise(agent)
+    policy = SavedPolicy(env=env, agent=agent, params=agent.init(jax.random.key(1), env), about={})
+    _, starts = jax.jit(reset_batch, static_argnums=2)(env, jax.random.key(0), 1000)
+    observations = np.asarray(starts.observation)
+    expected = unclipped(policy, observations)
+    computed = run(to_onnx(functions.action(policy).function, observations.shape), observations)
+    np.testing.assert_allclose(computed, expected, atol=1e-5)
 
 
 @pytest.mark.thorough
