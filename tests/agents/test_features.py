@@ -38,6 +38,22 @@ def observed(task: str, ahead: np.ndarray) -> tuple[jaxsafe.Environment, jax.Arr
     return env, timestep.observation
 
 
+def seen_inbound(
+    task: str, distance: float
+) -> tuple[jaxsafe.Environment, jax.Array, list[float], float]:
+    """Return what a deputy on the x axis observes that flies inwards and a little sideways.
+
+    Its speed towards the chief is 80 % of the limit, and 0.3 m/s across. Return the environment,
+    the observation, a zero for the third axis if there is one, and the limit.
+    """
+    env = jaxsafe.make(task)
+    rest = [0.0] * env.observation_names.count("position.z")
+    limit = 0.2 + 2.0 * 0.001027 * distance
+    deputy = {"position": [distance, 0.0, *rest], "velocity": [-0.8 * limit, 0.3, *rest]}
+    _, timestep = jaxsafe.reset_to(env, {"deputy": deputy})
+    return env, timestep.observation, rest, limit
+
+
 def test_docking_features_are_direction_and_log_distance() -> None:
     env = jaxsafe.make("docking3d")
     agent = Agent(features=DockingFeatures())
@@ -80,14 +96,10 @@ def test_approach_features_measure_the_velocity_by_its_limit(task: str) -> None:
 @pytest.mark.parametrize("task", ["docking2d", "docking3d"])
 @pytest.mark.parametrize("distance", [100.0, 10_000.0])
 def test_far_approach_features_measure_by_full_thrust(task: str, distance: float) -> None:
-    env = jaxsafe.make(task)
-    rest = [0.0] * env.observation_names.count("position.z")
+    env, observation, rest, limit = seen_inbound(task, distance)
     n, full_thrust = 0.001027, 1.0 / 12.0
-    limit = 0.2 + 2.0 * n * distance
-    deputy = {"position": [distance, 0.0, *rest], "velocity": [-0.8 * limit, 0.3, *rest]}
-    _, timestep = jaxsafe.reset_to(env, {"deputy": deputy})
-    inputs = np.asarray(FarApproachFeatures()(env, timestep.observation))
-    approach = ApproachFeatures(with_observation=False)(env, timestep.observation)
+    inputs = np.asarray(FarApproachFeatures()(env, observation))
+    approach = ApproachFeatures(with_observation=False)(env, observation)
     np.testing.assert_array_equal(inputs[: approach.size], approach)
     d = 2 + len(rest)
     missing, along, across, held = np.split(inputs[approach.size :], [1, 1 + d, 1 + 2 * d])
@@ -103,13 +115,9 @@ def test_far_approach_features_measure_by_full_thrust(task: str, distance: float
 @pytest.mark.parametrize("task", ["docking2d", "docking3d"])
 @pytest.mark.parametrize("distance", [100.0, 10_000.0])
 def test_far_directions_features_measure_by_full_thrust(task: str, distance: float) -> None:
-    env = jaxsafe.make(task)
-    rest = [0.0] * env.observation_names.count("position.z")
+    env, observation, rest, limit = seen_inbound(task, distance)
     n, full_thrust = 0.001027, 1.0 / 12.0
-    limit = 0.2 + 2.0 * n * distance
-    deputy = {"position": [distance, 0.0, *rest], "velocity": [-0.8 * limit, 0.3, *rest]}
-    _, timestep = jaxsafe.reset_to(env, {"deputy": deputy})
-    inputs = np.asarray(FarDirectionsFeatures()(env, timestep.observation))
+    inputs = np.asarray(FarDirectionsFeatures()(env, observation))
     d = 2 + len(rest)
     numbers, away, aside, held = np.split(inputs, [11, 11 + d, 11 + 2 * d])
     speed = np.hypot(0.8 * limit, 0.3)

@@ -232,9 +232,11 @@ def directional() -> Any:
     return agent.policy(env, agent.init(KEY, env), deterministic=True)
 
 
-@pytest.mark.parametrize("policy", [thorough(braking), directional()], ids=["own", "directional"])
-def test_the_program_is_the_loop_that_runs(policy: Any) -> None:
-    env = jaxsafe.make("docking2d")
+@pytest.mark.parametrize(
+    "build", [thorough(lambda: braking), directional], ids=["own", "directional"]
+)
+def test_the_program_is_the_loop_that_runs(build: Callable[[], Any]) -> None:
+    env, policy = jaxsafe.make("docking2d"), build()
     loop = closed_loop(env, policy)
     x = np.random.default_rng(0).uniform([-90, 60, -0.3, -0.3], [90, 120, 0.3, 0.3], (2000, 4))
 
