@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, TypeVar
+from typing import Any, Literal, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int, UInt32
+from jaxtyping import Array, Bool
 
 from jaxsafe.devices.backend import accelerated
+from jaxsafe.sparse import flagged, pack
 
 Tree = TypeVar("Tree")
 
@@ -32,9 +33,6 @@ RESETS_PER_ROUND = 1 / 128
 
 MIN_RESETS_PER_ROUND = 16
 """The least number of environments that get their starts in one round."""
-
-FLAGS_PER_WORD = 32
-"""Number of environments whose flags share a word."""
 
 
 def renew(
@@ -99,10 +97,10 @@ def _renew_in_rounds(
     """Draw starts for a share of the batch at a time, until all that need one have theirs."""
     size = where.shape[0]
     per_round = max(MIN_RESETS_PER_ROUND, int(size * RESETS_PER_ROUND))
-    flags = _pack(where)
+    flags = pack(where)
 
     def renew_round(index: Array | int, batch: Tree) -> Tree:
-        indices = _indices(flags, index * per_round + jnp.arange(per_round), size)
+        indices = flagged(flags, index * per_round + jnp.arange(per_round), size)
         place = indices if axis == 0 else (..., indices)
         starts = draw(parameters, indices)
         return jax.tree.map(lambda x, new: x.at[place].set(new, mode="drop"), batch, starts)
@@ -120,51 +118,3 @@ def _renew_in_rounds(
 def _(draw: Draw[Tree], axis: Literal[0, -1], primals: tuple, tangents: tuple) -> tuple[Tree, Tree]:
     """Take the derivative of the definition, because a loop of unknown length has no reverse."""
     return jax.jvp(functools.partial(_renew_by_definition, draw, axis), primals, tangents)
-
-
-class Flags(NamedTuple):
-    """The flags of all environments, `FLAGS_PER_WORD` to a word.
-
-    Bit *b* of word *w* is the flag of environment *w* + *b* × (number of words).
-    """
-
-    words: UInt32[Array, " words"]
-    ends: Int[Array, " words"]  # number of flags that are set in this word and those before it
-
-
-def _pack(where: Bool[Array, " n"]) -> Flags:
-    """Pack flags into words by laying one half of them over the other, again and again.
-
-    These operations vectorise. On a CPU a sum over bits, or `jnp.nonzero`, is a loop of scalars.
-    """
-    padded = jnp.pad(where, (0, -where.shape[0] % FLAGS_PER_WORD))
-    words = padded.reshape(FLAGS_PER_WORD, -1).astype(jnp.uint32)
-    while (half := words.shape[0] // 2) > 0:
-        words = words[:half] | (words[half:] << half)
-    ends = jax.lax.population_count(words[0]).astype(jnp.int32)
-    shift = 1
-    while shift < ends.shape[0]:
-        ends = ends + jnp.pad(ends[:-shift], (shift, 0))
-        shift = 2 * shift
-    return Flags(words=words[0], ends=ends)
-
-
-def _indices(flags: Flags, rank: Int[Array, " k"], size: int) -> Int[Array, " k"]:
-    """Return the indices of environments whose flag is set, given their ranks among these.
-
-    Args:
-        flags: the flags of the batch.
-        rank: 0 for the first environment whose flag is set, 1 for the second, and so on.
-        size: size of the batch. It is returned for ranks beyond the last, because it is the index
-            of no environment.
-    """
-    num_words = flags.ends.shape[0]
-    word = jnp.searchsorted(flags.ends, rank, side="right", method="scan_unrolled")
-    existing = jnp.minimum(word, num_words - 1)
-    bits = flags.words[existing]
-    before = flags.ends[existing] - jax.lax.population_count(bits).astype(jnp.int32)
-    # Bits 0 … b of a word, for every b. The last one overflows to all bits.
-    upto = (jnp.uint32(2) << jnp.arange(FLAGS_PER_WORD, dtype=jnp.uint32)) - 1
-    seen = jax.lax.population_count(bits[:, None] & upto[None]).astype(jnp.int32)
-    bit = jnp.sum(seen <= (rank - before)[:, None], axis=1)
-    return jnp.where(word < num_words, existing + bit * num_words, size)
