@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, cast
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.rta.asif import linear, speed_ball
 from jaxsafe.rta.bound import UncertaintyBound
@@ -36,7 +36,7 @@ from jaxsafe.rta.tube_in_space import (
     next_in_space,
     wrong_course,
 )
-from jaxsafe.schema.component import Range, Unit
+from jaxsafe.schema.component import Range, Unit, fields
 from jaxsafe.simulation.dubins import Dubins2D, Dubins3D
 from jaxsafe.simulation.geometry import direction, safe_norm
 from jaxsafe.simulation.oriented import OrientedSpacecraft
@@ -337,8 +337,7 @@ class MatchVelocity(BackupController, type="match_velocity"):
                 share - _climb_share(jnp.maximum(jnp.abs(error) - largest, 0.0)),
             ]
             lowest, highest = plant.flight_path_angle_limits
-            steep = lowest if self.climb == "up" else highest
-            to_steep = jnp.abs(steep - lead.flight_path_angle)
+            to_steep = jnp.abs(self._steepest(plant) - lead.flight_path_angle)
             to_steep += self.away_gain * too_close / lead.speed
             by_error = jnp.minimum(to_steep, highest - lowest) * jnp.maximum(*changes)
             pursuit = pursuit.replace(climb_by_error=by_error)
@@ -368,14 +367,34 @@ class MatchVelocity(BackupController, type="match_velocity"):
         same_way = (to_turn >= doubt) & (to_turn + doubt < 2.0 * jnp.pi)
         return wider.replace(position=jnp.where(same_way, wider.position, LOST))
 
+    def merged(
+        self, others: Sequence[BackupController], index: Int[Array, ""]
+    ) -> BackupController | None:
+        sides = [other for other in others if type(other) is MatchVelocity]
+        alike = [side.replace(name="", turn=self.turn, climb=self.climb) for side in sides]
+        in_space = {side.climb is not None for side in sides}
+        structures = {jax.tree.structure(side) for side in alike}
+        if len(sides) < len(others) or len(in_space) > 1 or len(structures) > 1:
+            return None
+        chosen = jax.tree.map(lambda *numbers: jnp.stack(numbers)[index], *alike)
+        numbers = {name: getattr(chosen, name) for name in fields(MatchVelocity)}
+        left = jnp.array([side.turn == "left" for side in sides])[index]
+        up = jnp.array([side.climb == "up" for side in sides])[index]
+        return EitherWay(**numbers, left=left, up=up)
+
     @property
     def away_gain(self) -> float:
         """Speed away from the lead per foot that the agent is too close [1/s]."""
         return 1.0 / self.away_time
 
     @property
-    def _sign(self) -> float:
+    def _sign(self) -> Number:
         return 1.0 if self.turn == "left" else -1.0
+
+    def _steepest(self, plant: Dubins3D) -> Number:
+        """Return the flight path angle [rad] of the climb or dive."""
+        lowest, highest = plant.flight_path_angle_limits
+        return lowest if self.climb == "up" else highest  # ż = −v sin γ
 
     def _away(self, apart: Float[Array, " d"]) -> Float[Array, " d"]:
         """Return w, the velocity away from the lead where the agent is too close."""
@@ -399,7 +418,7 @@ class MatchVelocity(BackupController, type="match_velocity"):
         bank = arctan(own.speed * (TURN_GAIN * error + lead_turn) / plant.gravity)
         bank = jnp.clip(bank, plant.roll_limits[0], plant.roll_limits[1])
         lowest, highest = plant.flight_path_angle_limits
-        steep = lowest if self.climb == "up" else highest  # ż = −v sin γ
+        steep = self._steepest(plant)
         level = jnp.clip(angle, lowest, highest)
         share = _climb_share(jnp.abs(error))
         gamma = level + share * (steep - level)
@@ -407,6 +426,21 @@ class MatchVelocity(BackupController, type="match_velocity"):
             "roll_rate": (bank - own.roll) / env.dt,
             "flight_path_angle_rate": (gamma - own.flight_path_angle) / env.dt,
         }
+
+
+class EitherWay(MatchVelocity):
+    """A `match_velocity` whose turn and climb are numbers, so that they may differ in a batch."""
+
+    left: Bool[Array, ""]
+    up: Bool[Array, ""]
+
+    @property
+    def _sign(self) -> Number:
+        return jnp.where(self.left, 1.0, -1.0)
+
+    def _steepest(self, plant: Dubins3D) -> Number:
+        lowest, highest = plant.flight_path_angle_limits
+        return jnp.where(self.up, lowest, highest)
 
 
 class VelocityMatched(TerminalSet, type="velocity_matched"):

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsafe.rta.bound import UncertaintyBound
 from jaxsafe.rta.tube import Tube
@@ -57,6 +58,19 @@ class BackupController(Component):
     ) -> tuple[Float[Array, " m"], Any]:
         """Return the control, as `control` does, and the memory after the step."""
         return self.control(env, sim, later), memory
+
+    def merged(
+        self, others: Sequence[BackupController], index: Int[Array, ""]
+    ) -> BackupController | None:
+        """Return a controller without memory that acts as one of several, or None.
+
+        With None each of them computes its control, and that of one is taken.
+
+        Args:
+            others: all backup controllers of a filter, this one among them.
+            index: the index of the one that acts. It is traced.
+        """
+        return None
 
     def unfinished(self, env: Environment, sim: Sim, memory: Any) -> Bool[Array, ""]:
         """Return whether a manoeuvre is under way. The filter lets the controller finish it."""

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -31,6 +31,7 @@ from jaxsafe.rta.prediction import others_react, repeat
 from jaxsafe.rta.speed_limit import lowered, speed_limit_facts
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.geometry import safe_norm
+from jaxsafe.sparse import only_where
 from jaxsafe.transition import (
     Others,
     advance,
@@ -80,6 +81,18 @@ class Paths(Record):
         return jnp.where(self.certified, self.least, -jnp.inf)
 
 
+class Way(Record):
+    """The predicted way of one backup controller, with what `Paths` says of it."""
+
+    index: Int[Array, ""]  # of the backup controller
+    margins: Float[Array, " c"]
+    value: Float[Array, ""]
+    memories_ahead: tuple[Any, ...]  # of all backup controllers, and only that of this one counts
+    ahead: Mapping[str, Any]
+    actuators_ahead: Mapping[str, Any]
+    remembered_ahead: Mapping[str, Any]
+
+
 class CertifiedRTA(RTA):
     """A filter that passes a control only if a prediction with the plant's own map shows it safe.
 
@@ -88,10 +101,11 @@ class CertifiedRTA(RTA):
     from there, and the last state must lie in the `terminal` set. The filter also checks what the
     proofs of the backup controller and of the set assume of the environment's numbers.
 
-    A control that is not certified is replaced by the backup controller of the last certificate.
-    The certificate is renewed while that controller acts. If renewing fails, or nothing has been
-    certified yet, the backup controllers compete. The first one that is certified acts. Until then
-    the one with the largest h on its way acts.
+    The backup controller of the last certificate is in reserve. Its way is predicted first, and
+    those of the others only if it does not certify the control. A control that nothing certifies is
+    replaced by the controller in reserve, whose certificate is renewed while it acts. If renewing
+    fails, or nothing has been certified yet, the backup controllers compete. The first one that is
+    certified acts. Until then the one with the largest h on its way acts.
 
     After an intervention, control returns to the agent only with `release` on top of the margin.
     Without `enforce` a feasible proposal acts whatever the prediction says. That is how filters of
@@ -275,24 +289,23 @@ class CertifiedRTA(RTA):
             memory, info = undelayed.begin(env, predicted)
             memory = memory.replace(under_way=UnderWay(controls=controls, certified=certified))
             return memory, info.replace(certified=start_info.certified & jnp.all(certified))
-        paths = self.follow(env, sim, sim)
-        best = self._best(env, paths)
+        best = self._best(env, self.follow(env, sim, sim))
         memory = RTAMemory(
             intervening=jnp.zeros((), bool),
-            backup_index=best,
-            certified=paths.values[best] >= self.margin_to_certify(env),
-            ahead=_selected(paths.ahead, best),
-            actuators_ahead=_selected(paths.actuators_ahead, best),
+            backup_index=best.index,
+            certified=best.value >= self.margin_to_certify(env),
+            ahead=best.ahead,
+            actuators_ahead=best.actuators_ahead,
             backups=self._fresh(env, sim),
-            backups_ahead=paths.memories_ahead,
-            remembered_ahead=_selected(paths.remembered_ahead, best),
+            backups_ahead=best.memories_ahead,
+            remembered_ahead=best.remembered_ahead,
         )
         info = RTAInfo(
             correction=jnp.zeros_like(sim.time),
             feasible=jnp.ones((), bool),
             certified=memory.certified,
             predicted_margin=self.lowest(env, sim, sim),
-            backup_index=best,
+            backup_index=best.index,
             constraint=NO_CONSTRAINT(),
         )
         return memory, info
@@ -339,46 +352,45 @@ class CertifiedRTA(RTA):
         memories_if_backed_up = self._memories_after(
             env, after_backup, index=memory.backup_index, moved=moved
         )
-        paths = self.follow(
+        to_pass = self.margin_to_certify(env, proposal)
+        to_back_up = self.margin_to_certify(env, backup)
+        required = to_pass + jnp.where(memory.intervening, self.release, 0.0)
+        way = self._way(
             env,
             sim,
             _where(certified_before, after_proposal, after_backup),
             memories=_where(certified_before, memories_if_passed, memories_if_backed_up),
+            reserve=memory.backup_index,
+            required=jnp.where(certified_before, required, jnp.inf),
         )
-        best = self._best(env, paths)
-        to_pass = self.margin_to_certify(env, proposal)
-        to_back_up = self.margin_to_certify(env, backup)
-        safe = paths.values[best] >= to_pass + jnp.where(memory.intervening, self.release, 0.0)
+        safe = way.value >= required
         passes = finite & certified_before & (safe if self.enforce else feasible)
         passes = passes & ~self._unfinished(env, sim, memory)
 
         backup_margin = self.lowest(env, sim, after_backup)
         new_certificate = passes | ~certified_before
         ends = ({}, {}, {})  # nothing is renewed with a bound or without a horizon
-        memories_ahead = paths.memories_ahead
+        memories_ahead = way.memories_ahead
         if self.horizon and self.bound is not None:
             still_certified = _finite(after_backup)
             if self._rehearsed_steps and self.terminal:  # a rehearsal may begin at this state
                 still_certified &= _none(self.terminal.faults(self._within_bound(env), sim, self))
                 for each in self.backups:
                     still_certified &= _none(each.faults(env, sim, self))
-            backup_certified = jnp.where(
-                certified_before, still_certified, paths.values[best] >= to_back_up
-            )
+            backup_certified = jnp.where(certified_before, still_certified, way.value >= to_back_up)
         elif self.horizon:
             backup_certified, end, memories_ahead = self._renew(
                 env, sim, memory=memory, after_backup=after_backup, backup_margin=backup_margin
             )
             backup_certified = jnp.where(
-                certified_before, backup_certified, paths.values[best] >= to_back_up
+                certified_before, backup_certified, way.value >= to_back_up
             )
-            new_ends = (paths.ahead, paths.actuators_ahead, paths.remembered_ahead)
             ends = _where(
                 new_certificate,
-                _selected(new_ends, best),
+                (way.ahead, way.actuators_ahead, way.remembered_ahead),
                 (end.platforms, end.actuators, end.remembered),
             )
-            memories_ahead = _where(new_certificate, paths.memories_ahead, memories_ahead)
+            memories_ahead = _where(new_certificate, way.memories_ahead, memories_ahead)
         else:
             backup_certified = self.follow(env, sim, after_backup).values[0] >= to_back_up
         ahead, actuators_ahead, remembered_ahead = ends
@@ -386,12 +398,12 @@ class CertifiedRTA(RTA):
         correction = jnp.where(jnp.isfinite(desired), actual - wanted, actual)
         certified = jnp.where(passes, safe, backup_certified)
         intervening = altered(env, correction, self.tolerance) | ~finite
-        cause = self.closest(env, paths.margins[best])
+        cause = self.closest(env, way.margins)
         if changed_for:
             cause = jnp.where(passes if self.backups else True, changed_for[0], cause)
         memory = RTAMemory(
             intervening=intervening,
-            backup_index=jnp.where(new_certificate, best, memory.backup_index),
+            backup_index=jnp.where(new_certificate, way.index, memory.backup_index),
             certified=certified,
             ahead=ahead,
             actuators_ahead=actuators_ahead,
@@ -642,16 +654,86 @@ class CertifiedRTA(RTA):
         renewed = renewed & proved & _finite(after_backup)
         return renewed, *jax.lax.stop_gradient((new_end, memories))
 
-    def _best(self, env: Environment, paths: Paths) -> Int[Array, ""]:
-        """Return the index of the backup controller with the largest h on its way.
+    def _way(
+        self,
+        env: Environment,
+        before: Sim,
+        sim: Sim,
+        memories: tuple[Any, ...],
+        reserve: Int[Array, ""],
+        required: Number,
+    ) -> Way:
+        """Return the way that decides: that in reserve if it suffices, else the best of all.
 
-        Only certified ones are compared if there are any.
+        So most steps predict one way. With a `bound`, and where other platforms react to the agent,
+        all ways are predicted.
+
+        Args:
+            env: the environment.
+            before: the simulation one step before `sim`.
+            sim: the simulation from which the backup controllers act.
+            memories: what each backup controller remembers there.
+            reserve: the index of the backup controller in reserve.
+            required: the value from which on its way suffices.
         """
-        certified = paths.values >= self.required_margin(env)
-        if not self.backups:
-            return jnp.full((), -1, jnp.int32)
-        compared = jnp.where(jnp.any(certified), paths.values, paths.least)
-        return jnp.argmax(jnp.where(jnp.isnan(compared), -jnp.inf, compared)).astype(jnp.int32)
+
+        def best_of_all(rta: CertifiedRTA, env: Environment, *state: Any) -> Way:
+            return rta._best(env, rta.follow(env, *state))
+
+        state = (self, env, before, sim, memories)
+        if len(self.backups) < 2 or self.bound is not None or others_react(env, sim):
+            return best_of_all(*state)
+        kept = self._kept(env, before, sim, memories, reserve)
+        return only_where(~(kept.value >= required), best_of_all, state, otherwise=kept)
+
+    def _kept(
+        self,
+        env: Environment,
+        before: Sim,
+        sim: Sim,
+        memories: tuple[Any, ...],
+        reserve: Int[Array, ""],
+    ) -> Way:
+        """Return the way of the backup controller in reserve. Arguments are those of `_way`."""
+        alone = cast(BackupController, _Reserve(self.backups, reserve))
+        strict = self._within_bound(env)
+        faultless = [_none(backup.faults(strict, sim, self)) for backup in self.backups]
+        first = self.margins(env, before, sim)
+        margins, (end,), (moved,), _ = self._follow(
+            env, [(alone, memories)], first=first, earlier=before, sim=sim
+        )
+        proved = jnp.stack(faultless)[reserve] & _finite(sim) & self._may_end(env, end)
+        least = jnp.min(self.compared(env, margins[0]))
+        return jax.lax.stop_gradient(
+            Way(
+                index=reserve,
+                margins=margins[0],
+                value=jnp.where(proved, least, -jnp.inf),
+                memories_ahead=moved,
+                ahead=end.platforms,
+                actuators_ahead=end.actuators,
+                remembered_ahead=end.remembered,
+            )
+        )
+
+    def _best(self, env: Environment, paths: Paths) -> Way:
+        """Return the way with the largest h. Only certified ones are compared if there are any."""
+        if self.backups:
+            certified = paths.values >= self.required_margin(env)
+            compared = jnp.where(jnp.any(certified), paths.values, paths.least)
+            compared = jnp.where(jnp.isnan(compared), -jnp.inf, compared)
+            best = jnp.argmax(compared).astype(jnp.int32)
+        else:
+            best = jnp.full((), -1, jnp.int32)
+        return Way(
+            index=best,
+            margins=paths.margins[best],
+            value=paths.values[best],
+            memories_ahead=paths.memories_ahead,
+            ahead=_selected(paths.ahead, best),
+            actuators_ahead=_selected(paths.actuators_ahead, best),
+            remembered_ahead=_selected(paths.remembered_ahead, best),
+        )
 
     def _backup(
         self,
@@ -673,13 +755,8 @@ class CertifiedRTA(RTA):
         if not self.backups:
             return jnp.zeros(env.action_size, env.dt.dtype), ()
         strict = self._within_bound(env)
-        acts = [
-            backup.act(strict, sim, later, memory)
-            for backup, memory in zip(self.backups, memories, strict=True)
-        ]
-        controls = jnp.stack([control for control, _ in acts])
-        chosen = controls[index] if len(self.backups) > 1 else controls[0]
-        return admissible(env, chosen)[0], tuple(moved for _, moved in acts)
+        control, moved = _Reserve(self.backups, index).act(strict, sim, later, memories)
+        return admissible(env, control)[0], moved
 
     def _fresh(self, env: Environment, sim: Sim) -> tuple[Any, ...]:
         """Return the memories of backup controllers that take over at a state."""
@@ -707,6 +784,31 @@ class CertifiedRTA(RTA):
             for i, (backup, own) in pairs
         ]
         return functools.reduce(jnp.logical_or, under_way, jnp.zeros((), bool))
+
+
+class _Reserve:
+    """One of several backup controllers, whose index may differ between members of a batch.
+
+    Its memory is the memories of all.
+    """
+
+    def __init__(self, backups: Sequence[BackupController], index: Int[Array, ""]) -> None:
+        self.backups = backups
+        self.index = index
+        self.merged = backups[0].merged(backups, index)
+        self.within_limits = all(backup.within_limits for backup in backups)
+
+    def act(
+        self, env: Environment, sim: Sim, later: Others, memories: tuple[Any, ...]
+    ) -> tuple[Float[Array, " m"], tuple[Any, ...]]:
+        """Return the control of the chosen one, and the memories as if all had acted."""
+        if self.merged is not None:
+            return self.merged.control(env, sim, later), memories
+        pairs = zip(self.backups, memories, strict=True)
+        acts = [backup.act(env, sim, later, own) for backup, own in pairs]
+        controls = jnp.stack([control for control, _ in acts])
+        control = controls[self.index] if len(acts) > 1 else controls[0]
+        return control, tuple(moved for _, moved in acts)
 
 
 def _none(faults: Faults) -> Bool[Array, ""]:
