@@ -29,6 +29,7 @@ from jaxsafe.agents.networks import (
     from_one_draw,
     unroll,
 )
+from jaxsafe.control.law import ControlLaw
 from jaxsafe.environment import Environment
 from jaxsafe.rollout import Policy, RecurrentPolicy
 from jaxsafe.schema.component import ANY, Component, Range, Unit
@@ -60,6 +61,12 @@ class Agent(Component):
     """The network of each critic. None stands for one like the actor's."""
     features: Features = PlainFeatures()
     """What the networks see of the observation."""
+    controller: ControlLaw | None = None
+    """A control law whose action the actor corrects: align, pd, pursuit or one of your own.
+
+    The mean of the policy is the law's action plus the actor's outputs (residual policy learning,
+    Silver et al. 2018). The networks see the law's action before the features.
+    """
     log_std: Annotated[Number, Unit("1", length=ANY), Range(largest=20.0)] = -0.7
     """Initial logarithm of the standard deviation of continuous actions in [−1, 1].
 
@@ -157,7 +164,11 @@ class Agent(Component):
         Raises:
             ConfigError: the environment does not observe what the features need.
         """
-        return self.features(env, observation)
+        features = self.features(env, observation)
+        if self.controller is None:
+            return features
+        action = self.controller.policy(env).observed_action(observation)
+        return jnp.concatenate([action, features], axis=-1)
 
     def distribution(
         self,
@@ -175,7 +186,8 @@ class Agent(Component):
                 `[n, t, i]`.
             sequences: what else a recurrent actor needs to know of the sequences.
         """
-        return self._head(env, params, self._outputs("actor", env, params, inputs, sequences))
+        out = self._outputs("actor", env, params, inputs, sequences)
+        return self._head(env, params, inputs, out)
 
     def distribution_step(
         self, env: Environment, params: Params, inputs: Float[Array, "*batch i"], memory: Memory
@@ -191,12 +203,18 @@ class Agent(Component):
         if not self.actor.recurrent:
             return self.distribution(env, params, inputs), memory
         memory, outputs = self._apply("actor", env, params, memory, inputs)
-        return self._head(env, params, outputs), memory
+        return self._head(env, params, inputs, outputs), memory
 
     def _head(
-        self, env: Environment, params: Params, out: Float[Array, "*batch o"]
+        self,
+        env: Environment,
+        params: Params,
+        inputs: Float[Array, "*batch i"],
+        out: Float[Array, "*batch o"],
     ) -> Distribution:
         """Return the distribution over actions that the outputs of the actor stand for."""
+        if self.controller is not None:
+            out = out + inputs[..., : env.action_size]
         return action_distribution(env.num_action_points, out, params["log_std"], self._choices)
 
     def _choices(
@@ -380,6 +398,8 @@ def check_agent(agent: Agent, env: Environment, place: str = "agent") -> None:
                 f"{place}.actor: 'directional' needs features with {agent.actor.vectors} vectors,"
                 f" found {show(agent.features.type_name)} with {agent.features.num_vectors}"
             )
+    if agent.controller is not None:
+        _check_controller(agent.controller, env, f"{place}.controller")
     count = jnp.size(agent.log_std)
     if count not in (1, env.action_size):
         raise ConfigError(
@@ -401,6 +421,23 @@ def check_agent(agent: Agent, env: Environment, place: str = "agent") -> None:
                 f"{place}.{name}: expected {wanted[name]} outputs, "
                 f"found {getattr(outputs, 'shape', type(outputs).__name__)}"
             )
+
+
+def _check_controller(law: ControlLaw, env: Environment, place: str) -> None:
+    """Check that an actor can correct the actions of a control law.
+
+    Raises:
+        ConfigError: it cannot. The message begins with the place.
+    """
+    if env.action_kind != "continuous":
+        raise ConfigError(
+            f"{place}: needs continuous actions, found {env.action_kind} ones; leave it out"
+        )
+    if law.designs:
+        raise ConfigError(
+            f"{place}: {law.type_name!r} computes gains before it flies, but the numbers of the"
+            " environment may change in a training; choose pd, align or pursuit"
+        )
 
 
 def num_outputs(env: Environment) -> int:

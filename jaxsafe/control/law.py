@@ -46,6 +46,11 @@ class ControlLaw(Component):
         """
         raise NotImplementedError
 
+    @property
+    def designs(self) -> bool:
+        """Whether it computes something for an environment, whose numbers must then be known."""
+        return type(self).design is not ControlLaw.design
+
     def policy(self, env: Environment) -> LawPolicy:
         """Return the law as a policy for an environment.
 
@@ -71,6 +76,10 @@ class LawPolicy(Described):
         self.design = law.design(env)
 
     def __call__(self, key: Key, observation: Float[Array, "*batch o"]) -> Array:
+        """Return `observed_action(observation)`."""
+        return self.observed_action(observation)
+
+    def observed_action(self, observation: Float[Array, "*batch o"]) -> Array:
         """Return an action for each observation.
 
         Raises:

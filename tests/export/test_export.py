@@ -25,6 +25,7 @@ from jaxsafe.agents.callables import read_callable
 from jaxsafe.agents.imported_policy import ACTIVATIONS
 from jaxsafe.agents.policy_file import SavedPolicy, find_policy, read_policy, save_policy
 from jaxsafe.commands.export import main
+from jaxsafe.control import Align
 from jaxsafe.export import functions
 from jaxsafe.export.onnx import to_onnx
 from jaxsafe.export.vnnlib import search, write_vnnlib
@@ -140,8 +141,9 @@ def test_a_part_of_a_controller_has_a_counterpart(function: Any, shape: tuple[in
         ("docking2d", Agent(features=FarApproachFeatures())),
         ("docking2d", Agent(features=FarDirectionsFeatures(), actor=Directional())),
         ("docking2d_oriented", Agent(features=FarOrientedFeatures())),
+        ("docking2d_oriented", Agent(controller=Align())),
     ],
-    ids=["far_approach", "directional", "far_oriented"],
+    ids=["far_approach", "directional", "far_oriented", "corrected"],
 )
 def test_another_runtime_flies_from_far_alike(task: str, agent: Agent) -> None:
     env = jaxsafe.make(task, {"deputy.start.position.distance": [100.0, 10_000.0]})

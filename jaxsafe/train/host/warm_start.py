@@ -11,7 +11,15 @@ from jaxsafe.schema.errors import ConfigError
 from jaxsafe.schema.user_modules import import_modules
 from jaxsafe.train.host.run_config import read_content
 
-OPTIONS = ("actor", "critic", "features", "critic_sees_totals", "cost_critic", "cost_names")
+OPTIONS = (
+    "actor",
+    "critic",
+    "features",
+    "controller",
+    "critic_sees_totals",
+    "cost_critic",
+    "cost_names",
+)
 """Options of the agent that decide which parameters it has, and what these mean."""
 
 
