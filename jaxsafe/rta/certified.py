@@ -5,10 +5,9 @@ One rule carries every guarantee: propose, certify, else back up.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 import jax
@@ -29,6 +28,7 @@ from jaxsafe.rta.filter import (
 )
 from jaxsafe.rta.prediction import others_react, repeat
 from jaxsafe.rta.speed_limit import lowered, speed_limit_facts
+from jaxsafe.rta.ways import Paths, Reserve, Way
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.geometry import safe_norm
 from jaxsafe.sparse import only_where
@@ -43,7 +43,7 @@ from jaxsafe.transition import (
     others_later,
     remember,
 )
-from jaxsafe.types import ConstraintName, Number, Record, RTAInfo, Sim
+from jaxsafe.types import ConstraintName, Number, RTAInfo, Sim
 
 if TYPE_CHECKING:
     from jaxsafe.environment import Environment
@@ -59,38 +59,6 @@ Proposal = (
 
 A filter that knows for which constraint it changed the control adds the index of that constraint.
 """
-
-
-class Paths(Record):
-    """Predicted ways from one state, one for each backup controller."""
-
-    margins: Float[Array, "backups c"]  # smallest h of each constraint on the way
-    least: Float[Array, " backups"]  # the smallest of these, to be compared with the margin
-    # Whether the way ends in the terminal set and the proof holds. The margin is not looked at.
-    certified: Bool[Array, " backups"]
-    memories_ahead: tuple[Any, ...]  # what each backup controller remembers at its end
-    # Platforms, `Sim.actuators` and `Sim.remembered` at the end, [backups, ...]; empty without a
-    # horizon.
-    ahead: Mapping[str, Any]
-    actuators_ahead: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    remembered_ahead: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-
-    @property
-    def values(self) -> Float[Array, " backups"]:
-        """Smallest h on each way, −∞ where the way proves nothing whatever its h."""
-        return jnp.where(self.certified, self.least, -jnp.inf)
-
-
-class Way(Record):
-    """The predicted way of one backup controller, with what `Paths` says of it."""
-
-    index: Int[Array, ""]  # of the backup controller
-    margins: Float[Array, " c"]
-    value: Float[Array, ""]
-    memories_ahead: tuple[Any, ...]  # of all backup controllers, and only that of this one counts
-    ahead: Mapping[str, Any]
-    actuators_ahead: Mapping[str, Any]
-    remembered_ahead: Mapping[str, Any]
 
 
 class CertifiedRTA(RTA):
@@ -695,9 +663,8 @@ class CertifiedRTA(RTA):
         reserve: Int[Array, ""],
     ) -> Way:
         """Return the way of the backup controller in reserve. Arguments are those of `_way`."""
-        alone = cast(BackupController, _Reserve(self.backups, reserve))
-        strict = self._within_bound(env)
-        faultless = [_none(backup.faults(strict, sim, self)) for backup in self.backups]
+        alone = cast(BackupController, Reserve(self.backups, reserve))
+        faultless = [_none(backup.faults(env, sim, self)) for backup in self.backups]
         first = self.margins(env, before, sim)
         margins, (end,), (moved,), _ = self._follow(
             env, [(alone, memories)], first=first, earlier=before, sim=sim
@@ -755,7 +722,7 @@ class CertifiedRTA(RTA):
         if not self.backups:
             return jnp.zeros(env.action_size, env.dt.dtype), ()
         strict = self._within_bound(env)
-        control, moved = _Reserve(self.backups, index).act(strict, sim, later, memories)
+        control, moved = Reserve(self.backups, index).act(strict, sim, later, memories)
         return admissible(env, control)[0], moved
 
     def _fresh(self, env: Environment, sim: Sim) -> tuple[Any, ...]:
@@ -784,31 +751,6 @@ class CertifiedRTA(RTA):
             for i, (backup, own) in pairs
         ]
         return functools.reduce(jnp.logical_or, under_way, jnp.zeros((), bool))
-
-
-class _Reserve:
-    """One of several backup controllers, whose index may differ between members of a batch.
-
-    Its memory is the memories of all.
-    """
-
-    def __init__(self, backups: Sequence[BackupController], index: Int[Array, ""]) -> None:
-        self.backups = backups
-        self.index = index
-        self.merged = backups[0].merged(backups, index)
-        self.within_limits = all(backup.within_limits for backup in backups)
-
-    def act(
-        self, env: Environment, sim: Sim, later: Others, memories: tuple[Any, ...]
-    ) -> tuple[Float[Array, " m"], tuple[Any, ...]]:
-        """Return the control of the chosen one, and the memories as if all had acted."""
-        if self.merged is not None:
-            return self.merged.control(env, sim, later), memories
-        pairs = zip(self.backups, memories, strict=True)
-        acts = [backup.act(env, sim, later, own) for backup, own in pairs]
-        controls = jnp.stack([control for control, _ in acts])
-        control = controls[self.index] if len(acts) > 1 else controls[0]
-        return control, tuple(moved for _, moved in acts)
 
 
 def _none(faults: Faults) -> Bool[Array, ""]:
