@@ -2,6 +2,8 @@
 
 - `calls`: filter calls a second on a batch of 4096 states, in float32. The states are met under
   random actions. Compiling is measured apart, and numbers are medians.
+- `reserve`: seconds for the wingman's default filter close to the lead, at the task's starts and
+  far away, as a multiple of those of a filter that predicts all backup controllers at every step.
 - `qp`: the small quadratic program.
 - `change`: how often and how much each docking filter alters random actions.
 - `starts`: what becomes of starts that are not certified.
@@ -11,7 +13,7 @@
 Where cbfpy or run-time-assurance is installed, its filter runs in the same invocation. Results are
 written to `benchmarks/results/rta.json`, and the tables are printed:
 
-    python benchmarks/rta.py [parts=calls,qp,change,starts,training] [repeats=7]
+    python benchmarks/rta.py [parts=calls,reserve,qp,change,starts,training] [repeats=7]
 """
 
 from __future__ import annotations
@@ -35,11 +37,14 @@ from tables import markdown
 import jaxsafe
 from jaxsafe.agents.agent import Agent
 from jaxsafe.config import override
+from jaxsafe.control.law import action_of
 from jaxsafe.envs import TASKS
+from jaxsafe.evaluate.adversaries import intercept
 from jaxsafe.evaluate.run_adversaries import attack
 from jaxsafe.rollout import reset_batch, step_or_reset_batch
 from jaxsafe.rta.qp import nearest_solution
-from jaxsafe.schema.component import normalise
+from jaxsafe.rta.simplex import Simplex
+from jaxsafe.schema.component import fields, normalise
 from jaxsafe.train.hyperparameters import PPO
 from jaxsafe.train.ppo import init, update
 from jaxsafe.transition import bounds
@@ -52,6 +57,7 @@ def main() -> None:
     """Measure the chosen parts, write the results and print the tables."""
     parts = {
         "calls": calls,
+        "reserve": reserves,
         "qp": programs,
         "change": changes,
         "starts": starts,
@@ -103,6 +109,76 @@ def calls(repeats: int) -> list[dict[str, Any]]:
             )
             print(rows[-1], flush=True)
     return rows + cbfpy_calls(repeats) + run_time_assurance_calls(repeats)
+
+
+DISTANCES: dict[str, tuple[float, float] | None] = {
+    "close": (700.0, 1500.0),
+    "as in the task": None,
+    "far": (20_000.0, 30_000.0),
+}
+"""Distances to the lead [ft] at which the wingman starts, by name. None stands for the task's."""
+
+
+class AllPredicted(Simplex):
+    """A simplex that predicts the ways of all backup controllers at every step."""
+
+    def _way(
+        self, env: Any, before: Any, sim: Any, memories: Any, reserve: Any, required: Any
+    ) -> Any:
+        return self._best(env, self.follow(env, before, sim, memories))
+
+
+def reserves(repeats: int) -> list[dict[str, Any]]:
+    """Measure what is gained by predicting the backup controller in reserve first.
+
+    The wingman intercepts the lead for 20 steps with the filter. Both filters then take turns in
+    the states that are met.
+    """
+    rows = []
+    for task in ("rejoin2d", "rejoin3d"):
+        for name, distance in DISTANCES.items():
+            starts = {} if distance is None else {"wingman.start.position.distance": [*distance]}
+            env = jaxsafe.make(task, starts, rta="default")
+            numbers = {field: getattr(env.rta, field) for field in fields(Simplex)}
+            both = {"reserve": env, "all": env.replace(rta=AllPredicted(**numbers))}
+            arguments = intercepting(env)
+            times: dict[str, list[float]] = {kind: [] for kind in both}
+            for _ in range(repeats + 1):  # in turns, and the first turn compiles
+                for kind, each in both.items():
+                    run = functools.partial(filter_batch, each, *arguments)
+                    times[kind].append(timed(run, 1)[0])
+            ratios = [a / b for a, b in zip(*(times[kind][1:] for kind in both), strict=True)]
+            rows.append(
+                {
+                    "task": task,
+                    "start": name,
+                    "calls_per_s": BATCH / statistics.median(times["reserve"][1:]),
+                    "all_calls_per_s": BATCH / statistics.median(times["all"][1:]),
+                    "ratio": statistics.median(ratios),
+                }
+            )
+            print(rows[-1], flush=True)
+    return rows
+
+
+def intercepting(env: jaxsafe.Environment) -> tuple[Any, Any, jax.Array]:
+    """Return simulations, the filter's memories, and controls towards where the lead will be."""
+
+    def controls(sims: Any, key: jax.Array) -> jax.Array:
+        return jax.vmap(functools.partial(intercept, env))(sims, jax.random.split(key, BATCH))
+
+    @jax.jit
+    def run(env: Any, key: jax.Array) -> Any:
+        state, _ = reset_batch(env, key, BATCH)
+
+        def one_step(state: Any, key: jax.Array) -> tuple[Any, None]:
+            action = jax.vmap(functools.partial(action_of, env))(controls(state.sim, key))
+            return step_or_reset_batch(env, state, action, key)[0][0], None
+
+        return jax.lax.scan(one_step, state, jax.random.split(key, 20))[0]
+
+    state = jax.block_until_ready(run(env, jax.random.key(0)))
+    return state.sim, state.memory.rta, controls(state.sim, jax.random.key(1))
 
 
 @jax.jit
