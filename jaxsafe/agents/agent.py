@@ -187,7 +187,7 @@ class Agent(Component):
             sequences: what else a recurrent actor needs to know of the sequences.
         """
         out = self._outputs("actor", env, params, inputs, sequences)
-        return self._head(env, params, inputs, out)
+        return self._head(env, params, self._corrected(env, inputs, out))
 
     def distribution_step(
         self, env: Environment, params: Params, inputs: Float[Array, "*batch i"], memory: Memory
@@ -203,18 +203,18 @@ class Agent(Component):
         if not self.actor.recurrent:
             return self.distribution(env, params, inputs), memory
         memory, outputs = self._apply("actor", env, params, memory, inputs)
-        return self._head(env, params, inputs, outputs), memory
+        return self._head(env, params, self._corrected(env, inputs, outputs)), memory
+
+    def _corrected(
+        self, env: Environment, inputs: Float[Array, "*batch i"], out: Float[Array, "*batch o"]
+    ) -> Float[Array, "*batch o"]:
+        """Return the outputs of the actor, added to the action of the law if there is one."""
+        return out if self.controller is None else out + inputs[..., : env.action_size]
 
     def _head(
-        self,
-        env: Environment,
-        params: Params,
-        inputs: Float[Array, "*batch i"],
-        out: Float[Array, "*batch o"],
+        self, env: Environment, params: Params, out: Float[Array, "*batch o"]
     ) -> Distribution:
         """Return the distribution over actions that the outputs of the actor stand for."""
-        if self.controller is not None:
-            out = out + inputs[..., : env.action_size]
         return action_distribution(env.num_action_points, out, params["log_std"], self._choices)
 
     def _choices(
