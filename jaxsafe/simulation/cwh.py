@@ -6,7 +6,7 @@ step (zero-order hold), so the linear equations are solved in closed form and th
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -187,3 +187,28 @@ def cwh_flow(
         position.append(z - versine * z + t * s1 * vz + t * t * c2 * az)
         velocity.append(vz - n * sine * z - versine * vz + t * s1 * az)
     return jnp.stack(position), jnp.stack(velocity)
+
+
+def cwh_response(vx: Number, vy: Number, n: Number, t: Number) -> tuple[Any, Any, Any, Any]:
+    """Return position and velocity along x and y, a time t after an impulse in the plane.
+
+    It is `cwh_flow` from rest at the origin, as single numbers.
+
+    Args:
+        vx: change of the velocity along x by the impulse [m/s].
+        vy: the same along y.
+        n: mean motion [rad/s].
+        t: time [s].
+    """
+    tau = n * t
+    s1, c2, _ = sine_ratios(tau)
+    half = 2.0 * tau * c2  # 2(1 − cos τ)/τ
+    straight = t * (4.0 * s1 - 3.0)
+    sine = tau * s1  # sin τ
+    versine = tau * tau * c2  # 1 − cos τ
+    return (
+        t * s1 * vx + t * half * vy,
+        straight * vy - t * half * vx,
+        vx - versine * vx + 2.0 * sine * vy,
+        vy - 2.0 * sine * vx - 4.0 * versine * vy,
+    )

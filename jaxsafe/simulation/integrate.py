@@ -6,7 +6,6 @@ Gauss-Legendre nodes. Where no exact solution is known, there are Runge-Kutta st
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -232,16 +231,29 @@ def _in_scalars(tree: T) -> tuple[Callable[[T], list[Array]], Callable[[list[Arr
     return split, join
 
 
-def pieces(stops: Sequence[Any], dt: Number) -> tuple[Float[Array, " s"], Float[Array, " s"]]:
-    """Return the beginning and length [s] of the pieces of a step, each of shape (len(stops) + 1,).
+def through_pieces(
+    fly: Callable[[T, Number, Number], T], start: T, stops: Sequence[Any], dt: Number
+) -> T:
+    """Return the state after all pieces of a step, one after another.
+
+    The pieces are a loop over single numbers. Without a loop XLA would compute a piece again for
+    each use of it. From stacked times it would compute one number at a time.
 
     Args:
+        fly: returns the state after a piece, given the state before it, and the beginning and the
+            length of the piece [s].
+        start: the state at time 0, a tree of numbers.
         stops: times [s] at which one piece ends and the next one begins, in any order.
         dt: length of the step [s].
     """
+
+    def one_piece(carry: tuple[list[Any], T], _: None) -> tuple[tuple[list[Any], T], None]:
+        (begin, end, *later), state = carry
+        return ([end, *later, dt], fly(state, begin, end - begin)), None
+
     bounds = [jnp.zeros_like(dt), *ascending(stops), dt]
-    lengths = [end - begin for begin, end in itertools.pairwise(bounds)]
-    return jnp.stack(bounds[:-1]), jnp.stack(lengths)
+    (_, state), _ = jax.lax.scan(one_piece, (bounds, start), length=len(stops) + 1)
+    return state
 
 
 def ascending(values: Sequence[Any]) -> list[Any]:

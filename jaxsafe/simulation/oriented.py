@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsafe.schema.component import Range, Unit
 from jaxsafe.simulation.controllers import Controls
-from jaxsafe.simulation.cwh import MASS, MEAN_MOTION, MeanMotion, cwh_acceleration, cwh_flow
+from jaxsafe.simulation.cwh import (
+    MASS,
+    MEAN_MOTION,
+    MeanMotion,
+    cwh_acceleration,
+    cwh_flow,
+    cwh_response,
+)
 from jaxsafe.simulation.geometry import direction, rotation
-from jaxsafe.simulation.integrate import NODES, WEIGHTS, ramp, time_to_limit
+from jaxsafe.simulation.integrate import NODES, WEIGHTS, ramp, through_pieces, time_to_limit
 from jaxsafe.simulation.platform import Platform
-from jaxsafe.simulation.trig import wrap
+from jaxsafe.simulation.trig import sin_cos, wrap
 from jaxsafe.types import Kilograms, Number, Record, Seconds
 
 RATE_LIMIT = jnp.pi / 90.0
@@ -87,29 +94,36 @@ class OrientedSpacecraft(Platform, type="oriented_spacecraft"):
         final_rate = ramp(first_rate, rate=turn, limits=limits, t=dt)
         thrust = controls.get("thrust", 0.0) / self.mass
 
-        zeros = jnp.zeros_like(state.position)
-        attitude = state.attitude
-        position, velocity = cwh_flow(
-            r=state.position, v=state.velocity, a=zeros, n=self.mean_motion, t=dt
-        )
-        stop = time_to_limit(first_rate, rate=turn, limits=limits, dt=dt)
-        for begin, length, rate, acceleration in (
-            (0.0, stop, first_rate, turn),
-            (stop, dt - stop, final_rate, 0.0),
-        ):
+        def fly(before: list[Any], begin: Number, length: Number) -> list[Any]:
+            attitude, rate, acceleration, *moved = before
             for node, weight in zip(NODES, WEIGHTS, strict=True):
                 elapsed = node * length
-                angle = attitude + rate * elapsed + acceleration * elapsed**2 / 2.0
-                impulse = thrust * weight * length * direction(angle)
-                response = cwh_flow(
-                    r=zeros, v=impulse, a=zeros, n=self.mean_motion, t=dt - begin - elapsed
+                sine, cosine = sin_cos(attitude + rate * elapsed + acceleration * elapsed**2 / 2.0)
+                impulse = thrust * weight * length
+                response = cwh_response(
+                    vx=impulse * cosine,
+                    vy=impulse * sine,
+                    n=self.mean_motion,
+                    t=dt - begin - elapsed,
                 )
-                position = position + response[0]
-                velocity = velocity + response[1]
+                moved = [total + part for total, part in zip(moved, response, strict=True)]
             attitude = attitude + length * (rate + acceleration * length / 2.0)
+            return [attitude, final_rate, still, *moved]
+
+        stop = time_to_limit(first_rate, rate=turn, limits=limits, dt=dt)
+        position, velocity = cwh_flow(
+            r=state.position,
+            v=state.velocity,
+            a=jnp.zeros_like(state.position),
+            n=self.mean_motion,
+            t=dt,
+        )
+        still = jnp.zeros_like(first_rate)
+        start = [state.attitude, first_rate, still + turn, *position, *velocity]
+        attitude, _, _, *moved = through_pieces(fly, start, [stop], dt)
         return OrientedState(
-            position=position,
-            velocity=velocity,
+            position=jnp.stack(moved[:2]),
+            velocity=jnp.stack(moved[2:]),
             delta_v=(thrust * dt)[None],
             attitude=wrapped(attitude),
             attitude_rate=final_rate,

@@ -5,6 +5,7 @@ They are compared with scipy and with exact fractions.
 
 import math
 from fractions import Fraction
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,10 +18,10 @@ from jaxsafe.simulation.integrate import (
     NODES,
     PARTIAL_WEIGHTS,
     WEIGHTS,
-    pieces,
     ramp,
     runge_kutta,
     sine_ratios,
+    through_pieces,
     time_to_limit,
 )
 
@@ -150,15 +151,25 @@ def test_a_time_to_a_limit_has_no_derivative() -> None:
         assert [float(gradient) for gradient in gradients] == [0.0, 0.0, 0.0]
 
 
-def test_pieces_partition_the_step_in_order() -> None:
-    begin, length = pieces(
-        [jnp.float32(0.75), jnp.float32(0.25), jnp.float32(1.0)], jnp.float32(1.0)
-    )
-    np.testing.assert_array_equal(begin, [0.0, 0.25, 0.75, 1.0])
-    np.testing.assert_array_equal(length, [0.25, 0.5, 0.25, 0.0])
-    begin, length = pieces([jnp.float32(2.0), jnp.float32(0.0)], jnp.float32(2.0))
-    np.testing.assert_array_equal(begin, [0.0, 0.0, 2.0])
-    np.testing.assert_array_equal(length, [0.0, 2.0, 0.0])
+@pytest.mark.parametrize(
+    ("stops", "dt", "expected"),
+    [
+        ([0.75, 0.25, 1.0], 1.0, [(0.0, 0.25), (0.25, 0.5), (0.75, 0.25), (1.0, 0.0)]),
+        ([2.0, 0.0], 2.0, [(0.0, 0.0), (0.0, 2.0), (2.0, 0.0)]),
+        ([], 0.5, [(0.0, 0.5)]),
+    ],
+)
+def test_pieces_partition_the_step_in_order(
+    stops: list[float], dt: float, expected: list[tuple[float, float]]
+) -> None:
+    def fly(before: tuple[Any, Any], begin: Any, length: Any) -> tuple[Any, Any]:
+        count, flown = before
+        return count + 1, flown.at[count].set(jnp.stack([begin, length]))
+
+    start = (0, jnp.zeros((len(expected), 2)))
+    count, flown = through_pieces(fly, start, [jnp.float32(t) for t in stops], jnp.float32(dt))
+    assert count == len(expected)
+    np.testing.assert_array_equal(flown, expected)
 
 
 @pytest.mark.parametrize("degree", range(6))
