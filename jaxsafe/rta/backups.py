@@ -38,7 +38,7 @@ from jaxsafe.rta.tube_in_space import (
 )
 from jaxsafe.schema.component import Range, Unit, fields
 from jaxsafe.simulation.dubins import Dubins2D, Dubins3D
-from jaxsafe.simulation.geometry import direction, safe_norm
+from jaxsafe.simulation.geometry import direction, dot, safe_norm
 from jaxsafe.simulation.oriented import OrientedSpacecraft
 from jaxsafe.simulation.trig import arctan, wrap
 from jaxsafe.transition import Others, bounds, undirected
@@ -133,7 +133,7 @@ class AlignAndBrake(BackupController, type="align_and_brake"):
             u=jnp.zeros(1, turn.dtype), low=low[:1], high=high[:1], beta=beta, p=p, k=k
         )
         hold = jnp.where(feasible | (jnp.abs(error) <= self.steep), hold[0], 0.0)
-        along = jnp.sum(state.velocity * direction(state.attitude))
+        along = dot(state.velocity, direction(state.attitude))
         brake = -along * plant.mass / env.dt
         return jnp.stack([jnp.where(jnp.abs(error) <= self.aligned, brake, hold), turn])
 
@@ -264,8 +264,8 @@ class MatchVelocity(BackupController, type="match_velocity"):
         lead's horizontal speed [ft²/s²], and the heading error [rad].
         """
         away = self._away(own.position - lead.position)
-        level_squared = jnp.sum(lead.velocity[:2] ** 2)
-        faster = jnp.sum(away * lead.velocity) / lead.speed
+        level_squared = dot(lead.velocity[:2], lead.velocity[:2])
+        faster = dot(away, lead.velocity) / lead.speed
         goal = lead_after.heading if self.climb is None else lead.heading
         goal += (lead.velocity[0] * away[1] - lead.velocity[1] * away[0]) / level_squared
         error = self._sign * wrap(self._sign * (goal - own.heading), -self.dead_zone, 2.0 * jnp.pi)

@@ -109,7 +109,7 @@ class Dubins2D(Platform, type="dubins2d"):
         start = [state.heading, speed, still + acceleration, still, still]
         _, _, _, *moved = through_pieces(fly, start, [stop], dt)
         return Dubins2DState(
-            position=state.position + jnp.stack(moved),
+            position=moved_by(state.position, moved),
             heading=state.heading + turn * dt,
             speed=final_speed,
         )
@@ -124,7 +124,7 @@ class Dubins2D(Platform, type="dubins2d"):
         moved = _arc(heading=state.heading, speed=speed, turn=turn, acceleration=acceleration, t=dt)
         final_speed = ramp(speed, rate=acceleration, limits=self.speed_limits, t=dt)
         return Dubins2DState(
-            position=state.position + jnp.stack(moved),
+            position=moved_by(state.position, moved),
             heading=state.heading + turn * dt,
             speed=final_speed,
         )
@@ -284,7 +284,7 @@ class Dubins3D(Platform, type="dubins3d"):
         """Return the state after the step, given its heading and its displacement."""
         roll, gamma, speed = (ramp(*quantity, dt) for quantity in ramps)
         return Dubins3DState(
-            position=state.position + jnp.stack(moved),
+            position=moved_by(state.position, moved),
             heading=heading,
             speed=speed,
             flight_path_angle=gamma,
@@ -369,6 +369,14 @@ def flight_direction(
     sin_heading, cos_heading = heading
     sin_gamma, cos_gamma = gamma
     return cos_heading * cos_gamma, sin_heading * cos_gamma, -sin_gamma
+
+
+def moved_by(position: Float[Array, " d"], moved: Sequence[Array]) -> Float[Array, " d"]:
+    """Return a position after a displacement along each axis.
+
+    It is a stack of sums, because XLA computes the sum with a stack one number at a time.
+    """
+    return jnp.stack([x + part for x, part in zip(position, moved, strict=True)])
 
 
 def weighted_sum(weights: Sequence[float], values: Sequence[Array]) -> Any:

@@ -22,6 +22,7 @@ from jaxsafe.simulation.dubins import (
     Dubins3D,
     Dubins3DState,
     flight_direction,
+    moved_by,
     weighted_sum,
 )
 from jaxsafe.simulation.integrate import (
@@ -94,7 +95,7 @@ class LaggedDubins2D(Dubins2D, type="dubins2d_lag"):
         still = [jnp.zeros_like(state.speed)] * 2
         moved, _ = jax.lax.scan(one_part, still, h * jnp.arange(self.substeps, dtype=h.dtype))
         return LaggedDubins2DState(
-            position=state.position + jnp.stack(moved),
+            position=moved_by(state.position, moved),
             heading=heading(dt),
             speed=speed(dt),
             heading_rate=lagged(*turn, dt),
@@ -207,7 +208,7 @@ class LaggedDubins3D(Dubins3D, type="dubins3d_lag"):
         )
         roll, gamma, speed = at(dt)
         return LaggedDubins3DState(
-            position=state.position + jnp.stack(moved),
+            position=moved_by(state.position, moved),
             heading=heading,
             speed=speed,
             flight_path_angle=gamma,

@@ -14,13 +14,24 @@ from jaxsafe.simulation.trig import sin_cos
 from jaxsafe.types import Number, Place, Reach
 
 
+def dot(
+    first: Float[Array, "*batch d"], second: Float[Array, "*batch d"]
+) -> Float[Array, "*batch"]:
+    """Return the scalar product of two vectors.
+
+    The sum is written out, because a reduction keeps XLA from working on many vectors at a time.
+    """
+    products = [first[..., i] * second[..., i] for i in range(first.shape[-1])]
+    return functools.reduce(jnp.add, products)
+
+
 def safe_norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
     """Return the Euclidean norm ‖v‖, whose gradient at v = 0 is 0 instead of NaN.
 
     The function uses two `where`. The root must not see 0 even in the branch that is not taken,
     because `where` would multiply the infinite derivative of that branch by zero.
     """
-    squared = jnp.sum(vector * vector, axis=-1)
+    squared = dot(vector, vector)
     zero = squared == 0.0  # false for NaN, so that NaN stays NaN
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
 
@@ -28,8 +39,8 @@ def safe_norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
 def closest_approach(before: Float[Array, " d"], after: Float[Array, " d"]) -> Float[Array, ""]:
     """Return the smallest norm on the straight line between two vectors."""
     change = after - before
-    squared = jnp.sum(change * change)
-    share = jnp.clip(-jnp.sum(before * change) / jnp.where(squared > 0.0, squared, 1.0), 0.0, 1.0)
+    squared = dot(change, change)
+    share = jnp.clip(-dot(before, change) / jnp.where(squared > 0.0, squared, 1.0), 0.0, 1.0)
     return safe_norm(before + share * change)
 
 
@@ -130,7 +141,7 @@ def angle_between(first: Float[Array, " d"], second: Float[Array, " d"]) -> Floa
     first = mag_norm(first)[1:]
     second = mag_norm(second)[1:]
     defined = jnp.any(first != 0.0) & jnp.any(second != 0.0)
-    cosine = jnp.sum(first * second)
+    cosine = dot(first, second)
     sine = safe_norm(second - cosine * first)
     return jnp.arctan2(jnp.where(defined, sine, 0.0), jnp.where(defined, cosine, 1.0))
 
