@@ -117,6 +117,17 @@ def test_llvm_keeps_its_expensive_passes_for_an_accelerator(
     assert ("disable_expensive_passes" in os.environ["XLA_FLAGS"]) == disabled
 
 
+@pytest.mark.parametrize("own", ["", "--xla_backend_extra_options=xla_cpu_optimize_for_size"])
+def test_small_loops_become_one_function_unless_the_user_has_set_such_options(
+    monkeypatch: pytest.MonkeyPatch, own: str
+) -> None:
+    monkeypatch.setenv("XLA_FLAGS", own)
+    claim_cores()
+    flags = os.environ["XLA_FLAGS"]
+    assert flags.count("--xla_backend_extra_options") == 1
+    assert ("xla_cpu_small_while_loop_byte_threshold=1000000" in flags) == (not own)
+
+
 @pytest.mark.parametrize("started", ["by itself", "by a process that imported jax first"])
 def test_a_cached_program_loads_without_a_word_even_if_jax_came_first(
     started: str, tmp_path: Path
