@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 from typing import Annotated, Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -21,8 +22,9 @@ def dot(
 
     The sum is written out, because a reduction keeps XLA from working on many vectors at a time.
     """
-    products = [first[..., i] * second[..., i] for i in range(first.shape[-1])]
-    return functools.reduce(jnp.add, products)
+    products = first * second
+    terms = [jax.lax.index_in_dim(products, i, -1, keepdims=False) for i in range(first.shape[-1])]
+    return functools.reduce(jnp.add, terms)
 
 
 def safe_norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:

@@ -322,6 +322,8 @@ class _Builder:
             keys = ("jaxpr", "call_jaxpr", "fun_jaxpr")
             inner = next(eqn.params[key] for key in keys if key in eqn.params)
             return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), x)
+        if name == "scan":
+            return self.loop(eqn, x)
         if name in _IDENTITIES:
             return x
         if name == "select_n" and isinstance(x[0], Constant) and not isinstance(x[1], Constant):
@@ -341,6 +343,17 @@ class _Builder:
         elif rule := getattr(self, f"_{name}", None):
             return [rule(eqn, *x)]
         raise ConfigError(f"verify: no rule for the operation {name!r}")
+
+    def loop(self, eqn: Any, x: list[Any]) -> list[Any]:
+        """Return the outputs of a loop whose number of turns is known, turn by turn."""
+        body = eqn.params["jaxpr"]
+        num_consts = eqn.params["num_consts"]
+        consts, carry = x[:num_consts], x[num_consts:]
+        if not len(carry) == len(eqn.outvars) == eqn.params["num_carry"]:
+            raise ConfigError("verify: no rule for a loop over the elements of an array")
+        for _ in range(eqn.params["length"]):
+            carry = self.run(body.jaxpr, body.consts, [*consts, *carry])
+        return carry
 
     def move(self, eqn: Any, x: list[Any]) -> list[Any]:
         """Return the outputs of an operation that leaves numbers as they are."""

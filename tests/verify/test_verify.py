@@ -975,6 +975,21 @@ def test_a_guarded_root_needs_the_guard_behind_it_too() -> None:
         trace(half_guarded, 2, 0.0)
 
 
+def test_a_loop_is_taken_turn_by_turn_and_one_over_an_array_is_refused() -> None:
+    def twice(y: jax.Array) -> jax.Array:
+        return jax.lax.scan(lambda x, _: (jnp.tanh(2.0 * x + y), None), y, length=2)[0]
+
+    def over_an_array(y: jax.Array) -> jax.Array:
+        return jax.lax.scan(lambda x, factor: (factor * x, None), y, jnp.stack([y, y]))[0]
+
+    y = np.array([0.3, -0.1])
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(trace(twice, 2, 0.0)(y), twice(y), rtol=1e-15)
+        message = "^verify: no rule for a loop over the elements of an array"
+        with pytest.raises(ConfigError, match=message):
+            trace(over_an_array, 2, 0.0)
+
+
 def test_a_fact_about_one_rounded_constant_is_refused() -> None:
     def checked(y: jax.Array) -> jax.Array:
         return jnp.where(jnp.isfinite(jnp.asarray(0.1)), y, 0.0)
