@@ -10,6 +10,8 @@
 - `training`: what a filter in the loop adds to the wall time of training. Training with it and
   without it take turns.
 
+All is measured on one core, with JAX set up as commands do it.
+
 Where cbfpy or run-time-assurance is installed, its filter runs in the same invocation. Results are
 written to `benchmarks/results/rta.json`, and the tables are printed:
 
@@ -38,6 +40,7 @@ import jaxsafe
 from jaxsafe.agents.agent import Agent
 from jaxsafe.config import override
 from jaxsafe.control.law import action_of
+from jaxsafe.devices.seed_mapper import claim_cores
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.adversaries import intercept
 from jaxsafe.evaluate.run_adversaries import attack
@@ -63,6 +66,7 @@ def main() -> None:
         "starts": starts,
         "training": training,
     }
+    claim_cores()
     options = words(repeats="7", parts=",".join(parts))
     repeats = int(options["repeats"])
     chosen = several("parts", options["parts"], parts)
