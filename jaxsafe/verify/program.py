@@ -346,13 +346,16 @@ class _Builder:
 
     def loop(self, eqn: Any, x: list[Any]) -> list[Any]:
         """Return the outputs of a loop whose number of turns is known, turn by turn."""
-        body = eqn.params["jaxpr"]
-        num_consts = eqn.params["num_consts"]
-        consts, carry = x[:num_consts], x[num_consts:]
-        if not len(carry) == len(eqn.outvars) == eqn.params["num_carry"]:
+        body = getattr(eqn.params["jaxpr"], "jaxpr", eqn.params["jaxpr"])
+        pairs = [*zip(body.invars, eqn.invars, strict=True)]
+        pairs += zip(body.outvars, eqn.outvars, strict=True)
+        if any(inner.aval.shape != outer.aval.shape for inner, outer in pairs):
             raise ConfigError("verify: no rule for a loop over the elements of an array")
+        num_consts = len(x) - len(eqn.outvars)
+        consts, carry = x[:num_consts], x[num_consts:]
+        closed_over = getattr(eqn.params["jaxpr"], "consts", ())
         for _ in range(eqn.params["length"]):
-            carry = self.run(body.jaxpr, body.consts, [*consts, *carry])
+            carry = self.run(body, closed_over, [*consts, *carry])
         return carry
 
     def move(self, eqn: Any, x: list[Any]) -> list[Any]:
