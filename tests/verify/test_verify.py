@@ -982,8 +982,8 @@ def test_a_loop_is_taken_turn_by_turn_and_one_over_an_array_is_refused() -> None
     def over_an_array(y: jax.Array) -> jax.Array:
         return jax.lax.scan(lambda x, factor: (factor * x, None), y, jnp.stack([y, y]))[0]
 
-    y = np.array([0.3, -0.1])
     with jax.enable_x64(True):
+        y = jnp.array([0.3, -0.1])
         np.testing.assert_allclose(trace(twice, 2, 0.0)(y), twice(y), rtol=1e-15)
         message = "^verify: no rule for a loop over the elements of an array"
         with pytest.raises(ConfigError, match=message):
