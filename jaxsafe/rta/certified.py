@@ -69,11 +69,12 @@ class CertifiedRTA(RTA):
     from there, and the last state must lie in the `terminal` set. The filter also checks what the
     proofs of the backup controller and of the set assume of the environment's numbers.
 
-    The backup controller of the last certificate is in reserve. Its way is predicted first, and
-    those of the others only if it does not certify the control. A control that nothing certifies is
-    replaced by the controller in reserve, whose certificate is renewed while it acts. If renewing
-    fails, or nothing has been certified yet, the backup controllers compete. The first one that is
-    certified acts. Until then the one with the largest h on its way acts.
+    The backup controller of the last certificate is in reserve. A filter with more than two of them
+    predicts its way first, and those of the others only if it does not certify the control. A
+    control that nothing certifies is replaced by the controller in reserve, whose certificate is
+    renewed while it acts. If renewing fails, or nothing has been certified yet, the backup
+    controllers compete. The first one that is certified acts. Until then the one with the largest h
+    on its way acts.
 
     After an intervention, control returns to the agent only with `release` on top of the margin.
     Without `enforce` a feasible proposal acts whatever the prediction says. That is how filters of
@@ -633,8 +634,8 @@ class CertifiedRTA(RTA):
     ) -> Way:
         """Return the way that decides: that in reserve if it suffices, else the best of all.
 
-        So most steps predict one way. With a `bound`, and where other platforms react to the agent,
-        all ways are predicted.
+        So most steps predict one way. All ways are predicted where there are only two, where
+        there is a `bound`, and where other platforms react to the agent.
 
         Args:
             env: the environment.
@@ -649,7 +650,7 @@ class CertifiedRTA(RTA):
             return rta._best(env, rta.follow(env, *state))
 
         state = (self, env, before, sim, memories)
-        if len(self.backups) < 2 or self.bound is not None or others_react(env, sim):
+        if len(self.backups) < 3 or self.bound is not None or others_react(env, sim):
             return best_of_all(*state)
         kept = self._kept(env, before, sim, memories, reserve)
         return only_where(~(kept.value >= required), best_of_all, state, otherwise=kept)

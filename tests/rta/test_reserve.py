@@ -28,15 +28,19 @@ class AllPredicted(Simplex):
         return self._best(env, self.follow(env, before, sim, memories))
 
 
-def near_the_lead(task: str) -> Environment:
-    return jaxsafe.make(task, {"wingman.start.position.distance": [700.0, 1500.0]}, rta="default")
+def near_the_lead(task: str) -> tuple[Environment, Environment]:
+    """Return an environment with three or four backups, and one that predicts all their ways."""
+    env = jaxsafe.make(task, {"wingman.start.position.distance": [700.0, 1500.0]}, rta="default")
+    numbers = {name: getattr(env.rta, name) for name in fields(Simplex)}
+    if task == "rejoin2d":
+        left, right = env.rta.backups
+        numbers["backups"] = (left, right, left.replace(name="short_left", away_time=5))
+    return env.replace(rta=Simplex(**numbers)), env.replace(rta=AllPredicted(**numbers))
 
 
 @pytest.mark.parametrize("task", ["rejoin2d", thorough("rejoin3d")])
 def test_a_control_passes_if_any_way_certifies_it(task: str) -> None:
-    env = near_the_lead(task)
-    numbers = {name: getattr(env.rta, name) for name in fields(Simplex)}
-    all_predicted = env.replace(rta=AllPredicted(**numbers))
+    env, all_predicted = near_the_lead(task)
     count = 64
 
     def one_step(state: Any, key: Any) -> tuple[Any, tuple[Any, ...]]:
@@ -75,6 +79,17 @@ def test_a_control_passes_if_any_way_certifies_it(task: str) -> None:
     assert not np.asarray(same)[passed].all()  # a better one does not take over
     assert np.asarray(kept)[passed].mean() > 0.9
     assert not np.asarray(kept)[flying].all()
+
+
+def test_a_filter_with_two_backups_predicts_both() -> None:
+    env = jaxsafe.make("rejoin2d", rta="default")
+    assert len(env.rta.backups) == 2
+    state, _ = jaxsafe.reset(env, KEY)
+    jaxpr = str(jax.make_jaxpr(jaxsafe.step)(env, state, jnp.zeros(2)))
+    more, _ = near_the_lead("rejoin2d")
+    gathered = str(jax.make_jaxpr(jaxsafe.step)(more, jaxsafe.reset(more, KEY)[0], jnp.zeros(2)))
+    assert "only_where" not in jaxpr
+    assert "only_where" in gathered
 
 
 @pytest.mark.parametrize("task", ["rejoin2d", "rejoin3d"])
