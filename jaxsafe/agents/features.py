@@ -20,7 +20,7 @@ from jaxsafe.processors.status import VelocityLimit
 from jaxsafe.schema.component import Component
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.simulation.cwh import ThrustedSpacecraft
-from jaxsafe.simulation.geometry import rotation, safe_norm
+from jaxsafe.simulation.geometry import rotation, safe_root
 from jaxsafe.simulation.oriented import OrientedSpacecraft
 from jaxsafe.transition import bounds
 from jaxsafe.types import Number
@@ -396,10 +396,10 @@ class RejoinFeatures(Features, type="rejoin"):
         return jnp.concatenate([observation, *aim, closing, 4.0 * across, miss, *danger], axis=-1)
 
 
-# A program of its own rounds alike whether its surroundings are compiled or not.
+# A program of its own, with a reduction, rounds alike whether its surroundings are compiled or not.
 @jax.jit
 def _norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch 1"]:
-    return safe_norm(vector)[..., None]
+    return safe_root(jnp.sum(vector * vector, axis=-1, keepdims=True))
 
 
 def _point_mass(env: Environment, name: str) -> ThrustedSpacecraft:

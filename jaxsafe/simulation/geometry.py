@@ -28,12 +28,16 @@ def dot(
 
 
 def safe_norm(vector: Float[Array, "*batch d"]) -> Float[Array, "*batch"]:
-    """Return the Euclidean norm ‖v‖, whose gradient at v = 0 is 0 instead of NaN.
+    """Return the Euclidean norm ‖v‖, whose gradient at v = 0 is 0 instead of NaN."""
+    return safe_root(dot(vector, vector))
+
+
+def safe_root(squared: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """Return the root of a squared norm, whose gradient at 0 is 0 instead of infinite.
 
     The function uses two `where`. The root must not see 0 even in the branch that is not taken,
     because `where` would multiply the infinite derivative of that branch by zero.
     """
-    squared = dot(vector, vector)
     zero = squared == 0.0  # false for NaN, so that NaN stays NaN
     return jnp.where(zero, 0.0, jnp.sqrt(jnp.where(zero, 1.0, squared)))
 
