@@ -154,38 +154,37 @@ def cwh_flow(
         Position [m] and velocity [m/s], each of shape (d,).
     """
     tau = n * t
-    s1, c2, s3 = sine_ratios(tau)
-    half = 2.0 * tau * c2  # 2(1 − cos τ)/τ
+    ratios = sine_ratios(tau)
+    _, c2, s3 = ratios
+    along, across, straight, sine, versine = _impulse_coefficients(tau, t, ratios)
     third = 2.0 * tau * s3 * t * t  # 2(τ − sin τ)/n²
-    sine = tau * s1  # sin τ
-    versine = tau * tau * c2  # 1 − cos τ
     x, y = r[0], r[1]
     vx, vy = v[0], v[1]
     ax, ay = a[0], a[1]
     position = [
-        x + 3.0 * versine * x + t * s1 * vx + t * half * vy + t * t * c2 * ax + third * ay,
+        x + 3.0 * versine * x + along * vx + across * vy + t * t * c2 * ax + third * ay,
         y
         - 6.0 * tau**3 * s3 * x
-        - t * half * vx
-        + t * (4.0 * s1 - 3.0) * vy
+        - across * vx
+        + straight * vy
         - third * ax
         + t * t * (4.0 * c2 - 1.5) * ay,
     ]
     velocity = [
-        vx + 3.0 * n * sine * x - versine * vx + 2.0 * sine * vy + t * s1 * ax + t * half * ay,
+        vx + 3.0 * n * sine * x - versine * vx + 2.0 * sine * vy + along * ax + across * ay,
         vy
         - 6.0 * n * versine * x
         - 2.0 * sine * vx
         - 4.0 * versine * vy
-        - t * half * ax
-        + t * (4.0 * s1 - 3.0) * ay,
+        - across * ax
+        + straight * ay,
     ]
     if r.shape[0] == 3:
         z = r[2]
         vz = v[2]
         az = a[2]
-        position.append(z - versine * z + t * s1 * vz + t * t * c2 * az)
-        velocity.append(vz - n * sine * z - versine * vz + t * s1 * az)
+        position.append(z - versine * z + along * vz + t * t * c2 * az)
+        velocity.append(vz - n * sine * z - versine * vz + along * az)
     return jnp.stack(position), jnp.stack(velocity)
 
 
@@ -201,14 +200,19 @@ def cwh_response(vx: Number, vy: Number, n: Number, t: Number) -> tuple[Any, Any
         t: time [s].
     """
     tau = n * t
-    s1, c2, _ = sine_ratios(tau)
-    half = 2.0 * tau * c2  # 2(1 − cos τ)/τ
-    straight = t * (4.0 * s1 - 3.0)
-    sine = tau * s1  # sin τ
-    versine = tau * tau * c2  # 1 − cos τ
+    along, across, straight, sine, versine = _impulse_coefficients(tau, t, sine_ratios(tau))
     return (
-        t * s1 * vx + t * half * vy,
-        straight * vy - t * half * vx,
+        along * vx + across * vy,
+        straight * vy - across * vx,
         vx - versine * vx + 2.0 * sine * vy,
         vy - 2.0 * sine * vx - 4.0 * versine * vy,
     )
+
+
+def _impulse_coefficients(
+    tau: Number, t: Number, ratios: tuple[Any, Any, Any]
+) -> tuple[Any, Any, Any, Any, Any]:
+    """Return sin τ/n, 2(1 − cos τ)/n, 4 sin τ/n − 3t, sin τ and 1 − cos τ."""
+    s1, c2, _ = ratios
+    half = 2.0 * tau * c2  # 2(1 − cos τ)/τ
+    return t * s1, t * half, t * (4.0 * s1 - 3.0), tau * s1, tau * tau * c2
