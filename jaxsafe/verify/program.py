@@ -321,7 +321,7 @@ class _Builder:
         if name in _INLINED:
             keys = ("jaxpr", "call_jaxpr", "fun_jaxpr")
             inner = next(eqn.params[key] for key in keys if key in eqn.params)
-            return self.run(getattr(inner, "jaxpr", inner), getattr(inner, "consts", ()), x)
+            return self.run(*_opened(inner), x)
         if name == "scan":
             return self.loop(eqn, x)
         if name in _IDENTITIES:
@@ -346,14 +346,13 @@ class _Builder:
 
     def loop(self, eqn: Any, x: list[Any]) -> list[Any]:
         """Return the outputs of a loop whose number of turns is known, turn by turn."""
-        body = getattr(eqn.params["jaxpr"], "jaxpr", eqn.params["jaxpr"])
+        body, closed_over = _opened(eqn.params["jaxpr"])
         pairs = [*zip(body.invars, eqn.invars, strict=True)]
         pairs += zip(body.outvars, eqn.outvars, strict=True)
         if any(inner.aval.shape != outer.aval.shape for inner, outer in pairs):
             raise ConfigError("verify: no rule for a loop over the elements of an array")
         num_consts = len(x) - len(eqn.outvars)
         consts, carry = x[:num_consts], x[num_consts:]
-        closed_over = getattr(eqn.params["jaxpr"], "consts", ())
         for _ in range(eqn.params["length"]):
             carry = self.run(body, closed_over, [*consts, *carry])
         return carry
@@ -702,6 +701,11 @@ class _Builder:
                 matrix = a if left == (0,) else Constant(a.value.T, a.radius.T)
                 return self.contracted(b, matrix, b.shape[-1])
         raise ConfigError("verify: no rule for the operation 'dot_general' of these values")
+
+
+def _opened(jaxpr: Any) -> tuple[Any, Sequence[Any]]:
+    """Return a jaxpr and the constants that it closes over, if it is a closed one."""
+    return getattr(jaxpr, "jaxpr", jaxpr), getattr(jaxpr, "consts", ())
 
 
 def _units(name: str) -> float:
