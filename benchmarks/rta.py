@@ -2,8 +2,8 @@
 
 - `calls`: filter calls a second on a batch of 4096 states, in float32. The states are met under
   random actions. Compiling is measured apart, and numbers are medians.
-- `reserve`: seconds for the wingman's default filter close to the lead, at the task's starts and
-  far away, as a multiple of those of a filter that predicts all backup controllers at every step.
+- `reserve`: seconds for rejoin3d's default filter close to the lead, at the task's starts and far
+  away, as a multiple of those of a filter that predicts all backup controllers at every step.
 - `qp`: the small quadratic program.
 - `change`: how often and how much each docking filter alters random actions.
 - `starts`: what becomes of starts that are not certified.

@@ -69,8 +69,8 @@ class CertifiedRTA(RTA):
     from there, and the last state must lie in the `terminal` set. The filter also checks what the
     proofs of the backup controller and of the set assume of the environment's numbers.
 
-    The backup controller of the last certificate is in reserve. A filter with more than two of them
-    predicts its way first, and those of the others only if it does not certify the control. A
+    The backup controller of the last certificate is in reserve. Where there are more than two, its
+    way is predicted first, and the ways of the others only if it does not certify the control. A
     control that nothing certifies is replaced by the controller in reserve, whose certificate is
     renewed while it acts. If renewing fails, or nothing has been certified yet, the backup
     controllers compete. The first one that is certified acts. Until then the one with the largest h

@@ -154,9 +154,8 @@ def cwh_flow(
         Position [m] and velocity [m/s], each of shape (d,).
     """
     tau = n * t
-    ratios = sine_ratios(tau)
-    _, c2, s3 = ratios
-    along, across, straight, sine, versine = _impulse_coefficients(tau, t, ratios)
+    s1, c2, s3 = sine_ratios(tau)
+    along, across, straight, sine, versine = _impulse_coefficients(tau, t, s1, c2)
     third = 2.0 * tau * s3 * t * t  # 2(τ − sin τ)/n²
     x, y = r[0], r[1]
     vx, vy = v[0], v[1]
@@ -200,7 +199,8 @@ def cwh_response(vx: Number, vy: Number, n: Number, t: Number) -> tuple[Any, Any
         t: time [s].
     """
     tau = n * t
-    along, across, straight, sine, versine = _impulse_coefficients(tau, t, sine_ratios(tau))
+    s1, c2, _ = sine_ratios(tau)
+    along, across, straight, sine, versine = _impulse_coefficients(tau, t, s1, c2)
     return (
         along * vx + across * vy,
         straight * vy - across * vx,
@@ -210,9 +210,8 @@ def cwh_response(vx: Number, vy: Number, n: Number, t: Number) -> tuple[Any, Any
 
 
 def _impulse_coefficients(
-    tau: Number, t: Number, ratios: tuple[Any, Any, Any]
+    tau: Number, t: Number, s1: Number, c2: Number
 ) -> tuple[Any, Any, Any, Any, Any]:
     """Return sin τ/n, 2(1 − cos τ)/n, 4 sin τ/n − 3t, sin τ and 1 − cos τ."""
-    s1, c2, _ = ratios
     half = 2.0 * tau * c2  # 2(1 − cos τ)/τ
     return t * s1, t * half, t * (4.0 * s1 - 3.0), tau * s1, tau * tau * c2
