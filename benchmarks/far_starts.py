@@ -1,9 +1,9 @@
-"""Measure policies that learn to dock from 100 m to 10 km.
+"""Measure policies from far away: docking from 100 m to 10 km, rejoin from up to 100,000 ft.
 
-Each docking task is trained by its recipe `wide`, with ten seeds. Then the policies of all seeds
-fly the task from three distances, with sampled actions and with the most probable ones. They are
-scored by the reward of the task, and not by that of the recipe. The time limit is that of the task,
-and from 10 km that of the recipe.
+Each docking task is trained by its recipe `wide`, and each rejoin task by its usual one, with ten
+seeds. Then the policies of all seeds fly the task from several distances, with sampled actions and
+with the most probable ones. They are scored by the reward of the task, and not by that of the
+recipe.
 
 Results are written to `benchmarks/results/far_starts.json`, and the table of docs/far_starts.md is
 printed:
@@ -17,25 +17,71 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from isolated import command, several, words
 
-import jaxsafe
-from jaxsafe.schema.dotted_paths import get_path
 from jaxsafe.storage.files import read_json, write_json
 
 OUT = Path(__file__).parent / "results" / "far_starts.json"
-TASKS = ("docking2d", "docking3d", "docking2d_oriented")
-DISTANCES: dict[str, tuple[float, float]] = {
-    "100 to 150 m": (100.0, 150.0),
-    "1 km": (1000.0, 1000.0),
-    "10 km": (10000.0, 10000.0),
-}
-"""The interval of the starts [m] by its name."""
 
-LONG = 6000
-"""The time limit from 10 km [s], whose flight at the speed limit takes 2,257 s."""
+
+class Start(NamedTuple):
+    """Starts at a distance.
+
+    Attributes:
+        name: the distance with its unit, as the table has it.
+        interval: least and greatest distance, in the unit of the task.
+        changes: overrides that the flight from there needs.
+    """
+
+    name: str
+    interval: tuple[float, float]
+    changes: tuple[str, ...] = ()
+
+
+class Study(NamedTuple):
+    """What is trained and where it starts.
+
+    Attributes:
+        recipe: the recipe that trains the policies.
+        body: the body that starts at the distance.
+        starts: the starts of the tests.
+    """
+
+    recipe: str
+    body: str
+    starts: tuple[Start, ...]
+
+
+DOCKING = Study(
+    "wide",
+    "deputy",
+    (
+        Start("100 to 150 m", (100.0, 150.0)),
+        Start("1 km", (1000.0, 1000.0)),
+        # The flight at the speed limit takes 2,257 s.
+        Start("10 km", (10000.0, 10000.0), ("env.terminal.timeout.limit=6000",)),
+    ),
+)
+FAR_WINGMAN = ("env.terminal.timeout.limit=4000", "env.terminal.distance.limit=200000")
+REJOIN = Study(
+    "engineered_features",
+    "wingman",
+    (
+        Start("5,000 to 10,000 ft", (5000.0, 10000.0)),
+        Start("25,000 to 50,000 ft", (25000.0, 50000.0), FAR_WINGMAN),
+        Start("50,000 to 100,000 ft", (50000.0, 100000.0), FAR_WINGMAN),
+    ),
+)
+STUDIES = {
+    "docking2d": DOCKING,
+    "docking3d": DOCKING,
+    "docking2d_oriented": DOCKING,
+    "rejoin2d": REJOIN,
+    "rejoin3d": REJOIN,
+}
+"""The study of each task."""
 
 KEPT = (
     "success_rate",
@@ -48,7 +94,7 @@ KEPT = (
 
 
 def measure(task: str, place: Path, seeds: int, episodes: int) -> list[dict[str, Any]]:
-    """Train a task by its recipe, test the policies, and return a row for each distance.
+    """Train a task by its recipe, test the policies, and return a row for each start.
 
     Args:
         task: the task.
@@ -56,29 +102,29 @@ def measure(task: str, place: Path, seeds: int, episodes: int) -> list[dict[str,
         seeds: number of seeds.
         episodes: episodes of each test of each seed.
     """
+    study = STUDIES[task]
     run = place / task
     if not (run / "results.json").exists():
         rest = ("eval_every=100000000", "episodes=1", f"out={run}")
-        command("train", f"env={task}", "preset=wide", f"seeds={seeds}", *rest)
+        command("train", f"env={task}", f"preset={study.recipe}", f"seeds={seeds}", *rest)
     training = read_json(run / "results.json")
-    own = float(get_path(jaxsafe.make(task), "terminal.timeout.limit"))
     rows = []
-    for name, (low, high) in DISTANCES.items():
-        tested = place / f"{task}_from_{high:.0f}_m"
-        limit = LONG if low > 1000.0 else own
+    for start in study.starts:
+        low, high = start.interval
+        tested = place / f"{task}_from_{high:.0f}"
+        changes = (
+            f"env={task}",
+            f"env.{study.body}.start.position.distance=[{low},{high}]",
+            *start.changes,
+        )
         if not (tested / "results.json").exists():
-            changes = (
-                f"env={task}",
-                f"env.deputy.start.position.distance=[{low},{high}]",
-                f"env.terminal.timeout.limit={limit}",
-            )
             command("evaluate", f"run={run}", *changes, f"episodes={episodes}", f"out={tested}")
         evaluation = read_json(tested / "results.json")["evaluation"]
         rows.append(
             {
                 "task": task,
-                "start": name,
-                "time_limit": limit,
+                "start": start.name,
+                "changes": changes,
                 "steps": training["steps"],
                 "wall_s": training["wall_s"],
                 "evaluation": {
@@ -92,8 +138,8 @@ def measure(task: str, place: Path, seeds: int, episodes: int) -> list[dict[str,
 
 def main() -> None:
     """Run the command."""
-    options = words(tasks=",".join(TASKS), seeds="10", episodes="200", out="")
-    tasks = several("tasks", options["tasks"], TASKS)
+    options = words(tasks=",".join(STUDIES), seeds="10", episodes="200", out="")
+    tasks = several("tasks", options["tasks"], STUDIES)
     counts = {name: int(options[name]) for name in ("seeds", "episodes")}
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(options["out"] or temporary).resolve()

@@ -307,10 +307,11 @@ def constraints(results: Results) -> str:
 
 
 def far_starts(results: Results) -> str:
-    """Return the table of policies that learn to dock from far away."""
+    """Return the table of policies that dock or rejoin from far away."""
     rows = []
     for row in results["rows"]:
         drawn, mode = (row["evaluation"][kind] for kind in EVALUATION_KINDS)
+        used = mode["control_usage_l1"]["mean"]
         successes = drawn["success_rate"]["per_seed"] + mode["success_rate"]["per_seed"]
         rows.append(
             (
@@ -321,7 +322,7 @@ def far_starts(results: Results) -> str:
                 f"{100.0 * min(successes):.1f}",
                 f"{100.0 * mode['episode_safety_violation_rate']['mean']:.2g}",
                 _interval(mode["average_return"], 1.0, 2),
-                f"{mode['control_usage_l1']['mean']:.1f}",
+                "–" if used is None else f"{used:.1f}",
                 f"{mode['episode_length']['mean']:,.0f}",
             )
         )
