@@ -3,7 +3,7 @@
 Each docking task is trained by its recipe `wide`, and each rejoin task by its usual one, with ten
 seeds. Then the policies of all seeds fly the task from several distances, with sampled actions and
 with the most probable ones. They are scored by the reward of the task, and not by that of the
-recipe.
+recipe. A classical controller flies the same starts.
 
 Results are written to `benchmarks/results/far_starts.json`, and the table of docs/far_starts.md is
 printed:
@@ -45,17 +45,20 @@ class Study(NamedTuple):
 
     Attributes:
         recipe: the recipe that trains the policies.
+        controller: the classical controller that flies the same starts.
         body: the body that starts at the distance.
         starts: the starts of the tests.
     """
 
     recipe: str
+    controller: str
     body: str
     starts: tuple[Start, ...]
 
 
 DOCKING = Study(
     "wide",
+    "pd",
     "deputy",
     (
         Start("100 to 150 m", (100.0, 150.0)),
@@ -67,6 +70,7 @@ DOCKING = Study(
 FAR_WINGMAN = ("env.terminal.timeout.limit=4000", "env.terminal.distance.limit=200000")
 REJOIN = Study(
     "engineered_features",
+    "pursuit",
     "wingman",
     (
         Start("5,000 to 10,000 ft", (5000.0, 10000.0)),
@@ -77,7 +81,7 @@ REJOIN = Study(
 STUDIES = {
     "docking2d": DOCKING,
     "docking3d": DOCKING,
-    "docking2d_oriented": DOCKING,
+    "docking2d_oriented": DOCKING._replace(controller="align"),
     "rejoin2d": REJOIN,
     "rejoin3d": REJOIN,
 }
@@ -94,7 +98,7 @@ KEPT = (
 
 
 def measure(task: str, place: Path, seeds: int, episodes: int) -> list[dict[str, Any]]:
-    """Train a task by its recipe, test the policies, and return a row for each start.
+    """Train a task by its recipe, and return a row for each start and policy.
 
     Args:
         task: the task.
@@ -111,28 +115,32 @@ def measure(task: str, place: Path, seeds: int, episodes: int) -> list[dict[str,
     rows = []
     for start in study.starts:
         low, high = start.interval
-        tested = place / f"{task}_from_{high:.0f}"
         changes = (
             f"env={task}",
             f"env.{study.body}.start.position.distance=[{low},{high}]",
             *start.changes,
         )
-        if not (tested / "results.json").exists():
-            command("evaluate", f"run={run}", *changes, f"episodes={episodes}", f"out={tested}")
-        evaluation = read_json(tested / "results.json")["evaluation"]
-        rows.append(
-            {
-                "task": task,
-                "start": start.name,
-                "changes": changes,
-                "steps": training["steps"],
-                "wall_s": training["wall_s"],
-                "evaluation": {
-                    kind: {name: metrics[name] for name in KEPT}
-                    for kind, metrics in evaluation.items()
-                },
-            }
-        )
+        for policy, flown in (("ppo", run), (study.controller, f"controller/{study.controller}")):
+            tested = place / f"{task}_{policy}_from_{high:.0f}"
+            if not (tested / "results.json").exists():
+                given = (f"run={flown}", *changes, f"episodes={episodes}", f"out={tested}")
+                command("evaluate", *given)
+            learnt = {name: training[name] for name in ("steps", "wall_s")}
+            rows.append(
+                {
+                    "task": task,
+                    "policy": policy,
+                    "start": start.name,
+                    "changes": changes,
+                    **(learnt if policy == "ppo" else {}),
+                    "evaluation": {
+                        kind: {name: metrics[name] for name in KEPT}
+                        for kind, metrics in read_json(tested / "results.json")[
+                            "evaluation"
+                        ].items()
+                    },
+                }
+            )
     return rows
 
 

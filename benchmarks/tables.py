@@ -307,19 +307,23 @@ def constraints(results: Results) -> str:
 
 
 def far_starts(results: Results) -> str:
-    """Return the table of policies that dock or rejoin from far away."""
+    """Return the table of policies and controllers that dock or rejoin from far away."""
     rows = []
     for row in results["rows"]:
-        drawn, mode = (row["evaluation"][kind] for kind in EVALUATION_KINDS)
+        mode = row["evaluation"]["deterministic"]
+        drawn = row["evaluation"].get("stochastic")  # a controller has none
         used = mode["control_usage_l1"]["mean"]
-        successes = drawn["success_rate"]["per_seed"] + mode["success_rate"]["per_seed"]
+        successes = [
+            rate for kind in (mode, drawn) if kind for rate in kind["success_rate"]["per_seed"]
+        ]
         rows.append(
             (
                 row["task"],
                 row["start"],
-                _interval(drawn["success_rate"], 100.0, 2),
+                row["policy"],
+                _interval(drawn["success_rate"], 100.0, 2) if drawn else "–",
                 _interval(mode["success_rate"], 100.0, 2),
-                f"{100.0 * min(successes):.1f}",
+                f"{100.0 * min(successes):.1f}" if drawn else "–",
                 f"{100.0 * mode['episode_safety_violation_rate']['mean']:.2g}",
                 _interval(mode["average_return"], 1.0, 2),
                 "–" if used is None else f"{used:.1f}",
@@ -327,8 +331,8 @@ def far_starts(results: Results) -> str:
             )
         )
     heads = (
-        "task | from | success, stochastic [%] | deterministic | worst seed | violating steps [%]"
-        " | return | Δv, L1 [m/s] | length [s]"
+        "task | from | policy | success, stochastic [%] | deterministic | worst seed"
+        " | violating steps [%] | return | Δv, L1 [m/s] | length [s]"
     )
     return markdown(heads.split(" | "), rows)
 

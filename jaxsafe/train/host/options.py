@@ -88,8 +88,8 @@ class TrainConfig(Component):
     preset: str = "engineered_features"
     """The recipe of the task: engineered_features, observation_only, many_envs or shortest_time.
 
-    docking3d also has wide, for starts from 100 m to 10 km. The values of a recipe take the place
-    of the defaults of other options.
+    The docking tasks also have wide, for starts from 100 m to 10 km. The values of a recipe take
+    the place of the defaults of other options.
     """
     recipe: str | None = None
     """The task or the file whose recipe is taken, or none for the options' own defaults.
