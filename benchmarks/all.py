@@ -33,6 +33,7 @@ RESULTS = Path(__file__).parent / "results"
 SCRIPTS: dict[str, tuple[str, ...]] = {
     "environments": ("repeats=3",),
     "dynamics": (),
+    "hot_spots": (),
     "rta": (),
     "ppo": ("repeats=2",),
     "startup": ("rta=none", "repeats=2"),

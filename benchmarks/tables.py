@@ -431,6 +431,19 @@ def ppo(results: Results) -> str:
     )
 
 
+def hot_spots(results: Results) -> str:
+    """Return the table of the functions that the time of a step goes into."""
+    rows = []
+    for row in results["rows"]:
+        spent = row["spent_us"].items()
+        shown = {name: value for name, value in spent if value >= 0.02 * row["step_us"]}
+        shown["the rest"] = row["step_us"] - sum(shown.values())
+        for name, value in shown.items():
+            share = f"{100.0 * value / row['step_us']:.0f}"
+            rows.append((row["task"], name.replace("_", "\\_"), f"{value:.0f}", share))
+    return markdown(["task", "function", "µs per step", "share [%]"], rows)
+
+
 def startup_parts(results: Results) -> str:
     """Return the table of the seconds of each part, without a cache."""
     rows = []
@@ -1297,6 +1310,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("startup", startup_parts, "docs/performance.md"),
     ("startup", startup_first, "docs/performance.md"),
     ("startup", startup_profile, "docs/performance_limits.md"),
+    ("hot_spots", hot_spots, "docs/performance_limits.md"),
     ("five_tasks", five_tasks, "docs/performance.md"),
     ("learning", learning, "docs/performance.md"),
     ("", goals, "docs/performance_limits.md"),
