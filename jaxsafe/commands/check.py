@@ -1,4 +1,4 @@
-"""Check whether the results of a run have all that the protocol of the benchmark asks for.
+"""Check whether results have all that the protocol of the benchmark asks for.
 
 The protocol is docs/protocol.md. The exit code is 1 if something is missing.
 """
@@ -23,7 +23,7 @@ class Options(CommandOptions):
             first=True, examples=("run=runs/docking3d",), takes="a directory, or a results.json"
         ),
     ]
-    """A run directory, whose evaluations count too, or a single results.json."""
+    """A run, an evaluation or a submission: a directory of results.json files, or one of them."""
     hidden_seed: File | None = None
     """The file of a hidden seed, to check that the results were measured with it."""
 
@@ -31,20 +31,20 @@ class Options(CommandOptions):
 def main(argv: Sequence[str]) -> int:
     """Run the command and return its exit code."""
     from jaxsafe.evaluate.hidden_seed import read_hidden_seed
-    from jaxsafe.runs.protocol import committed, findings, read_all
+    from jaxsafe.runs.protocol import committed, findings, read_submission
     from jaxsafe.train.host.log import headline
 
     options = Options.parse(argv)
     try:
-        results, *others = read_all(options.run)
+        submission = read_submission(options.run)
+        found = findings(submission)
     except ConfigError as error:
         raise ConfigError(f"run: {error}") from None
-    found = findings(results, others, options.run if Path(options.run).is_dir() else "RUN")
     if options.hidden_seed is not None:
         hidden = read_hidden_seed(Path(options.hidden_seed))
-        found.append(committed([results, *others], hidden))
+        found.append(committed([submission.results, *submission.others], hidden))
     width = max(len(finding.what) for finding in found)
-    print(f"{headline(results)}\n")
+    print(f"{headline(submission.results)}\n")
     for what, reported, detail in found:
         print(f"{'reported' if reported else 'MISSING':8}  {what:{width}}  {detail}")
     missing = sum(not finding.reported for finding in found)

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from jaxsafe.agents.agent import Agent
-from jaxsafe.agents.callables import is_callable
+from jaxsafe.agents.callables import CONTROLLER
 from jaxsafe.agents.imported_policy import ForeignAgent
 from jaxsafe.agents.networks import Params
 from jaxsafe.agents.policy_file import find_policy, is_single, read_policy
@@ -66,7 +66,8 @@ def load_foreign(options: PolicyOptions) -> Subject:
     own_facts = {
         "env": options.task,
         "preset": path.name,
-        "algorithm": "not trained" if is_callable(options.run) else "unknown",
+        # A function of a module may be a trained policy.
+        "algorithm": "not trained" if options.run.startswith(CONTROLLER) else "unknown",
         "seeds": 1,
         "seed": 0,
         "steps": 0,

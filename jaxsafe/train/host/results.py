@@ -78,6 +78,18 @@ _NEW = (
 )
 """Metrics that the results of earlier versions lack."""
 
+_OPTIONAL = {
+    "algorithm": TEXT,
+    "rta": TEXT,
+    "task": {"id": TEXT | NULL, "changes": [TEXT]},
+    "episodes": COUNT,
+    "cases": TEXT,
+    "seed_commitment": TEXT,
+    "diverged": [{"seed": COUNT, "step": COUNT | NULL}],
+    "versions": {OTHERS: TEXT | NULL},
+}
+"""The form of what some results have, and those of earlier versions lack."""
+
 
 def finish(training: Training) -> dict[str, Any]:
     """Evaluate a training, write its policies and results, and return the results."""
@@ -234,11 +246,16 @@ def check_results(results: Any, place: str, training: bool) -> None:
     Raises:
         ConfigError: they have another form.
     """
-    check(
-        results,
-        {"seeds": COUNT, "seed": COUNT, "steps": COUNT, "evaluation": {OTHERS: {OTHERS: {}}}},
-        place,
-    )
+    form = {
+        "env": TEXT,
+        "preset": TEXT,
+        "seeds": COUNT,
+        "seed": COUNT,
+        "steps": COUNT,
+        "evaluation": {OTHERS: {OTHERS: {}}},
+    }
+    check(results, form, place)
+    check(results, {name: form for name, form in _OPTIONAL.items() if name in results}, place)
     seeds = results["seeds"]
     for kind, metrics in results["evaluation"].items():
         for name, values in _METRICS.items():
@@ -257,10 +274,9 @@ def check_results(results: Any, place: str, training: bool) -> None:
             "training_cost": _metric(seeds, AMOUNT),
             "versions": {"device": TEXT, OTHERS: TEXT | NULL},
         }
-        check(results, form, place)
-    check(
-        results.get("diverged", []), [{"seed": COUNT, "step": COUNT | NULL}], f"{place}: diverged"
-    )
+    else:
+        form = {"run": TEXT, "checkpoint": TEXT, "evaluation_seed": COUNT | NULL, "changes": {}}
+    check(results, form, place)
 
 
 def _metric(seeds: int, kind: Kind) -> dict[str, Any]:
