@@ -20,6 +20,8 @@ from baselines.plan import WITHOUT_RTA
 
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
+from jaxsafe.runs.protocol import Submission, findings, read_submission
+from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import read_json, write_text
 from jaxsafe.storage.text_table import or_dash
 from jaxsafe.train.host.results import mean_text
@@ -882,17 +884,23 @@ def readme_tasks(_: Results) -> str:
 def reported(_: Results) -> str:
     """Return the table of published and submitted results: the paper's, ours, and those of others.
 
-    A submitted result is the `results.json` of a run, as `docs/submitted/NAME-TASK.json`.
+    Raises:
+        ConfigError: a submission cannot be read, lacks something, or has another name.
     """
+    submitted: dict[str, list[list[str]]] = {task: [] for task in TASKS}
+    for directory in sorted(path for path in SUBMITTED.glob("*") if path.is_dir()):
+        task, submission = _submitted(directory)
+        who = directory.name.removesuffix(f"-{task}")
+        file = submission.file.relative_to(SUBMITTED.parent)
+        submitted[task].append(_reported(who, submission, f"[{directory.name}]({file})"))
     rows = []
     for task in TASKS:
         rows.append([task, "the paper", "–", f"{TASKS[task].paper_steps:,}", "–", "–", "Table 2"])
         for kind, who in (("engineered_features", "jaxsafe, PPO"), ("rta", "jaxsafe, PPO, filter")):
             file = BASELINES / f"{task}-{kind}.json"
-            rows.append([task, *_reported(who, read_json(file)["results"], file)])
-        for file in sorted(SUBMITTED.glob(f"*-{task}.json")):
-            who = file.stem.removesuffix(f"-{task}")
-            rows.append([task, *_reported(who, read_json(file), file)])
+            link = f"[{file.stem}]({file.relative_to(BASELINES.parent)})"
+            rows.append([task, *_reported(who, read_submission(str(file)), link)])
+        rows += [[task, *cells] for cells in submitted[task]]
     heads = (
         "task | who | seeds | 80 % success after | success [%] | violating steps of the training"
         " | file"
@@ -900,16 +908,40 @@ def reported(_: Results) -> str:
     return markdown(heads.split(" | "), rows)
 
 
-def _reported(who: str, results: Results, file: Path) -> list[str]:
+def _submitted(directory: Path) -> tuple[str, Submission]:
+    """Return the task and the results of `docs/submitted/NAME-TASK`.
+
+    Raises:
+        ConfigError: they cannot be read, lack something, or the directory has another name.
+    """
+    submission = read_submission(str(directory))
+    task = submission.task
+    if task not in TASKS or not directory.name.endswith(f"-{task}"):
+        raise ConfigError(
+            f"{directory}: expected a directory NAME-TASK with results of one of "
+            f"{', '.join(TASKS)}, found those of {task}"
+        )
+    lacking = [finding.what for finding in findings(submission) if not finding.reported]
+    if lacking:
+        raise ConfigError(f"{directory}: lacks {', '.join(lacking)}; see jaxsafe check")
+    return task, submission
+
+
+def _reported(who: str, submission: Submission, link: str) -> list[str]:
     """Return the cells of a result after that of its task."""
-    success = [results["evaluation"][kind]["success_rate"] for kind in EVALUATION_KINDS]
+    results = submission.results
+    success = [
+        results["evaluation"].get(kind, {}).get("success_rate", {}).get("mean")
+        for kind in EVALUATION_KINDS
+    ]
+    efficiency = results.get("interaction_efficiency")
     return [
         who,
-        str(results["seeds"]),
-        _until(results["interaction_efficiency"]["timesteps"]),
-        " / ".join(f"{100 * rate['mean']:.2f}" for rate in success),
-        f"{results['training_cost']['mean']:,.0f}",
-        f"[{file.stem}]({file.relative_to(ROOT / 'docs')})",
+        "–" if submission.untrained else str(results["seeds"]),
+        "–" if efficiency is None else _until(efficiency["timesteps"]),
+        " / ".join(or_dash(rate and 100 * rate, ".2f") for rate in success),
+        or_dash(submission.training_cost, ",.0f"),
+        link,
     ]
 
 

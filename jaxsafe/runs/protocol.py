@@ -107,7 +107,7 @@ class Submission(NamedTuple):
     def task(self) -> str:
         """Name of the task, or of the environment if it is no task of jaxsafe."""
         names = {str(task.gymnasium_id): name for name, task in (TASKS | STARTERS).items()}
-        return names.get(str(self.results.get("task", {}).get("id")), self.results["env"])
+        return names.get(str(self.results.get("task", {}).get("id"))) or self.results["env"]
 
 
 def read_submission(place: str) -> Submission:

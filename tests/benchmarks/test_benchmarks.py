@@ -8,8 +8,11 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from submission_files import write_policies, write_run
 
 from jaxsafe.envs import TASKS, make
+from jaxsafe.runs.protocol import TRAINING, findings, read_submission
+from jaxsafe.schema.errors import ConfigError
 
 ROOT = Path(__file__).parents[2]
 
@@ -69,6 +72,67 @@ def test_a_page_without_the_table_is_named(
         match=r"docs/scaling.md: found 0 tables that begin with \| a \| b \|; expected one",
     ):
         tables.pages()
+
+
+def test_submissions_have_rows_after_our_own(
+    tables: ModuleType, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    submitted = tmp_path / "submitted"
+    monkeypatch.setattr(tables, "SUBMITTED", submitted)
+    before = tables.reported({}).splitlines()
+    write_run(whole, submitted / "me-docking2d")
+    write_policies(whole, submitted / "others-docking2d")
+    training = submitted / "others-docking2d" / TRAINING
+    violating = [2_000] * 10
+    content = {"algorithm": "SAC", "steps": 1_000_000, "violating_steps": violating}
+    training.write_text(json.dumps(content))
+    rows = tables.reported({}).splitlines()
+    new = [row for row in rows if row not in before]
+    results = json.loads((submitted / "me-docking2d" / "results.json").read_text())
+    success = [
+        f"{100 * results['evaluation'][kind]['success_rate']['mean']:.2f}"
+        for kind in ("stochastic", "deterministic")
+    ]
+    cost = results["training_cost"]["mean"]
+    assert new == [
+        f"| docking2d | me | 10 | never | {success[0]} / {success[1]} | {cost:,.0f} "
+        "| [me-docking2d](submitted/me-docking2d/results.json) |",
+        f"| docking2d | others | 10 | – | – / {success[1]} | 2,000 "
+        "| [others-docking2d](submitted/others-docking2d/0/results.json) |",
+    ]
+    own = next(index for index, row in enumerate(rows) if "docking2d-rta" in row)
+    assert rows[own + 1 : own + 3] == new
+    assert [row for row in rows if row not in new] == before
+
+
+def test_a_submission_that_lacks_something_is_refused(
+    tables: ModuleType, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, "SUBMITTED", tmp_path)
+    write_policies(whole, tmp_path / "me-docking2d")
+    with pytest.raises(ConfigError, match="me-docking2d: lacks steps and violating steps of the"):
+        tables.reported({})
+    (tmp_path / "me-docking2d").rename(tmp_path / "me-docking3d")
+    with pytest.raises(ConfigError, match=r"expected a directory NAME-TASK .* those of docking2d"):
+        tables.reported({})
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("kind", ["engineered_features", "rta"])
+def test_our_own_rows_lack_only_what_the_page_says(task: str, kind: str) -> None:
+    submission = read_submission(str(ROOT / "docs" / "baselines" / f"{task}-{kind}.json"))
+    assert submission.task == task
+    found = {finding.what: finding for finding in findings(submission)}
+    lacking = {what for what, finding in found.items() if not finding.reported}
+    expected = {"the fixed starts of the task"}
+    if not (task.startswith("rejoin") and kind == "rta"):
+        expected |= {"the tail of the severity of violations", "with and without a filter"}
+        filtered = found["with and without a filter"]
+        assert "lacks the tail of the severity of violations; " in filtered.detail
+    if (task, kind) == ("docking2d_oriented", "rta"):
+        expected.add("the task as it is")
+        assert "with other deputy.start.velocity.share" in found["the task as it is"].detail
+    assert lacking == expected
 
 
 @pytest.mark.parametrize(

@@ -322,7 +322,9 @@ def test_the_command_flies_and_films_a_controller(own: str) -> None:
     ):
         words = [f"run={own}:{run}", "env=docking2d", "episodes=3", f"out={run}"]
         assert main([*words, *["deterministic=false"] * (run == "drawn")]) == 0
-        found = read_json(Path(run) / "results.json")["evaluation"]
+        results = read_json(Path(run) / "results.json")
+        assert results["algorithm"] == "unknown"  # a function may be trained
+        found = results["evaluation"]
         assert [*found] == [kind]
         assert found[kind]["success_rate"]["mean"] == (run == "law")
 

@@ -3,11 +3,12 @@
 import copy
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
+from submission_files import as_evaluation, complete_results, write, write_policies
 
 from jaxsafe.commands.check import main
+from jaxsafe.commands.evaluate import main as evaluate
 from jaxsafe.evaluate.hidden_seed import read_hidden_seed, read_or_draw_hidden_seed
 from jaxsafe.runs.protocol import TRAINING, Submission, findings, read_submission
 from jaxsafe.schema.errors import ConfigError
@@ -18,53 +19,16 @@ COST = "steps and violating steps of the training"
 ENOUGH = "10 seeds or more, none diverged"
 
 
-def over(results: dict, seeds: int) -> dict:
-    """Return results whose numbers are repeated, so that they are those of so many seeds."""
-    results = copy.deepcopy(results)
-    metrics = [metric for of_kind in results["evaluation"].values() for metric in of_kind.values()]
-    for metric in [*metrics, results["training_cost"], results["interaction_efficiency"]]:
-        metric["per_seed"] = (seeds * metric["per_seed"])[:seeds]
-        if "ci95" in metric and seeds == 1:
-            metric["ci95"] = None
-    return results | {"seeds": seeds}
-
-
-def as_evaluation(results: dict, **changes: Any) -> dict:
-    """Return the results of an evaluation of the policies of a training."""
-    left_out = ("training_cost", "interaction_efficiency", "wall_s", "compile_s")
-    kept = {name: value for name, value in results.items() if name not in left_out}
-    about = {"run": "runs/x", "checkpoint": "last", "evaluation_seed": 0, "changes": {}}
-    return copy.deepcopy(kept | about | changes)
-
-
-def write(results: dict, *places: Any) -> Path:
-    """Write results, and return their directory."""
-    path = Path(*places)
-    path.mkdir(parents=True)
-    (path / "results.json").write_text(json.dumps(results))
-    return path
-
-
 @pytest.fixture(scope="module")
 def complete(whole: Path) -> tuple[dict, list[dict]]:
     """Return results that have everything, and those of two further evaluations."""
-    results = over(json.loads((whole / "results.json").read_text()), 10)
-    results |= {"episodes": 1000, "task": {"id": "jaxsafe/Docking2D-v0", "changes": []}}
-    filtered = as_evaluation(results, rta="discrete_asif")
-    return results, [filtered, as_evaluation(results, cases="docking2d")]
+    return complete_results(whole)
 
 
 @pytest.fixture
-def of_policies(complete: tuple[dict, list[dict]], tmp_path: Path) -> Path:
+def of_policies(whole: Path, tmp_path: Path) -> Path:
     """Return a directory with three evaluations of each of ten policies from elsewhere."""
-    single = over(complete[0], 1)
-    single["algorithm"] = "unknown"
-    del single["evaluation"]["stochastic"]
-    for number in range(10):
-        own = as_evaluation(single, run=f"policy_{number}.onnx")
-        write(own, tmp_path, "ten", str(number))
-        write(own | {"rta": "discrete_asif"}, tmp_path, "ten", f"{number}-filter")
-        write(own | {"cases": "docking2d"}, tmp_path, "ten", f"{number}-cases")
+    write_policies(whole, tmp_path / "ten")
     return tmp_path / "ten"
 
 
@@ -249,6 +213,19 @@ def test_ten_policies_from_elsewhere_are_a_submission(
     # The nine others cannot stand for the one that was not flown with a filter.
     (of_policies / "3-filter" / "results.json").unlink()
     assert lacking(read_submission(str(of_policies))) == [FILTER]
+
+
+@pytest.mark.thorough
+def test_the_directory_of_an_evaluation_is_read(
+    whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "evaluation"
+    assert evaluate([f"run={whole}", "episodes=2", "deterministic=true", f"out={out}"]) == 0
+    submission = read_submission(str(out))
+    assert submission.run == str(whole)
+    assert submission.results["episodes"] == 2
+    assert main([str(out)]) == 1
+    assert "MISSING   deterministic and sampled actions" in capsys.readouterr().out
 
 
 def test_a_policy_that_is_evaluated_twice_counts_once(of_policies: Path) -> None:
