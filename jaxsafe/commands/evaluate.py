@@ -52,7 +52,7 @@ class Options(PolicyOptions):
     cases: str | None = None
     """A CSV or YAML file of starts. There is one episode from each.
 
-    A task stands for the file that comes with it: 1,000 random starts, and a grid.
+    A task stands for the file that comes with it: 1,000 random starts, and then the corners.
     """
     seed: Seed = 0
     """Seed of the starts and of the noise. 0 gives those of the results of the run itself."""

@@ -1,7 +1,9 @@
 """Evaluations from chosen starts."""
 
 import csv
+import itertools
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +115,55 @@ def test_the_cases_of_a_task_are_its_own_starts_and_a_grid(task: str) -> None:
         assert np.min(extreme[name]) <= np.min(own[name]) + 0.05 * spread
         # The last quarter turn is three quarters of the way.
         assert np.max(extreme[name]) >= np.max(own[name]) - 0.26 * spread
+
+
+def grid_columns(task: str) -> dict[str, np.ndarray]:
+    """Return the starts of a file after the random ones, by column."""
+    with (CONFIGS / f"{task}.csv").open(newline="") as file:
+        names, *rows = csv.reader(file)
+    return dict(zip(names, np.array(rows[1000:], float).T, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("task", "corners"), [("docking2d", 40), ("docking3d", 12), ("docking2d_oriented", 160)]
+)
+def test_the_grid_of_docking_has_every_corner_and_then_the_middle(task: str, corners: int) -> None:
+    grid = np.stack([*grid_columns(task).values()], axis=-1)
+    space = task == "docking3d"
+    # In space the extremes of the polar angle are the poles.
+    directions = [(0, 0, 1), (0, 0, -1)] if space else [(1, 0), (0, 1), (-1, 0), (0, -1)]
+    attitudes = [(turn * np.pi,) for turn in (-1.0, -0.5, 0.0, 0.5)] if "oriented" in task else [()]
+    expected = []
+    for distance, towards, attitude in itertools.product((100.0, 150.0), directions, attitudes):
+        limit = 0.2 + 2 * 0.001027 * distance
+        velocities = [np.zeros(len(towards)), *(limit * np.array(directions))]
+        expected += [[*(distance * np.array(towards)), *v, *attitude] for v in velocities]
+    assert len(expected) == corners
+    tolerance = (
+        [0.5] * len(directions[0]) + [2e-3] * len(directions[0]) + [1e-3] * len(attitudes[0])
+    )
+    for row, corner in zip(grid[:corners], np.array(expected), strict=True):
+        assert np.any(np.all(np.abs(grid[:corners] - corner) < tolerance, axis=-1)), corner
+        assert np.any(np.all(np.abs(expected - row) < tolerance, axis=-1)), row
+    assert corners < len(grid) <= 256
+    middle = np.linalg.norm(grid[corners:, : len(directions[0])], axis=-1)
+    assert np.any(np.abs(middle - 125.0) < 0.5)
+
+
+@pytest.mark.parametrize("task", ["rejoin2d", "rejoin3d"])
+def test_the_grid_of_rejoin_has_all_pairs_of_extremes_equally_often(task: str) -> None:
+    grid = grid_columns(task)
+    apart = [grid.pop(f"wingman.position.{axis}") - grid[f"lead.position.{axis}"] for axis in "xy"]
+    drawn = {**grid, "distance": np.hypot(*apart), "azimuth": np.arctan2(*apart[::-1]) % 6.28}
+    # The values are those of two numbers, or of four quarter turns.
+    levels = {
+        name: np.round((values - values.min()) / np.ptp(values) * 3.0)
+        for name, values in drawn.items()
+    }
+    for one, other in itertools.combinations(levels, 2):
+        pairs = np.unique(np.stack([levels[one], levels[other]]), axis=1, return_counts=True)[1]
+        sizes = [4 if name.endswith(("heading", "azimuth")) else 2 for name in (one, other)]
+        assert pairs.tolist() == [256 // math.prod(sizes)] * math.prod(sizes), (one, other)
 
 
 def test_a_yaml_file_and_python_give_what_a_csv_file_gives(tmp_path: Path) -> None:
