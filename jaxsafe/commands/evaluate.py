@@ -84,7 +84,7 @@ class Options(PolicyOptions):
     If there is no such episode, the first is shown.
     """
     film_seed: Seed | None = None
-    """The training seed whose policy is shown. By default it is the first one."""
+    """The training seed whose policy is shown. By default it is the first with such an episode."""
     log: Annotated[tuple[str, ...], Option(names=LOGGED, kind="episode")] = ()
     """Log all steps of all episodes that fail or violate a constraint, or of all episodes.
 

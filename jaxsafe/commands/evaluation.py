@@ -45,7 +45,34 @@ class Film(NamedTuple):
     """The first episode, the first that is `failing` or `violating`, or the `worst` by return."""
 
     seed: int | None = None
-    """The training seed of the policy. None stands for the first one."""
+    """The training seed of the policy. None stands for the first one with such an episode."""
+
+    def find(
+        self, which: str, sums: Episode, env: Environment, first: int, left_out: Sequence[int] = ()
+    ) -> tuple[int, int, str]:
+        """Return the index of a policy, the number of its episode, and a line if there is none.
+
+        If no policy has such an episode, it is the first episode of the first policy.
+
+        Args:
+            which: the name of the episode.
+            sums: sums over the episodes, each field [seeds, episodes].
+            env: the environment, which says what counts as success.
+            first: the first training seed.
+            left_out: indices of policies that are passed over, unless the seed is given.
+        """
+        count = len(sums.outcome)
+        own = [jax.tree.map(lambda x, index=index: x[index], sums) for index in range(count)]
+        numbers = [self.choose(which, episodes, env) for episodes in own]
+        sound = [index for index in range(count) if index not in left_out] or [0]
+        having = [index for index in sound if numbers[index] is not None]
+        index = next(iter([*having, *sound])) if self.seed is None else self.seed - first
+        number = numbers[index]
+        if number is not None:
+            return index, number, ""
+        whose = "any seed" if self.seed is None and count > 1 else f"seed {first + index}"
+        other = f", but seed {first + having[0]} has one" if having else ""
+        return index, 0, f"no {which} episode of {whose}{other}; the first one is shown"
 
     @staticmethod
     def choose(which: str, sums: Episode, env: Environment) -> int | None:
@@ -182,7 +209,7 @@ def evaluate(
         lines.append(_map(subject, env, starts, of_kind, kind, panels, path))
     if film is not None:
         for kind, of_kind in sums.items():
-            lines += _render(subject, evaluator, of_kind, seed, kind, film, path)
+            lines += _render(subject, evaluator, of_kind, seed, kind, film, left_out, path)
     for kind, of_kind in sums.items() if logged else ():
         lines.append(_log(subject, evaluator, of_kind, seed, kind, logged, left_out, path))
     return path / "results.json", results, lines
@@ -208,9 +235,10 @@ def _render(
     seed: int,
     kind: str,
     film: Film,
+    left_out: Sequence[int],
     path: Path,
 ) -> list[str]:
-    """Show episodes of one policy, and return lines with the paths.
+    """Show some episodes, and return lines with the seeds and the paths.
 
     Args:
         subject: the policies.
@@ -219,19 +247,20 @@ def _render(
         seed: the seed of the evaluation.
         kind: the kind of evaluation.
         film: what to show.
+        left_out: indices of policies that are shown only if their seed is given.
         path: the directory of the evaluation.
     """
     env = evaluator.env
     first = subject.facts["seed"]
-    index = 0 if film.seed is None else film.seed - first
-    own, params = _of_seed(index, sums, subject.mapper.gather(subject.params))
-    whose = f"seed {first + index}, {kind}"
+    sums = jax.tree.map(np.asarray, sums)
+    all_params = subject.mapper.gather(subject.params)
     lines = []
     for which in film.which:
-        number = film.choose(which, own, env)
-        if number is None:
-            lines.append(f"film: no {which} episode of {whose}; the first one is shown")
-        number = number or 0
+        index, number, note = film.find(which, sums, env, first, left_out)
+        if note:
+            lines.append(f"film, {kind}: {note}")
+        whose = f"seed {first + index}, {kind}"
+        _, params = _of_seed(index, sums, all_params)
         episode = evaluator.episode(params, number, seed, kind == "deterministic")
         title = f"{subject.name}, {whose}, episode {number}"
         stem = f"episode_{kind}" + f"_{which}" * (len(film.which) > 1)

@@ -219,6 +219,24 @@ def test_a_film_of_what_did_not_happen_is_that_of_the_first_episode() -> None:
     assert Film.choose("first", sums, env) == 0
 
 
+def test_a_film_is_of_the_first_seed_that_has_such_an_episode() -> None:
+    env = jaxsafe.make("docking2d")
+    success, crash = (env.outcomes.index(name) for name in ("success", "crash"))
+    outcome = np.full((4, 3), success)
+    outcome[1, 1] = outcome[2, 2] = outcome[3, 0] = crash
+    sums: Any = run_episodes(env, zero, jax.random.key(0), 12)
+    sums = jax.tree.map(lambda x: np.asarray(x).reshape(4, 3), sums)
+    sums = sums.replace(outcome=outcome, violating_steps=np.zeros((4, 3)))
+    assert Film(["gif"]).find("failing", sums, env, first=5) == (1, 1, "")
+    # A policy that is not finite always fails.
+    assert Film(["gif"]).find("failing", sums, env, first=5, left_out=[1]) == (2, 2, "")
+    assert Film(["gif"], seed=8).find("failing", sums, env, first=5) == (3, 0, "")
+    nowhere = (0, 0, "no violating episode of any seed; the first one is shown")
+    assert Film(["gif"]).find("violating", sums, env, first=5) == nowhere
+    there = (0, 0, "no failing episode of seed 5, but seed 6 has one; the first one is shown")
+    assert Film(["gif"], seed=5).find("failing", sums, env, first=5) == there
+
+
 @pytest.mark.thorough
 def test_evaluations_get_directories_of_their_own(whole: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
