@@ -14,6 +14,7 @@ from jaxsafe.commands.options import Count, Directory, File, Option, Seed
 from jaxsafe.commands.policy_options import PolicyOptions, differences
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
 from jaxsafe.devices.seed_mapper import claim_cores
+from jaxsafe.schema.component import Range
 from jaxsafe.schema.errors import ConfigError
 
 FORMS = ("gif", "mp4", "png", "jsonl")
@@ -27,6 +28,8 @@ LOGGED = ("failing", "violating", "all")
 
 MAPS = ("success", "violations", "return", "length", "delta_v")
 """The panels of a map. `jaxsafe.plot.start_map` has their labels."""
+
+Radius = Annotated[float, Range(0.0, open_low=True, high=1e6), Option(takes="a radius > 0 in m")]
 
 
 class Options(PolicyOptions):
@@ -42,6 +45,7 @@ class Options(PolicyOptions):
             "hidden_seed",
             "map",
             "bounds",
+            "passive_safety",
             "out",
         ),
         "Films, figures and logs of single episodes.": ("render", "film", "film_seed", "log"),
@@ -71,6 +75,11 @@ class Options(PolicyOptions):
     """Whether the policies act by their most probable action. By default both are measured."""
     map: Annotated[tuple[str, ...], Option(names=MAPS, kind="panel")] = ()
     """Draw a map of the starts, with a panel for each of these quantities: means over the seeds."""
+    passive_safety: Radius | None = None
+    """Measure in how many steps the craft would stay outside of a radius without thrust.
+
+    The chief is the centre, and the drift lasts one orbit.
+    """
     bounds: bool = False
     """Compare with what is possible: the gap of each episode to the bounds of its start."""
     render: Annotated[tuple[str, ...], Option(names=FORMS, kind="format")] = ()
@@ -104,6 +113,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.evaluate.cases import load_cases
     from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
     from jaxsafe.evaluate.hidden_seed import read_or_draw_hidden_seed
+    from jaxsafe.evaluate.passive_safety import with_passive_safety
     from jaxsafe.train.host.options import cases_file
     from jaxsafe.train.host.results import table
 
@@ -141,6 +151,12 @@ def main(argv: Sequence[str]) -> int:
     env = subject.env if foreign else options.change(subject.env, subject.name)
     if difference := differences(subject.env, env):
         print(difference)
+    changes = {
+        name: value for name, value in options.changes.items() if not (foreign and name == "env")
+    }
+    if options.passive_safety is not None:
+        env = with_passive_safety(env, options.passive_safety)
+        changes["passive_safety"] = options.given["passive_safety"]
     cases = None
     if options.cases is not None:
         options.refuse_beside(["episodes"], "beside cases, which say how many there are")
@@ -155,11 +171,7 @@ def main(argv: Sequence[str]) -> int:
         **({} if hidden is None else {"seed_commitment": hidden.commitment}),
         "checkpoint": options.checkpoint or "last",
         **({} if options.cases is None else {"cases": options.cases}),
-        "changes": {
-            name: value
-            for name, value in options.changes.items()
-            if not (foreign and name == "env")
-        },
+        "changes": changes,
     }
     path, results, films = evaluate(
         subject,

@@ -247,6 +247,8 @@ def _convert(value: Any, field: Field, key: str) -> Any:
     if hint is int:
         limits = field.range or Range()
         return arguments.count(value, key, least=limits.low, most=limits.largest)
+    if hint is float:
+        return _number(value, field, key)
     if hint == tuple[float, float]:
         return _interval(value, field, key)
     if hint == tuple[float, ...]:
@@ -268,6 +270,13 @@ def _name(value: Any, field: Field, key: str) -> str:
         unknown = f"unknown {kind}" if kind else "found"
         raise ConfigError(f"{key}: {unknown} {show(name)}{choices_text(name, names)}")
     return name
+
+
+def _number(value: Any, field: Field, key: str) -> float:
+    number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not number or value not in (field.range or Range()):
+        raise ConfigError(f"{key}: expected {option(field).takes}, found {show(value)}")
+    return float(value)
 
 
 def _interval(value: Any, field: Field, key: str) -> tuple[float, float]:
