@@ -70,6 +70,7 @@ def load_cases(env: Environment, path: str) -> Cases:
     lengths = {len(values) for values in columns.values()}
     if len(lengths) != 1 or 0 in lengths:
         raise ConfigError(f"cases: {path}: expected columns of one length of at least 1")
+    _refuse_unknown(env, path, columns)
     for name, values in columns.items():
         wrong = np.flatnonzero(~np.isfinite(values))
         if wrong.size:
@@ -106,7 +107,6 @@ def _states(
 ) -> dict[str, dict[str, np.ndarray]]:
     """Return the fields of the platforms' states that the columns hold."""
     states: dict[str, dict[str, np.ndarray]] = {}
-    unknown = set(columns)
     for platform in env.platforms:
         for field, names in _columns_by_field(platform).items():
             given = [columns[name] for name in names if name in columns]
@@ -116,13 +116,18 @@ def _states(
                 raise ConfigError(f"cases: {path}: expected all of {', '.join(names)}, or none")
             whole = "." not in names[0].removeprefix(f"{platform.name}.")
             states.setdefault(platform.name, {})[field] = given[0] if whole else np.stack(given, -1)
-            unknown -= set(names)
-    if unknown:
-        name = min(unknown)
-        raise ConfigError(
-            f"cases: {path}: unknown column {show(name)}{choices_text(name, column_names(env))}"
-        )
     return states
+
+
+def _refuse_unknown(env: Environment, path: str, columns: Mapping[str, np.ndarray]) -> None:
+    """Refuse a column that is neither a field of a platform nor a number that is drawn."""
+    known = [*env.randomize]
+    for platform in env.platforms:
+        known += [name for names in _columns_by_field(platform).values() for name in names]
+    for name in columns:
+        if name not in known:
+            near = choices_text(name, column_names(env))
+            raise ConfigError(f"cases: {path}: unknown column {show(name)}{near}")
 
 
 def _columns_by_field(platform: Platform) -> dict[str, list[str]]:

@@ -187,6 +187,10 @@ def test_a_yaml_file_and_python_give_what_a_csv_file_gives(tmp_path: Path) -> No
         ("deputy.velocity.x\n1\n", "expected all of deputy.velocity.x, deputy.velocity.y, or none"),
         ("deputy.mass\n1\n", "unknown column 'deputy.mass'. Did you mean 'deputy.position.y'"),
         (
+            "deputy.positon.x,deputy.position.y\n1,2\n",
+            "unknown column 'deputy.positon.x'. Did you mean 'deputy.position.x'",
+        ),
+        (
             "deputy.position.x\nnan\n",
             "case 0: deputy.position.x: expected a finite number, found nan",
         ),
