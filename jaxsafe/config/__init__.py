@@ -64,6 +64,10 @@ def load(source: str | os.PathLike) -> Environment:
     directory = DIRECTORY.set(Path() if text else Path(source).parent)
     try:
         return from_data(_without_recipes(data), "")
+    except ConfigError as error:
+        if text:
+            raise
+        raise _in_file(source, error) from error
     finally:
         DIRECTORY.reset(directory)
 
@@ -83,11 +87,18 @@ def load_filter(path: str | os.PathLike) -> RTA:
     data = _imported(yaml12.read(path), f"{path}: rta")
     if not isinstance(data, dict) or "platforms" not in data:
         return to_component(data, RTA, f"{path}: rta")
-    data = _without_recipes(data)
-    rta = build(to_component(data, Environment, f"{path}: environment")).rta
+    try:
+        rta = build(to_component(_without_recipes(data), Environment, "")).rta
+    except ConfigError as error:
+        raise _in_file(path, error) from error
     if rta is None:
         raise ConfigError(f"rta: {path} is an environment without a filter; rta=none is for none")
     return rta
+
+
+def _in_file(path: str | os.PathLike, error: ConfigError) -> ConfigError:
+    """Return the error with the name of the file that it concerns before its message."""
+    return type(error)(f"{os.fspath(path)}: {error}")
 
 
 def load_recipes(path: str | os.PathLike) -> dict[str, dict[str, Any]]:

@@ -76,7 +76,18 @@ class _Loader(yaml.SafeLoader):
                 problem = f"key {show(key)} stands twice"
                 raise ConstructorError(problem=problem, problem_mark=node.start_mark)
             result[key] = self.construct_object(value_node, deep=deep)
+            if result[key] is None and _lacks_space(key_node, value_node):
+                name, _, value = key_node.value.partition(":")
+                problem = f"found {show(key_node.value)}; write a space after the colon: "
+                problem += f"{name}: {value}"
+                raise ConstructorError(problem=problem, problem_mark=key_node.start_mark)
         return result
+
+
+def _lacks_space(key: yaml.ScalarNode, value: yaml.Node) -> bool:
+    """Return whether a key without a value is `name:value`, written without the space."""
+    plain = key.style is None and value.start_mark.index == value.end_mark.index
+    return plain and re.fullmatch(r"[^:]+:[^:]+", key.value) is not None
 
 
 def _count_values(node: yaml.Node, counts: dict[int, int | None]) -> int:

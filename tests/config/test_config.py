@@ -1420,6 +1420,10 @@ def test_numbers_without_a_point_reach_the_environment(env: Environment) -> None
         ("agent: [1, 2\n", r"^environment, line \d: not valid YAML: expected"),
         ("agent: 'x\n", r"^environment, line \d: not valid YAML: "),
         ("a: b: c\n", r"^environment, line 1: not valid YAML: mapping values are not allowed"),
+        (
+            "x: {a: 1, agent:deputy}\n",
+            r"^environment, line 1: .*'agent:deputy'; write a space after the colon: agent: d",
+        ),
         ("agent: *x\n", r"^environment, line 1: not valid YAML: found undefined alias"),
         ("\tagent: x\n", r"^environment, line 1: not valid YAML: "),
         ("{[1, 2]: 3}\n", r"^environment.*: not valid YAML: "),
@@ -1448,6 +1452,12 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
     broken = tmp_path / "broken.yaml"
     broken.write_text("dt: [1\n")
     assert fault(lambda: load(broken)).startswith(f"{broken}, line 2: not valid YAML: ")
+    broken.write_text("platforms: 3\n")
+    missing_field = f"{broken}: environment: field 'agent' is missing; it takes a name"
+    assert fault(lambda: load(broken)) == missing_field
+    broken.write_text(dump(jaxsafe.make("docking2d")).replace("agent: deputy", "agent: deputi"))
+    unknown = f"{broken}: agent: nothing is called 'deputi'. Did you mean 'deputy'"
+    assert fault(lambda: load(broken)).startswith(unknown)
 
 
 @pytest.mark.parametrize(
@@ -1758,12 +1768,15 @@ def test_a_filter_comes_from_a_file(tmp_path: Path) -> None:
             "{type: simplex, constraints: [collision], backups: [{type: brake, name: b}]}",
             "collision",
         ),
+        ("BROKEN", r"rta\.yaml: agent: nothing is called 'deputi'"),
     ],
 )
 def test_a_file_without_a_filter_is_told(text: str | None, message: str, tmp_path: Path) -> None:
     path = tmp_path / "rta.yaml"
+    whole = dump(jaxsafe.make("docking2d"))
+    texts = {"ENV": whole, "BROKEN": whole.replace("agent: deputy", "agent: deputi")}
     if text is not None:
-        path.write_text(dump(jaxsafe.make("docking2d")) if text == "ENV" else text)
+        path.write_text(texts.get(text, text))
     with pytest.raises(ConfigError, match=message) as raised:
         jaxsafe.make("docking2d", rta=str(path))
     assert "\n" not in str(raised.value)

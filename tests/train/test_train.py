@@ -886,6 +886,10 @@ def test_ppo_lagrangian_runs_logs_its_multiplier_and_resumes(
             "cost_limit: unknown constraint 'velocity'. Did you mean 'velocity_limit'.",
         ),
         (
+            ["algorithm=ppo_lagrangian", "cost_limit={velocity_limit:1}"],
+            "cost_limit, line 1: .* write a space after the colon: velocity_limit: 1$",
+        ),
+        (
             ["algorithm=ppo_lagrangian", "cost_limit={}"],
             "cost_limit: expected a constraint; choose from velocity_limit",
         ),
