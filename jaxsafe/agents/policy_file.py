@@ -6,6 +6,7 @@ data. The policies in `jaxsafe/pretrained/` come with the package. They are name
 
 from __future__ import annotations
 
+import difflib
 import io
 import json
 import os
@@ -24,9 +25,9 @@ from jaxsafe.agents.trained_policy import (
     TrainedRecurrentPolicy,
     trained_policy,
 )
-from jaxsafe.control.law import LawPolicy
+from jaxsafe.control.law import ControlLaw, LawPolicy
 from jaxsafe.environment import Environment, require_environment
-from jaxsafe.schema.component import normalise
+from jaxsafe.schema.component import choices, normalise
 from jaxsafe.schema.convert import to_component, to_data
 from jaxsafe.schema.errors import ConfigError, choices_text
 from jaxsafe.schema.user_modules import imports_allowed
@@ -176,6 +177,20 @@ def is_single(run: str) -> bool:
     Otherwise it is a directory with the policies of all seeds.
     """
     return run.endswith(".npz") or (run.startswith(PRETRAINED) and not Path(run).exists())
+
+
+def meant_policy(run: str) -> str | None:
+    """Return what a `run` with a misspelt prefix probably means, or None.
+
+    So `controler/lqr` probably means `controller/lqr`.
+    """
+    head, slash, _ = run.partition("/")
+    prefixes = [CONTROLLER.rstrip("/"), PRETRAINED.rstrip("/")]
+    if not slash or not difflib.get_close_matches(head, prefixes, n=1, cutoff=0.75):
+        return None
+    names = [CONTROLLER + name for name in choices(ControlLaw)]
+    names += [PRETRAINED + file.stem for file in _PRETRAINED.glob("*.npz")]
+    return next(iter(difflib.get_close_matches(run, names, n=1)), None)
 
 
 def find_policy(policy: str | os.PathLike) -> Path:

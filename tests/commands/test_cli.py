@@ -288,6 +288,8 @@ def test_an_unwritable_output_is_told_in_one_line(
     [
         ([], "run: missing"),
         (["run=runs/x"], "run: no run in 'runs/x'"),
+        (["run=controler/lqr", "env=docking2d"], "config.yaml). Did you mean 'controller/lqr'?"),
+        (["run=pretraned/docking3d"], "config.yaml). Did you mean 'pretrained/docking3d'?"),
         (["run=runs/x", "episodes=0"], "episodes: expected a whole number ≥ 1, found 0"),
         (
             ["run=runs/x", "deterministic=maybe"],

@@ -78,6 +78,7 @@ def test_a_run_that_has_ended_goes_on(
     ("words", "message"),
     [
         (["from=nowhere"], "from: no run in 'nowhere'"),
+        (["from=pretraned/docking2d"], "no policy file. Did you mean 'pretrained/docking2d'"),
         (["from=pretrained/docking9d"], "is no .npz file and not pretrained. Did you mean"),
         (["from=pretrained/docking2d"], "agent.actor.hidden: the training starts from pretrained"),
     ],

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import jaxsafe.config
-from jaxsafe.agents.policy_file import with_networks
+from jaxsafe.agents.policy_file import meant_policy, with_networks
 from jaxsafe.environment import Environment
 from jaxsafe.envs import TASKS, user_module
 from jaxsafe.schema import yaml12
@@ -145,6 +145,8 @@ def read(path: Path, option: str) -> tuple[TrainConfig, Environment, str]:
             else []
         )
         hint = choices_text(str(path), sorted(beside)) if beside else ""
+        if option == "run" and (meant := meant_policy(str(path))):
+            hint = f". Did you mean {meant!r}?"
         raise ConfigError(f"{option}: no run in {str(path)!r} (a directory with config.yaml){hint}")
     content = read_content(path)
     config, env = from_described(content, f"{path / 'config.yaml'}: ")

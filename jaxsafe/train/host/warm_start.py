@@ -5,7 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from jaxsafe.agents.policy_file import find_policy, is_single, read_policy, with_networks
+from jaxsafe.agents.policy_file import (
+    PRETRAINED,
+    find_policy,
+    is_single,
+    meant_policy,
+    read_policy,
+    with_networks,
+)
 from jaxsafe.schema.convert import to_data
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.schema.user_modules import import_modules
@@ -40,8 +47,11 @@ def agent_options(source: str) -> dict[str, Any]:
     else:
         file = Path(source) / "config.yaml"
         if not file.is_file():
+            meant = meant_policy(source) or ""
+            hint = f". Did you mean {meant!r}?" if meant.startswith(PRETRAINED) else ""
             raise ConfigError(
-                f"from: no run in {source!r} (a directory with config.yaml) and no policy file"
+                f"from: no run in {source!r} (a directory with config.yaml) "
+                f"and no policy file{hint}"
             )
         content = read_content(Path(source))
         # The environment names the modules in which the agent's parts are too.
