@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import operator
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -63,7 +64,7 @@ def act(
     Raises:
         ConfigError: a `RecurrentPolicy` returns no pair, or a memory of another shape.
     """
-    with _policy_hints(observation):
+    with _policy_hints(policy, observation):
         if not isinstance(policy, RecurrentPolicy):
             return policy(key, observation), memory
         returned = policy.act(key, observation, memory)
@@ -81,8 +82,8 @@ def act(
 
 
 @contextmanager
-def _policy_hints(observation: Array) -> Iterator[None]:
-    """Add a note to every error inside that says what a policy must be like.
+def _policy_hints(policy: Policy | RecurrentPolicy, observation: Array) -> Iterator[None]:
+    """Add a note to every error inside that names the policy and says what it must be like.
 
     A compiled program does not contain it, because it runs only while the program is traced.
     """
@@ -100,7 +101,9 @@ def _policy_hints(observation: Array) -> Iterator[None]:
             )
         else:
             hint = f"it gets a key and an observation of shape {jnp.shape(observation)}"
-        error.add_note(f"in the policy: {hint}")
+        function = policy.act if isinstance(policy, RecurrentPolicy) else policy
+        name = getattr(function, "__qualname__", type(function).__name__)
+        error.add_note(f"in the policy {function.__module__}:{name}: {hint}")
         raise
 
 
@@ -302,13 +305,30 @@ def require_policy(policy: Policy | RecurrentPolicy) -> None:
     """Refuse what cannot be called, such as the name of a policy that is to be loaded first.
 
     Raises:
-        ConfigError: it is neither a function nor a `RecurrentPolicy`.
+        ConfigError: it is neither a function nor a `RecurrentPolicy`, or it takes another number of
+            arguments.
     """
     if not callable(policy) and not isinstance(policy, RecurrentPolicy):
         hint = f"; write jaxsafe.load_policy({show(policy)})" if isinstance(policy, str) else ""
         raise ConfigError(
             f"policy: expected a function of a key and an observation, found {show(policy)}{hint}"
         )
+    function, arguments = (
+        (policy.act, ("key", "observation", "memory"))
+        if isinstance(policy, RecurrentPolicy)
+        else (policy, ("key", "observation"))
+    )
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # some callables that are not written in Python have none
+        return
+    try:
+        signature.bind(*arguments)
+    except TypeError:
+        name = getattr(function, "__name__", type(function).__name__)
+        raise ConfigError(
+            f"policy: expected a function of ({', '.join(arguments)}), found {name}{signature}"
+        ) from None
 
 
 def require_hashable(policy: Policy | RecurrentPolicy) -> None:

@@ -196,6 +196,10 @@ def recurrent(act: Any) -> RecurrentPolicy:
             r"policy: expected a function of a key and an observation, found 'docking3d'; "
             r"write jaxsafe\.load_policy\('docking3d'\)$",
         ),
+        (
+            {"policy": lambda observation: jnp.zeros(2)},
+            r"policy: expected a function of \(key, observation\), found <lambda>\(observation\)$",
+        ),
         ({"start": "here"}, "fly: start: expected what reset or reset_to returns"),
         ({"start": {"chief": {}}}, "reset_to: "),
         ({"policy": lambda key, o: None}, r"action: expected shape \(2,\) .*, found None"),
@@ -221,7 +225,7 @@ def test_what_does_not_fit_is_refused_in_one_line(
     [
         (lambda key, o: np.clip(o[:2], -1, 1), "write jnp in place of np, and jnp.where in place"),
         (lambda key, o: jnp.ones(2) if o[0] > 0 else jnp.zeros(2), "jnp.where in place of if"),
-        (lambda observation: jnp.zeros(2), r"it gets a key and an observation of shape \(6,\)$"),
+        (lambda key, o: jnp.zeros(2) + o, r"it gets a key and an observation of shape \(6,\)$"),
     ],
 )
 def test_an_error_in_a_policy_says_what_a_policy_must_be_like(
@@ -229,4 +233,6 @@ def test_an_error_in_a_policy_says_what_a_policy_must_be_like(
 ) -> None:
     with pytest.raises(TypeError) as caught:
         jaxsafe.fly(env, policy)
-    assert re.search(f"^in the policy: .*{hint}", "\n".join(caught.value.__notes__), re.M)
+    assert re.search(
+        f"^in the policy test_fly:<lambda>: .*{hint}", "\n".join(caught.value.__notes__), re.M
+    )

@@ -386,8 +386,11 @@ def test_a_policy_that_forgets_the_batch_is_told_so(
 def test_an_error_on_a_batch_says_that_there_is_one(env: Environment) -> None:
     with pytest.raises(TypeError) as caught:
         jaxsafe.evaluate(env, lambda key, observation: jnp.ones((2, 6)) @ observation, episodes=4)
-    hint = "in the policy: it gets a batch, observations of shape (4, 6); for a policy of one obs"
-    assert any(note.startswith(hint) for note in caught.value.__notes__)
+    hint = "<lambda>: it gets a batch, observations of shape (4, 6); for a policy of one obs"
+    assert any(
+        note.startswith("in the policy test_rollout:") and hint in note
+        for note in caught.value.__notes__
+    )
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from jaxsafe.agents.imported_policy import ForeignAgent, ForeignPolicy
 from jaxsafe.control.law import ControlLaw
 from jaxsafe.environment import Environment
 from jaxsafe.envs.task import registered
-from jaxsafe.rollout import Policy, RecurrentPolicy
+from jaxsafe.rollout import Policy, RecurrentPolicy, require_policy
 from jaxsafe.schema.component import choices
 from jaxsafe.schema.errors import ConfigError, choices_text, show
 from jaxsafe.schema.user_modules import import_modules
@@ -118,10 +118,27 @@ def _from_module(run: str) -> Any:
     """Return the function, `RecurrentPolicy` or `ControlLaw` that `MODULE:NAME` names."""
     module, _, name = run.partition(":")
     import_modules([module], "run")
-    policy = getattr(importlib.import_module(module), name, None)
-    if not (callable(policy) or isinstance(policy, RecurrentPolicy | ControlLaw)):
-        found = "nothing" if policy is None else show(policy)
+    imported = importlib.import_module(module)
+    policy: Any = getattr(imported, name, None)
+    if policy is None:
+        names = [
+            known
+            for known, value in vars(imported).items()
+            if isinstance(value, RecurrentPolicy | ControlLaw)
+            or (callable(value) and getattr(value, "__module__", None) == module)
+        ]
         raise ConfigError(
-            f"run: {run}: expected a function policy(key, observation), found {found}"
+            f"run: {module} has no policy called {show(name)}{choices_text(name, names)}"
         )
+    if isinstance(policy, ControlLaw):
+        return policy
+    if not (callable(policy) or isinstance(policy, RecurrentPolicy)):
+        raise ConfigError(
+            f"run: {run}: expected a function policy(key, observation), found {show(policy)}"
+        )
+    function: Any = policy
+    try:
+        require_policy(function)
+    except ConfigError as error:
+        raise ConfigError(f"run: {run}: {error}") from None
     return policy

@@ -32,7 +32,11 @@ from jaxsafe.rollout import RecurrentPolicy
 def drawn(key, observation):
     return jax.random.uniform(key, (*observation.shape[:-1], 2))
 
+def alone(seen):
+    return seen[..., :2]
+
 law = PD(share=0.5)
+forgets = RecurrentPolicy(alone, 0.0)
 remembering = RecurrentPolicy(lambda key, seen, memory: (0.0 * seen[..., :2], memory), 0.0)
 number = 3
 """
@@ -337,7 +341,13 @@ def test_the_command_refuses_what_is_no_policy(own: str) -> None:
         "run=controller/pd env=docking2d deterministic=false": "deterministic: expected true",
         "run=controller/pd env=docking2d env.observation=[speed]": "needs the position of deputy",
         f"run={own}:number env=docking2d": "expected a function policy.key, observation., found 3",
-        f"run={own}:nothing env=docking2d": "found nothing",
+        f"run={own}:drwn env=docking2d": f"{own} has no policy called 'drwn'. Did you mean 'drawn'",
+        f"run={own}:alone env=docking2d": (
+            r"alone: policy: expected a function of \(key, observation\), found alone\(seen\)$"
+        ),
+        f"run={own}:forgets env=docking2d": (
+            r"policy: expected a function of \(key, observation, memory\), found alone\(seen\)$"
+        ),
         "run=no_such_module:x env=docking2d": "cannot import 'no_such_module'",
     }
     for words, message in cases.items():
