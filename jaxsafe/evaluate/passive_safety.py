@@ -37,8 +37,12 @@ def with_passive_safety(env: Environment, radius: float) -> Environment:
     """
     agent = env.platform(env.agent)
     anchors = [platform.name for platform in env.platforms if type(platform) is Anchor]
-    # Other dynamics, some of which are subclasses, do not drift as the closed form says.
-    if type(agent) not in (Spacecraft, OrientedSpacecraft) or len(anchors) != 1:
+    # Subclasses have other dynamics, which do not drift as the closed form says.
+    if (
+        not isinstance(agent, Spacecraft | OrientedSpacecraft)
+        or type(agent) not in (Spacecraft, OrientedSpacecraft)
+        or len(anchors) != 1
+    ):
         raise ConfigError(
             "passive_safety: expected an agent that is a spacecraft or an oriented_spacecraft, "
             f"and one anchor, found {agent.type_name} and {len(anchors)} anchors"

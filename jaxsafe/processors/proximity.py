@@ -59,13 +59,13 @@ class BrakingDistance(Constraint, type="braking_distance"):
 
 
 class DriftDistance(Status, type="drift_distance"):
-    """Smallest distance to an anchor in the next `duration` seconds if all thrust fails.
+    """Lower bound of the least distance to an anchor in the next `duration` seconds without thrust.
 
     Instead of an anchor it may be the centre of a region at rest. A separation of this status makes
     a spacecraft passively safe, as in Dunlap, van Wijk and Hobbs, arXiv:2302.02885. The drift is
-    the closed form of Clohessy-Wiltshire motion. The result is a lower bound: the smallest distance
-    on the straight lines between `samples` + 1 instants, less what the drift may bend between two
-    of them (Proposition 10 of docs/safety/proofs.md).
+    the closed form of Clohessy-Wiltshire motion. The result is the smallest distance on the
+    straight lines between `samples` + 1 instants, less what the drift may bend between two of them
+    (Proposition 10 of docs/safety/proofs.md).
     """
 
     of: PlatformName
