@@ -256,12 +256,12 @@ def uncertain_training(results: Results) -> str:
 
 def datasets(results: Results) -> str:
     """Return the scores of data for offline learning by where they come from."""
-    heads = ("task", "`kind`", "episodes", "return", "length", "success", "violating steps")
+    heads = ("task", "`kind`", "steps", "return", "length", "success", "violating steps")
     rows = [
         (
             row["task"],
             f"`{row['kind']}`",
-            f"{row['episodes']:,}",
+            f"{row['steps']:,}",
             f"{row['mean_return']:.3f}",
             f"{row['mean_length']:,.1f}",
             f"{100.0 * row['success_rate']:.1f} %",

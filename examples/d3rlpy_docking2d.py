@@ -1,7 +1,7 @@
 """d3rlpy learns docking2d from recorded steps alone, by behaviour cloning.
 
     pip install . d3rlpy
-    jaxsafe dataset pretrained/docking2d steps=50_000
+    jaxsafe dataset pretrained/docking2d episodes=120
     python examples/d3rlpy_docking2d.py docking2d_expert.npz [updates]
 
 The training takes some minutes on a core.

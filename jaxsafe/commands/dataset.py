@@ -1,4 +1,4 @@
-"""Write steps of policies as data for offline reinforcement learning.
+"""Write episodes of policies as data for offline reinforcement learning.
 
 The data are an .npz file, or a dataset of Minari. Every step has its cost by safety constraint.
 """
@@ -11,11 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
 from jaxsafe.commands import cli
-from jaxsafe.commands.options import Option, Seed
+from jaxsafe.commands.options import Count, Option, Seed
 from jaxsafe.commands.policy_options import PolicyOptions
-from jaxsafe.config.arguments import MAX_COUNT
 from jaxsafe.devices.compilation_cache import enable_compilation_cache
-from jaxsafe.schema.component import Range
 from jaxsafe.schema.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -25,10 +23,10 @@ KINDS = {
     "random": "actions drawn uniformly",
     "expert": "the policies after the training",
     "medium": "the policies of the checkpoint at which half of the success was reached",
-    "replay": "the policies of all checkpoints, as much of each",
+    "replay": "the policies of all checkpoints, as many of each",
     "filtered": "the policies after the training, under run time assurance",
 }
-"""Where the steps of each kind of data come from."""
+"""Where the episodes of each kind of data come from."""
 
 
 class Options(PolicyOptions):
@@ -37,7 +35,7 @@ class Options(PolicyOptions):
     groups: ClassVar = {
         "The policies.": ("run", "kind", "deterministic", "activation"),
         "The environment in which they act.": ("env", "env.PATH", "actions", "variant", "rta"),
-        "The data.": ("steps", "seed", "format", "out"),
+        "The data.": ("episodes", "seed", "format", "out"),
     }
 
     run: Annotated[  # pyright: ignore[reportIncompatibleVariableOverride] it may be left out here
@@ -45,7 +43,7 @@ class Options(PolicyOptions):
     ] = None
     """The policies, as for `jaxsafe evaluate`. With kind=random there are none."""
     kind: Literal["random", "expert", "medium", "replay", "filtered"] = "expert"
-    """Where the steps come from.
+    """Where the episodes come from.
 
     random draws actions. expert and filtered have the policies after the training, filtered under
     run time assurance. medium has those of the checkpoint at which half of the success was reached,
@@ -53,8 +51,11 @@ class Options(PolicyOptions):
     """
     deterministic: bool = False
     """Whether the policies act by their most probable action. By default actions are sampled."""
-    steps: Annotated[int, Range(1, largest=MAX_COUNT)] = 100_000
-    """Number of steps, of all seeds together."""
+    episodes: Count = 1000
+    """Number of whole episodes, of all policies together.
+
+    It is rounded up, because each policy flies as many.
+    """
     seed: Seed = 0
     """Seed of the starts and of the noise."""
     format: Literal["npz", "minari"] = "npz"
@@ -82,7 +83,8 @@ def main(argv: Sequence[str]) -> int:
     if options.format == "minari":
         require_minari(env)
     key = jax.random.key(options.seed)
-    data = collect_from_each(env, policy_of, parameters, key, options.steps)
+    each = -(-options.episodes // len(parameters))
+    data = collect_from_each(env, policy_of, parameters, key, each)
     found = facts(env, data)
     header = {
         "task": name,
@@ -124,7 +126,7 @@ class _Policies(NamedTuple):
 
 
 def _policies(options: Options) -> _Policies:
-    """Return the policies whose steps are asked for.
+    """Return the policies whose episodes are asked for.
 
     Raises:
         ConfigError: the options do not fit each other.

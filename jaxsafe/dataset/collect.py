@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -12,24 +12,22 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsafe.environment import Environment, action_bounds
-from jaxsafe.processors.terminal import time_limit
-from jaxsafe.rollout import Policy, RecurrentPolicy, rollout
+from jaxsafe.evaluate.episodes import max_steps
+from jaxsafe.rollout import Policy, RecurrentPolicy, require_count, rollout
 from jaxsafe.types import Key
 
-NUM_ENVS = 16
-"""Number of environments side by side. Each contributes episodes one after another."""
-
-EPISODES_PER_ENV = 4
-"""Number of the longest episodes for which each environment has time, if there is one."""
+EPISODES_PER_BATCH = 100
+"""Largest number of episodes that run side by side."""
 
 CHUNK = 512
-"""Number of steps of each environment between two copies from the device."""
+"""Number of steps of each episode between two copies from the device."""
 
 
 class Dataset(NamedTuple):
-    """Steps in order: those of an episode follow each other, and so do episodes.
+    """Whole episodes, one after another, as arrays of their n steps.
 
-    The last step of an episode that was cut because there were enough steps is truncated.
+    Where no timeout ends episodes, one that goes on for 10,000 steps is given up. Its last step is
+    truncated.
     """
 
     observation: Float[np.ndarray, "n o"]
@@ -58,23 +56,26 @@ class Dataset(NamedTuple):
 
     def episodes(self) -> list[slice]:
         """Return the steps of each episode."""
-        ends = np.flatnonzero(self.done) + 1
+        ends = (np.flatnonzero(self.done) + 1).tolist()
         return [slice(start, end) for start, end in zip([0, *ends[:-1]], ends, strict=True)]
 
 
 def collect(
-    env: Environment, policy: Policy | RecurrentPolicy, key: Key, num_steps: int
+    env: Environment, policy: Policy | RecurrentPolicy, key: Key, num_episodes: int
 ) -> Dataset:
-    """Return steps that a policy takes from random starts.
+    """Return whole episodes of a policy from random starts.
 
     Args:
         env: the environment.
         policy: `policy(key, observation)` returns an action for each of a batch of observations. It
             may be a `RecurrentPolicy`.
         key: a typed PRNG key.
-        num_steps: number of steps.
+        num_episodes: number of episodes.
+
+    Raises:
+        ConfigError: `num_episodes` is not a whole number, or is too small.
     """
-    return collect_from_each(env, lambda _: policy, [()], key, num_steps)
+    return collect_from_each(env, lambda _: policy, [()], key, num_episodes)
 
 
 def collect_from_each(
@@ -82,58 +83,64 @@ def collect_from_each(
     policy_of: Callable[[Any], Policy | RecurrentPolicy],
     parameters: Sequence[Any],
     key: Key,
-    num_steps: int,
+    num_episodes: int,
 ) -> Dataset:
-    """Return steps that several policies take, as many of each, one after another.
+    """Return whole episodes of several policies, as many of each, one policy after another.
+
+    The number of episodes is fixed before they run. Whatever keeps a number of steps instead has
+    short episodes more often than long ones.
 
     Args:
         env: the environment.
         policy_of: returns the policy that some parameters stand for. Its program is compiled once.
         parameters: the parameters of each policy, which are trees of arrays of the same shapes.
         key: a typed PRNG key.
-        num_steps: number of steps of all policies together.
+        num_episodes: number of episodes of each policy.
+
+    Raises:
+        ConfigError: `num_episodes` is not a whole number, or is too small.
     """
-    count = -(-num_steps // len(parameters))
-    num_envs = _num_envs(env, count)
+    require_count("num_episodes", num_episodes, least=1)
+    num_envs = min(num_episodes, EPISODES_PER_BATCH)
     run = jax.jit(functools.partial(_chunk, policy_of=policy_of, num_envs=num_envs))
-    parts = []
+    episodes = []
     for number, own in enumerate(parameters):
         advance = functools.partial(run, env, own)
-        parts.append(_steps(advance, jax.random.fold_in(key, number), count, num_envs))
-    whole = Dataset(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-    return _first(whole, num_steps)
+        key_policy = jax.random.fold_in(key, number)
+        for first in range(0, num_episodes, num_envs):
+            count = min(num_envs, num_episodes - first)
+            key_batch = jax.random.fold_in(key_policy, first)
+            episodes += _episodes(advance, key_batch, count, max_steps(env))
+    return Dataset(*(np.concatenate(arrays) for arrays in zip(*episodes, strict=True)))
 
 
-def _num_envs(env: Environment, num_steps: int) -> int:
-    """Return how many environments run side by side, so that each has time for some episodes."""
-    longest = time_limit(env)
-    episode = 1000.0 if longest is None else float(longest) / float(env.dt)
-    return int(np.clip(num_steps / (EPISODES_PER_ENV * episode), 1, NUM_ENVS))
+def _episodes(advance: Callable[..., Any], key: Key, count: int, limit: int) -> Iterator[Dataset]:
+    """Yield the first episode of each of the first `count` environments of a batch.
 
-
-def _steps(advance: Callable[..., Any], key: Key, num_steps: int, num_envs: int) -> Dataset:
-    """Return the steps of one policy, environment after environment."""
-    per_env = -(-num_steps // num_envs)
-    parts = []
+    Args:
+        advance: `_chunk` of a policy, as a function of the key and of where the batch has got to.
+        key: a typed PRNG key of the batch.
+        count: number of episodes.
+        limit: number of steps after which an episode is given up.
+    """
+    pieces: list[list[Dataset]] = [[] for _ in range(count)]
+    running = [*range(count)]
     start = None
-    for number in range(-(-per_env // CHUNK)):
-        start, part = advance(jax.random.fold_in(key, number), start)
-        parts.append(jax.device_get(part))
-    steps = _first(Dataset(**{name: _column(parts, name) for name in Dataset._fields}), per_env)
-    flat = Dataset(*(np.swapaxes(x, 0, 1).reshape(-1, *x.shape[2:]) for x in steps))
-    return _first(flat, num_steps)
-
-
-def _first(steps: Dataset, count: int) -> Dataset:
-    """Return the first steps. The last one is truncated if the episode does not end there."""
-    cut = Dataset(*(array[:count] for array in steps))
-    cut.truncated[-1] |= ~cut.terminated[-1]
-    return cut
-
-
-def _column(parts: Sequence[dict[str, np.ndarray]], name: str) -> np.ndarray:
-    """Return a field of all steps. The arrays are copies, which may be written to."""
-    return np.concatenate([part[name] for part in parts])
+    for before in range(0, limit, CHUNK):
+        start, steps = advance(jax.random.fold_in(key, before), start)
+        part = Dataset(**jax.device_get(steps))
+        ends = {env: np.flatnonzero(part.done[:, env]) for env in running}
+        for env in running:
+            length = ends[env][0] + 1 if ends[env].size else min(CHUNK, limit - before)
+            # Copies, or the steps after the end of the episode would stay in memory.
+            pieces[env].append(Dataset(*(array[:length, env].copy() for array in part)))
+        running = [env for env in running if not ends[env].size]
+        if not running:
+            break
+    for of_episode in pieces:
+        whole = Dataset(*(np.concatenate(arrays) for arrays in zip(*of_episode, strict=True)))
+        whole.truncated[-1] |= ~whole.terminated[-1]
+        yield whole
 
 
 def _chunk(

@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxsafe.dataset.collect import Dataset
 from jaxsafe.environment import Environment
+from jaxsafe.evaluate.episodes import max_steps
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.archive import open_archive
 from jaxsafe.storage.files import write_bytes
@@ -23,24 +24,26 @@ FORMAT = "jaxsafe dataset 1"
 
 
 def facts(env: Environment, data: Dataset) -> dict[str, Any]:
-    """Return what a header says of the data: names, and averages over whole episodes.
+    """Return what a header says of the data: names, counts, and averages over the episodes.
 
-    Episodes that were cut at the end of the data are left out of the averages, where others are
-    left.
+    Episodes that were given up are counted as `given_up`. They are part of the averages, as in an
+    evaluation.
     """
     episodes = data.episodes()
-    whole = [part for part in episodes if data.terminated[part].any()] or episodes
-    costs = [data.costs[part].sum(axis=0) for part in whole]
+    last = np.array([part.stop - 1 for part in episodes])
+    lengths = np.array([part.stop - part.start for part in episodes])
+    costs = [data.costs[part].sum(axis=0) for part in episodes]
     return {
         "observation_names": list(env.observation_names),
         "action_names": list(env.action_names),
         "constraints": [constraint.name for constraint in env.constraints],
         "steps": len(data.reward),
         "episodes": len(episodes),
-        "mean_return": float(np.mean([data.reward[part].sum() for part in whole])),
-        "mean_length": float(np.mean([part.stop - part.start for part in whole])),
+        "given_up": int(np.sum(data.truncated[last] & (lengths == max_steps(env)))),
+        "mean_return": float(np.mean([data.reward[part].sum() for part in episodes])),
+        "mean_length": float(lengths.mean()),
         "mean_costs": np.mean(costs, axis=0).tolist(),
-        "success_rate": float(np.mean([data.success[part].any() for part in whole])),
+        "success_rate": float(data.success[last].mean()),
     }
 
 

@@ -1,4 +1,4 @@
-"""Data for offline learning: every step is one that the environment took."""
+"""Data for offline learning: whole episodes, whose every step is one that the environment took."""
 
 import sys
 from pathlib import Path
@@ -15,6 +15,7 @@ from jaxsafe.commands.dataset import main
 from jaxsafe.dataset import collect, collect_from_each, load_dataset, random_policy, save_dataset
 from jaxsafe.dataset.files import facts
 from jaxsafe.schema.errors import ConfigError
+from jaxsafe.train.host.checkpoint import Checkpoints
 
 SHORT = {"terminal.timeout.limit": 30.0}
 
@@ -26,11 +27,10 @@ def env() -> Any:
 
 @pytest.fixture(scope="module")
 def data(env: Any) -> Any:
-    return collect(env, random_policy(env), jax.random.key(0), 700)
+    return collect(env, random_policy(env), jax.random.key(0), 23)
 
 
 def test_steps_of_an_episode_follow_each_other(data: Any) -> None:
-    assert len(data.reward) == 700
     assert np.all(np.abs(data.action) <= 1.0)
     assert data.done[-1]
     goes_on = ~data.done[:-1]
@@ -38,7 +38,8 @@ def test_steps_of_an_episode_follow_each_other(data: Any) -> None:
         data.observation[1:][goes_on], data.next_observation[:-1][goes_on]
     )
     lengths = [part.stop - part.start for part in data.episodes()]
-    assert sum(lengths) == 700
+    assert len(lengths) == 23
+    assert sum(lengths) == len(data.reward)
     assert max(lengths) == 31  # the first step with t > limit
     assert np.any(data.observation[1:][~goes_on] != data.next_observation[:-1][~goes_on])
 
@@ -56,17 +57,65 @@ def test_a_step_is_what_the_environment_does(env: Any, data: Any) -> None:
         np.testing.assert_allclose(timestep.info.control_actual, data.control[index], atol=1e-6)
 
 
-def test_each_of_several_policies_takes_as_many_steps(env: Any) -> None:
+@pytest.fixture(scope="module")
+def leaving() -> Any:
+    """Return a task from which drift leads out early or late, or not before the timeout."""
+    return jaxsafe.make(
+        "docking2d", {"terminal.distance.limit": 155.0, "terminal.timeout.limit": 300.0}
+    )
+
+
+def test_each_of_several_policies_flies_as_many_whole_episodes(leaving: Any) -> None:
     def pushing(parameters: Any) -> Any:
         return lambda key, observation: jnp.full((len(observation), 2), parameters)
 
     thrusts = [jnp.float32(x) for x in (-0.5, 0.0, 0.25)]
-    data = collect_from_each(env, pushing, thrusts, jax.random.key(1), 500)
-    values, counts = np.unique(data.action[:, 0], return_counts=True)
-    assert values.tolist() == [-0.5, 0.0, 0.25]
-    assert counts.tolist() == [167, 167, 166]
-    changes = np.flatnonzero(np.diff(data.action[:, 0]))
-    assert data.done[changes].all()  # no episode is of two policies
+    data = collect_from_each(leaving, pushing, thrusts, jax.random.key(1), 7)
+    episodes = data.episodes()
+    of_episode = [set(data.action[part, 0].tolist()) for part in episodes]
+    assert of_episode == 7 * [{-0.5}] + 7 * [{0.0}] + 7 * [{0.25}]
+    assert all(data.terminated[part.stop - 1] for part in episodes)
+    means = [
+        np.mean([part.stop - part.start for part in episodes[first : first + 7]])
+        for first in (0, 7, 14)
+    ]
+    assert max(means) > 1.5 * min(means)  # as many of each, although they differ in length
+
+
+def test_long_episodes_are_as_frequent_as_in_an_evaluation(leaving: Any) -> None:
+    policy = random_policy(leaving)
+    data = collect(leaving, policy, jax.random.key(2), 150)  # more than run side by side
+    lengths = np.array([part.stop - part.start for part in data.episodes()])
+    assert len(lengths) == 150
+    assert np.mean(lengths == 301) > 0.15
+    measured = jaxsafe.evaluate(leaving, policy, episodes=1000)["episode_length"]
+    error = lengths.std() / np.sqrt(len(lengths))
+    assert facts(leaving, data)["mean_length"] == pytest.approx(measured, abs=3.0 * error)
+
+
+def test_episodes_that_a_timeout_truncates_are_part_of_the_averages() -> None:
+    env = jaxsafe.make("docking2d", {**SHORT, "terminal.timeout.ends": "truncated"})
+    data = collect(env, random_policy(env), jax.random.key(0), 3)
+    header = facts(env, data)
+    assert data.truncated.sum() == header["episodes"] == 3
+    assert header["mean_length"] == 31
+    assert header["given_up"] == 0
+
+
+def test_an_episode_that_never_ends_is_given_up_and_counted() -> None:
+    endless = {"terminal": ["success", "crash", "distance"], "reward": ["distance_change"]}
+    env = jaxsafe.make("docking2d", endless)
+    data = collect(env, lambda key, x: jnp.zeros((len(x), 2)), jax.random.key(0), 2)
+    header = facts(env, data)
+    assert header["given_up"] == header["episodes"] == data.truncated.sum() == 2
+    assert header["mean_length"] == 10_000
+    assert header["success_rate"] == 0.0
+
+
+@pytest.mark.parametrize("number", [0, -1, 2.5])
+def test_a_number_of_episodes_is_whole_and_positive(env: Any, number: Any) -> None:
+    with pytest.raises(ConfigError, match="num_episodes: expected a whole number ≥ 1, found"):
+        collect(env, random_policy(env), jax.random.key(0), number)
 
 
 @pytest.mark.parametrize("actions", ["discrete", "continuous"])
@@ -90,10 +139,9 @@ def test_a_file_has_all_that_was_collected(env: Any, data: Any, tmp_path: Path) 
     for name, array in data._asdict().items():
         np.testing.assert_array_equal(getattr(again, name), array)
     assert header["constraints"] == ["velocity_limit"]
-    assert header["steps"] == 700
-    assert header["episodes"] == len(data.episodes())
-    whole = [part for part in data.episodes() if data.terminated[part].any()]
-    returns = [data.reward[part].sum() for part in whole]
+    assert header["steps"] == len(data.reward)
+    assert header["episodes"] == 23
+    returns = [data.reward[part].sum() for part in data.episodes()]
     assert header["mean_return"] == pytest.approx(np.mean(returns), rel=1e-5)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ConfigError, match=r"data\.npz: not a dataset, or a damaged one"):
@@ -104,33 +152,36 @@ def test_the_command_writes_data_of_random_actions(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     out = tmp_path / "random.npz"
-    words = ["env=docking2d", "kind=random", "steps=300", "env.terminal.timeout.limit=20"]
+    words = ["env=docking2d", "kind=random", "episodes=3", "env.terminal.timeout.limit=20"]
     assert main([*words, f"out={out}"]) == 0
-    assert "300 steps in " in capsys.readouterr().out
+    assert "63 steps in 3 episodes of actions" in capsys.readouterr().out
     data, header = load_dataset(out)
     assert header["kind"] == "random"
-    assert len(data.reward) == 300
+    assert len(data.reward) == 63
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["medium", "replay"])
 def test_data_of_checkpoints_are_of_all_seeds(kind: str, whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "data.npz"
-    assert main([f"run={whole}", f"kind={kind}", "steps=400", f"out={out}"]) == 0
-    data, header = load_dataset(out)
-    assert header["steps"] == len(data.reward) == 400
+    assert main([f"run={whole}", f"kind={kind}", "episodes=13", f"out={out}"]) == 0
+    policies = 3 * (1 if kind == "medium" else len(Checkpoints(whole).steps))
+    header = load_dataset(out)[1]
+    assert header["episodes"] % policies == 0
+    assert 13 <= header["episodes"] < 13 + policies
 
 
 def test_minari_reads_every_episode(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    words = ["run=pretrained/docking2d", "steps=300", "env.terminal.timeout.limit=40"]
+    words = ["run=pretrained/docking2d", "episodes=8", "env.terminal.timeout.limit=40"]
     words += ["format=minari", "out=jaxsafe/docking2d/test-v0", "kind=filtered"]
     assert main(words) == 0
     assert "written to jaxsafe/docking2d/test-v0" in capsys.readouterr().out
     dataset = minari.load_dataset("jaxsafe/docking2d/test-v0")
-    assert dataset.total_steps == 300
+    assert dataset.total_episodes == 8
+    assert dataset.total_steps == 8 * 41
     for episode in dataset.iterate_episodes():
         assert len(episode.observations) == len(episode.actions) + 1
         assert len(episode.infos["costs"]["velocity_limit"]) == len(episode.observations)
@@ -152,7 +203,7 @@ def test_a_learner_of_another_library_docks(
     import d3rlpy_docking2d as example  # pyright: ignore[reportMissingImports]
 
     path = tmp_path / "expert.npz"
-    assert main(["run=pretrained/docking2d", "steps=50_000", f"out={path}"]) == 0
+    assert main(["run=pretrained/docking2d", "episodes=120", f"out={path}"]) == 0
     policy = example.as_policy(example.learn(load_dataset(path)[0]))
     results = jaxsafe.evaluate(jaxsafe.make("docking2d"), policy, episodes=100)
     assert results["success_rate"] >= 0.9
@@ -162,7 +213,7 @@ def test_a_learner_of_another_library_docks(
 def test_without_minari_nothing_is_collected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "minari", None)
     with pytest.raises(ConfigError, match="format: minari is not installed; pip install"):
-        main(["env=docking2d", "kind=random", "format=minari", "steps=1_000_000"])
+        main(["env=docking2d", "kind=random", "format=minari", "episodes=1_000_000"])
 
 
 @pytest.mark.parametrize(
@@ -174,6 +225,7 @@ def test_without_minari_nothing_is_collected(monkeypatch: pytest.MonkeyPatch) ->
         ([], "run: missing; the policies"),
         (["run=docking2d"], "run: docking2d is a task"),
         (["run=pretrained/docking2d", "kind=replay"], "run: kind=replay needs the directory of a"),
+        (["pretrained/docking2d", "episodes=0"], "episodes: expected a whole number ≥ 1"),
         (
             ["run=pretrained/docking2d", "out=data.csv"],
             r"out: expected NAME\.npz, found data\.csv",
