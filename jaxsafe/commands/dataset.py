@@ -6,7 +6,7 @@ The data are an .npz file, or a dataset of Minari. Every step has its cost by sa
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 KINDS = {
     "random": "actions drawn uniformly",
     "expert": "the policies after the training",
-    "medium": "the policies of the checkpoint at which half of the success was reached",
+    "medium": "the policies of the checkpoint with about half of the success",
     "replay": "the policies of all checkpoints, as many of each",
-    "filtered": "the policies after the training, under run time assurance",
+    "filtered": "the policies after the training",
 }
-"""Where the episodes of each kind of data come from."""
+"""Where the episodes of each kind of data come from, but for the filter."""
 
 
 class Options(PolicyOptions):
@@ -46,8 +46,9 @@ class Options(PolicyOptions):
     """Where the episodes come from.
 
     random draws actions. expert and filtered have the policies after the training, filtered under
-    run time assurance. medium has those of the checkpoint at which half of the success was reached,
-    and replay those of all checkpoints. These two need the directory of a run.
+    run time assurance: the filter of the environment, or rta=default. medium has those of the
+    checkpoint with about half of the success, and replay those of all checkpoints. These two need
+    the directory of a run.
     """
     deterministic: bool = False
     """Whether the policies act by their most probable action. By default actions are sampled."""
@@ -72,23 +73,32 @@ def main(argv: Sequence[str]) -> int:
 
     from jaxsafe.dataset.collect import collect_from_each
     from jaxsafe.dataset.files import facts, require_minari, save_dataset, save_minari
-    from jaxsafe.envs import find_task
+    from jaxsafe.environment import filter_name
+    from jaxsafe.envs.identity import identity
     from jaxsafe.storage.provenance import versions
 
     options = Options.parse(argv)
-    name, env, policy_of, parameters = _policies(options)
-    place = Path(options.out or f"{name}_{options.kind}.npz")
+    policies = _policies(options)
+    env = policies.env
+    place = Path(options.out or f"{policies.name}_{options.kind}.npz")
     if options.format == "npz" and place.suffix != ".npz":
         raise ConfigError(f"out: expected NAME.npz, found {place}")
     if options.format == "minari":
         require_minari(env)
     key = jax.random.key(options.seed)
-    each = -(-options.episodes // len(parameters))
-    data = collect_from_each(env, policy_of, parameters, key, each)
+    each = -(-options.episodes // len(policies.parameters))
+    data = collect_from_each(env, policies.policy_of, policies.parameters, key, each)
     found = facts(env, data)
+    task = identity(env)
+    same = task["id"] is not None and not task["changes"]
     header = {
-        "task": name,
+        "task": policies.name,
+        "changes": task["changes"],
+        "rta": filter_name(env),
         "kind": options.kind,
+        "policies": len(policies.parameters),
+        "diverged": policies.diverged,
+        "training_steps": policies.training_steps,
         "command": f"jaxsafe dataset {shlex.join(argv)}",
         "versions": versions(),
         **found,
@@ -97,21 +107,31 @@ def main(argv: Sequence[str]) -> int:
         save_dataset(place, data, header)
         where = str(place)
     else:
-        where = options.out or f"jaxsafe/{name}/{options.kind}-v0"
-        task = find_task(options.env or name)
-        plain = options.changes.keys() <= {"env"} and options.kind != "filtered"
-        save_minari(where, env, data, header, task.gymnasium_id if task and plain else None)
+        where = options.out or f"jaxsafe/{policies.name}/{options.kind}-v0"
+        gymnasium_id = task["id"] if same and env.rta is None else None
+        save_minari(where, env, data, header, gymnasium_id)
+    print("\n".join([*_told(policies, header), f"written to {where}"]))
+    return 0
+
+
+def _told(policies: _Policies, header: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what the terminal says of the data, line by line."""
+    count = f"{header['steps']:,} steps in {header['episodes']:,} episodes of "
+    rta = "" if header["rta"] == "none" else f", with the filter {header['rta']}"
+    yield count + policies.source + rta
     costs = ", ".join(
         f"{cost:.2f} {constraint}"
-        for constraint, cost in zip(found["constraints"], found["mean_costs"], strict=True)
+        for constraint, cost in zip(header["constraints"], header["mean_costs"], strict=True)
     )
-    counted = "violating steps" if env.cost == "violation" else "cost"
-    print(
-        f"{found['steps']:,} steps in {found['episodes']:,} episodes of {KINDS[options.kind]}\n"
-        f"return {found['mean_return']:.3f}, success {found['success_rate']:.1%}, "
-        f"{counted} of an episode: {costs or 'no constraint'}\nwritten to {where}"
+    counted = "violating steps" if policies.env.cost == "violation" else "cost"
+    yield (
+        f"return {header['mean_return']:.3f}, success {header['success_rate']:.1%}, "
+        f"{counted} of an episode: {costs or 'no constraint'}"
     )
-    return 0
+    if header["given_up"]:
+        yield f"episodes still running at the end, given up: {header['given_up']:,}"
+    if header["diverged"]:
+        yield f"policies left out because their training diverged: {header['diverged']:,}"
 
 
 class _Policies(NamedTuple):
@@ -119,22 +139,30 @@ class _Policies(NamedTuple):
 
     name: str
     """The name of the environment."""
+    source: str
+    """Where the policies come from, in words."""
     env: Environment
     policy_of: Callable[[Any], Any]
     """Returns the policy of some parameters."""
     parameters: list[Any]
+    training_steps: Sequence[int] = ()
+    """Environment steps of each seed at the checkpoints that the policies are from."""
+    diverged: int = 0
+    """Number of policies that are left out because their parameters are not finite."""
 
 
 def _policies(options: Options) -> _Policies:
     """Return the policies whose episodes are asked for.
 
     Raises:
-        ConfigError: the options do not fit each other.
+        ConfigError: the options do not fit each other, or there are no such policies.
     """
     from jaxsafe.commands.policies import load, load_foreign
     from jaxsafe.dataset.collect import random_policy
+    from jaxsafe.envs import short_name
 
-    if options.kind == "random":
+    kind = options.kind
+    if kind == "random":
         options.refuse_beside(["deterministic", "activation"], "with kind=random")
         if (options.run is None) == (options.env is None):
             raise ConfigError(
@@ -143,25 +171,36 @@ def _policies(options: Options) -> _Policies:
         options = options.replace(env=options.env or options.run, run=None)
         env = options.make(str(options.env))
         policy = random_policy(env)
-        return _Policies(options.task, env, lambda _: policy, [()])
+        return _Policies(options.task, KINDS[kind], env, lambda _: policy, [()])
     run = options.run
     if run is None:
         raise ConfigError("run: missing; the policies, for instance run=pretrained/docking2d")
-    if options.kind == "filtered" and options.rta is None:
-        options = options.replace(rta="default")
-    if options.kind in ("medium", "replay"):
-        subjects = list(_at_checkpoints(run, options.kind))
-    elif options.is_foreign():
+    foreign = options.is_foreign()
+    if kind in ("medium", "replay"):
+        subjects = list(_at_checkpoints(run, kind))
+    elif foreign:
         subjects = [load_foreign(options)]
     else:
+        _require_finished(run, kind)
         subjects = [load(run, None)]
     first = subjects[0]
-    env = first.env if options.is_foreign() else options.change(first.env, first.name)
+    env = first.env if foreign else options.change(first.env, first.name)
+    if kind == "filtered" and env.rta is None:
+        if options.rta is not None:
+            raise ConfigError("rta: kind=filtered needs a filter, found none; or use kind=expert")
+        return _policies(options.replace(rta="default"))
+    every = [parameters for subject in subjects for parameters in _by_seed(subject)]
+    sound = [parameters for parameters in every if foreign or _is_finite(parameters)]
+    if not sound:
+        raise ConfigError(f"run: the training of {run} diverged, so it has no policies")
     return _Policies(
-        first.name,
-        env,
-        lambda parameters: first.agent.policy(env, parameters, options.deterministic),
-        [parameters for subject in subjects for parameters in _by_seed(subject)],
+        name=short_name(options.env or first.name),
+        source=run if foreign else KINDS[kind],
+        env=env,
+        policy_of=lambda parameters: first.agent.policy(env, parameters, options.deterministic),
+        parameters=sound,
+        training_steps=[] if foreign else [int(subject.facts["steps"]) for subject in subjects],
+        diverged=len(every) - len(sound),
     )
 
 
@@ -176,34 +215,78 @@ def _by_seed(subject: Any) -> list[Any]:
     ]
 
 
+def _is_finite(parameters: Any) -> bool:
+    """Return whether all parameters of a policy are finite, unlike those of a diverged training."""
+    import jax
+    import numpy as np
+
+    return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(parameters))
+
+
+def _require_finished(run: str, kind: str) -> None:
+    """Refuse the directory of a run whose training has not ended.
+
+    Raises:
+        ConfigError: it has checkpoints and no results.
+    """
+    from jaxsafe.agents.policy_file import is_single
+
+    place = Path(run)
+    began = not is_single(run) and (place / "checkpoints").is_dir()
+    if began and not (place / "results.json").exists():
+        raise ConfigError(
+            f"run: {run} has not finished, and kind={kind} needs its end; "
+            f"go on with jaxsafe train resume={run}"
+        )
+
+
 def _at_checkpoints(run: str, kind: str) -> Iterator[Any]:
     """Yield the policies of a run at the checkpoints from which data of a kind come.
 
     Raises:
-        ConfigError: it is no run, or its log has no success rates.
+        ConfigError: it is no run, it has no checkpoint of this kind, or for `medium` it has not
+            finished.
     """
-    from jaxsafe.agents.policy_file import is_single
     from jaxsafe.commands.policies import load
     from jaxsafe.train.host.checkpoint import Checkpoints
-    from jaxsafe.train.host.log import read_progress
 
-    if is_single(run):
+    if not Path(run).is_dir():
         raise ConfigError(f"run: kind={kind} needs the directory of a run, found {run}")
     steps = Checkpoints(Path(run)).steps
     if not steps:
         load(run, None)  # which says what is wrong
     if kind == "medium":
-        rows = [row for row in read_progress(Path(run)) if row["success_rate"] is not None]
-        if not rows:
-            raise ConfigError(f"run: no training episode of {run} has ended")
-        rates = [_mean_rate(rows, step) for step in steps]
-        half = 0.5 * rates[-1]
-        steps = [next(step for step, rate in zip(steps, rates, strict=True) if rate >= half)]
+        _require_finished(run, kind)
+        steps = [_half_way(run, steps)]
     for step in steps:
         yield load(run, str(step))
 
 
-def _mean_rate(rows: Sequence[dict[str, Any]], step: int) -> float:
+def _half_way(run: str, steps: Sequence[int]) -> int:
+    """Return the checkpoint of a run at which the success was nearest to half of that at the end.
+
+    Raises:
+        ConfigError: there is none between a quarter and three quarters of the success at the end.
+    """
+    from jaxsafe.train.host.log import read_progress
+
+    rows = [row for row in read_progress(Path(run)) if row["success_rate"] is not None]
+    rates = [_mean_rate(rows, step) for step in steps]
+    final = rates[-1]
+    distances = {step: abs(rate - 0.5 * final) for step, rate in zip(steps, rates, strict=True)}
+    nearest = min(steps, key=distances.__getitem__)
+    if final == 0.0:
+        raise ConfigError(f"run: {run} ended without a success, so it has no data of kind=medium")
+    if distances[nearest] > 0.25 * final:
+        listed = ", ".join(f"{rate:.0%}" for rate in rates)
+        raise ConfigError(
+            f"run: kind=medium needs a checkpoint near half of the success at the end, {run} has "
+            f"{listed}; train with a smaller checkpoint_every"
+        )
+    return nearest
+
+
+def _mean_rate(rows: Sequence[Mapping[str, Any]], step: int) -> float:
     """Return the success rate over seeds in the last rows of a progress log up to a step."""
     latest = {row["seed"]: row["success_rate"] for row in rows if row["step"] <= step}
     return sum(latest.values()) / len(latest) if latest else 0.0

@@ -1,5 +1,7 @@
 """Data for offline learning: whole episodes, whose every step is one that the environment took."""
 
+import json
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,9 @@ import numpy as np
 import pytest
 
 import jaxsafe
+from jaxsafe.commands import policies
 from jaxsafe.commands.dataset import main
+from jaxsafe.config import dump
 from jaxsafe.dataset import collect, collect_from_each, load_dataset, random_policy, save_dataset
 from jaxsafe.dataset.files import facts
 from jaxsafe.schema.errors import ConfigError
@@ -154,21 +158,119 @@ def test_the_command_writes_data_of_random_actions(
     out = tmp_path / "random.npz"
     words = ["env=docking2d", "kind=random", "episodes=3", "env.terminal.timeout.limit=20"]
     assert main([*words, f"out={out}"]) == 0
-    assert "63 steps in 3 episodes of actions" in capsys.readouterr().out
+    assert "63 steps in 3 episodes of actions drawn uniformly\n" in capsys.readouterr().out
     data, header = load_dataset(out)
     assert header["kind"] == "random"
+    assert header["rta"] == "none"
+    assert header["changes"] == ["reward.success.time_scale", "terminal.timeout.limit"]
     assert len(data.reward) == 63
+    assert main([*words, f"out={out}", "rta=default"]) == 0
+    assert "drawn uniformly, with the filter discrete_asif\n" in capsys.readouterr().out
+    assert load_dataset(out)[1]["rta"] == "discrete_asif"
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("kind", ["medium", "replay"])
-def test_data_of_checkpoints_are_of_all_seeds(kind: str, whole: Path, tmp_path: Path) -> None:
+def test_data_of_all_checkpoints_are_of_all_seeds(whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "data.npz"
-    assert main([f"run={whole}", f"kind={kind}", "episodes=13", f"out={out}"]) == 0
-    policies = 3 * (1 if kind == "medium" else len(Checkpoints(whole).steps))
+    assert main([f"run={whole}", "kind=replay", "episodes=13", f"out={out}"]) == 0
     header = load_dataset(out)[1]
-    assert header["episodes"] % policies == 0
-    assert 13 <= header["episodes"] < 13 + policies
+    assert header["training_steps"] == Checkpoints(whole).steps
+    assert header["policies"] == 3 * len(Checkpoints(whole).steps)
+    assert header["episodes"] % header["policies"] == 0
+    assert 13 <= header["episodes"] < 13 + header["policies"]
+
+
+def with_success(whole: Path, run: Path, *rates: float) -> Path:
+    """Return a copy of a run whose checkpoints have these success rates in training."""
+    shutil.copytree(whole, run)
+    rows = [json.loads(line) for line in (run / "progress.jsonl").read_text().splitlines()]
+    steps = Checkpoints(run).steps
+    for row in rows:
+        row["success_rate"] = rates[sum(step < row["step"] for step in steps)]
+    (run / "progress.jsonl").write_text("".join(f"{json.dumps(row)}\n" for row in rows))
+    return run
+
+
+@pytest.mark.thorough
+def test_medium_is_the_checkpoint_nearest_to_half_of_the_success(
+    whole: Path, tmp_path: Path
+) -> None:
+    run = with_success(whole, tmp_path / "run", 0.0, 0.3, 0.8, 0.8)
+    out = tmp_path / "data.npz"
+    assert main([f"run={run}", "kind=medium", "episodes=3", f"out={out}"]) == 0
+    header = load_dataset(out)[1]
+    assert header["training_steps"] == Checkpoints(run).steps[1:2]
+    assert header["policies"] == header["episodes"] == 3
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize(
+    ("rates", "message"),
+    [
+        ((0.0, 0.0, 0.0, 0.0), "ended without a success, so it has no data of kind=medium"),
+        ((0.1, 0.9, 1.0, 1.0), "has 10%, 90%, 100%, 100%; train with a smaller checkpoint_every"),
+    ],
+)
+def test_a_run_without_a_medium_policy_is_refused(
+    rates: tuple[float, ...], message: str, whole: Path, tmp_path: Path
+) -> None:
+    run = with_success(whole, tmp_path / "run", *rates)
+    with pytest.raises(ConfigError, match=message):
+        main([f"run={run}", "kind=medium", "episodes=3"])
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", ["expert", "filtered", "medium"])
+def test_a_training_that_has_not_ended_has_no_expert(
+    kind: str, whole: Path, tmp_path: Path
+) -> None:
+    run = with_success(whole, tmp_path / "run", 0.0, 0.3, 0.8, 0.8)
+    (run / "results.json").unlink()
+    with pytest.raises(ConfigError, match=f"has not finished, and kind={kind} needs its end"):
+        main([f"run={run}", f"kind={kind}", "episodes=3"])
+
+
+@pytest.mark.thorough
+def test_policies_that_diverged_are_left_out_and_told(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    diverged = [1]
+
+    def spoil(leaf: jax.Array) -> jax.Array:
+        return leaf.at[jnp.array(diverged)].set(jnp.nan)
+
+    def load(run: str, checkpoint: str | None, before: Any = policies.load) -> Any:
+        subject = before(run, checkpoint)
+        return subject._replace(params=jax.tree.map(spoil, subject.params))
+
+    monkeypatch.setattr("jaxsafe.commands.policies.load", load)
+    out = tmp_path / "data.npz"
+    assert main([f"run={whole}", "episodes=2", f"out={out}"]) == 0
+    assert "left out because their training diverged: 1\n" in capsys.readouterr().out
+    header = load_dataset(out)[1]
+    assert (header["policies"], header["diverged"]) == (2, 1)
+    diverged += [0, 2]
+    with pytest.raises(ConfigError, match="diverged, so it has no policies"):
+        main([f"run={whole}", "episodes=2"])
+
+
+def test_the_header_names_the_environment_in_which_the_policies_act(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    out = tmp_path / "data.npz"
+    words = ["controller/lqr", "env=docking1d", "episodes=2", "env.terminal.timeout.limit=20"]
+    assert main([*words, "kind=filtered", f"out={out}"]) == 0
+    said = capsys.readouterr().out
+    assert "42 steps in 2 episodes of controller/lqr, with the filter discrete_asif\n" in said
+    header = load_dataset(out)[1]
+    assert (header["task"], header["rta"]) == ("docking1d", "discrete_asif")
+    assert header["training_steps"] == []
+    other = tmp_path / "shorter.yaml"
+    other.write_text(dump(jaxsafe.make("docking2d", SHORT, rta="explicit_simplex")))
+    words = ["pretrained/docking2d", "kind=filtered", "episodes=2", f"env={other}"]
+    assert main([*words, f"out={out}"]) == 0
+    header = load_dataset(out)[1]
+    assert (header["task"], header["rta"]) == ("shorter", "simplex")  # the filter of the file
 
 
 def test_minari_reads_every_episode(
@@ -225,6 +327,11 @@ def test_without_minari_nothing_is_collected(monkeypatch: pytest.MonkeyPatch) ->
         ([], "run: missing; the policies"),
         (["run=docking2d"], "run: docking2d is a task"),
         (["run=pretrained/docking2d", "kind=replay"], "run: kind=replay needs the directory of a"),
+        (["controller/lqr", "env=docking2d", "kind=medium"], "kind=medium needs the directory"),
+        (
+            ["pretrained/docking2d", "kind=filtered", "rta=none"],
+            "rta: kind=filtered needs a filter",
+        ),
         (["pretrained/docking2d", "episodes=0"], "episodes: expected a whole number ≥ 1"),
         (
             ["run=pretrained/docking2d", "out=data.csv"],
