@@ -74,6 +74,7 @@ def main(argv: Sequence[str]) -> int:
     from jaxsafe.dataset.collect import collect_from_each
     from jaxsafe.dataset.files import facts, require_minari, save_dataset, save_minari
     from jaxsafe.environment import filter_name
+    from jaxsafe.envs import registered
     from jaxsafe.envs.identity import identity
     from jaxsafe.storage.provenance import versions
 
@@ -91,6 +92,7 @@ def main(argv: Sequence[str]) -> int:
     found = facts(env, data)
     task = identity(env)
     same = task["id"] is not None and not task["changes"]
+    known = registered(env.task) if same else None
     header = {
         "task": policies.name,
         "changes": task["changes"],
@@ -101,6 +103,7 @@ def main(argv: Sequence[str]) -> int:
         "training_steps": policies.training_steps,
         "command": f"jaxsafe dataset {shlex.join(argv)}",
         "versions": versions(),
+        "reference_returns": dict(known.reference_returns) if known else {},
         **found,
     }
     if options.format == "npz":

@@ -88,7 +88,8 @@ def save_minari(
         name: its name, such as `jaxsafe/docking2d/expert-v0`.
         env: the environment.
         data: the steps.
-        header: what the description says.
+        header: what the description says. Its `kind` is the name of the algorithm, and its
+            `reference_returns` are the scores with which Minari normalises returns.
         gymnasium_id: the id of the environment, with which Minari can make it again.
 
     Raises:
@@ -101,6 +102,7 @@ def save_minari(
     from jaxsafe.adapters.gymnasium_spaces import spaces
 
     observation_space, action_space = spaces(env)
+    reference = header["reference_returns"]
     buffers = []
     for number, part in enumerate(data.episodes()):
         costs = {
@@ -131,6 +133,8 @@ def save_minari(
                 observation_space=observation_space,
                 action_space=action_space,
                 algorithm_name=str(header["kind"]),
+                ref_min_score=reference.get("random"),
+                ref_max_score=reference.get("expert"),
                 description=json.dumps(dict(header)),
             )
     except (ValueError, FileExistsError) as error:

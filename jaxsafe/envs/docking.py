@@ -357,6 +357,7 @@ TASKS = (
         gymnasium_id="jaxsafe/Docking2D-v0",
         recipe="docking2d.yaml",
         paper_steps=340_000,
+        reference_returns={"random": -5.951, "expert": 2.855},
     ),
     Task(
         name="docking3d",
@@ -367,6 +368,7 @@ TASKS = (
         gymnasium_id="jaxsafe/Docking3D-v0",
         recipe="docking3d.yaml",
         paper_steps=660_000,
+        reference_returns={"random": -5.954, "expert": 2.811},
     ),
     Task(
         name="docking2d_oriented",
@@ -377,6 +379,7 @@ TASKS = (
         gymnasium_id="jaxsafe/Docking2DOriented-v0",
         recipe="docking2d_oriented.yaml",
         paper_steps=1_500_000,
+        reference_returns={"random": -5.858, "expert": 2.919},
     ),
 )
 """The tasks of this domain."""

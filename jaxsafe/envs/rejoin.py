@@ -347,6 +347,7 @@ TASKS = (
         gymnasium_id="jaxsafe/Rejoin2D-v0",
         recipe="rejoin2d.yaml",
         paper_steps=300_000,
+        reference_returns={"random": -1.705, "expert": 5.437},
     ),
     Task(
         name="rejoin3d",
@@ -357,6 +358,7 @@ TASKS = (
         gymnasium_id="jaxsafe/Rejoin3D-v0",
         recipe="rejoin3d.yaml",
         paper_steps=2_300_000,
+        reference_returns={"random": -1.701, "expert": 5.467},
     ),
 )
 """The tasks of this domain."""

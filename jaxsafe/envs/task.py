@@ -60,6 +60,10 @@ class Task:
     `observation_only`, which has the defaults of the options."""
     paper_steps: int | None = None
     """Table 2 of the paper: environment steps to 80 % success in training."""
+    reference_returns: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    """Mean returns of an episode: `random` of random actions, `expert` of the packaged policy.
+
+    A return of an offline learner is scored between them. Without them there are no scores."""
     starter: bool = False
     """Whether it is a small task to begin with, which no comparison of tasks includes."""
 

@@ -18,9 +18,11 @@ from jaxsafe.commands.dataset import main
 from jaxsafe.config import dump
 from jaxsafe.dataset import collect, collect_from_each, load_dataset, random_policy, save_dataset
 from jaxsafe.dataset.files import facts
+from jaxsafe.envs import TASKS
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.host.checkpoint import Checkpoints
 
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 SHORT = {"terminal.timeout.limit": 30.0}
 
 
@@ -163,6 +165,7 @@ def test_the_command_writes_data_of_random_actions(
     assert header["kind"] == "random"
     assert header["rta"] == "none"
     assert header["changes"] == ["reward.success.time_scale", "terminal.timeout.limit"]
+    assert header["reference_returns"] == {}  # those of the task are not of this one
     assert len(data.reward) == 63
     assert main([*words, f"out={out}", "rta=default"]) == 0
     assert "drawn uniformly, with the filter discrete_asif\n" in capsys.readouterr().out
@@ -292,6 +295,33 @@ def test_minari_reads_every_episode(
         assert dataset.spec.action_space.contains(episode.actions[0])
     with pytest.raises(ConfigError, match="out: jaxsafe/docking2d/test-v0: "):
         main(words)
+
+
+@pytest.mark.parametrize("kind", ["expert", "filtered"])
+def test_minari_normalises_returns_between_those_of_the_task(
+    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    name = f"jaxsafe/rejoin2d/{kind}-v0"
+    words = ["pretrained/rejoin2d", "format=minari", f"kind={kind}", "episodes=2"]
+    assert main([*words, "deterministic=true"]) == 0
+    reference = TASKS["rejoin2d"].reference_returns
+    dataset = minari.load_dataset(name)
+    ends = np.array([reference["random"], reference["expert"]])
+    np.testing.assert_allclose(minari.get_normalized_score(dataset, ends), [0.0, 1.0])
+    spec = dataset.spec.env_spec
+    assert (spec is None) if kind == "filtered" else (spec.id == TASKS["rejoin2d"].gymnasium_id)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_references_of_a_task_are_those_that_were_measured(task: str) -> None:
+    results = json.loads((BENCHMARKS / "results" / "datasets.json").read_text(encoding="utf-8"))
+    measured = {
+        row["kind"]: pytest.approx(row["mean_return"], abs=6e-4)
+        for row in results["rows"]
+        if row["task"] == task and row["kind"] != "filtered"
+    }
+    assert TASKS[task].reference_returns == measured
 
 
 @pytest.mark.peer
