@@ -102,7 +102,6 @@ def save_minari(
     from jaxsafe.adapters.gymnasium_spaces import spaces
 
     observation_space, action_space = spaces(env)
-    reference = header["reference_returns"]
     buffers = []
     for number, part in enumerate(data.episodes()):
         costs = {
@@ -126,19 +125,22 @@ def save_minari(
     try:
         # Minari warns of each field of authors and links that is left out.
         with warnings.catch_warnings(action="ignore", category=UserWarning):
-            minari.create_dataset_from_buffers(
+            written = minari.create_dataset_from_buffers(
                 dataset_id=name,
                 buffer=buffers,
                 env=gymnasium_id,
                 observation_space=observation_space,
                 action_space=action_space,
                 algorithm_name=str(header["kind"]),
-                ref_min_score=reference.get("random"),
-                ref_max_score=reference.get("expert"),
                 description=json.dumps(dict(header)),
             )
     except (ValueError, FileExistsError) as error:
         raise ConfigError(f"out: {name}: {str(error).splitlines()[0]}") from None
+    if reference := header["reference_returns"]:
+        # As arguments they would be kept only together with the id of the environment.
+        written.storage.update_metadata(
+            {"ref_min_score": reference["random"], "ref_max_score": reference["expert"]}
+        )
 
 
 def require_minari(env: Environment) -> None:

@@ -63,7 +63,8 @@ class Task:
     reference_returns: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Mean returns of an episode: `random` of random actions, `expert` of the packaged policy.
 
-    A return of an offline learner is scored between them. Without them there are no scores."""
+    The score of an offline learner is 0 at the first and 100 at the second. Headers of datasets
+    have them if the task has a `gymnasium_id`."""
     starter: bool = False
     """Whether it is a small task to begin with, which no comparison of tasks includes."""
 
