@@ -437,13 +437,13 @@ def hot_spots(results: Results) -> str:
     """Return the table of the functions that the time of a step goes into."""
     rows = []
     for row in results["rows"]:
-        spent = row["spent_us"].items()
-        shown = {name: value for name, value in spent if value >= 0.02 * row["step_us"]}
-        shown["the rest"] = row["step_us"] - sum(shown.values())
+        whole = row["profiled_us"]
+        shown = {name: us for name, us in row["spent_us"].items() if us >= 0.03 * whole}
+        shown["the rest"] = whole - sum(shown.values())
         for name, value in shown.items():
-            share = f"{100.0 * value / row['step_us']:.0f}"
-            rows.append((row["task"], name.replace("_", "\\_"), f"{value:.0f}", share))
-    return markdown(["task", "function", "µs per step", "share [%]"], rows)
+            code = name if " " in name or "." not in name else f"`{name}`"
+            rows.append((row["task"], code, f"{100.0 * value / whole:.0f}"))
+    return markdown(["task", "function", "share of a step [%]"], rows)
 
 
 def startup_parts(results: Results) -> str:
