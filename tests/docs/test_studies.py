@@ -37,6 +37,16 @@ def test_there_are_eighteen_ways_of_training(modules: None) -> None:
     assert len({way.name for way in training_with_rta.WAYS}) == 18
 
 
+def test_what_is_trained_without_a_filter_is_tested_with_one(modules: None) -> None:
+    import study  # pyright: ignore[reportMissingImports]
+
+    for name in ("no filter", "no filter and a higher penalty"):
+        tests = study.tests_of(name)
+        assert jaxsafe.override(published("none"), tests["with"]).rta is not None
+        assert jaxsafe.override(published("none"), tests["without"]).rta is None
+    assert study.tests_of("certified asif") == {"without": {"rta": None}, "with": {}}
+
+
 def test_the_plant_is_that_of_the_study(modules: None) -> None:
     env = published("none")
     state, _ = jaxsafe.reset_to(env, FAST)

@@ -3,7 +3,8 @@
 Six configurations are those of the study: no filter, no filter with a higher penalty, and four
 filters. Beside them stand the certified Simplex and ASIF of jaxsafe. All seeds of a configuration
 are trained in the task of `published_docking.yaml`, and tested with their filter and without it:
-from random starts, and from the ten test points of the study.
+from random starts, and from the ten test points of the study. What was trained without a filter is
+tested with the explicit switching of the study.
 
     cd examples/studies/published_docking
     python study.py seeds=5
@@ -14,6 +15,7 @@ Runs are kept in `runs`, and what is complete is not done again. The results are
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -65,6 +67,9 @@ CONFIGURATIONS: Mapping[str, tuple[str, ...]] = {
     **FILTERS,
 }
 """The options of each training. The task as written has the penalties of the filters."""
+
+FILTER_OF_UNFILTERED = {"type": "published_explicit_simplex"}
+"""The filter in the tests of what was trained without one. It needs no other plant."""
 
 TEST_POINTS = {
     "distance": [100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0, 900.0, 1000.0],
@@ -138,22 +143,39 @@ def train(name: str, options: Options) -> Path:
     return run
 
 
-def test(run: Path, filtered: bool, options: Options) -> dict[str, Any]:
-    """Test all seeds of a run from random starts, and return the metrics that are kept."""
-    out = run / "evaluations" / ("with" if filtered else "without")
+def tests_of(name: str) -> dict[str, dict[str, Any]]:
+    """Return what each test of a configuration changes in the environment of its training."""
+    own = {} if name in FILTERS else {"rta": FILTER_OF_UNFILTERED}
+    return {"without": {"rta": None}, "with": own}
+
+
+def test(run: Path, key: str, changes: Mapping[str, Any], options: Options) -> dict[str, Any]:
+    """Test all seeds of a run from random starts, and return the metrics that are kept.
+
+    Args:
+        run: the run directory.
+        key: the name of the test.
+        changes: what the test changes in the environment, by path.
+        options: the options of the study.
+    """
+    out = run / "evaluations" / key
     if not (out / "results.json").exists():
         words = (f"episodes={options.episodes}", "deterministic=true", f"out={out}")
-        call("evaluate", f"run={run}", *words, *(() if filtered else ("rta=none",)))
+        changed = (f"env.{path}={json.dumps(value)}" for path, value in changes.items())
+        call("evaluate", f"run={run}", *words, *changed)
     metrics = read_json(out / "results.json")["evaluation"]["deterministic"]
     return {name: metrics[name] for name in KEPT if name in metrics}
 
 
-def test_points(run: Run, filtered: bool) -> dict[str, Any]:
-    """Fly all seeds from the ten test points, and return what happened by seed and point."""
+def test_points(run: Run, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Fly all seeds from the ten test points, and return what happened by seed and point.
+
+    Args:
+        run: the run.
+        changes: what the test changes in the environment, by path.
+    """
     mass = float(run.env.agent_platform.mass)
-    changes: dict[str, Any] = {"terminal.fuel.limit": TEST_FUEL / mass}
-    changes |= {} if filtered else {"rta": None}
-    env = jaxsafe.override(run.env, changes)
+    env = jaxsafe.override(run.env, {"terminal.fuel.limit": TEST_FUEL / mass, **changes})
     # The bounds of a test are 1.5 times its distance. They are numbers of the environment, so one
     # compiled program flies all points.
     envs = [
@@ -220,31 +242,32 @@ def row(name: str, options: Options) -> dict[str, Any]:
     """Return all that is known of a configuration."""
     path = train(name, options)
     run = jaxsafe.open_run(path)
-    filtered = {"without": False} | ({"with": True} if name in FILTERS else {})
-    points = {key: test_points(run, value) for key, value in filtered.items()}
+    changes = tests_of(name)
+    points = {key: test_points(run, changed) for key, changed in changes.items()}
     return {
         "configuration": name,
+        "tested_with": name if name in FILTERS else "explicit switching",
         "steps": run.results["steps"],
         "wall_s": run.results["wall_s"],
         "steps_to_80": run.results["interaction_efficiency"],
         "training_cost": run.results["training_cost"],
-        "tests": {key: test(path, value, options) for key, value in filtered.items()},
+        "tests": {key: test(path, key, changed, options) for key, changed in changes.items()},
         "test_points": {key: over_points(found) for key, found in points.items()},
         "each_point": points,
     }
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draw what the policies of each configuration do, with and without their filter.
+    """Draw what the policies of each configuration do, with a filter and without.
 
     Args:
         rows: the rows of the results.
         path: the file of the figure.
     """
     looks = {
-        "tested with the filter": {"color": BLUE},
+        "tested with a filter": {"color": BLUE},
         "tested without a filter": {"color": BLUE, "markerfacecolor": "white"},
-        "from the ten test points, with the filter": {"color": GREEN, "marker": "s"},
+        "from the ten test points, with a filter": {"color": GREEN, "marker": "s"},
         "from the ten test points, without a filter": {
             "color": GREEN,
             "marker": "s",
@@ -255,9 +278,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     series = [(source, key) for source in ("tests", "test_points") for key in ("with", "without")]
     for name, (source, key) in zip(looks, series, strict=True):
         for metric, (label, unit) in SHOWN.items():
-            panels[label][name] = [
-                dot(row[source][key][metric], unit) if key in row[source] else None for row in rows
-            ]
+            panels[label][name] = [dot(row[source][key][metric], unit) for row in rows]
     dot_chart(path, [row["configuration"] for row in rows], panels, looks)
 
 
