@@ -20,6 +20,7 @@ from baselines.plan import WITHOUT_RTA
 
 from jaxsafe.envs import TASKS
 from jaxsafe.evaluate.evaluator import EVALUATION_KINDS
+from jaxsafe.metrics import stratified_iqm, with_interval
 from jaxsafe.runs.protocol import Submission, findings, read_submission
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import read_json, write_text
@@ -776,33 +777,79 @@ def filtered_training(_: Results) -> str:
 
 
 def studied_training(_: Results) -> str:
-    """Return the table of the study of filters in training, with a row for each way of training."""
+    """Return the table of the ways of training, over the seeds of both tasks."""
+    rows = [
+        [*_way(of_task[0]), *_studied_tests(of_task)]
+        for of_task in zip(*_studied_rows(), strict=True)
+    ]
+    return markdown(["trained with", "and", *STUDIED_TESTS], rows)
+
+
+def studied_training_tests(_: Results) -> str:
+    """Return the table of the tests of each way of training, by task."""
+    rows = [
+        [row["task"], *_way(row), *_studied_tests([row])]
+        for rows in _studied_rows()
+        for row in rows
+    ]
+    return markdown(["task", "trained with", "and", *STUDIED_TESTS], rows)
+
+
+def studied_training_means(_: Results) -> str:
+    """Return the table of how each way of training went and how its policies fly, by task."""
     rows = []
-    files = [RESULTS / f"training_with_rta_{task}.json" for task in ("docking2d", "docking3d")]
-    for row in [row for file in files for row in read_json(file)["rows"]]:
+    for row in [row for rows in _studied_rows() for row in rows]:
         own, alone = row["tests"]["with"], row["tests"]["without"]
-        iqm = row["success_iqm"]
         rows.append(
-            (
+            [
                 row["task"],
-                f"`{row['filter']}`" if row["filter"] != "none" else "none",
-                row["treatment"],
+                *_way(row),
                 _until(row["steps_to_80"]["timesteps"]),
                 f"{row['training_cost']['mean']:,.0f}",
-                f"{100 * iqm['with']['iqm']:.4g}",
-                f"{own['episode_length']['mean']:.0f}",
                 f"{100 * own['intervention_rate']['mean']:.3g}",
-                f"{100 * iqm['without']['iqm']:.4g}",
-                f"{100 * alone['episode_safety_violation_rate']['mean']:.3g}",
+                f"{own['episode_length']['mean']:.0f}",
                 f"{alone['episode_length']['mean']:.0f}",
-            )
+            ]
         )
     heads = (
         "task | trained with | and | 80 % in training after | violations in training"
-        " | success, IQM [%] | length [s] | steps altered [%] | alone: success, IQM [%]"
-        " | alone: violating steps [%] | alone: length [s]"
+        " | steps altered [%] | length [s] | alone: length [s]"
     )
     return markdown(heads.split(" | "), rows)
+
+
+STUDIED_TESTS = (
+    "success [%]",
+    "violating steps [%]",
+    "alone: success [%]",
+    "alone: violating steps [%]",
+)
+"""Columns of `_studied_tests`."""
+
+
+def _studied_rows() -> list[list[Results]]:
+    """Return the rows of the study of filters in training for each task, in the same order."""
+    tasks = ("docking2d", "docking3d")
+    return [read_json(RESULTS / f"training_with_rta_{task}.json")["rows"] for task in tasks]
+
+
+def _way(row: Results) -> list[str]:
+    """Return the filter and the treatment of a way of training."""
+    return [f"`{row['filter']}`" if row["filter"] != "none" else "none", row["treatment"]]
+
+
+def _studied_tests(rows: Sequence[Results]) -> list[str]:
+    """Return interquartile means over the seeds of some rows, with and without the filter.
+
+    The bootstrap of their intervals has a stratum for each row.
+    """
+    cells = []
+    for tested in ("with", "without"):
+        for metric in ("success_rate", "episode_safety_violation_rate"):
+            score = stratified_iqm([row["tests"][tested][metric]["per_seed"] for row in rows])
+            interval = [100 * bound for bound in score["ci95"]]
+            cells.append(with_interval(100 * score["iqm"], interval, ".3g"))
+    return cells
 
 
 def studied_filters(results: Results) -> str:
@@ -1372,6 +1419,8 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("", adversaries, "docs/safety/attacks.md"),
     ("", filtered_training, "docs/safety/cost.md"),
     ("", studied_training, "docs/studies.md"),
+    ("", studied_training_tests, "docs/studies.md"),
+    ("", studied_training_means, "docs/studies.md"),
     ("published_docking", studied_filters, "docs/studies.md"),
     ("", readme_tasks, "README.md"),
     ("", reported, "docs/protocol.md"),

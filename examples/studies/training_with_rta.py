@@ -3,12 +3,14 @@
 Two ways have no filter: the task as it is, and the task with one more penalty on each violating
 step. In the other 16 each of four filters acts while training, and interventions are treated in
 four ways: not at all, by a penalty, by learning from the control that acted, and by both. All
-seeds of a way are then tested without a filter and with the one that they were trained with.
+seeds of a way are then tested without a filter and with the one that they were trained with. What
+was trained without a filter is tested with `explicit_simplex`.
 
     python examples/studies/training_with_rta.py tasks=docking2d,docking3d seeds=10
 
 Runs are kept in `runs`, and what is complete is not done again. The results are written to
-`out`/training_with_rta.json, and drawn in `out`/training_with_rta.png.
+`out`/training_with_rta.json, and drawn in `out`/training_with_rta.png. They are interquartile means
+with 95 % intervals, for each task and over the seeds of all tasks.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import sys
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
-from dot_chart import Dot, dot, dot_chart
+from dot_chart import dot, dot_chart
 
 import jaxsafe
 from jaxsafe.commands import cli
@@ -57,6 +59,9 @@ SHOWN = {
     "episode_length": ("length [s]", 1.0),
 }
 """The label and the unit of each metric of the figure."""
+
+OVER_TASKS = ("success_rate", "episode_safety_violation_rate")
+"""Metrics that mean the same in each task, and so are averaged over the seeds of all tasks."""
 
 
 class Way(NamedTuple):
@@ -169,15 +174,44 @@ def row(task: str, way: Way, options: Options) -> dict[str, Any]:
         "wall_s": training["wall_s"],
         "steps_to_80": training["interaction_efficiency"],
         "training_cost": training.get("training_cost"),
-        "success_iqm": {
-            name: stratified_iqm([tests[name]["success_rate"]["per_seed"]]) for name in tests
-        },
         "tests": tests,
     }
 
 
+def iqm(rows: list[dict[str, Any]], tested: str, metric: str) -> dict[str, Any]:
+    """Return the interquartile mean of a metric over the seeds of some rows, with its interval.
+
+    The bootstrap of the 95 % interval has a stratum for each row.
+
+    Args:
+        rows: the rows of one way of training, one for each task.
+        tested: `with` a filter or `without`.
+        metric: the name of the metric.
+    """
+    return stratified_iqm([row["tests"][tested][metric]["per_seed"] for row in rows])
+
+
+def over_tasks(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the results of each way of training over the seeds of all tasks."""
+    of_way: dict[Way, list[dict[str, Any]]] = {}
+    for row in rows:
+        of_way.setdefault(Way(row["filter"], row["treatment"]), []).append(row)
+    return [
+        {
+            **way._asdict(),
+            "tests": {
+                tested: {metric: iqm(same, tested, metric) for metric in OVER_TASKS}
+                for tested in ("without", "with")
+            },
+        }
+        for way, same in of_way.items()
+    ]
+
+
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
     """Draw what the policies of each way do, with and without their filter.
+
+    A dot is an interquartile mean over the seeds.
 
     Args:
         rows: the rows of the results.
@@ -195,16 +229,11 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             name = f"{task}, tested {tested} a filter"
             looks[name] = {"color": colour, "markerfacecolor": filled}
             for metric, (label, unit) in SHOWN.items():
-                panels[label][name] = [row and _dot(row, metric, tested, unit) for row in of_task]
+                panels[label][name] = [
+                    row and dot(iqm([row], tested, metric), unit) for row in of_task
+                ]
     first = [line for line, way in enumerate(ways) if line and way.filter != ways[line - 1].filter]
     dot_chart(path, [f"{way.filter}: {way.treatment}" for way in ways], panels, looks, first)
-
-
-def _dot(row: dict[str, Any], metric: str, tested: str, unit: float) -> Dot | None:
-    """Return a metric of a row. It is the mean over the seeds, and the IQM of the successes."""
-    if metric == "success_rate":
-        return dot(row["success_iqm"][tested], unit)
-    return dot(row["tests"][tested][metric], unit)
 
 
 def main(argv: list[str]) -> int:
@@ -226,6 +255,7 @@ def main(argv: list[str]) -> int:
             "commit": provenance.commit(),
             "versions": provenance.versions(),
             "rows": rows,
+            "over_tasks": over_tasks(rows),
         },
     )
     draw(rows, out / "training_with_rta.png")

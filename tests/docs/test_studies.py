@@ -37,6 +37,21 @@ def test_there_are_eighteen_ways_of_training(modules: None) -> None:
     assert len({way.name for way in training_with_rta.WAYS}) == 18
 
 
+def test_each_task_is_a_stratum_of_the_mean_over_tasks(modules: None) -> None:
+    import training_with_rta  # pyright: ignore[reportMissingImports]
+
+    def row(task: str, rate: float) -> dict[str, Any]:
+        metrics = {name: {"per_seed": [rate] * 6} for name in training_with_rta.OVER_TASKS}
+        tests = {"with": metrics, "without": metrics}
+        return {"task": task, "filter": "none", "treatment": "baseline", "tests": tests}
+
+    (way,) = training_with_rta.over_tasks([row("docking2d", 0.0), row("docking3d", 1.0)])
+    # Each resample has six seeds of each task. So all have the same mean.
+    expected = {"iqm": 0.5, "ci95": [0.5, 0.5]}
+    assert way["tests"]["with"]["success_rate"] == expected
+    assert way["tests"]["without"]["episode_safety_violation_rate"] == expected
+
+
 def test_what_is_trained_without_a_filter_is_tested_with_one(modules: None) -> None:
     import study  # pyright: ignore[reportMissingImports]
 
