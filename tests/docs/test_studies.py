@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib import image
 
 import jaxsafe
 from jaxsafe.storage.files import read_json
@@ -119,6 +120,67 @@ def test_the_reward_of_a_step_is_that_of_the_study(modules: None) -> None:
     too_slow = -0.0075 * abs(speed - (0.5 * 0.001027 * distance - 0.2))
     expected = progress + too_slow - 0.0025
     assert float(timestep.reward) == pytest.approx(expected, rel=1e-3)
+
+
+def run_study(script: Path, *words: str) -> None:
+    done = subprocess.run(
+        [sys.executable, script, *words], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def assert_drawn(figure: Path) -> None:
+    """Require a picture with many coloured pixels."""
+    pixels = image.imread(figure)[..., :3]
+    coloured = pixels.max(axis=-1) - pixels.min(axis=-1) > 0.2
+    assert coloured.sum() > 500
+
+
+@pytest.mark.slow
+def test_the_study_of_filters_in_training_runs(tmp_path: Path) -> None:
+    smallest = (
+        "tasks=docking2d",
+        "filters=implicit_simplex",
+        "seeds=2",
+        "steps=3000",
+        "episodes=4",
+    )
+    places = (f"runs={tmp_path / 'runs'}", f"out={tmp_path}")
+    run_study(STUDIES / "training_with_rta.py", *smallest, *places)
+    results = read_json(tmp_path / "training_with_rta.json")
+    treatments = ["no punishment", "punishment", "corrected action", "both"]
+    assert [row["treatment"] for row in results["rows"]] == treatments
+    assert [way["treatment"] for way in results["over_tasks"]] == treatments
+    for row in results["rows"]:
+        for tested in ("with", "without"):
+            per_seed = row["tests"][tested]["success_rate"]["per_seed"]
+            assert len(per_seed) == 2
+            assert all(4 * rate in range(5) for rate in per_seed)
+        assert row["tests"]["with"]["episode_safety_violation_rate"]["per_seed"] == [0.0, 0.0]
+        assert row["tests"]["without"]["intervention_rate"]["mean"] is None
+    assert_drawn(tmp_path / "training_with_rta.png")
+
+
+@pytest.mark.slow
+def test_the_published_study_runs(tmp_path: Path) -> None:
+    smallest = (
+        "configurations=no filter,explicit switching",
+        "seeds=2",
+        "steps=3000",
+        "episodes=4",
+    )
+    places = (f"runs={tmp_path / 'runs'}", f"out={tmp_path}")
+    run_study(PUBLISHED / "study.py", *smallest, *places)
+    rows = read_json(tmp_path / "published_docking.json")["rows"]
+    assert [row["configuration"] for row in rows] == ["no filter", "explicit switching"]
+    for row in rows:
+        assert row["tested_with"] == "explicit switching"
+        for tested in ("with", "without"):
+            interventions = row["tests"][tested]["intervention_rate"]["mean"]
+            assert (interventions is None) == (tested == "without")
+            assert np.shape(row["each_point"][tested]["success"]) == (2, 10)
+            assert len(row["test_points"][tested]["success_rate"]["per_seed"]) == 2
+    assert_drawn(tmp_path / "published_docking.png")
 
 
 @pytest.mark.slow
