@@ -71,7 +71,8 @@ def dot_chart(
         for line in above:
             panel.axhline(line - 0.5, color=GREY, linewidth=0.5)
         panel.set_xlabel(label)
-        panel.set_xlim(left=-0.03 * panel.get_xlim()[1])  # a dot at 0 is seen whole
+        largest = panel.get_xlim()[1]
+        panel.set_xlim(-0.03 * largest, 1.03 * largest)  # dots at both ends are seen whole
     axes[0].set_yticks(range(len(lines)), lines)
     axes[0].set_ylim(len(lines) - 0.5, -0.5)
     handles, names = axes[0].get_legend_handles_labels()

@@ -53,6 +53,20 @@ def test_each_task_is_a_stratum_of_the_mean_over_tasks(modules: None) -> None:
     assert way["tests"]["without"]["episode_safety_violation_rate"] == expected
 
 
+def test_dots_at_both_ends_of_a_panel_are_whole(
+    modules: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import dot_chart  # pyright: ignore[reportMissingImports]
+
+    drawn = []
+    monkeypatch.setattr(dot_chart, "save", lambda figure, path: drawn.append(figure))
+    dots = {str(value): [dot_chart.Dot(value, value, value)] for value in (3.3, 4.2)}
+    dot_chart.dot_chart(Path("chart.png"), ["a way"], {"length [s]": dots}, {"3.3": {}, "4.2": {}})
+    low, high = drawn[0].axes[0].get_xlim()
+    assert low < 0.0
+    assert high - 4.2 > 0.03 * (high - low)
+
+
 def test_what_is_trained_without_a_filter_is_tested_with_one(modules: None) -> None:
     import study  # pyright: ignore[reportMissingImports]
 
