@@ -24,6 +24,7 @@ from jaxsafe.metrics import stratified_iqm, with_interval
 from jaxsafe.runs.protocol import Submission, findings, read_submission
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.storage.files import read_json, write_text
+from jaxsafe.storage.text_table import or_dash
 from jaxsafe.train.host.results import mean_text
 
 ROOT = Path(__file__).parent.parent
