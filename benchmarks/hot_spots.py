@@ -39,9 +39,6 @@ NUM_STEPS = 200
 ELSEWHERE = "elsewhere"
 """The name of what jaxsafe did not trace: random actions, copies, and what is between kernels."""
 
-THREADS = "tf_XLAEigen"
-"""How the names of the threads begin on which a CPU runs kernels."""
-
 PACKAGE = Path(jaxsafe.__file__).parent
 
 
@@ -126,7 +123,6 @@ def kernels(run: Callable[[], Any]) -> Counter[str]:
             [(event.start_ns, event.duration_ns, event.name) for event in line.events]
             for plane in planes
             for line in plane.lines
-            if line.name.startswith(THREADS)
         ]
     spent: Counter[str] = Counter()
     for events in lines:
