@@ -90,6 +90,7 @@ STUDIES = {
 KEPT = (
     "success_rate",
     "average_return",
+    "return_gap",
     "episode_length",
     "control_usage_l1",
     "safety_violation_rate",
@@ -124,7 +125,7 @@ def measure(task: str, place: Path, seeds: int, episodes: int) -> list[dict[str,
             tested = place / f"{task}_{policy}_from_{high:.0f}"
             if not (tested / "results.json").exists():
                 given = (f"run={flown}", *changes, f"episodes={episodes}", f"out={tested}")
-                command("evaluate", *given)
+                command("evaluate", *given, "bounds=true")
             learnt = {name: training[name] for name in ("steps", "wall_s")}
             rows.append(
                 {

@@ -329,13 +329,14 @@ def far_starts(results: Results) -> str:
                 f"{100.0 * min(successes):.1f}" if drawn else "–",
                 f"{100.0 * mode['episode_safety_violation_rate']['mean']:.2g}",
                 _interval(mode["average_return"], 1.0, 2),
+                f"{mode['return_gap']['mean']:.2f}",
                 "–" if used is None else f"{used:.1f}",
                 f"{mode['episode_length']['mean']:,.0f}",
             )
         )
     heads = (
         "task | from | policy | success, stochastic [%] | deterministic | worst seed"
-        " | violating steps [%] | return | Δv, L1 [m/s] | length [s]"
+        " | violating steps [%] | return | below the bound by | Δv, L1 [m/s] | length [s]"
     )
     return markdown(heads.split(" | "), rows)
 
