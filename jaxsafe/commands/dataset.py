@@ -192,8 +192,13 @@ def _policies(options: Options) -> _Policies:
         if options.rta is not None:
             raise ConfigError("rta: kind=filtered needs a filter, found none; or use kind=expert")
         return _policies(options.replace(rta="default"))
-    every = [parameters for subject in subjects for parameters in _by_seed(subject)]
-    sound = [parameters for parameters in every if foreign or _is_finite(parameters)]
+    left_out = [[] if foreign else subject.not_finite() for subject in subjects]
+    sound = [
+        parameters
+        for subject, indices in zip(subjects, left_out, strict=True)
+        for index, parameters in enumerate(_by_seed(subject))
+        if index not in indices
+    ]
     if not sound:
         raise ConfigError(f"run: the training of {run} diverged, so it has no policies")
     return _Policies(
@@ -203,7 +208,7 @@ def _policies(options: Options) -> _Policies:
         policy_of=lambda parameters: first.agent.policy(env, parameters, options.deterministic),
         parameters=sound,
         training_steps=[] if foreign else [int(subject.facts["steps"]) for subject in subjects],
-        diverged=len(every) - len(sound),
+        diverged=sum(map(len, left_out)),
     )
 
 
@@ -216,14 +221,6 @@ def _by_seed(subject: Any) -> list[Any]:
         jax.tree.map(lambda x, index=index: x[index], gathered)
         for index in range(subject.facts["seeds"])
     ]
-
-
-def _is_finite(parameters: Any) -> bool:
-    """Return whether all parameters of a policy are finite, unlike those of a diverged training."""
-    import jax
-    import numpy as np
-
-    return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(parameters))
 
 
 def _require_finished(run: str, kind: str) -> None:

@@ -66,7 +66,7 @@ class Film(NamedTuple):
         numbers = [self.choose(which, episodes, env) for episodes in own]
         sound = [index for index in range(count) if index not in left_out] or [0]
         having = [index for index in sound if numbers[index] is not None]
-        index = next(iter([*having, *sound])) if self.seed is None else self.seed - first
+        index = [*having, *sound][0] if self.seed is None else self.seed - first
         number = numbers[index]
         if number is not None:
             return index, number, ""
@@ -176,7 +176,7 @@ def evaluate(
         run_directory.discard_unused(path)
         raise
     first = subject.facts["seed"]
-    left_out = _not_finite(subject)
+    left_out = subject.not_finite()
     for kind, of_kind in sums.items() if hidden is None else ():
         rows = episode_rows(
             env, of_kind, first, possible, step=subject.facts["steps"], kind=kind, final=True
@@ -213,19 +213,6 @@ def evaluate(
     for kind, of_kind in sums.items() if logged else ():
         lines.append(_log(subject, evaluator, of_kind, seed, kind, logged, left_out, path))
     return path / "results.json", results, lines
-
-
-def _not_finite(subject: Subject) -> list[int]:
-    """Return the indices of the policies with parameters that are not finite.
-
-    A training that diverged leaves such policies.
-    """
-    leaves = jax.tree.leaves(subject.mapper.gather(subject.params))
-    return [
-        index
-        for index in range(subject.facts["seeds"])
-        if not all(np.isfinite(leaf[index]).all() for leaf in leaves)
-    ]
 
 
 def _render(

@@ -46,6 +46,18 @@ class Subject(NamedTuple):
     place: Path
     """Directory into which evaluations of the policies are written."""
 
+    def not_finite(self) -> list[int]:
+        """Return the indices of the policies with parameters that are not finite.
+
+        A training that diverged leaves such policies.
+        """
+        leaves = jax.tree.leaves(self.mapper.gather(self.params))
+        return [
+            index
+            for index in range(self.facts["seeds"])
+            if not all(np.isfinite(leaf[index]).all() for leaf in leaves)
+        ]
+
 
 def load_foreign(options: PolicyOptions) -> Subject:
     """Return a policy that was trained elsewhere or not at all, to act in a task.
