@@ -17,7 +17,6 @@ import functools
 import json
 import re
 import statistics
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -26,6 +25,7 @@ from typing import Any
 
 import jax
 from isolated import probe, several, words
+from profiler import profiled
 
 import jaxsafe
 from jaxsafe.devices.seed_mapper import claim_cores
@@ -111,21 +111,10 @@ def kernels(run: Callable[[], Any]) -> Counter[str]:
     Args:
         run: runs the program until its result is there.
     """
-    options = jax.profiler.ProfileOptions()
-    options.python_tracer_level = 0
-    with tempfile.TemporaryDirectory() as place:
-        jax.profiler.start_trace(place, profiler_options=options)
+    with profiled() as threads:
         run()
-        jax.profiler.stop_trace()
-        [file] = Path(place).rglob("*.xplane.pb")
-        planes = jax.profiler.ProfileData.from_file(str(file)).planes
-        lines = [
-            [(event.start_ns, event.duration_ns, event.name) for event in line.events]
-            for plane in planes
-            for line in plane.lines
-        ]
     spent: Counter[str] = Counter()
-    for events in lines:
+    for events in threads:
         around: list[tuple[float, str]] = []
         # Of two events that begin together the longer one is around the other.
         for start, duration, name in sorted(events, key=lambda event: (event[0], -event[1])):

@@ -38,6 +38,7 @@ from typing import Any
 
 from isolated import interpreter, several, variables, versions, words
 from isolated import probe as apart
+from profiler import profiled
 
 OUT = Path(__file__).parent / "results" / "startup.json"
 NUM_ENVS = 64
@@ -234,22 +235,10 @@ def profile(result: Callable[[], Any]) -> dict[str, float]:
         spans.append((event, (now := time.perf_counter()) - duration_secs, now))
 
     jax.monitoring.register_event_duration_secs_listener(listen)
-    options = jax.profiler.ProfileOptions()
-    options.python_tracer_level = 0
-    with tempfile.TemporaryDirectory() as place:
-        jax.profiler.start_trace(place, profiler_options=options)
+    with profiled() as threads:
         began = time.perf_counter()
         result()
         ended = time.perf_counter()
-        jax.profiler.stop_trace()
-        [file] = Path(place).rglob("*.xplane.pb")
-        planes = jax.profiler.ProfileData.from_file(str(file)).planes
-        events = [
-            (event.name, event.duration_ns)
-            for plane in planes
-            for line in plane.lines
-            for event in line.events
-        ]
     stages = [*EVENTS.values()]
     spent = [
         _covered([span for span in spans if span[0] in stages[i:]]) for i in range(len(stages))
@@ -258,7 +247,10 @@ def profile(result: Callable[[], Any]) -> dict[str, float]:
     parts |= {"import of JAX": imported - start, "the rest": ended - began - spent[0]}
     parts["whole"] = sum(parts.values())
     parts |= {
-        part: sum(ns for name, ns in events if name in regions) / 1e9
+        part: sum(
+            event.duration_ns for events in threads for event in events if event.name in regions
+        )
+        / 1e9
         for part, regions in REGIONS.items()
     }
     return {name: round(value, 3) for name, value in parts.items()}
