@@ -11,12 +11,11 @@ from jaxsafe.agents.agent import Agent
 from jaxsafe.agents.features import ApproachFeatures, DockingFeatures
 from jaxsafe.agents.networks import GRU
 from jaxsafe.devices.seed_mapper import SeedMapper
-from jaxsafe.devices.shard import WHOLE, Shard
 from jaxsafe.schema.component import normalise
 from jaxsafe.schema.errors import ConfigError
 from jaxsafe.train.hyperparameters import PPO
-from jaxsafe.train.ppo import DIAGNOSTICS, TrainState, init, update
-from jaxsafe.train.train import STATE, programs
+from jaxsafe.train.ppo import DIAGNOSTICS, TrainState
+from jaxsafe.train.train import begin, chunk, programs
 
 ENV = jaxsafe.make("docking2d")
 AGENT = normalise(Agent(features=DockingFeatures()))
@@ -24,28 +23,14 @@ HYPER = normalise(PPO(num_envs=4, num_steps=32, num_epochs=2))
 UPDATES = 5
 
 
-def train(
-    shared: tuple, key: jax.Array, updates: int = UPDATES, shard: Shard = WHOLE
-) -> TrainState:
-    env, agent, ppo = shared
-    begin = init(env, agent, ppo, key, shard)
-    return jax.lax.fori_loop(
-        0, updates, lambda _, state: update(env, agent, ppo, UPDATES, state, shard)[0], begin
-    )
-
-
 def seeds(
     first: int, count: int, share: int = 1, updates: int = UPDATES, agent: Agent = AGENT
 ) -> TrainState:
     mapper = SeedMapper(count, (share,))
-
-    def train_shared(shared: tuple, key: jax.Array) -> TrainState:
-        return train(shared, key, updates, mapper.shard)
-
-    state = mapper.map(train_shared, out_specs=STATE)(
-        mapper.replicate((ENV, agent, HYPER)), mapper.keys(first)
-    )
-    return mapper.gather(state)
+    shared = mapper.replicate((ENV, agent, HYPER))
+    fresh, advance = programs(mapper, updates, UPDATES)
+    state = fresh(shared, mapper.keys(first))
+    return mapper.gather(advance(shared, state)[0] if updates else state)
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +116,10 @@ def test_devices_share_a_seed_whose_networks_remember() -> None:
 @pytest.mark.thorough
 def test_a_seed_is_to_rounding_the_same_run_under_vmap(three: TrainState) -> None:
     keys = jax.vmap(jax.random.key)(np.arange(3))
+
+    def train(shared: tuple, key: jax.Array) -> TrainState:
+        return chunk(shared, begin(shared, key), UPDATES, UPDATES)[0]
+
     together = jax.jit(jax.vmap(train, in_axes=(None, 0)))((ENV, AGENT, HYPER), keys)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), three.params, together.params
