@@ -217,8 +217,8 @@ def test_a_printed_file_keeps_what_its_source_had(
 def test_every_seed_learns_the_composed_environment(tmp_path: Path) -> None:
     """The command is that of docs/compose.md, with fewer episodes of evaluation.
 
-    The least success of a seed was 0.83 on two devices and 0.52 on one, where sums round otherwise.
-    The means were above 0.9. Without the recipe's changes three seeds never docked.
+    The least success of a seed was 0.99 on two devices and 0.91 on one, where sums round otherwise,
+    and 0.86 of thirty other seeds. Without the recipe's changes three seeds never docked.
     """
     root = Path(__file__).parents[2]
     page = (root / "docs" / "compose.md").read_text(encoding="utf-8")
@@ -229,7 +229,7 @@ def test_every_seed_learns_the_composed_environment(tmp_path: Path) -> None:
     subprocess.run(command_line, cwd=root, check=True, capture_output=True, env=as_users)
     rates = jaxsafe.open_run(tmp_path / "run").results["evaluation"]["deterministic"]
     assert len(rates["success_rate"]["per_seed"]) == 10
-    assert min(rates["success_rate"]["per_seed"]) >= 0.4
+    assert min(rates["success_rate"]["per_seed"]) >= 0.7
     assert rates["success_rate"]["mean"] >= 0.8
 
 
