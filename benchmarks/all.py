@@ -34,7 +34,6 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "environments": ("repeats=3",),
     "dynamics": (),
     "hot_spots": (),
-    "rta": (),
     "ppo": ("repeats=2",),
     "startup": ("rta=none", "repeats=2"),
     "adapters": ("repeats=3",),
@@ -50,8 +49,9 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "constraints": (),
     "far_starts": (),
     "verification": (),
+    "rta": (),
 }
-"""The options of each script, by its name, in the order in which they run."""
+"""The options of each script, by its name, in the order in which they run. The longest is last."""
 
 SAME = ("processor", "cores", "python", "jax", "jaxlib", "sources")
 """What must be as it is here for a result to be current."""
