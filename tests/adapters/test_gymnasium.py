@@ -81,7 +81,7 @@ def step_by_step(ours: GymVectorEnv, theirs: SyncVectorEnv, steps: int) -> int:
     for (observation, infos), (expected, their_infos) in [
         (ours.reset(seed=5), theirs.reset(seed=5))
     ]:
-        np.testing.assert_allclose(observation, expected, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(observation, expected, rtol=1e-6, atol=1e-7)
         same(infos, their_infos, everywhere, "reset")
     for action in actions(theirs, steps):
         (*result, infos) = ours.step(action)
