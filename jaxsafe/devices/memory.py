@@ -27,15 +27,17 @@ OPTIONS = "ppo.num_envs, ppo.num_steps, seeds"
 COMPILE_BYTES = 1200 * 2**20
 """Bytes that each process takes while the programs of a training are compiled.
 
-Resident memory rose by 0.67 to 0.71 GB for docking2d and by 0.76 to 0.94 GB for rejoin3d. Large
-trainings with a filter are not covered. It rose by 1.58 GB for rejoin3d with its filter.
+Resident memory rose by 0.67 to 0.71 GB for docking2d and by 0.76 to 0.94 GB for rejoin3d. With
+their filters it rose by 0.79 to 1.04 GB for four tasks. rejoin3d with its filter is not covered. It
+took 1.3 to 1.6 GB, and in an earlier version 2.01 GB with 16,384 environments.
 """
 
 RUN_BYTES = 512 * 2**20
 """Bytes that each process takes besides the buffers of the update.
 
 They are for code, the programs of evaluations and compiling them, logs and figures. Resident memory
-rose by 310 to 480 MB for docking2d and rejoin3d after the update had been compiled.
+rose by 310 to 480 MB for docking2d and rejoin3d after the update had been compiled. With filters it
+rose by 440 MB to 1.1 GB, which is not all covered.
 """
 
 
