@@ -98,6 +98,9 @@ def world(task: str, rta: str, level: float) -> Environment:
     return override(robust, {"rta": nominal.rta, **model})
 
 
+_rollout = jax.jit(jaxsafe.rollout, static_argnums=(1, 3, 4))
+
+
 def chatter(env: Environment, policy: Any, episodes: int) -> dict[str, float]:
     """Return how much the controls, and the filter, change from step to step.
 
@@ -106,7 +109,7 @@ def chatter(env: Environment, policy: Any, episodes: int) -> dict[str, float]:
         the filter begins or ceases to intervene.
     """
     low, high = bounds(env)
-    steps = jaxsafe.rollout(env, policy, jax.random.key(1), CHATTER_STEPS, num_envs=episodes)
+    steps = _rollout(env, policy, jax.random.key(1), CHATTER_STEPS, episodes)
     info = steps.info
     change = jnp.abs(info.control_actual[1:] - info.control_actual[:-1]) / (high - low)
     switched = info.intervening[1:] != info.intervening[:-1]
@@ -117,10 +120,9 @@ def chatter(env: Environment, policy: Any, episodes: int) -> dict[str, float]:
     }
 
 
-def measure(task: str, rta: str, level: float, episodes: int) -> dict[str, Any]:
+def measure(task: str, policy: Any, rta: str, level: float, episodes: int) -> dict[str, Any]:
     """Fly whole episodes, and under attack. Return the row of the results."""
     env = world(task, rta, level)
-    policy = jaxsafe.load_policy(task)
     metrics = jaxsafe.evaluate(env, policy, jax.random.key(0), episodes)
     names = (
         "success_rate",
@@ -177,12 +179,12 @@ def main() -> None:
     """Run the command."""
     options = words(episodes="200", levels="0,0.5,1,1.5,2", tasks=",".join(BOUNDS))
     episodes = int(options["episodes"])
-    rows = [
-        measure(task, rta, level, episodes)
-        for task in several("tasks", options["tasks"], BOUNDS)
-        for rta in FILTERS
-        for level in map(float, options["levels"].split(","))
-    ]
+    levels = [float(level) for level in options["levels"].split(",")]
+    rows = []
+    for task in several("tasks", options["tasks"], BOUNDS):
+        policy = jaxsafe.load_policy(task)  # once, because programs are compiled for each policy
+        rows += [measure(task, policy, rta, level, episodes) for rta in FILTERS for level in levels]
+        jax.clear_caches()  # a process may have only so many programs
     results = {
         "command": f"python benchmarks/robustness.py {' '.join(sys.argv[1:])}".strip(),
         "bounds": BOUNDS,

@@ -112,6 +112,7 @@ def calls(repeats: int) -> list[dict[str, Any]]:
                 }
             )
             print(rows[-1], flush=True)
+            jax.clear_caches()  # a process may have only so many programs
     return rows + cbfpy_calls(repeats) + run_time_assurance_calls(repeats)
 
 
