@@ -235,6 +235,10 @@ def profile(result: Callable[[], Any]) -> dict[str, float]:
         spans.append((event, (now := time.perf_counter()) - duration_secs, now))
 
     jax.monitoring.register_event_duration_secs_listener(listen)
+    if result is our_update:
+        from jaxsafe.devices.seed_mapper import claim_cores
+
+        claim_cores()  # here too, because XLA reads its flags when the profiler starts
     with profiled() as threads:
         began = time.perf_counter()
         result()
