@@ -604,6 +604,7 @@ def filter_calls(results: Results) -> str:
         "implicit_simplex",
         "implicit_asif",
         "explicit_asif",
+        "robust",
         "released",
         *FILTERS,
     ]
@@ -613,6 +614,19 @@ def filter_calls(results: Results) -> str:
         if any(cells):
             rows.append([FILTERS.get(name, f"`{name}`"), *cells])
     return markdown(["filter", *TASKS], rows)
+
+
+def filter_reserve(results: Results) -> str:
+    """Return the table of what is gained by predicting the backup controller in reserve first."""
+    rows = results["reserve"]["rows"]
+    return markdown(
+        ["calls/s of rejoin3d's filter, from starts", *(row["start"] for row in rows)],
+        [
+            ["the backup in reserve first", *(_scale(row["calls_per_s"]) for row in rows)],
+            ["all backups at every step", *(_scale(row["all_calls_per_s"]) for row in rows)],
+            ["time, all backups = 1", *(f"{row['ratio']:.2f}" for row in rows)],
+        ],
+    )
 
 
 def filter_changes(results: Results) -> str:
@@ -1420,6 +1434,7 @@ TABLES: Sequence[tuple[str, Callable[[Results], str], str]] = (
     ("possible", possible, "docs/possible.md"),
     ("adapters", adapters, "docs/adapters/gymnasium.md"),
     ("rta", filter_calls, "docs/safety/cost.md"),
+    ("rta", filter_reserve, "docs/safety/cost.md"),
     ("rta", filter_changes, "docs/safety/cost.md"),
     ("rta", programs, "docs/safety/cost.md"),
     ("rta", filter_cost, "docs/safety/cost.md"),
