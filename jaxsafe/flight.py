@@ -6,7 +6,6 @@ import base64
 import os
 import tempfile
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxsafe.devices.latest_programs import latest_programs
 from jaxsafe.environment import Environment, require_environment, reset, reset_to, step
 from jaxsafe.evaluate.episodes import max_steps
 from jaxsafe.evaluate.evaluator import MAX_RECORDED_STEPS, RECORDED_STEPS_PER_CALL
@@ -241,7 +241,7 @@ def fly(
     """Fly one whole episode and return it.
 
     The program is compiled once for an environment and a policy, whatever the start and the numbers
-    of the environment are.
+    of the environment are. The 32 latest are kept.
 
     Args:
         env: the environment.
@@ -274,7 +274,7 @@ def fly(
     actions = []
     limit = min(max_steps(env), MAX_RECORDED_STEPS)
     for before in range(0, limit, RECORDED_STEPS_PER_CALL):
-        position, recorded = _fly_on(env, policy, key_act, jnp.asarray(before), position)
+        position, recorded = _fly_on(policy, env, key_act, jnp.asarray(before), position)
         recorded = jax.device_get(recorded)
         ends = np.flatnonzero(recorded[1].done)
         size = ends[0] + 1 if ends.size else min(RECORDED_STEPS_PER_CALL, limit - before)
@@ -287,10 +287,10 @@ def fly(
     return Flight(env, states=states, timesteps=timesteps, actions=np.concatenate(actions))
 
 
-@partial(jax.jit, static_argnames="policy")
+@latest_programs
 def _fly_on(
-    env: Environment,
     policy: Policy | RecurrentPolicy,
+    env: Environment,
     key: Key,
     before: jax.Array,
     position: RolloutState,

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 
+from jaxsafe.devices.latest_programs import latest_programs
 from jaxsafe.environment import Environment, require_environment
-from jaxsafe.evaluate.cases import load_cases
+from jaxsafe.evaluate.cases import Cases, load_cases
 from jaxsafe.evaluate.episodes import run_episodes
-from jaxsafe.metrics import metrics_in
+from jaxsafe.metrics import Episode, metrics_in
 from jaxsafe.rollout import Policy, RecurrentPolicy, require_count, require_hashable
 from jaxsafe.types import Key, require_key
 
@@ -22,6 +25,9 @@ def evaluate(
     cases: str | None = None,
 ) -> dict[str, float | None]:
     """Return the metrics of Section 5 over whole episodes of a policy.
+
+    The program is compiled once for an environment, a policy and a number of episodes, whatever the
+    numbers of the environment are. The 32 latest are kept.
 
     Args:
         env: the environment.
@@ -51,5 +57,12 @@ def evaluate(
     key = jax.random.key(0) if key is None else key
     starts = None if cases is None else load_cases(env, cases)
     count = count if starts is None else starts.size
-    sums = jax.jit(run_episodes, static_argnums=(1, 3))(env, policy, key, count, starts)
+    sums = _run((policy, count), env, key, starts)
     return metrics_in(env, jax.device_get(sums))
+
+
+@latest_programs
+def _run(constants: tuple[Any, int], env: Environment, key: Key, cases: Cases | None) -> Episode:
+    """Run the episodes of a policy. The constants are the policy and the number of episodes."""
+    policy, num_episodes = constants
+    return run_episodes(env, policy, key, num_episodes, cases)
