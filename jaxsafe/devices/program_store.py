@@ -153,7 +153,7 @@ def only_installed_code() -> bool:
 
     Other modules are a user's, and so is the main module of a notebook or an interactive session.
     """
-    if not hasattr(sys.modules["__main__"], "__file__"):
+    if not os.path.exists(getattr(sys.modules["__main__"], "__file__", None) or ""):
         return False
     names = ("stdlib", "platstdlib", "scripts")
     places = (OWN, *(os.path.join(sysconfig.get_path(name), "") for name in names))
@@ -173,9 +173,13 @@ def _directory() -> Path | None:
 
 
 def _loaded_files() -> list[str]:
-    """Return the paths of all loaded modules."""
-    modules = [getattr(module, "__file__", None) for module in list(sys.modules.values())]
-    return sorted({os.path.abspath(path) for path in modules if path})
+    """Return the paths of all loaded modules.
+
+    PyTorch makes modules by hand that name files that do not exist, such as `_ops.py`.
+    """
+    files = [getattr(module, "__file__", None) for module in list(sys.modules.values())]
+    named = [path for path in files if path and (os.path.isabs(path) or os.path.exists(path))]
+    return sorted({os.path.abspath(path) for path in named})
 
 
 @cache
@@ -186,7 +190,8 @@ def _surroundings() -> str:
         digest.update(f"{path.relative_to(PACKAGE)}\n".encode() + path.read_bytes())
     for path in _loaded_files():
         if not path.startswith(OWN):
-            stat = os.stat(path)
+            archive = (path, *map(str, Path(path).parents))  # a module may be inside one
+            stat = os.stat(next(place for place in archive if os.path.exists(place)))
             digest.update(f"{path} {stat.st_size} {stat.st_mtime_ns}\n".encode())
     facts = (
         sys.version,

@@ -114,8 +114,15 @@ def test_a_module_of_the_user_keeps_programs_from_being_stored(
     for place in (tmp_path / "my_parts.py", PACKAGE.with_name("jaxsafe_mine.py")):
         own.__file__ = str(place)
         assert not only_installed_code()
-    monkeypatch.setattr(sys, "modules", {"__main__": ModuleType("__main__")})
-    assert not only_installed_code()
+    for place in ("_ops.py", os.path.join(jax.__file__, "inside_an_archive.py")):
+        own.__file__ = place
+        assert only_installed_code()
+        program_store._surroundings.__wrapped__()
+    for place in (None, "<stdin>"):
+        main = ModuleType("__main__")
+        main.__file__ = place
+        monkeypatch.setattr(sys, "modules", {"__main__": main})
+        assert not only_installed_code()
 
 
 def test_a_file_that_is_not_whole_is_no_program(tmp_path: Path) -> None:
