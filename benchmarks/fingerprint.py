@@ -8,11 +8,16 @@ from __future__ import annotations
 import ast
 import functools
 import hashlib
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 BENCHMARKS = ROOT / "benchmarks"
+
+NAMED = re.compile(r"jaxsafe(\.\w+)+")
+"""The name of a module of jaxsafe."""
+
 LEFT_OUT = (ROOT / "jaxsafe" / "__init__.py", BENCHMARKS / "tables.py")
 
 
@@ -35,9 +40,9 @@ def fingerprint(script: Path) -> str:
 def sources(script: Path) -> list[Path]:
     """Return the paths of a script and of the modules of this repository that it needs, in order.
 
-    These are the modules that it names anywhere, and those that a module imports when it is
-    imported. Of the face of jaxsafe only the functions that the script calls count. Tables are made
-    after the measurement.
+    These are the modules that it names, those of the commands that it runs, and all that these
+    import, when they are imported or when they are called. Of the face of jaxsafe only the
+    functions that the script calls count. Tables are made after the measurement.
     """
     script = script.resolve()
     found = {script}
@@ -55,34 +60,43 @@ def _needed(path: Path) -> set[str]:
     """Return the dotted names that a module needs. Some may be no modules."""
     tree = _tree(path)
     if path.parent != BENCHMARKS:
-        return set(_imported(_at_import(tree)))
-    names = set(_imported(ast.walk(tree)))
-    face = {
-        name.rpartition(".")[2]: name
-        for name in _imported(ast.walk(_tree(ROOT / "jaxsafe" / "__init__.py")))
-    }
+        return set(_imported(_that_runs(tree)))
+    nodes = list(ast.walk(tree))
     called = {
         node.attr
-        for node in ast.walk(tree)
+        for node in nodes
         if isinstance(node, ast.Attribute)
         and isinstance(node.value, ast.Name)
         and node.value.id == "jaxsafe"
     }
-    return names | {face[name] for name in called & face.keys()}
+    # A package that can be called has the name of the function that it calls, so both count.
+    face = _imported(ast.walk(_tree(ROOT / "jaxsafe" / "__init__.py")))
+    functions = {name for name in face if name.rpartition(".")[2] in called}
+    return {*_imported(nodes), *functions, *_run(nodes)}
 
 
-def _at_import(tree: ast.AST) -> Iterator[ast.AST]:
-    """Yield the nodes that run when a module is imported: those outside functions."""
+def _run(nodes: Iterable[ast.AST]) -> Iterator[str]:
+    """Yield the names of modules of jaxsafe that these nodes run by name, mostly as commands.
+
+    They are the texts `"jaxsafe.train"`, and the first arguments of `isolated.command`.
+    """
+    for node in nodes:
+        if isinstance(node, ast.Constant) and NAMED.fullmatch(str(node.value)):
+            yield from (str(node.value), f"{node.value}.__main__")
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) == "command":
+            yield f"jaxsafe.{ast.literal_eval(node.args[0])}.__main__"
+
+
+def _that_runs(tree: ast.AST) -> Iterator[ast.AST]:
+    """Yield all nodes but those that only a type checker reads."""
     for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
-            continue
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             continue
         yield node
-        yield from _at_import(node)
+        yield from _that_runs(node)
 
 
-def _imported(nodes: Iterator[ast.AST]) -> Iterator[str]:
+def _imported(nodes: Iterable[ast.AST]) -> Iterator[str]:
     """Yield the dotted names that these nodes import."""
     for node in nodes:
         if isinstance(node, ast.Import):

@@ -54,20 +54,27 @@ def test_texts_do_not_count_and_code_that_is_needed_does(
     fingerprint: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     files = {
-        "benchmarks/script.py": '"""Text."""\nimport jaxsafe\n\njaxsafe.make(1)\n',
-        "jaxsafe/__init__.py": "from jaxsafe.a import make\nfrom jaxsafe.b import fly\n",
+        "benchmarks/script.py": '"""Text."""\nimport jaxsafe\n\njaxsafe.make(1)\njaxsafe.f()\n'
+        'command("e", "x=1")\nrun(["-m", "jaxsafe.g"])\n',
+        "jaxsafe/__init__.py": "from jaxsafe.a import make\nfrom jaxsafe.b import fly\n"
+        "if TYPE_CHECKING:\n    from jaxsafe.f.f import f\nelse:\n    from jaxsafe import f\n",
         "jaxsafe/a.py": "import jaxsafe.c\n\ndef make(x):\n    import jaxsafe.later\n",
         "jaxsafe/b.py": "fly = 1\n",
         "jaxsafe/c.py": "if TYPE_CHECKING:\n    import jaxsafe.d\n",
         "jaxsafe/d.py": "hint = 1\n",
         "jaxsafe/later.py": "late = 1\n",
+        "jaxsafe/e/__main__.py": "from jaxsafe.command import run\n",
+        "jaxsafe/command.py": "run = 1\n",
+        "jaxsafe/f/__init__.py": "make_callable('jaxsafe.f.f')\n",
+        "jaxsafe/f/f.py": "f = 1\n",
+        "jaxsafe/g/__main__.py": "g = 1\n",
         "configs/recipe.yaml": "steps: 1\n",
     }
 
     def changed(name: str = "", text: str = "") -> str:
         for path, content in (files | ({name: text} if name else {})).items():
             place = tmp_path / path
-            place.parent.mkdir(exist_ok=True)
+            place.parent.mkdir(exist_ok=True, parents=True)
             place.write_text(content)
         fingerprint._tree.cache_clear()
         return fingerprint.fingerprint(tmp_path / "benchmarks" / "script.py")
@@ -77,10 +84,9 @@ def test_texts_do_not_count_and_code_that_is_needed_does(
     monkeypatch.setattr(fingerprint, "LEFT_OUT", (tmp_path / "jaxsafe" / "__init__.py",))
     before = changed()
     same = {
-        "benchmarks/script.py": '"""Another text."""\nimport jaxsafe\njaxsafe.make(1)  # one\n',
+        "benchmarks/script.py": files["benchmarks/script.py"].replace("Text", "Another # text"),
         "jaxsafe/b.py": "fly = 2\n",
         "jaxsafe/d.py": "hint = 2\n",
-        "jaxsafe/later.py": "late = 2\n",
     }
     for name, text in same.items():
         assert changed(name, text) == before, name
@@ -88,6 +94,10 @@ def test_texts_do_not_count_and_code_that_is_needed_does(
         "benchmarks/script.py": "import jaxsafe\n\njaxsafe.make(2)\n",
         "jaxsafe/a.py": "import jaxsafe.c\n\ndef make(x):\n    return 1\n",
         "jaxsafe/c.py": "number = 1\n",
+        "jaxsafe/later.py": "late = 2\n",
+        "jaxsafe/command.py": "run = 2\n",
+        "jaxsafe/f/f.py": "f = 2\n",
+        "jaxsafe/g/__main__.py": "g = 2\n",
         "configs/recipe.yaml": "steps: 2\n",
     }
     for name, text in other.items():
@@ -106,6 +116,25 @@ def test_a_script_depends_on_the_environment_and_not_on_figures(fingerprint: Mod
         "benchmarks/isolated.py",
     } <= paths
     assert not [path for path in paths if path.startswith(("jaxsafe/plot", "jaxsafe/verify"))]
+
+
+@pytest.mark.parametrize(
+    ("script", "module"),
+    [
+        ("controllers", "evaluate/evaluate"),
+        ("verification", "verify/verify"),
+        ("far_starts", "train/ppo"),
+        ("constraints", "commands/evaluate"),
+        ("five_tasks", "devices/program_store"),
+        ("startup", "commands/train"),
+        ("datasets", "dataset/collect"),
+    ],
+)
+def test_a_script_depends_on_what_it_calls_and_on_the_commands_that_it_runs(
+    script: str, module: str, fingerprint: ModuleType
+) -> None:
+    needed = fingerprint.sources(BENCHMARKS / f"{script}.py")
+    assert BENCHMARKS.parent / "jaxsafe" / f"{module}.py" in needed
 
 
 def test_every_script_that_writes_results_is_run(monkeypatch: pytest.MonkeyPatch) -> None:
