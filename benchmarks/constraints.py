@@ -7,7 +7,7 @@ sampled actions and with the most probable ones. An episode costs its violating 
 Results are written to `benchmarks/results/constraints.json`, and the table of docs/constrained.md
 is printed:
 
-    python benchmarks/constraints.py [seeds=10] [steps=300000] [episodes=200] [out=DIRECTORY]
+    python benchmarks/constraints.py [seeds=10] [steps=500000] [episodes=200] [out=DIRECTORY]
 
 With `out` the runs are kept, and what is there already is not trained or tested again.
 """
@@ -94,7 +94,7 @@ def measure(
 
 def main() -> None:
     """Run the command."""
-    options = words(seeds="10", steps="300000", episodes="200", out="")
+    options = words(seeds="10", steps="500000", episodes="200", out="")
     counts = {name: int(options[name]) for name in ("seeds", "steps", "episodes")}
     with tempfile.TemporaryDirectory() as temporary:
         place = Path(options["out"] or temporary).resolve()
