@@ -11,11 +11,17 @@ from contextlib import contextmanager
 
 @contextmanager
 def without_collection() -> Iterator[None]:
-    """Suspend garbage collection, unless it is already."""
+    """Suspend garbage collection, unless it is already.
+
+    All objects then count as old. Otherwise the collector would look through all new ones at once.
+    """
     was_enabled = gc.isenabled()
     gc.disable()
     try:
         yield
     finally:
         if was_enabled:
+            if not gc.get_freeze_count():  # nobody keeps objects out of the collector's sight
+                gc.freeze()
+                gc.unfreeze()
             gc.enable()
