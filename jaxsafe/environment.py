@@ -314,7 +314,7 @@ def filter_name(env: Environment) -> str:
 
 def length_unit(env: Environment) -> str | None:
     """Return the unit of positions, m or ft, or None if the agent's platform names none."""
-    return units(type(env.agent_platform.rest())).get("position")
+    return units(type(env.agent_platform.shapes())).get("position")
 
 
 def control_unit(name: str, length: str | None) -> str | None:

@@ -27,6 +27,7 @@ from jaxsafe.schema.ties import follow
 from jaxsafe.schema.user_modules import modules
 from jaxsafe.simulation.platform import Platform
 from jaxsafe.transition import judge, regions_so_far
+from jaxsafe.types import is_key
 
 MAX_PARTS = 1000
 """Largest number of parts of a section.
@@ -114,10 +115,12 @@ def _check_problems(env: Environment) -> None:
     for part, place in _parts_and_filter(env):
         if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(part)):
             continue
-        for component, component_place in _with_inner(part, place):
+        # JAX would compile each comparison of its own arrays.
+        on_host = jax.tree.map(lambda x: x if is_key(x) else np.asarray(x), part)
+        for component, component_place in _with_inner(on_host, place):
             try:
                 # Inside a trace, comparisons of constants would be traced too.
-                with jax.ensure_compile_time_eval():
+                with jax.ensure_compile_time_eval(), np.errstate(all="ignore"):
                     problem = component.problem()
             except ConfigError:
                 raise
@@ -225,7 +228,7 @@ def _check_platform(platform: Platform, is_agent: bool) -> None:
         )
     first = [initializer for initializer in platform.start if not initializer.redraws]
     _check_names(f"{place}.start", [name for initializer in first for name in initializer.draws])
-    rest = vars(platform.rest())
+    rest = vars(platform.shapes())
     drawn: set[str] = set()
     for initializer in platform.start:
         start_place = f"{place}.start.{initializer.name}"

@@ -103,7 +103,7 @@ def check_ties(env: Environment) -> None:
                     f"of a platform, such as deputy.mass, found {end}"
                 )
             try:
-                set_path(env, end, jnp.zeros(()), one_number)
+                set_path(env, end, np.zeros(()), one_number)
             except ConfigError as error:
                 raise ConfigError(f"tied: {error}") from None
             if _number(env, end) is None:

@@ -81,7 +81,7 @@ def start_map(
     """
     x, y = seen_from_the_other(env, starts).T
     others = [platform.name for platform in env.platforms if platform.name != env.agent]
-    moves = bool(others) and "heading" in vars(env.platform(others[0]).rest())
+    moves = bool(others) and "heading" in vars(env.platform(others[0]).shapes())
     labels = frame_labels(others[0] if moves else None, length_unit(env))
     figure = Figure(figsize=(PANEL_WIDTH * len(values), 3.4), layout="constrained")
     axes = figure.subplots(1, len(values), squeeze=False)[0]

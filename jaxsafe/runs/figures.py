@@ -207,7 +207,7 @@ def _row_form(env: Environment, names: Sequence[str], rows: Rows) -> dict[str, A
     sizes = {platform.name: platform.dimension for platform in env.platforms}
     position = {"position": numbers(max(sizes.values()))}
     headed = any(
-        "heading" in vars(platform.rest())
+        "heading" in vars(platform.shapes())
         for platform in env.platforms
         if platform.name == names[0]
     )

@@ -254,7 +254,12 @@ def _normalised_item(item: Any) -> Any:
 
 
 def _as_array(value: Any) -> Any:
-    return None if value is None else jnp.asarray(value, jnp.result_type(float))
+    if value is None:
+        return None
+    dtype = jnp.result_type(float)
+    if not any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value)):
+        value = np.asarray(value, dtype)  # JAX would compile the conversion of a Python number
+    return jnp.asarray(value, dtype)
 
 
 def _refuse_taken(type_name: str, cls: type[Component]) -> None:

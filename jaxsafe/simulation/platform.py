@@ -45,9 +45,13 @@ class Platform(Component):
         """Return the state record before any initializer has run: at the origin, at rest."""
         raise NotImplementedError
 
+    def shapes(self) -> Any:
+        """Return the state record with shapes and types for arrays, so nothing is computed."""
+        return jax.eval_shape(lambda: self.rest())
+
     def quantities(self) -> tuple[str, ...]:
         """Return the names of what can be observed: fields of the state and its properties."""
-        state = self.rest()
+        state = self.shapes()
         derived = [
             name
             for base in reversed(type(state).__mro__)
@@ -101,7 +105,7 @@ class Platform(Component):
     def can_be_pushed(self) -> bool:
         """Whether `pushed` is defined: the velocity is a field of the state or can be set."""
         sets_velocity = type(self).with_velocity is not Platform.with_velocity
-        return sets_velocity or "velocity" in vars(self.rest())
+        return sets_velocity or "velocity" in vars(self.shapes())
 
     def pushed(
         self,

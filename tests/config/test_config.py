@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from default_cases import one_of_each_kind
+from own_process import check_as_compiled_by_commands
 
 import jaxsafe
 from jaxsafe import ConfigError, Environment
@@ -1788,3 +1789,21 @@ def test_a_section_of_thousands_of_parts_is_refused_at_once(tree: dict[str, Any]
     ]
     message = fault(lambda: compose(tree))
     assert message == "status: expected at most 1,000 parts, found 1,007"
+
+
+def nothing_is_compiled_to_make_a_task() -> None:
+    compiled = []
+
+    def note(event: str, *_: Any, **details: Any) -> None:
+        if "backend_compile" in event:
+            compiled.append(details)
+
+    jax.monitoring.register_event_duration_secs_listener(note)
+    for task in TASKS:
+        jaxsafe.make(task)
+    assert not compiled, compiled
+
+
+def test_nothing_is_compiled_to_make_a_task() -> None:
+    """Each small program takes some 15 ms, and a check of every number would be one."""
+    check_as_compiled_by_commands(nothing_is_compiled_to_make_a_task)
