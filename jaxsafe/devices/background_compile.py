@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import jax
 
-from jaxsafe.devices.program_store import compile_anew, load, program_file, save
+from jaxsafe.devices import memory
+from jaxsafe.devices.program_store import (
+    StoredProgram,
+    compile_anew,
+    program_file,
+    read,
+    save,
+)
 
 NUM_THREADS = 4
 """How many programs are compiled at a time. A training has as many.
@@ -24,6 +30,9 @@ class CompiledInBackground:
     It is traced at once and compiled before it is first called, unless its program is in a file.
     """
 
+    result_shapes: Any
+    """Shapes and types of what it returns."""
+
     def __init__(
         self,
         function: Any,
@@ -37,40 +46,44 @@ class CompiledInBackground:
             function: the jitted function.
             *arguments: arguments like those of the calls, or their shapes, types and shardings.
             made_from: a text for `program_file`. None stands for a program that is not stored.
-            after: a function that is needed sooner. Its compilation has the cores first.
+            after: a function that is needed sooner. It is compiled or loaded first.
         """
         file = None if made_from is None else program_file(made_from, arguments)
+        stored = None if file is None else read(file)
 
-        def load_or_compile(file: Path) -> jax.stages.Compiled:
-            return load(file) or compile_in_turn(function.lower(*arguments))
+        def load_or_compile(stored: StoredProgram) -> jax.stages.Compiled:
+            if after is not None:
+                after.compiled()
+            return stored.load() or compile_in_turn(function.lower(*arguments))
 
         def compile_in_turn(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
             if after is not None:
                 after.compiled()
             compiled, is_new = compile_anew(lowered)
             if file is not None and is_new:
-                _threads().submit(save, file, lowered, compiled)
+                _threads().submit(save, file, lowered, compiled, self.result_shapes)
             return compiled
 
-        self._lowered = None
-        if file is not None and file.exists():
-            self._compiled = _threads().submit(load_or_compile, file)
+        self._stored = stored
+        if stored is not None:
+            self.result_shapes = stored.result_shapes
+            self._compiled = _threads().submit(load_or_compile, stored)
         else:
-            self._lowered = function.lower(*arguments)
-            self._compiled = _threads().submit(compile_in_turn, self._lowered)
+            lowered = function.lower(*arguments)
+            self.result_shapes = jax.eval_shape(function, *arguments)
+            self._compiled = _threads().submit(compile_in_turn, lowered)
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the function once it is compiled."""
         return self.compiled()(*arguments)
 
-    def result_shapes(self) -> Any:
-        """Return shapes and types of what the function returns."""
-        info = (self._lowered or self.compiled()).out_info
-        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), info)
-
     def compiled(self) -> jax.stages.Compiled:
         """Wait for the program and return it."""
         return self._compiled.result()
+
+    def footprint(self) -> int:
+        """Return the bytes that the program needs on each device, as `memory.footprint` does."""
+        return memory.footprint(self.compiled()) if self._stored is None else self._stored.footprint
 
 
 @cache

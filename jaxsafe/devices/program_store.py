@@ -21,13 +21,14 @@ import sysconfig
 import threading
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.experimental import serialize_executable
 from jax.sharding import Mesh
 
+from jaxsafe.devices.memory import footprint
 from jaxsafe.storage.files import write_bytes
 
 MAX_PROGRAMS = 64
@@ -74,24 +75,45 @@ def program_file(made_from: str, arguments: Any) -> Path | None:
     return place / name
 
 
-def load(path: Path) -> jax.stages.Compiled | None:
-    """Return the program of a file, or None if there is none that is whole."""
+class StoredProgram(NamedTuple):
+    """What a file holds. It is read at once, and making a program of it takes much longer."""
+
+    devices: list[int]
+    """Numbers of the devices on which the program runs, in its own order."""
+    with_lapack: bool
+    """Whether the program calls LAPACK."""
+    result_shapes: Any
+    """Shapes and types of what the program returns."""
+    footprint: int
+    """Bytes that the program needs on each device. JAX takes long to tell."""
+    parts: tuple[bytes, Any, Any]
+    """What JAX makes of the program, and the structures of its arguments and results."""
+
+    def load(self) -> jax.stages.Compiled | None:
+        """Return the program, or None if it cannot be used here."""
+        try:
+            if self.with_lapack:
+                _register_lapack()
+            devices = {device.id: device for device in jax.devices()}
+            return serialize_executable.deserialize_and_load(
+                *self.parts, execution_devices=[devices[number] for number in self.devices]
+            )
+        except Exception:  # whatever is wrong with it, the program can be compiled
+            return None
+
+
+def read(path: Path) -> StoredProgram | None:
+    """Return what a file holds, or None if there is none that is whole."""
     try:
         content = path.read_bytes()
         digest, content = content[:32], content[32:]
         if hashlib.sha256(content).digest() != digest:
             return None
-        numbers, with_lapack, parts = pickle.loads(content)
-        if with_lapack:
-            _register_lapack()
-        devices = {device.id: device for device in jax.devices()}
-        program = serialize_executable.deserialize_and_load(
-            *parts, execution_devices=[devices[number] for number in numbers]
-        )
+        stored = StoredProgram(*pickle.loads(content))
         os.utime(path)
     except Exception:  # whatever is wrong with it, the program can be compiled
         return None
-    return program
+    return stored
 
 
 def compile_anew(lowered: jax.stages.Lowered) -> tuple[jax.stages.Compiled, bool]:
@@ -106,17 +128,31 @@ def compile_anew(lowered: jax.stages.Lowered) -> tuple[jax.stages.Compiled, bool
     return compiled, REQUEST in _events.seen and HIT not in _events.seen
 
 
-def save(path: Path, lowered: jax.stages.Lowered, compiled: jax.stages.Compiled) -> None:
+def save(
+    path: Path, lowered: jax.stages.Lowered, compiled: jax.stages.Compiled, result_shapes: Any
+) -> None:
     """Store a program, if it can be, and remove programs that were not used for long.
 
     A program that calls other libraries than LAPACK is not stored. JAX registers their functions
     when it lowers a program, and a program that calls an unknown function crashes.
+
+    Args:
+        path: the path that `program_file` has returned.
+        lowered: the program before it was compiled.
+        compiled: the program.
+        result_shapes: shapes and types of what it returns.
     """
     called = re.findall(r"custom_call @(\w+)", lowered.as_text())
     if not all(name.startswith(LAPACK) for name in called):
         return
-    parts = serialize_executable.serialize(compiled)
-    content = pickle.dumps((_devices(compiled), bool(called), parts))
+    stored = StoredProgram(
+        devices=_devices(compiled),
+        with_lapack=bool(called),
+        result_shapes=result_shapes,
+        footprint=footprint(compiled),
+        parts=serialize_executable.serialize(compiled),
+    )
+    content = pickle.dumps(tuple(stored))
     with contextlib.suppress(OSError):  # without its file the program is compiled again
         write_bytes(path, hashlib.sha256(content).digest() + content)
         newest = sorted(path.parent.iterdir(), key=lambda file: file.stat().st_mtime, reverse=True)

@@ -180,6 +180,8 @@ class SeedMapper:
 
     def pad(self, values: Any) -> Any:
         """Repeat the last seed's entry up to `padded` entries."""
+        if len(values) == self.padded:
+            return values
         return values[np.minimum(np.arange(self.padded), len(values) - 1)]
 
     def replicate(self, tree: Any) -> Any:

@@ -125,9 +125,10 @@ class Evaluator:
         params_of_seed = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), params)
         begin, go_on = self._recorder(MIN_RECORDED_EPISODES)
         cases = self._cases(0, MIN_RECORDED_EPISODES)
-        position, _ = jax.eval_shape(begin, params_of_seed, key, cases)
+        begin = compile_soon("starts", begin, params_of_seed, key, cases)
+        position, _ = begin.result_shapes
         self._recorders[MIN_RECORDED_EPISODES] = Recorder(
-            begin=compile_soon("starts", begin, params_of_seed, key, cases),
+            begin=begin,
             go_on=compile_soon("steps", go_on, params_of_seed, key, deterministic, position),
         )
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from unittest.mock import Mock
 
 import jax
 import jax.numpy as jnp
@@ -22,9 +23,9 @@ from jaxsafe.devices import program_store
 from jaxsafe.devices.background_compile import CompiledInBackground
 from jaxsafe.devices.program_store import (
     compile_anew,
-    load,
     only_installed_code,
     program_file,
+    read,
     save,
 )
 
@@ -48,7 +49,7 @@ def stored(path: Path, function: Callable[[jax.Array], Any] = lambda x: x) -> Pa
     lowered = jax.jit(lambda x: function(new * x)).lower(jnp.arange(3.0))
     compiled, is_new = compile_anew(lowered)
     assert is_new
-    save(path, lowered, compiled)
+    save(path, lowered, compiled, lowered.out_info)
     return path
 
 
@@ -72,7 +73,23 @@ def test_a_program_that_was_stored_is_not_traced(installed: Path) -> None:
     again = CompiledInBackground(traced, x, made_from="2 x")
     np.testing.assert_array_equal(again(x), expected)
     assert len(traces) == 1
+    assert again.result_shapes == first.result_shapes
+    assert again.footprint() == first.footprint() > 0
     assert [*installed.iterdir()] == [file]
+
+
+def test_a_stored_program_that_cannot_be_used_is_compiled_again(
+    installed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    x = jnp.arange(3.0)
+    file = program_file("3 x", (x,))
+    assert file is not None
+    stored(file)
+    fault = Mock(side_effect=RuntimeError("another processor"))
+    monkeypatch.setattr(program_store.serialize_executable, "deserialize_and_load", fault)
+    again = CompiledInBackground(jax.jit(lambda x: 3.0 * x), x, made_from="3 x")
+    np.testing.assert_array_equal(again(x), 3.0 * x)
+    fault.assert_called_once()
 
 
 def test_other_words_shapes_and_surroundings_are_other_programs(
@@ -127,12 +144,12 @@ def test_a_module_of_the_user_keeps_programs_from_being_stored(
 
 def test_a_file_that_is_not_whole_is_no_program(tmp_path: Path) -> None:
     file = stored(tmp_path / "program")
-    assert load(file) is not None
+    assert read(file) is not None
     content = file.read_bytes()
     for spoilt in (content[:-1], content[:20], b"", content[:-1] + bytes([content[-1] ^ 1])):
         file.write_bytes(spoilt)
-        assert load(file) is None
-    assert load(tmp_path / "missing") is None
+        assert read(file) is None
+    assert read(tmp_path / "missing") is None
 
 
 def test_a_program_in_the_cache_of_jax_is_not_stored() -> None:
@@ -164,7 +181,7 @@ def test_a_process_that_has_traced_nothing_runs_a_program_with_lapack(tmp_path: 
     file = stored(tmp_path / "program", lambda x: jnp.linalg.qr(x[:, None]))
     code = (
         "import numpy as np; from pathlib import Path; from jaxsafe.devices import program_store; "
-        f"program = program_store.load(Path({str(file)!r})); "
+        f"program = program_store.read(Path({str(file)!r})).load(); "
         "q, r = program(np.arange(3, dtype=np.float32)); "
         "assert r.shape == (1, 1); np.testing.assert_allclose(q.T @ q, 1.0, rtol=1e-6)"
     )
@@ -179,7 +196,7 @@ def test_the_programs_used_longest_ago_go_first(
         file = stored(tmp_path / name)
         used = file.stat().st_mtime - age
         os.utime(file, (used, used))
-    load(tmp_path / "first")
+    read(tmp_path / "first")
     stored(tmp_path / "third")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["first", "third"]
 

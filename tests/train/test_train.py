@@ -713,6 +713,14 @@ def without_newer(tree: Any) -> Any:
     return type("Older", (Record,), {"__annotations__": dict.fromkeys(kept, Any)})(**kept)
 
 
+def test_a_new_run_has_no_directory_of_checkpoints_before_the_first(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path, create=True)
+    assert checkpoints.steps == []
+    assert not checkpoints.directory.exists()
+    checkpoints.save(1, {"x": np.zeros(2)}, {})
+    assert checkpoints.steps == [1]
+
+
 def test_a_checkpoint_from_before_the_newer_arrays_were_kept_is_read(
     tmp_path: Path, whole: Path
 ) -> None:

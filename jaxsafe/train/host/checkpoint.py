@@ -64,22 +64,28 @@ class Checkpoints:
             run: the run directory.
             create: whether to make the directory if it is missing, and to write to it.
         """
-        import orbax.checkpoint as ocp
-
-        self._ocp = ocp
         self.directory = (run / "checkpoints").absolute()
-        options = ocp.CheckpointManagerOptions(
-            create=create, enable_async_checkpointing=False, read_only=not create
-        )
+        self._create = create
         if create:
             self._recover()
-        if create or self.directory.is_dir():
-            self._manager = ocp.CheckpointManager(self.directory, options=options)
+
+    @functools.cached_property
+    def _ocp(self) -> Any:
+        import orbax.checkpoint  # this takes a while, and a new run needs it late
+
+        return orbax.checkpoint
+
+    @functools.cached_property
+    def _manager(self) -> Any:
+        options = self._ocp.CheckpointManagerOptions(
+            create=self._create, enable_async_checkpointing=False, read_only=not self._create
+        )
+        return self._ocp.CheckpointManager(self.directory, options=options)
 
     @property
     def steps(self) -> list[int]:
         """The steps at which there are checkpoints, in order."""
-        return sorted(self._manager.all_steps()) if hasattr(self, "_manager") else []
+        return sorted(self._manager.all_steps()) if self.directory.is_dir() else []
 
     def save(self, step: int, state: Any, facts: dict[str, Any]) -> None:
         """Write one checkpoint, or write it again.

@@ -223,7 +223,7 @@ class Training:
         else:
             text = f"start of {described}"
             fresh = CompiledInBackground(fresh, self.shared, keys, made_from=text)
-            shapes = fresh.result_shapes()
+            shapes = fresh.result_shapes
         like = self.mapper.like(shapes, STATE)
         # The best parameters of each seed are in memory too.
         state_bytes = memory.size((like, like.average)) // self.mapper.mesh.size
@@ -310,12 +310,12 @@ class Training:
             ConfigError: it does not fit.
         """
         begin = time.monotonic()
-        compiled = self.advance.compiled()
+        self.advance.compiled()
         self.compile_s += time.monotonic() - begin
         # The state is in memory already.
         state_bytes = memory.size(self.state) // self.mapper.mesh.size
         memory.require(
-            memory.footprint(compiled) - state_bytes,
+            self.advance.footprint() - state_bytes,
             self.mapper.num_local_devices,
             memory.RUN_BYTES,
         )
