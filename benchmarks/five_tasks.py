@@ -12,7 +12,6 @@ are written to `benchmarks/results/five_tasks.json`, and a table of medians is p
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 import tempfile
@@ -22,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from baselines.measures import failed_seeds, wall_to
-from isolated import CACHE, words
+from isolated import variables, words
 
 from jaxsafe.envs import TASKS
 from jaxsafe.storage.files import read_json, read_rows
@@ -99,9 +98,7 @@ def watched(
 
     Their growth is a list of times in s, each with the bytes of every log.
     """
-    environment = {key: value for key, value in os.environ.items() if key not in CACHE} | {
-        "XDG_CACHE_HOME": str(cache)
-    }
+    environment = variables() | {"XDG_CACHE_HOME": str(cache)}
     logs = [run / "progress.jsonl" for run in runs]
     began = time.monotonic()
     sizes = []

@@ -119,11 +119,14 @@ def versions(names: Iterable[str]) -> dict[str, dict[str, str]]:
 def variables(cache: Path | None = None) -> dict[str, str]:
     """Return the environment variables of a process.
 
+    Python keeps its bytecode, as it does for packages that pip has installed.
+
     Args:
         cache: a directory that keeps every program that JAX compiles, however small. Without it
             nothing is kept.
     """
-    given = {key: value for key, value in os.environ.items() if key not in CACHE}
+    without = (*CACHE, "PYTHONDONTWRITEBYTECODE")
+    given = {key: value for key, value in os.environ.items() if key not in without}
     kept = dict(zip(CACHE, (str(cache), "0", "-1"), strict=True)) if cache else {}
     return {**given, **kept}
 
