@@ -39,6 +39,7 @@ class Options(CommandOptions):
             "preset",
             "like",
             "steps",
+            "stop_at_success",
             "seeds",
             "seed",
             "algorithm",

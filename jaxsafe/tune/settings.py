@@ -129,6 +129,10 @@ def settings(
     for point in points:
         changes = dict(zip(sweep, point, strict=True))
         config, env, _ = resolve({**arguments.options, **changes})
+        if config.stop_at_success is not None:
+            raise ConfigError(
+                "stop_at_success: all trainings of a sweep have the same steps; leave it out"
+            )
         result.append(Setting(changes, config, env))
     return result
 

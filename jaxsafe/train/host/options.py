@@ -120,6 +120,11 @@ class TrainConfig(Component):
     """
     steps: Steps = 500_000
     """Number of environment steps of each seed."""
+    stop_at_success: Annotated[float, Range(0.0, 1.0, open_low=True)] | None = None
+    """The success rate of every seed at which training ends before `steps`.
+
+    It is that of the last 100 training episodes. By default training goes on to `steps`.
+    """
     actions: Literal["continuous", "discrete", "mixed"] | None = None
     """The kind of actions. By default it is what the environment says."""
     variant: Literal["paper", "released"] | None = None

@@ -62,6 +62,7 @@ They are 0 then, or empty, because no part of an older environment or algorithm 
 
 MAY_CHANGE = (
     "steps",
+    "stop_at_success",
     "devices_per_seed",
     "out",
     "eval_every",

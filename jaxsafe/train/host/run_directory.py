@@ -182,7 +182,8 @@ def from_described(content: Mapping[str, Any], place: str) -> tuple[TrainConfig,
 def extend(runs: Sequence[Path], steps: Any) -> None:
     """Let runs train for more steps, even if they have ended. Schedules run over the new number.
 
-    The results of a run that has ended are kept as `results_STEPS.json`.
+    The results of a run that has ended are kept as `results_STEPS.json`. It trains for all of its
+    steps then, also if it has ended early by `stop_at_success`.
 
     Args:
         runs: the run directories.
@@ -199,8 +200,10 @@ def extend(runs: Sequence[Path], steps: Any) -> None:
     for run, config in configs.items():
         if (run / "results.json").exists():
             (run / "results.json").rename(run / f"results_{config.steps}.json")
+            longer[run] = longer[run].replace(stop_at_success=None)
         content = read_content(run)
         content["training"]["steps"] = longer[run].steps
+        content["training"]["stop_at_success"] = longer[run].stop_at_success
         write_text(run / "config.yaml", yaml12.write(content))
 
 

@@ -37,6 +37,7 @@ from jaxsafe.train.host.log import Display, ProgressLog, progress_rows, read_pro
 from jaxsafe.train.host.options import TrainConfig, flatten
 from jaxsafe.train.host.restore import made_from, restore, start_params
 from jaxsafe.train.host.sinks import Sink, open_sinks
+from jaxsafe.train.recent_episodes import SIZE as WINDOW
 from jaxsafe.train.train import STATE, programs
 
 
@@ -162,7 +163,7 @@ class Training:
         with self.clock, _StopRequest() as stop:
             # All processes agree on this, because a signal may reach only one of them.
             stopping = False
-            while self.updates < self.config.num_updates and not stopping:
+            while not self.has_ended and not stopping:
                 before = self.updates
                 self.state, curves = self.advance(self.shared, self.state)
                 self.updates = min(before + self.chunk, self.config.num_updates)
@@ -170,9 +171,12 @@ class Training:
                 if untrained is not None:
                     self._record(untrained, 0, num_episodes=1)
                     untrained = None
-                if self.updates < self.config.num_updates and self._due(
-                    before, self.config.eval_every
-                ):
+                if self._succeeds_enough():
+                    display.tell(
+                        f"every seed succeeds in {self.config.stop_at_success:.0%} of its last "
+                        f"{WINDOW} episodes: training ends at step {self.step:,}"
+                    )
+                if not self.has_ended and self._due(before, self.config.eval_every):
                     self._evaluate()
                 elif self._early_due():
                     self._record(self.state.average, self.step, num_episodes=1)
@@ -320,6 +324,28 @@ class Training:
             memory.RUN_BYTES,
         )
 
+    @property
+    def has_ended(self) -> bool:
+        """Whether all updates are done, or the seeds succeed often enough to end before."""
+        return self.updates == self.config.num_updates or self._succeeds_enough()
+
+    def _succeeds_enough(self) -> bool:
+        """Return whether every seed succeeds as often as `stop_at_success` asks.
+
+        The last episodes of a seed must be as many as the progress log averages over. With a
+        curriculum they count once it has come to its end.
+        """
+        level, ppo = self.config.stop_at_success, self.config.ppo
+        easier = ppo.curriculum and (
+            self.updates < float(ppo.curriculum_share) * self.config.num_updates
+        )
+        if level is None or easier:
+            return False
+        latest = [row for row in self.log.rows[-self.config.seeds :] if not row.get("diverged")]
+        return bool(latest) and all(
+            row["episodes"] >= WINDOW and row["success_rate"] >= level for row in latest
+        )
+
     def _due(self, before: int, every: int | None) -> bool:
         """Return whether a chunk passed a multiple of an interval, or the end.
 
@@ -328,9 +354,7 @@ class Training:
             every: the interval in environment steps, as `TrainConfig.every` takes it.
         """
         interval = self.config.every(every)
-        return (
-            self.updates // interval > before // interval or self.updates == self.config.num_updates
-        )
+        return self.updates // interval > before // interval or self.has_ended
 
     def _early_due(self) -> bool:
         """Return whether to log an episode that shows early learning.
@@ -339,14 +363,16 @@ class Training:
         """
         chunks = self.updates // self.chunk
         first = self.config.every(self.config.eval_every)
-        return self.updates < first < self.config.num_updates and chunks & (chunks - 1) == 0
+        early = self.updates < first < self.config.num_updates and not self.has_ended
+        return early and chunks & (chunks - 1) == 0
 
     def _is_kept(self, row: dict[str, Any]) -> bool:
         """Return whether to keep a row of the logs of evaluations.
 
         A row is kept if the training, which goes on from here, will not write it again.
         """
-        return self.updates > 0 and row["step"] <= self.step and row["step"] < self.num_steps
+        written_again = row["step"] == self.step and self.has_ended
+        return self.updates > 0 and row["step"] <= self.step and not written_again
 
     def _write_progress(self, curves: dict[str, jax.Array], count: int, display: Display) -> None:
         host = {name: value[:, :count] for name, value in self.mapper.gather(curves).items()}
@@ -378,7 +404,7 @@ class Training:
         the only one.
         """
         params = self.state.average
-        if self.updates < self.config.num_updates and not self._has_evaluated():
+        if not self.has_ended and not self._has_evaluated():
             self._keep_best(self.best["params"], step=0)
         self._keep_best(params, self.step)
         self._record(self.state.average, self.step, self.config.eval_episodes)
