@@ -10,7 +10,6 @@ import jax
 
 from jaxsafe.devices import memory
 from jaxsafe.devices.program_store import (
-    StoredProgram,
     compile_anew,
     program_file,
     read,
@@ -50,28 +49,26 @@ class CompiledInBackground:
         """
         file = None if made_from is None else program_file(made_from, arguments)
         stored = None if file is None else read(file)
+        lowered = None if stored else function.lower(*arguments)
 
-        def load_or_compile(stored: StoredProgram) -> jax.stages.Compiled:
+        def load_or_compile() -> jax.stages.Compiled:
             if after is not None:
                 after.compiled()
-            return stored.load() or compile_in_turn(function.lower(*arguments))
+            return (stored and stored.load()) or compile_and_store(
+                lowered or function.lower(*arguments)
+            )
 
-        def compile_in_turn(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
-            if after is not None:
-                after.compiled()
+        def compile_and_store(lowered: jax.stages.Lowered) -> jax.stages.Compiled:
             compiled, is_new = compile_anew(lowered)
             if file is not None and is_new:
                 _threads().submit(save, file, lowered, compiled, self.result_shapes)
             return compiled
 
         self._stored = stored
-        if stored is not None:
-            self.result_shapes = stored.result_shapes
-            self._compiled = _threads().submit(load_or_compile, stored)
-        else:
-            lowered = function.lower(*arguments)
-            self.result_shapes = jax.eval_shape(function, *arguments)
-            self._compiled = _threads().submit(compile_in_turn, lowered)
+        self.result_shapes = (
+            stored.result_shapes if stored else jax.eval_shape(function, *arguments)
+        )
+        self._compiled = _threads().submit(load_or_compile)
 
     def __call__(self, *arguments: Any) -> Any:
         """Call the function once it is compiled."""

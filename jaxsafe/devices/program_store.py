@@ -109,7 +109,7 @@ def read(path: Path) -> StoredProgram | None:
         digest, content = content[:32], content[32:]
         if hashlib.sha256(content).digest() != digest:
             return None
-        stored = StoredProgram(*pickle.loads(content))
+        stored = pickle.loads(content)
         os.utime(path)
     except Exception:  # whatever is wrong with it, the program can be compiled
         return None
@@ -152,7 +152,7 @@ def save(
         footprint=footprint(compiled),
         parts=serialize_executable.serialize(compiled),
     )
-    content = pickle.dumps(tuple(stored))
+    content = pickle.dumps(stored)
     with contextlib.suppress(OSError):  # without its file the program is compiled again
         write_bytes(path, hashlib.sha256(content).digest() + content)
         newest = sorted(path.parent.iterdir(), key=lambda file: file.stat().st_mtime, reverse=True)

@@ -76,7 +76,7 @@ def test_a_run_that_was_killed_before_its_evaluation_trains_no_further(
     assert_same_end(run, ended)
 
 
-def test_more_steps_are_trained_to_their_end(ended: Path, tmp_path: Path) -> None:
+def test_more_steps_are_trained_to_their_end(tmp_path: Path) -> None:
     run = tmp_path / "run"
     assert command.main([*EASY, f"out={run}"]) == 0
     assert command.main([f"resume={run}", "steps=1920"]) == 0
