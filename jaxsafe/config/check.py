@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.stages import Compiled
 
 from jaxsafe.config.tied import check_ties, one_number
 from jaxsafe.environment import Environment, empty_sim, modelled, reset, step
@@ -322,8 +323,13 @@ def _shapes(env: Environment) -> tuple[Any, tuple]:
 
     Ties are part of it only if numbers are random.
     """
-    leaves, structure = jax.tree.flatten(env if env.randomize else env.replace(tied={}))
+    leaves, structure = jax.tree.flatten(_as_traced(env))
     return structure, tuple((jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
+
+
+def _as_traced(env: Environment) -> Environment:
+    """Return an environment without its ties, unless numbers are random."""
+    return env if env.randomize else env.replace(tied={})
 
 
 @lru_cache(maxsize=256)
@@ -417,21 +423,19 @@ def _check_suited(env: Environment) -> None:
     """
     if env.rta is None or any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(env)):
         return
-    # Inside a trace, constants would be traced too.
+    program = _fault_finder(*_shapes(env), jnp.result_type(float))
+    if program is None:
+        return
+    # Inside a trace, what the program returns would be traced too.
     with jax.ensure_compile_time_eval():
-        if not _can_report(*_shapes(env), jnp.result_type(float)):
-            return
-        faults = _faults_of_starts(env, jax.random.split(jax.random.key(0), 8))
-        for fault, present in faults.items():
-            if present.all():
+        for fault, present in program(jax.tree.map(np.asarray, _as_traced(env))).items():
+            if np.asarray(present).all():
                 raise ConfigError(fault if fault.startswith("rta.") else f"rta: {fault}")
 
 
 @lru_cache(maxsize=256)
-def _can_report(structure: Any, shapes: tuple, precision: Any) -> bool:
-    """Return whether a filter can report any fault.
-
-    Finding out traces a start, which is done once for each structure.
+def _fault_finder(structure: Any, shapes: tuple, precision: Any) -> Compiled | None:
+    """Return the program that looks for faults of a filter, or None if it can report none.
 
     Args:
         structure: the tree structure of the environment.
@@ -439,7 +443,13 @@ def _can_report(structure: Any, shapes: tuple, precision: Any) -> bool:
         precision: the dtype of a new number. It is part of the cache's key.
     """
     env = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(*shape) for shape in shapes])
-    return bool(jax.eval_shape(_faults, env, jax.random.key(0)))
+    traced = jax.jit(_faults_of_starts).trace(env)
+    return traced.lower().compile() if traced.out_info else None
+
+
+def _faults_of_starts(env: Environment) -> Mapping[str, jax.Array]:
+    """Return which of eight random starts have each of the faults that the filter knows."""
+    return jax.vmap(_faults, in_axes=(None, 0))(env, jax.random.split(jax.random.key(0), 8))
 
 
 def _faults(env: Environment, key: jax.Array) -> Mapping[str, jax.Array]:
@@ -452,6 +462,3 @@ def _faults(env: Environment, key: jax.Array) -> Mapping[str, jax.Array]:
 def _without_filter(paths: Mapping[str, Any]) -> dict[str, Any]:
     """Return the intervals of the random numbers that are not the filter's."""
     return {path: interval for path, interval in paths.items() if not path.startswith("rta.")}
-
-
-_faults_of_starts = jax.jit(jax.vmap(_faults, in_axes=(None, 0)))

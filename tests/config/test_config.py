@@ -1791,7 +1791,7 @@ def test_a_section_of_thousands_of_parts_is_refused_at_once(tree: dict[str, Any]
     assert message == "status: expected at most 1,000 parts, found 1,007"
 
 
-def nothing_is_compiled_to_make_a_task() -> None:
+def few_programs_are_compiled_to_make_a_task() -> None:
     compiled = []
 
     def note(event: str, *_: Any, **details: Any) -> None:
@@ -1802,8 +1802,11 @@ def nothing_is_compiled_to_make_a_task() -> None:
     for task in TASKS:
         jaxsafe.make(task)
     assert not compiled, compiled
+    # What looks for faults of a filter is one program.
+    jaxsafe.make("docking2d_oriented", rta="default")
+    assert len(compiled) == 1, compiled
 
 
-def test_nothing_is_compiled_to_make_a_task() -> None:
+def test_few_programs_are_compiled_to_make_a_task() -> None:
     """Each small program takes some 15 ms, and a check of every number would be one."""
-    check_as_compiled_by_commands(nothing_is_compiled_to_make_a_task)
+    check_as_compiled_by_commands(few_programs_are_compiled_to_make_a_task)
