@@ -2,11 +2,11 @@
 
     python benchmarks/all.py [names=environments,ppo,…] [measure=true] [published=FILE]
 
-Each script of this directory writes its own file in `benchmarks/results`. A result is current if it
-was measured on this processor with these versions, and its fingerprint of the sources is that of
-today's. What is current is not measured again, so a command that was stopped goes on where it was.
-The rows of the verification benchmark that need the published network are measured if `published`
-names it.
+Each script of this directory writes its own file in `benchmarks/results`, and each attack one in
+`benchmarks/results/attacks`. A result is current if it was measured on this processor with these
+versions, and its fingerprint of the sources is that of today's. What is current is not measured
+again, so a command that was stopped goes on where it was. The rows of the verification benchmark
+that need the published network are measured if `published` names it.
 
 Results of different machines are not mixed: with `names`, all others must be current. An
 accelerator has a script of its own.
@@ -23,6 +23,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from attacks import ATTACKS
 from isolated import several, words
 from machine import about
 
@@ -50,8 +51,9 @@ SCRIPTS: dict[str, tuple[str, ...]] = {
     "far_starts": (),
     "verification": (),
     "rta": (),
+    **{f"attacks/{name}": (f"names={name}",) for name in ATTACKS},
 }
-"""The options of each script, by its name, in the order in which they run. The longest is last."""
+"""The options of each script by the name of its result, in the order in which they run."""
 
 SAME = ("processor", "cores", "python", "jax", "jaxlib", "sources")
 """What must be as it is here for a result to be current."""
@@ -63,7 +65,7 @@ def main() -> int:
     names = several("names", options["names"], SCRIPTS) or list(SCRIPTS)
     stale = {name: why for name in SCRIPTS if (why := reason(name))}
     if options["measure"] == "false":
-        print("\n".join(f"{name:20s}{stale.get(name, 'current')}" for name in SCRIPTS))
+        print("\n".join(f"{name:34s}{stale.get(name, 'current')}" for name in SCRIPTS))
         return 1 if stale else 0
     if about(__file__)["changed"]:
         sys.exit("all.py: the code differs from its commit; commit it first")
@@ -74,23 +76,32 @@ def main() -> int:
     for name in names:
         if name in stale:
             given = [*SCRIPTS[name], *published * (name == "verification")]
-            script = Path(__file__).with_name(f"{name}.py")
-            print(f"$ python benchmarks/{name}.py {' '.join(given)}".strip(), flush=True)
+            script = script_of(name)
+            print(f"$ python benchmarks/{script.name} {' '.join(given)}".strip(), flush=True)
             if code := subprocess.run([sys.executable, script, *given], check=False).returncode:
                 return code
     return 0
+
+
+def script_of(name: str) -> Path:
+    """Return the path of the script that makes a result.
+
+    Args:
+        name: the name of the result.
+    """
+    return Path(__file__).with_name(f"{name.partition('/')[0]}.py")
 
 
 def reason(name: str) -> str | None:
     """Return why a result is not current, or None if it is.
 
     Args:
-        name: the name of the script that made it.
+        name: the name of the result.
     """
     path = RESULTS / f"{name}.json"
     if not path.exists():
         return "not measured"
-    here = about(str(Path(__file__).with_name(f"{name}.py")))
+    here = about(str(script_of(name)))
     found = list(_measurements(read_json(path)))
     if not found:
         return "nothing says where it was measured"
@@ -104,7 +115,7 @@ def reason(name: str) -> str | None:
 def _measurements(content: Any) -> Iterator[dict[str, Any]]:
     """Yield what the parts of a result say about where they were measured."""
     if isinstance(content, dict):
-        if "processor" in content:
+        if "sources" in content:
             yield content
         for value in content.values():
             yield from _measurements(value)

@@ -698,7 +698,7 @@ def attacks(_: Results) -> str:
     """Return the table of what all adversaries together achieved against each task's filter."""
     rows = []
     for task in DOCKING_FIRST:
-        results = read_json(RESULTS / "falsify" / f"{task}.json")
+        results = read_json(RESULTS / "attacks" / f"{task}.json")
         policies = results["policies"]
         violating = [row["violating_steps"] + row["violating_steps_inside"] for row in policies]
         rows.append(
@@ -718,7 +718,7 @@ def bounded_attacks(_: Results) -> str:
     """Return the table of what all adversaries together achieved against `robust`, by level."""
     rows = []
     for task in DOCKING_FIRST:
-        files = [RESULTS / "falsify" / f"{task}_{part}.json" for part in ("within", "beyond")]
+        files = [RESULTS / "attacks" / f"{task}_{part}.json" for part in ("within", "beyond")]
         flights = [row for file in files if file.exists() for row in read_json(file)["policies"]]
         for level in sorted({row["level"] for row in flights}):
             of_level = [row for row in flights if row["level"] == level]
@@ -747,7 +747,7 @@ def adversaries(_: Results) -> str:
     """Return the table of what each adversary achieved against each task's filter."""
     rows = []
     for task in DOCKING_FIRST:
-        results = read_json(RESULTS / "falsify" / f"{task}.json")
+        results = read_json(RESULTS / "attacks" / f"{task}.json")
         for row in results["policies"]:
             rows.append(
                 [

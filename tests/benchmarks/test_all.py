@@ -128,6 +128,7 @@ def test_a_script_depends_on_the_environment_and_not_on_figures(fingerprint: Mod
         ("five_tasks", "devices/program_store"),
         ("startup", "commands/train"),
         ("datasets", "dataset/collect"),
+        ("attacks", "evaluate/run_adversaries"),
     ],
 )
 def test_a_script_depends_on_what_it_calls_and_on_the_commands_that_it_runs(
@@ -144,7 +145,21 @@ def test_every_script_that_writes_results_is_run(monkeypatch: pytest.MonkeyPatch
         for path in BENCHMARKS.glob("*.py")
         if "about(__file__)" in path.read_text(encoding="utf-8")
     }
-    assert {*importlib.import_module("all").SCRIPTS} == scripts - {"accelerator", "all"}
+    everything = importlib.import_module("all")
+    run = {everything.script_of(name).stem for name in everything.SCRIPTS}
+    assert run == scripts - {"accelerator", "all"}
+
+
+def test_every_result_but_that_of_a_gpu_is_refreshed_by_one_command(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    everything = importlib.import_module("all")
+    results = {
+        path.relative_to(everything.RESULTS).with_suffix("").as_posix()
+        for path in everything.RESULTS.rglob("*.json")
+    }
+    assert results == {*everything.SCRIPTS, "accelerator"}
 
 
 @pytest.mark.parametrize("key", ["processor", "cores", "python", "jax", "jaxlib", "sources"])
@@ -159,7 +174,8 @@ def test_a_result_of_another_machine_or_code_is_stale(
     assert re.findall("current", capsys.readouterr().out) == ["current"] * 2
     write(tmp_path / "second.json", HERE | {key: "another"})
     assert run(everything, monkeypatch, "measure=false") == 1
-    assert f"second              {key}: another, here {HERE[key]}" in capsys.readouterr().out
+    line = f"{'second':34s}{key}: another, here {HERE[key]}"
+    assert line in capsys.readouterr().out
     with pytest.raises(SystemExit, match=f"^names: second is stale too \\({key}: another"):
         run(everything, monkeypatch, "names=first")
 
