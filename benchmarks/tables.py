@@ -505,8 +505,6 @@ def five_tasks(results: Results) -> str:
     }
     rows = []
     for way, label in labels.items():
-        if way not in results["runs"][0]:
-            continue  # results of an earlier version lack it
         least = [min(run[way]["success"].values()) for run in results["runs"]]
         columns = [[run[way][name] for run in results["runs"]] for name in ("learnt", "whole")]
         rows.append(
