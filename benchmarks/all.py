@@ -63,6 +63,10 @@ def main() -> int:
     """Run the command and return the exit code."""
     options = words(names="", measure="true", published="")
     names = several("names", options["names"], SCRIPTS) or list(SCRIPTS)
+    if options["measure"] not in ("true", "false"):
+        sys.exit(f"measure: found {options['measure']!r}; choose from true, false")
+    if options["published"] and not Path(options["published"]).is_file():
+        sys.exit(f"published: no file {options['published']!r}")
     stale = {name: why for name in SCRIPTS if (why := reason(name))}
     if options["measure"] == "false":
         print("\n".join(f"{name:34s}{stale.get(name, 'current')}" for name in SCRIPTS))

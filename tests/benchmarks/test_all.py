@@ -180,6 +180,26 @@ def test_a_result_of_another_machine_or_code_is_stale(
         run(everything, monkeypatch, "names=first")
 
 
+@pytest.mark.parametrize(
+    ("option", "error"),
+    [
+        ("measure=maybe", "measure: found 'maybe'; choose from true, false"),
+        ("published=nowhere.onnx", "published: no file 'nowhere.onnx'"),
+    ],
+)
+def test_a_wrong_option_ends_the_command_before_anything_is_measured(
+    everything: ModuleType,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    option: str,
+    error: str,
+) -> None:
+    monkeypatch.setattr(everything.subprocess, "run", None)
+    (tmp_path / "second.json").unlink()
+    with pytest.raises(SystemExit, match=f"^{re.escape(error)}$"):
+        run(everything, monkeypatch, option)
+
+
 def test_only_what_is_stale_is_measured(
     everything: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
