@@ -1323,7 +1323,7 @@ def verification(results: Results) -> str:
             f"{row['proved']:.1%}",
             f"{row['bounded']:,}",
             f"{row['seconds']:.1f}",
-            "" if row["check_seconds"] is None else f"{row['check_seconds']:.0f}",
+            "" if row["check_seconds"] is None else f"{row['check_seconds']:.1f}",
         ]
         for row in results["rows"].values()
         if row["box"].keys() == {"position", "velocity"}
@@ -1364,7 +1364,7 @@ def verification_turning(results: Results) -> str:
                     f"{row['proved']:.1%}",
                     f"{row['bounded']:,}",
                     f"{row['seconds']:.1f}",
-                    "" if row["check_seconds"] is None else f"{row['check_seconds']:.0f}",
+                    "" if row["check_seconds"] is None else f"{row['check_seconds']:.1f}",
                 ]
             )
     heads = (
