@@ -51,6 +51,17 @@ slow = partial(pytest.param, marks=pytest.mark.slow)
 
 
 @pytest.mark.thorough
+def test_starts_below_the_lower_limit_are_certified() -> None:
+    certified = jax.jit(
+        jax.vmap(lambda env, key: jaxsafe.reset(env, key)[1].info.rta.certified, (None, 0))
+    )
+    keys = jax.random.split(jax.random.key(0), 5000)
+    assert 0.015 < 1.0 - float(certified(robust(), keys).mean()) < 0.03
+    slower = jaxsafe.override(robust(), {"deputy.start.velocity.share": [0.0, 0.97]})
+    assert certified(slower, keys).all()
+
+
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "bound", [{"process": LARGEST}, thorough({"process": 1e-4, "position": 1.0, "velocity": 4e-3})]
 )

@@ -50,6 +50,11 @@ LONG = [
     if preset not in (*COMPARED, "default")
 ]
 
+BELOW_THE_LIMIT = {
+    ("robust", "docking2d_oriented"): {"deputy.start.velocity.share": [0.0, 0.97]},
+}
+"""Changes for filters that keep a limit which many starts of the task are above."""
+
 BRAKE = {"type": "brake", "name": "brake"}
 SLOW = {"type": "slow", "speed": 0.1}
 
@@ -361,7 +366,7 @@ def test_a_state_that_is_not_a_number_is_not_certified(task: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("preset", "task"), LONG)
 def test_no_adversary_breaks_any_filter(preset: str, task: str) -> None:
-    env = jaxsafe.make(task, rta=preset)
+    env = jaxsafe.make(task, BELOW_THE_LIMIT.get((preset, task), {}), rta=preset)
     for policy in ("bang_bang", "greedy", "sideways", "intercept"):
         assert_unbroken(env, attack(env, policy, 300, 64, jax.random.key(1)))
 
