@@ -48,7 +48,7 @@ class Options(CommandOptions):
     """The starts of the proof, along each axis [m/s]."""
     horizon: Count = 40
     """Number of steps of the proof."""
-    rounds: Count = 4
+    rounds: Count = 10
     """Largest number of further trainings."""
     boxes: Count = 4_000
     """Largest number of boxes of a proof."""
