@@ -1304,6 +1304,21 @@ def _program(row: Results) -> list[str]:
     return [f"{row['compile_s']:.2g}", "–" if memory is None else f"{memory / 2**20:.0f}"]
 
 
+PROOF_HEADS = ("result", "proved", "boxes bounded", "seconds", "check [s]")
+"""The last columns of the tables of proofs."""
+
+
+def _proof_cells(row: Results) -> list[str]:
+    """Return the cells below `PROOF_HEADS`."""
+    return [
+        row["result"],
+        f"{row['proved']:.1%}",
+        f"{row['bounded']:,}",
+        f"{row['seconds']:.1f}",
+        "" if row["check_seconds"] is None else f"{row['check_seconds']:.1f}",
+    ]
+
+
 def verification(results: Results) -> str:
     """Return the table of what was proved from a box of starts, and how long it took."""
 
@@ -1319,20 +1334,13 @@ def verification(results: Results) -> str:
             row.get("property", "safe"),
             str(row["steps"]),
             row["arithmetic"],
-            row["result"],
-            f"{row['proved']:.1%}",
-            f"{row['bounded']:,}",
-            f"{row['seconds']:.1f}",
-            "" if row["check_seconds"] is None else f"{row['check_seconds']:.1f}",
+            *_proof_cells(row),
         ]
         for row in results["rows"].values()
         if row["box"].keys() == {"position", "velocity"}
     )
-    heads = (
-        "policy | positions [m] | velocities [m/s] | property | steps | arithmetic | result | "
-        "proved | boxes bounded | seconds | check [s]"
-    )
-    return markdown(heads.split(" | "), rows)
+    heads = "policy | positions [m] | velocities [m/s] | property | steps | arithmetic"
+    return markdown([*heads.split(" | "), *PROOF_HEADS], rows)
 
 
 def verification_turning(results: Results) -> str:
@@ -1360,18 +1368,11 @@ def verification_turning(results: Results) -> str:
                     f"{distance:,.0f} {'ft' if aircraft else 'm'}",
                     widths(row, aircraft),
                     str(row["steps"]),
-                    row["result"],
-                    f"{row['proved']:.1%}",
-                    f"{row['bounded']:,}",
-                    f"{row['seconds']:.1f}",
-                    "" if row["check_seconds"] is None else f"{row['check_seconds']:.1f}",
+                    *_proof_cells(row),
                 ]
             )
-    heads = (
-        "policy | distance | widths of the box | steps | result | proved | boxes bounded | "
-        "seconds | check [s]"
-    )
-    return markdown(heads.split(" | "), lines)
+    heads = "policy | distance | widths of the box | steps"
+    return markdown([*heads.split(" | "), *PROOF_HEADS], lines)
 
 
 def verification_starts(results: Results) -> str:
