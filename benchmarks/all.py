@@ -34,7 +34,7 @@ RESULTS = Path(__file__).parent / "results"
 SCRIPTS: dict[str, tuple[str, ...]] = {
     "environments": ("repeats=3",),
     "dynamics": (),
-    "hot_spots": ("names=rejoin3d,docking3d", "repeats=5"),
+    "hot_spots": ("names=rejoin3d,docking3d,docking2d", "repeats=5"),
     "ppo": ("repeats=2",),
     "startup": ("rta=none", "repeats=2"),
     "adapters": ("repeats=3",),
